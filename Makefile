@@ -1,0 +1,36 @@
+PYTHON ?= python3.11
+VENV := .venv
+BIN := $(VENV)/bin
+
+.DEFAULT_GOAL := help
+.PHONY: help install demo test serve lint bench clean
+
+help: ## list the targets
+	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
+
+$(VENV)/installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	touch $@
+
+install: $(VENV)/installed ## the virtual environment with everything in it
+
+demo: install ## photographs in, mirror surfaces and flux forecasts out, under out/demo
+	$(BIN)/heliotwin demo $(ARGS)
+
+test: install ## every test
+	$(BIN)/pytest -n 2 $(ARGS)
+
+lint: install ## ruff and mypy
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+serve: install ## the service on http://127.0.0.1:8000
+	$(BIN)/heliotwin serve $(ARGS)
+
+bench: install ## the figures of RESULTS.md
+	$(BIN)/python -m tests.benchmarks
+
+clean: ## remove the virtual environment and everything that was made
+	rm -rf $(VENV) out build *.egg-info

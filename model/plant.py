@@ -1,0 +1,182 @@
+"""What a plant is made of: facets, heliostats, target planes.
+
+Plain frozen data in numpy; the tracers turn it into batched tensors (`model.tracing.scene`).
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from model.errors import InvalidInputError
+from model.frames import enu_to_wgs84, wgs84_to_enu
+from model.mount import Mount
+
+Vector = NDArray[np.float64]
+
+
+def _vector(name: str, value: ArrayLike) -> Vector:
+    vector = np.array(value, dtype=np.float64)
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise InvalidInputError(f"{name} must be three finite numbers, got {value!r}")
+    vector.flags.writeable = False
+    return vector
+
+
+@dataclass(frozen=True, eq=False)
+class Facet:
+    """One mirror facet and its ideal pose on the heliostat.
+
+    Attributes
+    ----------
+    position : (3,) [m]
+        Its centre in mirror coordinates (x right, y up, z out of the mirror).
+    canting_x, canting_y : (3,) [m]
+        Half its width and half its height, as vectors in mirror coordinates (PAINT's ``canting_e``, ``canting_n``).
+    """
+
+    position: Vector
+    canting_x: Vector
+    canting_y: Vector
+
+    def __post_init__(self) -> None:
+        for name in ("position", "canting_x", "canting_y"):
+            object.__setattr__(self, name, _vector(f"facet {name}", getattr(self, name)))
+        if np.linalg.norm(np.cross(self.canting_x, self.canting_y)) < 1e-9:
+            raise InvalidInputError("facet canting vectors must span an area")
+
+
+@dataclass(frozen=True, eq=False)
+class Heliostat:
+    """A heliostat: where it stands, how it turns and what mirrors it carries.
+
+    Attributes
+    ----------
+    name : str
+    position : (3,) [m]
+        The mount's reference point in ENU.
+    mount : Mount
+    facets : tuple of Facet
+        In PAINT's order: upper left, upper right, lower left, lower right, seen from the front.
+    width, height : float [m]
+        The mirror's outline.
+    """
+
+    name: str
+    position: Vector
+    mount: Mount
+    facets: tuple[Facet, ...]
+    width: float = 3.22
+    height: float = 2.56
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "position", _vector(f"position of {self.name}", self.position))
+        if not self.facets:
+            raise InvalidInputError(f"heliostat {self.name} has no facets")
+
+    @property
+    def facet_frames(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Centres (F, 3) [m], axes (F, 3 axes, 3) and half sizes (F, 2) [m] of the facets in mirror coordinates.
+
+        The axes are orthonormal: x along ``canting_x``, z their common normal, y completing them.
+        """
+        half_x = np.array([facet.canting_x for facet in self.facets])
+        half_y = np.array([facet.canting_y for facet in self.facets])
+        half_sizes = np.stack([np.linalg.norm(half_x, axis=-1), np.linalg.norm(half_y, axis=-1)], axis=-1)
+        x = half_x / half_sizes[:, :1]
+        z = np.cross(half_x, half_y)
+        z /= np.linalg.norm(z, axis=-1, keepdims=True)
+        axes = np.stack([x, np.cross(z, x), z], axis=-2)
+        return np.array([facet.position for facet in self.facets]), axes, half_sizes
+
+
+@dataclass(frozen=True, eq=False)
+class TargetPlane:
+    """A rectangle that light falls on: a calibration target, or any plane to forecast on.
+
+    Attributes
+    ----------
+    name : str
+    center : (3,) [m]
+        In ENU.
+    normal : (3,)
+        Unit normal of the side that is lit.
+    up : (3,)
+        Unit vector of the image's upward direction, made perpendicular to ``normal``.
+    width, height : float [m]
+    """
+
+    name: str
+    center: Vector
+    normal: Vector
+    up: Vector
+    width: float
+    height: float
+
+    def __post_init__(self) -> None:
+        if not (0 < self.width < 1e4 and 0 < self.height < 1e4):
+            raise InvalidInputError(f"target {self.name}: width and height must be positive metres")
+        normal, up = _vector("target normal", self.normal), _vector("target up", self.up)
+        normal = normal / max(float(np.linalg.norm(normal)), 1e-300)
+        up = up - (up @ normal) * normal
+        if np.linalg.norm(normal) < 0.5 or np.linalg.norm(up) < 1e-6:
+            raise InvalidInputError(f"target {self.name}: normal must not vanish and up must not be parallel to it")
+        object.__setattr__(self, "center", _vector("target center", self.center))
+        object.__setattr__(self, "normal", _vector("target normal", normal))
+        object.__setattr__(self, "up", _vector("target up", up / np.linalg.norm(up)))
+
+    @classmethod
+    def from_corners(
+        cls, name: str, upper_left: Vector, upper_right: Vector, lower_left: Vector, lower_right: Vector
+    ) -> "TargetPlane":
+        """The plane of four corners (3,) [m] as they appear in the image, by the means of opposite edges."""
+        corners = np.array([upper_left, upper_right, lower_left, lower_right], dtype=np.float64)
+        right = (corners[1] + corners[3] - corners[0] - corners[2]) / 2
+        up = (corners[0] + corners[1] - corners[2] - corners[3]) / 2
+        return cls(
+            name=name,
+            center=corners.mean(axis=0),
+            normal=np.cross(right, up),
+            up=up,
+            width=float(np.linalg.norm(right)),
+            height=float(np.linalg.norm(up)),
+        )
+
+    @property
+    def right(self) -> Vector:
+        """Unit vector along the image's columns (towards the west on a target that faces north)."""
+        return np.asarray(np.cross(self.up, self.normal))
+
+    @property
+    def axes(self) -> NDArray[np.float64]:
+        """Rows right, up, normal (3, 3)."""
+        return np.stack([self.right, self.up, self.normal])
+
+    def to_plane(self, points: ArrayLike) -> NDArray[np.float64]:
+        """Coordinates (..., 2) [m] right and up of the centre, of ENU points (..., 3)."""
+        return np.asarray((np.asarray(points, dtype=np.float64) - self.center) @ self.axes[:2].T)
+
+    def to_enu(self, coordinates: ArrayLike) -> NDArray[np.float64]:
+        """ENU points (..., 3) of coordinates (..., 2) [m] right and up of the centre."""
+        return np.asarray(self.center + np.asarray(coordinates, dtype=np.float64) @ self.axes[:2])
+
+
+@dataclass(frozen=True, eq=False)
+class Plant:
+    """A tower with its heliostats and targets; ``origin`` (3,) is the tower base in WGS84 [deg, deg, m]."""
+
+    name: str
+    origin: Vector
+    targets: dict[str, TargetPlane] = field(default_factory=dict)
+    heliostats: dict[str, Heliostat] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "origin", _vector("plant origin", self.origin))
+
+    def to_enu(self, wgs84: ArrayLike) -> NDArray[np.float64]:
+        """ENU (..., 3) [m] of WGS84 positions (..., 3) [deg, deg, m]."""
+        return wgs84_to_enu(wgs84, self.origin)
+
+    def to_wgs84(self, enu: ArrayLike) -> NDArray[np.float64]:
+        """WGS84 positions (..., 3) [deg, deg, m] of ENU (..., 3) [m]."""
+        return enu_to_wgs84(enu, self.origin)

@@ -1,0 +1,1 @@
+"""REST, storage, command line and PAINT import around `model`."""

@@ -1,0 +1,1 @@
+"""What makes the weights: surfaces, augmentation, rendering, training, evaluation, export."""
