@@ -66,22 +66,23 @@ class LinearActuator:
         if min(self.increment, self.offset, self.pivot_radius) <= 0:
             raise InvalidInputError("actuator increment, offset and pivot_radius must be positive")
 
-    def _pivot_angle(self, stroke: Array) -> Array:
-        cosine = (self.offset**2 + self.pivot_radius**2 - stroke**2) / (2 * self.offset * self.pivot_radius)
+    def _pivot_angle(self, stroke: ArrayLike) -> Array:
+        length = np.asarray(stroke, dtype=np.float64)
+        cosine = (self.offset**2 + self.pivot_radius**2 - length**2) / (2 * self.offset * self.pivot_radius)
         if (np.abs(cosine) > 1).any():
             raise UnreachableError("actuator stroke does not close its triangle; check the motor position")
-        return np.arccos(cosine)
+        return np.asarray(np.arccos(cosine))
 
     def angle(self, steps: ArrayLike) -> Array:
         """Axis angle (...) [rad] at motor position ``steps`` (...)."""
         stroke = np.asarray(steps, dtype=np.float64) / self.increment + self.initial_stroke_length
-        turned = self._pivot_angle(stroke) - self._pivot_angle(np.float64(self.initial_stroke_length))
+        turned = self._pivot_angle(stroke) - self._pivot_angle(self.initial_stroke_length)
         return self.initial_angle + (-turned if self.clockwise else turned)
 
     def steps(self, angle: ArrayLike) -> Array:
         """Motor position (...) [steps] at an axis angle (...) [rad]; inverts `angle`."""
         turned = np.asarray(angle, dtype=np.float64) - self.initial_angle
-        pivot = self._pivot_angle(np.float64(self.initial_stroke_length)) + (-turned if self.clockwise else turned)
+        pivot = self._pivot_angle(self.initial_stroke_length) + (-turned if self.clockwise else turned)
         stroke = np.sqrt(self.offset**2 + self.pivot_radius**2 - 2 * self.offset * self.pivot_radius * np.cos(pivot))
         return np.asarray((stroke - self.initial_stroke_length) * self.increment)
 
@@ -168,7 +169,7 @@ class Mount:
             raise InvalidInputError("this mount has no actuators, so motor positions say nothing of its angles")
         position = np.asarray(steps, dtype=np.float64)
         turned = [actuator.angle(position[..., axis]) for axis, actuator in enumerate(self.actuators)]
-        return np.stack(turned, axis=-1) + np.asarray(self.axis_zero)
+        return np.asarray(np.stack(turned, axis=-1) + np.asarray(self.axis_zero))
 
     def motors_from_angles(self, angles: ArrayLike) -> Array:
         """Motor positions (..., 2) [steps] at axis angles (..., 2) [rad]; inverts `angles_from_motors`."""
