@@ -1,0 +1,234 @@
+"""Finding the marks on a target: dark L brackets at its corners, dark T bars where two targets meet.
+
+A mark is a compact dark shape on a bright sheet. Relative darkness (black-hat over the local brightness) is thresholded
+at several levels, since a spot or glare near a mark lowers its contrast; each connected shape is compared with ideal
+marks of different strokes and tilts, and the best match names its kind. Its reference point is then measured on the
+full-size image, where straight lines are fitted to the mark's edges with sub-pixel accuracy.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Kind = Literal["L", "T"]
+Points = NDArray[np.float64]
+
+_WORK_SIZE = 1500  # longest side [px] of the image that is searched
+_LEVELS = (0.1, 0.16, 0.25, 0.35, 0.5)  # relative darkness
+_MIN_SIDE, _MAX_SIDE = 12, 220  # of a mark, in the searched image [px]
+_CELLS = 32
+_MIN_MATCH = 0.62
+_STROKES = (0.14, 0.2, 0.27, 0.34)
+_TILTS_DEG = tuple(range(-24, 25, 6))
+
+
+@dataclass(frozen=True, eq=False)
+class Mark:
+    """A mark in an image.
+
+    Attributes
+    ----------
+    kind : "L" or "T"
+    quarter : int
+        Quarter turns clockwise from its first attitude: an L that opens to the lower right (an upper left corner), a T
+        whose bar is on top.
+    point : (2,) [px]
+        Its reference point (x, y): an L's outer corner; a T's middle of the bar's outer edge.
+    arms : (2, 2) [px]
+        From the reference point: along an L's two arms; along half of a T's bar and along its stem.
+    score : float
+        Overlap with the ideal mark, 0 to 1.
+    """
+
+    kind: Kind
+    quarter: int
+    point: Points
+    arms: Points
+    score: float
+
+    @property
+    def size(self) -> float:
+        """Length of the longer arm [px]."""
+        return float(np.linalg.norm(self.arms, axis=1).max())
+
+
+def _outline(kind: Kind, stroke: float) -> Points:
+    """The ideal mark in its first attitude, reference point at the origin, y down."""
+    if kind == "L":
+        return np.array([[0, 0], [1, 0], [1, stroke], [stroke, stroke], [stroke, 1], [0, 1]], dtype=np.float64)
+    half = stroke / 2
+    return np.array(
+        [[-0.5, 0], [0.5, 0], [0.5, stroke], [half, stroke], [half, 1], [-half, 1], [-half, stroke], [-0.5, stroke]]
+    )
+
+
+def _turn(points: Points, degrees: float) -> Points:
+    angle = np.radians(degrees)
+    return points @ np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+
+
+@dataclass(frozen=True, eq=False)
+class _Template:
+    kind: Kind
+    quarter: int
+    point: Points  # in units of the bounding box
+    arms: Points
+    cells: NDArray[np.float32]
+
+
+@cache
+def _templates() -> tuple[_Template, ...]:
+    """Ideal marks of all kinds, attitudes, strokes and small tilts, each filling its bounding box."""
+    templates = []
+    for kind in ("L", "T"):
+        for quarter in range(4):
+            for stroke in _STROKES:
+                for tilt in _TILTS_DEG:
+                    templates.append(_template(kind, quarter, stroke, tilt))  # type: ignore[arg-type]
+    return tuple(templates)
+
+
+def _template(kind: Kind, quarter: int, stroke: float, tilt_deg: float) -> _Template:
+    ends = np.array([[0, 0], [1, 0], [0, 1]] if kind == "L" else [[0, 0], [0.5, 0], [0, 1]], dtype=np.float64)
+    outline = _turn(_outline(kind, stroke), 90 * quarter + tilt_deg)
+    ends = _turn(ends, 90 * quarter + tilt_deg)
+    low, span = outline.min(axis=0), np.ptp(outline, axis=0)
+    cells = np.zeros((4 * _CELLS, 4 * _CELLS), dtype=np.uint8)
+    cv2.fillPoly(cells, [np.round((outline - low) / span * 4 * _CELLS - 0.5).astype(np.int32)], 1)
+    shrunk = cv2.resize(cells.astype(np.float32), (_CELLS, _CELLS), interpolation=cv2.INTER_AREA)
+    point = (ends[0] - low) / span
+    return _Template(kind, quarter, point, (ends[1:] - ends[0]) / span, shrunk.astype(np.float32))
+
+
+@cache
+def _template_matrix() -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    matrix = np.stack([template.cells.ravel() for template in _templates()])
+    return matrix, matrix.sum(axis=1)
+
+
+def find_marks(gray: NDArray[np.uint8]) -> list[Mark]:
+    """All marks of a gray image (rows, columns), the best first, with sub-pixel reference points."""
+    scale = min(1.0, _WORK_SIZE / max(gray.shape))
+    small = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else gray
+    found: list[Mark] = []
+    for darkness in _darkness(np.asarray(small, dtype=np.uint8)):
+        for level in _LEVELS:
+            found += _marks_of_mask((darkness > level).astype(np.uint8))
+    kept: list[Mark] = []
+    for mark in sorted(found, key=lambda mark: -mark.score):
+        if all(np.linalg.norm(mark.point - other.point) > 0.5 * other.size for other in kept):
+            kept.append(mark)
+    return [_refined(gray, _scaled(mark, 1 / scale)) for mark in kept]
+
+
+def _darkness(gray: NDArray[np.uint8]) -> list[NDArray[np.float32]]:
+    """Relative darkness against the surroundings, for narrow and for wide strokes."""
+    smooth = cv2.GaussianBlur(gray, (0, 0), 1.0)
+    maps = []
+    for width in (17, 41):
+        closed = cv2.morphologyEx(smooth, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_RECT, (width, width)))
+        maps.append((closed.astype(np.float32) - smooth) / np.maximum(closed, 20).astype(np.float32))
+    return maps
+
+
+def _marks_of_mask(mask: NDArray[np.uint8]) -> list[Mark]:
+    """The connected shapes of a mask that look like marks."""
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
+    marks = []
+    for label in range(1, len(stats)):
+        left, top, width, height, area = (int(value) for value in stats[label])
+        sides = sorted((width, height))
+        fill = area / (width * height)
+        if _MIN_SIDE <= sides[0] and sides[1] <= min(_MAX_SIDE, 2.5 * sides[0]) and 0.15 < fill < 0.75:
+            shape = labels[top : top + height, left : left + width] == label
+            mark = _matched(shape.astype(np.float32), np.array([left, top, width, height], dtype=np.float64))
+            if mark is not None:
+                marks.append(mark)
+    return marks
+
+
+def _matched(shape: NDArray[np.float32], box: Points) -> Mark | None:
+    """The ideal mark that a shape overlaps best, if it does well enough (intersection over union)."""
+    interpolation = cv2.INTER_AREA if min(shape.shape) >= _CELLS else cv2.INTER_LINEAR
+    cells = cv2.resize(shape, (_CELLS, _CELLS), interpolation=interpolation).ravel()
+    matrix, areas = _template_matrix()
+    common = matrix @ cells
+    overlap = common / (areas + cells.sum() - common)
+    best = int(np.argmax(overlap))
+    if overlap[best] < _MIN_MATCH:
+        return None
+    template = _templates()[best]
+    # The box spans pixel edges; pixel centres lie at integers.
+    point = box[:2] - 0.5 + template.point * box[2:]
+    return Mark(template.kind, template.quarter, point, template.arms * box[2:], float(overlap[best]))
+
+
+def _scaled(mark: Mark, factor: float) -> Mark:
+    return Mark(mark.kind, mark.quarter, (mark.point + 0.5) * factor - 0.5, mark.arms * factor, mark.score)
+
+
+def _refined(gray: NDArray[np.uint8], mark: Mark) -> Mark:
+    """The mark with its reference point measured on its edges; unchanged where they are not clear."""
+    for _ in range(2):
+        point = _edge_corner(gray, mark) if mark.kind == "L" else _edge_tee(gray, mark)
+        if point is None or np.linalg.norm(point - mark.point) > 0.3 * mark.size:
+            return mark
+        mark = Mark(mark.kind, mark.quarter, point, mark.arms, mark.score)
+    return mark
+
+
+def _edge_corner(gray: NDArray[np.uint8], mark: Mark) -> Points | None:
+    """An L's outer corner: where the outer edges of its two arms meet."""
+    first = _edge_line(gray, mark.point + 0.15 * mark.arms[0], 0.7 * mark.arms[0], mark.arms[1])
+    second = _edge_line(gray, mark.point + 0.15 * mark.arms[1], 0.7 * mark.arms[1], mark.arms[0])
+    return None if first is None or second is None else _intersection(first, second)
+
+
+def _edge_tee(gray: NDArray[np.uint8], mark: Mark) -> Points | None:
+    """A T's reference point: where the axis of its stem meets the outer edge of its bar."""
+    half, stem = mark.arms
+    bar = _edge_line(gray, mark.point - 0.85 * half, 1.7 * half, stem)
+    start, run = mark.point + 0.4 * stem, 0.5 * stem
+    left = _edge_line(gray, start - 0.2 * half, run, half)
+    right = _edge_line(gray, start + 0.2 * half, run, -half)
+    if bar is None or left is None or right is None:
+        return None
+    axis = (left[0] + right[0]) / 2, left[1] + right[1]
+    return _intersection(bar, axis)
+
+
+Line = tuple[Points, Points]  # a point and a direction
+
+
+def _edge_line(gray: NDArray[np.uint8], start: Points, run: Points, inward: Points) -> Line | None:
+    """The line along which brightness falls, near ``start`` to ``start + run``, towards ``inward``."""
+    across = np.array([-run[1], run[0]]) / np.linalg.norm(run)
+    across *= np.sign(across @ inward)
+    reach = 0.17 * float(np.linalg.norm(inward)) * (2 if abs(np.linalg.norm(inward)) < np.linalg.norm(run) / 2 else 1)
+    offsets = np.arange(-reach, reach + 0.25, 0.5)
+    along = start + np.linspace(0, 1, max(8, int(np.linalg.norm(run) / 2)))[:, None] * run
+    places = (along[:, None] + offsets[:, None] * across).astype(np.float32)
+    profiles = cv2.remap(gray, places[..., 0], places[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    fall = np.maximum(-np.diff(profiles.astype(np.float64), axis=1), 0)
+    drop = fall.max(axis=1)
+    usable = drop > max(1.5, 0.4 * float(np.median(drop)))
+    if usable.sum() < 6:
+        return None
+    fall = np.where(fall >= 0.4 * drop[:, None], fall, 0)[usable]
+    shift = fall @ (offsets[:-1] + 0.25) / fall.sum(axis=1)
+    edge = (along[usable] + shift[:, None] * across).astype(np.float32)
+    dx, dy, x, y = (float(value) for value in cv2.fitLine(edge, cv2.DIST_HUBER, 0, 0.01, 0.01).ravel())
+    direction = np.array([dx, dy])
+    return np.array([x, y]), direction * np.sign(direction @ run)
+
+
+def _intersection(first: Line, second: Line) -> Points | None:
+    matrix = np.stack([first[1], -second[1]], axis=1)
+    if abs(np.linalg.det(matrix)) < 0.2:
+        return None
+    along = np.linalg.solve(matrix, second[0] - first[0])
+    return np.asarray(first[0] + along[0] * first[1])

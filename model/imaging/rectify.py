@@ -1,0 +1,233 @@
+"""From a camera frame to the target seen straight on: which marks are the target's, and the homography through them.
+
+A target has an L bracket at each free corner. Where two targets share an edge (the Juelich tower's upper and lower), T
+bars stand at the ends of that edge and L brackets only at the corners of the pair, so the pair's marks together serve
+either target. A target that is alone is searched by its four brackets. Each hypothesis of four marks gives a homography;
+it must be plausible (convex, the right aspect, arms along the edges) and is scored by all marks that agree with it.
+"""
+
+from dataclasses import dataclass
+from itertools import combinations, product
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from model.errors import ImageRefusedError, InvalidInputError
+from model.imaging.marks import Kind, Mark, Points, find_marks
+from model.plant import TargetPlane
+
+CROP_SIZE = 256
+
+_CANDIDATES = 4  # marks of one kind and attitude that are tried for one place
+_ASPECT_TOLERANCE = 0.35  # of the natural logarithm; a view from the side shortens the width
+_ARM_TOLERANCE_DEG = 14.0
+_MIN_ARM_RATIO, _MAX_ARM_RATIO = 0.03, 0.35  # arm to the target's side
+_AGREEMENT = 0.35  # of an arm: how far a mark may lie from where the homography puts it
+
+
+@dataclass(frozen=True)
+class MarkPlace:
+    """Where a mark stands on the plane: kind, quarter turns (see `Mark`), and x right and y down in target sides."""
+
+    kind: Kind
+    quarter: int
+    x: float
+    y: float
+
+
+_ALONE = (MarkPlace("L", 0, 0, 0), MarkPlace("L", 1, 1, 0), MarkPlace("L", 3, 0, 1), MarkPlace("L", 2, 1, 1))
+# The upper of two targets; the lower one has the same marks, one side further up.
+_UPPER = (
+    MarkPlace("L", 0, 0, 0),
+    MarkPlace("L", 1, 1, 0),
+    MarkPlace("T", 3, 0, 1),
+    MarkPlace("T", 1, 1, 1),
+    MarkPlace("T", 0, 0.5, 0),
+    MarkPlace("L", 3, 0, 2),
+    MarkPlace("L", 2, 1, 2),
+    MarkPlace("T", 2, 0.5, 2),
+)
+_LOWER = tuple(MarkPlace(place.kind, place.quarter, place.x, place.y - 1) for place in _UPPER)
+
+
+def mark_layouts(target_name: str) -> tuple[tuple[MarkPlace, ...], ...]:
+    """The layouts of marks to try for a target, in this order; one of a pair is named ``..._upper`` or ``..._lower``."""
+    name = target_name.lower()
+    if name.endswith("upper"):
+        return _UPPER, _ALONE
+    if name.endswith("lower"):
+        return _LOWER, _ALONE
+    return (_ALONE,)
+
+
+def find_corners(gray: NDArray[np.uint8], plane: TargetPlane, target_name: str | None = None) -> Points:
+    """The target's corners in a camera frame, by its marks.
+
+    Parameters
+    ----------
+    gray : uint8 (rows, columns)
+    plane : TargetPlane
+        Its aspect tells it from other targets in the frame.
+    target_name : str, optional
+        Default: the plane's name. See `mark_layouts`.
+
+    Returns
+    -------
+    ndarray (4, 2) [px]
+        x, y of the upper left, upper right, lower left and lower right corner; pixel centres are integers.
+
+    Raises
+    ------
+    ImageRefusedError
+        With reason ``target_not_found``.
+    """
+    marks = find_marks(gray)
+    for layout in mark_layouts(target_name or plane.name):
+        corners = _fit_layout(marks, layout, plane)
+        if corners is not None:
+            return corners
+    raise ImageRefusedError(
+        "target_not_found",
+        f"the corner marks of {target_name or plane.name} were not found; give the four corners in pixels",
+    )
+
+
+def check_corners(corners: ArrayLike) -> Points:
+    """Configured corners as a (4, 2) array [px].
+
+    Raises
+    ------
+    InvalidInputError
+        If they are not four finite points of a convex quadrilateral in the order upper left, upper right, lower left,
+        lower right.
+    """
+    points = np.asarray(corners, dtype=np.float64)
+    if points.shape != (4, 2) or not np.isfinite(points).all() or _smallest_turn(points) <= 1.0:
+        raise InvalidInputError(
+            "corners must be four points (x, y) in pixels: upper left, upper right, lower left, lower right"
+        )
+    return points
+
+
+def rectify(image: NDArray[np.uint8], corners: Points, size: int = CROP_SIZE) -> NDArray[np.uint8]:
+    """The target seen straight on.
+
+    Parameters
+    ----------
+    image : uint8 (rows, columns) or (rows, columns, 3)
+    corners : (4, 2) [px]
+        See `find_corners`.
+    size : int
+        Pixels on a side of the result, whose outer edges are the target's.
+
+    Returns
+    -------
+    ndarray uint8 (size, size) or (size, size, 3)
+        Each pixel the mean over the area that it covers: it is sampled finely and averaged.
+    """
+    longest = max(np.linalg.norm(corners[a] - corners[b]) for a, b in ((0, 1), (2, 3), (0, 2), (1, 3)))
+    factor = int(np.clip(np.ceil(longest / size), 1, 8))
+    fine = size * factor
+    edge = np.array([[0, 0], [fine, 0], [0, fine], [fine, fine]], dtype=np.float64) - 0.5
+    transform = cv2.getPerspectiveTransform(corners.astype(np.float32), edge.astype(np.float32))
+    warped = cv2.warpPerspective(image, transform, (fine, fine), flags=cv2.INTER_LINEAR)
+    return np.asarray(cv2.resize(warped, (size, size), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def _fit_layout(marks: list[Mark], layout: tuple[MarkPlace, ...], plane: TargetPlane) -> Points | None:
+    """The corners by the best agreeing set of marks, or None."""
+    candidates = [
+        [mark for mark in marks if (mark.kind, mark.quarter) == (place.kind, place.quarter)][:_CANDIDATES]
+        for place in layout
+    ]
+    best: tuple[float, Points] | None = None
+    # The target's own corners come first in a layout; other four marks are tried only where one of those is hidden.
+    for places in combinations(range(len(layout)), 4):
+        if best is not None and places != (0, 1, 2, 3) and best[0] >= 3.0:
+            break
+        source = np.array([[layout[i].x, layout[i].y] for i in places], dtype=np.float64)
+        if _spread(source) < 0.2:
+            continue
+        for chosen in product(*(candidates[i] for i in places)):
+            fitted = _fit_four(source, list(chosen), layout, candidates, plane)
+            if fitted is not None and (best is None or fitted[0] > best[0]):
+                best = fitted
+    return None if best is None else best[1]
+
+
+def _spread(points: Points) -> float:
+    """Twice the smallest area of a triangle among four points: zero where three lie in line."""
+    return min(abs(_cross(b - a, c - a)) for a, b, c in combinations(points, 3))
+
+
+def _fit_four(
+    source: Points, chosen: list[Mark], layout: tuple[MarkPlace, ...], candidates: list[list[Mark]], plane: TargetPlane
+) -> tuple[float, Points] | None:
+    """Score and corners of the homography through four marks, or None if it is implausible."""
+    sizes = np.array([mark.size for mark in chosen])
+    if sizes.max() > 1.8 * sizes.min():
+        return None
+    points = np.array([mark.point for mark in chosen])
+    transform = cv2.getPerspectiveTransform(source.astype(np.float32), points.astype(np.float32))
+    square = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], dtype=np.float64)
+    corners = _project(transform, square)
+    if not _plausible(corners, sizes, plane) or not all(
+        _arms_agree(transform, mark, place) for mark, place in zip(chosen, source, strict=True)
+    ):
+        return None
+    return _agreement(transform, layout, candidates, sizes.mean()), corners
+
+
+def _agreement(
+    transform: Points, layout: tuple[MarkPlace, ...], candidates: list[list[Mark]], size: float
+) -> float:
+    """Sum of the scores of the marks that lie where the homography puts them."""
+    total = 0.0
+    for place, marks in zip(layout, candidates, strict=True):
+        expected = _project(transform, np.array([[place.x, place.y]]))[0]
+        near = [mark.score for mark in marks if np.linalg.norm(mark.point - expected) < _AGREEMENT * size]
+        total += max(near, default=0.0)
+    return total
+
+
+def _project(transform: Points, points: Points) -> Points:
+    """Points (n, 2) through a homography (3, 3)."""
+    mapped = points @ transform[:, :2].T + transform[:, 2]
+    return np.asarray(mapped[:, :2] / mapped[:, 2:], dtype=np.float64)
+
+
+def _cross(a: Points, b: Points) -> float:
+    return float(a[0] * b[1] - a[1] * b[0])
+
+
+def _smallest_turn(corners: Points) -> float:
+    """Smallest cross product of successive edges, around upper left, upper right, lower right, lower left."""
+    ring = corners[[0, 1, 3, 2]]
+    edges = np.roll(ring, -1, axis=0) - ring
+    return min(_cross(a, b) for a, b in zip(edges, np.roll(edges, -1, axis=0), strict=True))
+
+
+def _plausible(corners: Points, sizes: Points, plane: TargetPlane) -> bool:
+    """Whether a quadrilateral can be the photograph of this target with these marks."""
+    top, bottom, left, right = (
+        float(np.linalg.norm(corners[b] - corners[a])) for a, b in ((0, 1), (2, 3), (0, 2), (1, 3))
+    )
+    if _smallest_turn(corners) <= 0 or max(top / bottom, bottom / top, left / right, right / left) > 1.6:
+        return False
+    aspect = np.log((top + bottom) / (left + right)) - np.log(plane.width / plane.height)
+    arm = sizes.mean() / ((top + bottom + left + right) / 4)
+    return bool(abs(aspect) < _ASPECT_TOLERANCE and _MIN_ARM_RATIO < arm < _MAX_ARM_RATIO)
+
+
+def _arms_agree(transform: Points, mark: Mark, place: Points) -> bool:
+    """Whether a mark's arms point along the target's edges as the homography draws them there."""
+    quarter = mark.quarter * np.pi / 2
+    along = np.array([np.cos(quarter), np.sin(quarter)]), np.array([-np.sin(quarter), np.cos(quarter)])
+    base = _project(transform, place[None])[0]
+    for arm, direction in zip(mark.arms, along, strict=True):
+        edge = _project(transform, (place + 0.1 * direction)[None])[0] - base
+        angle = np.degrees(np.arctan2(_cross(arm, edge), float(arm @ edge)))
+        if abs(angle) > _ARM_TOLERANCE_DEG:
+            return False
+    return True
