@@ -1,0 +1,204 @@
+"""Mirror surfaces as tensor-product B-splines (NURBS whose weights are all one).
+
+A facet is a grid of control points, clamped uniform knots, any degree. heliotwin's own surfaces put the control points
+on the Greville abscissae, where x and y are linear in the parameters, and store only heights: the deviation from the
+ideally canted, flat facet. Points and normals always come with their area element |du x dv|, because on other grids
+(evenly spaced control points, say) the parameters do not cover the mirror evenly.
+
+Source: Piegl and Tiller, *The NURBS Book*, algorithms A2.2, A2.3 and section 9.2.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from model.errors import InvalidInputError
+from model.plant import Heliostat
+
+FACETS, ROWS, COLUMNS, DEGREE = 4, 8, 8, 3
+"""heliotwin's own grid: facets, control points along x, along y, and the spline's degree."""
+
+Array = NDArray[np.float64]
+
+
+def knots(count: int, degree: int) -> Array:
+    """Clamped uniform knots (count + degree + 1,) on [0, 1] for ``count`` control points."""
+    if not 1 <= degree < count:
+        raise InvalidInputError(f"a spline of degree {degree} needs more than {degree} control points, got {count}")
+    inner = np.linspace(0, 1, count - degree + 1)
+    return np.concatenate([np.zeros(degree), inner, np.ones(degree)])
+
+
+def greville(count: int, degree: int = DEGREE) -> Array:
+    """Greville abscissae (count,) on [0, 1]: the parameters at which control points make x(u) = u."""
+    t = knots(count, degree)
+    return np.array([t[i + 1 : i + 1 + degree].mean() for i in range(count)])
+
+
+def basis(count: int, degree: int, parameters: ArrayLike) -> tuple[Array, Array]:
+    """Basis functions and their first derivatives, each (n, count), at ``parameters`` (n,) in [0, 1].
+
+    Cox-de Boor recursion; the derivative from the functions of one degree less.
+    """
+    u, t = np.asarray(parameters, dtype=np.float64), knots(count, degree)
+    span = np.clip(np.searchsorted(t, u, side="right") - 1, degree, count - 1)
+    values = np.zeros((len(u), len(t) - 1))
+    values[np.arange(len(u)), span] = 1.0
+    lower = values
+    for p in range(1, degree + 1):
+        lower, values = values, np.zeros_like(values)
+        for i in range(len(t) - 1 - p):
+            if t[i + p] > t[i]:
+                values[:, i] += (u - t[i]) / (t[i + p] - t[i]) * lower[:, i]
+            if t[i + p + 1] > t[i + 1]:
+                values[:, i] += (t[i + p + 1] - u) / (t[i + p + 1] - t[i + 1]) * lower[:, i + 1]
+    slopes = np.zeros((len(u), count))
+    for i in range(count):
+        if t[i + degree] > t[i]:
+            slopes[:, i] += degree / (t[i + degree] - t[i]) * lower[:, i]
+        if t[i + degree + 1] > t[i + 1]:
+            slopes[:, i] -= degree / (t[i + degree + 1] - t[i + 1]) * lower[:, i + 1]
+    return values[:, :count], slopes
+
+
+@lru_cache(maxsize=64)
+def midpoint_basis(
+    count: int, degree: int, samples: int, dtype: torch.dtype, device: torch.device
+) -> tuple[Tensor, Tensor]:
+    """Basis and derivatives, each (samples, count), at the midpoints of ``samples`` equal parameter intervals."""
+    values, slopes = basis(count, degree, (np.arange(samples) + 0.5) / samples)
+    return torch.as_tensor(values, dtype=dtype, device=device), torch.as_tensor(slopes, dtype=dtype, device=device)
+
+
+@dataclass(frozen=True, eq=False)
+class FacetSamples:
+    """Points of a surface with the area each stands for; component first, as the tracers want them.
+
+    Attributes
+    ----------
+    points : (..., 3, S) [m]
+    area_vectors : (..., 3, S) [m2]
+        Normals whose length is the sample's share of the mirror's area.
+    """
+
+    points: Tensor
+    area_vectors: Tensor
+
+
+def _cross(a: Tensor, b: Tensor) -> Tensor:
+    """Cross product along the third dimension from the end of (..., 3, S, T)."""
+    ax, ay, az = a.unbind(-3)
+    bx, by, bz = b.unbind(-3)
+    return torch.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], dim=-3)
+
+
+def sample(control_points: Tensor, samples: int, degree: int = DEGREE) -> FacetSamples:
+    """Evaluate every facet on a grid of parameter midpoints.
+
+    Parameters
+    ----------
+    control_points : Tensor (..., F, 3, I, J) [m]
+        In any Cartesian frame; the samples come in the same.
+    samples : int
+        Along each parameter of each facet; S = F * samples**2.
+    """
+    across_x = (control_points.shape[-2], degree, samples, control_points.dtype, control_points.device)
+    across_y = (control_points.shape[-1], degree, samples, control_points.dtype, control_points.device)
+    value_u, slope_u = midpoint_basis(*across_x)
+    value_v, slope_v = midpoint_basis(*across_y)
+    along_v, along_v_slope = control_points @ value_v.T, control_points @ slope_v.T
+    points = value_u @ along_v
+    area_vectors = _cross(slope_u @ along_v, value_u @ along_v_slope) / samples**2
+    return FacetSamples(_facets_last(points), _facets_last(area_vectors))
+
+
+def _facets_last(values: Tensor) -> Tensor:
+    """(..., F, 3, n, n) to (..., 3, F * n * n)."""
+    return values.transpose(-4, -3).flatten(-3)
+
+
+def evaluate(control_points: ArrayLike, u: ArrayLike, v: ArrayLike, degree: int = DEGREE) -> tuple[Array, Array]:
+    """Points and unit normals, each (..., n, m, 3), of one or more facets on the grid ``u`` (n,) by ``v`` (m,).
+
+    ``control_points`` is (..., I, J, 3) [m], the layout of files and reports.
+    """
+    points = np.asarray(control_points, dtype=np.float64)
+    value_u, slope_u = basis(points.shape[-3], degree, u)
+    value_v, slope_v = basis(points.shape[-2], degree, v)
+
+    def product(a: Array, b: Array) -> Array:
+        return np.asarray(np.einsum("ni,...ijc,mj->...nmc", a, points, b, optimize=True))
+
+    normals = np.cross(product(slope_u, value_v), product(value_u, slope_v))
+    return product(value_u, value_v), normals / np.linalg.norm(normals, axis=-1, keepdims=True)
+
+
+def control_points(heliostat: Heliostat, z: ArrayLike | None = None) -> Array:
+    """Control points (F, I, J, 3) [m] in mirror coordinates of heights ``z`` (F, I, J) [m] over the canted facets.
+
+    None gives the ideal surface: flat facets in their ideal poses.
+    """
+    centers, axes, half_sizes = heliostat.facet_frames
+    heights = np.zeros((len(heliostat.facets), ROWS, COLUMNS)) if z is None else np.asarray(z, dtype=np.float64)
+    if heights.ndim != 3 or len(heights) != len(heliostat.facets) or not np.isfinite(heights).all():
+        raise InvalidInputError(f"z must be finite heights (facets, i, j) for {len(heliostat.facets)} facets")
+    x = (2 * greville(heights.shape[1]) - 1)[None, :, None] * half_sizes[:, 0, None, None]
+    y = (2 * greville(heights.shape[2]) - 1)[None, None, :] * half_sizes[:, 1, None, None]
+    local = np.stack(np.broadcast_arrays(x, y, heights), axis=-1)
+    return np.asarray(centers[:, None, None, :] + np.einsum("fijc,fcd->fijd", local, axes))
+
+
+def heights(heliostat: Heliostat, points: ArrayLike, degree: int = DEGREE, samples: int = 64) -> Array:
+    """Heights z (F, 8, 8) [m], facet mean zero, of control points (F, I, J, 3) [m] in mirror coordinates.
+
+    The slopes of the given surface, seen in the frame of each ideal facet, are fitted by least squares: deflectometry
+    measures normals, and heights follow from them up to the facet's mean. Facets that sit some millimetres off their
+    ideal place keep their own centre.
+    """
+    _, axes, half_sizes = heliostat.facet_frames
+    grid = (np.arange(samples) + 0.5) / samples
+    _, normals = evaluate(points, grid, grid, degree)
+    u, v = (a.ravel() for a in np.meshgrid(grid, grid, indexing="ij"))
+    local = np.einsum("fnmd,fcd->fnmc", normals, axes).reshape(len(axes), -1, 3)
+    return np.array([fit_heights(u, v, n, size) for n, size in zip(local, half_sizes, strict=True)])
+
+
+def fit_heights(u: Array, v: Array, normals: Array, half_size: Array) -> Array:
+    """Heights (8, 8) [m], mean zero, of one facet whose slopes best match measured normals.
+
+    Parameters
+    ----------
+    u, v : (n,)
+        Places on the facet as spline parameters in [0, 1].
+    normals : (n, 3)
+        In the frame of the ideal facet, of any length.
+    half_size : (2,) [m]
+        Half the facet's width and height.
+    """
+    value_u, slope_u = basis(ROWS, DEGREE, u)
+    value_v, slope_v = basis(COLUMNS, DEGREE, v)
+    by_x = np.einsum("ni,nj->nij", slope_u, value_v).reshape(len(u), -1) / (2 * half_size[0])
+    by_y = np.einsum("ni,nj->nij", value_u, slope_v).reshape(len(u), -1) / (2 * half_size[1])
+    slope_x, slope_y = -normals[:, 0] / normals[:, 2], -normals[:, 1] / normals[:, 2]
+    # Slopes do not see the constant mode; the pseudo-inverse leaves it at zero.
+    gram = by_x.T @ by_x + by_y.T @ by_y
+    solution = np.linalg.pinv(gram, rcond=1e-12, hermitian=True) @ (by_x.T @ slope_x + by_y.T @ slope_y)
+    return np.asarray((solution - solution.mean()).reshape(ROWS, COLUMNS))
+
+
+def split_canting(z: ArrayLike) -> tuple[Array, Array]:
+    """Canting and waviness, two (..., 8, 8) [m] height fields that add up to ``z``.
+
+    Canting is the plane a x + b y of each facet that fits its heights best; on the Greville grid that is a rigid tilt.
+    """
+    surface: Any = np.asarray(z, dtype=np.float64)
+    x, y = 2 * greville(surface.shape[-2]) - 1, 2 * greville(surface.shape[-1]) - 1
+    design = np.stack([a.ravel() for a in np.meshgrid(x, y, indexing="ij")] + [np.ones(x.size * y.size)], axis=-1)
+    plane = design @ np.linalg.lstsq(design, surface.reshape(-1, x.size * y.size).T, rcond=None)[0]
+    canting = plane.T.reshape(surface.shape)
+    return canting, surface - canting

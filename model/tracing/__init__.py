@@ -1,0 +1,6 @@
+"""Ray tracing of heliostat flux: scenes, a deterministic convolution tracer and a Monte Carlo reference."""
+
+from model.tracing.convolution import Flux, trace
+from model.tracing.scene import Optics, Scene, Window
+
+__all__ = ["Flux", "Optics", "Scene", "Window", "trace"]

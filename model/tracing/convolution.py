@@ -1,0 +1,252 @@
+"""The convolution tracer: deterministic, batched, differentiable.
+
+Every mirror sample throws one ray, the sun's central ray, onto the target plane with its share of the power. The cone
+around it (sun shape, slope errors) is the same for all samples of a mirror up to their distance to the target, so the
+image of the central rays is convolved with it. That is done in frequency space, where everything is exact and smooth:
+the cone enters by its transfer function, stretched by the slant range and by the beam's slope on the plane, and what
+spreading a ray over pixels has smeared is divided out again, so that a pixel holds its area's mean irradiance.
+
+Approximations: the cone's size is taken at each mirror's (or facet's) centre, and the cone is small.
+
+Source: the idea of analytic cone optics is that of HELIOS and of Lipps and Walzel, Solar Energy 21 (1978); the
+formulation in frequency space, with the transfer function's argument in closed form, is ours (see `_cone_transfer`).
+"""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+
+from model.errors import InvalidInputError, UnreachableError
+from model.sunshape import FREQUENCY_COUNT, FREQUENCY_STEP, transfer_table
+from model.surface import sample
+from model.tracing.scene import Optics, Scene, Window
+
+
+@dataclass(frozen=True, eq=False)
+class Flux:
+    """Traced flux.
+
+    Attributes
+    ----------
+    irradiance : Tensor (B, rows, columns) [W/m2]
+        Row 0 at the top.
+    spot : Tensor (B, 2) [m]
+        Centre of mass of the central rays, right and up of the plane's centre.
+    center : Tensor (B, 2) [m]
+        Centre of the window on the plane.
+    power : Tensor (B,) [W]
+        All that the mirror throws at the plane, in the window or not.
+    """
+
+    irradiance: Tensor
+    spot: Tensor
+    center: Tensor
+    power: Tensor
+
+    def normalized(self, total: float = 100.0) -> Tensor:
+        """Flux (B, rows, columns) that sums to ``total`` (the paper's 100)."""
+        return total * self.irradiance / self.irradiance.sum(dim=(-2, -1), keepdim=True).clamp(min=1e-30)
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """Central rays on the target plane.
+
+    Attributes
+    ----------
+    hits : Tensor (B, 2, S) [m]
+        Right and up of the plane's centre.
+    power : Tensor (B, S) [m2]
+        Projected mirror area that each ray stands for.
+    direction : Tensor (B, 3)
+        Mean unit direction from mirror to target, in the plane's frame.
+    slant_range : Tensor (B,) [m]
+    normal : Tensor (B, 3)
+        Mean mirror normal in the plane's frame.
+    """
+
+    hits: Tensor
+    power: Tensor
+    direction: Tensor
+    slant_range: Tensor
+    normal: Tensor
+
+    @property
+    def spot(self) -> Tensor:
+        """Centre of mass (B, 2) [m]."""
+        return (self.hits * self.power[:, None]).sum(-1) / self.power.sum(-1)[:, None]
+
+
+def central_rays(scene: Scene, samples: int) -> Rays:
+    """Reflect the sun's centre at ``samples``**2 points of each facet and meet the plane.
+
+    Raises
+    ------
+    UnreachableError
+        Where a mirror shows its back to the sun or to the target.
+    """
+    control_points, sun = scene.in_plane()
+    mirror = sample(control_points, samples, scene.degree)
+    points, normals = mirror.points, mirror.area_vectors
+    facing = (normals * sun[..., None]).sum(-2)
+    # Reflection without square roots: the area vectors need no normalising.
+    scale = 2 * facing / (normals * normals).sum(-2)
+    direction = normals * scale[:, None] - sun[..., None]
+    mean_normal, mean_point = normals.mean(-1), points.mean(-1)
+    mean_normal = mean_normal / mean_normal.norm(dim=-1, keepdim=True)
+    beam = 2 * (mean_normal * sun).sum(-1, keepdim=True) * mean_normal - sun
+    if bool(((mean_normal * sun).sum(-1) <= 0).any()) or bool(((-beam[:, 2] <= 1e-3) | (mean_point[:, 2] <= 0)).any()):
+        raise UnreachableError("a mirror shows its back to the sun or to the target; check sun, target and alignment")
+    distance = points[:, 2] / direction[:, 2]
+    hits = points[:, :2] - direction[:, :2] * distance[:, None]
+    power = facing.clamp(min=0)
+    if scene.facet_reflectivity is not None:
+        power = power * scene.facet_reflectivity.repeat_interleave(samples**2, dim=-1)
+    return Rays(hits, power, beam, mean_point[:, 2] / -beam[:, 2], mean_normal)
+
+
+@lru_cache(maxsize=16)
+def _frequencies(
+    rows: int, columns: int, pixel: tuple[float, float], dtype: torch.dtype, device: torch.device
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Frequencies right (1, C/2+1), up (R, 1) [cycles/m] of a real FFT, and what undoes the splat's smear (R, C/2+1).
+
+    Bilinear spreading multiplies by sinc^2 along each axis, the mean over a pixel by sinc; what remains to divide out
+    is one sinc.
+    """
+    right = torch.fft.rfftfreq(columns, dtype=dtype, device=device)[None, :]
+    # Rows run downwards, the plane's second axis up.
+    up = -torch.fft.fftfreq(rows, dtype=dtype, device=device)[:, None]
+    unsmear = 1 / (torch.sinc(right) * torch.sinc(up))
+    return right / pixel[0], up / pixel[1], unsmear
+
+
+def _interpolate(table: Tensor, frequency: Tensor) -> Tensor:
+    """Linear interpolation of a transfer table (K,) or (B, K) at frequencies (B, ...) [cycles/rad]."""
+    position = (frequency / FREQUENCY_STEP).clamp(max=FREQUENCY_COUNT - 1.001)
+    index = position.detach().long()
+    fraction = position - index
+    if table.ndim == 1:
+        low, high = table[index], table[index + 1]
+    else:
+        flat = index.flatten(1)
+        low = table.gather(1, flat).view_as(position)
+        high = table.gather(1, flat + 1).view_as(position)
+    return torch.lerp(low, high, fraction)
+
+
+def _cone_transfer(rays: Rays, optics: Optics, right: Tensor, up: Tensor, table: Tensor) -> Tensor:
+    """Transfer function (B, R, C/2+1) of the reflected cone on the target plane.
+
+    A ray tilted by a small angle e (a vector across the beam d) meets the plane, whose normal is z, shifted by
+    R (e - d e_z / d_z). The frequency f on the plane therefore sees the angular frequency g = R (f - z (d.f) / d_z),
+    which lies across the beam; its length decides the sun shape's transfer, its components along and across the plane
+    of incidence that of the slope error, which turns the ray by twice the error along and 2 cos(incidence) across.
+    """
+    d = rays.direction[:, :, None, None]
+    slope = -(d[:, 0] * right + d[:, 1] * up) / d[:, 2]
+    angular = rays.slant_range[:, None, None]
+    transfer = _interpolate(table, angular * torch.sqrt(right**2 + up**2 + slope**2))
+    if isinstance(optics.slope_error, Tensor) or optics.slope_error > 0:
+        sigma = torch.as_tensor(optics.slope_error, dtype=right.dtype, device=right.device).reshape(-1, 1, 1)
+        n = rays.normal
+        cosine = (n * rays.direction).sum(-1)[:, None, None]
+        across = torch.linalg.cross(n, rays.direction)
+        across = (across / across.norm(dim=-1, keepdim=True).clamp(min=1e-12))[:, :, None, None]
+        total = right**2 + up**2 + slope**2
+        perpendicular = (across[:, 0] * right + across[:, 1] * up + across[:, 2] * slope) ** 2
+        variance = 4 * sigma**2 * (total - perpendicular * (1 - cosine**2)) * angular**2
+        transfer = transfer * torch.exp(-2 * math.pi**2 * variance)
+    return transfer
+
+
+def _splat(x: Tensor, y: Tensor, weight: Tensor, rows: int, columns: int) -> Tensor:
+    """Spread weights (B, S) bilinearly over pixels (B, rows, columns) at coordinates x, y (B, S); outside is lost."""
+    left, top = x.detach().floor(), y.detach().floor()
+    fx, fy = x - left, y - top
+    inside = (left >= 0) & (left < columns - 1) & (top >= 0) & (top < rows - 1)
+    weight = weight * inside
+    batch = torch.arange(x.shape[0], device=x.device)[:, None] * (rows * columns)
+    index = (batch + top.clamp(0, rows - 2).long() * columns + left.clamp(0, columns - 2).long()).flatten()
+    image = torch.zeros(x.shape[0] * rows * columns, dtype=x.dtype, device=x.device)
+    upper, lower = weight * (1 - fy), weight * fy
+    image = image.index_add(0, index, (upper * (1 - fx)).flatten())
+    image = image.index_add(0, index + 1, (upper * fx).flatten())
+    image = image.index_add(0, index + columns, (lower * (1 - fx)).flatten())
+    image = image.index_add(0, index + columns + 1, (lower * fx).flatten())
+    return image.view(x.shape[0], rows, columns)
+
+
+def _padded(size: int, padding: float) -> int:
+    """An even length of small prime factors that leaves ``padding`` of the window on each side."""
+    length = math.ceil(size * (1 + 2 * padding) / 2) * 2
+    while any(length % p == 0 for p in (7, 11, 13)) or not _smooth(length):
+        length += 2
+    return length
+
+
+def _smooth(length: int) -> bool:
+    for prime in (2, 3, 5):
+        while length % prime == 0:
+            length //= prime
+    return length == 1
+
+
+def trace(
+    scene: Scene,
+    window: Window,
+    optics: Optics | None = None,
+    *,
+    samples: int = 32,
+    padding: float = 0.5,
+    table: Tensor | None = None,
+) -> Flux:
+    """Trace the flux of every mirror of a scene.
+
+    Parameters
+    ----------
+    scene : Scene
+    window : Window
+    optics : Optics, optional
+        Buie's sun with a circumsolar ratio of 0.02, 1000 W/m2 and a perfect mirror unless given.
+    samples : int
+        Points along each side of each facet.
+    padding : float
+        How far beyond the window, in windows, light is followed before it is lost.
+    table : Tensor (K,) or (B, K), optional
+        A transfer table in place of the sun shape's own (`model.sunshape.transfer_table`); one for each mirror, say.
+
+    Raises
+    ------
+    UnreachableError
+        Where a mirror shows its back to the sun or to the target.
+    """
+    if samples < 1:
+        raise InvalidInputError("samples must be at least one")
+    optics = optics or Optics()
+    rays = central_rays(scene, samples)
+    spot = rays.spot
+    center = spot if window.on_spot else torch.zeros_like(spot)
+    rows, columns = _padded(window.rows, padding), _padded(window.columns, padding)
+    pixel_x, pixel_y = window.pixel
+    first_row, first_column = (rows - window.rows) // 2, (columns - window.columns) // 2
+    x = (rays.hits[:, 0] - center[:, :1] + window.width / 2) / pixel_x + first_column - 0.5
+    y = (window.height / 2 - rays.hits[:, 1] + center[:, 1:]) / pixel_y + first_row - 0.5
+    image = _splat(x, y, rays.power, rows, columns)
+
+    right, up, unsmear = _frequencies(rows, columns, window.pixel, image.dtype, image.device)
+    if table is None:
+        table = transfer_table(optics.sun_shape, image.dtype, image.device)
+    transfer = _cone_transfer(rays, optics, right, up, table) * unsmear
+    blurred = torch.fft.irfft2(torch.fft.rfft2(image) * transfer, s=(rows, columns))
+    cut = blurred[:, first_row : first_row + window.rows, first_column : first_column + window.columns]
+    irradiance = optics.irradiance(rays.slant_range)
+    return Flux(
+        irradiance=cut * (irradiance / (pixel_x * pixel_y))[:, None, None],
+        spot=spot,
+        center=center,
+        power=rays.power.sum(-1) * irradiance,
+    )

@@ -1,0 +1,172 @@
+"""Scenes: what both tracers trace. A batch of mirrors, each with its pose, its sun and its target plane."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from model.errors import InvalidInputError
+from model.plant import Heliostat, TargetPlane
+from model.sunshape import Buie, SunShape
+from model.surface import DEGREE
+
+
+@dataclass(frozen=True, eq=False)
+class Optics:
+    """What the light meets besides the mirror's shape.
+
+    Attributes
+    ----------
+    sun_shape : SunShape
+    slope_error : float or Tensor (B,) [rad]
+        Standard deviation of the mirror's normals per axis, below what the surface resolves.
+    dni : float [W/m2]
+    reflectivity : float
+    attenuation : tuple of float
+        Loss of light between mirror and target as a polynomial in the slant range [km], constant term first.
+    """
+
+    sun_shape: SunShape = field(default_factory=Buie)
+    slope_error: float | Tensor = 0.0
+    dni: float = 1000.0
+    reflectivity: float = 1.0
+    attenuation: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.reflectivity <= 1:
+            raise InvalidInputError(f"reflectivity must lie in [0, 1], got {self.reflectivity}")
+        if not 0 <= self.dni < 1e5:
+            raise InvalidInputError(f"dni [W/m2] must lie in [0, 100000), got {self.dni}")
+
+    def irradiance(self, slant_range: Tensor) -> Tensor:
+        """DNI [W/m2] after the mirror and the air, for slant ranges [m]."""
+        loss = torch.zeros_like(slant_range)
+        for coefficient in reversed(self.attenuation):
+            loss = loss * (slant_range / 1000) + coefficient
+        return self.dni * self.reflectivity * (1 - loss.clamp(0, 1))
+
+
+CLEAR_DAY = (0.006739, 0.1046, -0.0170, 0.002845)
+"""Attenuation of a clear day, 23 km visibility (Vittitoe and Biggs 1978, as in DELSOL3, SAND86-8018, eq. 2.2-3)."""
+
+
+@dataclass(frozen=True)
+class Window:
+    """The rectangle of the target plane that is imaged.
+
+    Attributes
+    ----------
+    width, height : float [m]
+    rows, columns : int
+        Row 0 at the top, column 0 at the image's left edge.
+    on_spot : bool
+        Centred on the spot's centre of mass instead of the plane's centre.
+    """
+
+    width: float = 4.0
+    height: float = 4.0
+    rows: int = 64
+    columns: int = 64
+    on_spot: bool = False
+
+    def __post_init__(self) -> None:
+        if not (0 < self.width < 1e4 and 0 < self.height < 1e4):
+            raise InvalidInputError("window width and height must be positive metres")
+        if not (1 <= self.rows <= 4096 and 1 <= self.columns <= 4096):
+            raise InvalidInputError("window rows and columns must lie in [1, 4096]")
+
+    @classmethod
+    def of(cls, plane: TargetPlane, rows: int = 256, columns: int = 256) -> "Window":
+        """The whole of a target plane."""
+        return cls(width=plane.width, height=plane.height, rows=rows, columns=columns)
+
+    @property
+    def pixel(self) -> tuple[float, float]:
+        """Pixel width and height [m]."""
+        return self.width / self.columns, self.height / self.rows
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A batch of mirrors before the sun and a plane each.
+
+    Attributes
+    ----------
+    control_points : Tensor (B, F, 3, I, J) [m]
+        In mirror coordinates; B may be one and is then shared.
+    attitude : Tensor (B, 3, 3)
+        Mirror coordinates to ENU.
+    center : Tensor (B, 3) [m]
+        The mirror's centre in ENU.
+    sun : Tensor (B, 3)
+        Unit vectors towards the sun.
+    plane_center : Tensor (B, 3) [m]
+    plane_axes : Tensor (B, 3, 3)
+        Rows right, up and normal of the target plane.
+    degree : int
+    facet_reflectivity : Tensor (B, F) or None
+        Relative to `Optics.reflectivity`; None for even facets.
+    """
+
+    control_points: Tensor
+    attitude: Tensor
+    center: Tensor
+    sun: Tensor
+    plane_center: Tensor
+    plane_axes: Tensor
+    degree: int = DEGREE
+    facet_reflectivity: Tensor | None = None
+
+    @classmethod
+    def build(
+        cls,
+        heliostats: Sequence[Heliostat],
+        control_points: Sequence[ArrayLike],
+        angles: ArrayLike,
+        suns: ArrayLike,
+        planes: Sequence[TargetPlane],
+        *,
+        degree: int = DEGREE,
+        dtype: torch.dtype = torch.float32,
+        device: torch.device | str = "cpu",
+    ) -> "Scene":
+        """A scene of ``B`` heliostats with control points (F, I, J, 3) [m], axis angles (B, 2) [rad], suns (B, 3)."""
+        t = np.asarray(angles, dtype=np.float64)
+        attitudes = np.array([h.mount.attitude(a) for h, a in zip(heliostats, t, strict=True)])
+        centers = [h.mount.mirror_center(h.position, r) for h, r in zip(heliostats, attitudes, strict=True)]
+
+        def tensor(values: object) -> Tensor:
+            return torch.as_tensor(np.asarray(values), dtype=dtype, device=device)
+
+        return cls(
+            control_points=tensor(control_points).movedim(-1, -3).contiguous(),
+            attitude=tensor(attitudes),
+            center=tensor(centers),
+            sun=tensor(suns),
+            plane_center=tensor([plane.center for plane in planes]),
+            plane_axes=tensor([plane.axes for plane in planes]),
+            degree=degree,
+        )
+
+    def with_(self, **changes: Tensor) -> "Scene":
+        """The same scene with some tensors replaced."""
+        return replace(self, **changes)  # type: ignore[arg-type]
+
+    @property
+    def batch(self) -> int:
+        """How many mirrors are traced."""
+        return self.sun.shape[0]
+
+    def in_plane(self) -> tuple[Tensor, Tensor]:
+        """Control points (B, F, 3, I, J) [m] and suns (B, 3) in the frame of each target plane.
+
+        Splines are affine invariant, so turning the few control points turns all their samples.
+        """
+        turn = self.plane_axes @ self.attitude
+        center = torch.einsum("bij,bj->bi", self.plane_axes, self.center - self.plane_center)
+        points = torch.einsum("bij,bfjuv->bfiuv", turn, self.control_points.expand(self.batch, -1, -1, -1, -1))
+        sun = torch.einsum("bij,bj->bi", self.plane_axes, self.sun)
+        return points + center[:, None, :, None, None], sun

@@ -1,0 +1,350 @@
+"""Measurement folders in PAINT's layout: the plant, its heliostats, measurements, measured surfaces, declared model.
+
+Source: the PAINT database of the Solar Tower Juelich, https://paint-database.org; DESIGN.md, section 6.
+"""
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from model.errors import InvalidInputError
+from model.frames import sun_direction
+from model.mount import LinearActuator, Mount
+from model.plant import Facet, Heliostat, Plant, TargetPlane
+from model.sunshape import Buie, Gaussian, Pillbox, SunShape
+from model.surface import control_points, fit_heights, heights
+from model.tracing import Optics
+
+Array = NDArray[np.float64]
+
+IMAGE_KINDS = ("flux", "cropped", "raw", "flux-centered")
+"""Kinds of image that a measurement may hold, the most worked-out one with a known place on the target first."""
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """One calibration measurement.
+
+    Attributes
+    ----------
+    identifier : str
+    heliostat, target : str
+    azimuth_deg, elevation_deg : float [deg]
+        The sun, azimuth from south and positive to the east.
+    spot : (3,) [m] or None
+        Measured centre of mass in ENU.
+    motor_position : (2,) [steps] or None
+    images : dict
+        Files by kind.
+    """
+
+    identifier: str
+    heliostat: str
+    target: str
+    azimuth_deg: float
+    elevation_deg: float
+    spot: Array | None = None
+    motor_position: Array | None = None
+    images: dict[str, Path] = field(default_factory=dict)
+
+    @property
+    def sun(self) -> Array:
+        """Unit vector (3,) towards the sun."""
+        return sun_direction(self.azimuth_deg, self.elevation_deg)
+
+    @property
+    def key(self) -> str:
+        """``heliostat/identifier``."""
+        return f"{self.heliostat}/{self.identifier}"
+
+
+def _get(data: Any, where: str, *keys: str | int) -> Any:
+    """Walk into parsed JSON; a missing key is named with its file."""
+    for key in keys:
+        try:
+            data = data[key]
+        except (KeyError, IndexError, TypeError):
+            raise InvalidInputError(f"{where}: '{key}' is missing") from None
+    return data
+
+
+def _numbers(data: Any, where: str, *keys: str | int, count: int) -> Array:
+    value = _get(data, where, *keys)
+    try:
+        numbers = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        numbers = np.array([np.nan])
+    if numbers.shape != (count,) or not np.isfinite(numbers).all():
+        raise InvalidInputError(f"{where}: '{keys[-1]}' must be {count} finite numbers, got {str(value)[:80]}")
+    return numbers
+
+
+def _number(data: Any, where: str, *keys: str | int) -> float:
+    value = _get(data, where, *keys)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+        raise InvalidInputError(f"{where}: '{keys[-1]}' must be a finite number, got {str(value)[:80]}")
+    return float(value)
+
+
+def read_json(path: Path) -> Any:
+    """Parsed JSON of a file; a file that is not JSON is named."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise InvalidInputError(f"{path}: not valid JSON ({error})") from None
+
+
+def _actuators(kinematics: Any, where: str) -> tuple[LinearActuator, LinearActuator] | None:
+    entries = _get(kinematics, where, "actuators")
+    if not isinstance(entries, list) or len(entries) != 2 or any(e.get("type_axis") != "linear" for e in entries):
+        return None
+    first, second = (
+        LinearActuator(
+            increment=_number(entry, where, "increment"),
+            initial_stroke_length=_number(entry, where, "initial_stroke_length"),
+            offset=_number(entry, where, "offset"),
+            pivot_radius=_number(entry, where, "pivot_radius"),
+            initial_angle=_number(entry, where, "initial_angle"),
+            clockwise=bool(_number(entry, where, "clockwise_axis_movement")),
+            max_increment=_number(entry, where, "max_increment"),
+        )
+        for entry in entries
+    )
+    return first, second
+
+
+def _mount(kinematics: Any, where: str) -> Mount:
+    joint = [
+        sum(_number(kinematics, where, f"joint_translation_{axis}_{stage}") for stage in (1, 2))
+        for axis in ("e", "n", "u")
+    ]
+    # Older files count the offset from an upright mirror, newer ones from a lying one; along the normal it is the same.
+    along_normal = abs(_number(kinematics, where, "concentrator_translation_n"))
+    return Mount.juelich(_actuators(kinematics, where), joint=joint, mirror_offset=(0.0, 0.0, along_normal))
+
+
+def read_heliostat(name: str, properties: Any, origin: Array) -> Heliostat:
+    """A heliostat of the contents of PAINT's ``heliostat-properties.json``.
+
+    ``origin`` (3,) is the tower base in WGS84. Raises `InvalidInputError`, which names the field.
+    """
+    where = f"properties of {name}"
+    if not isinstance(properties, dict):
+        raise InvalidInputError(f"{where}: must be a JSON object")
+    kinematics = properties.get("kinematics_properties", properties.get("kinematic_properties"))
+    if kinematics is None:
+        raise InvalidInputError(f"{where}: 'kinematics_properties' is missing")
+    facets = _get(properties, where, "facet_properties", "facets")
+    return Heliostat(
+        name=name,
+        position=Plant("", origin).to_enu(_numbers(properties, where, "heliostat_position", count=3)),
+        mount=_mount(kinematics, where),
+        facets=tuple(
+            Facet(
+                position=_numbers(facet, where, "translation_vector", count=3),
+                canting_x=_numbers(facet, where, "canting_e", count=3),
+                canting_y=_numbers(facet, where, "canting_n", count=3),
+            )
+            for facet in facets
+        ),
+        width=_number(properties, where, "width"),
+        height=_number(properties, where, "height"),
+    )
+
+
+def read_targets(tower: Any) -> tuple[Array, dict[str, TargetPlane]]:
+    """Tower base (3,) in WGS84 and the planar targets of PAINT's ``tower-measurements.json``.
+
+    The cylindrical receiver is left out: it is no plane.
+    """
+    where = "tower measurements"
+    origin = _numbers(tower, where, "power_plant_properties", "coordinates", count=3)
+    plant = Plant("", origin)
+    targets = {}
+    for name, entry in tower.items():
+        if isinstance(entry, dict) and entry.get("type") == "planar":
+            corners = [
+                plant.to_enu(_numbers(entry, f"{where}, {name}", "coordinates", corner, count=3))
+                for corner in ("upper_left", "upper_right", "lower_left", "lower_right")
+            ]
+            targets[name] = TargetPlane.from_corners(name, *corners)
+    if not targets:
+        raise InvalidInputError(f"{where}: no target of type 'planar'")
+    return origin, targets
+
+
+def _spot(data: Any, where: str, plant: Plant) -> Array | None:
+    """Measured centre of mass in ENU: PAINT's UTIS, else HeliOS."""
+    spots = data.get("focal_spot") or {}
+    for source in ("UTIS", "HeliOS"):
+        if isinstance(spots, dict) and spots.get(source) is not None:
+            return plant.to_enu(_numbers(spots, where, source, count=3))
+    return None
+
+
+def _motors(data: Any, where: str) -> Array | None:
+    motors = data.get("motor_position")
+    if motors is None:
+        return None
+    return np.array([_number(motors, where, f"axis_{axis}_motor_position") for axis in (1, 2)])
+
+
+def read_measurement(identifier: str, heliostat: str, data: Any, plant: Plant) -> Measurement:
+    """A measurement, without its images, of the contents of PAINT's ``calibration-properties.json``."""
+    where = f"measurement {heliostat}/{identifier}"
+    if not isinstance(data, dict):
+        raise InvalidInputError(f"{where}: must be a JSON object")
+    target = _get(data, where, "target_name")
+    if target not in plant.targets:
+        raise InvalidInputError(f"{where}: 'target_name' {target!r} is none of {', '.join(plant.targets)}")
+    elevation = _number(data, where, "sun_elevation")
+    if not 0 < elevation <= 90:
+        raise InvalidInputError(f"{where}: 'sun_elevation' must lie in (0, 90] degrees, got {elevation}")
+    return Measurement(
+        identifier=identifier,
+        heliostat=heliostat,
+        target=target,
+        azimuth_deg=_number(data, where, "sun_azimuth"),
+        elevation_deg=elevation,
+        spot=_spot(data, where, plant),
+        motor_position=_motors(data, where),
+    )
+
+
+def _sun_shape(declared: Any, where: str) -> SunShape:
+    shape = _get(declared, where, "shape")
+    if shape == "buie":
+        return Buie(_number(declared, where, "circumsolar_ratio"))
+    if shape == "pillbox":
+        return Pillbox(_number(declared, where, "half_angle_mrad") * 1e-3)
+    if shape == "gaussian":
+        return Gaussian(_number(declared, where, "sigma_mrad") * 1e-3)
+    raise InvalidInputError(f"{where}: 'shape' must be buie, pillbox or gaussian, got {shape!r}")
+
+
+@dataclass(frozen=True, eq=False)
+class MeasurementFolder:
+    """A folder in PAINT's layout.
+
+    Attributes
+    ----------
+    root : Path
+    plant : Plant
+        Its targets, and every heliostat that has a properties file.
+    optics : Optics
+        The declared model (``twin.json``), Buie's sun with 0.02 without one.
+    skipped : dict
+        Heliostats that are there but could not be read, with the reason.
+    """
+
+    root: Path
+    plant: Plant
+    optics: Optics
+    skipped: dict[str, str]
+
+    def measurements(self, heliostat: str) -> list[Measurement]:
+        """All readable measurements of a heliostat that have an image, by identifier."""
+        return [m for m in self._measurements(heliostat) if m.images]
+
+    def _measurements(self, heliostat: str) -> Iterator[Measurement]:
+        folder = self.root / heliostat / "Calibration"
+        for path in sorted(folder.glob("*calibration-properties.json")):
+            identifier = path.name.removesuffix("calibration-properties.json").removesuffix("-")
+            measurement = read_measurement(identifier, heliostat, read_json(path), self.plant)
+            images = {kind: folder / f"{identifier}-{kind}.png" for kind in IMAGE_KINDS}
+            measurement.images.update({kind: file for kind, file in images.items() if file.is_file()})
+            yield measurement
+
+    def measured_surface(self, heliostat: str) -> tuple[Array, int] | None:
+        """Control points (F, I, J, 3) [m] in mirror coordinates and degree of a measured surface, None without one."""
+        return read_surface(self.root, self.plant.heliostats[heliostat])
+
+
+def read_surface(root: Path, heliostat: Heliostat) -> tuple[Array, int] | None:
+    """Control points (F, I, J, 3) [m] and spline degree from ``root/H/Deflectometry``, None where there are none."""
+    folder = root / heliostat.name / "Deflectometry"
+    spline = folder / f"{heliostat.name}-nurbs-surface.npz"
+    if spline.is_file():
+        with np.load(spline) as data:
+            if "control_points" not in data:
+                raise InvalidInputError(f"{spline}: 'control_points' is missing")
+            points = np.asarray(data["control_points"], dtype=np.float64)
+            degree = int(data["degrees"][0]) if "degrees" in data else 3
+        if points.ndim != 4 or points.shape[-1] != 3 or not np.isfinite(points).all():
+            raise InvalidInputError(
+                f"{spline}: 'control_points' must be finite and (facets, i, j, 3), got {points.shape}"
+            )
+        return points, degree
+    for file in sorted(folder.glob("*deflectometry.h5")):
+        return control_points(heliostat, read_deflectometry(file, heliostat)), 3
+    return None
+
+
+def read_deflectometry(file: Path, heliostat: Heliostat) -> Array:
+    """Heights z (F, 8, 8) [m] fitted to PAINT's deflectometry: (n, 3) points and normals in mirror coordinates a facet."""
+    centers, axes, half_sizes = heliostat.facet_frames
+    facets = []
+    with h5py.File(file, "r") as data:
+        for index, (center, frame, half_size) in enumerate(zip(centers, axes, half_sizes, strict=True), start=1):
+            where = f"{file}, facet{index}"
+            points, normals = (
+                np.asarray(_get(data, where, f"facet{index}", name), dtype=np.float64).reshape(-1, 3) @ frame.T
+                for name in ("surface_points", "surface_normals")
+            )
+            u, v = ((points - frame @ center)[:, :2] / (2 * half_size) + 0.5).T
+            inside = (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1) & np.isfinite(normals).all(axis=-1)
+            if inside.sum() < 256:
+                raise InvalidInputError(f"{where}: only {inside.sum()} usable points on the facet, 256 are needed")
+            facets.append(fit_heights(u[inside], v[inside], normals[inside], half_size))
+    return np.array(facets)
+
+
+def measured_heights(heliostat: Heliostat, surface: tuple[Array, int]) -> Array:
+    """Heights z (F, 8, 8) [m] of a measured surface as `MeasurementFolder.measured_surface` gives it."""
+    return heights(heliostat, surface[0], surface[1])
+
+
+def read_folder(root: Path, heliostats: list[str] | None = None) -> MeasurementFolder:
+    """Read the plant of a measurement folder.
+
+    Raises
+    ------
+    InvalidInputError
+        Where the folder has no tower file, or no heliostat that can be read.
+    """
+    if not root.is_dir():
+        raise InvalidInputError(f"{root}: no such folder")
+    towers = sorted(root.glob("*tower-measurements.json"))
+    if not towers:
+        raise InvalidInputError(f"{root}: no '*tower-measurements.json' at the root; is it a PAINT folder?")
+    origin, targets = read_targets(read_json(towers[0]))
+    found: dict[str, Heliostat] = {}
+    skipped: dict[str, str] = {}
+    for path in sorted(root.glob("*/Properties/*heliostat-properties.json")):
+        name = path.parent.parent.name
+        if heliostats is None or name in heliostats:
+            try:
+                found[name] = read_heliostat(name, read_json(path), origin)
+            except InvalidInputError as error:
+                skipped[name] = str(error)
+    if not found:
+        raise InvalidInputError(f"{root}: no heliostat with a readable 'Properties/*heliostat-properties.json'")
+    plant = Plant(towers[0].name.removesuffix("-tower-measurements.json"), origin, targets, found)
+    return MeasurementFolder(root, plant, read_declared(root / "twin.json"), skipped)
+
+
+def read_declared(path: Path) -> Optics:
+    """The optics that ``twin.json`` declares; the defaults where there is no such file."""
+    if not path.is_file():
+        return Optics()
+    declared = _get(read_json(path), str(path), "declared")
+    if declared.get("effects"):
+        raise InvalidInputError(f"{path}: 'effects' can only be empty; this version applies none")
+    sun = declared.get("sun")
+    return Optics() if sun is None else Optics(sun_shape=_sun_shape(sun, str(path)))
