@@ -1,0 +1,207 @@
+"""The network: flux images of one heliostat in, its mirror surface out.
+
+Each image passes the same convolutional encoder, whose weights are modulated by that image's geometry and demodulated
+as in StyleGAN2; attention pools any number of images, in any order, into one set of styles w+; a StyleGAN2 decoder
+grows them into the control heights of the facets. Read it from top to bottom.
+
+Source: Lewen et al. 2024, *Inverse Deep Learning Ray Tracing for Heliostat Surface Prediction* (the idea: encoder with
+weight demodulation, w+, StyleGAN2 decoder); Karras et al. 2020, *Analyzing and Improving the Image Quality of StyleGAN*
+(modulation and demodulation). Ours differs in that images are encoded one by one and pooled, instead of stacked as
+channels, which makes their number and order free.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from model.surface import COLUMNS, FACETS, ROWS
+
+MAX_IMAGES = 8
+"""Images that one prediction takes at the most."""
+
+CONDITIONS = 12
+"""Numbers that describe the geometry of one image (`model.network.inputs.conditions`)."""
+
+IMAGE_SIZE = 64
+"""Rows and columns of a flux image."""
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """Sizes of the network; the names are those used below."""
+
+    encoder_channels: tuple[int, int, int] = (64, 128, 256)
+    features: int = 256
+    heads: int = 4
+    style_layers: int = 3
+    style_features: int = 32
+    decoder_channels: int = 128
+
+
+class ModulatedConv(nn.Module):
+    """A 3x3 convolution whose weights are scaled per sample by a style and normalised again.
+
+    Scaling the input channels by s and the output by 1/sqrt(sum (w s)^2) equals convolving with the modulated and
+    demodulated weights (Karras et al. 2020, eqs. 1 and 3), and needs no grouped convolution.
+    """
+
+    def __init__(self, inputs: int, outputs: int, style: int, stride: int = 1, demodulate: bool = True) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.randn(outputs, inputs, 3, 3) / (3 * inputs**0.5))
+        self.bias = nn.Parameter(torch.zeros(outputs))
+        self.to_scale = nn.Linear(style, inputs)
+        nn.init.zeros_(self.to_scale.weight)
+        nn.init.ones_(self.to_scale.bias)
+        self.stride, self.demodulate = stride, demodulate
+
+    def forward(self, x: Tensor, style: Tensor) -> Tensor:
+        """(N, inputs, H, W) and (N, style) to (N, outputs, H / stride, W / stride)."""
+        scale = self.to_scale(style)
+        x = functional.conv2d(x * scale[:, :, None, None], self.weight, stride=self.stride, padding=1)
+        if self.demodulate:
+            energy = scale.square() @ self.weight.square().sum(dim=(2, 3)).T
+            x = x * torch.rsqrt(energy + 1e-8)[:, :, None, None]
+        return x + self.bias[:, None, None]
+
+
+class EncoderBlock(nn.Module):
+    """Two modulated convolutions with a skip; the first halves the resolution where ``stride`` is two."""
+
+    def __init__(self, inputs: int, outputs: int, style: int, stride: int) -> None:
+        super().__init__()
+        self.first = ModulatedConv(inputs, outputs, style, stride)
+        self.second = ModulatedConv(outputs, outputs, style)
+        self.skip = nn.Conv2d(inputs, outputs, kernel_size=stride, stride=stride)
+
+    def forward(self, x: Tensor, style: Tensor) -> Tensor:
+        """(N, inputs, H, W) to (N, outputs, H / stride, W / stride)."""
+        y = functional.leaky_relu(self.first(x, style), 0.2)
+        return functional.leaky_relu((self.second(y, style) + self.skip(x)) * 0.7, 0.2)
+
+
+class Encoder(nn.Module):
+    """One flux image and its geometry to a feature vector."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        fine, middle, coarse = config.encoder_channels
+        self.style = nn.Sequential(
+            nn.Linear(CONDITIONS, 128), nn.LeakyReLU(0.2), nn.Linear(128, 128), nn.LeakyReLU(0.2)
+        )
+        self.fold = nn.PixelUnshuffle(4)
+        self.blocks = nn.ModuleList(
+            [
+                EncoderBlock(2 * 16, fine, 128, stride=1),
+                EncoderBlock(fine, middle, 128, stride=2),
+                EncoderBlock(middle, coarse, 128, stride=2),
+            ]
+        )
+        self.to_features = nn.Linear(coarse * 16 + 128, config.features)
+
+    def forward(self, flux: Tensor, conditions: Tensor) -> Tensor:
+        """Flux (N, 64, 64) of sum 100 and conditions (N, 12) to features (N, features)."""
+        style = self.style(conditions)
+        # The root brings out the faint wings, where the mirror's edges show; both have about unit scale.
+        x = torch.stack([flux * 8, torch.sqrt(flux.clamp(min=0) * 8)], dim=1)
+        x = self.fold(x)
+        for block in self.blocks:
+            x = block(x, style)
+        return self.to_features(torch.cat([x.flatten(1), style], dim=1))
+
+
+class Pooling(nn.Module):
+    """Attention among a heliostat's images, then one vector for all; blind to order, masked for missing ones."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.heads = config.heads
+        width = config.features
+        self.norm = nn.LayerNorm(width)
+        self.to_qkv = nn.Linear(width, 3 * width)
+        self.mix = nn.Linear(width, width)
+        self.mlp = nn.Sequential(
+            nn.LayerNorm(width), nn.Linear(width, 2 * width), nn.GELU(), nn.Linear(2 * width, width)
+        )
+        self.to_weight = nn.Linear(width, 1)
+
+    def forward(self, features: Tensor, mask: Tensor) -> Tensor:
+        """(B, M, features) and mask (B, M), one where there is an image, to (B, features)."""
+        batch, images, width = features.shape
+        qkv = self.to_qkv(self.norm(features)).view(batch, images, 3, self.heads, width // self.heads)
+        q, k, v = qkv.permute(2, 0, 3, 1, 4)
+        hidden = (mask - 1) * 1e4
+        scores = q @ k.transpose(-1, -2) * (width // self.heads) ** -0.5 + hidden[:, None, None, :]
+        mixed = (scores.softmax(dim=-1) @ v).transpose(1, 2).reshape(batch, images, width)
+        features = features + self.mix(mixed)
+        features = features + self.mlp(features)
+        weights = (self.to_weight(features)[..., 0] + hidden).softmax(dim=-1)
+        return (features * weights[..., None]).sum(dim=1)
+
+
+class Decoder(nn.Module):
+    """Styles w+ to the heights and their uncertainty, one channel a facet (StyleGAN2 without noise inputs)."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        channels, style = config.decoder_channels, config.style_features
+        self.seed = nn.Parameter(torch.randn(channels, ROWS // 2, COLUMNS // 2))
+        self.convs = nn.ModuleList([ModulatedConv(channels, channels, style) for _ in range(config.style_layers)])
+        self.to_heights = ModulatedConv(channels, 2 * FACETS, style, demodulate=False)
+
+    def forward(self, styles: Tensor) -> tuple[Tensor, Tensor]:
+        """(B, layers, style) to heights and log spreads, each (B, 4, 8, 8)."""
+        x = self.seed.expand(styles.shape[0], -1, -1, -1)
+        for layer, conv in enumerate(self.convs):
+            if layer == 1:
+                x = functional.interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=False)
+            x = functional.leaky_relu(conv(x, styles[:, layer]), 0.2)
+        heights, log_spread = self.to_heights(x, styles[:, -1]).chunk(2, dim=1)
+        return heights - heights.mean(dim=(2, 3), keepdim=True), log_spread
+
+
+class SurfaceNetwork(nn.Module):
+    """Flux images to control heights [mm] and the spread of their error [mm].
+
+    ``mean`` (4, 8, 8) [mm] is the mean surface of the training heliostats, to which the network adds, and ``scale``
+    [mm] the unit in which it does.
+    """
+
+    mean: Tensor
+
+    def __init__(self, config: NetworkConfig, mean: Tensor | None = None, scale: float = 0.35) -> None:
+        super().__init__()
+        self.config, self.scale = config, scale
+        self.encoder = Encoder(config)
+        self.pooling = Pooling(config)
+        self.to_styles = nn.Sequential(
+            nn.LayerNorm(config.features),
+            nn.Linear(config.features, config.features),
+            nn.LeakyReLU(0.2),
+            nn.Linear(config.features, config.style_layers * config.style_features),
+        )
+        self.decoder = Decoder(config)
+        self.register_buffer("mean", torch.zeros(FACETS, ROWS, COLUMNS) if mean is None else mean)
+
+    def forward(self, flux: Tensor, conditions: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+        """Predict.
+
+        Parameters
+        ----------
+        flux : Tensor (B, M, 64, 64)
+            4 m x 4 m about the centre of mass, sum 100; anything where there is no image.
+        conditions : Tensor (B, M, 12)
+        mask : Tensor (B, M)
+            One where there is an image, zero elsewhere.
+
+        Returns
+        -------
+        heights, spread : Tensor (B, 4, 8, 8) [mm]
+            Facet mean zero; the spread is the scale of a Laplace distribution of the error.
+        """
+        features = self.encoder(flux.flatten(0, 1), conditions.flatten(0, 1))
+        pooled = self.pooling(features.view(*mask.shape, -1), mask)
+        styles = self.to_styles(pooled).view(-1, self.config.style_layers, self.config.style_features)
+        heights, log_spread = self.decoder(styles)
+        return self.mean + self.scale * heights, self.scale * torch.exp(log_spread.clamp(-6, 2))

@@ -1,0 +1,185 @@
+"""Rendering training images: heliostats of the field under random suns, seen by imperfect cameras."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional
+
+from model.frames import sun_direction_at
+from model.mount import Mount
+from model.network.inputs import conditions
+from model.plant import Facet, Heliostat
+from model.sunshape import Buie, transfer_table
+from model.surface import control_points
+from model.tracing import Optics, Scene, Window, trace
+
+Array = NDArray[np.float64]
+
+JUELICH_LATITUDE = 50.913
+
+
+def load_field(root: Path) -> Array:
+    """Heliostat positions (N, 3) [m] in ENU from ``root/field-positions.json``."""
+    field = json.loads((root / "field-positions.json").read_text(encoding="utf-8"))
+    return np.array([entry["position_enu"] for entry in field.values()], dtype=np.float64)
+
+
+def juelich_heliostat(position: Array, focal_length: float, name: str = "synthetic") -> Heliostat:
+    """A heliostat of the Juelich kind: four facets canted to ``focal_length`` [m]."""
+    facets = []
+    for x, y in ((-0.8075, 0.6425), (0.8075, 0.6425), (-0.8075, -0.6425), (0.8075, -0.6425)):
+        slope_x, slope_y = x / (2 * focal_length), y / (2 * focal_length)
+        facets.append(
+            Facet(
+                position=np.array([x, y, 0.0402]),
+                canting_x=np.array([0.8025, 0.0, 0.8025 * slope_x]),
+                canting_y=np.array([0.0, 0.6375, 0.6375 * slope_y]),
+            )
+        )
+    return Heliostat(name, position, Mount.juelich(), tuple(facets))
+
+
+@dataclass(frozen=True)
+class Situations:
+    """Where heliostats stand, what they aim at, and under which suns.
+
+    Targets face north on a tower; their centres lie up to ``target_east`` [m] off the tower's axis at heights
+    ``target_up`` [m]. Suns are drawn over the year and the day, above ``min_elevation_deg``. Canting is for a focus at
+    ``focus`` times the distance to the tower's top.
+    """
+
+    target_east: float = 20.0
+    target_up: tuple[float, float] = (25.0, 60.0)
+    min_elevation_deg: float = 12.0
+    focus: tuple[float, float] = (0.75, 1.1)
+
+    def suns(self, count: int, rng: np.random.Generator) -> Array:
+        """Unit vectors (count, 3)."""
+        found = np.empty((0, 3))
+        while len(found) < count:
+            declination = 23.45 * np.sin(rng.uniform(0, 2 * np.pi, 4 * count))
+            directions = sun_direction_at(declination, rng.uniform(-105, 105, 4 * count), JUELICH_LATITUDE)
+            found = np.concatenate([found, directions[directions[:, 2] > np.sin(np.radians(self.min_elevation_deg))]])
+        return found[:count]
+
+    def scenes(self, field: Array, z: Array, images: int, rng: np.random.Generator) -> tuple[Scene, Scene]:
+        """Scenes of surfaces ``z`` (B, 4, 8, 8) [m], each with ``images`` suns and aims, and of the ideal surfaces.
+
+        The images of one heliostat follow one another: the scenes hold B * images mirrors.
+        """
+        count = len(z)
+        positions = field[rng.integers(len(field), size=count)]
+        focal = np.linalg.norm(positions - [0.0, 0.0, 55.0], axis=-1) * rng.uniform(*self.focus, count)
+        heliostats = [juelich_heliostat(p, f) for p, f in zip(positions, focal, strict=True)]
+        ideal = np.array([control_points(h) for h in heliostats])
+        points = np.array([control_points(h, surface) for h, surface in zip(heliostats, z, strict=True)])
+        mount, total = heliostats[0].mount, count * images
+        aims = np.stack(
+            [
+                rng.uniform(-self.target_east, self.target_east, total),
+                np.zeros(total),
+                rng.uniform(*self.target_up, total),
+            ],
+            axis=-1,
+        )
+        suns = self.suns(total, rng)
+        places = positions.repeat(images, axis=0)
+        attitude = mount.attitude(mount.align(places, suns, aims))
+        axes = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
+
+        def scene(surfaces: Array) -> Scene:
+            return Scene(
+                control_points=_float(surfaces.repeat(images, axis=0)).movedim(-1, -3).contiguous(),
+                attitude=_float(attitude),
+                center=_float(mount.mirror_center(places, attitude[..., :, :])),
+                sun=_float(suns),
+                plane_center=_float(aims),
+                plane_axes=_float(axes).expand(total, 3, 3),
+            )
+
+        return scene(points), scene(ideal)
+
+
+def _float(values: Array) -> Tensor:
+    return torch.as_tensor(np.ascontiguousarray(values), dtype=torch.float32)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """What separates a photograph from traced flux; every value is the limit or scale of a random draw.
+
+    Circumsolar ratio and slope error [mrad] act on the light; gamma on the camera's response; ``warp`` [of the window]
+    on the registration; ``background`` and ``noise`` are shares of the peak.
+    """
+
+    circumsolar_ratio: float = 0.15
+    slope_error_mrad: float = 0.8
+    gamma: float = 1.25
+    warp: float = 0.015
+    background: float = 0.02
+    noise: float = 0.02
+
+    def photograph(self, scene: Scene, device: torch.device, rng: np.random.Generator) -> Tensor:
+        """Flux images (B, 64, 64), sum 100, 4 m about the spot's centre."""
+        count = scene.batch
+        chis = np.exp(rng.uniform(np.log(1e-3), np.log(self.circumsolar_ratio), 8))
+        tables = torch.stack([transfer_table(Buie(float(c)), torch.float32, device) for c in chis])
+        table = tables[torch.as_tensor(rng.integers(len(chis), size=count), device=device)]
+        slope = torch.as_tensor(rng.uniform(0, self.slope_error_mrad * 1e-3, count), dtype=torch.float32, device=device)
+        optics = Optics(slope_error=slope)
+        flux = trace(scene, Window(on_spot=True), optics, samples=16, padding=0.25, table=table).irradiance
+        return normalized(self._develop(flux.clamp(min=0), rng))
+
+    def _develop(self, flux: Tensor, rng: np.random.Generator) -> Tensor:
+        """Warp, gamma, background residue, noise and 8-bit rounding of images (B, R, C)."""
+        count, device = len(flux), flux.device
+
+        def draw(low: float, high: float, *shape: int) -> Tensor:
+            return torch.as_tensor(rng.uniform(low, high, (count, *shape)), dtype=torch.float32, device=device)
+
+        affine = torch.eye(2, 3, device=device) + draw(-self.warp, self.warp, 2, 3)
+        grid = functional.affine_grid(affine, [count, 1, *flux.shape[1:]], align_corners=False)
+        image = functional.grid_sample(flux[:, None], grid, align_corners=False)[:, 0]
+        image = image / image.amax(dim=(1, 2), keepdim=True).clamp(min=1e-9)
+        log_gamma = float(np.log(self.gamma))
+        image = image.clamp(min=1e-6) ** torch.exp(draw(-log_gamma, log_gamma, 1, 1))
+        ramp = torch.linspace(-1, 1, image.shape[-1], device=device)
+        level, tilt_x, tilt_y = (draw(-self.background, self.background, 1, 1) for _ in range(3))
+        image = image + level + tilt_x * ramp + tilt_y * ramp[:, None]
+        seed = torch.Generator(device=device).manual_seed(int(rng.integers(2**31)))
+        noise = torch.randn(image.shape, generator=seed, device=device)
+        image = image + noise * draw(0, self.noise, 1, 1)
+        return torch.round(image.clamp(0, 1) * 255) / 255
+
+
+def normalized(flux: Tensor) -> Tensor:
+    """Images (..., R, C) scaled to a sum of 100."""
+    return 100 * flux / flux.sum(dim=(-2, -1), keepdim=True).clamp(min=1e-9)
+
+
+def to_device(scene: Scene, device: torch.device) -> Scene:
+    """The scene with its tensors on ``device``."""
+    names = ("control_points", "attitude", "center", "sun", "plane_center", "plane_axes")
+    return scene.with_(**{name: getattr(scene, name).to(device) for name in names})
+
+
+def render(
+    z: Array, images: int, field: Array, situations: Situations, camera: Camera | None, device: torch.device, seed: int
+) -> tuple[Tensor, Tensor]:
+    """Images (B, images, 64, 64) and conditions (B, images, 12) of surfaces ``z`` (B, 4, 8, 8) [m].
+
+    Without a camera the flux is traced for the default sun and nothing else.
+    """
+    rng = np.random.default_rng(seed)
+    scene, ideal = (to_device(s, device) for s in situations.scenes(field, z, images, rng))
+    if camera is None:
+        flux = normalized(trace(scene, Window(on_spot=True), samples=24, padding=0.25).irradiance.clamp(min=0))
+    else:
+        flux = camera.photograph(scene, device, rng)
+    shape = (len(z), images)
+    return flux.view(*shape, *flux.shape[1:]), conditions(ideal).view(*shape, -1)

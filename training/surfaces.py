@@ -1,0 +1,77 @@
+"""Surfaces to learn from: the measured ones, split by heliostat, and what augmentation makes of them."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.surface import greville, split_canting
+
+Array = NDArray[np.float64]
+
+
+def load_surfaces(root: Path) -> tuple[Array, list[str]]:
+    """Control heights (N, 4, 8, 8) [m] of measured heliostats and their names, from ``root/surfaces.npz``."""
+    with np.load(root / "surfaces.npz") as data:
+        return data["z"].astype(np.float64), [str(name) for name in data["names"]]
+
+
+def split_by_heliostat(count: int, held_out: int, seed: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Indices of the training and the held-out heliostats."""
+    order = np.random.default_rng(seed).permutation(count)
+    return np.sort(order[held_out:]), np.sort(order[:held_out])
+
+
+def rotated(z: Array) -> Array:
+    """The same mirrors (..., 4, 8, 8) turned by 180 degrees about their normals (Lewen et al. 2024)."""
+    return z[..., ::-1, ::-1, ::-1]
+
+
+def mirrored(z: Array) -> Array:
+    """The same mirrors (..., 4, 8, 8) with left and right exchanged."""
+    return z[..., [1, 0, 3, 2], ::-1, :]
+
+
+@dataclass(frozen=True)
+class Augmentation:
+    """How far samples may stray from the measured surfaces.
+
+    ``average`` is the share of samples that mix two or three heliostats, ``exchange`` the share whose facets come from
+    different ones; ``canting`` and ``waviness`` scale the two parts of the surface apart by up to that factor either
+    way, ``tilt_mrad`` adds canting at random.
+    """
+
+    average: float = 0.6
+    exchange: float = 0.3
+    canting: float = 1.4
+    waviness: float = 1.3
+    tilt_mrad: float = 0.15
+
+    def sample(self, surfaces: Array, count: int, rng: np.random.Generator) -> Array:
+        """Random surfaces (count, 4, 8, 8) [m] from measured ones (N, 4, 8, 8)."""
+        z = self._averaged(surfaces, count, rng)
+        other = self._averaged(surfaces, count, rng)
+        exchanged = (rng.random((count, 1, 1, 1)) < self.exchange) & (rng.random((count, 4, 1, 1)) < 0.5)
+        z = np.where(exchanged, other, z)
+        canting, waviness = split_canting(z)
+        scale_canting, scale_waviness = (
+            np.exp(rng.uniform(-1, 1, (count, 1, 1, 1)) * np.log(limit)) for limit in (self.canting, self.waviness)
+        )
+        return canting * scale_canting + waviness * scale_waviness + self._tilts(count, rng)
+
+    def _averaged(self, surfaces: Array, count: int, rng: np.random.Generator) -> Array:
+        """Weighted averages of up to three surfaces, their spread about the mean restored."""
+        mean = surfaces.mean(axis=0)
+        weights = rng.dirichlet(np.ones(3), count)
+        single = rng.random(count) >= self.average
+        weights[single] = [1.0, 0.0, 0.0]
+        chosen = surfaces[rng.integers(len(surfaces), size=(count, 3))] - mean
+        mixed = np.einsum("nk,nkfij->nfij", weights / np.linalg.norm(weights, axis=1, keepdims=True), chosen) + mean
+        mixed = np.where(rng.random((count, 1, 1, 1)) < 0.5, rotated(mixed), mixed)
+        return np.where(rng.random((count, 1, 1, 1)) < 0.5, mirrored(mixed), mixed)
+
+    def _tilts(self, count: int, rng: np.random.Generator) -> Array:
+        x, y = (2 * greville(8) - 1)[:, None] * 0.8, (2 * greville(8) - 1)[None, :] * 0.64
+        tilt = rng.normal(0, self.tilt_mrad * 1e-3, (2, count, 4, 1, 1))
+        return np.asarray(tilt[0] * x + tilt[1] * y)

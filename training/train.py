@@ -1,0 +1,188 @@
+"""Train the surface network: ``python -m training.train --config training/configs/first.json``.
+
+Images are rendered as the training goes, so that no surface is seen twice under the same sun. A run keeps everything in
+one folder: its config, a checkpoint to resume from, its curve, and the weights of the exponential moving average.
+"""
+
+import argparse
+import copy
+import json
+import math
+import time
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from model.network.architecture import MAX_IMAGES, NetworkConfig, SurfaceNetwork
+from training.render import Camera, Situations, load_field, render
+from training.surfaces import Augmentation, load_surfaces, split_by_heliostat
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Everything that decides a run; stored beside its result."""
+
+    data: str = "../shared/stj"
+    seed: int = 7
+    held_out: int = 8
+    steps: int = 20000
+    batch: int = 32
+    learning_rate: float = 1e-3
+    warmup: int = 300
+    weight_decay: float = 0.02
+    slope_weight: float = 0.5
+    spread_weight: float = 0.1
+    ema: float = 0.999
+    bfloat16: bool = True
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    augmentation: Augmentation = field(default_factory=Augmentation)
+    situations: Situations = field(default_factory=Situations)
+    camera: Camera = field(default_factory=Camera)
+
+    @classmethod
+    def read(cls, path: Path) -> "TrainConfig":
+        """A config from JSON; keys that are left out keep their defaults."""
+        values = json.loads(path.read_text(encoding="utf-8"))
+        parts = {"network": NetworkConfig, "augmentation": Augmentation, "situations": Situations, "camera": Camera}
+        for name, part in parts.items():
+            if name in values:
+                values[name] = part(**{k: tuple(v) if isinstance(v, list) else v for k, v in values[name].items()})
+        return cls(**values)
+
+
+def loss_terms(heights: Tensor, spread: Tensor, truth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean absolute height error [mm] and slope error [mm per control spacing], and the spread's neg. log-likelihood.
+
+    The spread learns from the error but does not pull at the heights.
+    """
+    error = heights - truth
+    slopes = error.diff(dim=-1).abs().mean() + error.diff(dim=-2).abs().mean()
+    likelihood = (error.detach().abs() / spread + torch.log(spread)).mean()
+    return error.abs().mean(), slopes, likelihood
+
+
+class Run:
+    """One training run in its folder."""
+
+    def __init__(self, config: TrainConfig, folder: Path, device: torch.device) -> None:
+        self.config, self.folder, self.device = config, folder, device
+        surfaces, self.names = load_surfaces(Path(config.data))
+        train, held_out = split_by_heliostat(len(surfaces), config.held_out, config.seed)
+        self.surfaces, self.held_out = surfaces[train], surfaces[held_out]
+        self.held_out_names = [self.names[i] for i in held_out]
+        self.field = load_field(Path(config.data))
+        mean = torch.as_tensor(self.surfaces.mean(axis=0) * 1e3, dtype=torch.float32)
+        torch.manual_seed(config.seed)
+        self.network = SurfaceNetwork(config.network, mean).to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.average = copy.deepcopy(self.network).requires_grad_(False)
+        self.optimizer = torch.optim.AdamW(
+            self.network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay, betas=(0.9, 0.98)
+        )
+        self.step = 0
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "config.json").write_text(json.dumps(asdict(config), indent=1) + "\n", encoding="utf-8")
+        if (folder / "checkpoint.pt").is_file():
+            self._resume()
+
+    def _resume(self) -> None:
+        state = torch.load(self.folder / "checkpoint.pt", map_location=self.device, weights_only=True)
+        self.network.load_state_dict(state["network"])
+        self.average.load_state_dict(state["average"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.step = state["step"]
+
+    def save(self) -> None:
+        """Write the checkpoint; a crash while writing leaves the old one."""
+        state = {
+            "network": self.network.state_dict(),
+            "average": self.average.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "step": self.step,
+        }
+        torch.save(state, self.folder / "checkpoint.tmp")
+        (self.folder / "checkpoint.tmp").replace(self.folder / "checkpoint.pt")
+
+    def _learning_rate(self) -> float:
+        """Linear warm-up, then a cosine to a hundredth."""
+        c = self.config
+        if self.step < c.warmup:
+            return c.learning_rate * (self.step + 1) / c.warmup
+        progress = min(1.0, (self.step - c.warmup) / max(1, c.steps - c.warmup))
+        return c.learning_rate * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * progress)))
+
+    def train_step(self) -> float:
+        """Render a batch, descend once, return the height error [mm]."""
+        c = self.config
+        rng = np.random.default_rng((c.seed, self.step))
+        z = c.augmentation.sample(self.surfaces, c.batch, rng)
+        images = int(rng.integers(1, MAX_IMAGES + 1))
+        with torch.no_grad():
+            flux, conditions = render(
+                z, images, self.field, c.situations, c.camera, self.device, int(rng.integers(2**31))
+            )
+        truth = torch.as_tensor(z * 1e3, dtype=torch.float32, device=self.device)
+        truth = truth - truth.mean(dim=(2, 3), keepdim=True)
+        mask = torch.ones(c.batch, images, device=self.device)
+        with torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=c.bfloat16):
+            heights, spread = self.network(flux, conditions, mask)
+        error, slopes, likelihood = loss_terms(heights.float(), spread.float(), truth)
+        self.optimizer.param_groups[0]["lr"] = self._learning_rate()
+        self.optimizer.zero_grad()
+        (error + c.slope_weight * slopes + c.spread_weight * likelihood).backward()
+        nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
+        self.optimizer.step()
+        self._update_average()
+        self.step += 1
+        return float(error.detach())
+
+    def _update_average(self) -> None:
+        decay = min(self.config.ema, (1 + self.step) / (10 + self.step))
+        with torch.no_grad():
+            for mean, current in zip(self.average.parameters(), self.network.parameters(), strict=True):
+                mean.lerp_(current, 1 - decay)
+
+    @torch.no_grad()
+    def validate(self, repeats: int = 16) -> float:
+        """Mean absolute height error [mm] on held-out heliostats with eight clean images each."""
+        z = self.held_out.repeat(repeats, axis=0)
+        flux, conditions = render(z, MAX_IMAGES, self.field, self.config.situations, None, self.device, seed=0)
+        truth = torch.as_tensor(z * 1e3, dtype=torch.float32, device=self.device)
+        heights, _ = self.average.eval()(flux, conditions, torch.ones(flux.shape[:2], device=self.device))
+        return float((heights - truth + truth.mean(dim=(2, 3), keepdim=True)).abs().mean())
+
+    def train(self, minutes: float, every: int = 250) -> None:
+        """Train to the last step, or until the time is up."""
+        end = time.monotonic() + 60 * minutes
+        errors: list[float] = []
+        while self.step < self.config.steps and time.monotonic() < end:
+            errors.append(self.train_step())
+            if self.step % every == 0 or self.step == self.config.steps:
+                self._report(float(np.mean(errors)))
+                errors.clear()
+        self.save()
+
+    def _report(self, error: float) -> None:
+        line = {"step": self.step, "train_mae_mm": round(error, 4), "held_out_mae_mm": round(self.validate(), 4)}
+        with (self.folder / "curve.jsonl").open("a", encoding="utf-8") as file:
+            file.write(json.dumps(line) + "\n")
+        print(json.dumps(line), flush=True)
+        self.save()
+
+
+def main() -> None:
+    """Train, or resume, one run."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--config", type=Path, help="JSON of TrainConfig; defaults without one")
+    parser.add_argument("--run", type=Path, default=Path("runs/first"), help="folder of the run")
+    parser.add_argument("--minutes", type=float, default=float("inf"), help="stop after so many minutes")
+    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    arguments = parser.parse_args()
+    config = TrainConfig.read(arguments.config) if arguments.config else TrainConfig()
+    Run(config, arguments.run, torch.device(arguments.device)).train(arguments.minutes)
+
+
+if __name__ == "__main__":
+    main()
