@@ -8,6 +8,7 @@ full-size image, where straight lines are fitted to the mark's edges with sub-pi
 
 from dataclasses import dataclass
 from functools import cache
+from itertools import product
 from typing import Literal
 
 import cv2
@@ -68,7 +69,7 @@ def _outline(kind: Kind, stroke: float) -> Points:
 
 def _turn(points: Points, degrees: float) -> Points:
     angle = np.radians(degrees)
-    return points @ np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    return np.asarray(points @ np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,13 +84,8 @@ class _Template:
 @cache
 def _templates() -> tuple[_Template, ...]:
     """Ideal marks of all kinds, attitudes, strokes and small tilts, each filling its bounding box."""
-    templates = []
-    for kind in ("L", "T"):
-        for quarter in range(4):
-            for stroke in _STROKES:
-                for tilt in _TILTS_DEG:
-                    templates.append(_template(kind, quarter, stroke, tilt))  # type: ignore[arg-type]
-    return tuple(templates)
+    kinds: tuple[Kind, ...] = ("L", "T")
+    return tuple(_template(*choice) for choice in product(kinds, range(4), _STROKES, _TILTS_DEG))
 
 
 def _template(kind: Kind, quarter: int, stroke: float, tilt_deg: float) -> _Template:
@@ -131,7 +127,8 @@ def _darkness(gray: NDArray[np.uint8]) -> list[NDArray[np.float32]]:
     maps = []
     for width in (17, 41):
         closed = cv2.morphologyEx(smooth, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_RECT, (width, width)))
-        maps.append((closed.astype(np.float32) - smooth) / np.maximum(closed, 20).astype(np.float32))
+        relative = (closed.astype(np.float32) - smooth) / np.maximum(closed, 20)
+        maps.append(np.asarray(relative, dtype=np.float32))
     return maps
 
 
@@ -143,7 +140,7 @@ def _marks_of_mask(mask: NDArray[np.uint8]) -> list[Mark]:
         left, top, width, height, area = (int(value) for value in stats[label])
         sides = sorted((width, height))
         fill = area / (width * height)
-        if _MIN_SIDE <= sides[0] and sides[1] <= min(_MAX_SIDE, 2.5 * sides[0]) and 0.15 < fill < 0.75:
+        if sides[0] >= _MIN_SIDE and sides[1] <= min(_MAX_SIDE, 2.5 * sides[0]) and 0.15 < fill < 0.75:
             shape = labels[top : top + height, left : left + width] == label
             mark = _matched(shape.astype(np.float32), np.array([left, top, width, height], dtype=np.float64))
             if mark is not None:

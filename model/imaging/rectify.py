@@ -2,8 +2,8 @@
 
 A target has an L bracket at each free corner. Where two targets share an edge (the Juelich tower's upper and lower), T
 bars stand at the ends of that edge and L brackets only at the corners of the pair, so the pair's marks together serve
-either target. A target that is alone is searched by its four brackets. Each hypothesis of four marks gives a homography;
-it must be plausible (convex, the right aspect, arms along the edges) and is scored by all marks that agree with it.
+either target. A target that is alone is searched by its four brackets. Four marks give a homography as a hypothesis; it
+must be plausible (convex, the right aspect, arms along the edges) and is scored by all marks that agree with it.
 """
 
 from dataclasses import dataclass
@@ -52,7 +52,7 @@ _LOWER = tuple(MarkPlace(place.kind, place.quarter, place.x, place.y - 1) for pl
 
 
 def mark_layouts(target_name: str) -> tuple[tuple[MarkPlace, ...], ...]:
-    """The layouts of marks to try for a target, in this order; one of a pair is named ``..._upper`` or ``..._lower``."""
+    """The layouts of marks to try for a target, in order; one of a pair is named ``..._upper`` or ``..._lower``."""
     name = target_name.lower()
     if name.endswith("upper"):
         return _UPPER, _ALONE
@@ -169,7 +169,9 @@ def _fit_four(
     if sizes.max() > 1.8 * sizes.min():
         return None
     points = np.array([mark.point for mark in chosen])
-    transform = cv2.getPerspectiveTransform(source.astype(np.float32), points.astype(np.float32))
+    transform = np.asarray(
+        cv2.getPerspectiveTransform(source.astype(np.float32), points.astype(np.float32)), dtype=np.float64
+    )
     square = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], dtype=np.float64)
     corners = _project(transform, square)
     if not _plausible(corners, sizes, plane) or not all(
@@ -179,9 +181,7 @@ def _fit_four(
     return _agreement(transform, layout, candidates, sizes.mean()), corners
 
 
-def _agreement(
-    transform: Points, layout: tuple[MarkPlace, ...], candidates: list[list[Mark]], size: float
-) -> float:
+def _agreement(transform: Points, layout: tuple[MarkPlace, ...], candidates: list[list[Mark]], size: float) -> float:
     """Sum of the scores of the marks that lie where the homography puts them."""
     total = 0.0
     for place, marks in zip(layout, candidates, strict=True):

@@ -15,7 +15,7 @@ def overlap_matrix(source_edges: NDArray[np.float64], target_edges: NDArray[np.f
     """Share of each source cell that falls into each target cell (targets, sources), both given by ascending edges."""
     low = np.maximum(target_edges[:-1, None], source_edges[None, :-1])
     high = np.minimum(target_edges[1:, None], source_edges[None, 1:])
-    return np.maximum(high - low, 0.0) / np.diff(source_edges)
+    return np.asarray(np.maximum(high - low, 0.0) / np.diff(source_edges))
 
 
 def _axis_weights(pixels: int, extent: float, center: float, window: float, resolution: int) -> NDArray[np.float64]:
@@ -82,4 +82,5 @@ def center_of_mass(flux: NDArray[np.floating], plane_size: tuple[float, float]) 
     rows, columns = image.shape
     right = (np.arange(columns) + 0.5) / columns - 0.5
     up = 0.5 - (np.arange(rows) + 0.5) / rows
-    return np.array([image.sum(axis=0) @ right * plane_size[0], image.sum(axis=1) @ up * plane_size[1]]) / total
+    moments = image.sum(axis=0) @ right * plane_size[0], image.sum(axis=1) @ up * plane_size[1]
+    return np.array(moments, dtype=np.float64) / float(total)

@@ -1,0 +1,174 @@
+"""Whether a photograph can be measured: a few figures, and the limits beyond which it is refused."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.imaging.separate import Separation
+
+SATURATED_GRAY = 250
+_LIMIT_SATURATED = 0.10
+_LIMIT_CUT = 0.05
+_LIMIT_SECOND = 0.40
+# 300 real empty targets show patches of at most 0.13 of the background and 29 noise deviations; spots start at 0.37.
+_LEAST_CONTRAST = 0.14
+_LEAST_CERTAINTY = 10.0
+_CERTAIN = 30.0
+_LEAST_AREA = 0.003
+
+_REMEDY = {
+    "no_spot": "no spot stands out from the target; photograph while the heliostat is on target",
+    "low_signal": "the spot is too faint against daylight and texture; give an empty-target reference or more exposure",
+    "saturated": "the spot's centre is beyond the camera's range; shorten the exposure",
+    "cut": "the spot runs over the target's edge; aim the heliostat at the target's centre",
+    "second_spot": "another spot is about as strong, so it is unknown which is meant; clear the target of others",
+}
+
+
+@dataclass(frozen=True)
+class Quality:
+    """What a photograph is worth.
+
+    Attributes
+    ----------
+    accepted : bool
+    reason : str or None
+        Short code of the refusal: ``target_not_found``, ``no_spot``, ``low_signal``, ``saturated``, ``cut`` or
+        ``second_spot``.
+    detail : str or None
+        One sentence with the remedy.
+    saturated_share : float [1]
+        Share of the spot's bright area (above half its peak) where the gray value is at the camera's limit.
+    clipped_share : float [1]
+        The same where at least one colour is: such light still raises the gray value, but less than in proportion.
+    cut_share : float [1]
+        Estimated share of the spot's energy that falls beside the target.
+    signal_to_background : float [1]
+        The spot's peak over the target's own brightness there; on separated flux, over the mean level off the spot.
+    energy_outside_window : float [1]
+        Share of the spot's energy that the centred window leaves out.
+    second_spot_share : float [1]
+        Energy of other spots on the target over the energy of all.
+    signal_to_noise : float [1]
+        The spot's peak over the deviation of the smoothed background.
+    spot_area_share : float [1]
+        Area of the spot with its wings over the target's area.
+    """
+
+    accepted: bool
+    reason: str | None = None
+    detail: str | None = None
+    saturated_share: float = 0.0
+    clipped_share: float = 0.0
+    cut_share: float = 0.0
+    signal_to_background: float = 0.0
+    energy_outside_window: float = 0.0
+    second_spot_share: float = 0.0
+    signal_to_noise: float = 0.0
+    spot_area_share: float = 0.0
+
+
+def judge(
+    parts: Separation, saturated: NDArray[np.bool_], clipped: NDArray[np.bool_], energy_outside_window: float
+) -> Quality:
+    """The quality of a separated image, and its refusal if a limit is passed.
+
+    Parameters
+    ----------
+    parts : Separation
+    saturated, clipped : bool (rows, columns)
+        Where the gray value, and where at least one colour, was at the camera's limit.
+    energy_outside_window : float [1]
+    """
+    if not parts.main.any():
+        return refused("no_spot")
+    peak = float(np.percentile(parts.smooth[parts.main], 99))
+    contrast = peak / max(float(parts.background[parts.main].mean()), 1.0)
+    certainty, area = peak / parts.noise, float(parts.main.mean())
+    quality = Quality(
+        accepted=True,
+        saturated_share=_bright_share(saturated, parts.smooth, peak, parts.main),
+        clipped_share=_bright_share(clipped, parts.smooth, peak, parts.main),
+        cut_share=_cut_share(parts.flux),
+        signal_to_background=contrast,
+        energy_outside_window=energy_outside_window,
+        second_spot_share=_second_share(parts),
+        signal_to_noise=certainty,
+        spot_area_share=area,
+    )
+    if contrast < _LEAST_CONTRAST or certainty < _LEAST_CERTAINTY or area < _LEAST_AREA:
+        return _refuse(quality, "low_signal" if certainty > _CERTAIN and area > _LEAST_AREA else "no_spot")
+    return _limited(quality)
+
+
+def _limited(quality: Quality) -> Quality:
+    """The same, or refused for the first figure that passes its limit."""
+    limits = (
+        ("saturated", quality.saturated_share > _LIMIT_SATURATED),
+        ("cut", quality.cut_share > _LIMIT_CUT),
+        ("second_spot", quality.second_spot_share > _LIMIT_SECOND),
+    )
+    for reason, passed in limits:
+        if passed:
+            return _refuse(quality, reason)
+    return quality
+
+
+def _refuse(quality: Quality, reason: str) -> Quality:
+    return replace(quality, accepted=False, reason=reason, detail=_REMEDY[reason])
+
+
+def refused(reason: str, detail: str | None = None) -> Quality:
+    """A refusal with its remedy, of an image of which nothing was measured."""
+    return Quality(accepted=False, reason=reason, detail=detail or _REMEDY[reason])
+
+
+def judge_flux(flux: NDArray[np.floating], main: NDArray[np.bool_], outside: float, second: float) -> Quality:
+    """The quality of an image whose background was already removed (rows, columns)."""
+    peak = float(flux.max())
+    if peak <= 0 or not main.any():
+        return refused("no_spot")
+    off = float(flux[~main].mean()) if not main.all() else 0.0
+    quality = Quality(
+        accepted=True,
+        saturated_share=_bright_share(flux >= 0.995 * peak, flux, peak, main),
+        cut_share=_cut_share(flux),
+        signal_to_background=peak / max(off, peak / 255),
+        energy_outside_window=outside,
+        second_spot_share=second,
+        signal_to_noise=peak / max(float(flux[~main].std()) if not main.all() else 0.0, peak / 255),
+        spot_area_share=float(main.mean()),
+    )
+    return _limited(quality)
+
+
+def _second_share(parts: Separation) -> float:
+    """Energy of the other spots over the energy of all."""
+    signal = np.maximum(parts.smooth, 0)
+    others = float(signal[parts.foreign].sum())
+    return others / max(others + float(signal[parts.main].sum()), 1e-9)
+
+
+def _bright_share(
+    where: NDArray[np.bool_], signal: NDArray[np.floating], peak: float, main: NDArray[np.bool_]
+) -> float:
+    bright = main & (signal > 0.5 * peak)
+    return float(where[bright].mean()) if bright.any() else 0.0
+
+
+def _cut_share(flux: NDArray[np.floating]) -> float:
+    """Energy beyond the image's edges over all energy, by continuing each row and column exponentially.
+
+    A profile of edge value e and inward slope g goes on with the area e^2 / g; it is at most that of the spot's radius,
+    for a profile that does not fall towards the edge at all.
+    """
+    radius = float(np.sqrt((flux > 0.5 * flux.max()).sum() / np.pi))
+    depth = max(4, round(0.5 * radius))
+    lost = 0.0
+    for turned in (flux, flux[::-1], flux.T, flux.T[::-1]):
+        edge = turned[:3].mean(axis=0, dtype=np.float64)
+        slope = (turned[depth : depth + 3].mean(axis=0, dtype=np.float64) - edge) / depth
+        reach = np.minimum(edge / np.maximum(slope, 1e-12), radius)
+        lost += float((edge * reach).sum())
+    return lost / (lost + float(flux.sum(dtype=np.float64)))

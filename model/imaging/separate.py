@@ -1,0 +1,286 @@
+"""Separating the heliostat's spot from the target that it falls on.
+
+Gray value = sheet's brightness + flux, both linear in light: on real images of the Juelich tower PAINT's flux is
+proportional to the gray value less a smooth background over its whole range. The sheet's brightness is therefore fitted
+as a smooth surface to the pixels off the spot, after dark lines, rivets and marks were bridged, and subtracted. What
+remains is kept where it belongs to the main spot; its faint wings fade out softly, for a hard mask would cut them.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Image = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+_LINE_WIDTH = 9  # [px] dark features up to this width are lines or rivets
+_MARK_WIDTH = 41  # ... and up to this width marks
+_LINE_DARKNESS, _MARK_DARKNESS = 0.03, 0.15  # relative to the surroundings
+_GRAIN = 1.5  # [px] smoothing of the flux itself, far below the width of the sun's image
+_SMOOTHING = 2.0  # [px] of the map on which the spot is told from noise
+_ROUNDS = 12
+_SPOT_LEVEL = 3.0  # noise deviations above which a pixel may belong to a spot
+_WING_SHARE = 0.02  # ... and share of the peak
+_CORE_SHARE = 0.15  # share of the peak above which light is taken for a spot and not for uneven daylight
+_SPLIT_SHARE = 0.3  # share of the peak on which spots that overlap are told apart
+_WING_REACH = 0.8  # how far wings reach out of the core, in its mean radius
+_MARGIN = 0.15  # added around it, for the light below the noise, likewise
+_TENDRIL = 9  # [px] width up to which a bright streak at a spot is the sheet's
+_LOBE_GAP = 0.5  # cores nearer than this, in mean radii, are lobes of one heliostat's spot
+_MIN_AREA = 40  # [px] of a spot
+
+
+@dataclass(frozen=True, eq=False)
+class Separation:
+    """A rectified image taken apart.
+
+    Attributes
+    ----------
+    flux : float32 (rows, columns) [gray]
+        The main spot's flux, zero elsewhere.
+    background : float32 (rows, columns) [gray]
+    smooth : float32 (rows, columns) [gray]
+        The whole signal, smoothed: all spots.
+    main, foreign : bool (rows, columns)
+        Where the main spot lies, and where others lie.
+    noise : float [gray]
+        Deviation of ``smooth`` off the spots.
+    """
+
+    flux: Image
+    background: Image
+    smooth: Image
+    main: Mask
+    foreign: Mask
+    noise: float
+
+
+def separate(crop: NDArray[np.uint8], empty: NDArray[np.uint8] | None = None) -> Separation:
+    """The spot on a rectified gray image (rows, columns), given optionally the same target without light.
+
+    An empty reference carries the sheet's own pattern; it is scaled by a smooth surface to the image's illumination.
+    """
+    bridged, hidden = bridge_dark_features(crop)
+    reference = np.ones_like(bridged) if empty is None else _pattern(empty)
+    # Only the pattern is divided out: the flux on a dull panel is dimmed by the same reflectance as the daylight.
+    even = _blurred(bridged / reference, _GRAIN)
+    surface = fit_background(even, hidden)
+    rough = _blurred(even - surface, _SMOOTHING)
+    noise = _noise(rough, hidden)
+    main, foreign = find_spots(rough, noise)
+    background = surface + _bridge_over(rough, main)
+    flux = np.maximum(even - background, 0) * _feathered(main, foreign)
+    return Separation(
+        flux.astype(np.float32), background.astype(np.float32), np.asarray(rough, np.float32), main, foreign, noise
+    )
+
+
+def _blurred(image: NDArray[np.floating], sigma: float) -> Image:
+    return np.asarray(cv2.GaussianBlur(image.astype(np.float32), (0, 0), sigma), dtype=np.float32)
+
+
+def bridge_dark_features(crop: NDArray[np.uint8]) -> tuple[Image, Mask]:
+    """The image with dark lines, rivets and marks filled from their surroundings, and the mask of the marks."""
+    gray = crop.astype(np.float32)
+    hidden = _dark(gray, _MARK_WIDTH, _MARK_DARKNESS)
+    hidden = cv2.dilate(hidden.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
+    lines = _dark(gray, _LINE_WIDTH, _LINE_DARKNESS)
+    holes = (hidden | lines).astype(np.uint8)
+    filled = _fill(gray, holes.astype(bool))
+    return filled, hidden
+
+
+def _dark(gray: Image, width: int, darkness: float) -> Mask:
+    kernel = cv2.getStructuringElement(cv2.MORPH_RECT, (width, width))
+    padded = cv2.copyMakeBorder(gray, width, width, width, width, cv2.BORDER_REFLECT_101)
+    soft = _blurred(np.asarray(padded, dtype=np.float32), 0.7)
+    closed = cv2.morphologyEx(soft, cv2.MORPH_CLOSE, kernel)
+    relative = (closed - soft) / np.maximum(closed, 1.0)
+    return np.asarray(relative[width:-width, width:-width] > darkness)
+
+
+def _fill(gray: Image, holes: Mask) -> Image:
+    """Holes filled by the mean of their neighbours, weighted by nearness, from fine to coarse."""
+    filled, missing = np.where(holes, 0, gray).astype(np.float32), holes.copy()
+    for sigma in (1.0, 2.0, 4.0, 8.0, 16.0):
+        weight = _blurred((~holes).astype(np.float32), sigma)
+        mean = _blurred(np.where(holes, 0, gray).astype(np.float32), sigma)
+        sure = missing & (weight > 0.1)
+        filled[sure] = mean[sure] / weight[sure]
+        missing &= ~sure
+    if missing.any():
+        filled[missing] = gray[~holes].mean() if (~holes).any() else gray.mean()
+    return filled
+
+
+def _pattern(empty: NDArray[np.uint8]) -> Image:
+    """The sheet's reflectance relative to its smooth brightness."""
+    filled, _ = bridge_dark_features(empty)
+    return np.clip(filled / np.maximum(_blurred(filled, 32), 1.0), 0.5, 2.0).astype(np.float32)
+
+
+def _basis(shape: tuple[int, int], degree: int) -> NDArray[np.float64]:
+    y, x = (np.linspace(-1, 1, count) for count in shape)
+    terms = [np.outer(y**j, x**i) for i in range(degree + 1) for j in range(degree + 1 - i)]
+    return np.stack(terms, axis=-1)
+
+
+def fit_background(gray: Image, hidden: Mask) -> Image:
+    """The sheet's brightness under and around the spot (rows, columns).
+
+    A polynomial surface is fitted, in rounds, to the pixels that are not brighter than it by more than noise allows.
+    The less of the sheet is free, the stiffer the surface.
+    """
+    free = ~hidden
+    surface = np.full(gray.shape, np.median(gray[free]) if free.any() else gray.mean())
+    smooth = _blurred(gray, _SMOOTHING)
+    for round_ in range(_ROUNDS):
+        residual = smooth - surface
+        below = residual[free & (residual < 0)]
+        spread = max(float(np.sqrt(np.mean(below**2))) if below.size else 0.0, 0.5)
+        keep = free & (residual < 1.5 * spread) & (residual > -4 * spread)
+        if round_ >= 4:
+            bright = ((residual > 2 * spread) & free).astype(np.uint8)
+            opened = cv2.morphologyEx(bright, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
+            keep &= ~cv2.dilate(opened, np.ones((15, 15), np.uint8)).astype(bool)
+        share = keep.mean()
+        degree = min(3 if share > 0.35 else 2 if share > 0.15 else 1, round_ // 2 + 1)
+        surface = _polynomial(smooth, keep, degree)
+    return surface.astype(np.float32)
+
+
+def _polynomial(gray: Image, keep: Mask, degree: int) -> NDArray[np.float64]:
+    basis = _basis((gray.shape[0], gray.shape[1]), degree)
+    picked = np.zeros_like(keep)
+    picked[::2, ::2] = keep[::2, ::2]
+    if picked.sum() < 4 * basis.shape[-1]:
+        return np.full(gray.shape, float(np.percentile(gray, 20)))
+    weights = np.linalg.lstsq(basis[picked], gray[picked].astype(np.float64), rcond=None)[0]
+    return np.asarray(basis @ weights)
+
+
+def _bridge_over(residual: Image, main: Mask) -> Image:
+    """What remains of the sheet's brightness off the main spot, carried smoothly across the spot.
+
+    It follows shadow edges, glare and other heliostats' spots outside; under the spot it is the smoothest interpolation
+    that push-pull gives: averages over ever larger cells, from coarse to fine (Gortler et al. 1996, The Lumigraph).
+    """
+    known = (~main).astype(np.float32)
+    return _blurred(_push_pull(residual * known, known), _SMOOTHING)
+
+
+def _push_pull(weighted: Image, weight: Image) -> Image:
+    if min(weight.shape) <= 2:
+        return np.full(weight.shape, weighted.sum() / max(float(weight.sum()), 1e-6), dtype=np.float32)
+    halved = (np.asarray(cv2.pyrDown(image), dtype=np.float32) for image in (weighted, weight))
+    coarse = _push_pull(*halved)
+    spread = cv2.pyrUp(coarse, dstsize=(weight.shape[1], weight.shape[0]))
+    sure = np.minimum(weight, 1.0)
+    return np.where(weight > 0, sure * weighted / np.maximum(weight, 1e-6) + (1 - sure) * spread, spread)
+
+
+def _noise(smooth: Image, hidden: Mask) -> float:
+    """Deviation of a map about zero, by its lower half: spots only add."""
+    below = smooth[~hidden & (smooth < 0)]
+    return max(float(1.4826 * np.median(-below)) if below.size else 0.0, 0.25)
+
+
+def find_spots(smooth: Image, noise: float) -> tuple[Mask, Mask]:
+    """Masks of the main spot, the one with the most energy, and of the others (rows, columns), of a smoothed signal.
+
+    A spot starts from its core and takes in the wings around it, so that a sunlit patch that touches the wings is not
+    taken for light of the spot.
+    """
+    cores = _cores(smooth, noise)
+    if cores.max() == 0:
+        return np.zeros(smooth.shape, bool), np.zeros(smooth.shape, bool)
+    level = max(_SPOT_LEVEL * noise, _WING_SHARE * float(smooth.max()))
+    regions = _nearest(cores)
+    masks = [_with_wings(smooth > level, cores == i, regions == i) for i in range(1, int(cores.max()) + 1)]
+    energies = [float(smooth[mask].sum()) for mask in masks]
+    main = masks[int(np.argmax(energies))]
+    return main, np.any(masks, axis=0) & ~main
+
+
+def _cores(smooth: Image, noise: float) -> NDArray[np.int32]:
+    """Labels of the spots' bright cores, 0 elsewhere; lobes of one spot share a label."""
+    peak = float(smooth.max())
+    low = smooth > max(_SPOT_LEVEL * noise, _CORE_SHARE * peak)
+    high = smooth > max(_SPOT_LEVEL * noise, _SPLIT_SHARE * peak)
+    lobes = _labelled(high)
+    labels = _joined(lobes)
+    _, islands = cv2.connectedComponents(low.astype(np.uint8), connectivity=8)
+    # Where one core lies in an island, the island is its core; overlapping spots keep the cores that tell them apart.
+    for island in range(1, int(islands.max()) + 1):
+        inside = islands == island
+        present = np.unique(labels[inside])
+        present = present[present > 0]
+        if len(present) == 1:
+            labels[inside] = present[0]
+    return labels
+
+
+def _labelled(mask: Mask) -> NDArray[np.int32]:
+    """Labels 1, 2, ... of the connected shapes that are large enough."""
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    large = np.flatnonzero(stats[1:, cv2.CC_STAT_AREA] >= _MIN_AREA) + 1
+    renamed = np.zeros(len(stats), np.int32)
+    renamed[large] = np.arange(1, len(large) + 1)
+    return np.asarray(renamed[labels], dtype=np.int32)
+
+
+def _joined(labels: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Labels with near neighbours merged into the larger one, and numbered anew."""
+    merged = labels.copy()
+    by_area = sorted(range(1, int(labels.max()) + 1), key=lambda i: -int((labels == i).sum()))
+    for position, small in enumerate(by_area):
+        for large in by_area[:position]:
+            shape = merged == large
+            if not shape.any():
+                continue
+            distance = cv2.distanceTransform((~shape).astype(np.uint8), cv2.DIST_L2, 5)
+            if distance[labels == small].min() < _LOBE_GAP * _radius(shape):
+                merged[labels == small] = large
+                break
+    _, renamed = np.unique(merged, return_inverse=True)
+    return renamed.reshape(labels.shape).astype(np.int32)
+
+
+def _nearest(cores: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Every pixel's nearest core."""
+    distances = [
+        cv2.distanceTransform((cores != i).astype(np.uint8), cv2.DIST_L2, 5) for i in range(1, int(cores.max()) + 1)
+    ]
+    return np.asarray(np.argmin(distances, axis=0) + 1, dtype=np.int32)
+
+
+def _with_wings(bright: Mask, core: Mask, region: Mask) -> Mask:
+    """A core with the bright pixels around it."""
+    distance = cv2.distanceTransform((~core).astype(np.uint8), cv2.DIST_L2, 5)
+    near = bright & region & (distance < _WING_REACH * _radius(core))
+    # Opening cuts the thin tendrils along seams and wrinkles of the sheet.
+    compact = cv2.morphologyEx(near.astype(np.uint8), cv2.MORPH_OPEN, _disc(_TENDRIL))
+    _, labels = cv2.connectedComponents((compact.astype(bool) | core).astype(np.uint8), connectivity=8)
+    joined = np.isin(labels, np.unique(labels[core])).astype(np.uint8)
+    wider = cv2.dilate(joined, _disc(max(3, round(2 * _MARGIN * _radius(core)) | 1))).astype(bool)
+    return np.asarray(wider & region)
+
+
+def _disc(diameter: int) -> NDArray[np.uint8]:
+    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (diameter, diameter)), dtype=np.uint8)
+
+
+def _radius(mask: Mask) -> float:
+    return float(np.sqrt(mask.sum() / np.pi))
+
+
+def _feathered(main: Mask, foreign: Mask, reach: float = 6.0) -> Image:
+    """Weight 1 in the main spot, falling to 0 within a few pixels [px] around it, 0 in other spots."""
+    if not main.any():
+        return np.zeros(main.shape, np.float32)
+    distance = cv2.distanceTransform((~main).astype(np.uint8), cv2.DIST_L2, 5)
+    weight = np.exp(-0.5 * (distance / reach) ** 2)
+    weight[foreign] = 0
+    return np.asarray(weight, dtype=np.float32)
