@@ -1,0 +1,38 @@
+"""How Alembic reaches the database: the connection that `service.database` hands in, or one from the settings."""
+
+from alembic import context
+from service.database import make_engine
+from service.settings import Settings
+from service.tables import Base
+from sqlalchemy import Connection, text
+
+# Any fixed number: it names the lock that lets one migration run at a time on PostgreSQL.
+_MIGRATION_LOCK = 0x68656C696F
+
+
+def _migrate(connection: Connection) -> None:
+    is_sqlite = connection.dialect.name == "sqlite"
+    context.configure(
+        connection=connection,
+        target_metadata=Base.metadata,
+        render_as_batch=is_sqlite,
+        transactional_ddl=True,  # on SQLite too: service.database begins real transactions
+    )
+    with context.begin_transaction():
+        if not is_sqlite:
+            connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": _MIGRATION_LOCK})
+        context.run_migrations()
+
+
+def _run() -> None:
+    connection = context.config.attributes.get("connection")
+    if connection is not None:
+        _migrate(connection)
+        return
+    engine = make_engine(Settings().database)
+    with engine.connect() as own:
+        _migrate(own)
+    engine.dispose()
+
+
+_run()

@@ -1,0 +1,117 @@
+"""Every error as a problem document (RFC 9457), by one table from exception to HTTP status."""
+
+import json
+import logging
+from collections.abc import Mapping, Sequence
+from http import HTTPStatus
+from typing import Any
+
+from fastapi import FastAPI, Request, Response
+from fastapi.exceptions import RequestValidationError
+from sqlalchemy.exc import OperationalError
+from starlette.exceptions import HTTPException
+from starlette.types import Scope
+
+from model.errors import ImageRefusedError, InvalidInputError, ModelError, UnreachableError
+from service import faults
+
+logger = logging.getLogger("heliotwin.service")
+
+PROBLEM_MEDIA_TYPE = "application/problem+json"
+
+STATUS: dict[type[Exception], HTTPStatus] = {
+    InvalidInputError: HTTPStatus.UNPROCESSABLE_ENTITY,
+    UnreachableError: HTTPStatus.UNPROCESSABLE_ENTITY,
+    ImageRefusedError: HTTPStatus.UNPROCESSABLE_ENTITY,
+    ModelError: HTTPStatus.UNPROCESSABLE_ENTITY,
+    faults.NotFoundError: HTTPStatus.NOT_FOUND,
+    faults.ConflictError: HTTPStatus.CONFLICT,
+    faults.NotAcceptableError: HTTPStatus.NOT_ACCEPTABLE,
+    faults.TooLargeError: HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
+    faults.UnsupportedImageError: HTTPStatus.UNSUPPORTED_MEDIA_TYPE,
+    faults.UnsupportedContentError: HTTPStatus.UNSUPPORTED_MEDIA_TYPE,
+}
+
+# What the caller may do about an error that comes without a sentence of its own.
+_REMEDIES = {
+    400: "the request could not be read; check its body",
+    404: "there is nothing at this path; see /docs for the paths",
+    405: "this path does not take this method; see the Allow header",
+}
+
+
+def request_id(scope: Scope) -> str:
+    """The request's id, as `service.middleware` gave it."""
+    return str(scope.get("state", {}).get("request_id", ""))
+
+
+def problem(
+    scope: Scope, status: int, detail: str, headers: Mapping[str, str] | None = None, **extension: Any
+) -> Response:
+    """A problem document as a response; ASCII, so that any text in it can be sent."""
+    document = {
+        "type": "about:blank",
+        "title": HTTPStatus(status).phrase,
+        "status": status,
+        "detail": detail,
+        "instance": scope.get("path", ""),
+        "request_id": request_id(scope),
+        **extension,
+    }
+    return Response(
+        json.dumps(document), status_code=status, headers=dict(headers or {}), media_type=PROBLEM_MEDIA_TYPE
+    )
+
+
+def _field(location: Sequence[int | str]) -> str:
+    """A field's name without the part of the request that it stands in."""
+    inner = location[1:] if location and location[0] in ("body", "path", "query", "header") else location
+    return ".".join(str(part) for part in inner) or "body"
+
+
+def _on_known(request: Request, error: Exception) -> Response:
+    status = next(STATUS[kind] for kind in type(error).__mro__ if kind in STATUS)
+    if isinstance(error, faults.NotAcceptableError):
+        return problem(request.scope, status, str(error), offered=list(error.offered))
+    return problem(request.scope, status, str(error))
+
+
+def _on_validation(request: Request, error: Exception) -> Response:
+    assert isinstance(error, RequestValidationError)
+    errors = [
+        {"field": _field(entry["loc"]), "message": entry["msg"].removeprefix("Value error, ")}
+        for entry in error.errors()
+    ]
+    detail = "; ".join(f"{entry['field']}: {entry['message']}" for entry in errors[:5])
+    return problem(request.scope, HTTPStatus.UNPROCESSABLE_ENTITY, detail, errors=errors[:100])
+
+
+def _on_http(request: Request, error: Exception) -> Response:
+    assert isinstance(error, HTTPException)
+    phrase = HTTPStatus(error.status_code).phrase
+    plain = str(error.detail) in ("", phrase)
+    detail = _REMEDIES.get(error.status_code, phrase) if plain else str(error.detail)
+    return problem(request.scope, error.status_code, detail, error.headers)
+
+
+def _on_database_away(request: Request, error: Exception) -> Response:
+    logger.error("database unavailable, request %s: %s", request_id(request.scope), error)
+    detail = "the database does not answer; try again later"
+    return problem(request.scope, HTTPStatus.SERVICE_UNAVAILABLE, detail, {"Retry-After": "5"})
+
+
+def _on_unexpected(request: Request, error: Exception) -> Response:
+    logger.error("unexpected error, request %s", request_id(request.scope), exc_info=error)
+    detail = "the service failed; report the request_id to its operator"
+    headers = {"X-Request-ID": request_id(request.scope)}  # this handler stands outside the middleware that adds it
+    return problem(request.scope, HTTPStatus.INTERNAL_SERVER_ERROR, detail, headers)
+
+
+def install(app: FastAPI) -> None:
+    """Make ``app`` answer every error with a problem document."""
+    for kind in STATUS:
+        app.add_exception_handler(kind, _on_known)
+    app.add_exception_handler(RequestValidationError, _on_validation)
+    app.add_exception_handler(HTTPException, _on_http)
+    app.add_exception_handler(OperationalError, _on_database_away)
+    app.add_exception_handler(Exception, _on_unexpected)

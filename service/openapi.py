@@ -1,0 +1,77 @@
+"""The OpenAPI document: what errors look like, and which routes may answer with which."""
+
+from typing import Any
+
+from fastapi import FastAPI
+from fastapi.openapi.utils import get_openapi
+
+from service import negotiation
+from service.errors import PROBLEM_MEDIA_TYPE
+from service.schemas import Problem
+
+_MEANINGS = {
+    400: "The body could not be read.",
+    404: "Something that the path or the body names is not stored.",
+    406: "None of the media types in Accept is offered.",
+    409: "The store is in no state to do this; the detail says what to do first.",
+    413: "The body or the image is too large.",
+    415: "The body or the image is of a format that is not taken.",
+    422: "A field is wrong; the detail names it.",
+    500: "The service failed.",
+    503: "The database does not answer.",
+}
+
+_TAGS = [
+    {"name": "plant", "description": "The tower base, which everything is measured from, and its target planes."},
+    {"name": "heliostats", "description": "Where heliostats stand and how they are built (PAINT properties)."},
+    {"name": "measurements", "description": "Target photographs: post them, read flux and quality back."},
+    {"name": "surfaces", "description": "Mirror surfaces by version: predict them, read the history."},
+    {"name": "forecasts", "description": "Flux maps on any plane."},
+    {"name": "health", "description": "For supervisors."},
+]
+
+_BINARY = {"type": "string", "format": "binary"}
+
+
+def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """Documented error answers of a route; every route may also fail with 422, 500 and 503."""
+    return {
+        status: {"model": Problem, "description": _MEANINGS[status]} for status in sorted({*statuses, 422, 500, 503})
+    }
+
+
+def arrays(description: str) -> dict[int | str, dict[str, Any]]:
+    """A documented answer in several representations beside JSON."""
+    binary = {media_type: {"schema": _BINARY} for media_type in negotiation.ARRAYS[1:]}
+    return {200: {"description": description, "content": binary}}
+
+
+def _as_problem(response: dict[str, Any]) -> None:
+    content = response.get("content", {})
+    if "application/json" in content:
+        content[PROBLEM_MEDIA_TYPE] = content.pop("application/json")
+
+
+def _document(app: FastAPI) -> dict[str, Any]:
+    document = get_openapi(
+        title=app.title, version=app.version, description=app.description, routes=app.routes, tags=_TAGS
+    )
+    for path in document["paths"].values():
+        for operation in path.values():
+            for status, response in operation["responses"].items():
+                if status.isdecimal() and int(status) >= 400 and "Problem" in str(response):
+                    _as_problem(response)
+    for unused in ("HTTPValidationError", "ValidationError"):
+        document["components"]["schemas"].pop(unused, None)
+    return document
+
+
+def install(app: FastAPI) -> None:
+    """Give ``app`` this document instead of FastAPI's own."""
+
+    def openapi() -> dict[str, Any]:
+        if app.openapi_schema is None:
+            app.openapi_schema = _document(app)
+        return app.openapi_schema
+
+    app.openapi = openapi  # type: ignore[method-assign]  # the way FastAPI documents

@@ -1,0 +1,41 @@
+"""Pictures of flux maps and surfaces as PNG, drawn without a display and without matplotlib's global state."""
+
+import io
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+_FACETS = ("upper left", "upper right", "lower left", "lower right")
+
+
+def _png(figure: Figure) -> bytes:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    return buffer.getvalue()
+
+
+def flux_picture(flux: NDArray[np.floating], size: tuple[float, float] | None, unit: str, title: str) -> bytes:
+    """A flux map (rows, columns), coloured; ``size`` is its width and height [m], pixels where it is None."""
+    figure = Figure(figsize=(6, 5), layout="constrained")
+    axes = figure.subplots()
+    extent = None if size is None else (-size[0] / 2, size[0] / 2, -size[1] / 2, size[1] / 2)
+    image = axes.imshow(flux, cmap="inferno", vmin=0, extent=extent, aspect="equal")
+    axes.set(title=title, xlabel="right [m]" if size else "column", ylabel="up [m]" if size else "row")
+    figure.colorbar(image, ax=axes, label=unit)
+    return _png(figure)
+
+
+def surface_picture(z: NDArray[np.floating], title: str) -> bytes:
+    """A surface's control heights (4, 8, 8) [m] as a map in mm, its facets as they are seen from the front."""
+    figure = Figure(figsize=(6.4, 5), layout="constrained")
+    panes = figure.subplots(2, 2).ravel()
+    heights = np.asarray(z, dtype=np.float64) * 1e3
+    bound = max(float(np.abs(heights).max()), 1e-3)
+    for pane, facet, name in zip(panes, heights, _FACETS, strict=True):
+        # i runs with x and j with y, so columns are i and rows, from below, are j
+        image = pane.imshow(facet.T, cmap="RdBu_r", vmin=-bound, vmax=bound, origin="lower", interpolation="bilinear")
+        pane.set(xticks=[], yticks=[], title=name)
+    figure.suptitle(title)
+    figure.colorbar(image, ax=panes.tolist(), label="deviation from the ideal facet [mm]")
+    return _png(figure)

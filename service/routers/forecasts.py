@@ -1,0 +1,74 @@
+"""Flux forecasts."""
+
+from typing import Annotated
+
+from fastapi import APIRouter, Body, Depends, Path, Query, Response, status
+
+from service import representations, store
+from service.dependencies import Limit, MediaType, ReadSession, RuntimeDep, require_json
+from service.openapi import arrays, problems
+from service.routers.plant import rectangle
+from service.schemas import ForecastIn, ForecastSummary, Name, Page, Version
+from service.workflows import ForecastRequest, make_forecast
+
+router = APIRouter(prefix="/forecasts", tags=["forecasts"])
+
+_EXAMPLE = {
+    "heliostat": "AA39",
+    "target": "multi_focus_tower",
+    "sun": {"azimuth_deg": -20.0, "elevation_deg": 45.0},
+    "surface": "ideal",
+}
+
+
+def _request(body: ForecastIn) -> ForecastRequest:
+    return ForecastRequest(
+        heliostat=body.heliostat,
+        target=body.target,
+        plane=None if body.plane is None else rectangle("plane", body.plane),
+        sun_azimuth_deg=body.sun.azimuth_deg,
+        sun_elevation_deg=body.sun.elevation_deg,
+        aim=body.aim_point,
+        surface=body.surface,
+        dni=body.dni_w_m2,
+        resolution=body.resolution,
+        window=body.window,
+        normalised=body.normalised,
+    )
+
+
+@router.post(
+    "",
+    status_code=status.HTTP_201_CREATED,
+    responses=problems(404, 409, 413, 415),
+    dependencies=[Depends(require_json)],
+)
+def post_forecast(
+    request: Annotated[ForecastIn, Body(examples=[_EXAMPLE])], runtime: RuntimeDep, response: Response
+) -> ForecastSummary:
+    """Compute a flux map and keep it; read the map itself from its own path."""
+    row = make_forecast(runtime, _request(request))
+    response.headers["Location"] = f"/v1/forecasts/{row.id}"
+    return representations.forecast_summary(row)
+
+
+@router.get("", responses=problems(404))
+def list_forecasts(
+    session: ReadSession,
+    limit: Limit = 100,
+    after: Annotated[Version | None, Query(description="The last id of the page before.")] = None,
+    heliostat: Annotated[Name | None, Query(description="Only those of this heliostat.")] = None,
+) -> Page[ForecastSummary]:
+    """Forecasts in the order they were made."""
+    of = None if heliostat is None else store.get_heliostat(session, heliostat)
+    rows = store.list_forecasts(session, limit + 1, after, of)
+    items = [representations.forecast_summary(row) for row in rows[:limit]]
+    return Page(items=items, next=str(items[-1].id) if len(rows) > limit else None)
+
+
+@router.get("/{number}", responses={**problems(404, 406), **arrays("`flux` (rows, columns).")})
+def get_forecast(
+    number: Annotated[Version, Path(description="Id of the forecast.")], session: ReadSession, media_type: MediaType
+) -> Response:
+    """A forecast with its map."""
+    return representations.forecast(store.get_forecast(session, number), media_type)

@@ -1,0 +1,76 @@
+"""Heliostats."""
+
+from typing import Annotated
+
+import numpy as np
+from fastapi import APIRouter, Depends, Query, Response, status
+from sqlalchemy.orm import Session
+
+from service import representations, store
+from service.dependencies import HeliostatDep, Limit, NamePath, ReadSession, RuntimeDep, require_json
+from service.openapi import problems
+from service.schemas import HeliostatIn, HeliostatOut, HeliostatProperties, HeliostatSummary, Name, Page
+
+router = APIRouter(tags=["heliostats"])
+
+
+def _put(session: Session, name: str, properties: HeliostatProperties) -> tuple[HeliostatOut, store.Change]:
+    from service.paint import read_heliostat
+
+    # Reading them as the model does is the check: what is stored can be traced.
+    heliostat = read_heliostat(name, properties.raw, np.array(store.get_plant(session).origin))
+    row, change = store.put_heliostat(session, name, properties.raw, heliostat.position)
+    return representations.heliostat(row), change
+
+
+@router.get("/heliostats", responses=problems())
+def list_heliostats(
+    session: ReadSession,
+    limit: Limit = 100,
+    after: Annotated[Name | None, Query(description="The last name of the page before.")] = None,
+) -> Page[HeliostatSummary]:
+    """Heliostats in the order of their names."""
+    rows = store.list_heliostats(session, limit + 1, after)
+    items = [representations.heliostat_summary(row) for row in rows[:limit]]
+    return Page(items=items, next=items[-1].name if len(rows) > limit else None)
+
+
+@router.post(
+    "/heliostats",
+    status_code=status.HTTP_201_CREATED,
+    responses={**problems(409, 413, 415), 200: {"model": HeliostatOut, "description": "It was there already."}},
+    dependencies=[Depends(require_json)],
+)
+def post_heliostat(request: HeliostatIn, runtime: RuntimeDep, response: Response) -> HeliostatOut:
+    """Add a heliostat; the same one again is no error, the same name with other properties is (use PUT)."""
+    with runtime.database.writing() as session:
+        known = store.find_heliostat(session, request.name)
+        if known is not None:
+            store.require_same_properties(known, request.properties.raw)
+            response.status_code = status.HTTP_200_OK
+            return representations.heliostat(known)
+        heliostat, _ = _put(session, request.name, request.properties)
+    response.headers["Location"] = f"/v1/heliostats/{request.name}"
+    return heliostat
+
+
+@router.get("/heliostats/{name}", responses=problems(404))
+def get_heliostat(heliostat: HeliostatDep) -> HeliostatOut:
+    """A heliostat with its properties."""
+    return representations.heliostat(heliostat)
+
+
+@router.put(
+    "/heliostats/{name}",
+    responses={**problems(409, 413, 415), 201: {"model": HeliostatOut, "description": "It is new."}},
+    dependencies=[Depends(require_json)],
+)
+def put_heliostat(
+    name: NamePath, properties: HeliostatProperties, runtime: RuntimeDep, response: Response
+) -> HeliostatOut:
+    """Set a heliostat's PAINT properties."""
+    with runtime.database.writing() as session:
+        heliostat, change = _put(session, name, properties)
+    if change is store.Change.NEW:
+        response.status_code = status.HTTP_201_CREATED
+    return heliostat

@@ -1,0 +1,102 @@
+"""The plant and its target planes."""
+
+from typing import Any
+
+import numpy as np
+from fastapi import APIRouter, Body, Depends, Response, status
+from sqlalchemy.orm import Session
+
+from model.errors import InvalidInputError
+from model.frames import wgs84_to_enu
+from model.plant import TargetPlane
+from service import representations, store
+from service.dependencies import NamePath, ReadSession, RuntimeDep, require_json
+from service.openapi import problems
+from service.schemas import Corners, Page, Plane, PlantOut, TargetIn, TargetOut, TowerMeasurements, valid_name
+
+router = APIRouter(tags=["plant"])
+
+_CORNERS = ("upper_left", "upper_right", "lower_left", "lower_right")
+_PLANE_EXAMPLE = {"plane": {"center": [0, -3.2, 35.9], "normal": [0, 1, 0], "width": 8.6, "height": 7.2}}
+
+
+def rectangle(name: str, plane: Plane) -> TargetPlane:
+    """The model's plane of a requested one."""
+    return TargetPlane(
+        name=name,
+        center=np.array(plane.center),
+        normal=np.array(plane.normal),
+        up=np.array(plane.up),
+        width=plane.width,
+        height=plane.height,
+    )
+
+
+def _from_corners(session: Session, name: str, corners: Corners) -> TargetPlane:
+    origin = store.get_plant(session).origin
+    return TargetPlane.from_corners(name, *(wgs84_to_enu(getattr(corners, corner), origin) for corner in _CORNERS))
+
+
+def _paint_corners(document: dict[str, Any], name: str) -> dict[str, list[float]]:
+    coordinates = document[name]["coordinates"]
+    return {corner: [float(value) for value in coordinates[corner]] for corner in _CORNERS}
+
+
+@router.get("/plant", responses=problems(409))
+def get_plant(session: ReadSession) -> PlantOut:
+    """The plant's name and the tower base."""
+    return representations.plant(store.get_plant(session))
+
+
+@router.put("/plant", responses=problems(409, 413, 415), dependencies=[Depends(require_json)])
+def put_plant(document: TowerMeasurements, runtime: RuntimeDep) -> PlantOut:
+    """Set the tower base and all planar targets from PAINT's tower measurements; repeating it changes nothing."""
+    from service.paint import read_targets
+
+    origin, targets = read_targets(document.raw)
+    for name in targets:
+        if not valid_name(name):
+            raise InvalidInputError(f"{name[:40]!r}: a target's name is 1 to 32 letters, digits, underscores, hyphens")
+    with runtime.database.writing() as session:
+        store.put_plant(session, document.power_plant_properties.ID, origin)
+        for name, plane in targets.items():
+            store.put_target(session, plane, _paint_corners(document.raw, name))
+        return representations.plant(store.get_plant(session))
+
+
+@router.get("/targets", responses=problems())
+def list_targets(session: ReadSession) -> Page[TargetOut]:
+    """All target planes."""
+    return Page(items=[representations.target(row) for row in store.list_targets(session)], next=None)
+
+
+@router.get("/targets/{name}", responses=problems(404))
+def get_target(name: NamePath, session: ReadSession) -> TargetOut:
+    """A target plane."""
+    return representations.target(store.get_target(session, name))
+
+
+@router.put(
+    "/targets/{name}",
+    responses={**problems(409, 413, 415), 201: {"model": TargetOut, "description": "It is new."}},
+    dependencies=[Depends(require_json)],
+)
+def put_target(
+    name: NamePath,
+    request: TargetIn = Body(examples=[_PLANE_EXAMPLE]),
+    *,
+    runtime: RuntimeDep,
+    response: Response,
+) -> TargetOut:
+    """Set a target plane, by its rectangle [m] or by its four corners in WGS84."""
+    with runtime.database.writing() as session:
+        if request.corners is not None:
+            plane = _from_corners(session, name, request.corners)
+            corners = {corner: list(getattr(request.corners, corner)) for corner in _CORNERS}
+        else:
+            assert request.plane is not None  # the schema wants one of both
+            plane, corners = rectangle(name, request.plane), None
+        row, change = store.put_target(session, plane, corners)
+        if change is store.Change.NEW:
+            response.status_code = status.HTTP_201_CREATED
+        return representations.target(row)

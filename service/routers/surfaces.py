@@ -1,0 +1,68 @@
+"""Surfaces by version."""
+
+from typing import Annotated
+
+from fastapi import APIRouter, Body, Depends, Path, Query, Response, status
+from pydantic import AwareDatetime
+
+from service import representations, store
+from service.dependencies import HeliostatDep, Limit, MediaType, NamePath, ReadSession, RuntimeDep, require_json
+from service.openapi import arrays, problems
+from service.schemas import Page, SurfaceIn, SurfaceOut, SurfaceSummary, Version
+from service.workflows import predict_surface
+
+router = APIRouter(prefix="/heliostats/{name}/surfaces", tags=["surfaces"])
+
+
+@router.post(
+    "",
+    status_code=status.HTTP_201_CREATED,
+    responses=problems(404, 409, 413, 415),
+    dependencies=[Depends(require_json)],
+)
+def post_surface(
+    name: NamePath,
+    runtime: RuntimeDep,
+    response: Response,
+    request: Annotated[SurfaceIn, Body(examples=[{"method": "network", "images": 4}])],
+) -> SurfaceOut:
+    """Predict the surface from stored measurements and keep it as the next version."""
+    row = predict_surface(runtime, name, request.method, request.measurements, request.images)
+    response.headers["Location"] = f"/v1/heliostats/{name}/surfaces/{row.version}"
+    return representations.surface_full(name, row)
+
+
+@router.get("", responses={**problems(404, 406), **arrays("With `at`: the surface itself.")}, response_model=None)
+def list_surfaces(
+    heliostat: HeliostatDep,
+    session: ReadSession,
+    media_type: MediaType,
+    limit: Limit = 100,
+    after: Annotated[Version | None, Query(description="The last version of the page before.")] = None,
+    at: Annotated[
+        AwareDatetime | None, Query(description="Answer with the surface that was valid then (time with zone).")
+    ] = None,
+) -> Page[SurfaceSummary] | Response:
+    """The history of the surface, oldest version first; with `at` the one that was valid at that time."""
+    if at is not None:
+        return representations.surface(heliostat.name, store.get_surface_at(session, heliostat, at), media_type)
+    rows = store.list_surfaces(session, heliostat, limit + 1, after)
+    items = [representations.surface_summary(heliostat.name, row) for row in rows[:limit]]
+    return Page(items=items, next=str(items[-1].version) if len(rows) > limit else None)
+
+
+@router.get("/current", responses={**problems(404, 406), **arrays("`control_points`, `z`, `z_std` [m].")})
+def get_current_surface(heliostat: HeliostatDep, session: ReadSession, media_type: MediaType) -> Response:
+    """The surface that is valid now."""
+    return representations.surface(heliostat.name, store.get_surface_at(session, heliostat), media_type)
+
+
+@router.get("/{version}", responses={**problems(404, 406), **arrays("`control_points`, `z`, `z_std` [m].")})
+def get_surface(
+    heliostat: HeliostatDep,
+    version: Annotated[Version, Path(description="Number of the version, from 1.")],
+    session: ReadSession,
+    media_type: MediaType,
+) -> Response:
+    """A version of the surface."""
+    return representations.surface(heliostat.name, store.get_surface(session, heliostat, version), media_type)

@@ -1,0 +1,458 @@
+"""What travels over HTTP: requests are checked here once, units stand in the descriptions.
+
+Numbers are finite, unknown keys are refused, and names fit a pattern that is safe in paths and URLs.
+"""
+
+import re
+from datetime import datetime
+from typing import Annotated, Any, Generic, Literal, Self, TypeVar
+
+from pydantic import (
+    AwareDatetime,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ModelWrapValidatorHandler,
+    PrivateAttr,
+    StringConstraints,
+    model_validator,
+)
+
+_NAME = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,31}$"
+
+Name = Annotated[
+    str,
+    StringConstraints(pattern=_NAME),
+    Field(description="1 to 32 letters, digits, underscores and hyphens.", examples=["AA39"]),
+]
+Identifier = Annotated[
+    str,
+    StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$"),
+    Field(description="1 to 64 letters, digits, underscores and hyphens.", examples=["205363"]),
+]
+MeasurementName = Annotated[
+    str,
+    StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,95}$"),
+    Field(description="The `id` of a measurement, as the service gave it.", examples=["205363"]),
+]
+Kind = Literal["raw", "cropped", "flux", "flux-centered"]
+Source = Literal["measured", "network", "refined", "imported"]
+Method = Literal["network", "refined"]
+
+Metres = Annotated[float, Field(ge=-1e6, le=1e6)]
+Position = Annotated[tuple[Metres, Metres, Metres], Field(description="East, north, up of the tower base [m].")]
+Direction = tuple[
+    Annotated[float, Field(ge=-1e3, le=1e3)],
+    Annotated[float, Field(ge=-1e3, le=1e3)],
+    Annotated[float, Field(ge=-1e3, le=1e3)],
+]
+Wgs84 = tuple[
+    Annotated[float, Field(ge=-90, le=90)],
+    Annotated[float, Field(ge=-180, le=180)],
+    Annotated[float, Field(ge=-1e4, le=1e5)],
+]
+Azimuth = Annotated[float, Field(ge=-360, le=360, description="Sun azimuth from south, positive to the east [deg].")]
+Elevation = Annotated[float, Field(gt=0, le=90, description="Sun elevation above the horizon [deg].")]
+Extent = Annotated[float, Field(gt=0, lt=1e4)]
+
+Item = TypeVar("Item")
+
+
+def valid_name(name: str) -> bool:
+    """Whether ``name`` may name a heliostat or a target."""
+    return re.fullmatch(_NAME, name) is not None
+
+
+# Nesting that no document of PAINT's reaches, far below Python's recursion limit.
+_MAX_DEPTH = 32
+
+
+def _is_text(value: str) -> bool:
+    return not any(character == "\x00" or "\ud800" <= character <= "\udfff" for character in value)
+
+
+def _check_json(value: Any, where: str = "document", depth: int = 0) -> Any:
+    """Refuse what JSON's grammar lets through but numbers and databases do not hold, wherever it is nested."""
+    if depth > _MAX_DEPTH:
+        raise ValueError(f"{where}: nested too deeply")
+    if isinstance(value, dict):
+        for key, entry in value.items():
+            _check_json(key, where, depth + 1)
+            _check_json(entry, f"{where}.{key}", depth + 1)
+    elif isinstance(value, list):
+        for index, entry in enumerate(value):
+            _check_json(entry, f"{where}[{index}]", depth + 1)
+    elif isinstance(value, int | float) and not abs(value) < 1e300:
+        raise ValueError(f"{where}: must be a finite number")
+    elif isinstance(value, str) and not _is_text(value):
+        raise ValueError(f"{where}: must not hold NUL or half characters")
+    return value
+
+
+class Model(BaseModel):
+    """Base of the requests: finite numbers, no unknown keys."""
+
+    model_config = ConfigDict(allow_inf_nan=False, extra="forbid", frozen=True)
+
+
+class Document(BaseModel):
+    """Base of documents in PAINT's format: kept as they come, only what is used of them is checked."""
+
+    model_config = ConfigDict(allow_inf_nan=False, extra="allow")
+
+    _raw: dict[str, Any] = PrivateAttr(default_factory=dict)
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _keep(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        document = handler(_check_json(data))
+        document._raw = data if isinstance(data, dict) else {}
+        return document
+
+    @property
+    def raw(self) -> dict[str, Any]:
+        """The document as it came."""
+        return self._raw
+
+
+class Page(BaseModel, Generic[Item]):
+    """A part of a list."""
+
+    items: list[Item]
+    next: str | None = Field(description="Pass as `after` for the next page; null on the last.")
+
+
+# --- plant, heliostats, targets ---------------------------------------------------------------------------------------
+
+
+class PowerPlantProperties(BaseModel):
+    """PAINT's ``power_plant_properties``."""
+
+    model_config = ConfigDict(allow_inf_nan=False, extra="allow")
+
+    ID: Name = Field(description="Name of the plant.", examples=["WRI1030197"])
+    coordinates: Wgs84 = Field(description="Tower base: latitude [deg], longitude [deg], altitude [m].")
+
+
+class TowerMeasurements(Document):
+    """PAINT's ``tower-measurements.json``: the tower base, and each planar target by its WGS84 corners."""
+
+    power_plant_properties: PowerPlantProperties
+
+
+class PlantOut(BaseModel):
+    """The plant."""
+
+    name: str
+    origin_wgs84: tuple[float, float, float] = Field(
+        description="Tower base: latitude [deg], longitude [deg], altitude [m]."
+    )
+
+
+class KinematicsProperties(BaseModel):
+    """PAINT's ``kinematics_properties``, as far as its shape matters."""
+
+    model_config = ConfigDict(extra="allow")
+
+    actuators: list[dict[str, Any]] = Field(max_length=2)
+
+
+class FacetProperties(BaseModel):
+    """PAINT's ``facet_properties``, as far as its shape matters."""
+
+    model_config = ConfigDict(extra="allow")
+
+    facets: list[dict[str, Any]] = Field(min_length=1, max_length=64)
+
+
+class HeliostatProperties(Document):
+    """PAINT's ``heliostat-properties.json``, kept as it comes; older files say ``kinematic_properties``."""
+
+    heliostat_position: Wgs84 = Field(description="Latitude [deg], longitude [deg], altitude [m].")
+    width: Extent = Field(description="Width of the mirror [m].")
+    height: Extent = Field(description="Height of the mirror [m].")
+    kinematics_properties: KinematicsProperties | None = Field(None, description="The mount and its actuators.")
+    kinematic_properties: KinematicsProperties | None = Field(None, description="The same in older files.")
+    facet_properties: FacetProperties = Field(description="Facets: position [m] and canting vectors [m].")
+
+
+class HeliostatIn(Model):
+    """A heliostat to be stored."""
+
+    name: Name
+    properties: HeliostatProperties
+
+
+class HeliostatSummary(BaseModel):
+    """A heliostat in a list."""
+
+    name: str
+    position_m: tuple[float, float, float] = Field(description="East, north, up of the tower base [m].")
+
+
+class HeliostatOut(HeliostatSummary):
+    """A heliostat with its properties."""
+
+    properties: dict[str, Any] = Field(description="PAINT properties as they were sent.")
+    updated_at: datetime
+
+
+class Plane(Model):
+    """A rectangle in space, seen from its lit side."""
+
+    center: Position
+    normal: Direction = Field(description="Normal of the lit side, east-north-up; need not be of unit length.")
+    up: Direction = Field((0.0, 0.0, 1.0), description="Upward direction of the image, not parallel to the normal.")
+    width: Extent = Field(description="[m]")
+    height: Extent = Field(description="[m]")
+
+
+class Corners(Model):
+    """A target by its corners as seen from the field, in WGS84 (latitude [deg], longitude [deg], altitude [m])."""
+
+    upper_left: Wgs84
+    upper_right: Wgs84
+    lower_left: Wgs84
+    lower_right: Wgs84
+
+
+class TargetIn(Model):
+    """A target plane, either by its rectangle in east-north-up metres or by its four corners in WGS84."""
+
+    plane: Plane | None = None
+    corners: Corners | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> Self:
+        if (self.plane is None) == (self.corners is None):
+            raise ValueError("give either plane or corners")
+        return self
+
+
+class TargetOut(BaseModel):
+    """A target plane."""
+
+    name: str
+    center: tuple[float, float, float] = Field(description="East, north, up of the tower base [m].")
+    normal: tuple[float, float, float] = Field(description="Unit normal of the lit side.")
+    up: tuple[float, float, float] = Field(description="Unit vector up the image.")
+    width: float = Field(description="[m]")
+    height: float = Field(description="[m]")
+    corners: dict[str, Any] | None = Field(description="The WGS84 corners that it was made from, if it was.")
+
+
+# --- measurements -----------------------------------------------------------------------------------------------------
+
+
+def _paint_motors(value: Any) -> Any:
+    """A pair out of PAINT's ``motor_position`` object."""
+    if isinstance(value, dict) and set(value) == {"axis_1_motor_position", "axis_2_motor_position"}:
+        return value["axis_1_motor_position"], value["axis_2_motor_position"]
+    return value
+
+
+def _paint_spot(value: Any) -> Any:
+    """One position out of PAINT's ``focal_spot`` object: UTIS, else HeliOS."""
+    if isinstance(value, dict) and value and set(value) <= {"UTIS", "HeliOS"}:
+        return value.get("UTIS") or value.get("HeliOS")
+    return value
+
+
+Motors = Annotated[
+    tuple[Annotated[float, Field(ge=-1e9, le=1e9)], Annotated[float, Field(ge=-1e9, le=1e9)]],
+    BeforeValidator(_paint_motors),
+]
+Pixel = tuple[Annotated[float, Field(ge=-1e5, le=1e5)], Annotated[float, Field(ge=-1e5, le=1e5)]]
+
+
+class MeasurementIn(Model):
+    """What is known of a photograph; PAINT's ``calibration-properties.json`` with ``kind`` (and ``id``) added fits."""
+
+    target_name: Name = Field(description="The target that the heliostat was aimed at.")
+    sun_azimuth: Azimuth
+    sun_elevation: Elevation
+    kind: Kind = Field(
+        description="raw: a camera frame; cropped: the rectified target; flux: the separated spot on the whole "
+        "target; flux-centered: the spot about its centre of mass, already separated."
+    )
+    id: Identifier | None = Field(None, description="The caller's own number of the measurement.")
+    taken_at: AwareDatetime | None = Field(None, description="When it was taken, with time zone.")
+    motor_position: Motors | None = Field(
+        None, description="Motor positions of both axes [steps], as a pair or as PAINT's object."
+    )
+    focal_spot: Annotated[Wgs84, BeforeValidator(_paint_spot)] | None = Field(
+        None,
+        description="Known centre of mass: latitude [deg], longitude [deg], altitude [m], or PAINT's object (UTIS is "
+        "preferred).",
+    )
+    corners: tuple[Pixel, Pixel, Pixel, Pixel] | None = Field(
+        None,
+        description="Pixel positions (x, y) of the target's upper left, upper right, lower left and lower right "
+        "corners in a raw frame; without them they are searched.",
+    )
+
+
+class MeasurementOut(BaseModel):
+    """A stored measurement."""
+
+    id: str = Field(description="Names it in this service's paths.")
+    heliostat: str
+    external_id: str | None = Field(description="The caller's own number.")
+    kind: Kind
+    target_name: str
+    sun_azimuth: float = Field(description="From south, positive to the east [deg].")
+    sun_elevation: float = Field(description="[deg]")
+    motor_position: tuple[float, float] | None = Field(description="[steps]")
+    taken_at: datetime | None
+    focal_spot: tuple[float, float, float] | None = Field(
+        description="As given: latitude [deg], longitude [deg], altitude [m]."
+    )
+    accepted: bool = Field(description="Whether the image can be used; a refused one is kept with its reason.")
+    reason: str | None = Field(description="Why it was refused.")
+    quality: dict[str, Any] = Field(description="The quality record of the image.")
+    center_of_mass: tuple[float, float] | None = Field(description="Right and up of the target's centre [m].")
+    image_sha256: str
+    image_media_type: str
+    created_at: datetime
+
+
+# --- surfaces ---------------------------------------------------------------------------------------------------------
+
+
+class SurfaceIn(Model):
+    """How to predict a surface; without ``measurements`` the newest accepted ones are chosen."""
+
+    method: Method = Field("network", description="network: at once; refined: fitted through the ray tracer.")
+    measurements: list[MeasurementName] | None = Field(
+        None, min_length=1, max_length=8, description="Ids of 1 to 8 accepted measurements."
+    )
+    images: int = Field(
+        8, ge=1, le=8, description="How many of the newest accepted ones to take, spread over the sun's positions."
+    )
+
+
+class SurfaceSummary(BaseModel):
+    """A version of a surface."""
+
+    heliostat: str
+    version: int
+    source: Source
+    model: str | None = Field(description="Name and hash of the network's weights.")
+    created_at: datetime
+    valid_from: datetime = Field(description="The mirror is taken to have this surface from then on.")
+    measurements: list[str] = Field(description="Ids of the measurements that it was made from.")
+    misfit: float | None = Field(description="What the refinement left unexplained of the flux.")
+
+
+class SurfaceOut(SurfaceSummary):
+    """A surface with its arrays."""
+
+    z: list[Any] = Field(
+        description="Control heights (4, 8, 8) [m]: facet, along x, along y; deviation from the ideally canted facet."
+    )
+    z_std: list[Any] = Field(description="Their standard deviations (4, 8, 8) [m].")
+    control_points: list[Any] = Field(description="(4, 8, 8, 3) [m] in heliostat coordinates.")
+
+
+# --- forecasts --------------------------------------------------------------------------------------------------------
+
+
+class Sun(Model):
+    """Where the sun stands."""
+
+    azimuth_deg: Azimuth
+    elevation_deg: Elevation
+
+
+def _square(value: Any) -> Any:
+    return (value, value) if isinstance(value, int) and not isinstance(value, bool) else value
+
+
+Side = Annotated[int, Field(ge=8, le=1024)]
+Version = Annotated[int, Field(ge=1, le=2**31 - 1)]
+
+
+class ForecastIn(Model):
+    """A flux map to compute."""
+
+    heliostat: Name
+    target: Name | None = Field(None, description="A stored target; either this or `plane`.")
+    plane: Plane | None = Field(None, description="Any plane; either this or `target`.")
+    sun: Sun
+    aim_point: Position | None = Field(None, description="Where the heliostat aims [m]; by default the plane's centre.")
+    surface: Literal["current", "ideal"] | Version = Field(
+        "current", description="The heliostat's current surface, the ideal one, or a version."
+    )
+    dni_w_m2: float = Field(1000.0, gt=0, le=2000, description="Direct normal irradiance [W/m2].")
+    resolution: Annotated[tuple[Side, Side], BeforeValidator(_square)] = Field(
+        (256, 256), description="Rows and columns of the map, or one number for both."
+    )
+    window: float | None = Field(
+        None, gt=0, le=1e3, description="Side of a square window about the centre of mass [m]; else the whole plane."
+    )
+    normalised: bool = Field(False, description="Scale the map to a sum of 100 instead of W/m2.")
+
+    @model_validator(mode="after")
+    def _one(self) -> Self:
+        if (self.target is None) == (self.plane is None):
+            raise ValueError("give either target or plane")
+        return self
+
+
+class ForecastSummary(BaseModel):
+    """A computed flux map without its pixels."""
+
+    id: int
+    heliostat: str
+    surface_version: int | None = Field(description="null: the ideal surface.")
+    target: str | None
+    plane: Plane = Field(description="The plane of the map [m]; with a window, the window's.")
+    sun: Sun
+    aim_point: tuple[float, float, float] | None = Field(description="[m], as given.")
+    dni_w_m2: float = Field(description="[W/m2]")
+    window: float | None = Field(description="[m]")
+    resolution: tuple[int, int] = Field(description="Rows, columns.")
+    normalised: bool
+    unit: str = Field(description="Unit of the map: W/m2, or 1 where it is normalised to a sum of 100.")
+    peak_w_m2: float = Field(description="Largest irradiance [W/m2].")
+    power_w: float = Field(description="Power on the map's plane [W].")
+    center_of_mass: tuple[float, float] = Field(description="Right and up of the map's centre [m].")
+    model_version: str
+    created_at: datetime
+
+
+class ForecastOut(ForecastSummary):
+    """A computed flux map."""
+
+    flux: list[Any] = Field(description="Rows from the top, columns from the left as seen from the lit side.")
+
+
+# --- health and problems ----------------------------------------------------------------------------------------------
+
+
+class Health(BaseModel):
+    """The state of the service; each check is "ok" or says what is wrong."""
+
+    status: Literal["ok", "unavailable"]
+    checks: dict[str, str]
+
+
+class FieldProblem(BaseModel):
+    """What is wrong with one field of the request."""
+
+    field: str = Field(examples=["sun.elevation_deg"])
+    message: str = Field(examples=["Input should be less than or equal to 90"])
+
+
+class Problem(BaseModel):
+    """An error, by RFC 9457."""
+
+    type: str = Field(examples=["about:blank"])
+    title: str = Field(examples=["Unprocessable Content"])
+    status: int = Field(examples=[422])
+    detail: str = Field(examples=["sun.elevation_deg: Input should be less than or equal to 90"])
+    instance: str = Field(examples=["/v1/forecasts"])
+    request_id: str = Field(description="Quote it when reporting a fault; it stands in the service's log.")
+    errors: list[FieldProblem] | None = Field(None, description="Every field at fault, where there are several.")
+    offered: list[str] | None = Field(None, description="Acceptable media types, where none was acceptable.")

@@ -1,0 +1,98 @@
+"""Settings of the service, from the environment (prefix ``HELIOTWIN_``) or a ``.env`` file."""
+
+import ipaddress
+from pathlib import Path
+from typing import Literal, Self
+
+from pydantic import Field, SecretStr, field_validator, model_validator
+from pydantic_settings import BaseSettings, SettingsConfigDict
+from sqlalchemy import URL, make_url
+from sqlalchemy.exc import ArgumentError
+
+LogLevel = Literal["critical", "error", "warning", "info", "debug"]
+
+_DRIVERS = {"sqlite": "sqlite", "postgresql": "postgresql+psycopg"}
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine can reach a server that listens on ``host``."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False  # a name that may resolve anywhere
+
+
+class Settings(BaseSettings):
+    """What an operator may set; unsafe combinations are refused when the settings are read."""
+
+    model_config = SettingsConfigDict(
+        env_prefix="HELIOTWIN_", env_file=".env", extra="ignore", frozen=True, env_ignore_empty=True
+    )
+
+    data_dir: Path = Field(Path("heliotwin-data"), description="Folder of the images and of the embedded database.")
+    database_url: str | None = Field(
+        None, description="sqlite:///FILE or postgresql://USER@HOST/NAME; without it SQLite inside data_dir."
+    )
+    database_password_file: Path | None = Field(
+        None, description="File holding the database password, so that no URL or environment does."
+    )
+    migrate_on_start: bool | None = Field(
+        None, description="Bring the schema to its newest version at start; without it only SQLite is migrated."
+    )
+    host: str = Field("127.0.0.1", description="Address to listen on.")
+    port: int = Field(8000, ge=1, le=65535)
+    allow_open_network: bool = Field(
+        False, description="Acknowledges that whoever reaches a non-loopback host may read and write everything."
+    )
+    max_image_bytes: int = Field(32 * 2**20, ge=1024, description="Largest image accepted [bytes].")
+    max_image_pixels: int = Field(50_000_000, ge=1024, description="Largest image accepted, width x height [pixels].")
+    max_json_bytes: int = Field(2**20, ge=1024, description="Largest request body that is not an image [bytes].")
+    parallel_computations: int = Field(2, ge=1, le=64, description="Measurements, predictions and tracings at a time.")
+    log_level: LogLevel = "info"
+
+    @field_validator("database_url")
+    @classmethod
+    def _known_database(cls, value: str | None) -> str | None:
+        if value is None:
+            return None
+        try:
+            backend = make_url(value).get_backend_name()
+        except ArgumentError as error:
+            raise ValueError("must be a database URL such as postgresql://user@host/name") from error
+        if backend not in _DRIVERS:
+            raise ValueError(f"must be a sqlite or postgresql URL, not {backend}")
+        return value
+
+    @model_validator(mode="after")
+    def _refuse_open_door(self) -> Self:
+        if not is_loopback(self.host) and not self.allow_open_network:
+            raise ValueError(
+                f"host {self.host} is reachable from other machines and the service asks nobody who they are: "
+                "listen on 127.0.0.1 or set HELIOTWIN_ALLOW_OPEN_NETWORK=true"
+            )
+        return self
+
+    @property
+    def password(self) -> SecretStr | None:
+        """The database password from its file, where one is named."""
+        if self.database_password_file is None:
+            return None
+        return SecretStr(self.database_password_file.read_text(encoding="utf-8").strip())
+
+    @property
+    def database(self) -> URL:
+        """The database URL with its driver and password filled in."""
+        if self.database_url is None:
+            return URL.create("sqlite", database=str(self.data_dir / "heliotwin.sqlite"))
+        url = make_url(self.database_url)
+        url = url.set(drivername=_DRIVERS[url.get_backend_name()])
+        return url if self.password is None else url.set(password=self.password.get_secret_value())
+
+    @property
+    def migrates_on_start(self) -> bool:
+        """Whether the service migrates by itself; on a shared database a one-shot ``heliotwin migrate`` does."""
+        if self.migrate_on_start is not None:
+            return self.migrate_on_start
+        return self.database.get_backend_name() == "sqlite"

@@ -1,0 +1,247 @@
+"""The tables: one typed class each; a column says its unit in its name.
+
+Arrays live in compressed npz blobs that are loaded only when asked for; images live in files (`service.images`) and
+are referred to by their SHA-256.
+"""
+
+from datetime import UTC, datetime
+from typing import Any
+
+from sqlalchemy import (
+    JSON,
+    CheckConstraint,
+    Column,
+    DateTime,
+    Dialect,
+    ForeignKey,
+    Index,
+    LargeBinary,
+    MetaData,
+    String,
+    Table,
+    TypeDecorator,
+    UniqueConstraint,
+)
+from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column, relationship
+
+_NAMING = {
+    "ix": "ix_%(table_name)s_%(column_0_N_name)s",
+    "uq": "uq_%(table_name)s_%(column_0_N_name)s",
+    "ck": "ck_%(table_name)s_%(constraint_name)s",
+    "fk": "fk_%(table_name)s_%(column_0_name)s_%(referred_table_name)s",
+    "pk": "pk_%(table_name)s",
+}
+
+KINDS = ("raw", "cropped", "flux", "flux-centered")
+SOURCES = ("measured", "network", "refined", "imported")
+
+# A missing JSON value is SQL's NULL, not the JSON text "null".
+_Json = JSON(none_as_null=True)
+
+
+def _one_of(column: str, values: tuple[str, ...]) -> CheckConstraint:
+    return CheckConstraint(f"{column} IN ({', '.join(repr(value) for value in values)})", name=column)
+
+
+class UtcDateTime(TypeDecorator[datetime]):
+    """A moment in UTC; SQLite keeps no zone, so it is put back on the way out."""
+
+    impl = DateTime(timezone=True)
+    cache_ok = True
+
+    def process_bind_param(self, value: datetime | None, dialect: Dialect) -> datetime | None:
+        """In UTC; a moment without a zone is a programming error."""
+        if value is None:
+            return None
+        if value.tzinfo is None:
+            raise ValueError("a stored moment needs a time zone")
+        return value.astimezone(UTC)
+
+    def process_result_value(self, value: datetime | None, dialect: Dialect) -> datetime | None:
+        """With its zone."""
+        if value is None:
+            return None
+        return value.replace(tzinfo=UTC) if value.tzinfo is None else value.astimezone(UTC)
+
+
+def now() -> datetime:
+    """The present moment in UTC."""
+    return datetime.now(UTC)
+
+
+class Base(DeclarativeBase):
+    """What all tables share: constraint names that migrations can refer to."""
+
+    metadata = MetaData(naming_convention=_NAMING)
+    type_annotation_map = {datetime: UtcDateTime, dict[str, Any]: _Json, list[float]: _Json}  # noqa: RUF012
+
+
+class PlantRow(Base):
+    """The plant: one row, written before anything that needs its origin."""
+
+    __tablename__ = "plant"
+    __table_args__ = (CheckConstraint("id = 1", name="single"),)
+
+    id: Mapped[int] = mapped_column(primary_key=True, autoincrement=False, default=1)
+    name: Mapped[str] = mapped_column(String(64))
+    latitude_deg: Mapped[float]
+    longitude_deg: Mapped[float]
+    altitude_m: Mapped[float]
+
+    @property
+    def origin(self) -> tuple[float, float, float]:
+        """The tower base in WGS84 [deg, deg, m]."""
+        return self.latitude_deg, self.longitude_deg, self.altitude_m
+
+
+class HeliostatRow(Base):
+    """A heliostat: its PAINT properties as they came, and its position in ENU [m] for queries."""
+
+    __tablename__ = "heliostats"
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    name: Mapped[str] = mapped_column(String(64), unique=True)
+    properties: Mapped[dict[str, Any]]
+    east_m: Mapped[float]
+    north_m: Mapped[float]
+    up_m: Mapped[float]
+    created_at: Mapped[datetime] = mapped_column(default=now)
+    updated_at: Mapped[datetime] = mapped_column(default=now, onupdate=now)
+
+
+class TargetRow(Base):
+    """A target plane in ENU [m]; ``corners`` are the WGS84 corners that it was made from, where it was."""
+
+    __tablename__ = "targets"
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    name: Mapped[str] = mapped_column(String(64), unique=True)
+    center_m: Mapped[list[float]]
+    normal: Mapped[list[float]]
+    up: Mapped[list[float]]
+    width_m: Mapped[float]
+    height_m: Mapped[float]
+    corners: Mapped[dict[str, Any] | None]
+    updated_at: Mapped[datetime] = mapped_column(default=now, onupdate=now)
+
+
+class ImageRow(Base):
+    """An image file in the store, by its content."""
+
+    __tablename__ = "images"
+
+    sha256: Mapped[str] = mapped_column(String(64), primary_key=True)
+    media_type: Mapped[str] = mapped_column(String(32))
+    size_bytes: Mapped[int]
+    width_px: Mapped[int]
+    height_px: Mapped[int]
+    created_at: Mapped[datetime] = mapped_column(default=now)
+
+
+class MeasurementRow(Base):
+    """One photograph of one heliostat's spot and what was measured in it.
+
+    ``arrays`` holds npz ``flux`` and ``centered``; a refused image has neither and keeps its ``reason``.
+    ``center_right_m``, ``center_up_m``: centre of mass from the target's centre.
+    """
+
+    __tablename__ = "measurements"
+    __table_args__ = (
+        UniqueConstraint("heliostat_id", "image_sha256", "kind"),
+        UniqueConstraint("heliostat_id", "identifier"),
+        Index(None, "heliostat_id", "accepted"),
+        _one_of("kind", KINDS),
+    )
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    heliostat_id: Mapped[int] = mapped_column(ForeignKey("heliostats.id"))
+    identifier: Mapped[str] = mapped_column(String(96))
+    external_id: Mapped[str | None] = mapped_column(String(64))
+    image_sha256: Mapped[str] = mapped_column(ForeignKey("images.sha256"), index=True)
+    kind: Mapped[str] = mapped_column(String(16))
+    target_id: Mapped[int] = mapped_column(ForeignKey("targets.id"), index=True)
+    sun_azimuth_deg: Mapped[float]
+    sun_elevation_deg: Mapped[float]
+    motor_axis_1: Mapped[float | None]
+    motor_axis_2: Mapped[float | None]
+    taken_at: Mapped[datetime | None]
+    focal_spot_wgs84: Mapped[list[float] | None]
+    corners_px: Mapped[dict[str, Any] | None]
+    accepted: Mapped[bool]
+    reason: Mapped[str | None] = mapped_column(String(64))
+    quality: Mapped[dict[str, Any]]
+    center_right_m: Mapped[float | None]
+    center_up_m: Mapped[float | None]
+    arrays: Mapped[bytes | None] = mapped_column(LargeBinary, deferred=True)
+    created_at: Mapped[datetime] = mapped_column(default=now)
+
+    target: Mapped[TargetRow] = relationship(lazy="joined", innerjoin=True)
+    image: Mapped[ImageRow] = relationship(lazy="joined", innerjoin=True)
+
+
+surface_measurements = Table(
+    "surface_measurements",
+    Base.metadata,
+    Column("surface_id", ForeignKey("surfaces.id"), primary_key=True),
+    Column("measurement_id", ForeignKey("measurements.id"), primary_key=True, index=True),
+)
+
+
+class SurfaceRow(Base):
+    """One version of a heliostat's surface; npz ``z``, ``z_std`` (4, 8, 8) and ``control_points`` (4, 8, 8, 3) [m].
+
+    ``content_sha256`` is set where the same content must not be stored twice (imports); predictions leave it empty.
+    """
+
+    __tablename__ = "surfaces"
+    __table_args__ = (
+        UniqueConstraint("heliostat_id", "version"),
+        UniqueConstraint("heliostat_id", "content_sha256"),
+        Index(None, "heliostat_id", "valid_from"),
+        _one_of("source", SOURCES),
+    )
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    heliostat_id: Mapped[int] = mapped_column(ForeignKey("heliostats.id"))
+    version: Mapped[int]
+    created_at: Mapped[datetime] = mapped_column(default=now)
+    valid_from: Mapped[datetime]
+    source: Mapped[str] = mapped_column(String(16))
+    model: Mapped[str | None] = mapped_column(String(128))
+    misfit: Mapped[float | None]
+    content_sha256: Mapped[str | None] = mapped_column(String(64))
+    arrays: Mapped[bytes] = mapped_column(LargeBinary, deferred=True)
+
+    measurements: Mapped[list[MeasurementRow]] = relationship(
+        secondary=surface_measurements, order_by=MeasurementRow.id, lazy="selectin"
+    )
+
+
+class ForecastRow(Base):
+    """A computed flux map: its inputs, its npz ``flux`` (rows, columns) float32 [W/m2] and its figures."""
+
+    __tablename__ = "forecasts"
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    heliostat_id: Mapped[int] = mapped_column(ForeignKey("heliostats.id"), index=True)
+    surface_id: Mapped[int | None] = mapped_column(ForeignKey("surfaces.id"), index=True)
+    target_name: Mapped[str | None] = mapped_column(String(64))
+    plane: Mapped[dict[str, Any]]
+    sun_azimuth_deg: Mapped[float]
+    sun_elevation_deg: Mapped[float]
+    aim_point_m: Mapped[list[float] | None]
+    dni_w_m2: Mapped[float]
+    window_m: Mapped[float | None]
+    normalised: Mapped[bool]
+    rows: Mapped[int]
+    columns: Mapped[int]
+    peak_w_m2: Mapped[float]
+    power_w: Mapped[float]
+    center_right_m: Mapped[float]
+    center_up_m: Mapped[float]
+    model_version: Mapped[str] = mapped_column(String(128))
+    flux: Mapped[bytes] = mapped_column(LargeBinary, deferred=True)
+    created_at: Mapped[datetime] = mapped_column(default=now)
+
+    heliostat: Mapped[HeliostatRow] = relationship(lazy="joined", innerjoin=True)
+    surface: Mapped[SurfaceRow | None] = relationship(lazy="joined")

@@ -1,0 +1,380 @@
+"""The three things the service is for, as plain functions: measure a photograph, predict a surface, forecast a flux.
+
+Each reads what it needs, computes outside any transaction, and writes at the end; routes and the command line share
+them.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from datetime import datetime
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy.orm import Session
+
+from model.errors import ImageRefusedError, InvalidInputError
+from model.frames import sun_direction, wgs84_to_enu
+from model.plant import Heliostat, TargetPlane
+from service import store
+from service.arrays import pack, unpack
+from service.faults import ConflictError, NotFoundError, TooLargeError
+from service.images import digest, media_type
+from service.runtime import FluxForecast, Operations, Runtime, SurfacePrediction
+from service.store import NewImage, NewMeasurement, NewSurface
+from service.tables import ForecastRow, HeliostatRow, MeasurementRow, SurfaceRow
+
+# The newest measurements, this many times as many as are wanted, stand for the mirror's present state; those that
+# are used are chosen among them for variety of the sun's position.
+_RECENT = 4
+
+
+def load_heliostat(session: Session, row: HeliostatRow) -> Heliostat:
+    """The model's heliostat of a stored one."""
+    from service.paint import read_heliostat
+
+    return read_heliostat(row.name, row.properties, np.array(store.get_plant(session).origin))
+
+
+# --- a photograph -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """What is known of an image that comes in; units as in `service.tables.MeasurementRow`.
+
+    ``corners``: pixels (x, y) of the target's upper left, upper right, lower left, lower right corner.
+    """
+
+    target_name: str
+    kind: str
+    sun_azimuth_deg: float
+    sun_elevation_deg: float
+    external_id: str | None = None
+    taken_at: datetime | None = None
+    motor_position: tuple[float, float] | None = None
+    focal_spot_wgs84: tuple[float, float, float] | None = None
+    corners: tuple[tuple[float, float], ...] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class _Reading:
+    """A `MeasuredFlux` with its quality as JSON; everything but the quality is None where it was refused."""
+
+    accepted: bool
+    reason: str | None
+    quality: dict[str, Any]
+    flux: NDArray[Any] | None = None
+    centered: NDArray[Any] | None = None
+    center_of_mass: NDArray[Any] | None = None
+
+
+def _plain(value: Any) -> Any:
+    """``value`` as JSON knows it; figures that are not finite become null."""
+    if isinstance(value, dict):
+        return {str(key): _plain(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _read(operations: Operations, pixels: NDArray[Any], photograph: Photograph, plane: TargetPlane) -> _Reading:
+    corners = None if photograph.corners is None else np.array(photograph.corners)
+    try:
+        measured = operations.measure(pixels, photograph.kind, plane, corners=corners)
+    except ImageRefusedError as refusal:
+        quality = {"accepted": False, "reason": refusal.reason, "detail": refusal.detail}
+        return _Reading(accepted=False, reason=refusal.reason, quality=quality)
+    quality = _plain(asdict(measured.quality))
+    return _Reading(
+        accepted=bool(measured.quality.accepted),
+        reason=measured.quality.reason or None,
+        quality=quality,
+        flux=measured.flux,
+        centered=measured.centered,
+        center_of_mass=measured.center_of_mass,
+    )
+
+
+def _decode(runtime: Runtime, data: bytes) -> NDArray[np.uint8]:
+    from model.imaging.decode import decode_image
+
+    limit = runtime.settings.max_image_bytes
+    if len(data) > limit:
+        raise TooLargeError(f"image: {len(data)} bytes is more than the {limit} allowed; crop or compress it")
+    return decode_image(data, max_pixels=runtime.settings.max_image_pixels)
+
+
+def _new_measurement(photograph: Photograph, image: NewImage, reading: _Reading, session: Session) -> NewMeasurement:
+    return NewMeasurement(
+        image=image,
+        kind=photograph.kind,
+        target=store.get_target(session, photograph.target_name),
+        sun_azimuth_deg=photograph.sun_azimuth_deg,
+        sun_elevation_deg=photograph.sun_elevation_deg,
+        accepted=reading.accepted,
+        quality=reading.quality,
+        reason=reading.reason,
+        external_id=photograph.external_id,
+        motor_position=photograph.motor_position,
+        taken_at=photograph.taken_at,
+        focal_spot_wgs84=photograph.focal_spot_wgs84,
+        corners_px=None if photograph.corners is None else {"corners": _plain(photograph.corners)},
+        center_of_mass=reading.center_of_mass,
+        flux=reading.flux,
+        centered=reading.centered,
+    )
+
+
+def ingest(runtime: Runtime, heliostat_name: str, photograph: Photograph, data: bytes) -> tuple[MeasurementRow, bool]:
+    """Measure and keep a photograph; the second value is False where it was there already.
+
+    An image that cannot be measured is kept too, not accepted, with its reason.
+
+    Raises
+    ------
+    NotFoundError
+        Where the heliostat or the target is not stored.
+    InvalidInputError, UnsupportedImageError, TooLargeError
+        Where the file is no image that can be decoded safely; it is not kept.
+    ConflictError
+        Where the external id belongs to another image of the same kind.
+    """
+    kind_of_file = media_type(data)
+    with runtime.database.reading() as session:
+        heliostat = store.get_heliostat(session, heliostat_name)
+        plane = store.target_plane(store.get_target(session, photograph.target_name))
+        known = store.find_measurement_of_image(session, heliostat, digest(data), photograph.kind)
+        if known is not None:
+            runtime.images.put(data)  # mends a file that the store has lost
+            return known, False
+    with runtime.computing() as operations:
+        pixels = _decode(runtime, data)
+        reading = _read(operations, pixels, photograph, plane)
+    height, width = pixels.shape[:2]
+    image = NewImage(runtime.images.put(data), kind_of_file, len(data), width, height)
+    with runtime.database.writing() as session:
+        heliostat = store.get_heliostat(session, heliostat_name)
+        return store.add_measurement(session, heliostat, _new_measurement(photograph, image, reading, session))
+
+
+# --- a surface --------------------------------------------------------------------------------------------------------
+
+
+def _spread(rows: Sequence[MeasurementRow], count: int) -> list[MeasurementRow]:
+    """``count`` of ``rows``, the first and then each time the one whose sun is farthest from those chosen."""
+    suns = sun_direction([row.sun_azimuth_deg for row in rows], [row.sun_elevation_deg for row in rows])
+    chosen = [0]
+    while len(chosen) < min(count, len(rows)):
+        nearest = (suns @ suns[chosen].T).max(axis=1)
+        nearest[chosen] = np.inf
+        chosen.append(int(nearest.argmin()))
+    return [rows[index] for index in chosen]
+
+
+def choose_measurements(session: Session, heliostat: HeliostatRow, count: int) -> list[MeasurementRow]:
+    """Up to ``count`` accepted measurements for a prediction: recent, and with the sun at different places.
+
+    Raises
+    ------
+    ConflictError
+        Where the heliostat has none.
+    """
+    recent = store.recent_measurements(session, heliostat, _RECENT * count)
+    if not recent:
+        raise ConflictError(f"heliostat {heliostat.name} has no accepted measurement; post target images of it first")
+    return _spread(recent, count)
+
+
+def _named_measurements(session: Session, heliostat: HeliostatRow, names: Sequence[str]) -> list[MeasurementRow]:
+    rows = [store.get_measurement(session, heliostat, name, arrays=True) for name in dict.fromkeys(names)]
+    for row in rows:
+        if not row.accepted or row.arrays is None:
+            raise ConflictError(f"measurements: {row.identifier} was refused ({row.reason}); choose accepted ones")
+    return rows
+
+
+def _spot(row: MeasurementRow, plane: TargetPlane, origin: tuple[float, float, float]) -> NDArray[np.float64]:
+    """Centre of mass in ENU: as measured, else as it was given, else the target's centre."""
+    if row.center_right_m is not None and row.center_up_m is not None:
+        return plane.to_enu((row.center_right_m, row.center_up_m))
+    if row.focal_spot_wgs84 is not None:
+        return wgs84_to_enu(row.focal_spot_wgs84, origin)
+    return np.array(plane.center)
+
+
+def _observation(operations: Operations, row: MeasurementRow, origin: tuple[float, float, float]) -> Any:
+    plane = store.target_plane(row.target)
+    motors = (row.motor_axis_1, row.motor_axis_2)
+    return operations.Observation(
+        flux=unpack(row.arrays or b"")["centered"],
+        sun=sun_direction(row.sun_azimuth_deg, row.sun_elevation_deg),
+        center_of_mass=_spot(row, plane, origin),
+        target=plane,
+        motor_position=None if None in motors else np.array(motors),
+        identifier=row.identifier,
+    )
+
+
+def predict_surface(
+    runtime: Runtime,
+    heliostat_name: str,
+    method: Literal["network", "refined"] = "network",
+    measurements: Sequence[str] | None = None,
+    images: int = 8,
+) -> SurfaceRow:
+    """Predict a heliostat's surface from stored measurements and keep it as its next version.
+
+    It is valid from when the newest of its images was taken, where that is known, else from now.
+
+    Raises
+    ------
+    NotFoundError, ConflictError
+        Where the heliostat or a measurement is not stored, or none is accepted.
+    """
+    with runtime.database.reading() as session:
+        row = store.get_heliostat(session, heliostat_name)
+        origin = store.get_plant(session).origin
+        heliostat = load_heliostat(session, row)
+        if measurements is None:
+            measurements = [measurement.identifier for measurement in choose_measurements(session, row, images)]
+        chosen = _named_measurements(session, row, measurements)
+    with runtime.computing() as operations:
+        observations = [_observation(operations, measurement, origin) for measurement in chosen]
+        predicted = operations.predict(heliostat, observations, method)
+    with runtime.database.writing() as session:
+        row = store.get_heliostat(session, heliostat_name)
+        used = [store.get_measurement(session, row, name) for name in predicted.used]
+        return store.add_surface(session, row, _new_surface(method, predicted, used))[0]
+
+
+def _new_surface(method: str, predicted: SurfacePrediction, used: list[MeasurementRow]) -> NewSurface:
+    return NewSurface(
+        source=method,
+        z=predicted.z,
+        z_std=predicted.z_std,
+        control_points=predicted.control_points,
+        valid_from=max((row.taken_at for row in used if row.taken_at is not None), default=None),
+        model=predicted.weights,
+        measurements=used,
+        misfit=predicted.misfit,
+    )
+
+
+# --- a forecast -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class ForecastRequest:
+    """What to forecast; ``target`` names a stored plane, else ``plane`` is one.
+
+    ``sun_azimuth_deg`` counts from south, positive to the east. ``aim`` (3,) [m] is by default the plane's centre.
+    ``surface``: "current", "ideal" or a version. ``window`` [m]: a square about the centre of mass, else the plane.
+    """
+
+    heliostat: str
+    sun_azimuth_deg: float
+    sun_elevation_deg: float
+    target: str | None = None
+    plane: TargetPlane | None = None
+    aim: tuple[float, float, float] | None = None
+    surface: str | int = "current"
+    dni: float = 1000.0
+    resolution: tuple[int, int] = (256, 256)
+    window: float | None = None
+    normalised: bool = False
+
+
+def _chosen_surface(session: Session, heliostat: HeliostatRow, choice: str | int) -> SurfaceRow | None:
+    if choice == "ideal":
+        return None
+    if isinstance(choice, int):
+        return store.get_surface(session, heliostat, choice)
+    try:
+        return store.get_surface_at(session, heliostat)
+    except NotFoundError as error:
+        raise ConflictError(f'surface: {error}, or ask for "ideal"') from error
+
+
+def _plane(session: Session, request: ForecastRequest) -> TargetPlane:
+    if request.plane is not None:
+        return request.plane
+    if request.target is None:
+        raise InvalidInputError("target: give a stored target or a plane")
+    return store.target_plane(store.get_target(session, request.target))
+
+
+def _window(plane: TargetPlane, center: NDArray[Any], side: float) -> TargetPlane:
+    """A square of ``side`` [m] on the plane about ``center`` (2,) [m]."""
+    return replace(plane, center=plane.to_enu(center), width=side, height=side)
+
+
+def _forecast_row(request: ForecastRequest, plane: TargetPlane, traced: FluxForecast) -> ForecastRow:
+    right, up = (float(value) for value in traced.center_of_mass)
+    geometry = {name: _plain(getattr(plane, name)) for name in ("center", "normal", "up", "width", "height")}
+    return ForecastRow(
+        target_name=request.target,
+        plane=geometry,
+        sun_azimuth_deg=request.sun_azimuth_deg,
+        sun_elevation_deg=request.sun_elevation_deg,
+        aim_point_m=None if request.aim is None else list(request.aim),
+        dni_w_m2=request.dni,
+        window_m=request.window,
+        normalised=request.normalised,
+        rows=traced.flux.shape[0],
+        columns=traced.flux.shape[1],
+        peak_w_m2=float(traced.peak),
+        power_w=float(traced.power),
+        center_right_m=right,
+        center_up_m=up,
+        model_version=traced.model_version,
+        flux=pack({"flux": np.asarray(traced.flux, np.float32)}),
+    )
+
+
+def make_forecast(runtime: Runtime, request: ForecastRequest) -> ForecastRow:
+    """Compute a flux map and keep it.
+
+    Raises
+    ------
+    NotFoundError, ConflictError
+        Where heliostat, target or surface version is not stored, or no surface is current.
+    InvalidInputError
+        Where no light falls on the plane, so that a window has no centre.
+    UnreachableError
+        Where the heliostat cannot reflect the sun to the aim point.
+    """
+    with runtime.database.reading() as session:
+        row = store.get_heliostat(session, request.heliostat)
+        heliostat = load_heliostat(session, row)
+        plane = _plane(session, request)
+        surface = _chosen_surface(session, row, request.surface)
+    plane, traced = _trace(runtime, heliostat, None if surface is None else unpack(surface.arrays)["z"], request, plane)
+    forecast = _forecast_row(request, plane, traced)
+    forecast.heliostat_id = row.id
+    forecast.surface_id = None if surface is None else surface.id
+    with runtime.database.writing() as session:
+        return store.add_forecast(session, forecast)
+
+
+def _trace(
+    runtime: Runtime, heliostat: Heliostat, z: NDArray[Any] | None, request: ForecastRequest, plane: TargetPlane
+) -> tuple[TargetPlane, FluxForecast]:
+    """The map, and the plane that it shows."""
+    sun = sun_direction(request.sun_azimuth_deg, request.sun_elevation_deg)
+    aim = np.array(plane.center if request.aim is None else request.aim)
+
+    def traced_on(part: TargetPlane) -> FluxForecast:
+        with runtime.computing() as operations:
+            return operations.forecast(heliostat, z, sun, part, aim=aim, resolution=request.resolution, dni=request.dni)
+
+    whole = traced_on(plane)
+    if request.window is None:
+        return plane, whole
+    if not whole.power > 0:
+        raise InvalidInputError("window: no light falls on the plane, so it has no centre; leave the window out")
+    part = _window(plane, whole.center_of_mass, request.window)
+    return part, traced_on(part)
