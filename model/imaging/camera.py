@@ -81,7 +81,7 @@ def target_corners(plane: TargetPlane, options: CameraOptions | None = None) -> 
             [half_width * (1 - far / 2) + lean, half_height * (1 - far / 3)],
         ]
     )
-    return corners + middle
+    return np.asarray(corners + middle)
 
 
 def photograph(
@@ -141,7 +141,7 @@ def _sheet(plane: TargetPlane, options: CameraOptions) -> NDArray[np.float64]:
     # Distances inward from the nearest corner's two edges.
     x, y = plane.width / 2 - np.abs(right), plane.height / 2 - np.abs(up)
     mark = (x >= 0) & (y >= 0) & (x < arm) & (y < arm) & ((x < stroke) | (y < stroke))
-    return np.where(mark, _DARK, sheet)
+    return np.asarray(np.where(mark, _DARK, sheet))
 
 
 def _light(flux: NDArray[np.floating], plane: TargetPlane, options: CameraOptions) -> NDArray[np.float64]:
@@ -153,7 +153,7 @@ def _light(flux: NDArray[np.floating], plane: TargetPlane, options: CameraOption
     if options.foreign_spot is not None:
         x, y, radius, peak = options.foreign_spot
         spot = spot + peak * np.exp(-0.5 * ((right - x) ** 2 + (up - y) ** 2) / radius**2)
-    return options.daylight * (1 + slope)[..., None] + options.peak * spot[..., None] * _SUNLIGHT
+    return np.asarray(options.daylight * (1 + slope)[..., None] + options.peak * spot[..., None] * _SUNLIGHT)
 
 
 def _resampled(image: NDArray[np.float64], right: NDArray[np.float64], up: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 Kind = Literal["L", "T"]
 Points = NDArray[np.float64]
+Line = tuple[Points, Points]  # a point and a unit direction
 
 _WORK_SIZE = 1500  # longest side [px] of the image that is searched
 _LEVELS = (0.1, 0.16, 0.25, 0.35, 0.5)  # relative darkness
@@ -171,34 +172,42 @@ def _scaled(mark: Mark, factor: float) -> Mark:
 def _refined(gray: NDArray[np.uint8], mark: Mark) -> Mark:
     """The mark with its reference point measured on its edges; unchanged where they are not clear."""
     for _ in range(2):
-        point = _edge_corner(gray, mark) if mark.kind == "L" else _edge_tee(gray, mark)
-        if point is None or np.linalg.norm(point - mark.point) > 0.3 * mark.size:
+        better = _edge_corner(gray, mark) if mark.kind == "L" else _edge_tee(gray, mark)
+        if better is None or np.linalg.norm(better.point - mark.point) > 0.3 * mark.size:
             return mark
-        mark = Mark(mark.kind, mark.quarter, point, mark.arms, mark.score)
+        mark = better
     return mark
 
 
-def _edge_corner(gray: NDArray[np.uint8], mark: Mark) -> Points | None:
+def _moved(mark: Mark, first: Line | None, second: Line | None) -> Mark | None:
+    """The mark with its reference point where two lines meet and its arms along them, or None."""
+    if first is None or second is None:
+        return None
+    point = _intersection(first, second)
+    if point is None:
+        return None
+    lengths = np.linalg.norm(mark.arms, axis=1, keepdims=True)
+    return Mark(mark.kind, mark.quarter, point, np.stack([first[1], second[1]]) * lengths, mark.score)
+
+
+def _edge_corner(gray: NDArray[np.uint8], mark: Mark) -> Mark | None:
     """An L's outer corner: where the outer edges of its two arms meet."""
     first = _edge_line(gray, mark.point + 0.15 * mark.arms[0], 0.7 * mark.arms[0], mark.arms[1])
     second = _edge_line(gray, mark.point + 0.15 * mark.arms[1], 0.7 * mark.arms[1], mark.arms[0])
-    return None if first is None or second is None else _intersection(first, second)
+    return _moved(mark, first, second)
 
 
-def _edge_tee(gray: NDArray[np.uint8], mark: Mark) -> Points | None:
+def _edge_tee(gray: NDArray[np.uint8], mark: Mark) -> Mark | None:
     """A T's reference point: where the axis of its stem meets the outer edge of its bar."""
     half, stem = mark.arms
     bar = _edge_line(gray, mark.point - 0.85 * half, 1.7 * half, stem)
     start, run = mark.point + 0.4 * stem, 0.5 * stem
     left = _edge_line(gray, start - 0.2 * half, run, half)
     right = _edge_line(gray, start + 0.2 * half, run, -half)
-    if bar is None or left is None or right is None:
+    if left is None or right is None:
         return None
-    axis = (left[0] + right[0]) / 2, left[1] + right[1]
-    return _intersection(bar, axis)
-
-
-Line = tuple[Points, Points]  # a point and a direction
+    along = (left[1] + right[1]) / np.linalg.norm(left[1] + right[1])
+    return _moved(mark, bar, ((left[0] + right[0]) / 2, along))
 
 
 def _edge_line(gray: NDArray[np.uint8], start: Points, run: Points, inward: Points) -> Line | None:

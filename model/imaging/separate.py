@@ -17,16 +17,17 @@ Mask = NDArray[np.bool_]
 
 _LINE_WIDTH = 9  # [px] dark features up to this width are lines or rivets
 _MARK_WIDTH = 41  # ... and up to this width marks
+_LINE_FLANK = 3  # [px] by which lines are widened, for their blurred flanks
 _LINE_DARKNESS, _MARK_DARKNESS = 0.03, 0.15  # relative to the surroundings
 _GRAIN = 1.5  # [px] smoothing of the flux itself, far below the width of the sun's image
 _SMOOTHING = 2.0  # [px] of the map on which the spot is told from noise
 _ROUNDS = 12
 _SPOT_LEVEL = 3.0  # noise deviations above which a pixel may belong to a spot
-_WING_SHARE = 0.02  # ... and share of the peak
+_WING_SHARE = 0.01  # ... and share of the peak
 _CORE_SHARE = 0.15  # share of the peak above which light is taken for a spot and not for uneven daylight
 _SPLIT_SHARE = 0.3  # share of the peak on which spots that overlap are told apart
 _WING_REACH = 0.8  # how far wings reach out of the core, in its mean radius
-_MARGIN = 0.15  # added around it, for the light below the noise, likewise
+_MARGIN = 0.25  # added around it, for the light below the noise, likewise
 _TENDRIL = 9  # [px] width up to which a bright streak at a spot is the sheet's
 _LOBE_GAP = 0.5  # cores nearer than this, in mean radii, are lobes of one heliostat's spot
 _MIN_AREA = 40  # [px] of a spot
@@ -67,14 +68,23 @@ def separate(crop: NDArray[np.uint8], empty: NDArray[np.uint8] | None = None) ->
     # Only the pattern is divided out: the flux on a dull panel is dimmed by the same reflectance as the daylight.
     even = _blurred(bridged / reference, _GRAIN)
     surface = fit_background(even, hidden)
-    rough = _blurred(even - surface, _SMOOTHING)
-    noise = _noise(rough, hidden)
-    main, foreign = find_spots(rough, noise)
-    background = surface + _bridge_over(rough, main)
+    rough, noise, main, foreign = _tell_spots(even, surface, hidden)
+    if main.any():
+        # The first surface only had to find the spots; the second is fitted to all that is off them.
+        surface = _polynomial(even, ~(main | foreign | hidden))
+        rough, noise, main, foreign = _tell_spots(even, surface, hidden)
+    background = surface + _bridge_over(rough, main | foreign)
     flux = np.maximum(even - background, 0) * _feathered(main, foreign)
     return Separation(
         flux.astype(np.float32), background.astype(np.float32), np.asarray(rough, np.float32), main, foreign, noise
     )
+
+
+def _tell_spots(even: Image, surface: Image, hidden: Mask) -> tuple[Image, float, Mask, Mask]:
+    """The smoothed signal over a surface, its noise, and the masks of the main and the foreign spots."""
+    rough = _blurred(even - surface, _SMOOTHING)
+    noise = _noise(rough, hidden)
+    return rough, noise, *find_spots(rough, noise)
 
 
 def _blurred(image: NDArray[np.floating], sigma: float) -> Image:
@@ -86,10 +96,8 @@ def bridge_dark_features(crop: NDArray[np.uint8]) -> tuple[Image, Mask]:
     gray = crop.astype(np.float32)
     hidden = _dark(gray, _MARK_WIDTH, _MARK_DARKNESS)
     hidden = cv2.dilate(hidden.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
-    lines = _dark(gray, _LINE_WIDTH, _LINE_DARKNESS)
-    holes = (hidden | lines).astype(np.uint8)
-    filled = _fill(gray, holes.astype(bool))
-    return filled, hidden
+    lines = cv2.dilate(_dark(gray, _LINE_WIDTH, _LINE_DARKNESS).astype(np.uint8), _disc(_LINE_FLANK)).astype(bool)
+    return _fill(gray, hidden | lines), hidden
 
 
 def _dark(gray: Image, width: int, darkness: float) -> Mask:
@@ -134,7 +142,7 @@ def fit_background(gray: Image, hidden: Mask) -> Image:
     The less of the sheet is free, the stiffer the surface.
     """
     free = ~hidden
-    surface = np.full(gray.shape, np.median(gray[free]) if free.any() else gray.mean())
+    surface = np.full(gray.shape, np.median(gray[free]) if free.any() else gray.mean(), dtype=np.float32)
     smooth = _blurred(gray, _SMOOTHING)
     for round_ in range(_ROUNDS):
         residual = smooth - surface
@@ -145,29 +153,30 @@ def fit_background(gray: Image, hidden: Mask) -> Image:
             bright = ((residual > 2 * spread) & free).astype(np.uint8)
             opened = cv2.morphologyEx(bright, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
             keep &= ~cv2.dilate(opened, np.ones((15, 15), np.uint8)).astype(bool)
-        share = keep.mean()
-        degree = min(3 if share > 0.35 else 2 if share > 0.15 else 1, round_ // 2 + 1)
-        surface = _polynomial(smooth, keep, degree)
-    return surface.astype(np.float32)
+        surface = _polynomial(smooth, keep, round_ // 2 + 1)
+    return surface
 
 
-def _polynomial(gray: Image, keep: Mask, degree: int) -> NDArray[np.float64]:
+def _polynomial(gray: Image, keep: Mask, most: int = 3) -> Image:
+    """The polynomial surface through the kept pixels, of a degree that their share of the sheet supports."""
+    share = keep.mean()
+    degree = min(3 if share > 0.35 else 2 if share > 0.15 else 1, most)
     basis = _basis((gray.shape[0], gray.shape[1]), degree)
     picked = np.zeros_like(keep)
     picked[::2, ::2] = keep[::2, ::2]
     if picked.sum() < 4 * basis.shape[-1]:
-        return np.full(gray.shape, float(np.percentile(gray, 20)))
+        return np.full(gray.shape, float(np.percentile(gray, 20)), dtype=np.float32)
     weights = np.linalg.lstsq(basis[picked], gray[picked].astype(np.float64), rcond=None)[0]
-    return np.asarray(basis @ weights)
+    return np.asarray(basis @ weights, dtype=np.float32)
 
 
-def _bridge_over(residual: Image, main: Mask) -> Image:
-    """What remains of the sheet's brightness off the main spot, carried smoothly across the spot.
+def _bridge_over(residual: Image, spots: Mask) -> Image:
+    """What remains of the sheet's brightness off the spots, carried smoothly across them.
 
-    It follows shadow edges, glare and other heliostats' spots outside; under the spot it is the smoothest interpolation
+    It follows shadow edges and glare outside; under a spot it is the smoothest interpolation
     that push-pull gives: averages over ever larger cells, from coarse to fine (Gortler et al. 1996, The Lumigraph).
     """
-    known = (~main).astype(np.float32)
+    known = (~spots).astype(np.float32)
     return _blurred(_push_pull(residual * known, known), _SMOOTHING)
 
 
