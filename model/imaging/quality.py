@@ -11,8 +11,8 @@ SATURATED_GRAY = 250
 _LIMIT_SATURATED = 0.10
 _LIMIT_CUT = 0.05
 _LIMIT_SECOND = 0.40
-# 300 real empty targets show patches of at most 0.13 of the background and 29 noise deviations; spots start at 0.37.
-_LEAST_CONTRAST = 0.14
+# 300 real empty targets show patches of at most 0.14 of the background and 27 noise deviations; spots start at 0.37.
+_LEAST_CONTRAST = 0.17
 _LEAST_CERTAINTY = 10.0
 _CERTAIN = 30.0
 _LEAST_AREA = 0.003

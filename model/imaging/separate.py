@@ -7,6 +7,7 @@ remains is kept where it belongs to the main spot; its faint wings fade out soft
 """
 
 from dataclasses import dataclass
+from functools import cache
 
 import cv2
 import numpy as np
@@ -22,6 +23,7 @@ _LINE_DARKNESS, _MARK_DARKNESS = 0.03, 0.15  # relative to the surroundings
 _GRAIN = 1.5  # [px] smoothing of the flux itself, far below the width of the sun's image
 _SMOOTHING = 2.0  # [px] of the map on which the spot is told from noise
 _ROUNDS = 12
+_STRIDE = 4  # [px] of the pixels to which the surface is fitted
 _SPOT_LEVEL = 3.0  # noise deviations above which a pixel may belong to a spot
 _WING_SHARE = 0.01  # ... and share of the peak
 _CORE_SHARE = 0.15  # share of the peak above which light is taken for a spot and not for uneven daylight
@@ -129,6 +131,7 @@ def _pattern(empty: NDArray[np.uint8]) -> Image:
     return np.clip(filled / np.maximum(_blurred(filled, 32), 1.0), 0.5, 2.0).astype(np.float32)
 
 
+@cache
 def _basis(shape: tuple[int, int], degree: int) -> NDArray[np.float64]:
     y, x = (np.linspace(-1, 1, count) for count in shape)
     terms = [np.outer(y**j, x**i) for i in range(degree + 1) for j in range(degree + 1 - i)]
@@ -163,7 +166,7 @@ def _polynomial(gray: Image, keep: Mask, most: int = 3) -> Image:
     degree = min(3 if share > 0.35 else 2 if share > 0.15 else 1, most)
     basis = _basis((gray.shape[0], gray.shape[1]), degree)
     picked = np.zeros_like(keep)
-    picked[::2, ::2] = keep[::2, ::2]
+    picked[::_STRIDE, ::_STRIDE] = keep[::_STRIDE, ::_STRIDE]
     if picked.sum() < 4 * basis.shape[-1]:
         return np.full(gray.shape, float(np.percentile(gray, 20)), dtype=np.float32)
     weights = np.linalg.lstsq(basis[picked], gray[picked].astype(np.float64), rcond=None)[0]
