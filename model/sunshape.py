@@ -40,7 +40,7 @@ class SunShape(Protocol):
 
 
 def _check(name: str, value: float | Tensor, low: float, high: float) -> None:
-    number = float(value)
+    number = float(value.detach()) if isinstance(value, Tensor) else float(value)
     if not low <= number <= high:
         raise InvalidInputError(f"{name} must lie in [{low:g}, {high:g}], got {number:g}")
 

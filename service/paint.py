@@ -287,7 +287,7 @@ def read_surface(root: Path, heliostat: Heliostat) -> tuple[Array, int] | None:
 
 
 def read_deflectometry(file: Path, heliostat: Heliostat) -> Array:
-    """Heights z (F, 8, 8) [m] fitted to PAINT's deflectometry: (n, 3) points and normals in mirror coordinates a facet."""
+    """Heights z (F, 8, 8) [m] fitted to the (n, 3) points and normals of each facet, in mirror coordinates."""
     centers, axes, half_sizes = heliostat.facet_frames
     facets = []
     with h5py.File(file, "r") as data:

@@ -30,7 +30,7 @@ class TrainConfig:
     held_out: int = 8
     steps: int = 20000
     batch: int = 32
-    learning_rate: float = 1e-3
+    learning_rate: float = 3e-4
     warmup: int = 300
     weight_decay: float = 0.02
     slope_weight: float = 0.5

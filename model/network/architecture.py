@@ -40,6 +40,11 @@ class NetworkConfig:
     decoder_channels: int = 128
 
 
+def activate(x: Tensor) -> Tensor:
+    """Leaky rectifier with the gain that keeps the variance (Karras et al. 2020)."""
+    return functional.leaky_relu(x, 0.2) * 2**0.5
+
+
 class ModulatedConv(nn.Module):
     """A 3x3 convolution whose weights are scaled per sample by a style and normalised again.
 
@@ -52,7 +57,6 @@ class ModulatedConv(nn.Module):
         self.weight = nn.Parameter(torch.randn(outputs, inputs, 3, 3) / (3 * inputs**0.5))
         self.bias = nn.Parameter(torch.zeros(outputs))
         self.to_scale = nn.Linear(style, inputs)
-        nn.init.zeros_(self.to_scale.weight)
         nn.init.ones_(self.to_scale.bias)
         self.stride, self.demodulate = stride, demodulate
 
@@ -77,8 +81,8 @@ class EncoderBlock(nn.Module):
 
     def forward(self, x: Tensor, style: Tensor) -> Tensor:
         """(N, inputs, H, W) to (N, outputs, H / stride, W / stride)."""
-        y = functional.leaky_relu(self.first(x, style), 0.2)
-        return functional.leaky_relu((self.second(y, style) + self.skip(x)) * 0.7, 0.2)
+        y = activate(self.first(x, style))
+        return activate((self.second(y, style) + self.skip(x)) * 0.5**0.5)
 
 
 class Encoder(nn.Module):
@@ -98,7 +102,7 @@ class Encoder(nn.Module):
                 EncoderBlock(middle, coarse, 128, stride=2),
             ]
         )
-        self.to_features = nn.Linear(coarse * 16 + 128, config.features)
+        self.to_features = nn.Sequential(nn.Linear(coarse * 16 + 128, config.features), nn.LayerNorm(config.features))
 
     def forward(self, flux: Tensor, conditions: Tensor) -> Tensor:
         """Flux (N, 64, 64) of sum 100 and conditions (N, 12) to features (N, features)."""
@@ -156,7 +160,7 @@ class Decoder(nn.Module):
         for layer, conv in enumerate(self.convs):
             if layer == 1:
                 x = functional.interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=False)
-            x = functional.leaky_relu(conv(x, styles[:, layer]), 0.2)
+            x = activate(conv(x, styles[:, layer]))
         heights, log_spread = self.to_heights(x, styles[:, -1]).chunk(2, dim=1)
         return heights - heights.mean(dim=(2, 3), keepdim=True), log_spread
 

@@ -149,7 +149,8 @@ def _cone_transfer(rays: Rays, optics: Optics, right: Tensor, up: Tensor, table:
     d = rays.direction[:, :, None, None]
     slope = -(d[:, 0] * right + d[:, 1] * up) / d[:, 2]
     angular = rays.slant_range[:, None, None]
-    transfer = _interpolate(table, angular * torch.sqrt(right**2 + up**2 + slope**2))
+    # The tiny term keeps the root's gradient finite at frequency zero.
+    transfer = _interpolate(table, angular * torch.sqrt(right**2 + up**2 + slope**2 + 1e-24))
     if isinstance(optics.slope_error, Tensor) or optics.slope_error > 0:
         sigma = torch.as_tensor(optics.slope_error, dtype=right.dtype, device=right.device).reshape(-1, 1, 1)
         n = rays.normal

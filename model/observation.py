@@ -1,0 +1,94 @@
+"""What surface prediction takes in and gives back."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from model.errors import InvalidInputError
+from model.plant import Heliostat, TargetPlane
+from model.surface import control_points
+from model.tracing.alignment import align_to_spots
+from model.tracing.scene import Scene
+
+FLUX_SHAPE = (64, 64)
+FLUX_WINDOW = 4.0
+"""Side [m] of the square that flux images show about their centre of mass (the paper's)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """One measured flux image and where it was taken.
+
+    Attributes
+    ----------
+    flux : (64, 64)
+        4 m x 4 m about the spot's centre of mass, sum 100.
+    sun : (3,)
+        Unit vector towards the sun in ENU.
+    target : TargetPlane
+    center_of_mass : (3,) [m]
+        The spot in ENU; the target's centre is a fair guess where it is not known.
+    identifier : str
+    motor_position : (2,) [steps] or None
+    """
+
+    flux: NDArray[np.float32]
+    sun: NDArray[np.float64]
+    target: TargetPlane
+    center_of_mass: NDArray[np.float64]
+    identifier: str
+    motor_position: NDArray[np.float64] | None = None
+
+    def __post_init__(self) -> None:
+        if self.flux.shape != FLUX_SHAPE:
+            raise InvalidInputError(f"flux of {self.identifier} must be {FLUX_SHAPE}, got {self.flux.shape}")
+        if not np.isfinite(self.flux).all() or not self.flux.sum() > 0:
+            raise InvalidInputError(f"flux of {self.identifier} must be finite and hold energy")
+
+
+@dataclass(frozen=True, eq=False)
+class SurfacePrediction:
+    """A predicted mirror surface.
+
+    Attributes
+    ----------
+    z, z_std : (4, 8, 8) [m]
+        Control heights over the canted facets, facet mean zero, and their standard deviation.
+    control_points : (4, 8, 8, 3) [m]
+        In mirror coordinates.
+    method : str
+        "network" or "refined".
+    weights : str
+        Name and content hash of the weights that were used.
+    misfit : float
+        How badly the surface explains its own images: one minus the mean flux accuracy of re-rendering them.
+    used : tuple of str
+        Identifiers of the images.
+    """
+
+    z: NDArray[np.float64]
+    z_std: NDArray[np.float64]
+    control_points: NDArray[np.float64]
+    method: str
+    weights: str
+    misfit: float
+    used: tuple[str, ...]
+
+
+def scene_of(
+    heliostat: Heliostat,
+    observations: Sequence[Observation],
+    z: NDArray[np.float64] | None = None,
+    dtype: torch.dtype = torch.float32,
+) -> Scene:
+    """The scene of a heliostat's observations with heights ``z`` (4, 8, 8) [m], aligned by spots; None is ideal."""
+    points = control_points(heliostat, z)
+    count = len(observations)
+    suns = np.array([o.sun for o in observations])
+    targets = [o.target for o in observations]
+    spots = np.array([o.center_of_mass for o in observations])
+    angles = align_to_spots([heliostat] * count, [points] * count, suns, targets, spots)
+    return Scene.build([heliostat] * count, [points] * count, angles, suns, targets, dtype=dtype)

@@ -1,0 +1,136 @@
+"""The Monte Carlo tracer: the slow, plain reference.
+
+Every ray is thrown for itself: a random place on a random facet, a random direction from the sun's disc and aureole, a
+random slope error, exact reflection, exact intersection with the plane. It shares the scene with the convolution tracer
+and nothing of its method, so that each can be tested against the other.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from model.errors import InvalidInputError
+from model.sunshape import Pillbox, random_angles
+from model.surface import basis
+from model.tracing.scene import Optics, Scene, Window
+
+Array = NDArray[np.float64]
+
+CHUNK = 500_000
+"""Rays traced at a time; bounds the memory to some hundred megabytes."""
+
+
+def _unit(vectors: Array) -> Array:
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
+
+
+def _across(axis: Array) -> tuple[Array, Array]:
+    """Two unit vectors (..., 3) that complete ``axis`` (..., 3) to an orthonormal frame."""
+    helper = np.where(np.abs(axis[..., :1]) < 0.9, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
+    first = _unit(np.cross(axis, helper))
+    return first, np.cross(axis, first)
+
+
+def _mirror_points(control_points: Array, degree: int, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Random points and area vectors, each (n, 3), of one facet (I, J, 3), even in the parameters."""
+    value_u, slope_u = basis(control_points.shape[0], degree, rng.random(count))
+    value_v, slope_v = basis(control_points.shape[1], degree, rng.random(count))
+
+    def product(a: Array, b: Array) -> Array:
+        return np.asarray(np.einsum("nj,njc->nc", b, np.tensordot(a, control_points, axes=1)))
+
+    return product(value_u, value_v), np.cross(product(slope_u, value_v), product(value_u, slope_v))
+
+
+def _sun_rays(sun: Array, optics: Optics, count: int, rng: np.random.Generator) -> Array:
+    """Unit vectors (n, 3) towards random points of the sun."""
+    angle, turn = random_angles(optics.sun_shape, count, rng), rng.uniform(0, 2 * np.pi, count)
+    first, second = _across(sun)
+    side = np.cos(turn)[:, None] * first + np.sin(turn)[:, None] * second
+    return np.asarray(np.cos(angle)[:, None] * sun + np.sin(angle)[:, None] * side)
+
+
+def _rays(
+    scene: Scene, index: int, optics: Optics, count: int, rng: np.random.Generator
+) -> Iterator[tuple[Array, Array]]:
+    """Hits (n, 2) [m] on the plane and the projected mirror area (n,) [m2] of each, facet by facet."""
+    points, suns = scene.in_plane()
+    facets = points[index].double().numpy()
+    sun = _unit(suns[index].double().numpy())
+    slope_error = float(np.broadcast_to(np.asarray(optics.slope_error), scene.batch)[index])
+    shares = rng.multinomial(count, np.full(len(facets), 1 / len(facets)))
+    for facet, share in enumerate(shares):
+        place, area = _mirror_points(np.moveaxis(facets[facet], 0, -1), scene.degree, share, rng)
+        normal = _unit(area)
+        toward_sun = _sun_rays(sun, optics, share, rng)
+        # The light that a patch collects counts its own area, not that of the tilted micro-facets on it.
+        weight = (area * toward_sun).sum(axis=-1).clip(min=0) * len(facets) / count
+        if scene.facet_reflectivity is not None:
+            weight = weight * float(scene.facet_reflectivity[index, facet])
+        if slope_error > 0:
+            first, second = _across(normal)
+            tilt = rng.normal(0, slope_error, (2, share, 1))
+            normal = _unit(normal + tilt[0] * first + tilt[1] * second)
+        out = 2 * (normal * toward_sun).sum(axis=-1, keepdims=True) * normal - toward_sun
+        distance = -place[:, 2] / out[:, 2]
+        hits = place[:, :2] + distance[:, None] * out[:, :2]
+        ahead = (distance > 0) & (out[:, 2] < 0)
+        yield hits[ahead], weight[ahead]
+
+
+def trace_montecarlo(
+    scene: Scene, window: Window, optics: Optics | None = None, *, rays: int = 1_000_000, seed: int = 0
+) -> tuple[Array, Array]:
+    """Trace every mirror of a scene with ``rays`` random rays.
+
+    Returns
+    -------
+    irradiance : (B, rows, columns) [W/m2]
+        Row 0 at the top.
+    spot : (B, 2) [m]
+        Centre of mass of all rays, right and up of the plane's centre; also the window's centre where it is on the spot.
+        The far aureole is heavy-tailed, so that this is noisier than the convolution tracer's.
+    """
+    if rays < 1:
+        raise InvalidInputError("rays must be at least one")
+    optics = optics or Optics()
+    rng = np.random.default_rng(seed)
+    images, spots = [], []
+    for index in range(scene.batch):
+        spot = _spot(scene, index, optics, np.random.default_rng((seed, index)))
+        image = np.zeros((window.rows, window.columns))
+        center = spot if window.on_spot else np.zeros(2)
+        for start in range(0, rays, CHUNK):
+            for hits, weight in _rays(scene, index, optics, min(CHUNK, rays - start), rng):
+                image += _histogram(hits - center, weight, window) * min(CHUNK, rays - start) / rays
+        images.append(image * _irradiance(scene, index, optics) / np.prod(window.pixel))
+        spots.append(spot)
+    return np.array(images), np.array(spots)
+
+
+def _spot(scene: Scene, index: int, optics: Optics, rng: np.random.Generator) -> Array:
+    """Centre of mass (2,) [m] of the light from the sun's very centre, which is where the convolution tracer has it."""
+    point_sun = replace(optics, sun_shape=Pillbox(1e-6), slope_error=0.0)
+    total, moment = 0.0, np.zeros(2)
+    for hits, weight in _rays(scene, index, point_sun, 200_000, rng):
+        total += weight.sum()
+        moment += weight @ hits
+    return moment / total
+
+
+def _histogram(hits: Array, weight: Array, window: Window) -> Array:
+    """Weights (n,) summed over the window's pixels (rows, columns)."""
+    pixel_x, pixel_y = window.pixel
+    column = np.floor((hits[:, 0] + window.width / 2) / pixel_x)
+    row = np.floor((window.height / 2 - hits[:, 1]) / pixel_y)
+    inside = (column >= 0) & (column < window.columns) & (row >= 0) & (row < window.rows)
+    cell = (row[inside] * window.columns + column[inside]).astype(np.int64)
+    return np.bincount(cell, weight[inside], window.rows * window.columns).reshape(window.rows, window.columns)
+
+
+def _irradiance(scene: Scene, index: int, optics: Optics) -> float:
+    distance = (scene.center[index] - scene.plane_center[index]).double().norm()
+    return float(optics.irradiance(torch.as_tensor(distance)))

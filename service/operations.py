@@ -1,0 +1,133 @@
+"""What the command line, the demo and REST do, as plain functions from arrays to arrays: measure, predict, forecast."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from model.errors import InvalidInputError
+from model.imaging import ImageKind, MeasuredFlux
+from model.imaging import measure as measure_image
+from model.network.predictor import default_predictor
+from model.observation import Observation, SurfacePrediction
+from model.plant import Heliostat, TargetPlane
+from model.refinement import refine
+from model.surface import DEGREE, control_points
+from model.tracing import Optics, Scene, Window, trace
+from model.tracing.alignment import align_to_spots
+
+Array = NDArray[np.float64]
+Method = Literal["network", "refined"]
+
+MODEL_VERSION = "1:none"
+"""Version of the plant's model and the effects it holds: none until a study's effect is adopted."""
+
+
+def measure(
+    image: NDArray[np.uint8], kind: ImageKind, plane: TargetPlane, *, corners: Array | None = None
+) -> MeasuredFlux:
+    """Flux and quality of one photograph of a target; see `model.imaging.measure`."""
+    return measure_image(image, kind, plane, corners=corners)
+
+
+def predict(
+    heliostat: Heliostat,
+    observations: Sequence[Observation],
+    method: Method = "network",
+    optics: Optics | None = None,
+) -> SurfacePrediction:
+    """The mirror surface of a heliostat from its images, by the network alone or refined through the tracer.
+
+    Raises
+    ------
+    InvalidInputError
+        For no or too many images, or an unknown method.
+    """
+    if method not in ("network", "refined"):
+        raise InvalidInputError(f"method must be 'network' or 'refined', got {method!r}")
+    by_network = default_predictor().predict(heliostat, observations)
+    return by_network if method == "network" else refine(heliostat, observations, by_network.z, optics=optics)
+
+
+@dataclass(frozen=True, eq=False)
+class Forecast:
+    """Flux of one heliostat on a plane.
+
+    Attributes
+    ----------
+    flux : (rows, columns) float32 [W/m2]
+    center_of_mass : (2,) [m]
+        Right and up of the plane's centre.
+    peak : float [W/m2]
+    power : float [W]
+        On the imaged part of the plane.
+    model_version : str
+    """
+
+    flux: NDArray[np.float32]
+    center_of_mass: Array
+    peak: float
+    power: float
+    model_version: str = MODEL_VERSION
+
+
+def forecast(
+    heliostat: Heliostat,
+    z: ArrayLike | None,
+    sun: ArrayLike,
+    plane: TargetPlane,
+    *,
+    aim: ArrayLike | None = None,
+    spot: ArrayLike | None = None,
+    resolution: tuple[int, int] = (256, 256),
+    window: float | None = None,
+    optics: Optics | None = None,
+    surface: tuple[ArrayLike, int] | None = None,
+) -> Forecast:
+    """Trace the flux of a heliostat on a plane.
+
+    Parameters
+    ----------
+    z : array_like (4, 8, 8) [m], or None
+        Heights over the canted facets; None for the ideal surface.
+    sun : array_like (3,)
+        Unit vector towards the sun in ENU.
+    aim : array_like (3,) [m], optional
+        Where the ray from the mirror's centre goes; the plane's centre unless given.
+    spot : array_like (3,) [m], optional
+        Where the spot's centre of mass shall lie; the heliostat is turned until it does. Goes before ``aim``.
+    resolution : (rows, columns)
+    window : float [m], optional
+        Side of a square about the spot; the whole plane unless given.
+    surface : (control points (F, I, J, 3) [m], degree), optional
+        A measured surface in place of ``z``.
+
+    Raises
+    ------
+    UnreachableError
+        Where no attitude reflects the sun to the plane.
+    """
+    points, degree = (control_points(heliostat, z), DEGREE) if surface is None else surface
+    direction = np.asarray(sun, dtype=np.float64)
+    if spot is not None:
+        angles = align_to_spots([heliostat], [points], direction[None], [plane], np.array([spot]), degree=degree)
+    else:
+        goal = plane.center if aim is None else np.asarray(aim, dtype=np.float64)
+        angles = heliostat.mount.align(heliostat.position, direction, goal)[None]
+    scene = Scene.build([heliostat], [points], angles, direction[None], [plane], degree=degree)
+    rows, columns = resolution
+    view = Window.of(plane, rows, columns) if window is None else Window(window, window, rows, columns, on_spot=True)
+    with torch.no_grad():
+        traced = trace(scene, view, optics)
+    # Frequency space leaves ripples of some 1e-5 of the peak below zero.
+    flux = traced.irradiance[0].clamp(min=0).numpy()
+    pixel_x, pixel_y = view.pixel
+    return Forecast(
+        flux=flux,
+        center_of_mass=traced.spot[0].double().numpy(),
+        peak=float(flux.max()),
+        power=float(flux.sum(dtype=np.float64) * pixel_x * pixel_y),
+    )
