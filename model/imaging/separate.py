@@ -7,7 +7,6 @@ remains is kept where it belongs to the main spot; its faint wings fade out soft
 """
 
 from dataclasses import dataclass
-from functools import cache
 
 import cv2
 import numpy as np
@@ -126,16 +125,9 @@ def _fill(gray: Image, holes: Mask) -> Image:
 
 
 def _pattern(empty: NDArray[np.uint8]) -> Image:
-    """The sheet's reflectance relative to its smooth brightness."""
-    filled, _ = bridge_dark_features(empty)
-    return np.clip(filled / np.maximum(_blurred(filled, 32), 1.0), 0.5, 2.0).astype(np.float32)
-
-
-@cache
-def _basis(shape: tuple[int, int], degree: int) -> NDArray[np.float64]:
-    y, x = (np.linspace(-1, 1, count) for count in shape)
-    terms = [np.outer(y**j, x**i) for i in range(degree + 1) for j in range(degree + 1 - i)]
-    return np.stack(terms, axis=-1)
+    """The sheet's reflectance relative to its smooth brightness, which is that day's light."""
+    filled, hidden = bridge_dark_features(empty)
+    return np.clip(filled / np.maximum(_polynomial(filled, ~hidden), 1.0), 0.5, 2.0).astype(np.float32)
 
 
 def fit_background(gray: Image, hidden: Mask) -> Image:
@@ -161,16 +153,26 @@ def fit_background(gray: Image, hidden: Mask) -> Image:
 
 
 def _polynomial(gray: Image, keep: Mask, most: int = 3) -> Image:
-    """The polynomial surface through the kept pixels, of a degree that their share of the sheet supports."""
+    """The polynomial surface through the kept pixels, of a degree that their share of the sheet supports.
+
+    Its normal equations are moments of the image, which separate into rows and columns.
+    """
     share = keep.mean()
     degree = min(3 if share > 0.35 else 2 if share > 0.15 else 1, most)
-    basis = _basis((gray.shape[0], gray.shape[1]), degree)
-    picked = np.zeros_like(keep)
-    picked[::_STRIDE, ::_STRIDE] = keep[::_STRIDE, ::_STRIDE]
-    if picked.sum() < 4 * basis.shape[-1]:
+    y, x = (np.linspace(-1, 1, count) for count in gray.shape)
+    weight = keep[::_STRIDE, ::_STRIDE].astype(np.float64)
+    if weight.sum() < 64:
         return np.full(gray.shape, float(np.percentile(gray, 20)), dtype=np.float32)
-    weights = np.linalg.lstsq(basis[picked], gray[picked].astype(np.float64), rcond=None)[0]
-    return np.asarray(basis @ weights, dtype=np.float32)
+    y_powers, x_powers = (np.vander(axis[::_STRIDE], 2 * degree + 1, increasing=True) for axis in (y, x))
+    moments = y_powers.T @ weight @ x_powers
+    right = y_powers.T @ (weight * gray[::_STRIDE, ::_STRIDE]) @ x_powers
+    terms = [(j, i) for j in range(degree + 1) for i in range(degree + 1 - j)]
+    matrix = np.array([[moments[j + n, i + m] for n, m in terms] for j, i in terms])
+    solution = np.linalg.lstsq(matrix, np.array([right[term] for term in terms]), rcond=None)[0]
+    coefficients = np.zeros((degree + 1, degree + 1))
+    for term, value in zip(terms, solution, strict=True):
+        coefficients[term] = value
+    return np.asarray(np.polynomial.polynomial.polygrid2d(y, x, coefficients), dtype=np.float32)
 
 
 def _bridge_over(residual: Image, spots: Mask) -> Image:

@@ -1,0 +1,142 @@
+import dataclasses
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from model.errors import InvalidInputError
+from model.imaging import MeasuredFlux, center_of_mass, measure
+from model.imaging.camera import CameraOptions, photograph, target_corners
+from model.imaging.rectify import rectify
+from tests.imaging import accuracy, gaussian
+
+SIZE = (5.4, 6.4)
+
+
+def taken(flux, plane, **options):
+    return photograph(flux, plane, np.random.default_rng(5), CameraOptions(**options))
+
+
+def check_measured(result: MeasuredFlux):
+    assert result.quality.accepted
+    assert result.quality.reason is None
+    for image, shape in ((result.flux, (256, 256)), (result.centered, (64, 64))):
+        assert image.shape == shape
+        assert image.dtype == np.float32
+        assert image.min() >= 0
+        assert image.sum(dtype=float) == pytest.approx(100, abs=1e-3)
+    assert result.crop.shape == (256, 256)
+
+
+@pytest.mark.parametrize(
+    ("options", "least"),
+    [
+        ({}, 0.96),
+        ({"gradient": (0.4, -0.4)}, 0.95),
+        ({"perspective": 0.2}, 0.95),
+        ({"noise": 6.0}, 0.95),
+        ({"foreign_spot": (-1.9, 2.1, 0.35, 0.8)}, 0.95),
+        ({"foreign_spot": (2.0, 2.4, 0.3, 1.0)}, 0.95),
+    ],
+    ids=["plain", "uneven light", "slanted", "noisy", "foreign spot", "brighter foreign spot"],
+)
+def test_a_photograph_gives_back_the_flux(plane, spot, options, least):
+    result = measure(taken(spot, plane, **options), "raw", plane)
+    check_measured(result)
+    assert np.linalg.norm(result.center_of_mass - center_of_mass(spot, SIZE)) < 0.02
+    assert accuracy(result.flux, spot) > least
+    assert (result.quality.second_spot_share > 0.05) == ("foreign_spot" in options)
+
+
+def test_the_window_is_centred_on_the_spot(plane, spot):
+    result = measure(taken(spot, plane), "raw", plane)
+    assert np.abs(center_of_mass(result.centered, (4.0, 4.0))).max() < 0.06
+    assert result.quality.energy_outside_window < 0.03
+
+
+def test_configured_corners_replace_the_marks(plane, spot):
+    options = CameraOptions()
+    frame = taken(spot, plane, gradient=(0.0, 0.0))
+    corners = target_corners(plane, options)
+    for corner in corners:
+        cv2.circle(frame, tuple(np.round(corner).astype(int).tolist()), 90, (128, 128, 128), -1)
+    assert measure(frame, "raw", plane).quality.reason == "target_not_found"
+    result = measure(frame, "raw", plane, corners=corners)
+    check_measured(result)
+    assert np.linalg.norm(result.center_of_mass - center_of_mass(spot, SIZE)) < 0.03
+
+
+@pytest.mark.parametrize(
+    ("reason", "flux", "options"),
+    [
+        ("saturated", (0.0, 0.0, 0.6, 0.6), {"peak": 0.9}),
+        ("cut", (2.6, 0.0, 0.6, 0.6), {}),
+        ("cut", (0.0, 3.0, 0.6, 0.9), {}),
+        ("no_spot", (0.0, 0.0, 0.6, 0.6), {"peak": 0.0}),
+        ("no_spot", (0.0, 0.0, 0.6, 0.6), {"peak": 0.02}),
+        ("low_signal", (0.0, 0.0, 0.6, 0.6), {"peak": 0.06}),
+        ("second_spot", (0.9, -1.0, 0.45, 0.45), {"foreign_spot": (-1.2, 1.5, 0.45, 0.9)}),
+    ],
+)
+def test_a_bad_photograph_is_refused_with_its_reason_and_kept(plane, reason, flux, options):
+    result = measure(taken(gaussian(plane, *flux), plane, **options), "raw", plane)
+    assert result.quality.reason == reason
+    assert not result.quality.accepted
+    assert result.quality.detail.count(".") == 0
+    assert ";" in result.quality.detail  # a finding and its remedy
+    assert result.flux is result.centered is result.center_of_mass is None
+    assert result.crop.shape == (256, 256)
+
+
+def test_a_quality_record_is_json(plane, spot):
+    for frame in (taken(spot, plane), np.zeros((200, 200, 3), np.uint8)):
+        record = dataclasses.asdict(measure(frame, "raw", plane).quality)
+        assert json.loads(json.dumps(record, allow_nan=False)) == record
+
+
+def test_a_crop_is_measured_like_its_frame(plane, spot):
+    frame = taken(spot, plane)
+    crop = rectify(cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY), target_corners(plane))
+    result = measure(crop, "cropped", plane)
+    check_measured(result)
+    assert accuracy(result.flux, measure(frame, "raw", plane).flux) > 0.98
+
+
+def test_separated_flux_is_only_normalised(plane, spot):
+    image = np.round(255 * spot).astype(np.uint8)
+    result = measure(image, "flux", plane)
+    assert np.allclose(result.flux, 100.0 * image / image.sum(), atol=1e-6)
+    assert result.crop is None
+    assert np.allclose(result.center_of_mass, center_of_mass(image, SIZE))
+    assert result.centered.sum() == pytest.approx(100, abs=1e-3)
+
+
+def test_a_centred_flux_has_no_place_on_the_target(plane):
+    wide = dataclasses.replace(plane, width=6.1, height=6.1)
+    image = np.round(255 * gaussian(wide, 0, 0, 0.8, 0.5, 0.3, size=64)).astype(np.uint8)
+    result = measure(image, "flux-centered", plane)
+    assert result.flux is None
+    assert result.center_of_mass is None
+    expected = gaussian(dataclasses.replace(plane, width=4.0, height=4.0), 0, 0, 0.8, 0.5, 0.3, size=64)
+    assert accuracy(result.centered, expected) > 0.98
+
+
+@pytest.mark.parametrize("kind", ["raw", "cropped", "flux", "flux-centered"])
+def test_black_images_are_refused_and_not_raised(plane, kind):
+    quality = measure(np.zeros((256, 256), np.uint8), kind, plane).quality
+    assert quality.reason == ("target_not_found" if kind == "raw" else "no_spot")
+
+
+@pytest.mark.parametrize(
+    ("image", "kind"),
+    [
+        (np.zeros((256, 256), np.float32), "cropped"),
+        (np.zeros((256, 256, 4), np.uint8), "cropped"),
+        (np.zeros((5, 256), np.uint8), "cropped"),
+        (np.zeros((256, 256), np.uint8), "sketch"),
+    ],
+)
+def test_malformed_arguments_raise(plane, image, kind):
+    with pytest.raises(InvalidInputError):
+        measure(image, kind, plane)
