@@ -30,7 +30,7 @@ def _run() -> None:
         _migrate(connection)
         return
     engine = make_engine(Settings().database)
-    with engine.connect() as own:
+    with engine.execution_options(writes=True).connect() as own:
         _migrate(own)
     engine.dispose()
 

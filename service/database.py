@@ -1,5 +1,6 @@
 """The database: connections to SQLite or PostgreSQL, transactions, and the schema's version."""
 
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,14 +18,15 @@ import migrations
 # Seconds that a writer waits for another on SQLite, and that a connection to PostgreSQL may take.
 _PATIENCE_S = 15
 
+# Alembic keeps its context in module globals: one migration at a time in a process.
+_alembic = threading.Lock()
 
-def alembic_config(url: URL | None = None) -> Config:
+
+def alembic_config() -> Config:
     """The Alembic configuration whose scripts are the installed `migrations` package."""
     config = Config()
     config.set_main_option("script_location", str(Path(migrations.__file__).parent).replace("%", "%%"))
     config.set_main_option("path_separator", "os")
-    if url is not None:
-        config.attributes["url"] = url
     return config
 
 
@@ -91,7 +93,7 @@ class Database:
     @contextmanager
     def _migrating(self) -> Iterator[Config]:
         config = alembic_config()
-        with self._writer.connect() as connection:
+        with _alembic, self._writer.connect() as connection:
             config.attributes["connection"] = connection
             yield config
 

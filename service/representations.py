@@ -167,7 +167,7 @@ def forecast_summary(row: ForecastRow) -> ForecastSummary:
             "unit": "1" if row.normalised else "W/m2",
             "peak_w_m2": row.peak_w_m2,
             "power_w": row.power_w,
-            "center_of_mass": (row.center_right_m, row.center_up_m),
+            "center_of_mass": _pair(row.center_right_m, row.center_up_m),
             "model_version": row.model_version,
             "created_at": row.created_at,
         }
@@ -187,7 +187,7 @@ def forecast(row: ForecastRow, media_type: str) -> Response:
     name = f"{row.heliostat.name}-forecast-{row.id}"
     if media_type == negotiation.PNG:
         unit = "share of 100" if row.normalised else "W/m²"
-        size = (row.plane["width"], row.plane["height"])
+        size = (row.window_m or row.plane["width"], row.window_m or row.plane["height"])
         title = f"{row.heliostat.name}, forecast {row.id}"
         return _file(flux_picture(flux, size, unit, title), media_type, f"{name}.png")
     if media_type != negotiation.JSON:

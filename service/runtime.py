@@ -1,122 +1,52 @@
 """What a running service holds: settings, database, image store, and the model behind one narrow door."""
 
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib import import_module
-from typing import Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from numpy.typing import NDArray
 
-from model.plant import Heliostat, TargetPlane
 from service.database import Database
 from service.images import ImageStore
 from service.settings import Settings
 
-
-class MeasuredFlux(Protocol):
-    """What a photograph yields; see `model.imaging`."""
-
-    @property
-    def flux(self) -> NDArray[Any] | None:
-        """(256, 256) over the whole target."""
-
-    @property
-    def centered(self) -> NDArray[Any] | None:
-        """(64, 64) about the centre of mass, sum 100."""
-
-    @property
-    def center_of_mass(self) -> NDArray[Any] | None:
-        """(2,) [m] right and up of the target's centre."""
-
-    @property
-    def quality(self) -> Any:
-        """A dataclass with ``accepted``, ``reason``, ``detail`` and figures."""
-
-
-class SurfacePrediction(Protocol):
-    """A predicted surface: heights (4, 8, 8) and control points (4, 8, 8, 3) [m]."""
-
-    @property
-    def z(self) -> NDArray[Any]:
-        """(4, 8, 8) [m]."""
-
-    @property
-    def z_std(self) -> NDArray[Any]:
-        """(4, 8, 8) [m]."""
-
-    @property
-    def control_points(self) -> NDArray[Any]:
-        """(4, 8, 8, 3) [m]."""
-
-    @property
-    def weights(self) -> str:
-        """Name and hash of the network."""
-
-    @property
-    def misfit(self) -> float | None:
-        """What the refinement left unexplained."""
-
-    @property
-    def used(self) -> Sequence[str]:
-        """Identifiers of the observations that were used."""
-
-
-class FluxForecast(Protocol):
-    """A traced flux map and its figures."""
-
-    @property
-    def flux(self) -> NDArray[Any]:
-        """(H, W) float32 [W/m2]."""
-
-    @property
-    def center_of_mass(self) -> NDArray[Any]:
-        """(2,) [m] right and up of the plane's centre."""
-
-    @property
-    def peak(self) -> float:
-        """[W/m2]."""
-
-    @property
-    def power(self) -> float:
-        """[W]."""
-
-    @property
-    def model_version(self) -> str:
-        """What computed it."""
+if TYPE_CHECKING:  # these bring the tracer's libraries with them, which take seconds to load
+    from model.imaging import ImageKind, MeasuredFlux
+    from model.observation import Observation, SurfacePrediction
+    from model.plant import Heliostat, TargetPlane
+    from model.tracing import Optics
+    from service.operations import Forecast, Method
 
 
 class Operations(Protocol):
     """The model as the service uses it: the interface of the module `service.operations`."""
 
-    @property
-    def Observation(self) -> Callable[..., Any]:  # noqa: N802
-        """Class of what `predict` takes."""
-
     def measure(
-        self, image: NDArray[Any], kind: str, plane: TargetPlane, *, corners: NDArray[Any] | None = None
-    ) -> MeasuredFlux:
+        self, image: NDArray[Any], kind: "ImageKind", plane: "TargetPlane", *, corners: NDArray[Any] | None = None
+    ) -> "MeasuredFlux":
         """Flux, centre of mass and quality of a photograph."""
 
-    def predict(self, heliostat: Heliostat, observations: Sequence[Any], method: Any = "network") -> SurfacePrediction:
+    def predict(
+        self, heliostat: "Heliostat", observations: Sequence["Observation"], method: "Method" = "network"
+    ) -> "SurfacePrediction":
         """A surface from observations."""
 
     def forecast(
         self,
-        heliostat: Heliostat,
+        heliostat: "Heliostat",
         z: NDArray[Any] | None,
         sun: NDArray[Any],
-        plane: TargetPlane,
+        plane: "TargetPlane",
         *,
-        aim: NDArray[Any] | None,
-        resolution: tuple[int, int],
-        dni: float,
-    ) -> FluxForecast:
+        aim: NDArray[Any] | None = None,
+        resolution: tuple[int, int] = (256, 256),
+        window: float | None = None,
+        optics: "Optics | None" = None,
+    ) -> "Forecast":
         """The flux of a heliostat on a plane."""
-
-    def weights_version(self) -> str:
-        """Name and hash of the network's weights, loaded; raises where they cannot be."""
 
 
 def load_operations() -> Operations:

@@ -4,10 +4,11 @@ Numbers are finite, unknown keys are refused, and names fit a pattern that is sa
 """
 
 import re
-from datetime import datetime
+from datetime import UTC, datetime
 from typing import Annotated, Any, Generic, Literal, Self, TypeVar
 
 from pydantic import (
+    AfterValidator,
     AwareDatetime,
     BaseModel,
     BeforeValidator,
@@ -54,7 +55,13 @@ Wgs84 = tuple[
 ]
 Azimuth = Annotated[float, Field(ge=-360, le=360, description="Sun azimuth from south, positive to the east [deg].")]
 Elevation = Annotated[float, Field(gt=0, le=90, description="Sun elevation above the horizon [deg].")]
-Extent = Annotated[float, Field(gt=0, lt=1e4)]
+Extent = Annotated[float, Field(ge=0.01, le=1e3)]
+
+Moment = Annotated[
+    AwareDatetime,
+    Field(ge=datetime(1970, 1, 1, tzinfo=UTC), lt=datetime(9000, 1, 1, tzinfo=UTC)),
+    AfterValidator(lambda moment: moment.astimezone(UTC)),
+]
 
 Item = TypeVar("Item")
 
@@ -211,10 +218,10 @@ class Plane(Model):
 class Corners(Model):
     """A target by its corners as seen from the field, in WGS84 (latitude [deg], longitude [deg], altitude [m])."""
 
-    upper_left: Wgs84
-    upper_right: Wgs84
-    lower_left: Wgs84
-    lower_right: Wgs84
+    upper_left: Wgs84 = Field(description="[deg, deg, m]")
+    upper_right: Wgs84 = Field(description="[deg, deg, m]")
+    lower_left: Wgs84 = Field(description="[deg, deg, m]")
+    lower_right: Wgs84 = Field(description="[deg, deg, m]")
 
 
 class TargetIn(Model):
@@ -277,7 +284,7 @@ class MeasurementIn(Model):
         "target; flux-centered: the spot about its centre of mass, already separated."
     )
     id: Identifier | None = Field(None, description="The caller's own number of the measurement.")
-    taken_at: AwareDatetime | None = Field(None, description="When it was taken, with time zone.")
+    taken_at: Moment | None = Field(None, description="When it was taken, with time zone.")
     motor_position: Motors | None = Field(
         None, description="Motor positions of both axes [steps], as a pair or as PAINT's object."
     )
@@ -288,7 +295,7 @@ class MeasurementIn(Model):
     )
     corners: tuple[Pixel, Pixel, Pixel, Pixel] | None = Field(
         None,
-        description="Pixel positions (x, y) of the target's upper left, upper right, lower left and lower right "
+        description="Positions (x, y) [px] of the target's upper left, upper right, lower left and lower right "
         "corners in a raw frame; without them they are searched.",
     )
 
@@ -389,7 +396,7 @@ class ForecastIn(Model):
         (256, 256), description="Rows and columns of the map, or one number for both."
     )
     window: float | None = Field(
-        None, gt=0, le=1e3, description="Side of a square window about the centre of mass [m]; else the whole plane."
+        None, ge=0.01, le=1e3, description="Side of a square about the centre of mass to map [m]; else the plane."
     )
     normalised: bool = Field(False, description="Scale the map to a sum of 100 instead of W/m2.")
 
@@ -407,17 +414,17 @@ class ForecastSummary(BaseModel):
     heliostat: str
     surface_version: int | None = Field(description="null: the ideal surface.")
     target: str | None
-    plane: Plane = Field(description="The plane of the map [m]; with a window, the window's.")
+    plane: Plane = Field(description="The plane that the light falls on [m].")
     sun: Sun
     aim_point: tuple[float, float, float] | None = Field(description="[m], as given.")
     dni_w_m2: float = Field(description="[W/m2]")
-    window: float | None = Field(description="[m]")
+    window: float | None = Field(description="Side of the mapped square about the centre of mass [m]; null: the plane.")
     resolution: tuple[int, int] = Field(description="Rows, columns.")
     normalised: bool
     unit: str = Field(description="Unit of the map: W/m2, or 1 where it is normalised to a sum of 100.")
     peak_w_m2: float = Field(description="Largest irradiance [W/m2].")
-    power_w: float = Field(description="Power on the map's plane [W].")
-    center_of_mass: tuple[float, float] = Field(description="Right and up of the map's centre [m].")
+    power_w: float = Field(description="Power on the mapped area [W].")
+    center_of_mass: tuple[float, float] | None = Field(description="Right and up of the plane's centre [m].")
     model_version: str
     created_at: datetime
 

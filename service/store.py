@@ -418,7 +418,7 @@ def _surface_row(heliostat: HeliostatRow, version: int, new: NewSurface, content
         misfit=new.misfit,
         content_sha256=content,
         arrays=pack({name: np.asarray(array, np.float64) for name, array in arrays.items()}),
-        measurements=list(new.measurements),
+        measurements=sorted(new.measurements, key=lambda measurement: measurement.id),
     )
 
 

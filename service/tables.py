@@ -237,8 +237,8 @@ class ForecastRow(Base):
     columns: Mapped[int]
     peak_w_m2: Mapped[float]
     power_w: Mapped[float]
-    center_right_m: Mapped[float]
-    center_up_m: Mapped[float]
+    center_right_m: Mapped[float | None]
+    center_up_m: Mapped[float | None]
     model_version: Mapped[str] = mapped_column(String(128))
     flux: Mapped[bytes] = mapped_column(LargeBinary, deferred=True)
     created_at: Mapped[datetime] = mapped_column(default=now)

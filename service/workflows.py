@@ -6,9 +6,9 @@ them.
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from datetime import datetime
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,9 +21,14 @@ from service import store
 from service.arrays import pack, unpack
 from service.faults import ConflictError, NotFoundError, TooLargeError
 from service.images import digest, media_type
-from service.runtime import FluxForecast, Operations, Runtime, SurfacePrediction
+from service.runtime import Operations, Runtime
 from service.store import NewImage, NewMeasurement, NewSurface
 from service.tables import ForecastRow, HeliostatRow, MeasurementRow, SurfaceRow
+
+if TYPE_CHECKING:  # see `service.runtime`
+    from model.imaging import ImageKind
+    from model.observation import Observation, SurfacePrediction
+    from service.operations import Forecast, Method
 
 # The newest measurements, this many times as many as are wanted, stand for the mirror's present state; those that
 # are used are chosen among them for variety of the sun's position.
@@ -48,7 +53,7 @@ class Photograph:
     """
 
     target_name: str
-    kind: str
+    kind: "ImageKind"
     sun_azimuth_deg: float
     sun_elevation_deg: float
     external_id: str | None = None
@@ -100,7 +105,7 @@ def _read(operations: Operations, pixels: NDArray[Any], photograph: Photograph, 
 
 
 def _decode(runtime: Runtime, data: bytes) -> NDArray[np.uint8]:
-    from model.imaging.decode import decode_image
+    from model.imaging import decode_image
 
     limit = runtime.settings.max_image_bytes
     if len(data) > limit:
@@ -206,10 +211,12 @@ def _spot(row: MeasurementRow, plane: TargetPlane, origin: tuple[float, float, f
     return np.array(plane.center)
 
 
-def _observation(operations: Operations, row: MeasurementRow, origin: tuple[float, float, float]) -> Any:
+def _observation(row: MeasurementRow, origin: tuple[float, float, float]) -> "Observation":
+    from model.observation import Observation
+
     plane = store.target_plane(row.target)
     motors = (row.motor_axis_1, row.motor_axis_2)
-    return operations.Observation(
+    return Observation(
         flux=unpack(row.arrays or b"")["centered"],
         sun=sun_direction(row.sun_azimuth_deg, row.sun_elevation_deg),
         center_of_mass=_spot(row, plane, origin),
@@ -222,7 +229,7 @@ def _observation(operations: Operations, row: MeasurementRow, origin: tuple[floa
 def predict_surface(
     runtime: Runtime,
     heliostat_name: str,
-    method: Literal["network", "refined"] = "network",
+    method: "Method" = "network",
     measurements: Sequence[str] | None = None,
     images: int = 8,
 ) -> SurfaceRow:
@@ -242,8 +249,8 @@ def predict_surface(
         if measurements is None:
             measurements = [measurement.identifier for measurement in choose_measurements(session, row, images)]
         chosen = _named_measurements(session, row, measurements)
+    observations = [_observation(measurement, origin) for measurement in chosen]
     with runtime.computing() as operations:
-        observations = [_observation(operations, measurement, origin) for measurement in chosen]
         predicted = operations.predict(heliostat, observations, method)
     with runtime.database.writing() as session:
         row = store.get_heliostat(session, heliostat_name)
@@ -251,7 +258,7 @@ def predict_surface(
         return store.add_surface(session, row, _new_surface(method, predicted, used))[0]
 
 
-def _new_surface(method: str, predicted: SurfacePrediction, used: list[MeasurementRow]) -> NewSurface:
+def _new_surface(method: str, predicted: "SurfacePrediction", used: list[MeasurementRow]) -> NewSurface:
     return NewSurface(
         source=method,
         z=predicted.z,
@@ -272,7 +279,8 @@ class ForecastRequest:
     """What to forecast; ``target`` names a stored plane, else ``plane`` is one.
 
     ``sun_azimuth_deg`` counts from south, positive to the east. ``aim`` (3,) [m] is by default the plane's centre.
-    ``surface``: "current", "ideal" or a version. ``window`` [m]: a square about the centre of mass, else the plane.
+    ``surface``: "current", "ideal" or a version. ``window`` [m]: the side of a square about the centre of mass that is
+    mapped; the whole plane without it.
     """
 
     heliostat: str
@@ -307,13 +315,8 @@ def _plane(session: Session, request: ForecastRequest) -> TargetPlane:
     return store.target_plane(store.get_target(session, request.target))
 
 
-def _window(plane: TargetPlane, center: NDArray[Any], side: float) -> TargetPlane:
-    """A square of ``side`` [m] on the plane about ``center`` (2,) [m]."""
-    return replace(plane, center=plane.to_enu(center), width=side, height=side)
-
-
-def _forecast_row(request: ForecastRequest, plane: TargetPlane, traced: FluxForecast) -> ForecastRow:
-    right, up = (float(value) for value in traced.center_of_mass)
+def _forecast_row(request: ForecastRequest, plane: TargetPlane, traced: "Forecast") -> ForecastRow:
+    right, up = _plain(traced.center_of_mass)  # null where no light comes near the plane
     geometry = {name: _plain(getattr(plane, name)) for name in ("center", "normal", "up", "width", "height")}
     return ForecastRow(
         target_name=request.target,
@@ -342,17 +345,15 @@ def make_forecast(runtime: Runtime, request: ForecastRequest) -> ForecastRow:
     ------
     NotFoundError, ConflictError
         Where heliostat, target or surface version is not stored, or no surface is current.
-    InvalidInputError
-        Where no light falls on the plane, so that a window has no centre.
     UnreachableError
-        Where the heliostat cannot reflect the sun to the aim point.
+        Where the heliostat cannot reflect the sun to the aim point, or light does not reach the plane's lit side.
     """
     with runtime.database.reading() as session:
         row = store.get_heliostat(session, request.heliostat)
         heliostat = load_heliostat(session, row)
         plane = _plane(session, request)
         surface = _chosen_surface(session, row, request.surface)
-    plane, traced = _trace(runtime, heliostat, None if surface is None else unpack(surface.arrays)["z"], request, plane)
+    traced = _trace(runtime, heliostat, None if surface is None else unpack(surface.arrays)["z"], request, plane)
     forecast = _forecast_row(request, plane, traced)
     forecast.heliostat_id = row.id
     forecast.surface_id = None if surface is None else surface.id
@@ -362,19 +363,17 @@ def make_forecast(runtime: Runtime, request: ForecastRequest) -> ForecastRow:
 
 def _trace(
     runtime: Runtime, heliostat: Heliostat, z: NDArray[Any] | None, request: ForecastRequest, plane: TargetPlane
-) -> tuple[TargetPlane, FluxForecast]:
-    """The map, and the plane that it shows."""
-    sun = sun_direction(request.sun_azimuth_deg, request.sun_elevation_deg)
-    aim = np.array(plane.center if request.aim is None else request.aim)
+) -> "Forecast":
+    from model.tracing import Optics
 
-    def traced_on(part: TargetPlane) -> FluxForecast:
-        with runtime.computing() as operations:
-            return operations.forecast(heliostat, z, sun, part, aim=aim, resolution=request.resolution, dni=request.dni)
-
-    whole = traced_on(plane)
-    if request.window is None:
-        return plane, whole
-    if not whole.power > 0:
-        raise InvalidInputError("window: no light falls on the plane, so it has no centre; leave the window out")
-    part = _window(plane, whole.center_of_mass, request.window)
-    return part, traced_on(part)
+    with runtime.computing() as operations:
+        return operations.forecast(
+            heliostat,
+            z,
+            sun_direction(request.sun_azimuth_deg, request.sun_elevation_deg),
+            plane,
+            aim=None if request.aim is None else np.array(request.aim),
+            resolution=request.resolution,
+            window=request.window,
+            optics=Optics(dni=request.dni),
+        )

@@ -3,12 +3,11 @@
 from typing import Annotated
 
 from fastapi import APIRouter, Body, Depends, Path, Query, Response, status
-from pydantic import AwareDatetime
 
 from service import representations, store
 from service.dependencies import HeliostatDep, Limit, MediaType, NamePath, ReadSession, RuntimeDep, require_json
 from service.openapi import arrays, problems
-from service.schemas import Page, SurfaceIn, SurfaceOut, SurfaceSummary, Version
+from service.schemas import Moment, Page, SurfaceIn, SurfaceOut, SurfaceSummary, Version
 from service.workflows import predict_surface
 
 router = APIRouter(prefix="/heliostats/{name}/surfaces", tags=["surfaces"])
@@ -40,7 +39,7 @@ def list_surfaces(
     limit: Limit = 100,
     after: Annotated[Version | None, Query(description="The last version of the page before.")] = None,
     at: Annotated[
-        AwareDatetime | None, Query(description="Answer with the surface that was valid then (time with zone).")
+        Moment | None, Query(description="Answer with the surface that was valid then (time with zone).")
     ] = None,
 ) -> Page[SurfaceSummary] | Response:
     """The history of the surface, oldest version first; with `at` the one that was valid at that time."""

@@ -1,0 +1,280 @@
+"""A service on SQLite or PostgreSQL with a stand-in for the model, and small makers of what it takes."""
+
+import json
+import os
+import uuid
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import psycopg
+import pytest
+from fastapi import FastAPI
+from sqlalchemy import URL, make_url
+
+from model.errors import UnreachableError
+from model.imaging import MeasuredFlux, Quality
+from model.observation import Observation, SurfacePrediction
+from model.plant import Heliostat, TargetPlane
+from service.app import create_app
+from service.database import Database
+from service.operations import Forecast
+from service.settings import Settings
+from service.tables import Base
+
+with warnings.catch_warnings():
+    # Starlette's client prefers the successor of httpx, which the environment does not hold.
+    warnings.simplefilter("ignore")
+    from fastapi.testclient import TestClient
+
+POSTGRES = os.environ.get("HELIOTWIN_TEST_POSTGRES", "postgresql://postgres@127.0.0.1:5432/postgres")
+ORIGIN = (50.913421122592574, 6.387824755874856, 87.0)
+
+
+# --- databases --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="session")
+def postgres_url() -> Iterator[URL]:
+    """A database of our own on the PostgreSQL server, dropped at the end."""
+    server = make_url(POSTGRES).set(drivername="postgresql")
+    address = server.render_as_string(hide_password=False)
+    name = f"heliotwin_test_{uuid.uuid4().hex[:12]}"
+    try:
+        with psycopg.connect(address, autocommit=True, connect_timeout=3) as connection:
+            connection.execute(f'CREATE DATABASE "{name}"')
+    except psycopg.OperationalError as error:
+        pytest.skip(f"no PostgreSQL server at {server}: {str(error).splitlines()[0]}")
+    yield server.set(drivername="postgresql+psycopg", database=name)
+    with psycopg.connect(address, autocommit=True) as connection:
+        connection.execute(f'DROP DATABASE "{name}" WITH (FORCE)')
+
+
+def _empty_postgres(url: URL) -> None:
+    database = Database(url)
+    with database.writing() as session:
+        for table in reversed(Base.metadata.sorted_tables):
+            session.execute(table.delete())  # on a few rows much faster than TRUNCATE
+    database.close()
+
+
+@pytest.fixture(params=["sqlite", pytest.param("postgres", marks=pytest.mark.postgres)])
+def empty_url(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[URL]:
+    """A database without a schema, on each of the two engines."""
+    if request.param == "sqlite":
+        yield URL.create("sqlite", database=str(tmp_path / "store.sqlite"))
+        return
+    url: URL = request.getfixturevalue("postgres_url")
+    yield url
+    database = Database(url)
+    database.downgrade("base")
+    database.close()
+
+
+@pytest.fixture(params=["sqlite", pytest.param("postgres", marks=pytest.mark.postgres)])
+def store_url(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[URL]:
+    """An empty store at the newest schema, on each of the two engines."""
+    if request.param == "sqlite":
+        url = URL.create("sqlite", database=str(tmp_path / "store.sqlite"))
+    else:
+        url = request.getfixturevalue("postgres_url")
+    database = Database(url)
+    database.upgrade()
+    database.close()
+    yield url
+    if request.param == "postgres":
+        _empty_postgres(url)
+
+
+@pytest.fixture
+def database(store_url: URL) -> Iterator[Database]:
+    opened = Database(store_url)
+    yield opened
+    opened.close()
+
+
+# --- the model's stand-in ---------------------------------------------------------------------------------------------
+
+
+@dataclass
+class FakeOperations:
+    """Answers like `service.operations` at no cost, and remembers what it was asked.
+
+    An image whose first pixel is 0 is refused; a forecast that aims below the ground is out of reach.
+    """
+
+    predictions: list[list[Observation]] = field(default_factory=list)
+    forecasts: list[dict[str, Any]] = field(default_factory=list)
+    measured: int = 0
+
+    def measure(self, image: Any, kind: str, plane: TargetPlane, *, corners: Any = None) -> MeasuredFlux:
+        self.measured += 1
+        if np.ravel(image)[0] == 0:
+            return MeasuredFlux(Quality(accepted=False, reason="no_spot", detail="no spot stands out"))
+        flux = np.full((256, 256), 100 / 256**2, dtype=np.float32)
+        centered = np.full((64, 64), 100 / 64**2, dtype=np.float32)
+        if kind == "flux-centered":
+            return MeasuredFlux(Quality(accepted=True), centered=centered)
+        return MeasuredFlux(Quality(accepted=True), flux, centered, np.array([0.5, -0.25]))
+
+    def predict(
+        self, heliostat: Heliostat, observations: list[Observation], method: str = "network"
+    ) -> SurfacePrediction:
+        self.predictions.append(list(observations))
+        z = np.linspace(-1e-3, 1e-3, 256).reshape(4, 8, 8)
+        return SurfacePrediction(
+            z=z,
+            z_std=np.full_like(z, 1e-4),
+            control_points=np.stack([z, z, z], axis=-1),
+            method=method,
+            weights="fake-000000000000",
+            misfit=0.05,
+            used=tuple(observation.identifier for observation in observations),
+        )
+
+    def forecast(self, heliostat: Heliostat, z: Any, sun: Any, plane: TargetPlane, **options: Any) -> Forecast:
+        self.forecasts.append({"heliostat": heliostat.name, "z": z, "sun": sun, "plane": plane, **options})
+        if options["aim"] is not None and options["aim"][2] < 0:
+            raise UnreachableError("the aim point lies behind the mirror")
+        flux = np.full(options["resolution"], 2.0, dtype=np.float32)
+        return Forecast(flux=flux, center_of_mass=np.array([0.1, 0.2]), peak=2.0, power=50.0)
+
+
+@pytest.fixture
+def operations() -> FakeOperations:
+    return FakeOperations()
+
+
+# --- the service ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def settings(tmp_path: Path) -> Settings:
+    return Settings(data_dir=tmp_path / "data", max_image_bytes=200_000, max_image_pixels=500_000)
+
+
+def client_of(app: FastAPI) -> TestClient:
+    """A client that sees a failure as the caller would, instead of its exception."""
+    return TestClient(app, raise_server_exceptions=False)
+
+
+@pytest.fixture
+def app(settings: Settings, operations: FakeOperations) -> FastAPI:
+    return create_app(settings, operations)
+
+
+@pytest.fixture
+def bare(app: FastAPI) -> Iterator[TestClient]:
+    """A service with an empty store."""
+    with client_of(app) as client:
+        yield client
+
+
+@pytest.fixture
+def client(bare: TestClient, tower: dict[str, Any], properties: dict[str, Any]) -> TestClient:
+    """A service that knows a tower with two targets, and the heliostat AA39."""
+    assert bare.put("/v1/plant", json=tower).status_code == 200
+    assert bare.put("/v1/heliostats/AA39", json=properties).status_code == 201
+    return bare
+
+
+# --- things to send ---------------------------------------------------------------------------------------------------
+
+
+def _target(altitude: float) -> dict[str, Any]:
+    east, west, north = 6.387885982262168, 6.387763286988281, 50.913392
+    return {
+        "type": "planar",
+        "normal_vector": [0, 1, 0],
+        "coordinates": {
+            "center": [north, (east + west) / 2, altitude],
+            "upper_left": [north, east, altitude + 3.5],
+            "upper_right": [north, west, altitude + 3.5],
+            "lower_left": [north, east, altitude - 3.5],
+            "lower_right": [north, west, altitude - 3.5],
+        },
+    }
+
+
+@pytest.fixture
+def tower() -> dict[str, Any]:
+    """PAINT's tower measurements."""
+    return {
+        "power_plant_properties": {"ID": "WRI1030197", "coordinates": list(ORIGIN)},
+        "lower": _target(122.9),
+        "upper": _target(130.1),
+        "receiver": {"type": "convex_cylinder", "radius": 4.14},
+    }
+
+
+def _actuator(clockwise: int, initial_angle: float) -> dict[str, Any]:
+    return {
+        "type_axis": "linear",
+        "min_increment": 0,
+        "max_increment": 70000,
+        "increment": 154166.6667,
+        "initial_stroke_length": 0.0775,
+        "offset": 0.338,
+        "pivot_radius": 0.325,
+        "clockwise_axis_movement": clockwise,
+        "initial_angle": initial_angle,
+    }
+
+
+def _facet(x: float, y: float) -> dict[str, Any]:
+    return {"translation_vector": [x, y, 0.04], "canting_e": [0.8025, 0.0, 0.0], "canting_n": [0.0, 0.6375, 0.0]}
+
+
+@pytest.fixture
+def properties() -> dict[str, Any]:
+    """PAINT's heliostat properties."""
+    translations = {f"joint_translation_{axis}_{stage}": 0.0 for axis in "enu" for stage in (1, 2)}
+    return {
+        "heliostat_position": [50.913643297719794, 6.3880132701249455, 88.68894196],
+        "height": 2.56,
+        "width": 3.22,
+        "kinematics_properties": {
+            "actuators": [_actuator(0, 0.039), _actuator(1, 0.944)],
+            **translations,
+            "concentrator_translation_n": 0.175,
+        },
+        "facet_properties": {
+            "number_of_facets": 4,
+            "facets": [_facet(-0.8, 0.64), _facet(0.8, 0.64), _facet(-0.8, -0.64), _facet(0.8, -0.64)],
+        },
+        "renovation": "2021-04-15",
+    }
+
+
+def png(seed: int = 1, size: tuple[int, int] = (32, 32), refused: bool = False) -> bytes:
+    """A small image; another for every seed."""
+    pixels = np.random.default_rng(seed).integers(1, 255, size, dtype=np.uint8)
+    pixels[0, 0] = 0 if refused else 200
+    return cv2.imencode(".png", pixels)[1].tobytes()
+
+
+def metadata(**changes: Any) -> dict[str, Any]:
+    """What goes with an image."""
+    return {"kind": "flux", "target_name": "lower", "sun_azimuth": 20.0, "sun_elevation": 45.0, **changes}
+
+
+Post = Callable[..., Any]
+
+
+@pytest.fixture
+def post(client: TestClient) -> Post:
+    """Posts an image of AA39 with its metadata."""
+
+    def send(image: bytes | None = None, heliostat: str = "AA39", raw: str | None = None, **changes: Any) -> Any:
+        document = json.dumps(metadata(**changes)) if raw is None else raw
+        return client.post(
+            f"/v1/heliostats/{heliostat}/measurements",
+            files={"image": ("spot.png", png() if image is None else image, "image/png")},
+            data={"metadata": document},
+        )
+
+    return send

@@ -1,0 +1,210 @@
+"""Plant, targets and heliostats over HTTP."""
+
+import copy
+import json
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+
+PLANE = {"center": [0, -3, 36], "normal": [0, 2, 0], "width": 8.6, "height": 7.2}
+
+
+def test_plant_must_be_set_first(bare: TestClient, properties: dict[str, Any]):
+    for answer in (
+        bare.get("/v1/plant"),
+        bare.put("/v1/heliostats/AA39", json=properties),
+        bare.post("/v1/heliostats", json={"name": "AA39", "properties": properties}),
+    ):
+        assert answer.status_code == 409
+        assert "/v1/plant" in answer.json()["detail"]
+
+
+def test_plant_brings_its_targets(client: TestClient, tower: dict[str, Any]):
+    assert client.get("/v1/plant").json() == {
+        "name": "WRI1030197",
+        "origin_wgs84": tower["power_plant_properties"]["coordinates"],
+    }
+    listed = client.get("/v1/targets").json()
+    assert [target["name"] for target in listed["items"]] == ["lower", "upper"]
+    lower = client.get("/v1/targets/lower").json()
+    assert lower["height"] == pytest.approx(7.0, abs=0.01)
+    assert lower["normal"] == pytest.approx([0, 1, 0], abs=1e-3)
+    assert lower["corners"]["upper_left"] == tower["lower"]["coordinates"]["upper_left"]
+    assert client.put("/v1/plant", json=tower).status_code == 200
+
+
+def test_plant_does_not_move_under_its_heliostats(client: TestClient, tower: dict[str, Any]):
+    moved = copy.deepcopy(tower)
+    moved["power_plant_properties"]["coordinates"][2] = 90.0
+    answer = client.put("/v1/plant", json=moved)
+    assert answer.status_code == 409
+    assert "origin is fixed" in answer.json()["detail"]
+
+
+def test_target_names_are_checked_in_the_tower_document(bare: TestClient, tower: dict[str, Any]):
+    tower["../lower"] = tower.pop("lower")
+    answer = bare.put("/v1/plant", json=tower)
+    assert answer.status_code == 422
+    assert "../lower" in answer.json()["detail"]
+
+
+def test_target_by_plane(client: TestClient):
+    created = client.put("/v1/targets/screen", json={"plane": PLANE})
+    assert created.status_code == 201
+    assert created.json()["normal"] == [0, 1, 0]
+    assert client.put("/v1/targets/screen", json={"plane": PLANE}).status_code == 200
+    changed = client.put("/v1/targets/screen", json={"plane": PLANE | {"width": 5}})
+    assert (changed.status_code, changed.json()["width"]) == (200, 5)
+    assert client.get("/v1/targets/screen").json() == changed.json()
+
+
+def test_target_by_corners(client: TestClient, tower: dict[str, Any]):
+    names = ("upper_left", "upper_right", "lower_left", "lower_right")
+    corners = {name: tower["lower"]["coordinates"][name] for name in names}
+    created = client.put("/v1/targets/copy", json={"corners": corners})
+    assert created.status_code == 201
+    assert created.json() == client.get("/v1/targets/lower").json() | {"name": "copy"}
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        {},
+        {"plane": PLANE, "corners": {}},
+        {"plane": PLANE | {"normal": [0, 0, 0]}},
+        {"plane": PLANE | {"normal": [0, 0, 1]}},
+        {"plane": PLANE | {"width": 0}},
+        {"plane": PLANE | {"depth": 1}},
+        {"corners": {name: [50, 6, 100] for name in ("upper_left", "upper_right", "lower_left", "lower_right")}},
+    ],
+)
+def test_target_that_is_no_rectangle(client: TestClient, body: dict[str, Any]):
+    assert client.put("/v1/targets/screen", json=body).status_code == 422
+    assert client.get("/v1/targets/screen").status_code == 404
+
+
+def test_heliostat_comes_back_as_it_was_sent(client: TestClient, properties: dict[str, Any]):
+    found = client.get("/v1/heliostats/AA39").json()
+    assert found["properties"] == properties
+    assert found["position_m"] == pytest.approx([13.25, 24.7, 1.69], abs=0.1)
+
+
+def test_heliostat_posted_twice_is_one(client: TestClient, properties: dict[str, Any]):
+    body = {"name": "AC43", "properties": properties}
+    created = client.post("/v1/heliostats", json=body)
+    assert created.status_code == 201
+    assert created.headers["Location"] == "/v1/heliostats/AC43"
+    assert client.post("/v1/heliostats", json=body).status_code == 200
+    other = client.post("/v1/heliostats", json={"name": "AC43", "properties": properties | {"width": 3.0}})
+    assert other.status_code == 409
+    assert "PUT" in other.json()["detail"]
+    assert client.put("/v1/heliostats/AC43", json=properties | {"width": 3.0}).status_code == 200
+    assert client.get("/v1/heliostats/AC43").json()["properties"]["width"] == 3.0
+
+
+def test_older_property_files_are_taken(client: TestClient, properties: dict[str, Any]):
+    properties["kinematic_properties"] = properties.pop("kinematics_properties")
+    assert client.put("/v1/heliostats/AA40", json=properties).status_code == 201
+
+
+def test_heliostats_in_pages(client: TestClient, properties: dict[str, Any]):
+    for name in ("AB01", "AB02"):
+        client.put(f"/v1/heliostats/{name}", json=properties)
+    first = client.get("/v1/heliostats?limit=2").json()
+    assert [item["name"] for item in first["items"]] == ["AA39", "AB01"]
+    assert "properties" not in first["items"][0]
+    second = client.get(f"/v1/heliostats?limit=2&after={first['next']}").json()
+    assert [item["name"] for item in second["items"]] == ["AB02"]
+    assert second["next"] is None
+
+
+@pytest.mark.parametrize("limit", ["0", "501", "-1", "x", "1e2", ""])
+def test_page_size_is_bounded(client: TestClient, limit: str):
+    assert client.get(f"/v1/heliostats?limit={limit}").status_code == 422
+
+
+def _without(document: dict[str, Any], *path: str) -> dict[str, Any]:
+    copied = copy.deepcopy(document)
+    inner = copied
+    for key in path[:-1]:
+        inner = inner[key]
+    del inner[path[-1]]
+    return copied
+
+
+@pytest.mark.parametrize(
+    ("path", "named"),
+    [
+        (("heliostat_position",), "heliostat_position"),
+        (("width",), "width"),
+        (("facet_properties", "facets"), "facets"),
+        (("kinematics_properties",), "kinematics_properties"),
+        (("kinematics_properties", "concentrator_translation_n"), "concentrator_translation_n"),
+    ],
+)
+def test_missing_property_is_named(client: TestClient, properties: dict[str, Any], path: tuple[str, ...], named: str):
+    answer = client.put("/v1/heliostats/AA39", json=_without(properties, *path))
+    assert answer.status_code == 422
+    assert named in answer.json()["detail"]
+
+
+@pytest.mark.parametrize("number", ["NaN", "Infinity", "-Infinity", "1e999", "1" + "0" * 400, "1" + "0" * 5000])
+@pytest.mark.parametrize("place", ["width", "renovation", "deep"])
+def test_numbers_that_are_none_are_refused_anywhere(
+    client: TestClient, properties: dict[str, Any], place: str, number: str
+):
+    properties[place] = "@"
+    text = json.dumps(properties | ({"deep": {"list": [1, "@"]}} if place == "deep" else {})).replace('"@"', number)
+    answer = client.put("/v1/heliostats/AA39", content=text, headers={"Content-Type": "application/json"})
+    assert answer.status_code in (400, 422)
+    assert answer.headers["Content-Type"] == "application/problem+json"
+
+
+@pytest.mark.parametrize("text", ["\x00", "\ud800", "a\udfffb"])
+def test_text_that_no_database_keeps_is_refused(client: TestClient, properties: dict[str, Any], text: str):
+    for document in (properties | {"note": text}, properties | {text: 1}):
+        answer = client.put(
+            "/v1/heliostats/AA39", content=json.dumps(document), headers={"Content-Type": "application/json"}
+        )
+        assert answer.status_code == 422
+
+
+@pytest.mark.parametrize("depth", [100, 5_000, 200_000])
+def test_deep_nesting_is_refused(client: TestClient, depth: int):
+    body = '{"note": ' + "[" * depth + "]" * depth + "}"
+    answer = client.put("/v1/heliostats/AA39", content=body, headers={"Content-Type": "application/json"})
+    assert answer.status_code in (400, 422)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"facet_properties": {"facets": ["x"]}},
+        {"facet_properties": {"facets": [None] * 4}},
+        {"facet_properties": {"facets": [{"translation_vector": "abc"}]}},
+        {
+            "facet_properties": {
+                "facets": [{"translation_vector": [0, 0, 0], "canting_e": [0, 0, 0], "canting_n": [0, 0, 0]}]
+            }
+        },
+        {"kinematics_properties": {"actuators": [1, 2]}},
+        {"kinematics_properties": []},
+        {"kinematics_properties": None},
+        {"heliostat_position": [91, 0, 0]},
+        {"heliostat_position": [1, 2]},
+        {"width": -1},
+    ],
+)
+def test_properties_of_the_wrong_shape(client: TestClient, properties: dict[str, Any], wrong: dict[str, Any]):
+    assert client.put("/v1/heliostats/AA39", json=properties | wrong).status_code == 422
+
+
+@pytest.mark.parametrize(
+    "name", ["..", "a b", "-a", "_a", "a" * 33, "a.b", "%2e%2e", "a%00", "ä", "a;b", "a'--", "%0a"]
+)
+@pytest.mark.parametrize("resource", ["heliostats", "targets"])
+def test_names_fit_the_pattern(client: TestClient, properties: dict[str, Any], resource: str, name: str):
+    for answer in (client.get(f"/v1/{resource}/{name}"), client.put(f"/v1/{resource}/{name}", json=properties)):
+        assert answer.status_code in (404, 405, 422)
+        assert answer.headers["Content-Type"] == "application/problem+json"
