@@ -182,6 +182,24 @@ def client(bare: TestClient, tower: dict[str, Any], properties: dict[str, Any]) 
     return bare
 
 
+@pytest.fixture(scope="session")
+def refusing(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
+    """A service for requests that must be refused: shared, because they change nothing; checked at the end."""
+    settings = Settings(data_dir=tmp_path_factory.mktemp("refusing"), max_image_bytes=200_000, max_image_pixels=500_000)
+    with client_of(create_app(settings, FakeOperations())) as client:
+        client.put("/v1/plant", json=tower_document())
+        client.put("/v1/heliostats/AA39", json=properties_document())
+
+        def state() -> list[str]:
+            paths = ("plant", "targets", "heliostats", "heliostats/AA39", "heliostats/AA39/measurements", "forecasts")
+            return [client.get(f"/v1/{path}").text for path in paths]
+
+        before = state()
+        yield client
+        assert state() == before
+        assert not [path for path in (settings.data_dir / "images").rglob("*") if path.is_file()]
+
+
 # --- things to send ---------------------------------------------------------------------------------------------------
 
 
@@ -200,9 +218,7 @@ def _target(altitude: float) -> dict[str, Any]:
     }
 
 
-@pytest.fixture
-def tower() -> dict[str, Any]:
-    """PAINT's tower measurements."""
+def tower_document() -> dict[str, Any]:
     return {
         "power_plant_properties": {"ID": "WRI1030197", "coordinates": list(ORIGIN)},
         "lower": _target(122.9),
@@ -230,8 +246,12 @@ def _facet(x: float, y: float) -> dict[str, Any]:
 
 
 @pytest.fixture
-def properties() -> dict[str, Any]:
-    """PAINT's heliostat properties."""
+def tower() -> dict[str, Any]:
+    """PAINT's tower measurements."""
+    return tower_document()
+
+
+def properties_document() -> dict[str, Any]:
     translations = {f"joint_translation_{axis}_{stage}": 0.0 for axis in "enu" for stage in (1, 2)}
     return {
         "heliostat_position": [50.913643297719794, 6.3880132701249455, 88.68894196],
@@ -250,6 +270,12 @@ def properties() -> dict[str, Any]:
     }
 
 
+@pytest.fixture
+def properties() -> dict[str, Any]:
+    """PAINT's heliostat properties."""
+    return properties_document()
+
+
 def png(seed: int = 1, size: tuple[int, int] = (32, 32), refused: bool = False) -> bytes:
     """A small image; another for every seed."""
     pixels = np.random.default_rng(seed).integers(1, 255, size, dtype=np.uint8)
@@ -265,10 +291,7 @@ def metadata(**changes: Any) -> dict[str, Any]:
 Post = Callable[..., Any]
 
 
-@pytest.fixture
-def post(client: TestClient) -> Post:
-    """Posts an image of AA39 with its metadata."""
-
+def poster(client: TestClient) -> Post:
     def send(image: bytes | None = None, heliostat: str = "AA39", raw: str | None = None, **changes: Any) -> Any:
         document = json.dumps(metadata(**changes)) if raw is None else raw
         return client.post(
@@ -278,3 +301,15 @@ def post(client: TestClient) -> Post:
         )
 
     return send
+
+
+@pytest.fixture
+def post(client: TestClient) -> Post:
+    """Posts an image of AA39 with its metadata."""
+    return poster(client)
+
+
+@pytest.fixture
+def refused_post(refusing: TestClient) -> Post:
+    """The same to a service that must refuse it."""
+    return poster(refusing)

@@ -85,16 +85,16 @@ def test_forecasts_in_pages(client: TestClient, properties: dict[str, Any]):
     assert client.get("/v1/forecasts?heliostat=AZ99").status_code == 404
 
 
-def test_out_of_reach_is_the_callers_error(client: TestClient):
-    answer = ask(client, target="lower", aim_point=[0, 0, -5])
+def test_out_of_reach_is_the_callers_error(refusing: TestClient):
+    answer = ask(refusing, target="lower", aim_point=[0, 0, -5])
     assert answer.status_code == 422
     assert "behind the mirror" in answer.json()["detail"]
 
 
-def test_what_is_not_there(client: TestClient):
-    assert ask(client, target="middle").status_code == 404
-    assert ask(client, target="lower", heliostat="AB01").status_code == 404
-    assert client.get("/v1/forecasts/1").status_code == 404
+def test_what_is_not_there(refusing: TestClient):
+    assert ask(refusing, target="middle").status_code == 404
+    assert ask(refusing, target="lower", heliostat="AB01").status_code == 404
+    assert refusing.get("/v1/forecasts/1").status_code == 404
 
 
 @pytest.mark.parametrize(
@@ -116,7 +116,7 @@ def test_what_is_not_there(client: TestClient):
         ({"target": "lower", "colour": "red"}, "colour"),
     ],
 )
-def test_wrong_field_is_named(client: TestClient, changes: dict[str, Any], named: str):
-    answer = ask(client, **changes)
+def test_wrong_field_is_named(refusing: TestClient, changes: dict[str, Any], named: str):
+    answer = ask(refusing, **changes)
     assert answer.status_code == 422
     assert named in answer.json()["detail"]

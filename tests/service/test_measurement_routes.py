@@ -160,47 +160,46 @@ def test_centered_image_has_no_place_on_the_target(client: TestClient, post: Pos
         ({"typo": 1}, "metadata.typo"),
     ],
 )
-def test_wrong_metadata_is_named(post: Post, changes: dict[str, Any], named: str):
-    answer = post(**changes)
+def test_wrong_metadata_is_named(refused_post: Post, changes: dict[str, Any], named: str):
+    answer = refused_post(**changes)
     assert answer.status_code == 422
     assert any(error["field"].startswith(named) for error in answer.json()["errors"]), answer.json()
 
 
 @pytest.mark.parametrize("number", ["NaN", "Infinity", "-Infinity", "1e999"])
-def test_numbers_that_are_none(post: Post, number: str):
+def test_numbers_that_are_none(refused_post: Post, number: str):
     for key in ("sun_azimuth", "sun_elevation"):
-        assert post(raw=json.dumps(metadata(**{key: "@"})).replace('"@"', number)).status_code == 422
-    assert post(raw=json.dumps(metadata(motor_position=["@", 1])).replace('"@"', number)).status_code == 422
+        assert refused_post(raw=json.dumps(metadata(**{key: "@"})).replace('"@"', number)).status_code == 422
+    assert refused_post(raw=json.dumps(metadata(motor_position=["@", 1])).replace('"@"', number)).status_code == 422
 
 
 @pytest.mark.parametrize("text", ["", "{", "null", "[]", "x" * 10_000, '{"kind": "flux"}'])
-def test_metadata_that_is_none(post: Post, text: str):
-    assert post(raw=text).status_code == 422
+def test_metadata_that_is_none(refused_post: Post, text: str):
+    assert refused_post(raw=text).status_code == 422
 
 
-def test_unknown_heliostat_or_target(post: Post):
-    assert "heliostat AB01" in post(heliostat="AB01").json()["detail"]
-    answer = post(target_name="middle")
+def test_unknown_heliostat_or_target(refused_post: Post):
+    assert "heliostat AB01" in refused_post(heliostat="AB01").json()["detail"]
+    answer = refused_post(target_name="middle")
     assert answer.status_code == 404
     assert "lower, upper" in answer.json()["detail"]
 
 
 @pytest.mark.parametrize("data", [b"", b"GIF89a", b"<svg xmlns='http://www.w3.org/2000/svg'/>", b"\x00" * 100])
-def test_file_of_another_format(post: Post, data: bytes):
-    answer = post(data)
+def test_file_of_another_format(refused_post: Post, data: bytes):
+    answer = refused_post(data)
     assert answer.status_code == 415
     assert "PNG" in answer.json()["detail"]
 
 
 @pytest.mark.parametrize("data", [png()[:60], png()[:-20], png() + b"PK\x03\x04", b"\xff\xd8\xff\xe0 no more"])
-def test_broken_file_is_refused_and_not_kept(post: Post, data: bytes, settings: Settings):
-    assert post(data).status_code == 422
-    assert not [path for path in (settings.data_dir / "images").rglob("*") if path.is_file()]
+def test_broken_file_is_refused(refused_post: Post, data: bytes):
+    assert refused_post(data).status_code == 422
 
 
-def test_too_many_pixels(post: Post):
+def test_too_many_pixels(refused_post: Post):
     flat = cv2.imencode(".png", np.full((1000, 1000), 7, np.uint8))[1].tobytes()
-    answer = post(flat)
+    answer = refused_post(flat)
     assert answer.status_code == 422
     assert "pixels" in answer.json()["detail"]
 
@@ -227,20 +226,20 @@ def test_body_without_announced_length_is_stopped(client: TestClient, settings: 
 
 
 @pytest.mark.parametrize("content_type", ["application/json", "image/png", "text/plain", ""])
-def test_body_that_is_no_form(client: TestClient, content_type: str):
+def test_body_that_is_no_form(refusing: TestClient, content_type: str):
     headers = {"Content-Type": content_type} if content_type else {}
-    answer = client.post(BASE, content=png(), headers=headers)
+    answer = refusing.post(BASE, content=png(), headers=headers)
     assert answer.status_code == 415
     assert "multipart/form-data" in answer.json()["detail"]
 
 
-def test_form_without_its_parts(client: TestClient):
-    answer = client.post(BASE, files={"other": ("x", b"y")})
+def test_form_without_its_parts(refusing: TestClient):
+    answer = refusing.post(BASE, files={"other": ("x", b"y")})
     assert answer.status_code == 422
     assert {error["field"] for error in answer.json()["errors"]} == {"image", "metadata"}
-    broken = client.post(BASE, content=b"nothing", headers={"Content-Type": "multipart/form-data; boundary=b"})
+    broken = refusing.post(BASE, content=b"nothing", headers={"Content-Type": "multipart/form-data; boundary=b"})
     assert broken.status_code in (400, 422)
-    no_boundary = client.post(BASE, content=b"nothing", headers={"Content-Type": "multipart/form-data"})
+    no_boundary = refusing.post(BASE, content=b"nothing", headers={"Content-Type": "multipart/form-data"})
     assert no_boundary.status_code in (400, 422)
 
 

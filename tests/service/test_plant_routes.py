@@ -79,9 +79,9 @@ def test_target_by_corners(client: TestClient, tower: dict[str, Any]):
         {"corners": {name: [50, 6, 100] for name in ("upper_left", "upper_right", "lower_left", "lower_right")}},
     ],
 )
-def test_target_that_is_no_rectangle(client: TestClient, body: dict[str, Any]):
-    assert client.put("/v1/targets/screen", json=body).status_code == 422
-    assert client.get("/v1/targets/screen").status_code == 404
+def test_target_that_is_no_rectangle(refusing: TestClient, body: dict[str, Any]):
+    assert refusing.put("/v1/targets/screen", json=body).status_code == 422
+    assert refusing.get("/v1/targets/screen").status_code == 404
 
 
 def test_heliostat_comes_back_as_it_was_sent(client: TestClient, properties: dict[str, Any]):
@@ -120,8 +120,8 @@ def test_heliostats_in_pages(client: TestClient, properties: dict[str, Any]):
 
 
 @pytest.mark.parametrize("limit", ["0", "501", "-1", "x", "1e2", ""])
-def test_page_size_is_bounded(client: TestClient, limit: str):
-    assert client.get(f"/v1/heliostats?limit={limit}").status_code == 422
+def test_page_size_is_bounded(refusing: TestClient, limit: str):
+    assert refusing.get(f"/v1/heliostats?limit={limit}").status_code == 422
 
 
 def _without(document: dict[str, Any], *path: str) -> dict[str, Any]:
@@ -143,8 +143,8 @@ def _without(document: dict[str, Any], *path: str) -> dict[str, Any]:
         (("kinematics_properties", "concentrator_translation_n"), "concentrator_translation_n"),
     ],
 )
-def test_missing_property_is_named(client: TestClient, properties: dict[str, Any], path: tuple[str, ...], named: str):
-    answer = client.put("/v1/heliostats/AA39", json=_without(properties, *path))
+def test_missing_property_is_named(refusing: TestClient, properties: dict[str, Any], path: tuple[str, ...], named: str):
+    answer = refusing.put("/v1/heliostats/AA39", json=_without(properties, *path))
     assert answer.status_code == 422
     assert named in answer.json()["detail"]
 
@@ -152,28 +152,28 @@ def test_missing_property_is_named(client: TestClient, properties: dict[str, Any
 @pytest.mark.parametrize("number", ["NaN", "Infinity", "-Infinity", "1e999", "1" + "0" * 400, "1" + "0" * 5000])
 @pytest.mark.parametrize("place", ["width", "renovation", "deep"])
 def test_numbers_that_are_none_are_refused_anywhere(
-    client: TestClient, properties: dict[str, Any], place: str, number: str
+    refusing: TestClient, properties: dict[str, Any], place: str, number: str
 ):
     properties[place] = "@"
     text = json.dumps(properties | ({"deep": {"list": [1, "@"]}} if place == "deep" else {})).replace('"@"', number)
-    answer = client.put("/v1/heliostats/AA39", content=text, headers={"Content-Type": "application/json"})
+    answer = refusing.put("/v1/heliostats/AA39", content=text, headers={"Content-Type": "application/json"})
     assert answer.status_code in (400, 422)
     assert answer.headers["Content-Type"] == "application/problem+json"
 
 
 @pytest.mark.parametrize("text", ["\x00", "\ud800", "a\udfffb"])
-def test_text_that_no_database_keeps_is_refused(client: TestClient, properties: dict[str, Any], text: str):
+def test_text_that_no_database_keeps_is_refused(refusing: TestClient, properties: dict[str, Any], text: str):
     for document in (properties | {"note": text}, properties | {text: 1}):
-        answer = client.put(
+        answer = refusing.put(
             "/v1/heliostats/AA39", content=json.dumps(document), headers={"Content-Type": "application/json"}
         )
         assert answer.status_code == 422
 
 
 @pytest.mark.parametrize("depth", [100, 5_000, 200_000])
-def test_deep_nesting_is_refused(client: TestClient, depth: int):
+def test_deep_nesting_is_refused(refusing: TestClient, depth: int):
     body = '{"note": ' + "[" * depth + "]" * depth + "}"
-    answer = client.put("/v1/heliostats/AA39", content=body, headers={"Content-Type": "application/json"})
+    answer = refusing.put("/v1/heliostats/AA39", content=body, headers={"Content-Type": "application/json"})
     assert answer.status_code in (400, 422)
 
 
@@ -196,15 +196,15 @@ def test_deep_nesting_is_refused(client: TestClient, depth: int):
         {"width": -1},
     ],
 )
-def test_properties_of_the_wrong_shape(client: TestClient, properties: dict[str, Any], wrong: dict[str, Any]):
-    assert client.put("/v1/heliostats/AA39", json=properties | wrong).status_code == 422
+def test_properties_of_the_wrong_shape(refusing: TestClient, properties: dict[str, Any], wrong: dict[str, Any]):
+    assert refusing.put("/v1/heliostats/AA39", json=properties | wrong).status_code == 422
 
 
 @pytest.mark.parametrize(
     "name", ["..", "a b", "-a", "_a", "a" * 33, "a.b", "%2e%2e", "a%00", "ä", "a;b", "a'--", "%0a"]
 )
 @pytest.mark.parametrize("resource", ["heliostats", "targets"])
-def test_names_fit_the_pattern(client: TestClient, properties: dict[str, Any], resource: str, name: str):
-    for answer in (client.get(f"/v1/{resource}/{name}"), client.put(f"/v1/{resource}/{name}", json=properties)):
+def test_names_fit_the_pattern(refusing: TestClient, properties: dict[str, Any], resource: str, name: str):
+    for answer in (refusing.get(f"/v1/{resource}/{name}"), refusing.put(f"/v1/{resource}/{name}", json=properties)):
         assert answer.status_code in (404, 405, 422)
         assert answer.headers["Content-Type"] == "application/problem+json"

@@ -24,25 +24,25 @@ def check(answer: Any, status: int) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("path", ["/", "/v1", "/v1/nothing", "/v1/heliostats/", "/v1/heliostats/a/b", "/../etc/passwd"])
-def test_unknown_path(bare: TestClient, path: str):
-    assert "docs" in check(bare.get(path), 404)["detail"]
+def test_unknown_path(refusing: TestClient, path: str):
+    assert "docs" in check(refusing.get(path), 404)["detail"]
 
 
-def test_unknown_method(bare: TestClient):
-    answer = bare.delete("/v1/heliostats")
+def test_unknown_method(refusing: TestClient):
+    answer = refusing.delete("/v1/heliostats")
     check(answer, 405)
     assert "GET" in answer.headers["Allow"] or "POST" in answer.headers["Allow"]
 
 
-def test_unreadable_body(bare: TestClient):
+def test_unreadable_body(refusing: TestClient):
     headers = {"Content-Type": "application/json"}
-    check(bare.post("/v1/heliostats", content=b"{", headers=headers), 422)
-    check(bare.post("/v1/heliostats", content=b"\xff\xfe", headers=headers), 422)
-    check(bare.post("/v1/heliostats", content=b"", headers=headers), 422)
+    check(refusing.post("/v1/heliostats", content=b"{", headers=headers), 422)
+    check(refusing.post("/v1/heliostats", content=b"\xff\xfe", headers=headers), 422)
+    check(refusing.post("/v1/heliostats", content=b"", headers=headers), 422)
 
 
 @pytest.mark.parametrize("content_type", ["text/plain", "application/x-www-form-urlencoded", "multipart/form-data", ""])
-def test_body_that_is_not_json(bare: TestClient, content_type: str):
+def test_body_that_is_not_json(refusing: TestClient, content_type: str):
     headers = {"Content-Type": content_type} if content_type else {}
     for method, path in (
         ("POST", "/v1/heliostats"),
@@ -52,7 +52,7 @@ def test_body_that_is_not_json(bare: TestClient, content_type: str):
         ("POST", "/v1/forecasts"),
         ("POST", "/v1/heliostats/A/surfaces"),
     ):
-        check(bare.request(method, path, content=b"{}", headers=headers), 415)
+        check(refusing.request(method, path, content=b"{}", headers=headers), 415)
 
 
 def test_body_that_is_too_large(bare: TestClient, settings: Settings):
@@ -66,14 +66,14 @@ def test_body_that_is_too_large(bare: TestClient, settings: Settings):
     check(bare.post("/v1/heliostats", content=chunks(), headers=headers), 413)
 
 
-def test_every_wrong_field_is_listed(bare: TestClient):
-    document = check(bare.post("/v1/forecasts", json={"heliostat": "a b", "sun": {"azimuth_deg": "x"}}), 422)
+def test_every_wrong_field_is_listed(refusing: TestClient):
+    document = check(refusing.post("/v1/forecasts", json={"heliostat": "a b", "sun": {"azimuth_deg": "x"}}), 422)
     assert {error["field"] for error in document["errors"]} == {"heliostat", "sun.azimuth_deg", "sun.elevation_deg"}
 
 
-def test_text_in_errors_can_always_be_sent(bare: TestClient):
+def test_text_in_errors_can_always_be_sent(refusing: TestClient):
     body = json.dumps({"heliostat": "A", "sun": {}, "\ud800": 1})
-    check(bare.post("/v1/forecasts", content=body, headers={"Content-Type": "application/json"}), 422)
+    check(refusing.post("/v1/forecasts", content=body, headers={"Content-Type": "application/json"}), 422)
 
 
 def test_unexpected_failure_says_nothing_of_the_inside(
@@ -106,16 +106,16 @@ def test_database_that_is_away_is_said(app: FastAPI, bare: TestClient, settings:
     assert bare.get("/livez").status_code == 200
 
 
-def test_request_id_is_the_callers_where_it_is_well_formed(bare: TestClient):
-    given = bare.get("/livez", headers={"X-Request-ID": "abc-12345"})
+def test_request_id_is_the_callers_where_it_is_well_formed(refusing: TestClient):
+    given = refusing.get("/livez", headers={"X-Request-ID": "abc-12345"})
     assert given.headers["X-Request-ID"] == "abc-12345"
     for bad in ("short", "a" * 65, "with space here", "a\tb3456789"):
-        assert bare.get("/livez", headers={"X-Request-ID": bad}).headers["X-Request-ID"] != bad
+        assert refusing.get("/livez", headers={"X-Request-ID": bad}).headers["X-Request-ID"] != bad
 
 
-def test_openapi_document_is_tidy(bare: TestClient):
-    document = bare.get("/openapi.json").json()
-    assert bare.get("/docs").status_code == 200
+def test_openapi_document_is_tidy(refusing: TestClient):
+    document = refusing.get("/openapi.json").json()
+    assert refusing.get("/docs").status_code == 200
     operations = [
         (path, method, operation)
         for path, methods in document["paths"].items()
@@ -133,13 +133,13 @@ def test_openapi_document_is_tidy(bare: TestClient):
     jsonschema.Draft202012Validator.check_schema({"$defs": document["components"]["schemas"]})
 
 
-def test_every_number_says_its_unit(bare: TestClient):
+def test_every_number_says_its_unit(refusing: TestClient):
     """Numbers in requests and answers carry a unit in their description, their name, or are known to have none."""
     unitless = {
         "normal", "up", "version", "images", "surface", "resolution", "misfit", "id", "surface_version", "status",
         "accepted", "power_plant_properties",
     }  # fmt: skip
-    schemas = bare.get("/openapi.json").json()["components"]["schemas"]
+    schemas = refusing.get("/openapi.json").json()["components"]["schemas"]
     missing = [
         f"{name}.{key}"
         for name, schema in schemas.items()

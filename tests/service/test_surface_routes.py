@@ -121,17 +121,17 @@ def test_prediction_without_images(client: TestClient, post: Post):
         [],
     ],
 )
-def test_wrong_request(client: TestClient, body: Any):
-    assert client.post(BASE, json=body).status_code == 422
+def test_wrong_request(refusing: TestClient, body: Any):
+    assert refusing.post(BASE, json=body).status_code == 422
 
 
 @pytest.mark.parametrize("version", ["0", "-1", "x", "1.5", "99999999999999999999", "2147483648"])
-def test_wrong_version(client: TestClient, version: str):
-    assert client.get(f"{BASE}/{version}").status_code == 422
+def test_wrong_version(refusing: TestClient, version: str):
+    assert refusing.get(f"{BASE}/{version}").status_code == 422
 
 
-def test_what_is_not_there(client: TestClient):
-    assert client.get(f"{BASE}/1").status_code == 404
-    assert client.get(f"{BASE}/current").status_code == 404
-    assert client.get("/v1/heliostats/AB01/surfaces").status_code == 404
-    assert client.post("/v1/heliostats/AB01/surfaces", json={}).status_code == 404
+def test_what_is_not_there(refusing: TestClient):
+    assert refusing.get(f"{BASE}/1").status_code == 404
+    assert refusing.get(f"{BASE}/current").status_code == 404
+    assert refusing.get("/v1/heliostats/AB01/surfaces").status_code == 404
+    assert refusing.post("/v1/heliostats/AB01/surfaces", json={}).status_code == 404
