@@ -179,8 +179,8 @@ class HeliostatProperties(Document):
     heliostat_position: Wgs84 = Field(description="Latitude [deg], longitude [deg], altitude [m].")
     width: Extent = Field(description="Width of the mirror [m].")
     height: Extent = Field(description="Height of the mirror [m].")
-    kinematics_properties: KinematicsProperties | None = Field(None, description="The mount and its actuators.")
-    kinematic_properties: KinematicsProperties | None = Field(None, description="The same in older files.")
+    kinematics_properties: KinematicsProperties | None = Field(default=None, description="The mount and its actuators.")
+    kinematic_properties: KinematicsProperties | None = Field(default=None, description="The same in older files.")
     facet_properties: FacetProperties = Field(description="Facets: position [m] and canting vectors [m].")
 
 
@@ -210,7 +210,9 @@ class Plane(Model):
 
     center: Position
     normal: Direction = Field(description="Normal of the lit side, east-north-up; need not be of unit length.")
-    up: Direction = Field((0.0, 0.0, 1.0), description="Upward direction of the image, not parallel to the normal.")
+    up: Direction = Field(
+        default=(0.0, 0.0, 1.0), description="Upward direction of the image, not parallel to the normal."
+    )
     width: Extent = Field(description="[m]")
     height: Extent = Field(description="[m]")
 
@@ -283,18 +285,18 @@ class MeasurementIn(Model):
         description="raw: a camera frame; cropped: the rectified target; flux: the separated spot on the whole "
         "target; flux-centered: the spot about its centre of mass, already separated."
     )
-    id: Identifier | None = Field(None, description="The caller's own number of the measurement.")
-    taken_at: Moment | None = Field(None, description="When it was taken, with time zone.")
+    id: Identifier | None = Field(default=None, description="The caller's own number of the measurement.")
+    taken_at: Moment | None = Field(default=None, description="When it was taken, with time zone.")
     motor_position: Motors | None = Field(
-        None, description="Motor positions of both axes [steps], as a pair or as PAINT's object."
+        default=None, description="Motor positions of both axes [steps], as a pair or as PAINT's object."
     )
     focal_spot: Annotated[Wgs84, BeforeValidator(_paint_spot)] | None = Field(
-        None,
+        default=None,
         description="Known centre of mass: latitude [deg], longitude [deg], altitude [m], or PAINT's object (UTIS is "
         "preferred).",
     )
     corners: tuple[Pixel, Pixel, Pixel, Pixel] | None = Field(
-        None,
+        default=None,
         description="Positions (x, y) [px] of the target's upper left, upper right, lower left and lower right "
         "corners in a raw frame; without them they are searched.",
     )
@@ -330,12 +332,15 @@ class MeasurementOut(BaseModel):
 class SurfaceIn(Model):
     """How to predict a surface; without ``measurements`` the newest accepted ones are chosen."""
 
-    method: Method = Field("network", description="network: at once; refined: fitted through the ray tracer.")
+    method: Method = Field(default="network", description="network: at once; refined: fitted through the ray tracer.")
     measurements: list[MeasurementName] | None = Field(
-        None, min_length=1, max_length=8, description="Ids of 1 to 8 accepted measurements."
+        default=None, min_length=1, max_length=8, description="Ids of 1 to 8 accepted measurements."
     )
     images: int = Field(
-        8, ge=1, le=8, description="How many of the newest accepted ones to take, spread over the sun's positions."
+        default=8,
+        ge=1,
+        le=8,
+        description="How many of the newest accepted ones to take, spread over the sun's positions.",
     )
 
 
@@ -384,21 +389,26 @@ class ForecastIn(Model):
     """A flux map to compute."""
 
     heliostat: Name
-    target: Name | None = Field(None, description="A stored target; either this or `plane`.")
-    plane: Plane | None = Field(None, description="Any plane; either this or `target`.")
+    target: Name | None = Field(default=None, description="A stored target; either this or `plane`.")
+    plane: Plane | None = Field(default=None, description="Any plane; either this or `target`.")
     sun: Sun
-    aim_point: Position | None = Field(None, description="Where the heliostat aims [m]; by default the plane's centre.")
-    surface: Literal["current", "ideal"] | Version = Field(
-        "current", description="The heliostat's current surface, the ideal one, or a version."
+    aim_point: Position | None = Field(
+        default=None, description="Where the heliostat aims [m]; by default the plane's centre."
     )
-    dni_w_m2: float = Field(1000.0, gt=0, le=2000, description="Direct normal irradiance [W/m2].")
+    surface: Literal["current", "ideal"] | Version = Field(
+        default="current", description="The heliostat's current surface, the ideal one, or a version."
+    )
+    dni_w_m2: float = Field(default=1000.0, gt=0, le=2000, description="Direct normal irradiance [W/m2].")
     resolution: Annotated[tuple[Side, Side], BeforeValidator(_square)] = Field(
-        (256, 256), description="Rows and columns of the map, or one number for both."
+        default=(256, 256), description="Rows and columns of the map, or one number for both."
     )
     window: float | None = Field(
-        None, ge=0.01, le=1e3, description="Side of a square about the centre of mass to map [m]; else the plane."
+        default=None,
+        ge=0.01,
+        le=1e3,
+        description="Side of a square about the centre of mass to map [m]; else the plane.",
     )
-    normalised: bool = Field(False, description="Scale the map to a sum of 100 instead of W/m2.")
+    normalised: bool = Field(default=False, description="Scale the map to a sum of 100 instead of W/m2.")
 
     @model_validator(mode="after")
     def _one(self) -> Self:
@@ -461,5 +471,7 @@ class Problem(BaseModel):
     detail: str = Field(examples=["sun.elevation_deg: Input should be less than or equal to 90"])
     instance: str = Field(examples=["/v1/forecasts"])
     request_id: str = Field(description="Quote it when reporting a fault; it stands in the service's log.")
-    errors: list[FieldProblem] | None = Field(None, description="Every field at fault, where there are several.")
-    offered: list[str] | None = Field(None, description="Acceptable media types, where none was acceptable.")
+    errors: list[FieldProblem] | None = Field(
+        default=None, description="Every field at fault, where there are several."
+    )
+    offered: list[str] | None = Field(default=None, description="Acceptable media types, where none was acceptable.")

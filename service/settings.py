@@ -31,25 +31,34 @@ class Settings(BaseSettings):
         env_prefix="HELIOTWIN_", env_file=".env", extra="ignore", frozen=True, env_ignore_empty=True
     )
 
-    data_dir: Path = Field(Path("heliotwin-data"), description="Folder of the images and of the embedded database.")
+    data_dir: Path = Field(
+        default=Path("heliotwin-data"), description="Folder of the images and of the embedded database."
+    )
     database_url: str | None = Field(
-        None, description="sqlite:///FILE or postgresql://USER@HOST/NAME; without it SQLite inside data_dir."
+        default=None, description="sqlite:///FILE or postgresql://USER@HOST/NAME; without it SQLite inside data_dir."
     )
     database_password_file: Path | None = Field(
-        None, description="File holding the database password, so that no URL or environment does."
+        default=None, description="File holding the database password, so that no URL or environment does."
     )
     migrate_on_start: bool | None = Field(
-        None, description="Bring the schema to its newest version at start; without it only SQLite is migrated."
+        default=None, description="Bring the schema to its newest version at start; without it only SQLite is migrated."
     )
-    host: str = Field("127.0.0.1", description="Address to listen on.")
-    port: int = Field(8000, ge=1, le=65535)
+    host: str = Field(default="127.0.0.1", description="Address to listen on.")
+    port: int = Field(default=8000, ge=1, le=65535)
     allow_open_network: bool = Field(
-        False, description="Acknowledges that whoever reaches a non-loopback host may read and write everything."
+        default=False,
+        description="Acknowledges that whoever reaches a non-loopback host may read and write everything.",
     )
-    max_image_bytes: int = Field(32 * 2**20, ge=1024, description="Largest image accepted [bytes].")
-    max_image_pixels: int = Field(50_000_000, ge=1024, description="Largest image accepted, width x height [pixels].")
-    max_json_bytes: int = Field(2**20, ge=1024, description="Largest request body that is not an image [bytes].")
-    parallel_computations: int = Field(2, ge=1, le=64, description="Measurements, predictions and tracings at a time.")
+    max_image_bytes: int = Field(default=32 * 2**20, ge=1024, description="Largest image accepted [bytes].")
+    max_image_pixels: int = Field(
+        default=50_000_000, ge=1024, description="Largest image accepted, width x height [pixels]."
+    )
+    max_json_bytes: int = Field(
+        default=2**20, ge=1024, description="Largest request body that is not an image [bytes]."
+    )
+    parallel_computations: int = Field(
+        default=2, ge=1, le=64, description="Measurements, predictions and tracings at a time."
+    )
     log_level: LogLevel = "info"
 
     @field_validator("database_url")

@@ -1,0 +1,232 @@
+"""The container's files, as far as they can be tried without an engine."""
+
+import http.server
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+import yaml
+
+from service.settings import Settings
+
+ROOT = Path(__file__).parents[2]
+DOCKER = ROOT / "docker"
+SECRET = "/run/secrets/database_password"
+
+
+def _substituted(text: str) -> str:
+    """The file with the defaults of its ``${NAME:-default}``."""
+    return re.sub(r"\$\{\w+:-([^}]*)\}", r"\1", text)
+
+
+@pytest.fixture(scope="module")
+def compose() -> dict[str, Any]:
+    document: dict[str, Any] = yaml.safe_load(_substituted((DOCKER / "compose.yaml").read_text(encoding="utf-8")))
+    return document
+
+
+@pytest.fixture(scope="module")
+def dockerfile() -> list[tuple[str, str]]:
+    """Instructions of the Dockerfile with their arguments, continued lines joined."""
+    text = (DOCKER / "Dockerfile").read_text(encoding="utf-8").replace("\\\n", " ")
+    lines = [line for line in text.splitlines() if line and not line.startswith("#")]
+    return [(line.split(maxsplit=1)[0], " ".join(line.split()[1:])) for line in lines]
+
+
+# --- compose.yaml -----------------------------------------------------------------------------------------------------
+
+
+def test_compose_file_fits_the_published_schema(compose: dict[str, Any]):
+    schema = json.loads((Path(__file__).parent / "compose-spec.json").read_text(encoding="utf-8"))
+    jsonschema.Draft202012Validator(schema).validate(compose)
+
+
+def test_services_start_in_order(compose: dict[str, Any]):
+    services = compose["services"]
+    assert services["migrate"]["depends_on"] == {"database": {"condition": "service_healthy"}}
+    assert services["service"]["depends_on"]["migrate"] == {"condition": "service_completed_successfully"}
+    assert services["migrate"]["restart"] == "no"
+    for name in ("database", "service"):
+        assert "test" in services[name]["healthcheck"]
+
+
+def test_what_compose_names_exists(compose: dict[str, Any]):
+    for service in compose["services"].values():
+        for volume in service.get("volumes", []):
+            assert volume.split(":")[0] in compose["volumes"]
+        assert set(service.get("secrets", [])) <= set(compose["secrets"])
+        if "build" in service:
+            assert (DOCKER / service["build"]["context"] / service["build"]["dockerfile"]).is_file()
+
+
+def test_no_secret_is_in_the_file(compose: dict[str, Any]):
+    for service in compose["services"].values():
+        for key, value in service.get("environment", {}).items():
+            assert not ("PASSWORD" in key and not key.endswith("_FILE")), key
+            assert not re.search(r"://[^/@]*:[^/@]*@", value), value
+    assert "secrets/" in (DOCKER / ".gitignore").read_text(encoding="utf-8")
+
+
+def test_containers_have_no_more_rights_than_they_need(compose: dict[str, Any]):
+    for name in ("migrate", "service"):
+        service = compose["services"][name]
+        assert service["read_only"] is True
+        assert service["cap_drop"] == ["ALL"]
+    for port in compose["services"]["service"]["ports"]:
+        assert port.startswith("127.0.0.1:")
+
+
+def test_environment_makes_valid_settings(compose: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    secret = tmp_path / "database_password"
+    secret.write_text("p@ss:word\n", encoding="utf-8")
+    for name in ("migrate", "service"):
+        for key, value in compose["services"][name]["environment"].items():
+            monkeypatch.setenv(key, value.replace(SECRET, str(secret)))
+        settings = Settings(_env_file=None)  # type: ignore[call-arg]  # pydantic-settings' own argument
+        assert settings.database.drivername == "postgresql+psycopg"
+        assert settings.database.password == "p@ss:word"
+        assert not settings.migrates_on_start
+
+
+# --- Dockerfile -------------------------------------------------------------------------------------------------------
+
+
+def _patterns() -> list[str]:
+    lines = (DOCKER / "Dockerfile.dockerignore").read_text(encoding="utf-8").splitlines()
+    return [line for line in lines if line and not line.startswith("#")]
+
+
+def _sources(dockerfile: list[tuple[str, str]]) -> list[str]:
+    copies = [arguments.split() for name, arguments in dockerfile if name == "COPY"]
+    return [source for words in copies if not words[0].startswith("--from") for source in words[:-1]]
+
+
+def test_sources_exist_and_are_in_the_context(dockerfile: list[tuple[str, str]]):
+    for source in _sources(dockerfile):
+        assert f"!{source}" in _patterns()
+        assert (ROOT / source).exists(), source
+
+
+def test_image_does_not_run_as_root(dockerfile: list[tuple[str, str]]):
+    users = [arguments for name, arguments in dockerfile if name == "USER"]
+    assert users == ["heliotwin"]
+    assert ("ENTRYPOINT", '["heliotwin"]') in dockerfile
+    assert ("CMD", '["serve"]') in dockerfile
+    names = [name for name, _ in dockerfile]
+    assert names.index("USER") < names.index("ENTRYPOINT")
+
+
+def test_torch_is_the_locked_one(dockerfile: list[tuple[str, str]]):
+    text = " ".join(arguments for _, arguments in dockerfile)
+    assert re.findall(r"torch==([\d.]+)", text) == re.findall(
+        r'"torch==([\d.]+)"', (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    )
+
+
+def test_no_package_index_is_named():
+    for path in DOCKER.iterdir():
+        if path.is_file():
+            assert not re.search(r"https?://(?!127\.0\.0\.1)", path.read_text(encoding="utf-8")), path
+
+
+# --- health checks ----------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def _answering(status: int) -> Iterator[int]:
+    """A server on this machine that answers everything with ``status``; yields its port."""
+
+    class Handler(http.server.BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(status)
+            self.end_headers()
+
+        def log_message(self, *_: Any) -> None:
+            pass
+
+    with http.server.HTTPServer(("127.0.0.1", 0), Handler) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield server.server_address[1]
+        server.shutdown()
+        thread.join()
+
+
+def _of_image(dockerfile: list[tuple[str, str]], _compose: dict[str, Any]) -> list[str]:
+    (arguments,) = [arguments for name, arguments in dockerfile if name == "HEALTHCHECK"]
+    command: list[str] = json.loads(arguments.split("CMD ", 1)[1])
+    return command
+
+
+def _of_compose(_dockerfile: list[tuple[str, str]], compose: dict[str, Any]) -> list[str]:
+    command: list[str] = compose["services"]["service"]["healthcheck"]["test"][1:]
+    return command
+
+
+@pytest.mark.parametrize("command_of", [_of_image, _of_compose])
+@pytest.mark.parametrize(("status", "is_healthy"), [(200, True), (503, False)])
+def test_health_check_command(
+    dockerfile: list[tuple[str, str]],
+    compose: dict[str, Any],
+    command_of: Callable[..., list[str]],
+    status: int,
+    is_healthy: bool,
+):
+    program, *arguments = command_of(dockerfile, compose)
+    assert program == "python"
+    with _answering(status) as port:
+        arguments = [argument.replace(":8000/", f":{port}/") for argument in arguments]
+        environment = os.environ | {"HELIOTWIN_PORT": str(port)}
+        done = subprocess.run([sys.executable, *arguments], env=environment, capture_output=True, check=False)
+    assert (done.returncode == 0) is is_healthy
+
+
+# --- the build by hand ------------------------------------------------------------------------------------------------
+
+
+_TRY = """
+import service, pathlib, sys
+assert pathlib.Path(service.__file__).is_relative_to(sys.argv[1]), service.__file__
+from service.server import migrate
+from service.settings import Settings
+print(migrate(Settings(data_dir=pathlib.Path(sys.argv[2]))))
+from model.network.predictor import default_predictor
+print(default_predictor().name)
+"""
+
+
+def _ignored(folder: str, names: list[str]) -> list[str]:
+    patterns = [pattern.removeprefix("**/") for pattern in _patterns() if pattern.startswith("**/")]
+    return [name for name in names if any(fnmatch(name, pattern) for pattern in patterns)]
+
+
+@pytest.mark.slow
+def test_installed_copy_brings_migrations_and_weights(dockerfile: list[tuple[str, str]], tmp_path: Path):
+    """What the Dockerfile copies is enough to install the service and to run it from anywhere."""
+    context, installed = tmp_path / "context", tmp_path / "installed"
+    context.mkdir()
+    for source in _sources(dockerfile):
+        path = ROOT / source
+        if path.is_dir():
+            shutil.copytree(path, context / source, ignore=_ignored)
+        elif path.is_file():
+            shutil.copy(path, context / source)
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--no-index"]
+    subprocess.run([*pip, "--target", str(installed), str(context)], check=True, capture_output=True)
+    environment = os.environ | {"PYTHONPATH": str(installed)}
+    command = [sys.executable, "-c", _TRY, str(installed), str(tmp_path / "data")]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, check=True, capture_output=True, text=True)
+    revision, weights = done.stdout.split()
+    assert revision.isdigit()
+    assert weights.startswith("surface-network-")
