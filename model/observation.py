@@ -92,3 +92,16 @@ def scene_of(
     spots = np.array([o.center_of_mass for o in observations])
     angles = align_to_spots([heliostat] * count, [points] * count, suns, targets, spots)
     return Scene.build([heliostat] * count, [points] * count, angles, suns, targets, dtype=dtype)
+
+
+def spread_suns(suns: NDArray[np.float64], count: int) -> list[int]:
+    """Indices of up to ``count`` unit vectors of (N, 3): the first, then each time the farthest from those chosen.
+
+    Images under suns that stand far apart tell more of a mirror than images of one morning.
+    """
+    chosen = [0]
+    while len(chosen) < min(count, len(suns)):
+        nearest = (suns @ suns[chosen].T).max(axis=1)
+        nearest[chosen] = np.inf
+        chosen.append(int(nearest.argmin()))
+    return chosen

@@ -59,7 +59,8 @@ class SurfacePrior:
         content = path.read_bytes()
         with np.load(io.BytesIO(content)) as data:
             name = f"{path.stem}-{hashlib.sha256(content).hexdigest()[:12]}"
-            return cls(*(data[key].astype(np.float64) for key in ("mean", "basis")), float(data["residual"]), name)
+            mean, basis = data["mean"].astype(np.float64), data["basis"].astype(np.float64)
+            return cls(mean, basis, float(data["residual"]), name)
 
     def coefficients(self, z: Array) -> Array:
         """Coefficients (K,) of the surface of the prior's span nearest to ``z`` (4, 8, 8) [m]."""

@@ -248,14 +248,16 @@ class MeasurementFolder:
     optics: Optics
     skipped: dict[str, str]
 
-    def measurements(self, heliostat: str) -> list[Measurement]:
-        """All readable measurements of a heliostat that have an image, by identifier."""
-        return [m for m in self._measurements(heliostat) if m.images]
+    def measurements(self, heliostat: str, with_images: bool = True) -> list[Measurement]:
+        """All measurements of a heliostat by identifier, or only those that have an image."""
+        return [m for m in self._measurements(heliostat) if m.images or not with_images]
 
     def _measurements(self, heliostat: str) -> Iterator[Measurement]:
         folder = self.root / heliostat / "Calibration"
         for path in sorted(folder.glob("*calibration-properties.json")):
             identifier = path.name.removesuffix("calibration-properties.json").removesuffix("-")
+            if not identifier:
+                continue  # a sample that PAINT ships without a number; nothing could refer to it
             measurement = read_measurement(identifier, heliostat, read_json(path), self.plant)
             images = {kind: folder / f"{identifier}-{kind}.png" for kind in IMAGE_KINDS}
             measurement.images.update({kind: file for kind, file in images.items() if file.is_file()})

@@ -25,12 +25,12 @@ def split_by_heliostat(count: int, held_out: int, seed: int) -> tuple[NDArray[np
 
 def rotated(z: Array) -> Array:
     """The same mirrors (..., 4, 8, 8) turned by 180 degrees about their normals (Lewen et al. 2024)."""
-    return z[..., ::-1, ::-1, ::-1]
+    return np.asarray(z[..., ::-1, ::-1, ::-1])
 
 
 def mirrored(z: Array) -> Array:
     """The same mirrors (..., 4, 8, 8) with left and right exchanged."""
-    return z[..., [1, 0, 3, 2], ::-1, :]
+    return np.asarray(z[..., [1, 0, 3, 2], ::-1, :])
 
 
 @dataclass(frozen=True)

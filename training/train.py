@@ -131,7 +131,8 @@ class Run:
         error, slopes, likelihood = loss_terms(heights.float(), spread.float(), truth)
         self.optimizer.param_groups[0]["lr"] = self._learning_rate()
         self.optimizer.zero_grad()
-        (error + c.slope_weight * slopes + c.spread_weight * likelihood).backward()
+        loss = error + c.slope_weight * slopes + c.spread_weight * likelihood
+        loss.backward()  # type: ignore[no-untyped-call]
         nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
         self.optimizer.step()
         self._update_average()

@@ -112,7 +112,8 @@ class Encoder(nn.Module):
         x = self.fold(x)
         for block in self.blocks:
             x = block(x, style)
-        return self.to_features(torch.cat([x.flatten(1), style], dim=1))
+        features: Tensor = self.to_features(torch.cat([x.flatten(1), style], dim=1))
+        return features
 
 
 class Pooling(nn.Module):
@@ -141,7 +142,8 @@ class Pooling(nn.Module):
         features = features + self.mix(mixed)
         features = features + self.mlp(features)
         weights = (self.to_weight(features)[..., 0] + hidden).softmax(dim=-1)
-        return (features * weights[..., None]).sum(dim=1)
+        pooled: Tensor = (features * weights[..., None]).sum(dim=1)
+        return pooled
 
 
 class Decoder(nn.Module):

@@ -91,8 +91,8 @@ def trace_montecarlo(
     irradiance : (B, rows, columns) [W/m2]
         Row 0 at the top.
     spot : (B, 2) [m]
-        Centre of mass of all rays, right and up of the plane's centre; also the window's centre where it is on the spot.
-        The far aureole is heavy-tailed, so that this is noisier than the convolution tracer's.
+        Centre of mass under a point sun, right and up of the plane's centre; the window's centre where it is on the
+        spot.
     """
     if rays < 1:
         raise InvalidInputError("rays must be at least one")
@@ -128,7 +128,8 @@ def _histogram(hits: Array, weight: Array, window: Window) -> Array:
     row = np.floor((window.height / 2 - hits[:, 1]) / pixel_y)
     inside = (column >= 0) & (column < window.columns) & (row >= 0) & (row < window.rows)
     cell = (row[inside] * window.columns + column[inside]).astype(np.int64)
-    return np.bincount(cell, weight[inside], window.rows * window.columns).reshape(window.rows, window.columns)
+    image = np.bincount(cell, weight[inside], window.rows * window.columns).astype(np.float64)
+    return image.reshape(window.rows, window.columns)
 
 
 def _irradiance(scene: Scene, index: int, optics: Optics) -> float:

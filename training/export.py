@@ -1,0 +1,106 @@
+"""Export a run's averaged weights to ONNX, check them against torch, write the model card.
+
+``python -m training.export --run runs/first``
+"""
+
+import argparse
+import json
+import math
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from model.network.architecture import CONDITIONS, IMAGE_SIZE, MAX_IMAGES, SurfaceNetwork
+from model.network.predictor import WEIGHTS, SurfacePredictor
+from training.evaluate import evaluate
+from training.train import Run, TrainConfig
+
+PARITY_MM = 1e-4
+"""Largest difference between torch and onnxruntime that is let through [mm]."""
+
+
+def example(batch: int, images: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Inputs of the network's form, the first ``images`` of eight present."""
+    generator = torch.Generator().manual_seed(batch * 10 + images)
+    flux = torch.rand(batch, MAX_IMAGES, IMAGE_SIZE, IMAGE_SIZE, generator=generator) ** 4
+    flux = 100 * flux / flux.sum(dim=(2, 3), keepdim=True)
+    conditions = torch.randn(batch, MAX_IMAGES, CONDITIONS, generator=generator)
+    mask = torch.zeros(batch, MAX_IMAGES)
+    mask[:, :images] = 1
+    return flux, conditions, mask
+
+
+def export(network: SurfaceNetwork, path: Path) -> None:
+    """Write the network as ONNX with a free batch size."""
+    batch = torch.export.Dim("batch", min=1, max=4096)
+    torch.onnx.export(
+        network.eval(),
+        example(2, 5),
+        str(path),
+        input_names=["flux", "conditions", "mask"],
+        output_names=["heights", "spread"],
+        dynamic_shapes=({0: batch}, {0: batch}, {0: batch}),
+        dynamo=True,
+        external_data=False,
+        verbose=False,
+    )
+
+
+def parity(network: SurfaceNetwork, path: Path) -> float:
+    """Largest difference [mm] between torch and onnxruntime at batches 1, 2, 7 and one to eight images."""
+    session = SurfacePredictor(path)
+    worst = 0.0
+    for batch in (1, 2, 7):
+        for images in range(1, MAX_IMAGES + 1):
+            inputs = example(batch, images)
+            with torch.no_grad():
+                expected = network(*inputs)[0].numpy()
+            z, _ = session.run(*(tensor.numpy() for tensor in inputs))
+            worst = max(worst, float(np.abs(z * 1e3 - expected).max()))
+    return worst
+
+
+def model_card(run: Run, difference: float) -> dict[str, Any]:
+    """What the weights are, what they were trained on and how well they do."""
+    network = run.average
+    return {
+        "name": "surface-network",
+        "task": "mirror surface (4 x 8 x 8 control heights) from 1 to 8 flux images of one heliostat",
+        "parameters": sum(p.numel() for p in network.parameters()),
+        "trained_on": {
+            "surfaces": f"{len(run.surfaces)} measured surfaces of the Solar Tower Juelich (surfaces.npz), augmented",
+            "held_out": run.held_out_names,
+            "images": "convolution-traced flux with random cameras, suns of the year, field positions of Juelich",
+            "steps": run.step,
+            "samples": run.step * run.config.batch,
+        },
+        "config": asdict(run.config),
+        "onnx_parity_mm": difference,
+        "evaluation": evaluate(run),
+        "limits": "Four-facet mirrors of the Juelich kind, flux in 4 m x 4 m windows; other mirrors are out of domain.",
+    }
+
+
+def main() -> None:
+    """Export, check, write."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--run", type=Path, default=Path("runs/first"))
+    parser.add_argument("--out", type=Path, default=WEIGHTS)
+    arguments = parser.parse_args()
+    run = Run(TrainConfig.read(arguments.run / "config.json"), arguments.run, torch.device("cpu"))
+    network = run.average.to(memory_format=torch.contiguous_format)
+    export(network, arguments.out)
+    difference = parity(network, arguments.out)
+    if not math.isfinite(difference) or difference > PARITY_MM:
+        raise SystemExit(f"ONNX differs from torch by {difference:.2e} mm, more than {PARITY_MM:.0e}")
+    card = model_card(run, difference)
+    arguments.out.with_suffix(".json").write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
+    print(json.dumps(card["evaluation"], indent=1))
+    print(f"{arguments.out}: {arguments.out.stat().st_size / 1e6:.1f} MB, parity {difference:.1e} mm")
+
+
+if __name__ == "__main__":
+    main()
