@@ -24,6 +24,7 @@ _LEVELS = (0.1, 0.16, 0.25, 0.35, 0.5)  # relative darkness
 _MIN_SIDE, _MAX_SIDE = 12, 220  # of a mark, in the searched image [px]
 _CELLS = 32
 _MIN_MATCH = 0.62
+_REACHES = (0.14, 0.08, 0.05)  # of the arm: how far an edge is searched, in rounds
 _STROKES = (0.14, 0.2, 0.27, 0.34)
 _TILTS_DEG = tuple(range(-24, 25, 6))
 
@@ -171,8 +172,9 @@ def _scaled(mark: Mark, factor: float) -> Mark:
 
 def _refined(gray: NDArray[np.uint8], mark: Mark) -> Mark:
     """The mark with its reference point measured on its edges; unchanged where they are not clear."""
-    for _ in range(2):
-        better = _edge_corner(gray, mark) if mark.kind == "L" else _edge_tee(gray, mark)
+    for reach in _REACHES:
+        measure = _edge_corner if mark.kind == "L" else _edge_tee
+        better = measure(gray, mark, max(2.0, reach * mark.size))
         if better is None or np.linalg.norm(better.point - mark.point) > 0.3 * mark.size:
             return mark
         mark = better
@@ -183,58 +185,76 @@ def _moved(mark: Mark, first: Line | None, second: Line | None) -> Mark | None:
     """The mark with its reference point where two lines meet and its arms along them, or None."""
     if first is None or second is None:
         return None
-    point = _intersection(first, second)
+    point = intersection(first, second)
     if point is None:
         return None
     lengths = np.linalg.norm(mark.arms, axis=1, keepdims=True)
     return Mark(mark.kind, mark.quarter, point, np.stack([first[1], second[1]]) * lengths, mark.score)
 
 
-def _edge_corner(gray: NDArray[np.uint8], mark: Mark) -> Mark | None:
+def _edge_corner(gray: NDArray[np.uint8], mark: Mark, reach: float) -> Mark | None:
     """An L's outer corner: where the outer edges of its two arms meet."""
-    first = _edge_line(gray, mark.point + 0.15 * mark.arms[0], 0.7 * mark.arms[0], mark.arms[1])
-    second = _edge_line(gray, mark.point + 0.15 * mark.arms[1], 0.7 * mark.arms[1], mark.arms[0])
+    first = _edge_line(gray, mark.point + 0.15 * mark.arms[0], 0.7 * mark.arms[0], mark.arms[1], reach)
+    second = _edge_line(gray, mark.point + 0.15 * mark.arms[1], 0.7 * mark.arms[1], mark.arms[0], reach)
     return _moved(mark, first, second)
 
 
-def _edge_tee(gray: NDArray[np.uint8], mark: Mark) -> Mark | None:
+def _edge_tee(gray: NDArray[np.uint8], mark: Mark, reach: float) -> Mark | None:
     """A T's reference point: where the axis of its stem meets the outer edge of its bar."""
     half, stem = mark.arms
-    bar = _edge_line(gray, mark.point - 0.85 * half, 1.7 * half, stem)
+    bar = _edge_line(gray, mark.point - 0.85 * half, 1.7 * half, stem, reach)
     start, run = mark.point + 0.4 * stem, 0.5 * stem
-    left = _edge_line(gray, start - 0.2 * half, run, half)
-    right = _edge_line(gray, start + 0.2 * half, run, -half)
+    left = _edge_line(gray, start - 0.2 * half, run, half, reach)
+    right = _edge_line(gray, start + 0.2 * half, run, -half, reach)
     if left is None or right is None:
         return None
     along = (left[1] + right[1]) / np.linalg.norm(left[1] + right[1])
     return _moved(mark, bar, ((left[0] + right[0]) / 2, along))
 
 
-def _edge_line(gray: NDArray[np.uint8], start: Points, run: Points, inward: Points) -> Line | None:
-    """The line along which brightness falls, near ``start`` to ``start + run``, towards ``inward``."""
+def _edge_line(gray: NDArray[np.uint8], start: Points, run: Points, inward: Points, reach: float) -> Line | None:
+    """The line along which brightness falls towards ``inward``, near ``start`` to ``start + run``, within ``reach``."""
     across = np.array([-run[1], run[0]]) / np.linalg.norm(run)
     across *= np.sign(across @ inward)
-    reach = 0.17 * float(np.linalg.norm(inward)) * (2 if abs(np.linalg.norm(inward)) < np.linalg.norm(run) / 2 else 1)
     offsets = np.arange(-reach, reach + 0.25, 0.5)
     along = start + np.linspace(0, 1, max(8, int(np.linalg.norm(run) / 2)))[:, None] * run
-    places = (along[:, None] + offsets[:, None] * across).astype(np.float32)
-    profiles = cv2.remap(gray, places[..., 0], places[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    fall = np.maximum(-np.diff(profiles.astype(np.float64), axis=1), 0)
+    fall = _fall(gray, along[:, None] + offsets[:, None] * across)
+    # The nearer the expected edge, the likelier; a rail or a seam beside the mark may be as sharp.
+    fall *= np.exp(-0.5 * ((offsets[:-1] + 0.25) / (0.5 * reach)) ** 2)
     drop = fall.max(axis=1)
-    usable = drop > max(1.5, 0.4 * float(np.median(drop)))
+    usable = drop > max(0.7, 0.4 * float(np.median(drop)))
     if usable.sum() < 6:
         return None
     fall = np.where(fall >= 0.4 * drop[:, None], fall, 0)[usable]
     shift = fall @ (offsets[:-1] + 0.25) / fall.sum(axis=1)
-    edge = (along[usable] + shift[:, None] * across).astype(np.float32)
-    dx, dy, x, y = (float(value) for value in cv2.fitLine(edge, cv2.DIST_HUBER, 0, 0.01, 0.01).ravel())
+    return _line_through(along[usable] + shift[:, None] * across, shift, run)
+
+
+def _fall(gray: NDArray[np.uint8], places: Points) -> Points:
+    """Fall of brightness (profiles, steps - 1) from step to step along profiles at places (profiles, steps, 2)."""
+    x, y = np.moveaxis(places.astype(np.float32), -1, 0)
+    profiles = cv2.remap(gray, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    # Neighbouring profiles are averaged along the edge, which is straight, before their slope is taken.
+    steady = cv2.blur(profiles.astype(np.float32), (1, max(1, len(profiles) // 5)))
+    return np.maximum(-np.diff(steady.astype(np.float64), axis=1), 0)
+
+
+def _line_through(points: Points, shift: Points, run: Points) -> Line:
+    """The line through edge points (n, 2), without those that lie far from most."""
+    deviation = np.abs(shift - np.median(shift))
+    close = deviation <= max(1.5, 3 * float(np.median(deviation)))
+    dx, dy, x, y = (
+        float(value) for value in cv2.fitLine(points[close].astype(np.float32), cv2.DIST_HUBER, 0, 0.01, 0.01).ravel()
+    )
     direction = np.array([dx, dy])
     return np.array([x, y]), direction * np.sign(direction @ run)
 
 
-def _intersection(first: Line, second: Line) -> Points | None:
-    matrix = np.stack([first[1], -second[1]], axis=1)
+def intersection(first: Line, second: Line) -> Points | None:
+    """Where two lines meet (2,), or None if they are nearly parallel."""
+    along = [line[1] / np.linalg.norm(line[1]) for line in (first, second)]
+    matrix = np.stack([along[0], -along[1]], axis=1)
     if abs(np.linalg.det(matrix)) < 0.2:
         return None
-    along = np.linalg.solve(matrix, second[0] - first[0])
-    return np.asarray(first[0] + along[0] * first[1])
+    distance = np.linalg.solve(matrix, second[0] - first[0])[0]
+    return np.asarray(first[0] + distance * along[0])

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model.errors import ImageRefusedError, InvalidInputError
-from model.imaging.marks import Kind, Mark, Points, find_marks
+from model.imaging.marks import Kind, Mark, Points, find_marks, intersection
 from model.plant import TargetPlane
 
 CROP_SIZE = 256
@@ -37,7 +37,9 @@ class MarkPlace:
 
 
 _ALONE = (MarkPlace("L", 0, 0, 0), MarkPlace("L", 1, 1, 0), MarkPlace("L", 3, 0, 1), MarkPlace("L", 2, 1, 1))
-# The upper of two targets; the lower one has the same marks, one side further up.
+_SQUARE = np.array([[place.x, place.y] for place in _ALONE], dtype=np.float64)
+# The upper of two targets; the lower one has the same marks, one side further up. A layout starts with the target's own
+# corners: upper left, upper right, lower left, lower right.
 _UPPER = (
     MarkPlace("L", 0, 0, 0),
     MarkPlace("L", 1, 1, 0),
@@ -48,7 +50,9 @@ _UPPER = (
     MarkPlace("L", 2, 1, 2),
     MarkPlace("T", 2, 0.5, 2),
 )
-_LOWER = tuple(MarkPlace(place.kind, place.quarter, place.x, place.y - 1) for place in _UPPER)
+_LOWER = tuple(
+    MarkPlace(place.kind, place.quarter, place.x, place.y - 1) for place in (*_UPPER[2:4], *_UPPER[5:7], *_UPPER[:2])
+) + tuple(MarkPlace(place.kind, place.quarter, place.x, place.y - 1) for place in (_UPPER[4], _UPPER[7]))
 
 
 def mark_layouts(target_name: str) -> tuple[tuple[MarkPlace, ...], ...]:
@@ -141,11 +145,24 @@ def _fit_layout(marks: list[Mark], layout: tuple[MarkPlace, ...], plane: TargetP
         [mark for mark in marks if (mark.kind, mark.quarter) == (place.kind, place.quarter)][:_CANDIDATES]
         for place in layout
     ]
+    own = _best_of(((0, 1, 2, 3),), layout, candidates, plane)
+    if own is not None:
+        return own
+    # A corner's mark is hidden: by other marks of the layout, or else by its neighbours' arms.
+    others = tuple(places for places in combinations(range(len(layout)), 4) if places != (0, 1, 2, 3))
+    fitted = _best_of(others, layout, candidates, plane)
+    return fitted if fitted is not None else _best_completed(layout, candidates, plane)
+
+
+def _best_of(
+    sets: tuple[tuple[int, ...], ...],
+    layout: tuple[MarkPlace, ...],
+    candidates: list[list[Mark]],
+    plane: TargetPlane,
+) -> Points | None:
+    """The corners by the best agreeing four marks, out of the given sets of places."""
     best: tuple[float, Points] | None = None
-    # The target's own corners come first in a layout; other four marks are tried only where one of those is hidden.
-    for places in combinations(range(len(layout)), 4):
-        if best is not None and places != (0, 1, 2, 3) and best[0] >= 3.0:
-            break
+    for places in sets:
         source = np.array([[layout[i].x, layout[i].y] for i in places], dtype=np.float64)
         if _spread(source) < 0.2:
             continue
@@ -154,6 +171,33 @@ def _fit_layout(marks: list[Mark], layout: tuple[MarkPlace, ...], plane: TargetP
             if fitted is not None and (best is None or fitted[0] > best[0]):
                 best = fitted
     return None if best is None else best[1]
+
+
+def _best_completed(layout: tuple[MarkPlace, ...], candidates: list[list[Mark]], plane: TargetPlane) -> Points | None:
+    """The corners by the best agreeing three corner marks, the fourth put where its neighbours' arms meet."""
+    best: tuple[float, Points] | None = None
+    for hidden in range(4):
+        opposite = 3 - hidden
+        first, second = (i for i in range(4) if i not in (hidden, opposite))
+        for across, a, b in product(candidates[opposite], candidates[first], candidates[second]):
+            guess = _meeting(across, a, b)
+            if guess is None:
+                continue
+            chosen = {hidden: guess, opposite: across, first: a, second: b}
+            fitted = _fit_four(_SQUARE, [chosen[i] for i in range(4)], layout, candidates, plane)
+            if fitted is not None and (best is None or fitted[0] > best[0]):
+                best = fitted
+    return None if best is None else best[1]
+
+
+def _meeting(opposite: Mark, first: Mark, second: Mark) -> Mark | None:
+    """The corner where the arms of two marks meet that do not point to the opposite corner."""
+    arms = []
+    for mark in (first, second):
+        toward = [float(arm @ (opposite.point - mark.point)) / float(np.linalg.norm(arm)) for arm in mark.arms]
+        arms.append(mark.arms[int(np.argmin(toward))])
+    point = intersection((first.point, arms[0]), (second.point, arms[1]))
+    return None if point is None else Mark("L", (opposite.quarter + 2) % 4, point, -opposite.arms, 0.0)
 
 
 def _spread(points: Points) -> float:
@@ -172,23 +216,36 @@ def _fit_four(
     transform = np.asarray(
         cv2.getPerspectiveTransform(source.astype(np.float32), points.astype(np.float32)), dtype=np.float64
     )
-    square = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], dtype=np.float64)
-    corners = _project(transform, square)
+    corners = _project(transform, _SQUARE)
     if not _plausible(corners, sizes, plane) or not all(
         _arms_agree(transform, mark, place) for mark, place in zip(chosen, source, strict=True)
     ):
         return None
-    return _agreement(transform, layout, candidates, sizes.mean()), corners
+    agreeing = _agreeing(transform, layout, candidates, float(sizes.mean()))
+    return sum(mark.score for mark in agreeing.values()), _settled(corners, agreeing, layout)
 
 
-def _agreement(transform: Points, layout: tuple[MarkPlace, ...], candidates: list[list[Mark]], size: float) -> float:
-    """Sum of the scores of the marks that lie where the homography puts them."""
-    total = 0.0
-    for place, marks in zip(layout, candidates, strict=True):
+def _agreeing(
+    transform: Points, layout: tuple[MarkPlace, ...], candidates: list[list[Mark]], size: float
+) -> dict[int, Mark]:
+    """The best mark near where the homography puts it, by place."""
+    found = {}
+    for index, (place, marks) in enumerate(zip(layout, candidates, strict=True)):
         expected = _project(transform, np.array([[place.x, place.y]]))[0]
-        near = [mark.score for mark in marks if np.linalg.norm(mark.point - expected) < _AGREEMENT * size]
-        total += max(near, default=0.0)
-    return total
+        near = [mark for mark in marks if np.linalg.norm(mark.point - expected) < _AGREEMENT * size]
+        if near:
+            found[index] = max(near, key=lambda mark: mark.score)
+    return found
+
+
+def _settled(corners: Points, agreeing: dict[int, Mark], layout: tuple[MarkPlace, ...]) -> Points:
+    """The corners: measured where their mark is seen, else by the homography through all agreeing marks."""
+    if len(agreeing) > 4:
+        source = np.array([[layout[i].x, layout[i].y] for i in agreeing], dtype=np.float64)
+        points = np.array([mark.point for mark in agreeing.values()])
+        transform, _ = cv2.findHomography(source, points)
+        corners = _project(np.asarray(transform, dtype=np.float64), _SQUARE)
+    return np.array([agreeing[i].point if i in agreeing else corners[i] for i in range(4)])
 
 
 def _project(transform: Points, points: Points) -> Points:
