@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import typer
 from pydantic import ValidationError
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
@@ -66,7 +67,7 @@ def make_table(title: str, *columns: str) -> Table:
     """An empty table; all columns but the first hold numbers."""
     table = Table(title=title, title_justify="left")
     for index, column in enumerate(columns):
-        table.add_column(column, justify="left" if index == 0 else "right")
+        table.add_column(escape(column), justify="left" if index == 0 else "right")
     return table
 
 
@@ -185,39 +186,30 @@ def serve(
     as_json: Annotated[bool, typer.Option("--json", help="Print where it listens as JSON before it starts.")] = False,
 ) -> None:
     """The REST service, on an embedded SQLite store unless HELIOTWIN_DATABASE_URL names another."""
-    import uvicorn
-
-    from service.app import create_app
+    from service import server
     from service.settings import Settings
 
-    given = {key: value for key, value in {"host": host, "port": port}.items() if value is not None}
+    given: dict[str, Any] = {key: value for key, value in {"host": host, "port": port}.items() if value is not None}
     settings = Settings(**given)
     address = f"http://{settings.host}:{settings.port}"
     if as_json:
         typer.echo(json.dumps({"url": address, "docs": f"{address}/docs"}))
     else:
         console.print(f"heliotwin listens on {address}, its documentation on {address}/docs")
-    uvicorn.run(create_app(settings), host=settings.host, port=settings.port, log_level=settings.log_level)
+    server.serve(settings)
 
 
 @app.command()
-def migrate(
-    revision: Annotated[str, typer.Argument(help="Revision to go to.")] = "head", as_json: AsJson = False
-) -> None:
+def migrate(as_json: AsJson = False) -> None:
     """Bring the database to its newest schema."""
-    from service.database import Database
+    from service import server
     from service.settings import Settings
 
     settings = Settings()
     settings.data_dir.mkdir(parents=True, exist_ok=True)
-    database = Database(settings.database)
-    try:
-        database.upgrade(revision)
-        report = {"revision": database.revision()}
-    finally:
-        database.close()
+    report = {"revision": server.migrate(settings)}
     show(report, as_json)
-    console.print(f"the schema stands at {report['revision']}")
+    console.print(f"the schema stands at {report['revision']}", highlight=False)
 
 
 @app.command()

@@ -39,3 +39,23 @@ def surface_picture(z: NDArray[np.floating], title: str) -> bytes:
     figure.suptitle(title)
     figure.colorbar(image, ax=panes.tolist(), label="deviation from the ideal facet [mm]")
     return _png(figure)
+
+
+def comparison_picture(
+    measured: NDArray[np.floating], forecast: NDArray[np.floating], side: float, title: str
+) -> bytes:
+    """Measured and forecast flux (n, n) over ``side`` [m], scaled to one sum, and their difference."""
+    a, b = (image / image.sum() * image.size for image in (np.asarray(measured), np.asarray(forecast)))
+    figure = Figure(figsize=(10, 3.4), layout="constrained")
+    panes = figure.subplots(1, 3)
+    extent = (-side / 2, side / 2, -side / 2, side / 2)
+    top, bound = max(float(a.max()), float(b.max())), max(float(np.abs(b - a).max()), 1e-9)
+    for pane, image, name in zip(panes, (a, b), ("measured", "forecast"), strict=False):
+        shown = pane.imshow(image, cmap="inferno", vmin=0, vmax=top, extent=extent)
+        pane.set(title=name, xlabel="right [m]")
+    figure.colorbar(shown, ax=panes[:2].tolist(), label="of the mean")
+    shown = panes[2].imshow(b - a, cmap="RdBu_r", vmin=-bound, vmax=bound, extent=extent)
+    panes[2].set(title="forecast - measured", xlabel="right [m]")
+    figure.colorbar(shown, ax=panes[2], label="of the mean")
+    figure.suptitle(title)
+    return _png(figure)

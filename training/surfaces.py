@@ -58,7 +58,7 @@ class Augmentation:
         scale_canting, scale_waviness = (
             np.exp(rng.uniform(-1, 1, (count, 1, 1, 1)) * np.log(limit)) for limit in (self.canting, self.waviness)
         )
-        return canting * scale_canting + waviness * scale_waviness + self._tilts(count, rng)
+        return np.asarray(canting * scale_canting + waviness * scale_waviness + self._tilts(count, rng))
 
     def _averaged(self, surfaces: Array, count: int, rng: np.random.Generator) -> Array:
         """Weighted averages of up to three surfaces, their spread about the mean restored."""
