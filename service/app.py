@@ -35,7 +35,7 @@ def create_app(settings: Settings, operations: Operations | None = None) -> Fast
     """The service for these settings.
 
     ``operations`` stands in for the model (`service.operations`) in tests. The store is opened, and an embedded SQLite
-    one migrated, when the application starts.
+    one migrated, when the application starts; a store that nobody migrated keeps it from starting.
     """
 
     @asynccontextmanager
@@ -44,6 +44,7 @@ def create_app(settings: Settings, operations: Operations | None = None) -> Fast
         try:
             if settings.migrates_on_start:
                 await to_thread.run_sync(runtime.database.upgrade)
+            await to_thread.run_sync(runtime.database.require_current)
             app.state.runtime = runtime
             yield
         finally:

@@ -14,6 +14,7 @@ from sqlalchemy import URL, Connection, Engine, create_engine, event, text
 from sqlalchemy.orm import Session
 
 import migrations
+from service.faults import SchemaError
 
 # Seconds that a writer waits for another on SQLite, and that a connection to PostgreSQL may take.
 _PATIENCE_S = 15
@@ -110,6 +111,11 @@ class Database:
     def is_current(self) -> bool:
         """Whether the schema is at the newest version that this code knows."""
         return self.revision() == ScriptDirectory.from_config(alembic_config()).get_current_head()
+
+    def require_current(self) -> None:
+        """Raise `SchemaError` unless the schema is at the newest version that this code knows."""
+        if not self.is_current():
+            raise SchemaError(f"the store's schema is at {self.revision()}, not the newest: run `heliotwin migrate`")
 
     def close(self) -> None:
         """Close all pooled connections."""

@@ -35,3 +35,7 @@ class NotAcceptableError(ServiceError):
 
 class StoreDamagedError(ServiceError):
     """What the store promised to keep is gone or altered: the operator's business, not the caller's."""
+
+
+class SchemaError(ServiceError):
+    """The database's schema is not the one that this code works with: the operator's business."""

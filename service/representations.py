@@ -110,7 +110,7 @@ def measured_flux(heliostat_name: str, row: MeasurementRow, media_type: str) -> 
         size = (row.target.width_m, row.target.height_m) if whole else None
         shown = arrays["flux" if whole else "centered"]
         title = f"{heliostat_name} {row.identifier}, measured"
-        return _file(flux_picture(shown, size, "share of the flux", title), media_type, f"{name}.png")
+        return _file(flux_picture(shown, size, "flux [% per pixel]", title), media_type, f"{name}.png")
     if media_type != negotiation.JSON:
         return _file(row.arrays, media_type, f"{name}.npz")
     return _json(measurement(heliostat_name, row), flux=arrays.get("flux"), centered=arrays.get("centered"))
@@ -186,7 +186,7 @@ def forecast(row: ForecastRow, media_type: str) -> Response:
     flux = _flux_of(row)
     name = f"{row.heliostat.name}-forecast-{row.id}"
     if media_type == negotiation.PNG:
-        unit = "share of 100" if row.normalised else "W/m²"
+        unit = "flux [% per pixel]" if row.normalised else "W/m²"
         size = (row.window_m or row.plane["width"], row.window_m or row.plane["height"])
         title = f"{row.heliostat.name}, forecast {row.id}"
         return _file(flux_picture(flux, size, unit, title), media_type, f"{name}.png")

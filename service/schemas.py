@@ -3,7 +3,6 @@
 Numbers are finite, unknown keys are refused, and names fit a pattern that is safe in paths and URLs.
 """
 
-import re
 from datetime import UTC, datetime
 from typing import Annotated, Any, Generic, Literal, Self, TypeVar
 
@@ -20,16 +19,16 @@ from pydantic import (
     model_validator,
 )
 
-_NAME = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,31}$"
+from service.names import IDENTIFIER, NAME
 
 Name = Annotated[
     str,
-    StringConstraints(pattern=_NAME),
+    StringConstraints(pattern=NAME),
     Field(description="1 to 32 letters, digits, underscores and hyphens.", examples=["AA39"]),
 ]
 Identifier = Annotated[
     str,
-    StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$"),
+    StringConstraints(pattern=IDENTIFIER),
     Field(description="1 to 64 letters, digits, underscores and hyphens.", examples=["205363"]),
 ]
 MeasurementName = Annotated[
@@ -66,13 +65,10 @@ Moment = Annotated[
 Item = TypeVar("Item")
 
 
-def valid_name(name: str) -> bool:
-    """Whether ``name`` may name a heliostat or a target."""
-    return re.fullmatch(_NAME, name) is not None
-
-
 # Nesting that no document of PAINT's reaches, far below Python's recursion limit.
 _MAX_DEPTH = 32
+# Larger than any of PAINT's numbers, and small enough that the tracer's single precision holds its square.
+_MAX_NUMBER = 1e15
 
 
 def _is_text(value: str) -> bool:
@@ -90,8 +86,8 @@ def _check_json(value: Any, where: str = "document", depth: int = 0) -> Any:
     elif isinstance(value, list):
         for index, entry in enumerate(value):
             _check_json(entry, f"{where}[{index}]", depth + 1)
-    elif isinstance(value, int | float) and not abs(value) < 1e300:
-        raise ValueError(f"{where}: must be a finite number")
+    elif isinstance(value, int | float) and not abs(value) < _MAX_NUMBER:
+        raise ValueError(f"{where}: must be a finite number of less than {_MAX_NUMBER:g}")
     elif isinstance(value, str) and not _is_text(value):
         raise ValueError(f"{where}: must not hold NUL or half characters")
     return value

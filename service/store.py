@@ -17,6 +17,7 @@ from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session, defer, undefer
 
 from model.plant import TargetPlane
+from service import names
 from service.arrays import pack
 from service.faults import ConflictError, NotFoundError
 from service.tables import (
@@ -136,7 +137,8 @@ def require_same_properties(row: HeliostatRow, properties: dict[str, Any]) -> No
 def put_heliostat(
     session: Session, name: str, properties: dict[str, Any], position: ArrayLike
 ) -> tuple[HeliostatRow, Change]:
-    """Keep a heliostat's PAINT ``properties`` and its ENU ``position`` (3,) [m]."""
+    """Keep a heliostat's PAINT ``properties`` and its ENU ``position`` (3,) [m]; InvalidInputError for a bad name."""
+    names.require(names.NAME, name, "heliostat")
     east, north, up = _floats(position)
     values = {"properties": properties, "east_m": east, "north_m": north, "up_m": up}
     row = find_heliostat(session, name)
@@ -173,21 +175,27 @@ def list_targets(session: Session) -> Sequence[TargetRow]:
 def put_target(
     session: Session, plane: TargetPlane, corners: dict[str, list[float]] | None = None
 ) -> tuple[TargetRow, Change]:
-    """Keep a target plane under its name; ``corners`` are the WGS84 corners that it was made from, if it was."""
-    values = {
+    """Keep a target plane under its name; ``corners`` are the WGS84 corners that it was made from, where known.
+
+    Raises `InvalidInputError` for a bad name.
+    """
+    names.require(names.NAME, plane.name, "target")
+    values: dict[str, Any] = {
         "center_m": _floats(plane.center),
         "normal": _floats(plane.normal),
         "up": _floats(plane.up),
         "width_m": float(plane.width),
         "height_m": float(plane.height),
-        "corners": corners,
     }
     row = find_target(session, plane.name)
     if row is None:
-        row = TargetRow(name=plane.name, **values)
+        row = TargetRow(name=plane.name, corners=corners, **values)
         if _insert(session, row):
             return row, Change.NEW
         row = get_target(session, plane.name)
+    moved = any(getattr(row, name) != value for name, value in values.items())
+    # Corners that are known stay known while the plane is the same.
+    values["corners"] = corners if moved or corners is not None else row.corners
     return row, _assign(row, values)
 
 
@@ -350,7 +358,11 @@ def add_measurement(session: Session, heliostat: HeliostatRow, new: NewMeasureme
     ------
     ConflictError
         Where the given id belongs to another image of the same kind.
+    InvalidInputError
+        Where the given id is no good name.
     """
+    if new.external_id is not None:
+        names.require(names.IDENTIFIER, new.external_id, "id")
     _put_image(session, new.image)
     for _ in range(_ROUNDS):
         existing = find_measurement_of_image(session, heliostat, new.image.sha256, new.kind)

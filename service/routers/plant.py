@@ -6,13 +6,12 @@ import numpy as np
 from fastapi import APIRouter, Body, Depends, Response, status
 from sqlalchemy.orm import Session
 
-from model.errors import InvalidInputError
 from model.frames import wgs84_to_enu
 from model.plant import TargetPlane
 from service import representations, store
 from service.dependencies import NamePath, ReadSession, RuntimeDep, require_json
 from service.openapi import problems
-from service.schemas import Corners, Page, Plane, PlantOut, TargetIn, TargetOut, TowerMeasurements, valid_name
+from service.schemas import Corners, Page, Plane, PlantOut, TargetIn, TargetOut, TowerMeasurements
 
 router = APIRouter(tags=["plant"])
 
@@ -54,9 +53,6 @@ def put_plant(document: TowerMeasurements, runtime: RuntimeDep) -> PlantOut:
     from service.paint import read_targets
 
     origin, targets = read_targets(document.raw)
-    for name in targets:
-        if not valid_name(name):
-            raise InvalidInputError(f"{name[:40]!r}: a target's name is 1 to 32 letters, digits, underscores, hyphens")
     with runtime.database.writing() as session:
         store.put_plant(session, document.power_plant_properties.ID, origin)
         for name, plane in targets.items():

@@ -9,8 +9,12 @@ import pytest
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
+from service.app import create_app
+from service.faults import SchemaError
 from service.schemas import Problem
 from service.settings import Settings
+
+from .conftest import client_of
 
 
 def check(answer: Any, status: int) -> dict[str, Any]:
@@ -155,6 +159,12 @@ def test_unready_until_migrated(settings: Settings, operations: Any, app: FastAP
     ready = bare.get("/readyz")
     assert ready.status_code == 503
     assert "heliotwin migrate" in ready.json()["checks"]["migrations"]
+
+
+def test_service_does_not_start_on_an_unmigrated_store(settings: Settings, operations: Any):
+    app = create_app(settings.model_copy(update={"migrate_on_start": False}), operations)
+    with pytest.raises(SchemaError, match="heliotwin migrate"), client_of(app):
+        pass
 
 
 def test_ready(bare: TestClient, monkeypatch: pytest.MonkeyPatch):

@@ -1,6 +1,7 @@
 """The store's functions: idempotent, paged, and safe against others who write the same thing."""
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 from sqlalchemy.orm import Session
 
+from model.errors import InvalidInputError
 from model.plant import TargetPlane
 from service import store
 from service.arrays import unpack
@@ -51,6 +53,29 @@ def test_plant_target_and_heliostat_are_written_once(database: Database):
         assert store.counts(session)["heliostats"] == 1
         plane = store.target_plane(store.get_target(session, "lower"))
         np.testing.assert_allclose(plane.axes, PLANE.axes)
+
+
+def test_corners_stay_known_while_the_plane_is_the_same(database: Database):
+    corners = {"upper_left": [50.0, 6.0, 100.0]}
+    with database.writing() as session:
+        store.put_target(session, PLANE, corners)
+        row, change = store.put_target(session, PLANE)
+        assert (row.corners, change) == (corners, Change.UNCHANGED)
+        row, change = store.put_target(session, replace(PLANE, width=5.0))
+        assert (row.corners, change) == (None, Change.CHANGED)
+        assert store.put_target(session, replace(PLANE, width=5.0), corners)[1] is Change.CHANGED
+
+
+@pytest.mark.parametrize("name", ["", "a b", "../a", "a" * 33, "-a", "a\n"])
+def test_names_that_no_path_could_hold_are_refused(database: Database, name: str):
+    with database.writing() as session:
+        heliostat, target = setup(session)
+        with pytest.raises(InvalidInputError, match="heliostat"):
+            store.put_heliostat(session, name, {}, (0, 0, 0))
+        with pytest.raises(InvalidInputError, match="target"):
+            store.put_target(session, replace(PLANE, name=name))
+        with pytest.raises(InvalidInputError, match="id"):
+            store.add_measurement(session, heliostat, new(target, external_id=name * 2))
 
 
 def test_origin_is_fixed_once_something_stands_on_it(database: Database):
