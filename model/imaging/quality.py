@@ -9,7 +9,7 @@ from model.imaging.separate import Separation
 
 SATURATED_GRAY = 250
 _LIMIT_SATURATED = 0.10
-_LIMIT_CUT = 0.05
+_LIMIT_CUT = 0.08
 _LIMIT_SECOND = 0.40
 # 300 real empty targets show patches of at most 0.14 of the background and 27 noise deviations; spots start at 0.37.
 _LEAST_CONTRAST = 0.17

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-_LINE_WIDTH = 9  # [px] dark features up to this width are lines or rivets
+_LINE_WIDTH = 7  # [px] dark features up to this width are lines or rivets
 _MARK_WIDTH = 41  # ... and up to this width marks
 _LINE_FLANK = 3  # [px] by which lines are widened, for their blurred flanks
 _LINE_DARKNESS, _MARK_DARKNESS = 0.03, 0.15  # relative to the surroundings
@@ -25,12 +25,11 @@ _ROUNDS = 12
 _STRIDE = 4  # [px] of the pixels to which the surface is fitted
 _SPOT_LEVEL = 3.0  # noise deviations above which a pixel may belong to a spot
 _WING_SHARE = 0.01  # ... and share of the peak
-_CORE_SHARE = 0.15  # share of the peak above which light is taken for a spot and not for uneven daylight
-_SPLIT_SHARE = 0.3  # share of the peak on which spots that overlap are told apart
+_CUTS = (0.15, 0.2, 0.3, 0.4, 0.5, 0.6)  # shares of the peak: a core begins at the first, for daylight is uneven
+_VALLEY = 0.6  # of the lower peak: a deeper valley parts two spots
 _WING_REACH = 0.8  # how far wings reach out of the core, in its mean radius
 _MARGIN = 0.25  # added around it, for the light below the noise, likewise
 _TENDRIL = 9  # [px] width up to which a bright streak at a spot is the sheet's
-_LOBE_GAP = 0.5  # cores nearer than this, in mean radii, are lobes of one heliostat's spot
 _MIN_AREA = 40  # [px] of a spot
 
 
@@ -95,7 +94,9 @@ def _blurred(image: NDArray[np.floating], sigma: float) -> Image:
 def bridge_dark_features(crop: NDArray[np.uint8]) -> tuple[Image, Mask]:
     """The image with dark lines, rivets and marks filled from their surroundings, and the mask of the marks."""
     gray = crop.astype(np.float32)
-    hidden = _dark(gray, _MARK_WIDTH, _MARK_DARKNESS)
+    # Marks are darker than the sheet itself; a gap between two spots, or a spot and the edge, is only darker than they.
+    sheet = fit_background(gray, np.zeros(gray.shape, bool))
+    hidden = _dark(gray, _MARK_WIDTH, _MARK_DARKNESS) & (gray < (1 - _MARK_DARKNESS) * sheet)
     hidden = cv2.dilate(hidden.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
     lines = cv2.dilate(_dark(gray, _LINE_WIDTH, _LINE_DARKNESS).astype(np.uint8), _disc(_LINE_FLANK)).astype(bool)
     return _fill(gray, hidden | lines), hidden
@@ -208,66 +209,48 @@ def find_spots(smooth: Image, noise: float) -> tuple[Mask, Mask]:
     taken for light of the spot.
     """
     cores = _cores(smooth, noise)
-    if cores.max() == 0:
+    if not cores:
         return np.zeros(smooth.shape, bool), np.zeros(smooth.shape, bool)
     level = max(_SPOT_LEVEL * noise, _WING_SHARE * float(smooth.max()))
     regions = _nearest(cores)
-    masks = [_with_wings(smooth > level, cores == i, regions == i) for i in range(1, int(cores.max()) + 1)]
+    masks = [_with_wings(smooth > level, core, regions == i) for i, core in enumerate(cores)]
     energies = [float(smooth[mask].sum()) for mask in masks]
     main = masks[int(np.argmax(energies))]
     return main, np.any(masks, axis=0) & ~main
 
 
-def _cores(smooth: Image, noise: float) -> NDArray[np.int32]:
-    """Labels of the spots' bright cores, 0 elsewhere; lobes of one spot share a label."""
-    peak = float(smooth.max())
-    low = smooth > max(_SPOT_LEVEL * noise, _CORE_SHARE * peak)
-    high = smooth > max(_SPOT_LEVEL * noise, _SPLIT_SHARE * peak)
-    lobes = _labelled(high)
-    labels = _joined(lobes)
-    _, islands = cv2.connectedComponents(low.astype(np.uint8), connectivity=8)
-    # Where one core lies in an island, the island is its core; overlapping spots keep the cores that tell them apart.
-    for island in range(1, int(islands.max()) + 1):
-        inside = islands == island
-        present = np.unique(labels[inside])
-        present = present[present > 0]
-        if len(present) == 1:
-            labels[inside] = present[0]
-    return labels
+def _cores(smooth: Image, noise: float) -> list[Mask]:
+    """The spots' bright cores.
+
+    The signal is cut at rising levels. A core that falls apart into peaks that rise well above the cut is several spots
+    that overlap; shallower valleys are the facets' images of one heliostat.
+    """
+    cores = [np.ones(smooth.shape, bool)]
+    for share in _CUTS:
+        level = max(_SPOT_LEVEL * noise, share * float(smooth.max()))
+        divided: list[Mask] = []
+        for core in cores:
+            peaks = _peaks_above(smooth, core, level)
+            if share == _CUTS[0] or not peaks:
+                divided += peaks if share == _CUTS[0] else [core]
+            else:
+                nearest = _nearest(peaks)
+                divided += [core & (nearest == i) for i in range(len(peaks))]
+        cores = divided
+    return cores
 
 
-def _labelled(mask: Mask) -> NDArray[np.int32]:
-    """Labels 1, 2, ... of the connected shapes that are large enough."""
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
-    large = np.flatnonzero(stats[1:, cv2.CC_STAT_AREA] >= _MIN_AREA) + 1
-    renamed = np.zeros(len(stats), np.int32)
-    renamed[large] = np.arange(1, len(large) + 1)
-    return np.asarray(renamed[labels], dtype=np.int32)
+def _peaks_above(smooth: Image, core: Mask, level: float) -> list[Mask]:
+    """The connected parts of a core above a level that are large enough and rise well above it."""
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(((smooth > level) & core).astype(np.uint8), connectivity=8)
+    parts = [labels == i for i in range(1, len(stats)) if stats[i, cv2.CC_STAT_AREA] >= _MIN_AREA]
+    return [part for part in parts if level < _VALLEY * float(smooth[part].max())]
 
 
-def _joined(labels: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Labels with near neighbours merged into the larger one, and numbered anew."""
-    merged = labels.copy()
-    by_area = sorted(range(1, int(labels.max()) + 1), key=lambda i: -int((labels == i).sum()))
-    for position, small in enumerate(by_area):
-        for large in by_area[:position]:
-            shape = merged == large
-            if not shape.any():
-                continue
-            distance = cv2.distanceTransform((~shape).astype(np.uint8), cv2.DIST_L2, 5)
-            if distance[labels == small].min() < _LOBE_GAP * _radius(shape):
-                merged[labels == small] = large
-                break
-    _, renamed = np.unique(merged, return_inverse=True)
-    return renamed.reshape(labels.shape).astype(np.int32)
-
-
-def _nearest(cores: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Every pixel's nearest core."""
-    distances = [
-        cv2.distanceTransform((cores != i).astype(np.uint8), cv2.DIST_L2, 5) for i in range(1, int(cores.max()) + 1)
-    ]
-    return np.asarray(np.argmin(distances, axis=0) + 1, dtype=np.int32)
+def _nearest(shapes: list[Mask]) -> NDArray[np.int32]:
+    """Every pixel's nearest shape, by its index."""
+    distances = [cv2.distanceTransform((~shape).astype(np.uint8), cv2.DIST_L2, 5) for shape in shapes]
+    return np.asarray(np.argmin(distances, axis=0), dtype=np.int32)
 
 
 def _with_wings(bright: Mask, core: Mask, region: Mask) -> Mask:
