@@ -19,6 +19,9 @@ from service.faults import SchemaError
 # Seconds that a writer waits for another on SQLite, and that a connection to PostgreSQL may take.
 _PATIENCE_S = 15
 
+# Beyond the five that are kept open; together they are enough for the 40 threads that Starlette runs routes in.
+_MORE_CONNECTIONS = 40
+
 # Alembic keeps its context in module globals: one migration at a time in a process.
 _alembic = threading.Lock()
 
@@ -49,10 +52,11 @@ def _prepare_sqlite(engine: Engine) -> None:
 def make_engine(url: URL) -> Engine:
     """A connection pool for ``url``; SQLite with write-ahead log, durable commits and foreign keys."""
     if url.get_backend_name() != "sqlite":
-        return create_engine(url, pool_pre_ping=True, connect_args={"connect_timeout": _PATIENCE_S})
+        connect = {"connect_timeout": _PATIENCE_S}
+        return create_engine(url, pool_pre_ping=True, connect_args=connect, max_overflow=_MORE_CONNECTIONS)
     if url.database:
         Path(url.database).parent.mkdir(parents=True, exist_ok=True)
-    engine = create_engine(url)
+    engine = create_engine(url, max_overflow=_MORE_CONNECTIONS)
     _prepare_sqlite(engine)
     return engine
 

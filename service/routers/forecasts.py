@@ -5,7 +5,7 @@ from typing import Annotated
 from fastapi import APIRouter, Body, Depends, Path, Query, Response, status
 
 from service import representations, store
-from service.dependencies import Limit, MediaType, ReadSession, RuntimeDep, require_json
+from service.dependencies import Limit, MediaType, RuntimeDep, require_json
 from service.openapi import arrays, problems
 from service.routers.plant import rectangle
 from service.schemas import ForecastIn, ForecastSummary, Name, Page, Version
@@ -54,21 +54,24 @@ def post_forecast(
 
 @router.get("", responses=problems(404))
 def list_forecasts(
-    session: ReadSession,
+    runtime: RuntimeDep,
     limit: Limit = 100,
     after: Annotated[Version | None, Query(description="The last id of the page before.")] = None,
     heliostat: Annotated[Name | None, Query(description="Only those of this heliostat.")] = None,
 ) -> Page[ForecastSummary]:
     """Forecasts in the order they were made."""
-    of = None if heliostat is None else store.get_heliostat(session, heliostat)
-    rows = store.list_forecasts(session, limit + 1, after, of)
+    with runtime.database.reading() as session:
+        of = None if heliostat is None else store.get_heliostat(session, heliostat)
+        rows = store.list_forecasts(session, limit + 1, after, of)
     items = [representations.forecast_summary(row) for row in rows[:limit]]
     return Page(items=items, next=str(items[-1].id) if len(rows) > limit else None)
 
 
 @router.get("/{number}", responses={**problems(404, 406), **arrays("`flux` (rows, columns).")})
 def get_forecast(
-    number: Annotated[Version, Path(description="Id of the forecast.")], session: ReadSession, media_type: MediaType
+    number: Annotated[Version, Path(description="Id of the forecast.")], runtime: RuntimeDep, media_type: MediaType
 ) -> Response:
     """A forecast with its map."""
-    return representations.forecast(store.get_forecast(session, number), media_type)
+    with runtime.database.reading() as session:
+        row = store.get_forecast(session, number)
+    return representations.forecast(row, media_type)

@@ -7,7 +7,7 @@ from fastapi import APIRouter, Depends, Query, Response, status
 from sqlalchemy.orm import Session
 
 from service import representations, store
-from service.dependencies import HeliostatDep, Limit, NamePath, ReadSession, RuntimeDep, require_json
+from service.dependencies import Limit, NamePath, RuntimeDep, require_json
 from service.openapi import problems
 from service.schemas import HeliostatIn, HeliostatOut, HeliostatProperties, HeliostatSummary, Name, Page
 
@@ -25,12 +25,13 @@ def _put(session: Session, name: str, properties: HeliostatProperties) -> tuple[
 
 @router.get("/heliostats", responses=problems())
 def list_heliostats(
-    session: ReadSession,
+    runtime: RuntimeDep,
     limit: Limit = 100,
     after: Annotated[Name | None, Query(description="The last name of the page before.")] = None,
 ) -> Page[HeliostatSummary]:
     """Heliostats in the order of their names."""
-    rows = store.list_heliostats(session, limit + 1, after)
+    with runtime.database.reading() as session:
+        rows = store.list_heliostats(session, limit + 1, after)
     items = [representations.heliostat_summary(row) for row in rows[:limit]]
     return Page(items=items, next=items[-1].name if len(rows) > limit else None)
 
@@ -55,9 +56,10 @@ def post_heliostat(request: HeliostatIn, runtime: RuntimeDep, response: Response
 
 
 @router.get("/heliostats/{name}", responses=problems(404))
-def get_heliostat(heliostat: HeliostatDep) -> HeliostatOut:
+def get_heliostat(name: NamePath, runtime: RuntimeDep) -> HeliostatOut:
     """A heliostat with its properties."""
-    return representations.heliostat(heliostat)
+    with runtime.database.reading() as session:
+        return representations.heliostat(store.get_heliostat(session, name))
 
 
 @router.put(

@@ -7,12 +7,10 @@ from pydantic import Json
 
 from service import representations, store
 from service.dependencies import (
-    HeliostatDep,
     Limit,
     MeasurementPath,
     MediaType,
     NamePath,
-    ReadSession,
     RuntimeDep,
     require_multipart,
 )
@@ -80,22 +78,25 @@ def post_measurement(
 
 @router.get("", responses=problems(404))
 def list_measurements(
-    heliostat: HeliostatDep,
-    session: ReadSession,
+    name: NamePath,
+    runtime: RuntimeDep,
     limit: Limit = 100,
     after: Annotated[MeasurementName | None, Query(description="The last id of the page before.")] = None,
     accepted: Annotated[bool | None, Query(description="Only accepted, or only refused ones.")] = None,
 ) -> Page[MeasurementOut]:
     """A heliostat's measurements in the order they came."""
-    rows = store.list_measurements(session, heliostat, limit + 1, after, accepted)
-    items = [representations.measurement(heliostat.name, row) for row in rows[:limit]]
+    with runtime.database.reading() as session:
+        rows = store.list_measurements(session, store.get_heliostat(session, name), limit + 1, after, accepted)
+    items = [representations.measurement(name, row) for row in rows[:limit]]
     return Page(items=items, next=items[-1].id if len(rows) > limit else None)
 
 
 @router.get("/{measurement}", responses=problems(404))
-def get_measurement(heliostat: HeliostatDep, measurement: MeasurementPath, session: ReadSession) -> MeasurementOut:
+def get_measurement(name: NamePath, measurement: MeasurementPath, runtime: RuntimeDep) -> MeasurementOut:
     """A measurement with its quality record."""
-    return representations.measurement(heliostat.name, store.get_measurement(session, heliostat, measurement))
+    with runtime.database.reading() as session:
+        row = store.get_measurement(session, store.get_heliostat(session, name), measurement)
+    return representations.measurement(name, row)
 
 
 @router.get(
@@ -103,19 +104,17 @@ def get_measurement(heliostat: HeliostatDep, measurement: MeasurementPath, sessi
     response_class=Response,
     responses={**problems(404), 200: {"description": "The file as it was sent.", "content": {"image/*": {}}}},
 )
-def get_image(
-    heliostat: HeliostatDep, measurement: MeasurementPath, session: ReadSession, runtime: RuntimeDep
-) -> Response:
+def get_image(name: NamePath, measurement: MeasurementPath, runtime: RuntimeDep) -> Response:
     """The image as it was sent."""
-    row = store.get_measurement(session, heliostat, measurement)
+    with runtime.database.reading() as session:
+        row = store.get_measurement(session, store.get_heliostat(session, name), measurement)
     headers = {"ETag": f'"{row.image_sha256}"', "X-Content-Type-Options": "nosniff"}
     return Response(runtime.images.read(row.image_sha256), media_type=row.image.media_type, headers=headers)
 
 
 @router.get("/{measurement}/flux", responses={**problems(404, 406), **arrays("`flux` and `centered`.")})
-def get_flux(
-    heliostat: HeliostatDep, measurement: MeasurementPath, session: ReadSession, media_type: MediaType
-) -> Response:
+def get_flux(name: NamePath, measurement: MeasurementPath, runtime: RuntimeDep, media_type: MediaType) -> Response:
     """The measured flux: over the whole target (256 x 256), and 64 x 64 about the centre of mass with sum 100."""
-    row = store.get_measurement(session, heliostat, measurement, arrays=True)
-    return representations.measured_flux(heliostat.name, row, media_type)
+    with runtime.database.reading() as session:
+        row = store.get_measurement(session, store.get_heliostat(session, name), measurement, arrays=True)
+    return representations.measured_flux(name, row, media_type)

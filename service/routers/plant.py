@@ -9,7 +9,7 @@ from sqlalchemy.orm import Session
 from model.frames import wgs84_to_enu
 from model.plant import TargetPlane
 from service import representations, store
-from service.dependencies import NamePath, ReadSession, RuntimeDep, require_json
+from service.dependencies import NamePath, RuntimeDep, require_json
 from service.openapi import problems
 from service.schemas import Corners, Page, Plane, PlantOut, TargetIn, TargetOut, TowerMeasurements
 
@@ -42,9 +42,10 @@ def _paint_corners(document: dict[str, Any], name: str) -> dict[str, list[float]
 
 
 @router.get("/plant", responses=problems(409))
-def get_plant(session: ReadSession) -> PlantOut:
+def get_plant(runtime: RuntimeDep) -> PlantOut:
     """The plant's name and the tower base."""
-    return representations.plant(store.get_plant(session))
+    with runtime.database.reading() as session:
+        return representations.plant(store.get_plant(session))
 
 
 @router.put("/plant", responses=problems(409, 413, 415), dependencies=[Depends(require_json)])
@@ -61,15 +62,17 @@ def put_plant(document: TowerMeasurements, runtime: RuntimeDep) -> PlantOut:
 
 
 @router.get("/targets", responses=problems())
-def list_targets(session: ReadSession) -> Page[TargetOut]:
+def list_targets(runtime: RuntimeDep) -> Page[TargetOut]:
     """All target planes."""
-    return Page(items=[representations.target(row) for row in store.list_targets(session)], next=None)
+    with runtime.database.reading() as session:
+        return Page(items=[representations.target(row) for row in store.list_targets(session)], next=None)
 
 
 @router.get("/targets/{name}", responses=problems(404))
-def get_target(name: NamePath, session: ReadSession) -> TargetOut:
+def get_target(name: NamePath, runtime: RuntimeDep) -> TargetOut:
     """A target plane."""
-    return representations.target(store.get_target(session, name))
+    with runtime.database.reading() as session:
+        return representations.target(store.get_target(session, name))
 
 
 @router.put(

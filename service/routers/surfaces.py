@@ -1,12 +1,14 @@
 """Surfaces by version."""
 
+from datetime import datetime
 from typing import Annotated
 
 from fastapi import APIRouter, Body, Depends, Path, Query, Response, status
 
 from service import representations, store
-from service.dependencies import HeliostatDep, Limit, MediaType, NamePath, ReadSession, RuntimeDep, require_json
+from service.dependencies import Limit, MediaType, NamePath, RuntimeDep, require_json
 from service.openapi import arrays, problems
+from service.runtime import Runtime
 from service.schemas import Moment, Page, SurfaceIn, SurfaceOut, SurfaceSummary, Version
 from service.workflows import predict_surface
 
@@ -33,8 +35,8 @@ def post_surface(
 
 @router.get("", responses={**problems(404, 406), **arrays("With `at`: the surface itself.")}, response_model=None)
 def list_surfaces(
-    heliostat: HeliostatDep,
-    session: ReadSession,
+    name: NamePath,
+    runtime: RuntimeDep,
     media_type: MediaType,
     limit: Limit = 100,
     after: Annotated[Version | None, Query(description="The last version of the page before.")] = None,
@@ -44,24 +46,33 @@ def list_surfaces(
 ) -> Page[SurfaceSummary] | Response:
     """The history of the surface, oldest version first; with `at` the one that was valid at that time."""
     if at is not None:
-        return representations.surface(heliostat.name, store.get_surface_at(session, heliostat, at), media_type)
-    rows = store.list_surfaces(session, heliostat, limit + 1, after)
-    items = [representations.surface_summary(heliostat.name, row) for row in rows[:limit]]
+        return _at(runtime, name, at, media_type)
+    with runtime.database.reading() as session:
+        rows = store.list_surfaces(session, store.get_heliostat(session, name), limit + 1, after)
+    items = [representations.surface_summary(name, row) for row in rows[:limit]]
     return Page(items=items, next=str(items[-1].version) if len(rows) > limit else None)
 
 
+def _at(runtime: Runtime, name: str, moment: datetime | None, media_type: str) -> Response:
+    with runtime.database.reading() as session:
+        row = store.get_surface_at(session, store.get_heliostat(session, name), moment)
+    return representations.surface(name, row, media_type)
+
+
 @router.get("/current", responses={**problems(404, 406), **arrays("`control_points`, `z`, `z_std` [m].")})
-def get_current_surface(heliostat: HeliostatDep, session: ReadSession, media_type: MediaType) -> Response:
+def get_current_surface(name: NamePath, runtime: RuntimeDep, media_type: MediaType) -> Response:
     """The surface that is valid now."""
-    return representations.surface(heliostat.name, store.get_surface_at(session, heliostat), media_type)
+    return _at(runtime, name, None, media_type)
 
 
 @router.get("/{version}", responses={**problems(404, 406), **arrays("`control_points`, `z`, `z_std` [m].")})
 def get_surface(
-    heliostat: HeliostatDep,
+    name: NamePath,
     version: Annotated[Version, Path(description="Number of the version, from 1.")],
-    session: ReadSession,
+    runtime: RuntimeDep,
     media_type: MediaType,
 ) -> Response:
     """A version of the surface."""
-    return representations.surface(heliostat.name, store.get_surface(session, heliostat, version), media_type)
+    with runtime.database.reading() as session:
+        row = store.get_surface(session, store.get_heliostat(session, name), version)
+    return representations.surface(name, row, media_type)
