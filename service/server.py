@@ -11,6 +11,8 @@ from service.settings import Settings
 _FORMAT = "%(asctime)s %(levelname)s %(name)s %(message)s"
 # Seconds that requests under way get to finish when the service is told to stop.
 _GRACE_S = 30
+# Seconds that an idle connection stays open: longer than clients and proxies usually keep one for their next request.
+_KEEP_ALIVE_S = 75
 
 
 def serve(settings: Settings) -> None:
@@ -24,6 +26,7 @@ def serve(settings: Settings) -> None:
         access_log=False,  # service.middleware writes one with request ids
         server_header=False,
         timeout_graceful_shutdown=_GRACE_S,
+        timeout_keep_alive=_KEEP_ALIVE_S,
     )
 
 

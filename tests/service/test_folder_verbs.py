@@ -1,0 +1,135 @@
+"""The command line on measurement folders: DESIGN.md, section 6, on a made plant and on the real ones."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from service.demo_plant import write_plant
+from service.paint import read_folder
+
+
+@pytest.fixture(scope="session")
+def made_plant(tmp_path_factory) -> Path:
+    """The demonstration's plant with few images and rays."""
+    root = tmp_path_factory.mktemp("plant")
+    write_plant(root, images=4, rays=60_000)
+    return root
+
+
+def heliotwin(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """Run the command as a user does."""
+    command = [sys.executable, "-m", "service", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, check=False)
+
+
+def succeeds(*arguments: object) -> dict:
+    """Run a verb with --json and give back its report."""
+    done = heliotwin(*arguments, "--json")
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def test_flux_predict_and_forecast_on_a_made_plant(made_plant, tmp_path):
+    names = sorted(read_folder(made_plant).plant.heliostats)
+
+    flux = succeeds("flux", made_plant, "--out", tmp_path / "flux")
+    assert len(flux["images"]) == 16
+    assert all(entry["accepted"] for entry in flux["images"].values())
+    assert json.loads((tmp_path / "flux" / "quality.json").read_text()) == flux
+    with np.load(tmp_path / "flux" / "AB12" / "101-flux-centered.npz") as centered:
+        assert centered["flux"].shape == (64, 64)
+        assert centered["flux"].sum() == pytest.approx(100, rel=1e-4)
+    assert (tmp_path / "flux" / "AB12" / "101-flux.png").is_file()
+
+    predictions = succeeds("predict", made_plant, "--out", tmp_path / "predicted", "--method", "refined", "--images", 3)
+    assert sorted(predictions["heliostats"]) == names
+    assert json.loads((tmp_path / "predicted" / "predictions.json").read_text()) == predictions
+    for name in names:
+        with np.load(tmp_path / "predicted" / name / "Deflectometry" / f"{name}-nurbs-surface.npz") as surface:
+            assert surface["control_points"].shape == (4, 8, 8, 3)
+            assert surface["z"].shape == surface["z_std"].shape == (4, 8, 8)
+        errors = predictions["heliostats"][name]["against_measured"]
+        assert errors["mae_mm"] < errors["mae_ideal_mm"]
+        assert len(predictions["heliostats"][name]["images"]) == 3
+
+    report = succeeds("forecast", made_plant, "--out", tmp_path / "forecast", "--surfaces", tmp_path / "predicted")
+    assert sorted(report["measurements"]) == sorted(flux["images"])
+    with np.load(tmp_path / "forecast" / "AB12" / "101-forecast.npz") as forecast:
+        assert forecast["flux"].shape == (256, 256)
+        assert forecast["flux"].dtype == np.float32
+        assert 300 < forecast["flux"].max() < 20_000
+
+
+def test_forecast_reaches_the_goal_on_real_images(stj, tmp_path):
+    """DESIGN.md, section 8: >= 0.855 in a 6 m window with measured surfaces and no effect; ideal ones far below."""
+    report = succeeds("forecast", stj, "--out", tmp_path, "--window", 6)
+    assert report["accuracy_mean"] >= 0.855
+    assert {key.split("/")[0] for key in report["measurements"]} == {"AA39", "AC43"}
+    assert "AD37" in report["skipped"]
+
+
+@pytest.mark.parametrize("number", [2, 5])
+def test_contract_on_undeclared_sets(undeclared, tmp_path, number):
+    folder = undeclared / f"set-{number}"
+    predictions = succeeds("predict", folder, "--out", tmp_path / "p")
+    assert len(predictions["heliostats"]) == 4
+    report = succeeds("forecast", folder, "--out", tmp_path / "f")
+    assert len(report["measurements"]) == 36
+    assert report["accuracy_mean"] > (0.96 if number == 2 else 0.8)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("predict", "nowhere", "--out", "x"), "no such folder"),
+        (("predict", ".", "--out", "x"), "tower-measurements.json"),
+        (("predict", "PLANT", "--out", "x", "--method", "magic"), "--method must be"),
+        (("predict", "PLANT", "--out", "x", "--images", "9"), "--images must lie in 1 to 8"),
+        (("forecast", "PLANT", "--out", "x", "--surfaces", "nowhere"), "--surfaces must be"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(made_plant, tmp_path, arguments, says):
+    done = heliotwin(*(made_plant if a == "PLANT" else a for a in arguments), cwd=Path.cwd())
+    assert done.returncode == 2
+    assert says in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert not Path("x").exists()
+
+
+def test_every_verb_has_help():
+    for verb in ("demo", "serve", "import", "flux", "predict", "forecast", "migrate"):
+        done = heliotwin(verb, "--help")
+        assert done.returncode == 0
+        assert "--json" in done.stdout
+
+
+def test_a_heliostat_without_images_is_skipped_with_its_reason(made_plant, tmp_path):
+    import shutil
+
+    root = tmp_path / "plant"
+    shutil.copytree(made_plant, root)
+    for path in (root / "AC31" / "Calibration").iterdir():
+        path.unlink()
+    (root / "AB12" / "Properties" / "AB12-heliostat-properties.json").write_text('{"width": 3}')
+    report = succeeds("predict", root, "--out", tmp_path / "out", "--images", 1)
+    assert sorted(report["heliostats"]) == ["AF27", "AK08"]
+    assert report["skipped"]["AC31"] == "no image"
+    assert "kinematics_properties" in report["skipped"]["AB12"]
+
+
+def test_demo_leaves_table_pictures_report_and_store(tmp_path, stj):
+    done = heliotwin("demo", "--data", stj, "--out", tmp_path / "demo")
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / "demo" / "report.json").read_text())
+    found = {entry["heliostat"]: entry for entry in report["heliostats"]}
+    assert {"AA39", "AC43", "AD37"} <= set(found)
+    assert found["AA39"]["accuracy_refined"] > found["AA39"]["accuracy_network"] > found["AA39"]["accuracy_ideal"]
+    for entry in found.values():
+        for picture in entry["pictures"]:
+            assert (tmp_path / "demo" / picture).read_bytes().startswith(b"\x89PNG")
+    assert "heliotwin serve" in done.stderr
+    assert (tmp_path / "demo" / "report.html").is_file()
