@@ -23,6 +23,7 @@ _JPEG_FRAMES = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 # Sizes [bytes] of TIFF's field types BYTE, SHORT and LONG, the only ones of the fields read here.
 _TIFF_TYPES = {1: ("B", 1), 3: ("H", 2), 4: ("I", 4)}
 _TIFF_WIDTH, _TIFF_HEIGHT, _TIFF_SAMPLES, _TIFF_BITS = 256, 257, 277, 258
+_TIFF_TILE_WIDTH, _TIFF_TILE_HEIGHT = 322, 323
 _TIFF_PLACES = ((273, 279), (324, 325))  # (offsets, byte counts) of strips and of tiles
 
 
@@ -170,6 +171,8 @@ def _read_tiff(data: bytes) -> tuple[bytes, tuple[int, int]]:
     # Samples and bits multiply the memory that the decoder takes for each pixel.
     if fields.get(_TIFF_SAMPLES, (1,))[0] > 4 or max(fields.get(_TIFF_BITS, (1,)), default=1) > 16:
         raise InvalidInputError("image: a TIFF of more than 4 samples or 16 bits is not supported; send PNG or JPEG")
+    if fields.get(_TIFF_TILE_WIDTH, (0,))[0] > 4096 or fields.get(_TIFF_TILE_HEIGHT, (0,))[0] > 4096:
+        raise InvalidInputError("image: a TIFF with tiles above 4096 pixels is not supported; send PNG or JPEG")
     for offsets, counts in _TIFF_PLACES:
         for offset, count in zip(fields.get(offsets, ()), fields.get(counts, ()), strict=False):
             if offset + count > len(data):

@@ -18,10 +18,11 @@ import matplotlib as mpl
 import numpy as np
 from numpy.typing import NDArray
 
-from model.imaging import MeasuredFlux, decode_image, measure
+from model.imaging import MeasuredFlux, center_of_mass, decode_image, measure
 from model.plant import Plant, TargetPlane
 
 TOWER = "WRI1030197-tower-measurements.json"
+Image = NDArray[np.generic]
 CORNERS = ("upper_left", "upper_right", "lower_left", "lower_right")
 
 
@@ -187,22 +188,48 @@ def measure_folder(folder: Path, plane: TargetPlane) -> Counter[str]:
     )
 
 
-def with_reference(cases: list[Case], folder: Path, plant: Plant) -> float:
-    """Median flux accuracy from PAINT's crops of the lower target, given an empty target of another day."""
-    references = sorted(folder.glob("*.png"))
-    if not references:
-        return float("nan")
-    lower = [case for case in cases if case.target.endswith("lower")]
-    empty = decode_image(references[len(references) // 2].read_bytes())
-    return float(
-        np.median(
-            [
-                accuracy(
-                    measure(case.paint_crop, "cropped", plant.targets[case.target], empty=empty).flux, case.paint_flux
-                )
-                for case in lower
-            ]
-        )
+def composite(
+    rng: np.random.Generator, empties: list[Path], fluxes: list[Path], *, foreign: bool
+) -> tuple[Image, Image]:
+    """A real empty target with a real flux somewhere on it, beside a foreign spot of half the size; and that flux."""
+    empty = decode_image(empties[rng.integers(len(empties))].read_bytes()).astype(np.float32)
+    reflectance = empty / np.median(empty)
+
+    def placed(scale: float) -> Image:
+        flux = decode_image(fluxes[rng.integers(len(fluxes))].read_bytes()).astype(np.float32)
+        flux = cv2.warpAffine(flux, np.array([[scale, 0, 0], [0, scale, 0]]), (256, 256))
+        rows, columns = np.nonzero(flux > 0.02 * flux.max())
+        shift = rng.integers(-columns.min(), 256 - columns.max()), rng.integers(-rows.min(), 256 - rows.max())
+        moved = cv2.warpAffine(flux, np.array([[1.0, 0, shift[0]], [0, 1, shift[1]]]), (256, 256))
+        return np.asarray(moved / flux.max(), dtype=np.float32)
+
+    spot, other = placed(1.0), np.zeros((256, 256), np.float32)
+    while foreign and (not other.any() or np.minimum(spot, other).sum() > 0.02 * spot.sum()):
+        spot, other = placed(1.0), placed(0.5) * np.float32(rng.uniform(0.3, 1.0))
+    light = empty + reflectance * rng.uniform(40, 90) * (spot + other) + rng.normal(0, 1, empty.shape)
+    return np.clip(light, 0, 255).astype(np.uint8), spot
+
+
+def composites(folder: Path, plane: TargetPlane, count: int, *, foreign: bool) -> str:
+    """Separation where the truth is known: real fluxes on real empty targets."""
+    empties = sorted((folder / "empty-targets").glob("*.png"))
+    fluxes = sorted(folder.glob("*/Calibration/*-flux.png"))
+    if not empties or not fluxes:
+        return "no data"
+    rng, rows = np.random.default_rng(0), []
+    refusals: Counter[str] = Counter()
+    for _ in range(count):
+        crop, truth = composite(rng, empties, fluxes, foreign=foreign)
+        result = measure(crop, "cropped", plane)
+        if result.flux is None or result.center_of_mass is None:
+            refusals[str(result.quality.reason)] += 1
+            continue
+        miss = result.center_of_mass - center_of_mass(truth, (plane.width, plane.height))
+        rows.append((accuracy(result.flux, truth), float(np.linalg.norm(miss))))
+    score, miss = np.array(rows).T
+    return (
+        f"accuracy median {np.median(score):.3f}, 5 % below {np.percentile(score, 5):.3f}; centre of mass median "
+        f"{np.median(miss):.3f} m, 95 % within {np.percentile(miss, 95):.3f} m; refused {dict(refusals) or 'none'}"
     )
 
 
@@ -210,6 +237,7 @@ def main(argv: list[str] | None = None) -> int:
     """Print the figures and write the contact sheet."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("out/imaging"))
+    parser.add_argument("--composites", type=int, default=150, help="how many are made of fluxes and empty targets")
     options = parser.parse_args(argv)
     folder = data_folder()
     if not (folder / TOWER).exists():
@@ -226,6 +254,9 @@ def main(argv: list[str] | None = None) -> int:
         verdicts = measure_folder(folder / name, lower)
         total = sum(verdicts.values())
         print(f"{name}: " + ", ".join(f"{reason} {count}/{total}" for reason, count in verdicts.most_common()))
+    for foreign in (False, True):
+        label = "real fluxes on real empty targets" + (", a foreign spot beside" if foreign else "")
+        print(f"{label} ({options.composites}): {composites(folder, lower, options.composites, foreign=foreign)}")
     return 0
 
 

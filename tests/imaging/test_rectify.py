@@ -79,6 +79,15 @@ def test_a_hidden_mark_is_replaced_by_those_of_the_other_target(corner):
     assert np.abs(find_corners(frame, plane, "solar_tower_upper") - upper).max() < 3.0
 
 
+@pytest.mark.parametrize("corner", range(4))
+def test_a_hidden_mark_of_a_lone_target_is_put_where_its_neighbours_point(plane, spot, corner):
+    frame = photograph(spot, plane, np.random.default_rng(2))
+    truth = target_corners(plane)
+    x, y = np.round(truth[corner]).astype(int)
+    cv2.circle(frame, (int(x), int(y)), 110, (125, 125, 125), -1)
+    assert np.abs(find_corners(gray(frame), plane) - truth).max() < 5.0
+
+
 def test_marks_are_named_by_kind_and_attitude():
     frame, _, _ = two_targets()
     best = {(mark.kind, mark.quarter) for mark in find_marks(frame)[:6]}

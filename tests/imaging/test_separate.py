@@ -63,3 +63,17 @@ def test_a_blank_image_holds_no_spot(value):
     parts = separate(np.full((256, 256), value, np.uint8))
     assert not parts.main.any()
     assert parts.flux.sum() == 0
+
+
+def test_the_gap_between_a_spot_and_the_edge_is_no_mark(plane):
+    spot = gaussian(plane, 1.9, 0.3, 0.3, 0.4)
+    filled, hidden = bridge_dark_features((120 + 90 * spot).round().astype(np.uint8))
+    assert not hidden.any()
+    assert np.abs(filled - (120 + 90 * spot)).max() < 2.0
+
+
+def test_touching_spots_are_parted(plane):
+    spot, other = gaussian(plane, 0.4, -0.4, 0.9, 0.4, 0.8), 0.9 * gaussian(plane, -0.9, 0.9, 0.3, 0.3)
+    parts = separate((120 + 80 * (spot + other)).round().astype(np.uint8))
+    assert parts.foreign[np.unravel_index(other.argmax(), other.shape)]
+    assert accuracy(parts.flux, spot) > 0.9
