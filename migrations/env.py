@@ -1,10 +1,11 @@
 """How Alembic reaches the database: the connection that `service.database` hands in, or one from the settings."""
 
 from alembic import context
+from sqlalchemy import Connection, text
+
 from service.database import make_engine
 from service.settings import Settings
 from service.tables import Base
-from sqlalchemy import Connection, text
 
 # Any fixed number: it names the lock that lets one migration run at a time on PostgreSQL.
 _MIGRATION_LOCK = 0x68656C696F

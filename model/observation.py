@@ -81,17 +81,22 @@ class SurfacePrediction:
 def scene_of(
     heliostat: Heliostat,
     observations: Sequence[Observation],
-    z: NDArray[np.float64] | None = None,
+    surfaces: Sequence[NDArray[np.float64] | None] = (None,),
     dtype: torch.dtype = torch.float32,
 ) -> Scene:
-    """The scene of a heliostat's observations with heights ``z`` (4, 8, 8) [m], aligned by spots; None is ideal."""
-    points = control_points(heliostat, z)
-    count = len(observations)
-    suns = np.array([o.sun for o in observations])
-    targets = [o.target for o in observations]
-    spots = np.array([o.center_of_mass for o in observations])
-    angles = align_to_spots([heliostat] * count, [points] * count, suns, targets, spots)
-    return Scene.build([heliostat] * count, [points] * count, angles, suns, targets, dtype=dtype)
+    """The scene of a heliostat's M observations with each of K surfaces in turn, aligned by the measured spots.
+
+    ``surfaces`` are heights (4, 8, 8) [m], None the ideal one; the scene holds K * M mirrors, all observations of the
+    first surface first.
+    """
+    count = len(observations) * len(surfaces)
+    shapes = [control_points(heliostat, z) for z in surfaces]
+    points = [shape for shape in shapes for _ in observations]
+    suns = np.tile([o.sun for o in observations], (len(surfaces), 1))
+    targets = [o.target for o in observations] * len(surfaces)
+    spots = np.tile([o.center_of_mass for o in observations], (len(surfaces), 1))
+    angles = align_to_spots([heliostat] * count, points, suns, targets, spots)
+    return Scene.build([heliostat] * count, points, angles, suns, targets, dtype=dtype)
 
 
 def spread_suns(suns: NDArray[np.float64], count: int) -> list[int]:

@@ -1,7 +1,7 @@
 """Surface refinement: maximum a posteriori through the tracer.
 
 Heights are ``mean + basis @ c`` with standard normal coefficients c: a Gaussian prior estimated from measured mirrors.
-Gauss-Newton steps bring the traced images to the measured ones; what a camera adds to an image (a shift, another
+Levenberg-Marquardt steps bring the traced images to the measured ones; what a camera adds to an image (a shift, another
 exposure, background, a little blur, another response) enters as a few directions per image with priors of their own and
 is marginalised exactly. The curvature at the end gives the uncertainty.
 
@@ -12,23 +12,25 @@ all coefficients and images.
 import hashlib
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from model.errors import InvalidInputError
 from model.metrics import flux_accuracy
 from model.observation import FLUX_WINDOW, Observation, SurfacePrediction, scene_of
 from model.plant import Heliostat
 from model.surface import control_points
-from model.tracing import Optics, Scene, Window, trace
+from model.tracing import Optics, Window, trace
 
 Array = NDArray[np.float64]
+
+STEP_HEIGHT = 3e-5
+"""Height [m, root mean square] by which a surface is changed to take a difference of its images."""
 
 PRIOR = Path(__file__).parent / "weights" / "surface-prior.npz"
 
@@ -85,12 +87,14 @@ class RefinementOptions:
     ``noise`` is the standard deviation of a pixel as a share of the image's peak, before ``correlation`` pixels are
     taken to err together; residuals of real images are correlated, and pixels counted one by one would be trusted
     far too much. ``shift_m``, ``exposure``, ``background`` [of the peak], ``blur_m`` and ``gamma`` are the standard
-    deviations of the nuisance parameters.
+    deviations of the nuisance parameters. ``annealing`` multiplies the noise, stage by stage: images that are trusted
+    little at first let the large features settle before the small ones are looked at.
     """
 
     noise: float = 0.02
     correlation: float = 16.0
-    iterations: int = 8
+    iterations: int = 12
+    annealing: tuple[float, ...] = (10.0, 3.0, 1.0)
     shift_m: float = 0.03
     exposure: float = 0.1
     background: float = 0.02
@@ -99,26 +103,18 @@ class RefinementOptions:
     samples: int = 20
 
 
-def _images(scene: Scene, surfaces: Array, heliostat: Heliostat, optics: Optics, samples: int) -> Array:
-    """Traced images (K, M, 64, 64), sum 100, of surfaces (K, 4, 8, 8) [m] under the M suns and targets of a scene."""
-    points = np.array([control_points(heliostat, z) for z in surfaces])
-    stacked = torch.as_tensor(points, dtype=scene.sun.dtype).movedim(-1, -3).repeat_interleave(scene.batch, dim=0)
+def _images(
+    heliostat: Heliostat, observations: Sequence[Observation], surfaces: Array, optics: Optics, samples: int
+) -> Array:
+    """Traced images (K, M, 64, 64), sum 100, of surfaces (K, 4, 8, 8) [m] where the M observations were taken.
 
-    def tiled(values: Tensor) -> Tensor:
-        return values.repeat(len(surfaces), *[1] * (values.ndim - 1))
-
-    batch = Scene(
-        control_points=stacked,
-        attitude=tiled(scene.attitude),
-        center=tiled(scene.center),
-        sun=tiled(scene.sun),
-        plane_center=tiled(scene.plane_center),
-        plane_axes=tiled(scene.plane_axes),
-    )
-    window = Window(FLUX_WINDOW, FLUX_WINDOW, on_spot=True)
+    Every surface is aligned anew: a tilt of the whole mirror is taken back by the mount and leaves no trace.
+    """
+    scene = scene_of(heliostat, observations, list(surfaces))
     with torch.no_grad():
-        flux = trace(batch, window, optics, samples=samples, padding=0.25).normalized()
-    return flux.double().numpy().reshape(len(surfaces), scene.batch, *flux.shape[1:])
+        window = Window(FLUX_WINDOW, FLUX_WINDOW, on_spot=True)
+        flux = trace(scene, window, optics, samples=samples, padding=0.25).normalized()
+    return flux.double().numpy().reshape(len(surfaces), len(observations), *flux.shape[1:])
 
 
 def _nuisance(image: Array, options: RefinementOptions) -> Array:
@@ -139,18 +135,88 @@ def _nuisance(image: Array, options: RefinementOptions) -> Array:
     return np.stack([d.ravel() for d in directions], axis=-1)
 
 
-def _whitened(residual: Array, jacobian: Array, image: Array, options: RefinementOptions) -> tuple[Array, Array]:
-    """Gradient (K,) and Gauss-Newton matrix (K, K) of one image, its nuisance parameters marginalised.
+class _Posterior:
+    """The posterior of one heliostat's surface, in coefficients of the prior."""
 
-    With residual r = J dc + N n + noise and n ~ N(0, 1), the noise covariance becomes s^2 + N N', inverted by
-    Woodbury's identity.
-    """
-    sigma = options.noise * image.max() * np.sqrt(options.correlation)
-    directions = _nuisance(image, options) / sigma
-    r, j = residual.ravel() / sigma, jacobian.reshape(len(jacobian), -1).T / sigma
-    inner = np.linalg.inv(np.eye(directions.shape[1]) + directions.T @ directions)
-    projected = inner @ (directions.T @ j)
-    return j.T @ r - projected.T @ (directions.T @ r), j.T @ j - (directions.T @ j).T @ projected
+    def __init__(
+        self,
+        heliostat: Heliostat,
+        observations: Sequence[Observation],
+        prior: SurfacePrior,
+        optics: Optics,
+        options: RefinementOptions,
+    ) -> None:
+        self.heliostat, self.observations = heliostat, observations
+        self.prior, self.optics, self.options = prior, optics, options
+        self.measured = np.array([o.flux / o.flux.sum() * 100 for o in observations], dtype=np.float64)
+
+    def images(self, surfaces: Array) -> Array:
+        """Traced images (K, M, 64, 64) of surfaces (K, 4, 8, 8) [m]."""
+        return _images(self.heliostat, self.observations, surfaces, self.optics, self.options.samples)
+
+    def _nuisances(self, image: Array) -> tuple[float, Array, Array]:
+        """Noise of an image's pixels, its nuisance directions over that noise (n, 6), and Woodbury's inner inverse.
+
+        With residual r = J dc + N n + noise and n ~ N(0, 1), the noise covariance is s^2 + N N'.
+        """
+        sigma = self.options.noise * float(image.max()) * self.options.correlation**0.5
+        directions = _nuisance(image, self.options) / sigma
+        return sigma, directions, np.linalg.inv(np.eye(directions.shape[1]) + directions.T @ directions)
+
+    def cost(self, c: Array, traced: Array) -> float:
+        """Negative logarithm of the posterior density at coefficients (K,) with images (M, 64, 64), to a constant."""
+        total = float(c @ c)
+        for measured, image in zip(self.measured, traced, strict=True):
+            sigma, directions, inner = self._nuisances(image)
+            r = (measured - image).ravel() / sigma
+            along = directions.T @ r
+            total += float(r @ r - along @ inner @ along)
+        return total / 2
+
+    def quadratic(self, c: Array, traced: Array, jacobian: Array) -> tuple[Array, Array]:
+        """Downhill gradient (K,) and Gauss-Newton curvature (K, K) of the cost; jacobian (K, M, 64, 64)."""
+        gradient, curvature = -c, np.eye(len(c))
+        for index, (measured, image) in enumerate(zip(self.measured, traced, strict=True)):
+            sigma, directions, inner = self._nuisances(image)
+            r = (measured - image).ravel() / sigma
+            j = jacobian[:, index].reshape(len(c), -1).T / sigma
+            projected = inner @ (directions.T @ j)
+            gradient = gradient + j.T @ r - projected.T @ (directions.T @ r)
+            curvature = curvature + j.T @ j - (directions.T @ j).T @ projected
+        return gradient, curvature
+
+    def _steps(self) -> Array:
+        """Steps (K, 1, 1, 1) of the differences: the same height for each direction.
+
+        Small enough for the images to be linear in it, large enough to stand out from their last digits.
+        """
+        height = np.sqrt((self.prior.basis**2).mean(axis=(1, 2, 3), keepdims=True))
+        return np.asarray(np.clip(STEP_HEIGHT / height, 0.1, 4.0))
+
+    def maximise(self, c: Array) -> tuple[Array, Array]:
+        """Coefficients (K,) of the highest density near ``c`` and the curvature (K, K) there (Levenberg-Marquardt)."""
+        damping, steps = 0.1, self._steps()
+        images = self.images(self.prior.surface(c)[None])[0]
+        cost = self.cost(c, images)
+        for _ in range(self.options.iterations):
+            z = self.prior.surface(c)
+            shifted = self.images(z + steps * self.prior.basis)
+            gradient, curvature = self.quadratic(c, images, (shifted - images) / steps)
+            for _ in range(6):
+                change = np.linalg.solve(curvature + damping * np.diag(np.diag(curvature)), gradient)
+                trial = c + change
+                trial_images = self.images(self.prior.surface(trial)[None])[0]
+                trial_cost = self.cost(trial, trial_images)
+                if trial_cost < cost:
+                    break
+                damping *= 4
+            else:
+                return c, curvature
+            gain, cost, c, images = cost - trial_cost, trial_cost, trial, trial_images
+            damping = max(damping / 5, 1e-4)
+            if gain < 0.05:
+                break
+        return c, curvature
 
 
 def refine(
@@ -179,26 +245,12 @@ def refine(
     """
     if not observations:
         raise InvalidInputError("a refinement takes at least one image")
-    prior, optics, options = prior or default_prior(), optics or Optics(), options or RefinementOptions()
-    measured = np.array([o.flux / o.flux.sum() * 100 for o in observations], dtype=np.float64)
+    prior, optics = prior or default_prior(), optics or Optics()
+    options = options or RefinementOptions()
     c = np.zeros(len(prior.basis)) if start is None else prior.coefficients(start)
-    for _ in range(options.iterations):
-        z = prior.surface(c)
-        scene = scene_of(heliostat, observations, z)
-        step = 0.25
-        surfaces = np.concatenate([z[None], z + step * prior.basis])
-        images = _images(scene, surfaces, heliostat, optics, options.samples)
-        jacobian = (images[1:] - images[0]) / step
-        gradient, curvature = -c, np.eye(len(c))
-        for image in range(len(measured)):
-            g, h = _whitened(measured[image] - images[0, image], jacobian[:, image], images[0, image], options)
-            gradient, curvature = gradient + g, curvature + h
-        change = np.linalg.solve(curvature, gradient)
-        # A trust region of two standard deviations: beyond it the images are far from linear in the surface.
-        change *= min(1.0, 2.0 / np.abs(change).max())
-        c = c + change
-        if np.abs(change).max() < 0.01:
-            break
+    for factor in options.annealing:
+        softened = replace(options, noise=options.noise * factor)
+        c, curvature = _Posterior(heliostat, observations, prior, optics, softened).maximise(c)
     z = prior.surface(c)
     covariance = np.linalg.inv(curvature)
     variance = np.einsum("kfij,kl,lfij->fij", prior.basis, covariance, prior.basis, optimize=True) + prior.residual**2
@@ -217,8 +269,7 @@ def misfit(
     heliostat: Heliostat, observations: Sequence[Observation], z: NDArray[np.float64], optics: Optics | None = None
 ) -> float:
     """One minus the mean accuracy with which heights ``z`` (4, 8, 8) [m] re-render the images they came from."""
-    scene = scene_of(heliostat, observations, z)
-    images = _images(scene, z[None], heliostat, optics or Optics(), RefinementOptions().samples)[0]
+    images = _images(heliostat, observations, z[None], optics or Optics(), RefinementOptions().samples)[0]
     return float(
         1 - np.mean([flux_accuracy(o.flux, image.clip(min=0)) for o, image in zip(observations, images, strict=True)])
     )

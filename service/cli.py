@@ -15,6 +15,7 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 from rich.table import Table
 
 from model.errors import InvalidInputError, ModelError
+from service.faults import ServiceError
 from service.operations import Method
 from service.paint import MeasurementFolder, read_folder
 
@@ -233,7 +234,7 @@ def main() -> None:
     except ValidationError as error:
         first = error.errors()[0]
         _fail(f"setting {'.'.join(map(str, first['loc'])) or 'combination'}: {first['msg']}", 2)
-    except (ModelError, OSError) as error:
+    except (ModelError, ServiceError, OSError) as error:
         _fail(error, 1)
 
 

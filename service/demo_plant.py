@@ -36,6 +36,7 @@ TARGET = TargetPlane(
     "calibration_target", np.array([0.0, 0.0, 40.0]), np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]), 8.0, 7.0
 )
 IMAGES, RAYS, PIXELS = 8, 400_000, 112
+"""Photographs of each heliostat, rays and pixels along each side of each."""
 
 
 def heliostat(name: str, position: Array) -> Heliostat:
@@ -96,19 +97,21 @@ def tower(plant: Plant) -> dict[str, Any]:
     }
 
 
-def suns(rng: np.random.Generator) -> Array:
-    """Unit vectors (IMAGES, 3): hours of the day through the seasons."""
-    hour_angle = np.linspace(-55, 55, IMAGES) + rng.uniform(-5, 5, IMAGES)
-    return sun_direction_at(rng.permutation(np.linspace(0, 22, IMAGES)), hour_angle, float(ORIGIN[0]))
+def suns(count: int, rng: np.random.Generator) -> Array:
+    """Unit vectors (count, 3): hours of the day through the seasons."""
+    hour_angle = np.linspace(-55, 55, count) + rng.uniform(-5, 5, count)
+    return sun_direction_at(rng.permutation(np.linspace(0, 22, count)), hour_angle, float(ORIGIN[0]))
 
 
-def photographs(mirror: Heliostat, z: Array, rng: np.random.Generator) -> tuple[Array, list[NDArray[np.uint8]]]:
-    """Suns (IMAGES, 3) and camera frames of one heliostat; its spot wanders about the target's centre."""
-    directions = suns(rng)
-    spots = TARGET.to_enu(rng.uniform(-0.6, 0.6, (IMAGES, 2)))
-    points, mirrors, planes = [control_points(mirror, z)] * IMAGES, [mirror] * IMAGES, [TARGET] * IMAGES
+def photographs(
+    mirror: Heliostat, z: Array, count: int, rays: int, rng: np.random.Generator
+) -> tuple[Array, list[NDArray[np.uint8]]]:
+    """Suns (count, 3) and camera frames of one heliostat; its spot wanders about the target's centre."""
+    directions = suns(count, rng)
+    spots = TARGET.to_enu(rng.uniform(-0.6, 0.6, (count, 2)))
+    points, mirrors, planes = [control_points(mirror, z)] * count, [mirror] * count, [TARGET] * count
     scene = Scene.build(mirrors, points, align_to_spots(mirrors, points, directions, planes, spots), directions, planes)
-    traced, _ = trace_montecarlo(scene, Window.of(TARGET, PIXELS, PIXELS), rays=RAYS, seed=int(rng.integers(2**31)))
+    traced, _ = trace_montecarlo(scene, Window.of(TARGET, PIXELS, PIXELS), rays=rays, seed=int(rng.integers(2**31)))
     frames = [
         photograph(flux, TARGET, rng, CameraOptions(time_stamp=f"demo {mirror.name} image {index + 1}"))
         for index, flux in enumerate(traced)
@@ -116,7 +119,9 @@ def photographs(mirror: Heliostat, z: Array, rng: np.random.Generator) -> tuple[
     return directions, frames
 
 
-def write_plant(root: Path, progress: Progress = quiet, seed: int = 2024) -> None:
+def write_plant(
+    root: Path, progress: Progress = quiet, *, images: int = IMAGES, rays: int = RAYS, seed: int = 2024
+) -> None:
     """Write the demonstration's measurement folder; the true surfaces lie in ``H/Deflectometry``."""
     rng = np.random.default_rng(seed)
     plant, prior = Plant("demo", ORIGIN), default_prior()
@@ -132,7 +137,7 @@ def write_plant(root: Path, progress: Progress = quiet, seed: int = 2024) -> Non
         np.savez_compressed(
             root / name / "Deflectometry" / f"{name}-nurbs-surface.npz", control_points=points, degrees=np.array([3, 3])
         )
-        for index, (sun, frame) in enumerate(zip(*photographs(mirror, z, rng), strict=True), start=1):
+        for index, (sun, frame) in enumerate(zip(*photographs(mirror, z, images, rays, rng), strict=True), start=1):
             azimuth, elevation = sun_angles(sun)
             stem = root / name / "Calibration" / f"{number}{index:02d}"
             about = {"target_name": TARGET.name, "sun_azimuth": float(azimuth), "sun_elevation": float(elevation)}

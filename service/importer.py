@@ -9,11 +9,14 @@ import numpy as np
 from model.errors import ImageRefusedError, InvalidInputError
 from model.surface import control_points
 from service import store
-from service.faults import ConflictError, TooLargeError
+from service.faults import ConflictError, TooLargeError, UnsupportedImageError
 from service.folder import Progress, quiet
 from service.paint import IMAGE_KINDS, Measurement, MeasurementFolder, measured_heights, read_json
 from service.runtime import Runtime
 from service.workflows import Photograph, ingest
+
+UNREADABLE = (InvalidInputError, ImageRefusedError, ConflictError, TooLargeError, UnsupportedImageError)
+"""What one image may be refused for without ending the import."""
 
 
 def import_folder(runtime: Runtime, folder: MeasurementFolder, progress: Progress = quiet) -> dict[str, Any]:
@@ -37,7 +40,7 @@ def import_folder(runtime: Runtime, folder: MeasurementFolder, progress: Progres
                 progress(f"{measurement.key} {kind}")
                 try:
                     counts[_put_image(runtime, folder, measurement, kind)] += 1
-                except (InvalidInputError, ImageRefusedError, ConflictError, TooLargeError) as error:
+                except UNREADABLE as error:
                     skipped[f"{measurement.key} {kind}"] = str(error)
     return {"counts": dict(sorted(counts.items())), "skipped": skipped}
 

@@ -6,6 +6,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from model.surface import DEGREE, basis
+
 _FACETS = ("upper left", "upper right", "lower left", "lower right")
 
 
@@ -27,14 +29,16 @@ def flux_picture(flux: NDArray[np.floating], size: tuple[float, float] | None, u
 
 
 def surface_picture(z: NDArray[np.floating], title: str) -> bytes:
-    """A surface's control heights (4, 8, 8) [m] as a map in mm, its facets as they are seen from the front."""
+    """A surface of control heights (4, 8, 8) [m] as a map in mm, its facets as they are seen from the front."""
     figure = Figure(figsize=(6.4, 5), layout="constrained")
     panes = figure.subplots(2, 2).ravel()
-    heights = np.asarray(z, dtype=np.float64) * 1e3
+    # Control heights crowd towards the facet's edges; the picture shows the surface on even steps.
+    across, along = (basis(count, DEGREE, np.linspace(0, 1, 48))[0] for count in np.shape(z)[1:])
+    heights = across @ np.asarray(z, dtype=np.float64) @ along.T * 1e3
     bound = max(float(np.abs(heights).max()), 1e-3)
     for pane, facet, name in zip(panes, heights, _FACETS, strict=True):
         # i runs with x and j with y, so columns are i and rows, from below, are j
-        image = pane.imshow(facet.T, cmap="RdBu_r", vmin=-bound, vmax=bound, origin="lower", interpolation="bilinear")
+        image = pane.imshow(facet.T, cmap="RdBu_r", vmin=-bound, vmax=bound, origin="lower")
         pane.set(xticks=[], yticks=[], title=name)
     figure.suptitle(title)
     figure.colorbar(image, ax=panes.tolist(), label="deviation from the ideal facet [mm]")

@@ -1,6 +1,11 @@
 """What the tests share: where the real data lie, and small scenes."""
 
 import os
+
+# Two cores, several test processes: threads of linear algebra would only spin against each other.
+for _library in ("OMP", "OPENBLAS", "MKL"):
+    os.environ.setdefault(f"{_library}_NUM_THREADS", "1")
+
 from pathlib import Path
 
 import numpy as np

@@ -7,13 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.refinement import PRIOR, SurfacePrior
-from training.surfaces import load_surfaces, mirrored, rotated, split_by_heliostat
+from training.surfaces import load_surfaces, mirrored, rotated, split_by_heliostat, tilt_modes
 from training.train import TrainConfig
 
 Array = NDArray[np.float64]
 
 
-def estimate(surfaces: Array, components: int = 48) -> SurfacePrior:
+def estimate(surfaces: Array, components: int = 96) -> SurfacePrior:
     """Mean and low-rank covariance of measured surfaces (N, 4, 8, 8) [m].
 
     A mirror is as likely as its mirror images, so that the surfaces seen from the left, turned about, and both, count
@@ -28,9 +28,35 @@ def estimate(surfaces: Array, components: int = 48) -> SurfacePrior:
     _, singular, directions = np.linalg.svd(deviations, full_matrices=False)
     spread = singular[:components] / np.sqrt(len(seen) - 1)
     left_out = (singular[components:] ** 2).sum() / (len(seen) - 1) / directions.shape[1]
-    return SurfacePrior(
-        mean, (directions[:components] * spread[:, None]).reshape(-1, *mean.shape), float(left_out**0.5)
-    )
+    measured = (directions[:components] * spread[:, None]).reshape(-1, *mean.shape)
+    basis = untilted(np.concatenate([measured, canting_directions()]))
+    return SurfacePrior(untilted(mean), orthogonal(basis), float(left_out**0.5))
+
+
+def untilted(z: Array) -> Array:
+    """Surfaces (..., 4, 8, 8) [m] without the tilt of the whole mirror, which is the mount's and not the surface's."""
+    modes = np.repeat(tilt_modes()[:, None], 4, axis=1).reshape(2, -1)
+    flat = z.reshape(*z.shape[:-3], -1)
+    return np.asarray((flat - flat @ np.linalg.pinv(modes) @ modes).reshape(z.shape))
+
+
+def canting_directions(sigma_mrad: float = 0.6) -> Array:
+    """Free canting of each facet (8, 4, 8, 8) [m], ``sigma_mrad`` of slope along x and along y.
+
+    A facet's canting is set by hand and against a nominal focus that is not always the real one; the sample of measured
+    heliostats does not show all of that.
+    """
+    free = np.zeros((4, 2, 4, 8, 8))
+    for facet in range(4):
+        free[facet, :, facet] = sigma_mrad * 1e-3 * tilt_modes()
+    return free.reshape(8, 4, 8, 8)
+
+
+def orthogonal(directions: Array) -> Array:
+    """Orthogonal directions (K, 4, 8, 8) [m] of the same covariance, the longest first."""
+    flat = directions.reshape(len(directions), -1)
+    _, singular, axes = np.linalg.svd(flat, full_matrices=False)
+    return np.asarray((singular[:, None] * axes)[singular > 1e-9].reshape(-1, *directions.shape[1:]))
 
 
 def _means(mean: Array) -> list[Array]:

@@ -39,7 +39,8 @@ class Augmentation:
 
     ``average`` is the share of samples that mix two or three heliostats, ``exchange`` the share whose facets come from
     different ones; ``canting`` and ``waviness`` scale the two parts of the surface apart by up to that factor either
-    way, ``tilt_mrad`` adds canting at random.
+    way, ``tilt_mrad`` adds canting at random, ``focus_mrad`` canting towards another focus: the measured heliostats
+    AA28 and AA39 lie off the others there, by what their properties call ideal.
     """
 
     average: float = 0.6
@@ -47,6 +48,7 @@ class Augmentation:
     canting: float = 1.4
     waviness: float = 1.3
     tilt_mrad: float = 0.15
+    focus_mrad: float = 0.4
 
     def sample(self, surfaces: Array, count: int, rng: np.random.Generator) -> Array:
         """Random surfaces (count, 4, 8, 8) [m] from measured ones (N, 4, 8, 8)."""
@@ -72,6 +74,12 @@ class Augmentation:
         return np.where(rng.random((count, 1, 1, 1)) < 0.5, mirrored(mixed), mixed)
 
     def _tilts(self, count: int, rng: np.random.Generator) -> Array:
-        x, y = (2 * greville(8) - 1)[:, None] * 0.8, (2 * greville(8) - 1)[None, :] * 0.64
-        tilt = rng.normal(0, self.tilt_mrad * 1e-3, (2, count, 4, 1, 1))
-        return np.asarray(tilt[0] * x + tilt[1] * y)
+        inward = np.array([[1, -1], [-1, -1], [1, 1], [-1, 1]])
+        tilt = rng.normal(0, self.tilt_mrad, (count, 4, 2)) + rng.normal(0, self.focus_mrad, (count, 1, 2)) * inward
+        return np.asarray(np.einsum("nfk,kij->nfij", tilt * 1e-3, tilt_modes()))
+
+
+def tilt_modes() -> Array:
+    """Heights (2, 8, 8) [m] of one radian of slope along a facet's x and y (Juelich's facets)."""
+    x, y = np.meshgrid(0.8025 * (2 * greville(8) - 1), 0.6375 * (2 * greville(8) - 1), indexing="ij")
+    return np.stack([x, y])

@@ -34,6 +34,8 @@ class SurfacePredictor:
     """
 
     def __init__(self, path: Path = WEIGHTS, threads: int = 1) -> None:
+        # A plant's computer reports to nobody.
+        onnxruntime.disable_telemetry_events()
         content = path.read_bytes()
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = threads

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from model.plant import Heliostat, TargetPlane
 from model.surface import DEGREE
 from model.tracing.convolution import central_rays
-from model.tracing.scene import Scene
+from model.tracing.scene import Scene, by_heliostat
 
 ROUNDS = 3
 """The spot follows the aim almost one to one, so that each round leaves a thousandth of the error or less."""
@@ -46,12 +46,21 @@ def align_to_spots(
     goal, directions = np.asarray(spots, dtype=np.float64), np.asarray(suns, dtype=np.float64)
     aim = goal.copy()
     for turn in range(ROUNDS + 1):
-        angles = np.array(
-            [h.mount.align(h.position, s, a) for h, s, a in zip(heliostats, directions, aim, strict=True)]
-        )
+        angles = _align(heliostats, directions, aim)
         if turn == ROUNDS:
             return angles
         scene = Scene.build(heliostats, control_points, angles, directions, planes, degree=degree, dtype=torch.float64)
         traced = central_rays(scene, samples).spot.numpy()
-        aim += goal - np.array([plane.to_enu(spot) for plane, spot in zip(planes, traced, strict=True)])
+        center, axes = scene.plane_center.numpy(), scene.plane_axes.numpy()
+        aim += goal - center - np.einsum("bi,bij->bj", traced, axes[:, :2])
     raise AssertionError("unreachable")
+
+
+def _align(
+    heliostats: Sequence[Heliostat], suns: NDArray[np.float64], aims: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Axis angles (B, 2) [rad] that send the ray from each mirror's centre to its aim (B, 3)."""
+    angles = np.empty((len(heliostats), 2))
+    for heliostat, rows in by_heliostat(heliostats):
+        angles[rows] = heliostat.mount.align(heliostat.position, suns[rows], aims[rows])
+    return angles

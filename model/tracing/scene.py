@@ -1,6 +1,6 @@
 """Scenes: what both tracers trace. A batch of mirrors, each with its pose, its sun and its target plane."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -89,6 +89,15 @@ class Window:
         return self.width / self.columns, self.height / self.rows
 
 
+def by_heliostat(heliostats: Sequence[Heliostat]) -> Iterator[tuple[Heliostat, list[int]]]:
+    """Each different heliostat with its places in the sequence, so that its mount turns all of them at once."""
+    places: dict[int, list[int]] = {}
+    for index, heliostat in enumerate(heliostats):
+        places.setdefault(id(heliostat), []).append(index)
+    for rows in places.values():
+        yield heliostats[rows[0]], rows
+
+
 @dataclass(frozen=True, eq=False)
 class Scene:
     """A batch of mirrors before the sun and a plane each.
@@ -135,8 +144,10 @@ class Scene:
     ) -> "Scene":
         """A scene of ``B`` heliostats with control points (F, I, J, 3) [m], axis angles (B, 2) [rad], suns (B, 3)."""
         t = np.asarray(angles, dtype=np.float64)
-        attitudes = np.array([h.mount.attitude(a) for h, a in zip(heliostats, t, strict=True)])
-        centers = [h.mount.mirror_center(h.position, r) for h, r in zip(heliostats, attitudes, strict=True)]
+        attitudes, centers = np.empty((len(t), 3, 3)), np.empty((len(t), 3))
+        for heliostat, rows in by_heliostat(heliostats):
+            attitudes[rows] = heliostat.mount.attitude(t[rows])
+            centers[rows] = heliostat.mount.mirror_center(heliostat.position, attitudes[rows])
 
         def tensor(values: object) -> Tensor:
             return torch.as_tensor(np.asarray(values), dtype=dtype, device=device)

@@ -54,7 +54,7 @@ def test_a_surface_measured_twice(stj):
     with np.load(stj / "surfaces.npz") as data:
         others = data["z"].reshape(len(data["z"]), -1)
     correlation = [np.corrcoef(z.ravel(), other)[0, 1] for other in others]
-    assert max(correlation) > 0.95
+    assert max(correlation) > 0.9
 
 
 def test_deflectometry_h5_is_fitted(tmp_path):

@@ -1,0 +1,127 @@
+import numpy as np
+import pytest
+import torch
+
+from model.errors import InvalidInputError
+from model.network.architecture import CONDITIONS, MAX_IMAGES, NetworkConfig, SurfaceNetwork
+from model.network.inputs import conditions
+from model.network.predictor import SurfacePredictor, default_predictor, model_card
+from model.observation import Observation, spread_suns
+from model.plant import TargetPlane
+from model.surface import control_points
+from model.tracing import Scene
+from model.tracing.convolution import central_rays
+from tests.conftest import flat_heliostat, target
+from training.export import PARITY_MM, example, export, parity
+
+SMALL = NetworkConfig(encoder_channels=(8, 16, 16), features=32, heads=2, style_features=8, decoder_channels=16)
+
+
+@pytest.fixture(scope="module")
+def network() -> SurfaceNetwork:
+    torch.manual_seed(0)
+    return SurfaceNetwork(SMALL).eval()
+
+
+def test_order_of_images_does_not_matter(network):
+    flux, geometry, mask = example(3, MAX_IMAGES)
+    order = torch.randperm(MAX_IMAGES)
+    with torch.no_grad():
+        straight, shuffled = network(flux, geometry, mask), network(flux[:, order], geometry[:, order], mask)
+    for a, b in zip(straight, shuffled, strict=True):
+        torch.testing.assert_close(a, b, atol=1e-5, rtol=1e-5)
+
+
+def test_what_stands_where_there_is_no_image_does_not_matter(network):
+    flux, geometry, mask = example(2, 3)
+    noise = torch.where(mask[..., None, None] > 0, flux, torch.rand_like(flux))
+    with torch.no_grad():
+        full, other = network(flux, geometry, mask)[0], network(noise, geometry, mask)[0]
+        alone = network(flux[:, :3], geometry[:, :3], mask[:, :3])[0]
+    torch.testing.assert_close(full, other)
+    torch.testing.assert_close(full, alone, atol=1e-5, rtol=1e-5)
+
+
+def test_heights_have_no_facet_mean_and_spread_is_positive(network):
+    with torch.no_grad():
+        heights, spread = network(*example(2, 5))
+    assert heights.shape == spread.shape == (2, 4, 8, 8)
+    torch.testing.assert_close(heights.mean(dim=(2, 3)), torch.zeros(2, 4), atol=1e-6, rtol=0)
+    assert (spread > 0).all()
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning", "ignore:# The axis name")
+def test_onnx_equals_torch_at_every_batch_and_number_of_images(network, tmp_path):
+    export(network, tmp_path / "small.onnx")
+    assert parity(network, tmp_path / "small.onnx") <= PARITY_MM
+
+
+def test_conditions_say_how_slopes_and_places_move_light():
+    """Against the tracer: tilt the whole mirror a little, and move it a little, and see where the spot goes."""
+    heliostat, plane = flat_heliostat((25.0, 70.0, 1.8)), target()
+    sun = np.array([0.35, -0.5, 0.79]) / np.linalg.norm([0.35, -0.5, 0.79])
+    angles = heliostat.mount.align(heliostat.position, sun, plane.center)
+    points = control_points(heliostat)
+    tilted = points.copy()
+    tilted[..., 2] += 1e-4 * points[..., 0]  # a slope of 0.1 mrad along the mirror's x
+    moved = points + [0.0, 0.01, 0.0]
+    scenes = [
+        Scene.build([heliostat], [p], [angles], [sun], [plane], dtype=torch.float64) for p in (points, tilted, moved)
+    ]
+    rays = [central_rays(s, 8) for s in scenes]
+    told = conditions(scenes[0])[0].numpy()
+    slope = (rays[1].spot - rays[0].spot)[0].numpy() / (2e-4 * float(rays[0].slant_range))
+    place = (rays[2].spot - rays[0].spot)[0].numpy() / 0.01
+    np.testing.assert_allclose(told[0:2], slope, atol=5e-3)
+    np.testing.assert_allclose(told[6:8], place, atol=5e-3)
+    assert told.shape == (CONDITIONS,)
+    assert told[8] == pytest.approx(np.log(float(rays[0].slant_range) / 100), abs=1e-3)
+
+
+def observation(identifier="1") -> Observation:
+    flux = np.exp(-0.5 * ((np.arange(64) - 31.5) / 12) ** 2)
+    image = np.outer(flux, flux).astype(np.float32)
+    plane: TargetPlane = target()
+    return Observation(image / image.sum() * 100, np.array([0.0, -0.6, 0.8]), plane, plane.center, identifier)
+
+
+def test_shipped_predictor_names_its_weights_and_keeps_the_contract():
+    predicted = default_predictor().predict(flat_heliostat(focal_length=75.0), [observation("a"), observation("b")])
+    assert predicted.z.shape == predicted.z_std.shape == (4, 8, 8)
+    assert predicted.control_points.shape == (4, 8, 8, 3)
+    assert predicted.used == ("a", "b")
+    assert predicted.weights.startswith("surface-network-")
+    assert (predicted.z_std > 0).all()
+    assert 0 < predicted.misfit < 1
+
+
+def test_predictor_takes_a_batch_of_any_size():
+    predictor: SurfacePredictor = default_predictor()
+    for batch in (1, 5):
+        z, z_std = predictor.run(*(tensor.numpy() for tensor in example(batch, 4)))
+        assert z.shape == z_std.shape == (batch, 4, 8, 8)
+
+
+def test_shipped_network_beats_the_mean_surface_by_its_own_card():
+    figures = model_card()["evaluation"]
+    network, mean = figures["network, 8 clean images"], figures["mean surface"]
+    assert network["mae_mm"]["median"] < 0.8 * mean["mae_mm"]["median"]
+    assert network["flux_accuracy"] > mean["flux_accuracy"]
+
+
+def test_wrong_number_of_images_is_named():
+    for images in ([], [observation(str(i)) for i in range(9)]):
+        with pytest.raises(InvalidInputError, match="1 to 8 images"):
+            default_predictor().predict(flat_heliostat(), images)
+
+
+def test_bad_flux_is_named():
+    with pytest.raises(InvalidInputError, match="flux of x"):
+        Observation(np.zeros((64, 64), np.float32), np.array([0, -0.6, 0.8]), target(), np.zeros(3), "x")
+
+
+def test_spread_suns_takes_the_extremes():
+    angles = np.radians([0, 1, 2, 50, 51, -50])
+    suns = np.stack([np.sin(angles), -np.cos(angles), np.zeros(6)], axis=-1)
+    assert sorted(spread_suns(suns, 3)) in ([0, 4, 5], [0, 3, 5])
+    assert len(spread_suns(suns, 8)) == 6

@@ -1,0 +1,76 @@
+"""Refinement on rendered images of mirrors it knows only by their light."""
+
+import numpy as np
+import pytest
+import torch
+
+from model.errors import InvalidInputError
+from model.frames import sun_direction_at
+from model.metrics import surface_error
+from model.observation import Observation, scene_of
+from model.plant import Heliostat
+from model.refinement import default_prior, misfit, refine
+from model.tracing import Window, trace
+from tests.conftest import flat_heliostat, target
+
+SUNS = sun_direction_at(np.array([-20.0, -5, 5, 20, 15, 0]), np.array([-40.0, 30, -15, 50, 0, 10]), 50.9)
+
+
+def observe(heliostat: Heliostat, z: np.ndarray, noise: float = 0.01) -> list[Observation]:
+    """Noisy 8-bit images of a mirror under six suns."""
+    rng, plane = np.random.default_rng(5), target()
+    blank = np.ones((64, 64), np.float32)
+    places = [Observation(blank, sun, plane, plane.center, str(i)) for i, sun in enumerate(SUNS)]
+    with torch.no_grad():
+        flux = trace(scene_of(heliostat, places, [z]), Window(on_spot=True), samples=40).irradiance.numpy()
+    flux = flux / flux.max(axis=(1, 2), keepdims=True) + rng.normal(0, noise, flux.shape)
+    images = np.round(flux.clip(0, 1) * 255).astype(np.float32)
+    return [
+        Observation(100 * image / image.sum(), o.sun, o.target, o.center_of_mass, o.identifier)
+        for image, o in zip(images, places, strict=True)
+    ]
+
+
+@pytest.fixture(scope="module")
+def heliostat() -> Heliostat:
+    return flat_heliostat((15.0, 75.0, 1.8), focal_length=85.0)
+
+
+@pytest.fixture(scope="module")
+def truth() -> np.ndarray:
+    prior = default_prior()
+    return prior.surface(np.random.default_rng(8).normal(0, 0.9, len(prior.basis)))
+
+
+@pytest.fixture(scope="module")
+def refined(heliostat, truth):
+    return refine(heliostat, observe(heliostat, truth))
+
+
+def test_the_true_surface_is_found(refined, truth):
+    error, before = surface_error(refined.z, truth), surface_error(default_prior().mean, truth)
+    assert error < 0.35 * before
+    assert error < 0.12e-3
+
+
+def test_the_uncertainty_covers_the_error(refined, truth):
+    error = np.abs(refined.z - truth)
+    assert (refined.z_std > 0).all()
+    assert 0.3 < np.mean(error < 1.645 * refined.z_std) <= 1
+
+
+def test_misfit_tells_a_surface_from_another(heliostat, truth, refined):
+    images = observe(heliostat, truth)
+    assert refined.misfit < 0.08
+    assert misfit(heliostat, images, default_prior().mean) > 1.5 * refined.misfit
+
+
+def test_prior_inverts_its_own_coefficients():
+    prior = default_prior()
+    c = np.random.default_rng(0).normal(size=len(prior.basis))
+    np.testing.assert_allclose(prior.coefficients(prior.surface(c)), c, rtol=1e-5)
+
+
+def test_no_image_is_named(heliostat):
+    with pytest.raises(InvalidInputError, match="at least one image"):
+        refine(heliostat, [])

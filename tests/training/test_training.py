@@ -1,0 +1,107 @@
+"""Training end to end, small: surfaces, rendering, steps, resuming."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from model.network.architecture import NetworkConfig
+from model.surface import split_canting
+from training.prior import estimate, untilted
+from training.render import Camera, Situations, load_field, render
+from training.surfaces import Augmentation, load_surfaces, mirrored, rotated, split_by_heliostat, tilt_modes
+from training.train import Run, TrainConfig
+
+SMALL = NetworkConfig(encoder_channels=(8, 16, 16), features=32, heads=2, style_features=8, decoder_channels=16)
+
+
+@pytest.fixture(scope="module")
+def surfaces(stj) -> np.ndarray:
+    return load_surfaces(stj)[0]
+
+
+def test_split_keeps_heliostats_apart():
+    train, held_out = split_by_heliostat(47, 8, 7)
+    assert len(held_out) == 8
+    assert set(train).isdisjoint(held_out)
+    assert len(set(train) | set(held_out)) == 47
+
+
+def test_turning_twice_and_mirroring_twice_change_nothing(surfaces):
+    np.testing.assert_array_equal(rotated(rotated(surfaces)), surfaces)
+    np.testing.assert_array_equal(mirrored(mirrored(surfaces)), surfaces)
+
+
+def test_a_mirrored_surface_throws_a_mirrored_spot(surfaces):
+    """On a heliostat due north under a noon sun the flux of the mirrored surface is the mirrored flux."""
+    from model.plant import TargetPlane
+    from model.surface import control_points
+    from model.tracing import Scene, Window, trace
+    from training.render import juelich_heliostat
+
+    heliostat = juelich_heliostat(np.array([0.0, 80.0, 1.8]), 90.0)
+    plane = TargetPlane("t", np.array([0.0, 0, 40]), np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), 8, 8)
+    sun = np.array([0.0, -0.6, 0.8])
+    angles = heliostat.mount.align(heliostat.position, sun, plane.center)
+    flux = []
+    for z in (surfaces[3], mirrored(surfaces[3])):
+        scene = Scene.build([heliostat], [control_points(heliostat, z)], [angles], [sun], [plane])
+        flux.append(trace(scene, Window(8, 8)).normalized()[0])
+    assert float((flux[1].flip(1) - flux[0]).abs().sum()) < 0.1
+
+
+def test_samples_resemble_the_measured_surfaces(surfaces):
+    drawn = Augmentation().sample(surfaces, 400, np.random.default_rng(0))
+    for part, (low, high) in zip((0, 1), ((0.8, 2.5), (0.6, 1.6)), strict=True):
+        ratio = split_canting(drawn)[part].std() / split_canting(surfaces)[part].std()
+        assert low < ratio < high
+
+
+def test_rendered_images_are_normalised_and_reproducible(surfaces, stj):
+    field, device = load_field(stj), torch.device("cpu")
+    first, again, other = (render(surfaces[:3], 4, field, Situations(), Camera(), device, seed) for seed in (1, 1, 2))
+    flux, conditions = first
+    assert flux.shape == (3, 4, 64, 64)
+    assert conditions.shape == (3, 4, 12)
+    torch.testing.assert_close(flux.sum(dim=(2, 3)), torch.full((3, 4), 100.0))
+    torch.testing.assert_close(flux, again[0], rtol=0, atol=0)
+    assert not torch.equal(flux, other[0])
+
+
+def test_prior_explains_measured_surfaces_and_holds_no_tilt_of_the_whole_mirror(surfaces):
+    prior = estimate(surfaces)
+    whole = np.repeat(tilt_modes()[:, None], 4, axis=1)
+    np.testing.assert_allclose(np.einsum("kfij,mfij->km", prior.basis, whole), 0, atol=1e-9)
+    flat = untilted(surfaces[5])
+    rest = flat - prior.surface(prior.coefficients(flat))
+    assert np.sqrt((rest**2).mean()) < 0.1 * np.sqrt((flat**2).mean())
+
+
+def test_a_run_learns_saves_and_resumes(stj, tmp_path):
+    config = TrainConfig(data=str(stj), steps=6, batch=4, warmup=2, network=SMALL, bfloat16=False)
+    device = torch.device("cpu")
+    whole = Run(config, tmp_path / "whole", device)
+    for _ in range(4):
+        assert np.isfinite(whole.train_step())
+    half = Run(config, tmp_path / "half", device)
+    for _ in range(2):
+        half.train_step()
+    half.save()
+    resumed = Run(config, tmp_path / "half", device)
+    assert resumed.step == 2
+    for _ in range(2):
+        resumed.train_step()
+    for a, b in zip(whole.network.parameters(), resumed.network.parameters(), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-6)
+    assert TrainConfig.read(tmp_path / "half" / "config.json") == config
+    assert np.isfinite(resumed.validate(repeats=1))
+
+
+def test_unfinished_training_stops_when_time_is_up(stj, tmp_path):
+    run = Run(TrainConfig(data=str(stj), steps=5, batch=2, network=SMALL), tmp_path, torch.device("cpu"))
+    run.train(minutes=0.0)
+    assert run.step == 0
+    assert (tmp_path / "checkpoint.pt").is_file()
+    assert json.loads(Path(tmp_path / "config.json").read_text())["steps"] == 5
