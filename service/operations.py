@@ -22,6 +22,9 @@ from model.tracing.alignment import align_to_spots
 Array = NDArray[np.float64]
 Method = Literal["network", "refined"]
 
+SAMPLES = 64
+"""Points along each side of a facet: measured surfaces of 20 x 20 control points converge to 0.2 % (L1)."""
+
 MODEL_VERSION = "1:none"
 """Version of the plant's model and the effects it holds: none until a study's effect is adopted."""
 
@@ -117,17 +120,17 @@ def forecast(
     else:
         goal = plane.center if aim is None else np.asarray(aim, dtype=np.float64)
         angles = heliostat.mount.align(heliostat.position, direction, goal)[None]
-    scene = Scene.build([heliostat], [points], angles, direction[None], [plane], degree=degree)
+    scene = Scene.build([heliostat], [points], angles, direction[None], [plane], degree=degree, dtype=torch.float64)
     rows, columns = resolution
     view = Window.of(plane, rows, columns) if window is None else Window(window, window, rows, columns, on_spot=True)
     with torch.no_grad():
-        traced = trace(scene, view, optics)
+        traced = trace(scene, view, optics, samples=SAMPLES)
     # Frequency space leaves ripples of some 1e-5 of the peak below zero.
-    flux = traced.irradiance[0].clamp(min=0).numpy()
+    flux = traced.irradiance[0].clamp(min=0).float().numpy()
     pixel_x, pixel_y = view.pixel
     return Forecast(
         flux=flux,
-        center_of_mass=traced.spot[0].double().numpy(),
+        center_of_mass=traced.spot[0].numpy(),
         peak=float(flux.max()),
         power=float(flux.sum(dtype=np.float64) * pixel_x * pixel_y),
     )

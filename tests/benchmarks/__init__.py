@@ -1,0 +1,1 @@
+"""Measured comparisons: ``make bench`` prints the figures of RESULTS.md."""

@@ -1,0 +1,78 @@
+"""How fast: ``python -m tests.benchmarks.speed``. Compare the ratios; the machines are shared."""
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from model.frames import sun_direction
+from model.network.architecture import CONDITIONS, MAX_IMAGES
+from model.network.predictor import SurfacePredictor
+from model.plant import TargetPlane
+from model.refinement import default_prior
+from model.surface import control_points
+from model.tracing import Scene, Window, trace
+from model.tracing.montecarlo import trace_montecarlo
+from training.render import juelich_heliostat
+
+BATCH = 64
+
+
+def seconds(work: Callable[[], object], repeats: int) -> float:
+    """Median time of one call [s], after a warm-up."""
+    work()
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        work()
+        times.append(time.perf_counter() - start)
+    return float(np.median(times))
+
+
+def scene(count: int, device: str) -> Scene:
+    """Random mirrors at 100 m under one sun."""
+    rng, prior = np.random.default_rng(0), default_prior()
+    heliostat = juelich_heliostat(np.array([20.0, 95.0, 1.8]), 100.0)
+    plane = TargetPlane("t", np.array([0.0, 0, 40]), np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), 8, 8)
+    suns = np.tile(sun_direction(25.0, 40.0), (count, 1))
+    angles = np.tile(heliostat.mount.align(heliostat.position, suns[0], plane.center), (count, 1))
+    points = [control_points(heliostat, prior.surface(rng.normal(size=len(prior.basis)))) for _ in range(count)]
+    return Scene.build([heliostat] * count, points, angles, suns, [plane] * count, device=device)
+
+
+def main() -> None:
+    """Print times of the tracers and of the network."""
+    window = Window(on_spot=True)
+    print(f"Speed ({torch.get_num_threads()} torch threads)")
+    with torch.no_grad():
+        batch, one = scene(BATCH, "cpu"), scene(1, "cpu")
+        reference = trace(batch, window, samples=96, padding=1.0).normalized()
+        for samples in (16, 24, 32):
+            error = (trace(batch, window, samples=samples, padding=0.25).normalized() - reference).abs().sum((1, 2))
+            each = seconds(lambda s=samples: trace(batch, window, samples=s, padding=0.25), 20) / BATCH * 1e3
+            print(
+                f"  convolution, {samples}^2 points a facet, batch {BATCH}: {each:.3f} ms a 64 x 64 flux, "
+                f"L1 to the converged image {float(error.mean()):.2f} %"
+            )
+        rays = seconds(lambda: trace_montecarlo(one, window, rays=1_000_000), 3)
+        print(f"  Monte Carlo, 1e6 rays: {rays:.2f} s a flux")
+        if torch.cuda.is_available():
+            many = scene(4096, "cuda")
+
+            def on_gpu() -> None:
+                trace(many, window, samples=24, padding=0.25)
+                torch.cuda.synchronize()
+
+            print(f"  convolution on {torch.cuda.get_device_name()}: {seconds(on_gpu, 10) / 4096 * 1e3:.4f} ms a flux")
+    predictor = SurfacePredictor(threads=1)
+    inputs = (
+        np.random.default_rng(0).random((1, MAX_IMAGES, 64, 64), dtype=np.float32) / 40,
+        np.zeros((1, MAX_IMAGES, CONDITIONS), np.float32),
+        np.ones((1, MAX_IMAGES), np.float32),
+    )
+    print(f"  network, one heliostat, 8 images, 1 core: {seconds(lambda: predictor.run(*inputs), 20) * 1e3:.1f} ms")
+
+
+if __name__ == "__main__":
+    main()
