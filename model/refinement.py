@@ -100,7 +100,7 @@ class RefinementOptions:
     background: float = 0.02
     blur_m: float = 0.05
     gamma: float = 0.1
-    samples: int = 20
+    samples: int = 24
 
 
 def _images(

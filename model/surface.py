@@ -67,18 +67,12 @@ def basis(count: int, degree: int, parameters: ArrayLike) -> tuple[Array, Array]
 
 
 @lru_cache(maxsize=64)
-def quadrature_basis(
+def midpoint_basis(
     count: int, degree: int, samples: int, dtype: torch.dtype, device: torch.device
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Basis and derivatives, each (samples, count), at Gauss-Legendre nodes, and the nodes' weights (samples,).
-
-    Light from a mirror is a smooth function of the place on it, cut off at the facet's edges, where even steps converge
-    only with the square of their number.
-    """
-    nodes, weights = np.polynomial.legendre.leggauss(samples)
-    arrays = (*basis(count, degree, (nodes + 1) / 2), weights / 2)
-    values, slopes, shares = (torch.as_tensor(array, dtype=dtype, device=device) for array in arrays)
-    return values, slopes, shares
+) -> tuple[Tensor, Tensor]:
+    """Basis and derivatives, each (samples, count), at the midpoints of ``samples`` equal parameter intervals."""
+    values, slopes = basis(count, degree, (np.arange(samples) + 0.5) / samples)
+    return torch.as_tensor(values, dtype=dtype, device=device), torch.as_tensor(slopes, dtype=dtype, device=device)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +98,7 @@ def _cross(a: Tensor, b: Tensor) -> Tensor:
 
 
 def sample(control_points: Tensor, samples: int, degree: int = DEGREE) -> FacetSamples:
-    """Evaluate every facet on a grid of Gauss-Legendre nodes.
+    """Evaluate every facet on a grid of parameter midpoints.
 
     Parameters
     ----------
@@ -115,11 +109,11 @@ def sample(control_points: Tensor, samples: int, degree: int = DEGREE) -> FacetS
     """
     across_x = (control_points.shape[-2], degree, samples, control_points.dtype, control_points.device)
     across_y = (control_points.shape[-1], degree, samples, control_points.dtype, control_points.device)
-    value_u, slope_u, share_u = quadrature_basis(*across_x)
-    value_v, slope_v, share_v = quadrature_basis(*across_y)
+    value_u, slope_u = midpoint_basis(*across_x)
+    value_v, slope_v = midpoint_basis(*across_y)
     along_v, along_v_slope = control_points @ value_v.T, control_points @ slope_v.T
     points = value_u @ along_v
-    area_vectors = _cross(slope_u @ along_v, value_u @ along_v_slope) * (share_u[:, None] * share_v)
+    area_vectors = _cross(slope_u @ along_v, value_u @ along_v_slope) / samples**2
     return FacetSamples(_facets_last(points), _facets_last(area_vectors))
 
 

@@ -1,10 +1,11 @@
 """The convolution tracer: deterministic, batched, differentiable.
 
-Every mirror sample throws one ray, the sun's central ray, onto the target plane with its share of the power. The cone
-around it (sun shape, slope errors) is the same for all samples of a mirror up to their distance to the target, so the
-image of the central rays is convolved with it. That is done in frequency space, where everything is exact and smooth:
-the cone enters by its transfer function, stretched by the slant range and by the beam's slope on the plane, and what
-spreading a ray over pixels has smeared is divided out again, so that a pixel holds its area's mean irradiance.
+Every mirror sample throws one ray, the sun's central ray, onto the target plane with its share of the power, a patch
+as large as the sample's share of the mirror. The cone around it (sun shape, slope errors) is the same for all samples
+of a mirror up to their distance to the target, so the image of the patches is convolved with it. That is done in
+frequency space, where everything is exact and smooth: the cone enters by its transfer function, stretched by the slant
+range and by the beam's slope on the plane, and what spreading a ray over pixels has smeared is divided out again, so
+that a pixel holds its area's mean irradiance.
 
 Approximations: the cone's size is taken at each mirror's (or facet's) centre, and the cone is small.
 
@@ -66,6 +67,8 @@ class Rays:
     slant_range : Tensor (B,) [m]
     normal : Tensor (B, 3)
         Mean mirror normal in the plane's frame.
+    footprint : Tensor (B, 2, 2) [m]
+        How far apart, right and up, the rays of neighbouring samples land, along the facet's x and y; mirror means.
     """
 
     hits: Tensor
@@ -73,6 +76,7 @@ class Rays:
     direction: Tensor
     slant_range: Tensor
     normal: Tensor
+    footprint: Tensor
 
     @property
     def spot(self) -> Tensor:
@@ -81,7 +85,7 @@ class Rays:
 
 
 def central_rays(scene: Scene, samples: int) -> Rays:
-    """Reflect the sun's centre at ``samples``**2 points of each facet and meet the plane.
+    """Reflect the sun's centre at some ``samples``**2 points of each facet and meet the plane.
 
     Raises
     ------
@@ -104,8 +108,20 @@ def central_rays(scene: Scene, samples: int) -> Rays:
     hits = points[:, :2] - direction[:, :2] * distance[:, None]
     power = facing.clamp(min=0)
     if scene.facet_reflectivity is not None:
-        power = power * scene.facet_reflectivity.repeat_interleave(samples**2, dim=-1)
-    return Rays(hits, power, beam, mean_point[:, 2] / -beam[:, 2], mean_normal)
+        power = power * scene.facet_reflectivity.repeat_interleave(
+            power.shape[-1] // scene.facet_reflectivity.shape[-1], dim=-1
+        )
+    return Rays(hits, power, beam, mean_point[:, 2] / -beam[:, 2], mean_normal, _footprint(hits, samples))
+
+
+def _footprint(hits: Tensor, samples: int) -> Tensor:
+    """Mean steps (B, 2 along x and y, 2) [m] between the hits (B, 2, S) of neighbouring samples."""
+    if samples < 2:
+        return hits.new_zeros(len(hits), 2, 2)
+    grid = hits.unflatten(-1, (-1, samples, samples))
+    along_x = (grid[..., -1, :] - grid[..., 0, :]).mean(dim=(-2, -1))
+    along_y = (grid[..., :, -1] - grid[..., :, 0]).mean(dim=(-2, -1))
+    return torch.stack([along_x, along_y], dim=1) / (samples - 1)
 
 
 @lru_cache(maxsize=16)
@@ -114,14 +130,24 @@ def _frequencies(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Frequencies right (1, C/2+1), up (R, 1) [cycles/m] of a real FFT, and what undoes the splat's smear (R, C/2+1).
 
-    Bilinear spreading multiplies by sinc^2 along each axis, the mean over a pixel by sinc; what remains to divide out
-    is one sinc.
+    A quadratic B-spline multiplies by sinc^3 along each axis, the mean over a pixel by sinc; two sincs remain to be
+    divided out.
     """
     right = torch.fft.rfftfreq(columns, dtype=dtype, device=device)[None, :]
     # Rows run downwards, the plane's second axis up.
     up = -torch.fft.fftfreq(rows, dtype=dtype, device=device)[:, None]
-    unsmear = 1 / (torch.sinc(right) * torch.sinc(up))
+    unsmear = 1 / (torch.sinc(right) * torch.sinc(up)) ** 2
     return right / pixel[0], up / pixel[1], unsmear
+
+
+def _patch_transfer(rays: Rays, right: Tensor, up: Tensor) -> Tensor:
+    """Transfer function (B, R, C/2+1) of the patch of light that each ray stands for.
+
+    The patches of a flat mirror tile its image without gap or overlap, so that the sampling leaves no trace: the sun's
+    sharp edge would otherwise show the grid of the rays.
+    """
+    step_x, step_y = rays.footprint[:, 0, :, None, None], rays.footprint[:, 1, :, None, None]
+    return torch.sinc(step_x[:, 0] * right + step_x[:, 1] * up) * torch.sinc(step_y[:, 0] * right + step_y[:, 1] * up)
 
 
 def _interpolate(table: Tensor, frequency: Tensor) -> Tensor:
@@ -165,20 +191,29 @@ def _cone_transfer(rays: Rays, optics: Optics, right: Tensor, up: Tensor, table:
 
 
 def _splat(x: Tensor, y: Tensor, weight: Tensor, rows: int, columns: int) -> Tensor:
-    """Spread weights (B, S) bilinearly over pixels (B, rows, columns) at coordinates x, y (B, S); outside is lost."""
-    left, top = x.detach().floor(), y.detach().floor()
-    fx, fy = x - left, y - top
-    inside = (left >= 0) & (left < columns - 1) & (top >= 0) & (top < rows - 1)
-    weight = weight * inside
+    """Spread weights (B, S) over pixels (B, rows, columns) at coordinates x, y (B, S); what falls outside is lost.
+
+    Each becomes a quadratic B-spline, three pixels wide: rays that stand in a grid of their own would beat visibly
+    against the pixels under a narrower one, and its slope is continuous for gradients.
+    """
+    column, row = x.detach().round(), y.detach().round()
+    inside = (column >= 1) & (column < columns - 1) & (row >= 1) & (row < rows - 1)
+    across, down = _quadratic(x - column), _quadratic(y - row)
     batch = torch.arange(x.shape[0], device=x.device)[:, None] * (rows * columns)
-    index = (batch + top.clamp(0, rows - 2).long() * columns + left.clamp(0, columns - 2).long()).flatten()
+    corner = batch + (row.clamp(1, rows - 2).long() - 1) * columns + column.clamp(1, columns - 2).long() - 1
+    corner = corner.flatten()
+    weight = weight * inside
     image = torch.zeros(x.shape[0] * rows * columns, dtype=x.dtype, device=x.device)
-    upper, lower = weight * (1 - fy), weight * fy
-    image = image.index_add(0, index, (upper * (1 - fx)).flatten())
-    image = image.index_add(0, index + 1, (upper * fx).flatten())
-    image = image.index_add(0, index + columns, (lower * (1 - fx)).flatten())
-    image = image.index_add(0, index + columns + 1, (lower * fx).flatten())
+    for step_down, share_down in enumerate(down):
+        line = weight * share_down
+        for step_across, share_across in enumerate(across):
+            image = image.index_add(0, corner + (step_down * columns + step_across), (line * share_across).flatten())
     return image.view(x.shape[0], rows, columns)
+
+
+def _quadratic(offset: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Shares of the pixel before, at and after a point that lies ``offset`` in [-1/2, 1/2] from its nearest pixel."""
+    return 0.5 * (0.5 - offset) ** 2, 0.75 - offset**2, 0.5 * (0.5 + offset) ** 2
 
 
 def _padded(size: int, padding: float) -> int:
@@ -214,7 +249,7 @@ def trace(
     optics : Optics, optional
         Buie's sun with a circumsolar ratio of 0.02, 1000 W/m2 and a perfect mirror unless given.
     samples : int
-        Points along each side of each facet.
+        Points along each side of each facet, rounded up to the same number in each knot span.
     padding : float
         How far beyond the window, in windows, light is followed before it is lost.
     table : Tensor (K,) or (B, K), optional
@@ -241,7 +276,7 @@ def trace(
     right, up, unsmear = _frequencies(rows, columns, window.pixel, image.dtype, image.device)
     if table is None:
         table = transfer_table(optics.sun_shape, image.dtype, image.device)
-    transfer = _cone_transfer(rays, optics, right, up, table) * unsmear
+    transfer = _cone_transfer(rays, optics, right, up, table) * _patch_transfer(rays, right, up) * unsmear
     blurred = torch.fft.irfft2(torch.fft.rfft2(image) * transfer, s=(rows, columns))
     cut = blurred[:, first_row : first_row + window.rows, first_column : first_column + window.columns]
     irradiance = optics.irradiance(rays.slant_range)

@@ -10,7 +10,7 @@ from model.errors import UnreachableError
 from model.frames import sun_direction
 from model.plant import TargetPlane
 from model.sunshape import Buie, Gaussian, Pillbox
-from model.surface import control_points, greville
+from model.surface import control_points, fit_heights, greville
 from model.tracing import Optics, Scene, Window, trace
 from model.tracing.alignment import align_to_spots
 from model.tracing.convolution import central_rays
@@ -88,15 +88,16 @@ def test_a_saddle_displaces_rays_by_twice_slope_times_distance():
     sun = np.array([0.0, -1.0, 0.0])  # behind the target: normal incidence, so that slope alone turns the ray
     plane = target(center=(0.0, 0.0, 40.0))
     flat, bent = (central_rays(scene(heliostat, surface, sun, plane), 16) for surface in (None, z))
-    shift = (bent.hits - flat.hits)[0].numpy().reshape(2, 4, 16, 16)
     u = (np.arange(16) + 0.5) / 8 - 1
+    shape = (16, 16)
+    shift = (bent.hits - flat.hits)[0].numpy().reshape(2, 4, *shape)
     distance = float(flat.slant_range)
     # dz/dx = 1 mm * v / half width; the image's right is the mirror's left.
     expected_x = 2 * distance * 1e-3 * u[None, :] / 0.8025
     expected_y = 2 * distance * 1e-3 * u[:, None] / 0.6375
     for facet in range(4):
-        np.testing.assert_allclose(np.abs(shift[0, facet]), np.broadcast_to(np.abs(expected_x), (16, 16)), rtol=0.01)
-        np.testing.assert_allclose(np.abs(shift[1, facet]), np.broadcast_to(np.abs(expected_y), (16, 16)), rtol=0.01)
+        np.testing.assert_allclose(np.abs(shift[0, facet]), np.broadcast_to(np.abs(expected_x), shape), rtol=0.01)
+        np.testing.assert_allclose(np.abs(shift[1, facet]), np.broadcast_to(np.abs(expected_y), shape), rtol=0.01)
 
 
 def test_a_focused_facet_images_the_sun():
@@ -106,8 +107,6 @@ def test_a_focused_facet_images_the_sun():
     x = 0.8025 * (2 * greville(8) - 1)[:, None]
     y = 0.6375 * (2 * greville(8) - 1)[None, :]
     # Control heights of x^2: blossom values differ from the square at the Greville points; fit them by the spline.
-    from model.surface import fit_heights
-
     u, v = (a.ravel() for a in np.meshgrid((np.arange(40) + 0.5) / 40, (np.arange(40) + 0.5) / 40, indexing="ij"))
     px, py = 0.8025 * (2 * u - 1), 0.6375 * (2 * v - 1)
     focal = 100.0 - 0.175
