@@ -226,11 +226,11 @@ def _cell(value: float | None) -> str:
     return "" if value is None else f"{value:.3f}"
 
 
-COLUMNS = ("heliostat", "images", "judged by", "ideal", "network", "refined", "measured", "network mm", "refined mm")
+COLUMNS = ("name", "used", "judged by", "ideal", "network", "refined", "measured", "net. mm", "ref. mm")
 
 
 def _row(result: Result) -> tuple[str, ...]:
-    judged = f"{result.judged} held out" if result.held_out else f"the same {result.judged}"
+    judged = f"{result.judged} others" if result.held_out else f"same {result.judged}"
     figures = (
         result.accuracy_ideal,
         result.accuracy_network,
@@ -245,7 +245,7 @@ def _row(result: Result) -> tuple[str, ...]:
 def _print(console: Console, results: list[Result], out: Path) -> None:
     from service.cli import make_table
 
-    table = make_table("Flux accuracy by surface, and surface error against the measured surface", *COLUMNS)
+    table = make_table("Images, flux accuracy by surface, and surface error against the measured one", *COLUMNS)
     for result in results:
         table.add_row(*_row(result))
     console.print(table)

@@ -124,7 +124,7 @@ def forecast(
     rows, columns = resolution
     view = Window.of(plane, rows, columns) if window is None else Window(window, window, rows, columns, on_spot=True)
     with torch.no_grad():
-        traced = trace(scene, view, optics, samples=SAMPLES)
+        traced = trace(scene, view, optics, samples=SAMPLES, cones="facet")
     # Frequency space leaves ripples of some 1e-5 of the peak below zero.
     flux = traced.irradiance[0].clamp(min=0).float().numpy()
     pixel_x, pixel_y = view.pixel

@@ -7,15 +7,16 @@ frequency space, where everything is exact and smooth: the cone enters by its tr
 range and by the beam's slope on the plane, and what spreading a ray over pixels has smeared is divided out again, so
 that a pixel holds its area's mean irradiance.
 
-Approximations: the cone's size is taken at each mirror's (or facet's) centre, and the cone is small.
+Approximations: the cone's size is taken at each mirror's or each facet's centre, and the cone is small.
 
 Source: the idea of analytic cone optics is that of HELIOS and of Lipps and Walzel, Solar Energy 21 (1978); the
 formulation in frequency space, with the transfer function's argument in closed form, is ours (see `_cone_transfer`).
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -81,7 +82,12 @@ class Rays:
     @property
     def spot(self) -> Tensor:
         """Centre of mass (B, 2) [m]."""
-        return (self.hits * self.power[:, None]).sum(-1) / self.power.sum(-1)[:, None]
+        return self.spot_of(1)
+
+    def spot_of(self, parts: int) -> Tensor:
+        """Common centre of mass (B / parts, 2) [m] of mirrors that were traced in so many parts."""
+        moment = (self.hits * self.power[:, None]).sum(-1).view(-1, parts, 2).sum(1)
+        return moment / self.power.sum(-1).view(-1, parts).sum(1, keepdim=True)
 
 
 def central_rays(scene: Scene, samples: int) -> Rays:
@@ -118,7 +124,7 @@ def _footprint(hits: Tensor, samples: int) -> Tensor:
     """Mean steps (B, 2 along x and y, 2) [m] between the hits (B, 2, S) of neighbouring samples."""
     if samples < 2:
         return hits.new_zeros(len(hits), 2, 2)
-    grid = hits.unflatten(-1, (-1, samples, samples))
+    grid = hits.view(*hits.shape[:2], -1, samples, samples)
     along_x = (grid[..., -1, :] - grid[..., 0, :]).mean(dim=(-2, -1))
     along_y = (grid[..., :, -1] - grid[..., :, 0]).mean(dim=(-2, -1))
     return torch.stack([along_x, along_y], dim=1) / (samples - 1)
@@ -239,6 +245,7 @@ def trace(
     samples: int = 32,
     padding: float = 0.5,
     table: Tensor | None = None,
+    cones: Literal["mirror", "facet"] = "mirror",
 ) -> Flux:
     """Trace the flux of every mirror of a scene.
 
@@ -249,11 +256,14 @@ def trace(
     optics : Optics, optional
         Buie's sun with a circumsolar ratio of 0.02, 1000 W/m2 and a perfect mirror unless given.
     samples : int
-        Points along each side of each facet, rounded up to the same number in each knot span.
+        Points along each side of each facet.
     padding : float
         How far beyond the window, in windows, light is followed before it is lost.
     table : Tensor (K,) or (B, K), optional
         A transfer table in place of the sun shape's own (`model.sunshape.transfer_table`); one for each mirror, say.
+    cones : {"mirror", "facet"}
+        Whether the reflected cone is taken at each mirror's centre or at each facet's, which costs four times as much
+        and counts for mirrors near the tower, where a facet is visibly nearer than the next.
 
     Raises
     ------
@@ -263,26 +273,42 @@ def trace(
     if samples < 1:
         raise InvalidInputError("samples must be at least one")
     optics = optics or Optics()
-    rays = central_rays(scene, samples)
-    spot = rays.spot
+    rays = central_rays(scene if cones == "mirror" else scene.by_facet(), samples)
+    parts = len(rays.power) // scene.batch
+    spot = rays.spot_of(parts)
     center = spot if window.on_spot else torch.zeros_like(spot)
+    if table is None:
+        table = transfer_table(optics.sun_shape, spot.dtype, spot.device)
+    elif table.ndim == 2:
+        table = table.repeat_interleave(parts, dim=0)
+    if isinstance(optics.slope_error, Tensor) and optics.slope_error.numel() > 1:
+        optics = replace(optics, slope_error=optics.slope_error.repeat_interleave(parts))
+    irradiance = optics.irradiance(rays.slant_range)
+    image = _image(rays, center.repeat_interleave(parts, dim=0), window, optics, table, irradiance, padding, parts)
+    power = (rays.power.sum(-1) * irradiance).view(-1, parts).sum(1)
+    return Flux(irradiance=image, spot=spot, center=center, power=power)
+
+
+def _image(
+    rays: Rays,
+    center: Tensor,
+    window: Window,
+    optics: Optics,
+    table: Tensor,
+    irradiance: Tensor,
+    padding: float,
+    parts: int,
+) -> Tensor:
+    """Irradiance (B / parts, rows, columns) [W/m2] of rays (B) in windows about ``center`` (B, 2) [m]."""
     rows, columns = _padded(window.rows, padding), _padded(window.columns, padding)
     pixel_x, pixel_y = window.pixel
     first_row, first_column = (rows - window.rows) // 2, (columns - window.columns) // 2
     x = (rays.hits[:, 0] - center[:, :1] + window.width / 2) / pixel_x + first_column - 0.5
     y = (window.height / 2 - rays.hits[:, 1] + center[:, 1:]) / pixel_y + first_row - 0.5
-    image = _splat(x, y, rays.power, rows, columns)
+    image = _splat(x, y, rays.power * (irradiance / (pixel_x * pixel_y))[:, None], rows, columns)
 
     right, up, unsmear = _frequencies(rows, columns, window.pixel, image.dtype, image.device)
-    if table is None:
-        table = transfer_table(optics.sun_shape, image.dtype, image.device)
     transfer = _cone_transfer(rays, optics, right, up, table) * _patch_transfer(rays, right, up) * unsmear
-    blurred = torch.fft.irfft2(torch.fft.rfft2(image) * transfer, s=(rows, columns))
-    cut = blurred[:, first_row : first_row + window.rows, first_column : first_column + window.columns]
-    irradiance = optics.irradiance(rays.slant_range)
-    return Flux(
-        irradiance=cut * (irradiance / (pixel_x * pixel_y))[:, None, None],
-        spot=spot,
-        center=center,
-        power=rays.power.sum(-1) * irradiance,
-    )
+    spectrum = (torch.fft.rfft2(image) * transfer).view(-1, parts, *transfer.shape[1:]).sum(1)
+    blurred: Tensor = torch.fft.irfft2(spectrum, s=(rows, columns))
+    return blurred[:, first_row : first_row + window.rows, first_column : first_column + window.columns]

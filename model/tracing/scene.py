@@ -171,6 +171,26 @@ class Scene:
         """How many mirrors are traced."""
         return self.sun.shape[0]
 
+    def by_facet(self) -> "Scene":
+        """The same facets as mirrors of their own, those of one mirror following one another (B * F mirrors)."""
+        facets = self.control_points.shape[1]
+        points = self.control_points.expand(self.batch, -1, -1, -1, -1).flatten(0, 1)[:, None]
+        shares = self.facet_reflectivity
+
+        def each(tensor: Tensor) -> Tensor:
+            return tensor.repeat_interleave(facets, dim=0)
+
+        return Scene(
+            control_points=points,
+            attitude=each(self.attitude),
+            center=each(self.center),
+            sun=each(self.sun),
+            plane_center=each(self.plane_center),
+            plane_axes=each(self.plane_axes),
+            degree=self.degree,
+            facet_reflectivity=None if shares is None else shares.reshape(-1, 1),
+        )
+
     def in_plane(self) -> tuple[Tensor, Tensor]:
         """Control points (B, F, 3, I, J) [m] and suns (B, 3) in the frame of each target plane.
 
