@@ -63,8 +63,8 @@ def parity(network: SurfaceNetwork, path: Path) -> float:
     return worst
 
 
-def model_card(run: Run, difference: float) -> dict[str, Any]:
-    """What the weights are, what they were trained on and how well they do."""
+def model_card(run: Run, difference: float, note: str) -> dict[str, Any]:
+    """What the weights are, what they were trained on and how well they do; ``note`` tells what the config does not."""
     network = run.average
     return {
         "name": "surface-network",
@@ -76,6 +76,7 @@ def model_card(run: Run, difference: float) -> dict[str, Any]:
             "images": "convolution-traced flux with random cameras, suns of the year, field positions of Juelich",
             "steps": run.step,
             "samples": run.step * run.config.batch,
+            "note": note,
         },
         "config": asdict(run.config),
         "onnx_parity_mm": difference,
@@ -89,6 +90,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--run", type=Path, default=Path("runs/first"))
     parser.add_argument("--out", type=Path, default=WEIGHTS)
+    parser.add_argument("--note", default="", help="what happened in the run that its config does not tell")
     arguments = parser.parse_args()
     run = Run(TrainConfig.read(arguments.run / "config.json"), arguments.run, torch.device("cpu"))
     network = run.average.to(memory_format=torch.contiguous_format)
@@ -96,7 +98,7 @@ def main() -> None:
     difference = parity(network, arguments.out)
     if not math.isfinite(difference) or difference > PARITY_MM:
         raise SystemExit(f"ONNX differs from torch by {difference:.2e} mm, more than {PARITY_MM:.0e}")
-    card = model_card(run, difference)
+    card = model_card(run, difference, arguments.note)
     arguments.out.with_suffix(".json").write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
     print(json.dumps(card["evaluation"], indent=1))
     print(f"{arguments.out}: {arguments.out.stat().st_size / 1e6:.1f} MB, parity {difference:.1e} mm")
