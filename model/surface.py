@@ -122,6 +122,19 @@ def _facets_last(values: Tensor) -> Tensor:
     return values.transpose(-4, -3).flatten(-3)
 
 
+def canted(control_points: Tensor, tilt: Tensor) -> Tensor:
+    """Control points (B, F, 3, I, J) [m] with each facet turned about its own centre; differentiable in both.
+
+    ``tilt`` (B, F, 2) [rad] is added to the facet's slope along the mirror's x and y. Canting errors are milliradians:
+    the turn is taken to first order, which errs by a millionth of the facet's size.
+    """
+    centre = control_points.mean(dim=(-2, -1), keepdim=True)
+    x, y, z = (control_points - centre).unbind(2)
+    along_x, along_y = tilt[..., 0, None, None], tilt[..., 1, None, None]
+    turned = torch.stack([x - along_x * z, y - along_y * z, z + along_x * x + along_y * y], dim=2)
+    return centre + turned
+
+
 def evaluate(control_points: ArrayLike, u: ArrayLike, v: ArrayLike, degree: int = DEGREE) -> tuple[Array, Array]:
     """Points and unit normals, each (..., n, m, 3), of one or more facets on the grid ``u`` (n,) by ``v`` (m,).
 

@@ -226,11 +226,15 @@ def _cell(value: float | None) -> str:
     return "" if value is None else f"{value:.3f}"
 
 
-COLUMNS = ("name", "used", "judged by", "ideal", "network", "refined", "measured", "net. mm", "ref. mm")
+COLUMNS = ("name", "images", "ideal", "network", "refined", "measured", "net. mm", "ref. mm")
+CAPTION = (
+    "images: those predicted from + those kept to judge by; without + they are the same. ideal to measured: flux "
+    "accuracy with that surface; mm: error of the network's and the refined surface against the measured one"
+)
 
 
 def _row(result: Result) -> tuple[str, ...]:
-    judged = f"{result.judged} others" if result.held_out else f"same {result.judged}"
+    images = f"{result.used} + {result.judged}" if result.held_out else str(result.used)
     figures = (
         result.accuracy_ideal,
         result.accuracy_network,
@@ -239,13 +243,14 @@ def _row(result: Result) -> tuple[str, ...]:
         result.error_network_mm,
         result.error_refined_mm,
     )
-    return (result.heliostat, str(result.used), judged, *map(_cell, figures))
+    return (result.heliostat, images, *map(_cell, figures))
 
 
 def _print(console: Console, results: list[Result], out: Path) -> None:
     from service.cli import make_table
 
-    table = make_table("Images, flux accuracy by surface, and surface error against the measured one", *COLUMNS)
+    table = make_table("What the surfaces are worth", *COLUMNS)
+    table.caption, table.caption_justify = CAPTION, "left"
     for result in results:
         table.add_row(*_row(result))
     console.print(table)
@@ -271,6 +276,6 @@ def _page(report: dict[str, Any], results: list[Result]) -> str:
         "td:first-child,th:first-child{text-align:left}img{max-width:100%;margin:.3rem}</style>"
         f"<h1>heliotwin demo</h1><p>Data: {html.escape(report['data'])}. Accuracy is one minus the summed difference "
         "of measured and forecast flux, in a 4 m window about the spot; errors are mean absolute differences of "
-        f"control heights.</p><table><tr>{head}</tr>{rows}</table>{pictures}"
+        f"control heights. {html.escape(CAPTION)}.</p><table><tr>{head}</tr>{rows}</table>{pictures}"
         f"<h2>Skipped</h2><ul>{skipped or '<li>none</li>'}</ul>"
     )

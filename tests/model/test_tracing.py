@@ -10,7 +10,7 @@ from model.errors import UnreachableError
 from model.frames import sun_direction
 from model.plant import TargetPlane
 from model.sunshape import Buie, Gaussian, Pillbox
-from model.surface import control_points, fit_heights, greville
+from model.surface import canted, control_points, fit_heights, greville
 from model.tracing import Optics, Scene, Window, trace
 from model.tracing.alignment import align_to_spots
 from model.tracing.convolution import central_rays
@@ -211,21 +211,35 @@ def test_gradients_agree_with_finite_differences():
     slope = torch.tensor([8e-4], dtype=torch.float64, requires_grad=True)
     points = base.control_points.clone().requires_grad_()
     center = base.center.clone().requires_grad_()
+    tilt = torch.zeros(1, 4, 2, dtype=torch.float64, requires_grad=True)
 
-    def value(points, center, chi, slope):
+    def value(points, center, chi, slope, tilt):
         optics = Optics(sun_shape=Buie(chi), slope_error=slope)
-        flux = trace(base.with_(control_points=points, center=center), Window(8.0, 8.0), optics, samples=16)
-        return (flux.irradiance[0] * weights).sum()
+        changed = base.with_(control_points=canted(points, tilt), center=center)
+        return (trace(changed, Window(8.0, 8.0), optics, samples=16).irradiance[0] * weights).sum()
 
-    value(points, center, chi, slope).backward()
+    value(points, center, chi, slope, tilt).backward()
     with torch.no_grad():
-        for tensor, step in ((points, 1e-8), (center, 1e-6), (chi, 1e-5), (slope, 1e-7)):
+        for tensor, step in ((points, 1e-8), (center, 1e-6), (chi, 1e-5), (slope, 1e-7), (tilt, 1e-8)):
             direction = torch.as_tensor(RNG.normal(size=tensor.shape))
-            arguments = {"points": points, "center": center, "chi": chi, "slope": slope}
+            arguments = {"points": points, "center": center, "chi": chi, "slope": slope, "tilt": tilt}
             name = next(k for k, v in arguments.items() if v is tensor)
             up, down = (value(**{**arguments, name: tensor + s * step * direction}) for s in (1, -1))
             expected = float(up - down) / (2 * step)
             assert float((tensor.grad * direction).sum()) == pytest.approx(expected, rel=2e-3), name
+
+
+def test_canting_moves_a_facets_light_by_twice_the_tilt():
+    heliostat = flat_heliostat((0.0, 100.0, 40.0))
+    base = scene(heliostat, None, np.array([0.0, -1.0, 0.0]))
+    tilt = torch.zeros(1, 4, 2, dtype=torch.float64)
+    tilt[0, 2, 0] = 1e-3
+    before, after = (
+        central_rays(base.with_(control_points=canted(base.control_points, t)), 8) for t in (0 * tilt, tilt)
+    )
+    shift = (after.hits - before.hits)[0].view(2, 4, -1).mean(-1).numpy()
+    assert abs(shift[0, 2]) == pytest.approx(2e-3 * float(before.slant_range), rel=1e-3)
+    np.testing.assert_allclose(np.delete(shift, 2, axis=1), 0, atol=1e-9)
 
 
 def test_sun_behind_the_mirror_is_refused():
