@@ -5,7 +5,7 @@ report that it also writes there. A verb fails only if nothing is left.
 """
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
@@ -63,8 +63,9 @@ def measure(folder: MeasurementFolder, measurement: Measurement, kind: str | Non
     return chosen, _measure(measurement.images[chosen], cast(ImageKind, chosen), plane)
 
 
-def _finish(report: dict[str, Any], path: Path, done: str) -> dict[str, Any]:
-    """Write the report; refuse to call nothing a success."""
+def _finish(folder: MeasurementFolder, report: dict[str, Any], path: Path, done: str) -> dict[str, Any]:
+    """Write the report with all that was skipped; refuse to call nothing a success."""
+    report["skipped"] = {**folder.skipped, **report["skipped"]}
     write_json(path, report)
     if not report[done]:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in list(report["skipped"].items())[:3])
@@ -77,7 +78,7 @@ def _finish(report: dict[str, Any], path: Path, done: str) -> dict[str, Any]:
 
 def flux_folder(folder: MeasurementFolder, out: Path, progress: Progress = quiet) -> dict[str, Any]:
     """Measure every camera frame or crop: ``OUT/H/ID-flux.png``, ``ID-flux-centered.npz``, ``quality.json``."""
-    report: dict[str, Any] = {"images": {}, "skipped": dict(folder.skipped)}
+    report: dict[str, Any] = {"images": {}, "skipped": {}}
     for name in folder.plant.heliostats:
         measurements = folder.measurements(name)
         if not measurements:
@@ -85,7 +86,11 @@ def flux_folder(folder: MeasurementFolder, out: Path, progress: Progress = quiet
         for measurement in measurements:
             progress(measurement.key)
             kind = next((k for k in ("raw", "cropped", *IMAGE_KINDS) if k in measurement.images), "")
-            _, measured = measure(folder, measurement, kind)
+            try:
+                _, measured = measure(folder, measurement, kind)
+            except ModelError as error:
+                report["skipped"][measurement.key] = str(error)
+                continue
             entry = {"kind": kind, **asdict(measured.quality)}
             if measured.flux is not None and measured.center_of_mass is not None:
                 spot = folder.plant.targets[measurement.target].to_enu(measured.center_of_mass)
@@ -93,7 +98,7 @@ def flux_folder(folder: MeasurementFolder, out: Path, progress: Progress = quiet
                 entry["center_of_mass_wgs84"] = [float(v) for v in folder.plant.to_wgs84(spot)]
             _write_flux(out / name, measurement.identifier, measured)
             report["images"][measurement.key] = entry
-    return _finish(report, out / "quality.json", "images")
+    return _finish(folder, report, out / "quality.json", "images")
 
 
 def _write_flux(folder: Path, identifier: str, measured: MeasuredFlux) -> None:
@@ -122,7 +127,10 @@ def write_gray(path: Path, image: NDArray[Any]) -> None:
 
 def observe(folder: MeasurementFolder, measurement: Measurement) -> Observation | str:
     """What a measurement shows, or why it was refused."""
-    _, measured = measure(folder, measurement)
+    try:
+        _, measured = measure(folder, measurement)
+    except InvalidInputError as error:
+        return str(error)
     if measured.centered is None:
         return f"{measured.quality.reason}: {measured.quality.detail}"
     target = folder.plant.targets[measurement.target]
@@ -188,7 +196,7 @@ def predict_folder(
     """Predict every heliostat's surface from up to ``images`` of its images; files as DESIGN.md, section 6."""
     if not 1 <= images <= 8:
         raise InvalidInputError(f"--images must lie in 1 to 8, got {images}")
-    report: dict[str, Any] = {"method": method, "heliostats": {}, "skipped": dict(folder.skipped)}
+    report: dict[str, Any] = {"method": method, "heliostats": {}, "skipped": {}}
     for name, heliostat in folder.plant.heliostats.items():
         progress(name)
         try:
@@ -198,7 +206,7 @@ def predict_folder(
             continue
         write_surface(out, name, predicted)
         report["heliostats"][name] = entry
-    return _finish(report, out / "predictions.json", "heliostats")
+    return _finish(folder, report, out / "predictions.json", "heliostats")
 
 
 def write_surface(out: Path, name: str, predicted: SurfacePrediction) -> None:
@@ -241,10 +249,21 @@ def check_effects(path: Path | None) -> None:
 def forecast_measurement(
     folder: MeasurementFolder, measurement: Measurement, surface: tuple[Array, int] | None
 ) -> operations.Forecast:
-    """Flux over the whole target of a measurement, the heliostat aligned by its measured spot."""
+    """Flux over the whole target of a measurement.
+
+    The heliostat is aligned by its measured spot; without one by its motors; without those at the target's centre.
+    """
     heliostat, plane = folder.plant.heliostats[measurement.heliostat], folder.plant.targets[measurement.target]
+    motors = measurement.motor_position if heliostat.mount.actuators else None
     return operations.forecast(
-        heliostat, None, measurement.sun, plane, spot=measurement.spot, optics=folder.optics, surface=surface
+        heliostat,
+        None,
+        measurement.sun,
+        plane,
+        spot=measurement.spot,
+        angles=None if motors is None else heliostat.mount.angles_from_motors(motors),
+        optics=folder.optics,
+        surface=surface,
     )
 
 
@@ -279,36 +298,42 @@ def forecast_folder(
     """Forecast every measurement of a folder; ``OUT/H/ID-forecast.npz`` and ``OUT/forecast.json``."""
     if surfaces not in ("measured", "ideal") and not Path(surfaces).is_dir():
         raise InvalidInputError(f"--surfaces must be 'measured', 'ideal' or a folder of predictions, got {surfaces!r}")
-    report: dict[str, Any] = {"surfaces": surfaces, "measurements": {}, "skipped": dict(folder.skipped)}
+    report: dict[str, Any] = {"surfaces": surfaces, "measurements": {}, "skipped": {}}
     for name, heliostat in folder.plant.heliostats.items():
         try:
             surface = _surface(folder, heliostat, surfaces)
-            for key, entry in _forecast_heliostat(folder, name, surface, out, window, progress):
-                report["measurements"][key] = entry
         except ModelError as error:
             report["skipped"][name] = str(error)
+            continue
+        measurements = folder.measurements(name, with_images=False)
+        if not measurements:
+            report["skipped"][name] = "no measurement"
+        for measurement in measurements:
+            progress(measurement.key)
+            try:
+                entry = _forecast_entry(folder, measurement, surface, out, window)
+            except ModelError as error:
+                report["skipped"][measurement.key] = str(error)
+                continue
+            report["measurements"][measurement.key] = entry
     accuracies = [e["accuracy"] for e in report["measurements"].values() if "accuracy" in e]
     report["accuracy_mean"] = float(np.mean(accuracies)) if accuracies else None
     report["accuracy_median"] = float(np.median(accuracies)) if accuracies else None
-    return _finish(report, out / "forecast.json", "measurements")
+    return _finish(folder, report, out / "forecast.json", "measurements")
 
 
-def _forecast_heliostat(
+def _forecast_entry(
     folder: MeasurementFolder,
-    name: str,
+    measurement: Measurement,
     surface: tuple[Array, int] | None,
     out: Path,
     window: float | None,
-    progress: Progress,
-) -> Iterator[tuple[str, dict[str, Any]]]:
-    measurements = folder.measurements(name, with_images=False)
-    if not measurements:
-        raise InvalidInputError("no measurement")
-    (out / name).mkdir(parents=True, exist_ok=True)
-    for measurement in measurements:
-        progress(measurement.key)
-        traced = forecast_measurement(folder, measurement, surface)
-        np.savez_compressed(out / name / f"{measurement.identifier}-forecast.npz", flux=traced.flux)
-        entry: dict[str, Any] = {"target": measurement.target, "peak_w_m2": traced.peak, "power_w": traced.power}
-        comparison = compare(folder, measurement, traced, window)
-        yield measurement.key, entry if comparison is None else {**entry, **comparison}
+) -> dict[str, Any]:
+    """Write the forecast of one measurement and give back its entry in ``forecast.json``."""
+    traced = forecast_measurement(folder, measurement, surface)
+    path = out / measurement.heliostat / f"{measurement.identifier}-forecast.npz"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(path, flux=traced.flux)
+    entry: dict[str, Any] = {"target": measurement.target, "peak_w_m2": traced.peak, "power_w": traced.power}
+    comparison = compare(folder, measurement, traced, window)
+    return entry if comparison is None else {**entry, **comparison}

@@ -85,6 +85,7 @@ def forecast(
     *,
     aim: ArrayLike | None = None,
     spot: ArrayLike | None = None,
+    angles: ArrayLike | None = None,
     resolution: tuple[int, int] = (256, 256),
     window: float | None = None,
     optics: Optics | None = None,
@@ -101,7 +102,9 @@ def forecast(
     aim : array_like (3,) [m], optional
         Where the ray from the mirror's centre goes; the plane's centre unless given.
     spot : array_like (3,) [m], optional
-        Where the spot's centre of mass shall lie; the heliostat is turned until it does. Goes before ``aim``.
+        Where the spot's centre of mass shall lie; the heliostat is turned until it does. Goes before ``angles``.
+    angles : array_like (2,) [rad], optional
+        The mount's axis angles, as its motors tell them. Goes before ``aim``.
     resolution : (rows, columns)
     window : float [m], optional
         Side of a square about the spot; the whole plane unless given.
@@ -116,11 +119,15 @@ def forecast(
     points, degree = (control_points(heliostat, z), DEGREE) if surface is None else surface
     direction = np.asarray(sun, dtype=np.float64)
     if spot is not None:
-        angles = align_to_spots([heliostat], [points], direction[None], [plane], np.array([spot]), degree=degree)
+        turned = align_to_spots([heliostat], [points], direction[None], [plane], np.array([spot]), degree=degree)[0]
+    elif angles is not None:
+        turned = np.asarray(angles, dtype=np.float64)
     else:
         goal = plane.center if aim is None else np.asarray(aim, dtype=np.float64)
-        angles = heliostat.mount.align(heliostat.position, direction, goal)[None]
-    scene = Scene.build([heliostat], [points], angles, direction[None], [plane], degree=degree, dtype=torch.float64)
+        turned = heliostat.mount.align(heliostat.position, direction, goal)
+    scene = Scene.build(
+        [heliostat], [points], turned[None], direction[None], [plane], degree=degree, dtype=torch.float64
+    )
     rows, columns = resolution
     view = Window.of(plane, rows, columns) if window is None else Window(window, window, rows, columns, on_spot=True)
     with torch.no_grad():

@@ -240,7 +240,7 @@ class MeasurementFolder:
     optics : Optics
         The declared model (``twin.json``), Buie's sun with 0.02 without one.
     skipped : dict
-        Heliostats that are there but could not be read, with the reason.
+        Heliostats and measurements that are there but could not be read, with the reason.
     """
 
     root: Path
@@ -249,7 +249,10 @@ class MeasurementFolder:
     skipped: dict[str, str]
 
     def measurements(self, heliostat: str, with_images: bool = True) -> list[Measurement]:
-        """All measurements of a heliostat by identifier, or only those that have an image."""
+        """All measurements of a heliostat by identifier, or only those that have an image.
+
+        A file that cannot be read is noted in ``skipped`` with its reason and costs none of the others.
+        """
         return [m for m in self._measurements(heliostat) if m.images or not with_images]
 
     def _measurements(self, heliostat: str) -> Iterator[Measurement]:
@@ -258,7 +261,11 @@ class MeasurementFolder:
             identifier = path.name.removesuffix("calibration-properties.json").removesuffix("-")
             if not identifier:
                 continue  # a sample that PAINT ships without a number; nothing could refer to it
-            measurement = read_measurement(identifier, heliostat, read_json(path), self.plant)
+            try:
+                measurement = read_measurement(identifier, heliostat, read_json(path), self.plant)
+            except InvalidInputError as error:
+                self.skipped[f"{heliostat}/{identifier}"] = str(error)
+                continue
             images = {kind: folder / f"{identifier}-{kind}.png" for kind in IMAGE_KINDS}
             measurement.images.update({kind: file for kind, file in images.items() if file.is_file()})
             yield measurement

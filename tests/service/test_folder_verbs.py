@@ -100,6 +100,25 @@ def test_bad_input_is_one_line_and_exit_code_2(made_plant, tmp_path, arguments, 
     assert not Path("x").exists()
 
 
+def test_without_a_spot_the_motors_turn_the_heliostat(stj, tmp_path):
+    """AA39's kinematics are good to about a degree, so that the light lands within some metres of the measured spot."""
+    import shutil
+
+    for name in ("AA39/Properties", "AA39/Deflectometry"):
+        shutil.copytree(stj / name, tmp_path / "plant" / name)
+    shutil.copy(stj / "WRI1030197-tower-measurements.json", tmp_path / "plant")
+    about = json.loads((stj / "AA39" / "Calibration" / "209075-calibration-properties.json").read_text())
+    del about["focal_spot"]
+    (tmp_path / "plant" / "AA39" / "Calibration").mkdir()
+    (tmp_path / "plant" / "AA39" / "Calibration" / "209075-calibration-properties.json").write_text(json.dumps(about))
+    by_motor = succeeds("forecast", tmp_path / "plant", "--out", tmp_path / "motor")["measurements"]["AA39/209075"]
+    del about["motor_position"]
+    (tmp_path / "plant" / "AA39" / "Calibration" / "209075-calibration-properties.json").write_text(json.dumps(about))
+    by_aim = succeeds("forecast", tmp_path / "plant", "--out", tmp_path / "aim")["measurements"]["AA39/209075"]
+    assert by_motor["power_w"] > 0.5 * by_aim["power_w"]
+    assert by_motor["power_w"] != pytest.approx(by_aim["power_w"], rel=1e-3)
+
+
 def test_every_verb_has_help():
     for verb in ("demo", "serve", "import", "flux", "predict", "forecast", "migrate"):
         done = heliotwin(verb, "--help")
@@ -115,10 +134,17 @@ def test_a_heliostat_without_images_is_skipped_with_its_reason(made_plant, tmp_p
     for path in (root / "AC31" / "Calibration").iterdir():
         path.unlink()
     (root / "AB12" / "Properties" / "AB12-heliostat-properties.json").write_text('{"width": 3}')
+    (root / "AF27" / "Calibration" / "301-calibration-properties.json").write_text('{"target_name": "moon"}')
+    (root / "AF27" / "Calibration" / "302-raw.png").write_bytes(b"not an image")
     report = succeeds("predict", root, "--out", tmp_path / "out", "--images", 1)
     assert sorted(report["heliostats"]) == ["AF27", "AK08"]
     assert report["skipped"]["AC31"] == "no image"
     assert "kinematics_properties" in report["skipped"]["AB12"]
+    assert "target_name" in report["skipped"]["AF27/301"]
+    assert "302-raw.png" in report["heliostats"]["AF27"]["refused"]["302"]
+    quality = succeeds("flux", root, "--out", tmp_path / "flux")
+    assert "302-raw.png" in quality["skipped"]["AF27/302"]
+    assert "AF27/303" in quality["images"]
 
 
 def test_demo_leaves_table_pictures_report_and_store(tmp_path, stj):
