@@ -169,17 +169,6 @@ def ingest(runtime: Runtime, heliostat_name: str, photograph: Photograph, data: 
 # --- a surface --------------------------------------------------------------------------------------------------------
 
 
-def _spread(rows: Sequence[MeasurementRow], count: int) -> list[MeasurementRow]:
-    """``count`` of ``rows``, the first and then each time the one whose sun is farthest from those chosen."""
-    suns = sun_direction([row.sun_azimuth_deg for row in rows], [row.sun_elevation_deg for row in rows])
-    chosen = [0]
-    while len(chosen) < min(count, len(rows)):
-        nearest = (suns @ suns[chosen].T).max(axis=1)
-        nearest[chosen] = np.inf
-        chosen.append(int(nearest.argmin()))
-    return [rows[index] for index in chosen]
-
-
 def choose_measurements(session: Session, heliostat: HeliostatRow, count: int) -> list[MeasurementRow]:
     """Up to ``count`` accepted measurements for a prediction: recent, and with the sun at different places.
 
@@ -191,7 +180,10 @@ def choose_measurements(session: Session, heliostat: HeliostatRow, count: int) -
     recent = store.recent_measurements(session, heliostat, _RECENT * count)
     if not recent:
         raise ConflictError(f"heliostat {heliostat.name} has no accepted measurement; post target images of it first")
-    return _spread(recent, count)
+    from model.observation import spread_suns
+
+    suns = sun_direction([row.sun_azimuth_deg for row in recent], [row.sun_elevation_deg for row in recent])
+    return [recent[index] for index in spread_suns(suns, count)]
 
 
 def _named_measurements(session: Session, heliostat: HeliostatRow, names: Sequence[str]) -> list[MeasurementRow]:

@@ -7,17 +7,17 @@ network nor the prior has seen, rendered with noise at random places of the fiel
 import time
 
 import numpy as np
-import torch
 
 from model.metrics import surface_error
 from model.network.predictor import default_predictor, model_card
-from model.observation import Observation, scene_of
+from model.observation import Observation
 from model.plant import Heliostat, TargetPlane
 from model.refinement import default_prior, refine
-from model.tracing import Window, trace
-from service.folder import choose, observe, surface_errors
+from service import folder as verbs
+from service.folder import choose, surface_errors
 from service.paint import measured_heights, read_folder
 from tests.benchmarks.imaging import data_folder
+from tests.rendered import observe
 from training.render import Situations, juelich_heliostat, load_field
 from training.surfaces import load_surfaces
 
@@ -30,7 +30,7 @@ def real() -> None:
     folder = read_folder(data_folder(), ["AA39", "AC43"])
     print("Real photographs to surfaces, mean absolute error of control heights [mm], facet means removed")
     for name, heliostat in folder.plant.heliostats.items():
-        observed = [observe(folder, measurement) for measurement in folder.measurements(name)]
+        observed = [verbs.observe(folder, measurement) for measurement in folder.measurements(name)]
         images = choose([o for o in observed if isinstance(o, Observation)], IMAGES)
         measured = folder.measured_surface(name)
         assert measured is not None
@@ -50,16 +50,7 @@ def photographs(heliostat: Heliostat, z: np.ndarray, rng: np.random.Generator) -
     suns = Situations().suns(IMAGES, rng)
     centers = np.stack([rng.uniform(-10, 10, IMAGES), np.zeros(IMAGES), rng.uniform(30, 55, IMAGES)], axis=-1)
     planes = [TargetPlane("t", c, np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]), 8, 8) for c in centers]
-    blank = np.ones((64, 64), np.float32)
-    places = [Observation(blank, s, p, p.center, str(i)) for i, (s, p) in enumerate(zip(suns, planes, strict=True))]
-    with torch.no_grad():
-        flux = trace(scene_of(heliostat, places, [z]), Window(on_spot=True), samples=48).irradiance.numpy()
-    flux = flux / flux.max(axis=(1, 2), keepdims=True) + rng.normal(0, NOISE, flux.shape)
-    images = np.round(flux.clip(0, 1) * 255).astype(np.float32)
-    return [
-        Observation(100 * image / image.sum(), o.sun, o.target, o.center_of_mass, o.identifier)
-        for image, o in zip(images, places, strict=True)
-    ]
+    return observe(heliostat, z, suns, planes, rng, NOISE)
 
 
 def simulated() -> None:

@@ -2,33 +2,22 @@
 
 import numpy as np
 import pytest
-import torch
 
 from model.errors import InvalidInputError
 from model.frames import sun_direction_at
 from model.metrics import surface_error
-from model.observation import Observation, scene_of
+from model.observation import Observation
 from model.plant import Heliostat
 from model.refinement import default_prior, misfit, refine
-from model.tracing import Window, trace
 from tests.conftest import flat_heliostat, target
+from tests.rendered import observe
 
 SUNS = sun_direction_at(np.array([-20.0, -5, 5, 20, 15, 0]), np.array([-40.0, 30, -15, 50, 0, 10]), 50.9)
 
 
-def observe(heliostat: Heliostat, z: np.ndarray, noise: float = 0.01) -> list[Observation]:
-    """Noisy 8-bit images of a mirror under six suns."""
-    rng, plane = np.random.default_rng(5), target()
-    blank = np.ones((64, 64), np.float32)
-    places = [Observation(blank, sun, plane, plane.center, str(i)) for i, sun in enumerate(SUNS)]
-    with torch.no_grad():
-        flux = trace(scene_of(heliostat, places, [z]), Window(on_spot=True), samples=40).irradiance.numpy()
-    flux = flux / flux.max(axis=(1, 2), keepdims=True) + rng.normal(0, noise, flux.shape)
-    images = np.round(flux.clip(0, 1) * 255).astype(np.float32)
-    return [
-        Observation(100 * image / image.sum(), o.sun, o.target, o.center_of_mass, o.identifier)
-        for image, o in zip(images, places, strict=True)
-    ]
+def images(heliostat: Heliostat, z: np.ndarray) -> list[Observation]:
+    """Noisy images of a mirror under six suns."""
+    return observe(heliostat, z, SUNS, [target()] * len(SUNS), np.random.default_rng(5))
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +33,7 @@ def truth() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def refined(heliostat, truth):
-    return refine(heliostat, observe(heliostat, truth))
+    return refine(heliostat, images(heliostat, truth))
 
 
 def test_the_true_surface_is_approached(refined, truth):
@@ -53,7 +42,7 @@ def test_the_true_surface_is_approached(refined, truth):
 
 
 def test_the_images_are_explained_as_well_as_by_the_truth(refined, heliostat, truth):
-    assert refined.misfit < misfit(heliostat, observe(heliostat, truth), truth) + 0.01
+    assert refined.misfit < misfit(heliostat, images(heliostat, truth), truth) + 0.01
 
 
 def test_the_uncertainty_covers_the_error(refined, truth):
@@ -63,9 +52,8 @@ def test_the_uncertainty_covers_the_error(refined, truth):
 
 
 def test_misfit_tells_a_surface_from_another(heliostat, truth, refined):
-    images = observe(heliostat, truth)
     assert refined.misfit < 0.08
-    assert misfit(heliostat, images, default_prior().mean) > 1.5 * refined.misfit
+    assert misfit(heliostat, images(heliostat, truth), default_prior().mean) > 1.5 * refined.misfit
 
 
 def test_prior_inverts_its_own_coefficients():
