@@ -22,10 +22,11 @@ UNREADABLE = (InvalidInputError, ImageRefusedError, ConflictError, TooLargeError
 def import_folder(runtime: Runtime, folder: MeasurementFolder, progress: Progress = quiet) -> dict[str, Any]:
     """Store the plant, its targets, and every heliostat with its images and measured surface.
 
-    Returns how many of each were new, changed or there already; images that cannot be read are listed with the reason.
+    Returns how many of each were new, changed or there already; measurements without an image, and images that cannot
+    be read, are listed with the reason.
     """
     counts: Counter[str] = Counter()
-    skipped = dict(folder.skipped)
+    skipped: dict[str, str] = {}
     with runtime.database.writing() as session:
         counts[f"plants {store.put_plant(session, folder.plant.name, folder.plant.origin)}"] += 1
         for plane in folder.plant.targets.values():
@@ -35,14 +36,16 @@ def import_folder(runtime: Runtime, folder: MeasurementFolder, progress: Progres
         counts[f"heliostats {_put_heliostat(runtime, folder, name)}"] += 1
         for outcome in _put_surface(runtime, folder, name):
             counts[outcome] += 1
-        for measurement in folder.measurements(name):
+        for measurement in folder.measurements(name, with_images=False):
+            if not measurement.images:
+                skipped[measurement.key] = "no image"
             for kind in sorted(measurement.images, key=IMAGE_KINDS.index):
                 progress(f"{measurement.key} {kind}")
                 try:
                     counts[_put_image(runtime, folder, measurement, kind)] += 1
                 except UNREADABLE as error:
                     skipped[f"{measurement.key} {kind}"] = str(error)
-    return {"counts": dict(sorted(counts.items())), "skipped": skipped}
+    return {"counts": dict(sorted(counts.items())), "skipped": {**folder.skipped, **skipped}}
 
 
 def _put_heliostat(runtime: Runtime, folder: MeasurementFolder, name: str) -> store.Change:

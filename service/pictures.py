@@ -38,7 +38,7 @@ def surface_picture(z: NDArray[np.floating], title: str) -> bytes:
     bound = max(float(np.abs(heights).max()), 1e-3)
     for pane, facet, name in zip(panes, heights, _FACETS, strict=True):
         # i runs with x and j with y, so columns are i and rows, from below, are j
-        image = pane.imshow(facet.T, cmap="RdBu_r", vmin=-bound, vmax=bound, origin="lower")
+        image = pane.imshow(facet.T, cmap="RdBu_r", vmin=-bound, vmax=bound, origin="lower", aspect=0.8)
         pane.set(xticks=[], yticks=[], title=name)
     figure.suptitle(title)
     figure.colorbar(image, ax=panes.tolist(), label="deviation from the ideal facet [mm]")
