@@ -1,7 +1,7 @@
 """What the command line, the demo and REST do, as plain functions from arrays to arrays: measure, predict, forecast."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -52,7 +52,10 @@ def predict(
     if method not in ("network", "refined"):
         raise InvalidInputError(f"method must be 'network' or 'refined', got {method!r}")
     by_network = default_predictor().predict(heliostat, observations)
-    return by_network if method == "network" else refine(heliostat, observations, by_network.z, optics=optics)
+    if method == "network":
+        return by_network
+    refined = refine(heliostat, observations, by_network.z, optics=optics)
+    return replace(refined, weights=f"{by_network.weights}+{refined.weights}")
 
 
 @dataclass(frozen=True, eq=False)
