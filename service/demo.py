@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from model.errors import InvalidInputError
+from model.errors import ModelError
 from model.frames import sun_angles
 from model.imaging.window import center_of_mass, flux_window
 from model.metrics import flux_accuracy
@@ -74,7 +74,8 @@ def run_demo(data: Path | None, out: Path, console: Console, quiet: bool = False
         finally:
             runtime.close()
     if not results:
-        raise InvalidInputError(f"{root}: no heliostat had an image that could be used: {skipped}")
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in list(skipped.items())[:3])
+        raise ModelError(f"{root}: no heliostat had an image that could be used ({reasons})")
     report = {
         "data": str(root),
         "store": imported["counts"],

@@ -69,7 +69,7 @@ def _finish(folder: MeasurementFolder, report: dict[str, Any], path: Path, done:
     write_json(path, report)
     if not report[done]:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in list(report["skipped"].items())[:3])
-        raise InvalidInputError(f"nothing to do: every heliostat was skipped ({reasons})")
+        raise ModelError(f"nothing was left to do, everything was skipped ({reasons}); see {path}")
     return report
 
 
@@ -237,7 +237,7 @@ def _surface(folder: MeasurementFolder, heliostat: Heliostat, surfaces: str) -> 
 
 
 def check_effects(path: Path | None) -> None:
-    """Refuse an effects file that asks for more than this version can do, or a folder of surfaces that is not there."""
+    """Refuse an effects file that asks for more than this version can do."""
     if path is None:
         return
     content = read_json(path)

@@ -93,9 +93,11 @@ def _number(data: Any, where: str, *keys: str | int) -> float:
 
 
 def read_json(path: Path) -> Any:
-    """Parsed JSON of a file; a file that is not JSON is named."""
+    """Parsed JSON of a file; a file that is missing or not JSON is named."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InvalidInputError(f"{path}: no such file") from None
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise InvalidInputError(f"{path}: not valid JSON ({error})") from None
 

@@ -90,6 +90,7 @@ def test_contract_on_undeclared_sets(undeclared, tmp_path, number):
         (("predict", "PLANT", "--out", "x", "--method", "magic"), "--method must be"),
         (("predict", "PLANT", "--out", "x", "--images", "9"), "--images must lie in 1 to 8"),
         (("forecast", "PLANT", "--out", "x", "--surfaces", "nowhere"), "--surfaces must be"),
+        (("forecast", "PLANT", "--out", "x", "--effects", "nowhere.json"), "nowhere.json: no such file"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(made_plant, tmp_path, arguments, says):
@@ -145,6 +146,13 @@ def test_a_heliostat_without_images_is_skipped_with_its_reason(made_plant, tmp_p
     quality = succeeds("flux", root, "--out", tmp_path / "flux")
     assert "302-raw.png" in quality["skipped"]["AF27/302"]
     assert "AF27/303" in quality["images"]
+
+    for name in ("AF27", "AK08"):
+        shutil.rmtree(root / name / "Calibration")
+    nothing = heliotwin("predict", root, "--out", tmp_path / "nothing")
+    assert nothing.returncode == 1
+    assert "AC31: no image" in nothing.stderr
+    assert len(nothing.stderr.strip().splitlines()) == 1
 
 
 def test_demo_leaves_table_pictures_report_and_store(tmp_path, stj):
