@@ -74,6 +74,32 @@ class Heliostat:
         if not self.facets:
             raise InvalidInputError(f"heliostat {self.name} has no facets")
 
+    @classmethod
+    def juelich(
+        cls,
+        name: str,
+        position: ArrayLike,
+        focal_length: float | None = None,
+        *,
+        mount: Mount | None = None,
+        facet_depth: float = 0.0402,
+    ) -> "Heliostat":
+        """A heliostat of the Solar Tower Juelich's kind: four facets of 1.605 m x 1.275 m.
+
+        ``position`` (3,) [m]; the facets are canted to ``focal_length`` [m], or lie in one plane without it, and stand
+        ``facet_depth`` [m] before the mirror's reference plane.
+        """
+        curvature = 0.0 if focal_length is None else 1 / (2 * focal_length)
+        facets = tuple(
+            Facet(
+                np.array([x, y, facet_depth]),
+                np.array([0.8025, 0.0, 0.8025 * x * curvature]),
+                np.array([0.0, 0.6375, 0.6375 * y * curvature]),
+            )
+            for x, y in ((-0.8075, 0.6425), (0.8075, 0.6425), (-0.8075, -0.6425), (0.8075, -0.6425))
+        )
+        return cls(name, np.asarray(position, dtype=np.float64), mount or Mount.juelich(), facets)
+
     @property
     def facet_frames(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Centres (F, 3) [m], axes (F, 3 axes, 3) and half sizes (F, 2) [m] of the facets in mirror coordinates.

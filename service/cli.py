@@ -60,8 +60,8 @@ def show(report: dict[str, Any], as_json: bool, table: Table | None = None) -> N
         console.print(f"skipped {name}: {reason}", style="yellow", highlight=False)
 
 
-def _count(folder: MeasurementFolder) -> int:
-    return sum(len(folder.measurements(name)) for name in folder.plant.heliostats)
+def _count(folder: MeasurementFolder, with_images: bool = True) -> int:
+    return sum(len(folder.measurements(name, with_images)) for name in folder.plant.heliostats)
 
 
 def make_table(title: str, *columns: str) -> Table:
@@ -140,7 +140,7 @@ def forecast(
 
     check_effects(effects)
     source = read_folder(folder)
-    with progress(_count(source), "forecast") as step:
+    with progress(_count(source, with_images=False), "forecast") as step:
         report = forecast_folder(source, out, surfaces, window, step)
     table = make_table("Forecasts", "measurement", "accuracy", "window [m]", "outside", "peak [kW/m2]")
     for key, entry in report["measurements"].items():

@@ -15,13 +15,14 @@ from model.errors import ModelError
 from model.frames import sun_angles
 from model.imaging.window import center_of_mass, flux_window
 from model.metrics import flux_accuracy
-from model.observation import FLUX_WINDOW, Observation, spread_suns
+from model.network.architecture import MAX_IMAGES
+from model.observation import FLUX_WINDOW, Observation
 from model.plant import Heliostat
 from model.tracing import Optics
 from service import operations, workflows
 from service.arrays import unpack
 from service.demo_plant import write_plant
-from service.folder import observe, surface_errors, write_json
+from service.folder import choose, observe, surface_errors, write_json
 from service.importer import import_folder
 from service.operations import Method
 from service.paint import MeasurementFolder, measured_heights, read_folder
@@ -123,7 +124,7 @@ def _split(observations: list[Observation]) -> tuple[list[Observation], list[Obs
         return observations, observations
     judged = observations[HELD_OUT - 1 :: HELD_OUT]
     used = [o for o in observations if not any(o is j for j in judged)]
-    return [used[i] for i in spread_suns(np.array([o.sun for o in used]), 8)], judged
+    return choose(used, MAX_IMAGES), judged
 
 
 def _stored(runtime: Runtime, name: str, method: Method, used: Sequence[Observation]) -> Array:

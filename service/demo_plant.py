@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from model.frames import sun_angles, sun_direction_at
 from model.imaging.camera import CameraOptions, photograph
-from model.mount import Mount
-from model.plant import Facet, Heliostat, Plant, TargetPlane
+from model.plant import Heliostat, Plant, TargetPlane
 from model.refinement import default_prior
 from model.surface import control_points
 from model.tracing import Scene, Window
@@ -31,26 +30,11 @@ POSITIONS = {
     "AF27": (38.0, 96.0, 1.9),
     "AK08": (-72.0, 138.0, 1.8),
 }
-FACET_CENTERS = ((-0.8075, 0.6425), (0.8075, 0.6425), (-0.8075, -0.6425), (0.8075, -0.6425))
 TARGET = TargetPlane(
     "calibration_target", np.array([0.0, 0.0, 40.0]), np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]), 8.0, 7.0
 )
 IMAGES, RAYS, PIXELS = 8, 400_000, 112
 """Photographs of each heliostat, rays and pixels along each side of each."""
-
-
-def heliostat(name: str, position: Array) -> Heliostat:
-    """A heliostat whose flat facets are canted to focus on the target."""
-    curvature = 1 / (2 * np.linalg.norm(position - TARGET.center))
-    facets = tuple(
-        Facet(
-            np.array([x, y, 0.0402]),
-            np.array([0.8025, 0.0, 0.8025 * x * curvature]),
-            np.array([0.0, 0.6375, 0.6375 * y * curvature]),
-        )
-        for x, y in FACET_CENTERS
-    )
-    return Heliostat(name, position, Mount.juelich(), facets)
 
 
 def properties(mirror: Heliostat, plant: Plant) -> dict[str, Any]:
@@ -128,7 +112,7 @@ def write_plant(
     write_json(root / "demo-tower-measurements.json", tower(plant))
     for number, (name, position) in enumerate(POSITIONS.items(), start=1):
         progress(name)
-        mirror = heliostat(name, np.array(position))
+        mirror = Heliostat.juelich(name, position, float(np.linalg.norm(position - TARGET.center)))
         z = prior.surface(rng.normal(0, 0.8, len(prior.basis)))
         write_json(root / name / "Properties" / f"{name}-heliostat-properties.json", properties(mirror, plant))
         (root / name / "Deflectometry").mkdir(parents=True, exist_ok=True)

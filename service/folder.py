@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from model.errors import InvalidInputError, ModelError
 from model.imaging import ImageKind, MeasuredFlux, decode_image
 from model.metrics import compare_on_target, surface_error
+from model.network.architecture import MAX_IMAGES
 from model.observation import Observation, SurfacePrediction, spread_suns
 from model.plant import Heliostat, TargetPlane
 from model.surface import split_canting
@@ -56,11 +57,11 @@ def _measure(path: Path, kind: ImageKind, plane: TargetPlane) -> MeasuredFlux:
     return operations.measure(read_image(path), kind, plane)
 
 
-def measure(folder: MeasurementFolder, measurement: Measurement, kind: str | None = None) -> tuple[str, MeasuredFlux]:
-    """Flux of a measurement's most worked-out image, or of its image of one kind; with the kind."""
+def measure(folder: MeasurementFolder, measurement: Measurement, kind: str | None = None) -> MeasuredFlux:
+    """Flux of a measurement's most worked-out image, or of its image of one kind."""
     chosen = kind or next(k for k in IMAGE_KINDS if k in measurement.images)
     plane = folder.plant.targets[measurement.target]
-    return chosen, _measure(measurement.images[chosen], cast(ImageKind, chosen), plane)
+    return _measure(measurement.images[chosen], cast(ImageKind, chosen), plane)
 
 
 def _finish(folder: MeasurementFolder, report: dict[str, Any], path: Path, done: str) -> dict[str, Any]:
@@ -87,7 +88,7 @@ def flux_folder(folder: MeasurementFolder, out: Path, progress: Progress = quiet
             progress(measurement.key)
             kind = next((k for k in ("raw", "cropped", *IMAGE_KINDS) if k in measurement.images), "")
             try:
-                _, measured = measure(folder, measurement, kind)
+                measured = measure(folder, measurement, kind)
             except ModelError as error:
                 report["skipped"][measurement.key] = str(error)
                 continue
@@ -128,7 +129,7 @@ def write_gray(path: Path, image: NDArray[Any]) -> None:
 def observe(folder: MeasurementFolder, measurement: Measurement) -> Observation | str:
     """What a measurement shows, or why it was refused."""
     try:
-        _, measured = measure(folder, measurement)
+        measured = measure(folder, measurement)
     except InvalidInputError as error:
         return str(error)
     if measured.centered is None:
@@ -191,11 +192,15 @@ def surface_errors(z: Array, truth: Array) -> dict[str, float]:
 
 
 def predict_folder(
-    folder: MeasurementFolder, out: Path, method: Method = "network", images: int = 8, progress: Progress = quiet
+    folder: MeasurementFolder,
+    out: Path,
+    method: Method = "network",
+    images: int = MAX_IMAGES,
+    progress: Progress = quiet,
 ) -> dict[str, Any]:
     """Predict every heliostat's surface from up to ``images`` of its images; files as DESIGN.md, section 6."""
-    if not 1 <= images <= 8:
-        raise InvalidInputError(f"--images must lie in 1 to 8, got {images}")
+    if not 1 <= images <= MAX_IMAGES:
+        raise InvalidInputError(f"--images must lie in 1 to {MAX_IMAGES}, got {images}")
     report: dict[str, Any] = {"method": method, "heliostats": {}, "skipped": {}}
     for name, heliostat in folder.plant.heliostats.items():
         progress(name)

@@ -13,7 +13,8 @@ import pytest
 import torch
 
 from model.mount import Mount
-from model.plant import Facet, Heliostat, TargetPlane
+from model.plant import Heliostat, TargetPlane
+from tests.benchmarks import data_folder
 
 torch.set_num_threads(1)
 
@@ -21,7 +22,7 @@ torch.set_num_threads(1)
 @pytest.fixture(scope="session")
 def stj() -> Path:
     """The real measurements of the Solar Tower Juelich; tests that need them skip where they are absent."""
-    root = Path(os.environ.get("HELIOTWIN_STJ", "../shared/stj"))
+    root = data_folder()
     if not root.is_dir():
         pytest.skip(f"no real measurements at {root}; set HELIOTWIN_STJ")
     return root
@@ -40,16 +41,7 @@ def flat_heliostat(
     position=(0.0, 60.0, 1.8), focal_length: float | None = None, mount: Mount | None = None
 ) -> Heliostat:
     """Four facets of 1.605 m x 1.275 m, flat in one plane or canted to a focal length [m]."""
-    curvature = 0.0 if focal_length is None else 1 / (2 * focal_length)
-    facets = tuple(
-        Facet(
-            np.array([x, y, 0.0]),
-            np.array([0.8025, 0.0, 0.8025 * x * curvature]),
-            np.array([0.0, 0.6375, 0.6375 * y * curvature]),
-        )
-        for x, y in ((-0.8075, 0.6425), (0.8075, 0.6425), (-0.8075, -0.6425), (0.8075, -0.6425))
-    )
-    return Heliostat("flat", np.array(position), mount or Mount.juelich(), facets)
+    return Heliostat.juelich("flat", position, focal_length, mount=mount, facet_depth=0.0)
 
 
 def target(size: float = 8.0, center=(0.0, 0.0, 40.0)) -> TargetPlane:

@@ -11,9 +11,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from model.frames import sun_direction_at
-from model.mount import Mount
 from model.network.inputs import conditions
-from model.plant import Facet, Heliostat
+from model.plant import Heliostat
 from model.sunshape import Buie, transfer_table
 from model.surface import control_points
 from model.tracing import Optics, Scene, Window, trace
@@ -27,21 +26,6 @@ def load_field(root: Path) -> Array:
     """Heliostat positions (N, 3) [m] in ENU from ``root/field-positions.json``."""
     field = json.loads((root / "field-positions.json").read_text(encoding="utf-8"))
     return np.array([entry["position_enu"] for entry in field.values()], dtype=np.float64)
-
-
-def juelich_heliostat(position: Array, focal_length: float, name: str = "synthetic") -> Heliostat:
-    """A heliostat of the Juelich kind: four facets canted to ``focal_length`` [m]."""
-    facets = []
-    for x, y in ((-0.8075, 0.6425), (0.8075, 0.6425), (-0.8075, -0.6425), (0.8075, -0.6425)):
-        slope_x, slope_y = x / (2 * focal_length), y / (2 * focal_length)
-        facets.append(
-            Facet(
-                position=np.array([x, y, 0.0402]),
-                canting_x=np.array([0.8025, 0.0, 0.8025 * slope_x]),
-                canting_y=np.array([0.0, 0.6375, 0.6375 * slope_y]),
-            )
-        )
-    return Heliostat(name, position, Mount.juelich(), tuple(facets))
 
 
 @dataclass(frozen=True)
@@ -75,7 +59,7 @@ class Situations:
         count = len(z)
         positions = field[rng.integers(len(field), size=count)]
         focal = np.linalg.norm(positions - [0.0, 0.0, 55.0], axis=-1) * rng.uniform(*self.focus, count)
-        heliostats = [juelich_heliostat(p, f) for p, f in zip(positions, focal, strict=True)]
+        heliostats = [Heliostat.juelich("synthetic", p, f) for p, f in zip(positions, focal, strict=True)]
         ideal = np.array([control_points(h) for h in heliostats])
         points = np.array([control_points(h, surface) for h, surface in zip(heliostats, z, strict=True)])
         mount, total = heliostats[0].mount, count * images

@@ -45,15 +45,13 @@ def align_to_spots(
     """
     goal, directions = np.asarray(spots, dtype=np.float64), np.asarray(suns, dtype=np.float64)
     aim = goal.copy()
-    for turn in range(ROUNDS + 1):
+    for _ in range(ROUNDS):
         angles = _align(heliostats, directions, aim)
-        if turn == ROUNDS:
-            return angles
         scene = Scene.build(heliostats, control_points, angles, directions, planes, degree=degree, dtype=torch.float64)
         traced = central_rays(scene, samples).spot.numpy()
         center, axes = scene.plane_center.numpy(), scene.plane_axes.numpy()
         aim += goal - center - np.einsum("bi,bij->bj", traced, axes[:, :2])
-    raise AssertionError("unreachable")
+    return _align(heliostats, directions, aim)
 
 
 def _align(

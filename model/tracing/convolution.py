@@ -225,7 +225,7 @@ def _quadratic(offset: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 def _padded(size: int, padding: float) -> int:
     """An even length of small prime factors that leaves ``padding`` of the window on each side."""
     length = math.ceil(size * (1 + 2 * padding) / 2) * 2
-    while any(length % p == 0 for p in (7, 11, 13)) or not _smooth(length):
+    while not _smooth(length):
         length += 2
     return length
 

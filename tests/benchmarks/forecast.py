@@ -11,7 +11,7 @@ import numpy as np
 
 from service.folder import forecast_folder
 from service.paint import read_folder
-from tests.benchmarks.imaging import data_folder
+from tests.benchmarks import data_folder
 
 
 def accuracies(root: Path, surfaces: str, heliostats: list[str] | None, window: float | None) -> np.ndarray:

@@ -7,7 +7,6 @@ centres of mass). The data are read from ``HELIOTWIN_STJ`` (default ``../shared/
 
 import argparse
 import json
-import os
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,10 +19,11 @@ from numpy.typing import NDArray
 
 from model.imaging import MeasuredFlux, center_of_mass, decode_image, measure
 from model.plant import Plant, TargetPlane
+from service.paint import read_json, read_targets
+from tests.benchmarks import data_folder
 
 TOWER = "WRI1030197-tower-measurements.json"
 Image = NDArray[np.generic]
-CORNERS = ("upper_left", "upper_right", "lower_left", "lower_right")
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,19 +45,10 @@ class Case:
         return self.from_raw or self.from_crop
 
 
-def data_folder() -> Path:
-    return Path(os.environ.get("HELIOTWIN_STJ", "../shared/stj"))
-
-
 def read_plant(folder: Path) -> Plant:
     """The tower and its targets, from PAINT's tower measurements."""
-    tower = json.loads((folder / TOWER).read_text())
-    plant = Plant("stj", np.array(tower["power_plant_properties"]["coordinates"]))
-    for name, entry in tower.items():
-        if all(corner in entry.get("coordinates", ()) for corner in CORNERS) and entry.get("type") == "planar":
-            corners = [plant.to_enu(entry["coordinates"][corner]) for corner in CORNERS]
-            plant.targets[name] = TargetPlane.from_corners(name, *corners)
-    return plant
+    origin, targets = read_targets(read_json(folder / TOWER))
+    return Plant("stj", origin, targets)
 
 
 def read_case(properties: Path, plant: Plant) -> Case:

@@ -9,12 +9,11 @@ import torch
 from model.frames import sun_direction
 from model.network.architecture import CONDITIONS, MAX_IMAGES
 from model.network.predictor import SurfacePredictor
-from model.plant import TargetPlane
+from model.plant import Heliostat, TargetPlane
 from model.refinement import default_prior
 from model.surface import control_points
 from model.tracing import Scene, Window, trace
 from model.tracing.montecarlo import trace_montecarlo
-from training.render import juelich_heliostat
 
 BATCH = 64
 
@@ -33,7 +32,7 @@ def seconds(work: Callable[[], object], repeats: int) -> float:
 def scene(count: int, device: str) -> Scene:
     """Random mirrors at 100 m under one sun."""
     rng, prior = np.random.default_rng(0), default_prior()
-    heliostat = juelich_heliostat(np.array([20.0, 95.0, 1.8]), 100.0)
+    heliostat = Heliostat.juelich("synthetic", np.array([20.0, 95.0, 1.8]), 100.0)
     plane = TargetPlane("t", np.array([0.0, 0, 40]), np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), 8, 8)
     suns = np.tile(sun_direction(25.0, 40.0), (count, 1))
     angles = np.tile(heliostat.mount.align(heliostat.position, suns[0], plane.center), (count, 1))

@@ -16,9 +16,9 @@ from model.refinement import default_prior, refine
 from service import folder as verbs
 from service.folder import choose, surface_errors
 from service.paint import measured_heights, read_folder
-from tests.benchmarks.imaging import data_folder
+from tests.benchmarks import data_folder
 from tests.rendered import observe
-from training.render import Situations, juelich_heliostat, load_field
+from training.render import Situations, load_field
 from training.surfaces import load_surfaces
 
 NOISE = 0.01  # of the peak
@@ -60,7 +60,9 @@ def simulated() -> None:
     for name in model_card()["trained_on"]["held_out"]:
         truth = surfaces[names.index(name)]
         position = field[rng.integers(len(field))]
-        heliostat = juelich_heliostat(position, float(np.linalg.norm(position - [0, 0, 55]) * rng.uniform(0.9, 1.05)))
+        heliostat = Heliostat.juelich(
+            "synthetic", position, float(np.linalg.norm(position - [0, 0, 55]) * rng.uniform(0.9, 1.05))
+        )
         images = photographs(heliostat, truth, rng)
         start = time.perf_counter()
         network = default_predictor().predict(heliostat, images)

@@ -2,7 +2,6 @@
 
 import io
 import json
-import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,10 +12,11 @@ from fastapi.testclient import TestClient
 
 from service.app import create_app
 from service.settings import Settings
+from tests.benchmarks import data_folder
 
 from .conftest import client_of
 
-STJ = Path(os.environ.get("HELIOTWIN_STJ", Path(__file__).parents[2].parent / "shared" / "stj"))
+STJ = data_folder()
 CALIBRATION = STJ / "AA39" / "Calibration"
 
 pytestmark = pytest.mark.skipif(not CALIBRATION.is_dir(), reason=f"no measurements of AA39 under {STJ}")

@@ -36,12 +36,11 @@ def test_turning_twice_and_mirroring_twice_change_nothing(surfaces):
 
 def test_a_mirrored_surface_throws_a_mirrored_spot(surfaces):
     """On a heliostat due north under a noon sun the flux of the mirrored surface is the mirrored flux."""
-    from model.plant import TargetPlane
+    from model.plant import Heliostat, TargetPlane
     from model.surface import control_points
     from model.tracing import Scene, Window, trace
-    from training.render import juelich_heliostat
 
-    heliostat = juelich_heliostat(np.array([0.0, 80.0, 1.8]), 90.0)
+    heliostat = Heliostat.juelich("synthetic", np.array([0.0, 80.0, 1.8]), 90.0)
     plane = TargetPlane("t", np.array([0.0, 0, 40]), np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), 8, 8)
     sun = np.array([0.0, -0.6, 0.8])
     angles = heliostat.mount.align(heliostat.position, sun, plane.center)
