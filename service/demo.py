@@ -66,7 +66,9 @@ def run_demo(data: Path | None, out: Path, console: Console, quiet: bool = False
             task = bars.add_task("photograph a plant", total=4)
             write_plant(root, lambda name: bars.update(task, description=f"photograph {name}", advance=1))
         folder = read_folder(root)
-        runtime = _open_store(out)
+        # A store holds one plant: demonstrations on different data under one folder keep out of each other's way.
+        store = out / f"store-{folder.plant.name}"
+        runtime = _open_store(store)
         try:
             count = sum(len(m.images) for name in folder.plant.heliostats for m in folder.measurements(name))
             task = bars.add_task("import", total=count + len(folder.plant.heliostats))
@@ -86,7 +88,7 @@ def run_demo(data: Path | None, out: Path, console: Console, quiet: bool = False
     write_json(out / "report.json", report)
     (out / "report.html").write_text(_page(report, results), encoding="utf-8")
     if not quiet:
-        _print(console, results, out)
+        _print(console, results, out, store)
     return report
 
 
@@ -95,8 +97,8 @@ def _bars(console: Console, quiet: bool) -> Progress:
     return Progress(*columns, TimeElapsedColumn(), console=console, disable=quiet)
 
 
-def _open_store(out: Path) -> Runtime:
-    runtime = Runtime.from_settings(Settings(data_dir=out / "store", database_url=None, host="127.0.0.1"))
+def _open_store(folder: Path) -> Runtime:
+    runtime = Runtime.from_settings(Settings(data_dir=folder, database_url=None, host="127.0.0.1"))
     runtime.database.upgrade()
     return runtime
 
@@ -248,7 +250,7 @@ def _row(result: Result) -> tuple[str, ...]:
     return (result.heliostat, images, *map(_cell, figures))
 
 
-def _print(console: Console, results: list[Result], out: Path) -> None:
+def _print(console: Console, results: list[Result], out: Path, store: Path) -> None:
     from service.cli import make_table
 
     table = make_table("What the surfaces are worth", *COLUMNS)
@@ -257,7 +259,7 @@ def _print(console: Console, results: list[Result], out: Path) -> None:
         table.add_row(*_row(result))
     console.print(table)
     console.print(f"pictures and report: {out / 'report.html'}", highlight=False)
-    console.print(f"next: HELIOTWIN_DATA_DIR={out / 'store'} heliotwin serve", highlight=False)
+    console.print(f"next: HELIOTWIN_DATA_DIR={store} heliotwin serve", highlight=False)
 
 
 def _page(report: dict[str, Any], results: list[Result]) -> str:

@@ -155,7 +155,10 @@ def test_a_heliostat_without_images_is_skipped_with_its_reason(made_plant, tmp_p
     assert len(nothing.stderr.strip().splitlines()) == 1
 
 
-def test_demo_leaves_table_pictures_report_and_store(tmp_path, stj):
+def test_demo_leaves_table_pictures_report_and_store(tmp_path, stj, made_plant):
+    """On one plant and then on another under the same folder, as README has it."""
+    before = heliotwin("demo", "--data", made_plant, "--out", tmp_path / "demo")
+    assert before.returncode == 0, before.stderr
     done = heliotwin("demo", "--data", stj, "--out", tmp_path / "demo")
     assert done.returncode == 0, done.stderr
     report = json.loads((tmp_path / "demo" / "report.json").read_text())
