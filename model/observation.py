@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from model.errors import InvalidInputError
 from model.plant import Heliostat, TargetPlane
 from model.surface import control_points
+from model.tracing import Optics, Scene, Window, trace
 from model.tracing.alignment import align_to_spots
-from model.tracing.scene import Scene
 
 FLUX_SHAPE = (64, 64)
 FLUX_WINDOW = 4.0
@@ -97,6 +97,25 @@ def scene_of(
     spots = np.tile([o.center_of_mass for o in observations], (len(surfaces), 1))
     angles = align_to_spots([heliostat] * count, points, suns, targets, spots)
     return Scene.build([heliostat] * count, points, angles, suns, targets, dtype=dtype)
+
+
+def render_observations(
+    heliostat: Heliostat,
+    observations: Sequence[Observation],
+    surfaces: Sequence[NDArray[np.float64]],
+    optics: Optics | None = None,
+    *,
+    samples: int = 24,
+) -> NDArray[np.float64]:
+    """What each of K surfaces (4, 8, 8) [m] would have thrown on the M targets: fluxes (K, M, 64, 64), sum 100.
+
+    Every surface is aligned anew: a tilt of the whole mirror is taken back by the mount and leaves no trace.
+    """
+    scene = scene_of(heliostat, observations, surfaces)
+    with torch.no_grad():
+        window = Window(FLUX_WINDOW, FLUX_WINDOW, on_spot=True)
+        flux = trace(scene, window, optics, samples=samples, padding=0.25).normalized()
+    return flux.double().numpy().reshape(len(surfaces), len(observations), *flux.shape[1:])
 
 
 def spread_suns(suns: NDArray[np.float64], count: int) -> list[int]:

@@ -17,15 +17,14 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from model.errors import InvalidInputError
 from model.metrics import flux_accuracy
-from model.observation import FLUX_WINDOW, Observation, SurfacePrediction, scene_of
+from model.observation import FLUX_WINDOW, Observation, SurfacePrediction, render_observations
 from model.plant import Heliostat
 from model.surface import control_points
-from model.tracing import Optics, Window, trace
+from model.tracing import Optics
 
 Array = NDArray[np.float64]
 
@@ -103,20 +102,6 @@ class RefinementOptions:
     samples: int = 24
 
 
-def _images(
-    heliostat: Heliostat, observations: Sequence[Observation], surfaces: Array, optics: Optics, samples: int
-) -> Array:
-    """Traced images (K, M, 64, 64), sum 100, of surfaces (K, 4, 8, 8) [m] where the M observations were taken.
-
-    Every surface is aligned anew: a tilt of the whole mirror is taken back by the mount and leaves no trace.
-    """
-    scene = scene_of(heliostat, observations, list(surfaces))
-    with torch.no_grad():
-        window = Window(FLUX_WINDOW, FLUX_WINDOW, on_spot=True)
-        flux = trace(scene, window, optics, samples=samples, padding=0.25).normalized()
-    return flux.double().numpy().reshape(len(surfaces), len(observations), *flux.shape[1:])
-
-
 def _nuisance(image: Array, options: RefinementOptions) -> Array:
     """Directions (64 * 64, 6) in which a camera may change an image, each as long as its standard deviation."""
     pixel = FLUX_WINDOW / image.shape[0]
@@ -152,7 +137,9 @@ class _Posterior:
 
     def images(self, surfaces: Array) -> Array:
         """Traced images (K, M, 64, 64) of surfaces (K, 4, 8, 8) [m]."""
-        return _images(self.heliostat, self.observations, surfaces, self.optics, self.options.samples)
+        return render_observations(
+            self.heliostat, self.observations, list(surfaces), self.optics, samples=self.options.samples
+        )
 
     def _nuisances(self, image: Array) -> tuple[float, Array, Array]:
         """Noise of an image's pixels, its nuisance directions over that noise (n, 6), and Woodbury's inner inverse.
@@ -269,7 +256,7 @@ def misfit(
     heliostat: Heliostat, observations: Sequence[Observation], z: NDArray[np.float64], optics: Optics | None = None
 ) -> float:
     """One minus the mean accuracy with which heights ``z`` (4, 8, 8) [m] re-render the images they came from."""
-    images = _images(heliostat, observations, z[None], optics or Optics(), RefinementOptions().samples)[0]
+    images = render_observations(heliostat, observations, [z], optics)[0]
     return float(
         1 - np.mean([flux_accuracy(o.flux, image.clip(min=0)) for o, image in zip(observations, images, strict=True)])
     )

@@ -1,4 +1,4 @@
-"""How well a run predicts surfaces it never saw: ``python -m training.evaluate --run runs/first``.
+"""How well a run predicts surfaces it never saw: ``python -m training.evaluate --run runs/best``.
 
 Held-out measured surfaces are placed over the field, photographed under random suns, predicted, and traced again under
 new suns. Beside the network stand the ideal surface and the mean surface of the training heliostats, which a network
@@ -24,11 +24,9 @@ Array = NDArray[np.float64]
 
 def _accuracy(predicted: Array, truth: Array, run: Run, seed: int) -> float:
     """Mean flux accuracy of surfaces (B, 4, 8, 8) [m] against the true ones at four suns the prediction did not see."""
-    with torch.no_grad():
-        forecast, measured = (
-            render(z, 4, run.field, run.config.situations, None, torch.device("cpu"), seed)[0]
-            for z in (predicted, truth)
-        )
+    forecast, measured = (
+        render(z, 4, run.field, run.config.situations, None, torch.device("cpu"), seed)[0] for z in (predicted, truth)
+    )
     pairs = zip(forecast.flatten(0, 1).numpy(), measured.flatten(0, 1).numpy(), strict=True)
     return float(np.mean([flux_accuracy(b, a) for a, b in pairs]))
 
@@ -44,9 +42,8 @@ def _errors(predicted: Array, truth: Array) -> dict[str, float]:
 @torch.no_grad()
 def predict(run: Run, truth: Array, images: int, camera: Camera | None, seed: int) -> Array:
     """Surfaces (B, 4, 8, 8) [m] that the run's averaged network sees in rendered images of true ones."""
-    flux, conditions = render(truth, images, run.field, run.config.situations, camera, torch.device("cpu"), seed)
-    heights, _ = run.average.eval()(flux, conditions, torch.ones(flux.shape[:2]))
-    return np.asarray(heights.double().numpy() * 1e-3)
+    flux, shots = render(truth, images, run.field, run.config.situations, camera, torch.device("cpu"), seed)
+    return run.predict(flux, shots).double().numpy()
 
 
 def evaluate(run: Run, repeats: int = 16, seed: int = 100) -> dict[str, Any]:
@@ -69,7 +66,7 @@ def evaluate(run: Run, repeats: int = 16, seed: int = 100) -> dict[str, Any]:
 def main() -> None:
     """Print the figures of one run."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--run", type=Path, default=Path("runs/first"))
+    parser.add_argument("--run", type=Path, default=Path("runs/best"))
     arguments = parser.parse_args()
     run = Run(TrainConfig.read(arguments.run / "config.json"), arguments.run, torch.device("cpu"))
     print(json.dumps(evaluate(run), indent=1))

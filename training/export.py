@@ -1,6 +1,6 @@
 """Export a run's averaged weights to ONNX, check them against torch, write the model card.
 
-``python -m training.export --run runs/first``
+``python -m training.export --run runs/best``
 """
 
 import argparse
@@ -12,9 +12,11 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import nn
 
-from model.network.architecture import CONDITIONS, IMAGE_SIZE, MAX_IMAGES, SurfaceNetwork
-from model.network.predictor import WEIGHTS, SurfacePredictor
+from model.network.architecture import CONDITIONS, IMAGE_SIZE, MAX_IMAGES
+from model.network.predictor import INPUTS, WEIGHTS, SurfacePredictor
+from model.surface import COLUMNS, FACETS, ROWS
 from training.evaluate import evaluate
 from training.train import Run, TrainConfig
 
@@ -22,34 +24,35 @@ PARITY_MM = 1e-4
 """Largest difference between torch and onnxruntime that is let through [mm]."""
 
 
-def example(batch: int, images: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Inputs of the network's form, the first ``images`` of eight present."""
+def example(batch: int, images: int) -> tuple[torch.Tensor, ...]:
+    """Inputs of the network's form in the order of `INPUTS`, the first ``images`` of eight present."""
     generator = torch.Generator().manual_seed(batch * 10 + images)
-    flux = torch.rand(batch, MAX_IMAGES, IMAGE_SIZE, IMAGE_SIZE, generator=generator) ** 4
-    flux = 100 * flux / flux.sum(dim=(2, 3), keepdim=True)
+    fluxes = torch.rand(2, batch, MAX_IMAGES, IMAGE_SIZE, IMAGE_SIZE, generator=generator) ** 4
+    flux, guess_flux = 100 * fluxes / fluxes.sum(dim=(3, 4), keepdim=True)
     conditions = torch.randn(batch, MAX_IMAGES, CONDITIONS, generator=generator)
     mask = torch.zeros(batch, MAX_IMAGES)
     mask[:, :images] = 1
-    return flux, conditions, mask
+    guess = 0.3 * torch.randn(batch, FACETS, ROWS, COLUMNS, generator=generator)
+    return flux, conditions, mask, guess_flux, guess
 
 
-def export(network: SurfaceNetwork, path: Path) -> None:
+def export(network: nn.Module, path: Path) -> None:
     """Write the network as ONNX with a free batch size."""
     batch = torch.export.Dim("batch", min=1, max=4096)
     torch.onnx.export(
         network.eval(),
         example(2, 5),
         str(path),
-        input_names=["flux", "conditions", "mask"],
+        input_names=list(INPUTS),
         output_names=["heights", "spread"],
-        dynamic_shapes=({0: batch}, {0: batch}, {0: batch}),
+        dynamic_shapes=tuple({0: batch} for _ in INPUTS),
         dynamo=True,
         external_data=False,
         verbose=False,
     )
 
 
-def parity(network: SurfaceNetwork, path: Path) -> float:
+def parity(network: nn.Module, path: Path) -> float:
     """Largest difference [mm] between torch and onnxruntime at batches 1, 2, 7 and one to eight images."""
     session = SurfacePredictor(path)
     worst = 0.0
@@ -58,7 +61,7 @@ def parity(network: SurfaceNetwork, path: Path) -> float:
             inputs = example(batch, images)
             with torch.no_grad():
                 expected = network(*inputs)[0].numpy()
-            z, _ = session.run(*(tensor.numpy() for tensor in inputs))
+            z, _ = session.look({name: tensor.numpy() for name, tensor in zip(INPUTS, inputs, strict=True)})
             worst = max(worst, float(np.abs(z * 1e3 - expected).max()))
     return worst
 
@@ -88,7 +91,7 @@ def model_card(run: Run, difference: float, note: str) -> dict[str, Any]:
 def main() -> None:
     """Export, check, write."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--run", type=Path, default=Path("runs/first"))
+    parser.add_argument("--run", type=Path, default=Path("runs/best"))
     parser.add_argument("--out", type=Path, default=WEIGHTS)
     parser.add_argument("--note", default="", help="what happened in the run that its config does not tell")
     arguments = parser.parse_args()

@@ -1,4 +1,4 @@
-"""Estimate the surface prior that ships: ``python -m training.prior --run runs/first``."""
+"""Estimate the surface prior that ships: ``python -m training.prior --run runs/best``."""
 
 import argparse
 from pathlib import Path
@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.refinement import PRIOR, SurfacePrior
-from training.surfaces import load_surfaces, mirrored, rotated, split_by_heliostat, tilt_modes
+from training.surfaces import load_surfaces, mirrored, rotated, split_by_heliostat, tilt_modes, untilted
 from training.train import TrainConfig
 
 Array = NDArray[np.float64]
@@ -31,13 +31,6 @@ def estimate(surfaces: Array, components: int = 96) -> SurfacePrior:
     measured = (directions[:components] * spread[:, None]).reshape(-1, *mean.shape)
     basis = untilted(np.concatenate([measured, canting_directions()]))
     return SurfacePrior(untilted(mean), orthogonal(basis), float(left_out**0.5))
-
-
-def untilted(z: Array) -> Array:
-    """Surfaces (..., 4, 8, 8) [m] without the tilt of the whole mirror, which is the mount's and not the surface's."""
-    modes = np.repeat(tilt_modes()[:, None], 4, axis=1).reshape(2, -1)
-    flat = z.reshape(*z.shape[:-3], -1)
-    return np.asarray((flat - flat @ np.linalg.pinv(modes) @ modes).reshape(z.shape))
 
 
 def canting_directions(sigma_mrad: float = 0.6) -> Array:
@@ -66,7 +59,7 @@ def _means(mean: Array) -> list[Array]:
 def main() -> None:
     """Write the prior of a run's training heliostats."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--run", type=Path, default=Path("runs/first"))
+    parser.add_argument("--run", type=Path, default=Path("runs/best"))
     parser.add_argument("--out", type=Path, default=PRIOR)
     arguments = parser.parse_args()
     config = TrainConfig.read(arguments.run / "config.json")

@@ -1,6 +1,7 @@
 """Rendering training images: heliostats of the field under random suns, seen by imperfect cameras."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +12,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from model.frames import sun_direction_at
-from model.network.inputs import conditions
+from model.network.architecture import CONDITIONS
+from model.network.inputs import GUESS_SAMPLES, conditions
 from model.plant import Heliostat
 from model.sunshape import Buie, transfer_table
 from model.surface import control_points
@@ -20,6 +22,9 @@ from model.tracing import Optics, Scene, Window, trace
 Array = NDArray[np.float64]
 
 JUELICH_LATITUDE = 50.913
+
+TENSORS = ("control_points", "attitude", "center", "sun", "plane_center", "plane_axes")
+"""What a scene holds for each mirror."""
 
 
 def load_field(root: Path) -> Array:
@@ -51,18 +56,11 @@ class Situations:
             found = np.concatenate([found, directions[directions[:, 2] > np.sin(np.radians(self.min_elevation_deg))]])
         return found[:count]
 
-    def scenes(self, field: Array, z: Array, images: int, rng: np.random.Generator) -> tuple[Scene, Scene]:
-        """Scenes of surfaces ``z`` (B, 4, 8, 8) [m], each with ``images`` suns and aims, and of the ideal surfaces.
-
-        The images of one heliostat follow one another: the scenes hold B * images mirrors.
-        """
-        count = len(z)
+    def shots(self, field: Array, count: int, images: int, rng: np.random.Generator, device: torch.device) -> "Shots":
+        """``count`` heliostats at random places (N, 3) [m] of the field, each before ``images`` suns and aims."""
         positions = field[rng.integers(len(field), size=count)]
         focal = np.linalg.norm(positions - [0.0, 0.0, 55.0], axis=-1) * rng.uniform(*self.focus, count)
-        heliostats = [Heliostat.juelich("synthetic", p, f) for p, f in zip(positions, focal, strict=True)]
-        ideal = np.array([control_points(h) for h in heliostats])
-        points = np.array([control_points(h, surface) for h, surface in zip(heliostats, z, strict=True)])
-        mount, total = heliostats[0].mount, count * images
+        total = count * images
         aims = np.stack(
             [
                 rng.uniform(-self.target_east, self.target_east, total),
@@ -71,26 +69,70 @@ class Situations:
             ],
             axis=-1,
         )
-        suns = self.suns(total, rng)
-        places = positions.repeat(images, axis=0)
+        heliostats = [Heliostat.juelich("synthetic", p, f) for p, f in zip(positions, focal, strict=True)]
+        return Shots.of(heliostats, self.suns(total, rng), aims, device)
+
+
+@dataclass(frozen=True, eq=False)
+class Shots:
+    """Photographs to be taken of heliostats, whatever their surfaces.
+
+    Attributes
+    ----------
+    ideal : Scene
+        The B * images mirrors with ideal surfaces; the images of one heliostat follow one another.
+    lift : Tensor (B, 4, 3)
+        What a unit of height adds to the control points of each facet: its normal.
+    images : int
+    """
+
+    ideal: Scene
+    lift: Tensor
+    images: int
+
+    @classmethod
+    def of(cls, heliostats: Sequence[Heliostat], suns: Array, aims: Array, device: torch.device) -> "Shots":
+        """Shots of heliostats of one mount with suns and aims (B * images, 3) on targets that face north."""
+        images, mount = len(suns) // len(heliostats), heliostats[0].mount
+        points = np.array([control_points(h) for h in heliostats])
+        raised = np.array([control_points(h, np.ones((4, 8, 8))) for h in heliostats])
+        places = np.array([h.position for h in heliostats]).repeat(images, axis=0)
         attitude = mount.attitude(mount.align(places, suns, aims))
         axes = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
 
-        def scene(surfaces: Array) -> Scene:
-            return Scene(
-                control_points=_float(surfaces.repeat(images, axis=0)).movedim(-1, -3).contiguous(),
-                attitude=_float(attitude),
-                center=_float(mount.mirror_center(places, attitude[..., :, :])),
-                sun=_float(suns),
-                plane_center=_float(aims),
-                plane_axes=_float(axes).expand(total, 3, 3),
-            )
+        def tensor(values: Array) -> Tensor:
+            return torch.as_tensor(np.ascontiguousarray(values), dtype=torch.float32, device=device)
 
-        return scene(points), scene(ideal)
+        ideal = Scene(
+            control_points=tensor(points.repeat(images, axis=0)).movedim(-1, -3).contiguous(),
+            attitude=tensor(attitude),
+            center=tensor(mount.mirror_center(places, attitude)),
+            sun=tensor(suns),
+            plane_center=tensor(aims),
+            plane_axes=tensor(axes).expand(len(suns), 3, 3),
+        )
+        return cls(ideal, tensor((raised - points)[:, :, 0, 0]), images)
 
+    def scene(self, z: Tensor) -> Scene:
+        """The scene of surfaces ``z`` (B, 4, 8, 8) [m]."""
+        raised = torch.einsum("bfij,bfk->bfkij", z, self.lift).repeat_interleave(self.images, dim=0)
+        return self.ideal.with_(control_points=self.ideal.control_points + raised)
 
-def _float(values: Array) -> Tensor:
-    return torch.as_tensor(np.ascontiguousarray(values), dtype=torch.float32)
+    def trace(self, z: Tensor, samples: int = GUESS_SAMPLES) -> Tensor:
+        """Flux (B, images, 64, 64), sum 100, of surfaces ``z`` (B, 4, 8, 8) [m], as no camera sees it."""
+        flux = trace(self.scene(z), Window(on_spot=True), samples=samples, padding=0.25).irradiance
+        return normalized(flux.clamp(min=0)).view(-1, self.images, *flux.shape[1:])
+
+    def conditions(self) -> Tensor:
+        """What the network is told of each image (B, images, 12)."""
+        return conditions(self.ideal).view(-1, self.images, CONDITIONS)
+
+    def __getitem__(self, rows: slice) -> "Shots":
+        """The shots of some of the heliostats."""
+        start, stop, _ = rows.indices(len(self.lift))
+        shots = slice(start * self.images, stop * self.images)
+        parts = {name: getattr(self.ideal, name)[shots] for name in TENSORS}
+        return Shots(self.ideal.with_(**parts), self.lift[rows], self.images)
 
 
 @dataclass(frozen=True)
@@ -146,24 +188,17 @@ def normalized(flux: Tensor) -> Tensor:
     return 100 * flux / flux.sum(dim=(-2, -1), keepdim=True).clamp(min=1e-9)
 
 
-def to_device(scene: Scene, device: torch.device) -> Scene:
-    """The scene with its tensors on ``device``."""
-    names = ("control_points", "attitude", "center", "sun", "plane_center", "plane_axes")
-    return scene.with_(**{name: getattr(scene, name).to(device) for name in names})
-
-
 def render(
     z: Array, images: int, field: Array, situations: Situations, camera: Camera | None, device: torch.device, seed: int
-) -> tuple[Tensor, Tensor]:
-    """Images (B, images, 64, 64) and conditions (B, images, 12) of surfaces ``z`` (B, 4, 8, 8) [m].
+) -> tuple[Tensor, Shots]:
+    """Flux (B, images, 64, 64) of surfaces ``z`` (B, 4, 8, 8) [m] in random situations, and the shots.
 
     Without a camera the flux is traced for the default sun and nothing else.
     """
     rng = np.random.default_rng(seed)
-    scene, ideal = (to_device(s, device) for s in situations.scenes(field, z, images, rng))
+    shots = situations.shots(field, len(z), images, rng, device)
+    surfaces = torch.as_tensor(z, dtype=torch.float32, device=device)
     if camera is None:
-        flux = normalized(trace(scene, Window(on_spot=True), samples=24, padding=0.25).irradiance.clamp(min=0))
-    else:
-        flux = camera.photograph(scene, device, rng)
-    shape = (len(z), images)
-    return flux.view(*shape, *flux.shape[1:]), conditions(ideal).view(*shape, -1)
+        return shots.trace(surfaces, samples=24), shots
+    flux = camera.photograph(shots.scene(surfaces), device, rng)
+    return flux.view(len(z), images, *flux.shape[1:]), shots

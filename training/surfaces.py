@@ -60,7 +60,7 @@ class Augmentation:
         scale_canting, scale_waviness = (
             np.exp(rng.uniform(-1, 1, (count, 1, 1, 1)) * np.log(limit)) for limit in (self.canting, self.waviness)
         )
-        return np.asarray(canting * scale_canting + waviness * scale_waviness + self._tilts(count, rng))
+        return untilted(canting * scale_canting + waviness * scale_waviness + self._tilts(count, rng))
 
     def _averaged(self, surfaces: Array, count: int, rng: np.random.Generator) -> Array:
         """Weighted averages of up to three surfaces, their spread about the mean restored."""
@@ -83,3 +83,10 @@ def tilt_modes() -> Array:
     """Heights (2, 8, 8) [m] of one radian of slope along a facet's x and y (Juelich's facets)."""
     x, y = np.meshgrid(0.8025 * (2 * greville(8) - 1), 0.6375 * (2 * greville(8) - 1), indexing="ij")
     return np.stack([x, y])
+
+
+def untilted(z: Array) -> Array:
+    """Surfaces (..., 4, 8, 8) [m] without the tilt of the whole mirror, which is the mount's and not the surface's."""
+    modes = np.repeat(tilt_modes()[:, None], 4, axis=1).reshape(2, -1)
+    flat = z.reshape(*z.shape[:-3], -1)
+    return np.asarray((flat - flat @ np.linalg.pinv(modes) @ modes).reshape(z.shape))

@@ -1,7 +1,8 @@
-"""Train the surface network: ``python -m training.train --config training/configs/first.json``.
+"""Train the surface network: ``python -m training.train --config training/configs/best.json``.
 
-Images are rendered as the training goes, so that no surface is seen twice under the same sun. A run keeps everything in
-one folder: its config, a checkpoint to resume from, its curve, and the weights of the exponential moving average.
+Images are rendered as the training goes, so that no surface is seen twice under the same sun. Half of each batch starts
+from the mean surface, half from what the network has just said of it. A run keeps everything in one folder: its config,
+a checkpoint to resume from, its curve, and the weights of the exponential moving average.
 """
 
 import argparse
@@ -17,13 +18,17 @@ import torch
 from torch import Tensor, nn
 
 from model.network.architecture import MAX_IMAGES, NetworkConfig, SurfaceNetwork
-from training.render import Camera, Situations, load_field, render
-from training.surfaces import Augmentation, load_surfaces, split_by_heliostat
+from model.network.paper import PaperConfig, PaperNetwork
+from training.render import Camera, Shots, Situations, load_field, render
+from training.surfaces import Augmentation, load_surfaces, split_by_heliostat, untilted
 
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Everything that decides a run; stored beside its result."""
+    """Everything that decides a run; stored beside its result.
+
+    ``paper`` takes the place of ``network`` where it is given; ``looks`` is how often the network sees its own guess.
+    """
 
     data: str = "../shared/stj"
     seed: int = 7
@@ -37,7 +42,9 @@ class TrainConfig:
     spread_weight: float = 0.1
     ema: float = 0.999
     bfloat16: bool = True
+    looks: int = 2
     network: NetworkConfig = field(default_factory=NetworkConfig)
+    paper: PaperConfig | None = None
     augmentation: Augmentation = field(default_factory=Augmentation)
     situations: Situations = field(default_factory=Situations)
     camera: Camera = field(default_factory=Camera)
@@ -46,9 +53,15 @@ class TrainConfig:
     def read(cls, path: Path) -> "TrainConfig":
         """A config from JSON; keys that are left out keep their defaults."""
         values = json.loads(path.read_text(encoding="utf-8"))
-        parts = {"network": NetworkConfig, "augmentation": Augmentation, "situations": Situations, "camera": Camera}
+        parts = {
+            "network": NetworkConfig,
+            "paper": PaperConfig,
+            "augmentation": Augmentation,
+            "situations": Situations,
+            "camera": Camera,
+        }
         for name, part in parts.items():
-            if name in values:
+            if values.get(name) is not None:
                 values[name] = part(**{k: tuple(v) if isinstance(v, list) else v for k, v in values[name].items()})
         return cls(**values)
 
@@ -74,9 +87,11 @@ class Run:
         self.surfaces, self.held_out = surfaces[train], surfaces[held_out]
         self.held_out_names = [self.names[i] for i in held_out]
         self.field = load_field(Path(config.data))
-        mean = torch.as_tensor(self.surfaces.mean(axis=0) * 1e3, dtype=torch.float32)
+        mean = untilted(self.surfaces.mean(axis=0))
+        self.mean = torch.as_tensor(mean, dtype=torch.float32, device=device)
         torch.manual_seed(config.seed)
-        self.network = SurfaceNetwork(config.network, mean).to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        network = SurfaceNetwork(config.network) if config.paper is None else PaperNetwork(config.paper)
+        self.network = network.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.average = copy.deepcopy(self.network).requires_grad_(False)
         self.optimizer = torch.optim.AdamW(
             self.network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay, betas=(0.9, 0.98)
@@ -113,6 +128,32 @@ class Run:
         progress = min(1.0, (self.step - c.warmup) / max(1, c.steps - c.warmup))
         return c.learning_rate * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * progress)))
 
+    def look(self, network: nn.Module, flux: Tensor, shots: Shots, guess: Tensor) -> tuple[Tensor, Tensor]:
+        """Heights and spread (B, 4, 8, 8) [mm] after one look at flux (B, M, 64, 64), from guesses (B, 4, 8, 8) [m]."""
+        with torch.no_grad():
+            guess_flux = shots.trace(guess)
+        mask = torch.ones(flux.shape[:2], device=self.device)
+        with torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=self.config.bfloat16 and network.training):
+            heights, spread = network(flux, shots.conditions(), mask, guess_flux, guess * 1e3)
+        return heights.float(), spread.float()
+
+    @torch.no_grad()
+    def predict(self, flux: Tensor, shots: Shots, looks: int | None = None) -> Tensor:
+        """Surfaces (B, 4, 8, 8) [m] that the averaged network sees in flux (B, M, 64, 64) after all its looks."""
+        guess = self.mean.expand(len(flux), -1, -1, -1)
+        for _ in range(self.config.looks if looks is None else looks):
+            guess = self.look(self.average.eval(), flux, shots, guess)[0] * 1e-3
+        return guess
+
+    def _guesses(self, flux: Tensor, shots: Shots) -> Tensor:
+        """Guesses (B, 4, 8, 8) [m]: the mean surface, and for an equal share of the batch the later looks' guesses."""
+        guess = self.mean.expand(len(flux), -1, -1, -1).clone()
+        for look in range(1, self.config.looks):
+            rows = slice(0, len(flux) * (self.config.looks - look) // self.config.looks)
+            with torch.no_grad():
+                guess[rows] = self.look(self.network, flux[rows], shots[rows], guess[rows])[0] * 1e-3
+        return guess
+
     def train_step(self) -> float:
         """Render a batch, descend once, return the height error [mm]."""
         c = self.config
@@ -120,15 +161,11 @@ class Run:
         z = c.augmentation.sample(self.surfaces, c.batch, rng)
         images = int(rng.integers(1, MAX_IMAGES + 1))
         with torch.no_grad():
-            flux, conditions = render(
-                z, images, self.field, c.situations, c.camera, self.device, int(rng.integers(2**31))
-            )
+            flux, shots = render(z, images, self.field, c.situations, c.camera, self.device, int(rng.integers(2**31)))
         truth = torch.as_tensor(z * 1e3, dtype=torch.float32, device=self.device)
         truth = truth - truth.mean(dim=(2, 3), keepdim=True)
-        mask = torch.ones(c.batch, images, device=self.device)
-        with torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=c.bfloat16):
-            heights, spread = self.network(flux, conditions, mask)
-        error, slopes, likelihood = loss_terms(heights.float(), spread.float(), truth)
+        heights, spread = self.look(self.network.train(), flux, shots, self._guesses(flux, shots))
+        error, slopes, likelihood = loss_terms(heights, spread, truth)
         self.optimizer.param_groups[0]["lr"] = self._learning_rate()
         self.optimizer.zero_grad()
         loss = error + c.slope_weight * slopes + c.spread_weight * likelihood
@@ -145,14 +182,14 @@ class Run:
             for mean, current in zip(self.average.parameters(), self.network.parameters(), strict=True):
                 mean.lerp_(current, 1 - decay)
 
-    @torch.no_grad()
-    def validate(self, repeats: int = 16) -> float:
-        """Mean absolute height error [mm] on held-out heliostats with eight clean images each."""
+    def validate(self, repeats: int = 8) -> list[float]:
+        """Mean absolute height error [mm] on held-out heliostats, eight clean images each, after each look."""
         z = self.held_out.repeat(repeats, axis=0)
-        flux, conditions = render(z, MAX_IMAGES, self.field, self.config.situations, None, self.device, seed=0)
-        truth = torch.as_tensor(z * 1e3, dtype=torch.float32, device=self.device)
-        heights, _ = self.average.eval()(flux, conditions, torch.ones(flux.shape[:2], device=self.device))
-        return float((heights - truth + truth.mean(dim=(2, 3), keepdim=True)).abs().mean())
+        flux, shots = render(z, MAX_IMAGES, self.field, self.config.situations, None, self.device, seed=0)
+        truth = torch.as_tensor(z, dtype=torch.float32, device=self.device)
+        truth = truth - truth.mean(dim=(2, 3), keepdim=True)
+        guesses = [self.predict(flux, shots, looks) for looks in range(1, self.config.looks + 1)]
+        return [round(float((guess - truth).abs().mean()) * 1e3, 4) for guess in guesses]
 
     def train(self, minutes: float, every: int = 250) -> None:
         """Train to the last step, or until the time is up."""
@@ -166,7 +203,7 @@ class Run:
         self.save()
 
     def _report(self, error: float) -> None:
-        line = {"step": self.step, "train_mae_mm": round(error, 4), "held_out_mae_mm": round(self.validate(), 4)}
+        line = {"step": self.step, "train_mae_mm": round(error, 4), "held_out_mae_mm": self.validate()}
         with (self.folder / "curve.jsonl").open("a", encoding="utf-8") as file:
             file.write(json.dumps(line) + "\n")
         print(json.dumps(line), flush=True)
@@ -177,7 +214,7 @@ def main() -> None:
     """Train, or resume, one run."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--config", type=Path, help="JSON of TrainConfig; defaults without one")
-    parser.add_argument("--run", type=Path, default=Path("runs/first"), help="folder of the run")
+    parser.add_argument("--run", type=Path, default=Path("runs/best"), help="folder of the run")
     parser.add_argument("--minutes", type=float, default=float("inf"), help="stop after so many minutes")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     arguments = parser.parse_args()

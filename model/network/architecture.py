@@ -1,13 +1,17 @@
 """The network: flux images of one heliostat in, its mirror surface out.
 
-Each image passes the same convolutional encoder, whose weights are modulated by that image's geometry and demodulated
-as in StyleGAN2; attention pools any number of images, in any order, into one set of styles w+; a StyleGAN2 decoder
-grows them into the control heights of the facets. Read it from top to bottom.
+Beside each image it sees what a guess of the surface would throw there, traced, and it says how the guess must change.
+The first guess is the mean surface; its own answer is the next guess, so that it may look twice.
+
+Each pair of images passes the same convolutional encoder, whose weights are modulated by that image's geometry and
+demodulated as in StyleGAN2; attention pools any number of images, in any order, into one set of styles w+; a StyleGAN2
+decoder grows them into the control heights of the facets. Read it from top to bottom.
 
 Source: Lewen et al. 2024, *Inverse Deep Learning Ray Tracing for Heliostat Surface Prediction* (the idea: encoder with
 weight demodulation, w+, StyleGAN2 decoder); Karras et al. 2020, *Analyzing and Improving the Image Quality of StyleGAN*
 (modulation and demodulation). Ours differs in that images are encoded one by one and pooled, instead of stacked as
-channels, which makes their number and order free.
+channels (`model.network.paper`), which makes their number and order free, and in the guess, which turns the question
+"what mirror is this?" into the easier "what is wrong with this mirror?".
 """
 
 from dataclasses import dataclass
@@ -86,7 +90,7 @@ class EncoderBlock(nn.Module):
 
 
 class Encoder(nn.Module):
-    """One flux image and its geometry to a feature vector."""
+    """One flux image, that of the guess and their geometry to a feature vector."""
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
@@ -97,23 +101,26 @@ class Encoder(nn.Module):
         self.fold = nn.PixelUnshuffle(4)
         self.blocks = nn.ModuleList(
             [
-                EncoderBlock(2 * 16, fine, 128, stride=1),
+                EncoderBlock(4 * 16, fine, 128, stride=1),
                 EncoderBlock(fine, middle, 128, stride=2),
                 EncoderBlock(middle, coarse, 128, stride=2),
             ]
         )
         self.to_features = nn.Sequential(nn.Linear(coarse * 16 + 128, config.features), nn.LayerNorm(config.features))
 
-    def forward(self, flux: Tensor, conditions: Tensor) -> Tensor:
-        """Flux (N, 64, 64) of sum 100 and conditions (N, 12) to features (N, features)."""
+    def forward(self, flux: Tensor, guess_flux: Tensor, conditions: Tensor) -> Tensor:
+        """Fluxes (N, 64, 64) of sum 100 and conditions (N, 12) to features (N, features)."""
         style = self.style(conditions)
-        # The root brings out the faint wings, where the mirror's edges show; both have about unit scale.
-        x = torch.stack([flux * 8, torch.sqrt(flux.clamp(min=0) * 8)], dim=1)
-        x = self.fold(x)
+        x = self.fold(torch.cat([_channels(flux), _channels(guess_flux)], dim=1))
         for block in self.blocks:
             x = block(x, style)
         features: Tensor = self.to_features(torch.cat([x.flatten(1), style], dim=1))
         return features
+
+
+def _channels(flux: Tensor) -> Tensor:
+    """Flux (N, 64, 64) and its root (N, 2, 64, 64), which brings out the faint wings, where the mirror's edges show."""
+    return torch.stack([flux * 8, torch.sqrt(flux.clamp(min=0) * 8)], dim=1)
 
 
 class Pooling(nn.Module):
@@ -168,19 +175,17 @@ class Decoder(nn.Module):
 
 
 class SurfaceNetwork(nn.Module):
-    """Flux images to control heights [mm] and the spread of their error [mm].
+    """Flux images and a guess to control heights [mm] and the spread of their error [mm].
 
-    ``mean`` (4, 8, 8) [mm] is the mean surface of the training heliostats, to which the network adds, and ``scale``
-    [mm] the unit in which it does.
+    ``scale`` [mm] is the unit in which the network thinks of heights.
     """
 
-    mean: Tensor
-
-    def __init__(self, config: NetworkConfig, mean: Tensor | None = None, scale: float = 0.35) -> None:
+    def __init__(self, config: NetworkConfig, scale: float = 0.35) -> None:
         super().__init__()
         self.config, self.scale = config, scale
         self.encoder = Encoder(config)
         self.pooling = Pooling(config)
+        self.from_guess = nn.Linear(FACETS * ROWS * COLUMNS, config.features)
         self.to_styles = nn.Sequential(
             nn.LayerNorm(config.features),
             nn.Linear(config.features, config.features),
@@ -188,9 +193,10 @@ class SurfaceNetwork(nn.Module):
             nn.Linear(config.features, config.style_layers * config.style_features),
         )
         self.decoder = Decoder(config)
-        self.register_buffer("mean", torch.zeros(FACETS, ROWS, COLUMNS) if mean is None else mean)
 
-    def forward(self, flux: Tensor, conditions: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(
+        self, flux: Tensor, conditions: Tensor, mask: Tensor, guess_flux: Tensor, guess: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Predict.
 
         Parameters
@@ -200,14 +206,17 @@ class SurfaceNetwork(nn.Module):
         conditions : Tensor (B, M, 12)
         mask : Tensor (B, M)
             One where there is an image, zero elsewhere.
+        guess_flux : Tensor (B, M, 64, 64)
+            What the guessed surface throws there, likewise.
+        guess : Tensor (B, 4, 8, 8) [mm]
 
         Returns
         -------
         heights, spread : Tensor (B, 4, 8, 8) [mm]
             Facet mean zero; the spread is the scale of a Laplace distribution of the error.
         """
-        features = self.encoder(flux.flatten(0, 1), conditions.flatten(0, 1))
-        pooled = self.pooling(features.view(*mask.shape, -1), mask)
+        features = self.encoder(flux.flatten(0, 1), guess_flux.flatten(0, 1), conditions.flatten(0, 1))
+        pooled = self.pooling(features.view(*mask.shape, -1), mask) + self.from_guess(guess.flatten(1) / self.scale)
         styles = self.to_styles(pooled).view(-1, self.config.style_layers, self.config.style_features)
         heights, log_spread = self.decoder(styles)
-        return self.mean + self.scale * heights, self.scale * torch.exp(log_spread.clamp(-6, 2))
+        return guess + self.scale * heights, self.scale * torch.exp(log_spread.clamp(-6, 2))

@@ -6,6 +6,9 @@ from torch import Tensor
 from model.surface import sample
 from model.tracing.scene import Scene
 
+GUESS_SAMPLES = 16
+"""Points along each side of a facet with which the flux of a guessed surface is traced for the network."""
+
 
 def _project(vectors: Tensor, direction: Tensor) -> Tensor:
     """Shift (..., 2) on the plane of rays along ``direction`` (..., 3) that are displaced by ``vectors`` (..., 3)."""

@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -12,14 +12,21 @@ import onnxruntime
 from numpy.typing import NDArray
 
 from model.errors import InvalidInputError
-from model.network.architecture import CONDITIONS, IMAGE_SIZE, MAX_IMAGES
-from model.network.inputs import conditions
-from model.observation import Observation, SurfacePrediction, scene_of
+from model.network.architecture import MAX_IMAGES
+from model.network.inputs import GUESS_SAMPLES, conditions
+from model.observation import Observation, SurfacePrediction, render_observations, scene_of
 from model.plant import Heliostat
-from model.refinement import misfit
+from model.refinement import default_prior, misfit
 from model.surface import FACETS, control_points
+from model.tracing import Optics
 
 Array = NDArray[np.float64]
+
+INPUTS = ("flux", "conditions", "mask", "guess_flux", "guess")
+"""What one look takes, by the names of `SurfaceNetwork.forward`, with a batch of eight images each."""
+
+LOOKS = 2
+"""How often the network sees what its own guess would throw; the first guess is the mean surface."""
 
 WEIGHTS = Path(__file__).parents[1] / "weights" / "surface-network.onnx"
 
@@ -42,17 +49,20 @@ class SurfacePredictor:
         self.session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
         self.name = f"{path.stem}-{hashlib.sha256(content).hexdigest()[:12]}"
 
-    def run(self, flux: NDArray[Any], image_conditions: NDArray[Any], mask: NDArray[Any]) -> tuple[Array, Array]:
-        """Heights and their standard deviation, each (B, 4, 8, 8) [m].
-
-        ``flux`` is (B, 8, 64, 64), ``image_conditions`` (B, 8, 12), ``mask`` (B, 8), one where there is an image.
-        """
-        inputs = {"flux": flux, "conditions": image_conditions, "mask": mask}
-        heights, spread = self.session.run(None, {k: v.astype(np.float32) for k, v in inputs.items()})
+    def look(self, inputs: Mapping[str, NDArray[Any]]) -> tuple[Array, Array]:
+        """Heights and their standard deviation, each (B, 4, 8, 8) [m], after one look at `INPUTS`."""
+        heights, spread = self.session.run(None, {name: inputs[name].astype(np.float32) for name in INPUTS})
         # The spread is the scale of a Laplace distribution, whose standard deviation is sqrt(2) of it.
         return heights.astype(np.float64) * 1e-3, spread.astype(np.float64) * 1e-3 * np.sqrt(2)
 
-    def predict(self, heliostat: Heliostat, observations: Sequence[Observation]) -> SurfacePrediction:
+    def predict(
+        self,
+        heliostat: Heliostat,
+        observations: Sequence[Observation],
+        optics: Optics | None = None,
+        *,
+        looks: int = LOOKS,
+    ) -> SurfacePrediction:
         """The surface of a heliostat from one to eight of its images.
 
         Raises
@@ -64,23 +74,34 @@ class SurfacePredictor:
             raise InvalidInputError(f"a prediction takes 1 to {MAX_IMAGES} images, got {len(observations)}")
         if len(heliostat.facets) != FACETS:
             raise InvalidInputError(f"the network knows mirrors of {FACETS} facets, {heliostat.name} has other")
-        count = len(observations)
-        flux = np.zeros((1, MAX_IMAGES, IMAGE_SIZE, IMAGE_SIZE), dtype=np.float32)
-        geometry = np.zeros((1, MAX_IMAGES, CONDITIONS), dtype=np.float32)
-        mask = np.zeros((1, MAX_IMAGES), dtype=np.float32)
-        flux[0, :count] = [o.flux for o in observations]
-        geometry[0, :count] = conditions(scene_of(heliostat, observations)).numpy()
-        mask[0, :count] = 1
-        z, z_std = (values[0] for values in self.run(flux, geometry, mask))
+        measured = np.array([o.flux for o in observations])
+        inputs = {
+            "flux": _filled(measured),
+            "conditions": _filled(conditions(scene_of(heliostat, observations)).numpy()),
+            "mask": _filled(np.ones(len(observations))),
+        }
+        z = default_prior().mean
+        for _ in range(looks):
+            traced = render_observations(heliostat, observations, [z], optics, samples=GUESS_SAMPLES)[0]
+            z, z_std = (
+                values[0] for values in self.look({**inputs, "guess_flux": _filled(traced), "guess": z[None] * 1e3})
+            )
         return SurfacePrediction(
             z=z,
             z_std=z_std,
             control_points=control_points(heliostat, z),
             method="network",
             weights=self.name,
-            misfit=misfit(heliostat, observations, z),
+            misfit=misfit(heliostat, observations, z, optics),
             used=tuple(o.identifier for o in observations),
         )
+
+
+def _filled(values: NDArray[Any]) -> NDArray[np.float32]:
+    """One heliostat's values (M, ...) as (1, 8, ...), zero for the images that are missing."""
+    padded = np.zeros((1, MAX_IMAGES, *values.shape[1:]), dtype=np.float32)
+    padded[0, : len(values)] = values
+    return padded
 
 
 @lru_cache(maxsize=1)

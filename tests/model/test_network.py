@@ -5,7 +5,8 @@ import torch
 from model.errors import InvalidInputError
 from model.network.architecture import CONDITIONS, MAX_IMAGES, NetworkConfig, SurfaceNetwork
 from model.network.inputs import conditions
-from model.network.predictor import SurfacePredictor, default_predictor, model_card
+from model.network.paper import PaperConfig, PaperNetwork
+from model.network.predictor import INPUTS, SurfacePredictor, default_predictor, model_card
 from model.observation import Observation, spread_suns
 from model.plant import TargetPlane
 from model.surface import control_points
@@ -24,30 +25,38 @@ def network() -> SurfaceNetwork:
 
 
 def test_order_of_images_does_not_matter(network):
-    flux, geometry, mask = example(3, MAX_IMAGES)
+    flux, geometry, mask, guess_flux, guess = example(3, MAX_IMAGES)
     order = torch.randperm(MAX_IMAGES)
     with torch.no_grad():
-        straight, shuffled = network(flux, geometry, mask), network(flux[:, order], geometry[:, order], mask)
+        straight = network(flux, geometry, mask, guess_flux, guess)
+        shuffled = network(flux[:, order], geometry[:, order], mask, guess_flux[:, order], guess)
     for a, b in zip(straight, shuffled, strict=True):
         torch.testing.assert_close(a, b, atol=1e-5, rtol=1e-5)
 
 
-def test_what_stands_where_there_is_no_image_does_not_matter(network):
-    flux, geometry, mask = example(2, 3)
+@pytest.mark.parametrize("kind", ["ours", "paper"])
+def test_what_stands_where_there_is_no_image_does_not_matter(network, kind):
+    network = network if kind == "ours" else PaperNetwork(PaperConfig(channels=16, decoder_channels=16)).eval()
+    flux, geometry, mask, guess_flux, guess = example(2, 3)
     noise = torch.where(mask[..., None, None] > 0, flux, torch.rand_like(flux))
     with torch.no_grad():
-        full, other = network(flux, geometry, mask)[0], network(noise, geometry, mask)[0]
-        alone = network(flux[:, :3], geometry[:, :3], mask[:, :3])[0]
+        full, other = (network(f, geometry, mask, guess_flux, guess)[0] for f in (flux, noise))
+        alone = network(*(values[:, :3] for values in (flux, geometry, mask, guess_flux)), guess)[0]
     torch.testing.assert_close(full, other)
     torch.testing.assert_close(full, alone, atol=1e-5, rtol=1e-5)
 
 
-def test_heights_have_no_facet_mean_and_spread_is_positive(network):
+def test_the_answer_keeps_facet_means_and_its_spread_is_positive(network):
+    inputs = example(2, 5)
     with torch.no_grad():
-        heights, spread = network(*example(2, 5))
+        heights, spread = network(*inputs)
     assert heights.shape == spread.shape == (2, 4, 8, 8)
-    torch.testing.assert_close(heights.mean(dim=(2, 3)), torch.zeros(2, 4), atol=1e-6, rtol=0)
+    torch.testing.assert_close(heights.mean(dim=(2, 3)), inputs[-1].mean(dim=(2, 3)), atol=1e-6, rtol=0)
     assert (spread > 0).all()
+
+
+def test_papers_network_has_the_papers_size():
+    assert sum(p.numel() for p in PaperNetwork(PaperConfig()).parameters()) == pytest.approx(3.5e6, rel=0.1)
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning", "ignore:# The axis name")
@@ -98,7 +107,7 @@ def test_shipped_predictor_names_its_weights_and_keeps_the_contract():
 def test_predictor_takes_a_batch_of_any_size():
     predictor: SurfacePredictor = default_predictor()
     for batch in (1, 5):
-        z, z_std = predictor.run(*(tensor.numpy() for tensor in example(batch, 4)))
+        z, z_std = predictor.look({n: t.numpy() for n, t in zip(INPUTS, example(batch, 4), strict=True)})
         assert z.shape == z_std.shape == (batch, 4, 8, 8)
 
 
