@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import torch
 from torch import nn
 
@@ -37,7 +38,7 @@ def example(batch: int, images: int) -> tuple[torch.Tensor, ...]:
 
 
 def export(network: nn.Module, path: Path) -> None:
-    """Write the network as ONNX with a free batch size."""
+    """Write a `rounded` network as ONNX with a free batch size."""
     batch = torch.export.Dim("batch", min=1, max=4096)
     torch.onnx.export(
         network.eval(),
@@ -50,6 +51,33 @@ def export(network: nn.Module, path: Path) -> None:
         external_data=False,
         verbose=False,
     )
+    store_in_half(path)
+
+
+def rounded(network: nn.Module) -> nn.Module:
+    """The network with its parameters rounded in place to what a 16-bit float holds."""
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.copy_(parameter.half().float())
+    return network
+
+
+def store_in_half(path: Path) -> None:
+    """Store the large weights of an ONNX file as 16-bit floats; they are cast back when it is loaded.
+
+    Half the file, the same arithmetic; exact for a network that was `rounded` before.
+    """
+    model = onnx.load(path)
+    casts = []
+    for tensor in model.graph.initializer:
+        if tensor.data_type == onnx.TensorProto.FLOAT and len(tensor.raw_data) > 4096:
+            name, values = tensor.name, onnx.numpy_helper.to_array(tensor).astype(np.float16)
+            tensor.CopyFrom(onnx.numpy_helper.from_array(values, f"{name}_half"))
+            casts.append(onnx.helper.make_node("Cast", [f"{name}_half"], [name], to=onnx.TensorProto.FLOAT))
+    nodes = [*casts, *model.graph.node]
+    del model.graph.node[:]
+    model.graph.node.extend(nodes)
+    onnx.save(model, path)
 
 
 def parity(network: nn.Module, path: Path) -> float:
@@ -96,7 +124,7 @@ def main() -> None:
     parser.add_argument("--note", default="", help="what happened in the run that its config does not tell")
     arguments = parser.parse_args()
     run = Run(TrainConfig.read(arguments.run / "config.json"), arguments.run, torch.device("cpu"))
-    network = run.average.to(memory_format=torch.contiguous_format)
+    network = rounded(run.average.to(memory_format=torch.contiguous_format))
     export(network, arguments.out)
     difference = parity(network, arguments.out)
     if not math.isfinite(difference) or difference > PARITY_MM:

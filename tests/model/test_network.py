@@ -13,15 +13,15 @@ from model.surface import control_points
 from model.tracing import Scene
 from model.tracing.convolution import central_rays
 from tests.conftest import flat_heliostat, target
-from training.export import PARITY_MM, example, export, parity
+from training.export import PARITY_MM, example, export, parity, rounded
 
 SMALL = NetworkConfig(encoder_channels=(8, 16, 16), features=32, heads=2, style_features=8, decoder_channels=16)
 
 
 @pytest.fixture(scope="module")
-def network() -> SurfaceNetwork:
+def network() -> torch.nn.Module:
     torch.manual_seed(0)
-    return SurfaceNetwork(SMALL).eval()
+    return rounded(SurfaceNetwork(SMALL).eval())
 
 
 def test_order_of_images_does_not_matter(network):
