@@ -17,10 +17,21 @@ def load_surfaces(root: Path) -> tuple[Array, list[str]]:
         return data["z"].astype(np.float64), [str(name) for name in data["names"]]
 
 
-def split_by_heliostat(count: int, held_out: int, seed: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Indices of the training and the held-out heliostats."""
+def split_by_heliostat(
+    count: int, held_out: int, seed: int, fold: int = 0
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Indices of the training and the held-out heliostats; every heliostat is held out in one fold.
+
+    Raises
+    ------
+    ValueError
+        Where the fold leaves no heliostat to hold out.
+    """
     order = np.random.default_rng(seed).permutation(count)
-    return np.sort(order[held_out:]), np.sort(order[:held_out])
+    apart = order[fold * held_out : (fold + 1) * held_out]
+    if fold < 0 or not len(apart):
+        raise ValueError(f"fold must lie in [0, {-(-count // held_out)}), got {fold}")
+    return np.setdiff1d(order, apart), np.sort(apart)
 
 
 def rotated(z: Array) -> Array:

@@ -3,6 +3,9 @@
 Images are rendered as the training goes, so that no surface is seen twice under the same sun. Half of each batch starts
 from the mean surface, half from what the network has just said of it. A run keeps everything in one folder: its config,
 a checkpoint to resume from, its curve, and the weights of the exponential moving average.
+
+On several GPUs, or CPU processes, which share every batch:
+``torchrun --nproc-per-node 4 -m training.train --config training/configs/best.json --folder runs/best``.
 """
 
 import argparse
@@ -10,7 +13,7 @@ import copy
 import json
 import math
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +22,7 @@ from torch import Tensor, nn
 
 from model.network.architecture import MAX_IMAGES, NetworkConfig, SurfaceNetwork
 from model.network.paper import PaperConfig, PaperNetwork
+from training import parallel
 from training.render import Camera, Shots, Situations, load_field, render
 from training.surfaces import Augmentation, load_surfaces, split_by_heliostat, untilted
 
@@ -28,11 +32,13 @@ class TrainConfig:
     """Everything that decides a run; stored beside its result.
 
     ``paper`` takes the place of ``network`` where it is given; ``looks`` is how often the network sees its own guess.
+    ``fold`` counts which ``held_out`` heliostats are kept back; ``batch`` is shared among processes.
     """
 
     data: str = "../shared/stj"
     seed: int = 7
     held_out: int = 8
+    fold: int = 0
     steps: int = 20000
     batch: int = 32
     learning_rate: float = 3e-4
@@ -81,9 +87,11 @@ class Run:
     """One training run in its folder."""
 
     def __init__(self, config: TrainConfig, folder: Path, device: torch.device) -> None:
+        if config.batch % parallel.size():
+            raise ValueError(f"batch {config.batch} cannot be shared evenly among {parallel.size()} processes")
         self.config, self.folder, self.device = config, folder, device
         surfaces, self.names = load_surfaces(Path(config.data))
-        train, held_out = split_by_heliostat(len(surfaces), config.held_out, config.seed)
+        train, held_out = split_by_heliostat(len(surfaces), config.held_out, config.seed, config.fold)
         self.surfaces, self.held_out = surfaces[train], surfaces[held_out]
         self.held_out_names = [self.names[i] for i in held_out]
         self.field = load_field(Path(config.data))
@@ -97,10 +105,13 @@ class Run:
             self.network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay, betas=(0.9, 0.98)
         )
         self.step = 0
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / "config.json").write_text(json.dumps(asdict(config), indent=1) + "\n", encoding="utf-8")
         if (folder / "checkpoint.pt").is_file():
             self._resume()
+
+    @classmethod
+    def open(cls, folder: Path) -> "Run":
+        """A run as its folder describes it, on the CPU."""
+        return cls(TrainConfig.read(folder / "config.json"), folder, torch.device("cpu"))
 
     def _resume(self) -> None:
         state = torch.load(self.folder / "checkpoint.pt", map_location=self.device, weights_only=True)
@@ -110,7 +121,11 @@ class Run:
         self.step = state["step"]
 
     def save(self) -> None:
-        """Write the checkpoint; a crash while writing leaves the old one."""
+        """Write the config and the checkpoint; a crash while writing leaves the old one."""
+        if parallel.rank() > 0:
+            return
+        self.folder.mkdir(parents=True, exist_ok=True)
+        (self.folder / "config.json").write_text(json.dumps(asdict(self.config), indent=1) + "\n", encoding="utf-8")
         state = {
             "network": self.network.state_dict(),
             "average": self.average.state_dict(),
@@ -157,8 +172,8 @@ class Run:
     def train_step(self) -> float:
         """Render a batch, descend once, return the height error [mm]."""
         c = self.config
-        rng = np.random.default_rng((c.seed, self.step))
-        z = c.augmentation.sample(self.surfaces, c.batch, rng)
+        rng = np.random.default_rng((c.seed, self.step, parallel.rank()))
+        z = c.augmentation.sample(self.surfaces, c.batch // parallel.size(), rng)
         images = int(rng.integers(1, MAX_IMAGES + 1))
         with torch.no_grad():
             flux, shots = render(z, images, self.field, c.situations, c.camera, self.device, int(rng.integers(2**31)))
@@ -170,6 +185,7 @@ class Run:
         self.optimizer.zero_grad()
         loss = error + c.slope_weight * slopes + c.spread_weight * likelihood
         loss.backward()  # type: ignore[no-untyped-call]
+        parallel.average_gradients(self.network.parameters())
         nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
         self.optimizer.step()
         self._update_average()
@@ -195,7 +211,7 @@ class Run:
         """Train to the last step, or until the time is up."""
         end = time.monotonic() + 60 * minutes
         errors: list[float] = []
-        while self.step < self.config.steps and time.monotonic() < end:
+        while self.step < self.config.steps and not parallel.agreed(time.monotonic() >= end, self.device):
             errors.append(self.train_step())
             if self.step % every == 0 or self.step == self.config.steps:
                 self._report(float(np.mean(errors)))
@@ -203,23 +219,31 @@ class Run:
         self.save()
 
     def _report(self, error: float) -> None:
+        """One line of the curve, and a checkpoint."""
+        self.save()
+        if parallel.rank() > 0:
+            return
         line = {"step": self.step, "train_mae_mm": round(error, 4), "held_out_mae_mm": self.validate()}
         with (self.folder / "curve.jsonl").open("a", encoding="utf-8") as file:
             file.write(json.dumps(line) + "\n")
         print(json.dumps(line), flush=True)
-        self.save()
 
 
 def main() -> None:
     """Train, or resume, one run."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--config", type=Path, help="JSON of TrainConfig; defaults without one")
-    parser.add_argument("--run", type=Path, default=Path("runs/best"), help="folder of the run")
+    # torchrun takes "--run" for a beginning of its own "--run-path", wherever it stands.
+    parser.add_argument("--run", "--folder", type=Path, default=Path("runs/best"), help="folder of the run")
     parser.add_argument("--minutes", type=float, default=float("inf"), help="stop after so many minutes")
-    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    parser.add_argument("--fold", type=int, help="which heliostats to keep back, for a cross-validation")
+    parser.add_argument("--device", help="a GPU where there is one, unless given")
     arguments = parser.parse_args()
     config = TrainConfig.read(arguments.config) if arguments.config else TrainConfig()
-    Run(config, arguments.run, torch.device(arguments.device)).train(arguments.minutes)
+    if arguments.fold is not None:
+        config = replace(config, fold=arguments.fold)
+    with parallel.team(arguments.device) as device:
+        Run(config, arguments.run, device).train(arguments.minutes)
 
 
 if __name__ == "__main__":
