@@ -9,9 +9,11 @@ turns with the first. The Juelich heliostats turn about east and then about "up"
 and then about east. The same mirror normal reached by different mounts leaves the mirror rolled differently about it,
 and so turns the flux image; hence this is data, not code.
 
-All functions take and return float64 numpy arrays with any leading batch shape.
+All functions take and return float64 numpy arrays with any leading batch shape. A `Mount.stack` of mounts turns every
+mirror of a batch by a mount of its own.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,6 +36,16 @@ def rotation(axis: ArrayLike, angle: ArrayLike) -> Array:
     zero = np.zeros_like(x)
     cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*x.shape, 3, 3)
     return np.asarray(np.eye(3) + np.sin(theta) * cross + (1 - np.cos(theta)) * (cross @ cross))
+
+
+def _dot(a: Array, b: Array) -> Array:
+    """Scalar products (...) of vectors (..., 3)."""
+    return np.asarray((a * b).sum(axis=-1))
+
+
+def _apply(matrix: Array, vector: Array) -> Array:
+    """Matrices (..., 3, 3) times vectors (..., 3)."""
+    return np.asarray((matrix @ vector[..., None])[..., 0])
 
 
 @dataclass(frozen=True)
@@ -89,17 +101,17 @@ class LinearActuator:
 
 @dataclass(frozen=True, eq=False)
 class Mount:
-    """A two-axis mount.
+    """A two-axis mount, or a batch (...) of them.
 
     Attributes
     ----------
-    first_axis, second_axis : (3,)
+    first_axis, second_axis : (..., 3)
         Unit vectors in ENU at zero angles.
-    zero_attitude : (3, 3)
+    zero_attitude : (..., 3, 3)
         Mirror coordinates to ENU at zero angles.
-    joint : (3,) [m]
+    joint : (..., 3) [m]
         From the heliostat's position to the pivot where the axes meet, in ENU.
-    mirror_offset : (3,) [m]
+    mirror_offset : (..., 3) [m]
         From the pivot to the mirror's centre, in mirror coordinates.
     actuators : pair of LinearActuator, or None
         None where an axis is driven directly, or its drive is not known.
@@ -146,13 +158,24 @@ class Mount:
             mirror_offset=np.asarray(mirror_offset, dtype=np.float64),
         )
 
+    @classmethod
+    def stack(cls, mounts: Sequence["Mount"]) -> "Mount":
+        """A batch (B,) of mounts, without their actuators."""
+        return cls(
+            first_axis=np.array([mount.first_axis for mount in mounts]),
+            second_axis=np.array([mount.second_axis for mount in mounts]),
+            zero_attitude=np.array([mount.zero_attitude for mount in mounts]),
+            joint=np.array([mount.joint for mount in mounts]),
+            mirror_offset=np.array([mount.mirror_offset for mount in mounts]),
+        )
+
     def tilted(self, attitude: ArrayLike) -> "Mount":
         """The same mount with its foundation turned by ``attitude`` (3, 3)."""
         turn = np.asarray(attitude, dtype=np.float64)
         return replace(
             self,
-            first_axis=turn @ self.first_axis,
-            second_axis=turn @ self.second_axis,
+            first_axis=self.first_axis @ turn.T,
+            second_axis=self.second_axis @ turn.T,
             zero_attitude=turn @ self.zero_attitude,
         )
 
@@ -192,29 +215,29 @@ class Mount:
         """
         goal = np.asarray(normal, dtype=np.float64)
         goal = goal / np.linalg.norm(goal, axis=-1, keepdims=True)
-        zero = self.zero_attitude[:, 2]
+        zero = self.zero_attitude[..., 2]
         first, second = self.first_axis, self.second_axis
-        along = (zero @ second) * second
+        along = _dot(zero, second)[..., None] * second
         across = zero - along
         # first . R(second, t2) zero = constant + cosine cos(t2) + sine sin(t2)
-        constant, cosine, sine = first @ along, first @ across, first @ np.cross(second, across)
+        constant, cosine, sine = _dot(first, along), _dot(first, across), _dot(first, np.cross(second, across))
         amplitude = np.hypot(cosine, sine)
-        ratio = (goal @ first - constant) / amplitude
+        ratio = (_dot(goal, first) - constant) / amplitude
         if (np.abs(ratio) > 1 + 1e-9).any():
             raise UnreachableError("the mount cannot turn its mirror to this normal")
         phase, swing = np.arctan2(sine, cosine), np.arccos(np.clip(ratio, -1, 1))
         both = np.stack([phase + swing, phase - swing], axis=-1)
         both = np.arctan2(np.sin(both), np.cos(both))
         t2 = np.take_along_axis(both, np.abs(both).argmin(axis=-1)[..., None], axis=-1)[..., 0]
-        turned = rotation(second, t2) @ zero
-        before = turned - (turned @ first)[..., None] * first
-        after = goal - (goal @ first)[..., None] * first
-        t1 = np.arctan2((np.cross(before, after) @ first), (before * after).sum(axis=-1))
+        turned = _apply(rotation(second, t2), zero)
+        before = turned - _dot(turned, first)[..., None] * first
+        after = goal - _dot(goal, first)[..., None] * first
+        t1 = np.arctan2(_dot(np.cross(before, after), first), _dot(before, after))
         return np.stack([t1, t2], axis=-1)
 
     def mirror_center(self, position: ArrayLike, attitude: ArrayLike) -> Array:
         """The mirror's centre (..., 3) [m] in ENU for a heliostat at ``position`` (..., 3), turned by ``attitude``."""
-        return np.asarray(np.asarray(position) + self.joint + np.asarray(attitude) @ self.mirror_offset)
+        return np.asarray(np.asarray(position) + self.joint + _apply(np.asarray(attitude), self.mirror_offset))
 
     def align(self, position: ArrayLike, sun: ArrayLike, aim: ArrayLike) -> Array:
         """Axis angles (..., 2) [rad] that reflect the sun from the mirror's centre to an aim point.

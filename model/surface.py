@@ -75,6 +75,12 @@ def midpoint_basis(
     return torch.as_tensor(values, dtype=dtype, device=device), torch.as_tensor(slopes, dtype=dtype, device=device)
 
 
+@lru_cache(maxsize=64)
+def edge_basis(count: int, degree: int, samples: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Basis (samples + 1, count) at the ends of ``samples`` equal parameter intervals."""
+    return torch.as_tensor(basis(count, degree, np.linspace(0, 1, samples + 1))[0], dtype=dtype, device=device)
+
+
 @dataclass(frozen=True, eq=False)
 class FacetSamples:
     """Points of a surface with the area each stands for; component first, as the tracers want them.

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from model.errors import InvalidInputError, UnreachableError
 from model.sunshape import FREQUENCY_COUNT, FREQUENCY_STEP, transfer_table
-from model.surface import sample
+from model.surface import edge_basis, midpoint_basis, sample
 from model.tracing.scene import Optics, Scene, Window
 
 
@@ -70,6 +70,8 @@ class Rays:
         Mean mirror normal in the plane's frame.
     footprint : Tensor (B, 2, 2) [m]
         How far apart, right and up, the rays of neighbouring samples land, along the facet's x and y; mirror means.
+    swing : Tensor (B, 2) or None [m/rad]
+        How far, right and up, the spot moves as the mirror turns about the mount's first axis, where that is known.
     """
 
     hits: Tensor
@@ -78,6 +80,7 @@ class Rays:
     slant_range: Tensor
     normal: Tensor
     footprint: Tensor
+    swing: Tensor | None
 
     @property
     def spot(self) -> Tensor:
@@ -117,7 +120,36 @@ def central_rays(scene: Scene, samples: int) -> Rays:
         power = power * scene.facet_reflectivity.repeat_interleave(
             power.shape[-1] // scene.facet_reflectivity.shape[-1], dim=-1
         )
-    return Rays(hits, power, beam, mean_point[:, 2] / -beam[:, 2], mean_normal, _footprint(hits, samples))
+    if scene.blocked_below is not None:
+        power = power * _unblocked(scene, scene.blocked_below, samples)
+    slant_range = mean_point[:, 2] / -beam[:, 2]
+    swing = None if scene.first_axis is None else _swing(scene, scene.first_axis, mean_normal, sun, beam, slant_range)
+    return Rays(hits, power, beam, slant_range, mean_normal, _footprint(hits, samples), swing)
+
+
+def _unblocked(scene: Scene, line: Tensor, samples: int) -> Tensor:
+    """Share (B, S) of each sample's cell that lies above ``line`` (B,) [m] along the mirror's y.
+
+    Cells are cut, not dropped, so that the power follows the line smoothly.
+    """
+    y = scene.control_points[:, :, 1]
+    value_u, _ = midpoint_basis(y.shape[-2], scene.degree, samples, y.dtype, y.device)
+    edges = value_u @ y @ edge_basis(y.shape[-1], scene.degree, samples, y.dtype, y.device).T
+    low, high = edges[..., :-1], edges[..., 1:]
+    share: Tensor = ((high - line[:, None, None, None]) / (high - low)).clamp(0, 1)
+    return share.flatten(1)
+
+
+def _swing(scene: Scene, axis: Tensor, normal: Tensor, sun: Tensor, beam: Tensor, slant_range: Tensor) -> Tensor:
+    """Movement (B, 2) [m/rad] of the spot as mirrors turn about ``axis`` (B, 3), all others in the plane's frame.
+
+    The normal moves by axis x normal, the beam 2 (n.s) n - s by the derivative of that, and the spot by the slant range
+    times what of it lies across the beam, taken along the beam to the plane.
+    """
+    moved = torch.linalg.cross(torch.einsum("bij,bj->bi", scene.plane_axes, axis), normal)
+    turned = 2 * ((moved * sun).sum(-1, keepdim=True) * normal + (normal * sun).sum(-1, keepdim=True) * moved)
+    moved_spot: Tensor = slant_range[:, None] * (turned[:, :2] - beam[:, :2] * turned[:, 2:] / beam[:, 2:])
+    return moved_spot
 
 
 def _footprint(hits: Tensor, samples: int) -> Tensor:
@@ -193,6 +225,12 @@ def _cone_transfer(rays: Rays, optics: Optics, right: Tensor, up: Tensor, table:
         perpendicular = (across[:, 0] * right + across[:, 1] * up + across[:, 2] * slope) ** 2
         variance = 4 * sigma**2 * (total - perpendicular * (1 - cosine**2)) * angular**2
         transfer = transfer * torch.exp(-2 * math.pi**2 * variance)
+    if isinstance(optics.tracking_jitter, Tensor) or optics.tracking_jitter > 0:
+        if rays.swing is None:
+            raise InvalidInputError("tracking jitter needs a scene with 'first_axis'")
+        sigma = torch.as_tensor(optics.tracking_jitter, dtype=right.dtype, device=right.device).reshape(-1, 1, 1)
+        moved = rays.swing[:, 0, None, None] * right + rays.swing[:, 1, None, None] * up
+        transfer = transfer * torch.exp(-2 * math.pi**2 * (sigma * moved) ** 2)
     return transfer
 
 
@@ -281,12 +319,20 @@ def trace(
         table = transfer_table(optics.sun_shape, spot.dtype, spot.device)
     elif table.ndim == 2:
         table = table.repeat_interleave(parts, dim=0)
-    if isinstance(optics.slope_error, Tensor) and optics.slope_error.numel() > 1:
-        optics = replace(optics, slope_error=optics.slope_error.repeat_interleave(parts))
+    optics = replace(
+        optics,
+        slope_error=_of_parts(optics.slope_error, parts),
+        tracking_jitter=_of_parts(optics.tracking_jitter, parts),
+    )
     irradiance = optics.irradiance(rays.slant_range)
     image = _image(rays, center.repeat_interleave(parts, dim=0), window, optics, table, irradiance, padding, parts)
     power = (rays.power.sum(-1) * irradiance).view(-1, parts).sum(1)
     return Flux(irradiance=image, spot=spot, center=center, power=power)
+
+
+def _of_parts(value: float | Tensor, parts: int) -> float | Tensor:
+    """A value of all mirrors as it is, values (B,) of each repeated for the mirror's parts."""
+    return value.repeat_interleave(parts) if isinstance(value, Tensor) and value.numel() > 1 else value
 
 
 def _image(

@@ -1,8 +1,8 @@
 """The Monte Carlo tracer: the slow, plain reference.
 
 Every ray is thrown for itself: a random place on a random facet, a random direction from the sun's disc and aureole, a
-random slope error, exact reflection, exact intersection with the plane. It shares the scene with the convolution tracer
-and nothing of its method, so that each can be tested against the other.
+random slope error, a random swing of the mount, exact reflection, exact intersection with the plane. It shares the
+scene with the convolution tracer and nothing of its method, so that each can be tested against the other.
 """
 
 from collections.abc import Iterator
@@ -11,8 +11,10 @@ from dataclasses import replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from model.errors import InvalidInputError
+from model.mount import rotation
 from model.sunshape import Pillbox, random_angles
 from model.surface import basis
 from model.tracing.scene import Optics, Scene, Window
@@ -53,6 +55,11 @@ def _sun_rays(sun: Array, optics: Optics, count: int, rng: np.random.Generator) 
     return np.asarray(np.cos(angle)[:, None] * sun + np.sin(angle)[:, None] * side)
 
 
+def _sigma(value: float | Tensor, scene: Scene, index: int) -> float:
+    """The standard deviation that belongs to one mirror of a scene."""
+    return float(torch.as_tensor(value).detach().expand(scene.batch)[index])
+
+
 def _rays(
     scene: Scene, index: int, optics: Optics, count: int, rng: np.random.Generator
 ) -> Iterator[tuple[Array, Array]]:
@@ -60,16 +67,17 @@ def _rays(
     points, suns = scene.in_plane()
     facets = points[index].double().numpy()
     sun = _unit(suns[index].double().numpy())
-    slope_error = float(np.broadcast_to(np.asarray(optics.slope_error), scene.batch)[index])
+    slope_error, jitter = (_sigma(v, scene, index) for v in (optics.slope_error, optics.tracking_jitter))
     shares = rng.multinomial(count, np.full(len(facets), 1 / len(facets)))
     for facet, share in enumerate(shares):
         place, area = _mirror_points(np.moveaxis(facets[facet], 0, -1), scene.degree, share, rng)
+        seen = _seen(scene, index, facet, place)
+        if jitter > 0:
+            place, area = _swung(scene, index, place, area, rng.normal(0, jitter, share))
         normal = _unit(area)
         toward_sun = _sun_rays(sun, optics, share, rng)
         # The light that a patch collects counts its own area, not that of the tilted micro-facets on it.
-        weight = (area * toward_sun).sum(axis=-1).clip(min=0) * len(facets) / count
-        if scene.facet_reflectivity is not None:
-            weight = weight * float(scene.facet_reflectivity[index, facet])
+        weight = (area * toward_sun).sum(axis=-1).clip(min=0) * seen * len(facets) / count
         if slope_error > 0:
             first, second = _across(normal)
             tilt = rng.normal(0, slope_error, (2, share, 1))
@@ -79,6 +87,33 @@ def _rays(
         hits = place[:, :2] + distance[:, None] * out[:, :2]
         ahead = (distance > 0) & (out[:, 2] < 0)
         yield hits[ahead], weight[ahead]
+
+
+def _center_and_turn(scene: Scene, index: int) -> tuple[Array, Array]:
+    """The mirror's centre (3,) [m] in the frame of its plane, and ENU to that frame (3, 3)."""
+    turn = scene.plane_axes[index].double().numpy()
+    return turn @ (scene.center[index] - scene.plane_center[index]).double().numpy(), turn
+
+
+def _seen(scene: Scene, index: int, facet: int, place: Array) -> Array:
+    """Share (n,) of the light at mirror points (n, 3), given in the plane's frame, that gets to the target."""
+    share = np.ones(len(place))
+    if scene.facet_reflectivity is not None:
+        share *= float(scene.facet_reflectivity[index, facet])
+    if scene.blocked_below is not None:
+        center, turn = _center_and_turn(scene, index)
+        upwards = turn @ scene.attitude[index, :, 1].double().numpy()
+        share *= (place - center) @ upwards >= float(scene.blocked_below[index])
+    return share
+
+
+def _swung(scene: Scene, index: int, place: Array, area: Array, angle: Array) -> tuple[Array, Array]:
+    """Points and area vectors (n, 3) of a mirror that is turned about its first axis by ``angle`` (n,) [rad] each."""
+    if scene.first_axis is None:
+        raise InvalidInputError("tracking jitter needs a scene with 'first_axis'")
+    center, turn = _center_and_turn(scene, index)
+    swing = rotation(turn @ scene.first_axis[index].double().numpy(), angle)
+    return center + np.einsum("nij,nj->ni", swing, place - center), np.einsum("nij,nj->ni", swing, area)
 
 
 def trace_montecarlo(
@@ -113,7 +148,7 @@ def trace_montecarlo(
 
 def _spot(scene: Scene, index: int, optics: Optics, rng: np.random.Generator) -> Array:
     """Centre of mass (2,) [m] of the light from the sun's very centre, which is where the convolution tracer has it."""
-    point_sun = replace(optics, sun_shape=Pillbox(1e-6), slope_error=0.0)
+    point_sun = replace(optics, sun_shape=Pillbox(1e-6), slope_error=0.0, tracking_jitter=0.0)
     total, moment = 0.0, np.zeros(2)
     for hits, weight in _rays(scene, index, point_sun, 200_000, rng):
         total += weight.sum()

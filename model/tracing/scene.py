@@ -1,6 +1,6 @@
 """Scenes: what both tracers trace. A batch of mirrors, each with its pose, its sun and its target plane."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from model.errors import InvalidInputError
+from model.mount import Mount
 from model.plant import Heliostat, TargetPlane
 from model.sunshape import Buie, SunShape
 from model.surface import DEGREE
@@ -23,6 +24,8 @@ class Optics:
     sun_shape : SunShape
     slope_error : float or Tensor (B,) [rad]
         Standard deviation of the mirror's normals per axis, below what the surface resolves.
+    tracking_jitter : float or Tensor (B,) [rad]
+        Standard deviation with which the mirror swings about the first mount axis while it is imaged.
     dni : float [W/m2]
     reflectivity : float
     attenuation : tuple of float
@@ -31,6 +34,7 @@ class Optics:
 
     sun_shape: SunShape = field(default_factory=Buie)
     slope_error: float | Tensor = 0.0
+    tracking_jitter: float | Tensor = 0.0
     dni: float = 1000.0
     reflectivity: float = 1.0
     attenuation: tuple[float, ...] = ()
@@ -89,15 +93,6 @@ class Window:
         return self.width / self.columns, self.height / self.rows
 
 
-def by_heliostat(heliostats: Sequence[Heliostat]) -> Iterator[tuple[Heliostat, list[int]]]:
-    """Each different heliostat with its places in the sequence, so that its mount turns all of them at once."""
-    places: dict[int, list[int]] = {}
-    for index, heliostat in enumerate(heliostats):
-        places.setdefault(id(heliostat), []).append(index)
-    for rows in places.values():
-        yield heliostats[rows[0]], rows
-
-
 @dataclass(frozen=True, eq=False)
 class Scene:
     """A batch of mirrors before the sun and a plane each.
@@ -118,6 +113,10 @@ class Scene:
     degree : int
     facet_reflectivity : Tensor (B, F) or None
         Relative to `Optics.reflectivity`; None for even facets.
+    first_axis : Tensor (B, 3) or None
+        The mount's first axis in ENU, about which tracking jitter turns the mirror.
+    blocked_below : Tensor (B,) or None [m]
+        Mirror y below which a neighbour takes the light away; None for free mirrors.
     """
 
     control_points: Tensor
@@ -128,6 +127,8 @@ class Scene:
     plane_axes: Tensor
     degree: int = DEGREE
     facet_reflectivity: Tensor | None = None
+    first_axis: Tensor | None = None
+    blocked_below: Tensor | None = None
 
     @classmethod
     def build(
@@ -143,11 +144,9 @@ class Scene:
         device: torch.device | str = "cpu",
     ) -> "Scene":
         """A scene of ``B`` heliostats with control points (F, I, J, 3) [m], axis angles (B, 2) [rad], suns (B, 3)."""
-        t = np.asarray(angles, dtype=np.float64)
-        attitudes, centers = np.empty((len(t), 3, 3)), np.empty((len(t), 3))
-        for heliostat, rows in by_heliostat(heliostats):
-            attitudes[rows] = heliostat.mount.attitude(t[rows])
-            centers[rows] = heliostat.mount.mirror_center(heliostat.position, attitudes[rows])
+        mount = Mount.stack([heliostat.mount for heliostat in heliostats])
+        attitudes = mount.attitude(angles)
+        centers = mount.mirror_center([heliostat.position for heliostat in heliostats], attitudes)
 
         def tensor(values: object) -> Tensor:
             return torch.as_tensor(np.asarray(values), dtype=dtype, device=device)
@@ -160,6 +159,7 @@ class Scene:
             plane_center=tensor([plane.center for plane in planes]),
             plane_axes=tensor([plane.axes for plane in planes]),
             degree=degree,
+            first_axis=tensor(mount.first_axis),
         )
 
     def with_(self, **changes: Tensor) -> "Scene":
@@ -189,6 +189,8 @@ class Scene:
             plane_axes=each(self.plane_axes),
             degree=self.degree,
             facet_reflectivity=None if shares is None else shares.reshape(-1, 1),
+            first_axis=None if self.first_axis is None else each(self.first_axis),
+            blocked_below=None if self.blocked_below is None else each(self.blocked_below),
         )
 
     def in_plane(self) -> tuple[Tensor, Tensor]:

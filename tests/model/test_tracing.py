@@ -167,7 +167,7 @@ def test_cones_of_facets_add_up_to_that_of_the_mirror_far_away(slope_error):
     batch = far.with_(
         **{
             name: getattr(far, name).repeat(3, *[1] * (getattr(far, name).ndim - 1))
-            for name in ("control_points", "attitude", "center", "sun", "plane_center", "plane_axes")
+            for name in ("control_points", "attitude", "center", "sun", "plane_center", "plane_axes", "first_axis")
         }
     )
     optics = Optics(slope_error=torch.full((3,), slope_error, dtype=torch.float64))

@@ -1,0 +1,160 @@
+"""What an effect is: a few bounded parameters and pure functions that act where the physics acts.
+
+Light meets the hooks in this order: `Effect.on_sun` and `Effect.on_mount` change where things point, in numpy, since
+the alignment that follows is numpy; `Effect.on_scene` changes mirrors that already stand before the sun,
+`Effect.on_optics` what the light meets on its way, and `Effect.on_image` what the camera makes of the flux, all three
+in torch, where parameters that are tensors carry gradients.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from model.errors import InvalidInputError
+from model.mount import Mount
+from model.plant import Heliostat
+from model.tracing.scene import Optics, Scene, Window
+
+Array = NDArray[np.float64]
+Scalar = float | Tensor
+ByHeliostat = Mapping[str, Any]
+"""Heliostat name to a number, an array or a tensor: (facets,) or a scalar, as the parameter's scope says."""
+
+Scope = Literal["set", "camera", "heliostat", "facet"]
+Stage = Literal["geometry", "optics", "image"]
+
+JUELICH_LATITUDE = 50.913
+"""Latitude [deg] of the Solar Tower Juelich."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter of an effect.
+
+    Attributes
+    ----------
+    name, unit : str
+    low, high : float
+        Bounds.
+    neutral : float
+        The value at which the effect changes nothing.
+    scope : {"set", "camera", "heliostat", "facet"}
+        Whom one value belongs to: all measurements, a camera's, one heliostat, or each facet of one heliostat.
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    neutral: float
+    scope: Scope
+
+    def check(self, effect: str, value: object) -> None:
+        """Raise `InvalidInputError` unless ``value``, a number or an array, is finite and within the bounds."""
+        try:
+            numbers = np.asarray(value.detach().cpu() if isinstance(value, Tensor) else value)
+        except ValueError:  # rows of different lengths
+            numbers = np.array("")
+        fits = numbers.dtype.kind in "iuf" and numbers.ndim == (self.scope == "facet")
+        if not fits or not ((numbers >= self.low) & (numbers <= self.high)).all():
+            kind = "numbers, one a facet," if self.scope == "facet" else "a number"
+            unit = "" if self.unit == "1" else f" {self.unit}"
+            raise InvalidInputError(
+                f"effect {effect}: '{self.name}' must be {kind} in [{self.low:g}, {self.high:g}]{unit}, "
+                f"got {str(value)[:80]}"
+            )
+
+
+def parameter(neutral: float, low: float, high: float, unit: str, scope: Scope = "set") -> Any:
+    """A dataclass field of an effect; one that belongs to heliostats is a mapping, empty where none is named."""
+    about = {"neutral": neutral, "low": low, "high": high, "unit": unit, "scope": scope}
+    if scope in ("heliostat", "facet"):
+        return field(default_factory=dict, metadata=about)
+    return field(default=neutral, metadata=about)
+
+
+@dataclass(frozen=True, eq=False)
+class Effect:
+    """Base of all effects, which are frozen dataclasses of parameters; without arguments an effect changes nothing.
+
+    Attributes
+    ----------
+    name : str
+        As in DESIGN.md, section 5.
+    stage : {"geometry", "optics", "image"}
+        What must be done anew when a parameter changes: the alignment of the mirrors, the tracing, or only the image.
+    """
+
+    name: ClassVar[str]
+    stage: ClassVar[Stage]
+
+    def __post_init__(self) -> None:
+        for p in self.parameters():
+            value = getattr(self, p.name)
+            if p.scope in ("set", "camera"):
+                p.check(self.name, value)
+            elif not isinstance(value, Mapping):
+                raise InvalidInputError(f"effect {self.name}: '{p.name}' must map heliostat names to values")
+            else:
+                for one in value.values():
+                    p.check(self.name, one)
+
+    @classmethod
+    def parameters(cls) -> tuple[Parameter, ...]:
+        """The effect's parameters in their order."""
+        return tuple(Parameter(name=f.name, **f.metadata) for f in fields(cls))
+
+    def on_sun(self, suns: Array, latitude_deg: float) -> Array:
+        """Unit vectors (B, 3) towards the sun, as they were recorded, to where it really stood."""
+        return suns
+
+    def on_mount(self, mount: Mount) -> Mount:
+        """A mount as it was surveyed to how it really stands."""
+        return mount
+
+    def on_scene(self, scene: Scene, heliostats: Sequence[Heliostat]) -> Scene:
+        """A scene of B mirrors, those of the B ``heliostats``, to how they really are."""
+        return scene
+
+    def on_optics(self, optics: Optics) -> Optics:
+        """The declared optics to what the light really meets."""
+        return optics
+
+    def on_image(self, images: Tensor, window: Window) -> Tensor:
+        """Irradiance (B, rows, columns) over ``window`` to what the camera shows of it."""
+        return images
+
+
+def quadrature(first: Scalar, second: Scalar) -> Scalar:
+    """Standard deviation of the sum of two independent errors; differentiable where the first is zero, too."""
+    if not isinstance(first, Tensor) and not isinstance(second, Tensor):
+        return math.hypot(first, second)
+    if not isinstance(first, Tensor) and first == 0:
+        return second
+    return torch.sqrt(torch.as_tensor(first) ** 2 + torch.as_tensor(second) ** 2)
+
+
+def stacked(effect: str, values: ByHeliostat, heliostats: Sequence[Heliostat], neutral: Tensor) -> Tensor:
+    """The values (B, ...) of B heliostats, ``neutral`` (...) for those that are not named.
+
+    Raises
+    ------
+    InvalidInputError
+        Where a heliostat has not as many facets as values.
+    """
+    rows = []
+    for heliostat in heliostats:
+        value = values.get(heliostat.name)
+        row = neutral if value is None else torch.as_tensor(value).to(neutral)
+        if row.shape != neutral.shape:
+            raise InvalidInputError(
+                f"effect {effect}: {heliostat.name} has {neutral.shape[0]} facets, got {row.shape[0]} values"
+            )
+        rows.append(row)
+    return torch.stack(rows)

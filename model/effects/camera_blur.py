@@ -1,0 +1,46 @@
+"""Camera blur: a lens out of focus, air that shimmers."""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from model.effects.base import Effect, Scalar, Stage, parameter
+from model.tracing.scene import Window
+
+
+@dataclass(frozen=True, eq=False)
+class CameraBlur(Effect):
+    """The image is smeared by a Gaussian of standard deviation ``sigma_m`` [m on the target] per axis."""
+
+    name: ClassVar[str] = "camera_blur"
+    stage: ClassVar[Stage] = "image"
+
+    sigma_m: Scalar = parameter(0.0, 0.0, 0.5, "m", "camera")
+
+    def on_image(self, images: Tensor, window: Window) -> Tensor:
+        """Blur along rows and columns; light is mirrored at the window's edges, so that none is lost."""
+        pixel_x, pixel_y = window.pixel
+        across = _blur(images.shape[-1], pixel_x, self.sigma_m, images)
+        down = _blur(images.shape[-2], pixel_y, self.sigma_m, images)
+        return down @ images @ across.T
+
+
+def _blur(size: int, pixel: float, sigma: Scalar, like: Tensor) -> Tensor:
+    """The Gaussian blur of lines of pixels as a matrix (size, size): diagonal in cosines, whose edges mirror."""
+    cosines = _cosines(size, like.dtype, like.device)
+    frequency = torch.arange(size, dtype=like.dtype, device=like.device) / (2 * size * pixel)
+    transfer = torch.exp(-2 * math.pi**2 * sigma**2 * frequency**2)
+    return (cosines.T * transfer) @ cosines
+
+
+@lru_cache(maxsize=16)
+def _cosines(size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """The orthonormal discrete cosine transform of type II (size, size), frequency first."""
+    index = torch.arange(size, dtype=torch.float64)
+    table = torch.cos(math.pi * index[:, None] * (index + 0.5) / size) * math.sqrt(2 / size)
+    table[0] = 1 / math.sqrt(size)
+    return table.to(dtype=dtype, device=device)

@@ -1,0 +1,52 @@
+"""Gravity bending: the mirror sags under its own weight, the more the flatter it lies."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from model.effects.base import Effect, Scalar, Stage, parameter
+from model.plant import Heliostat
+from model.surface import basis, greville
+from model.tracing.scene import Scene
+
+
+@dataclass(frozen=True, eq=False)
+class GravityBending(Effect):
+    """A lying mirror's left and right edges hang ``amplitude_mm`` [mm] below its centre."""
+
+    name: ClassVar[str] = "gravity_bending"
+    stage: ClassVar[Stage] = "geometry"
+
+    amplitude_mm: Scalar = parameter(0.0, -8.0, 8.0, "mm")
+
+    def on_scene(self, scene: Scene, heliostats: Sequence[Heliostat]) -> Scene:
+        """Lower the mirrors' heights by amplitude * sin(elevation of the normal) * (r / r_edge)**2."""
+        points = scene.control_points
+        half_width = points.new_tensor([heliostat.width / 2 for heliostat in heliostats])
+        scale = 1e-3 * self.amplitude_mm * scene.attitude[:, 2, 2] / half_width**2
+        sag = scale[:, None, None, None] * _radius_squared(points, scene.degree)
+        x, y, z = points.unbind(2)
+        x, y = x.expand_as(sag), y.expand_as(sag)
+        return scene.with_(control_points=torch.stack([x, y, z - sag], dim=2))
+
+
+def _radius_squared(points: Tensor, degree: int) -> Tensor:
+    """Spline coefficients (B, F, I, J) of x**2 + y**2 [m2] over facets (B, F, 3, I, J).
+
+    Interpolated at the Greville abscissae: exact where x and y are linear in the parameters, as on heliotwin's grid.
+    """
+    value_u, inverse_u = _collocation(points.shape[-2], degree, points.dtype, points.device)
+    value_v, inverse_v = _collocation(points.shape[-1], degree, points.dtype, points.device)
+    place = value_u @ points[:, :, :2] @ value_v.T
+    return inverse_u @ (place**2).sum(2) @ inverse_v.T
+
+
+@lru_cache(maxsize=16)
+def _collocation(count: int, degree: int, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Basis at the Greville abscissae (count, count), which turns coefficients to values, and its inverse."""
+    values = torch.as_tensor(basis(count, degree, greville(count, degree))[0])
+    return values.to(dtype=dtype, device=device), torch.linalg.inv(values).to(dtype=dtype, device=device)

@@ -1,0 +1,50 @@
+"""Target registration: the target's corners were not found where they are."""
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+from torch.nn.functional import affine_grid, grid_sample
+
+from model.effects.base import Effect, Scalar, Stage, parameter
+from model.tracing.scene import Window
+
+
+@dataclass(frozen=True, eq=False)
+class TargetRegistration(Effect):
+    """The image shows the target scaled, sheared and turned about its centre.
+
+    A point (x, y) [m, right and up] appears at R(rotation_deg) (scale_x * (x + shear * y), scale_y * y), with R
+    anticlockwise.
+    """
+
+    name: ClassVar[str] = "target_registration"
+    stage: ClassVar[Stage] = "image"
+
+    scale_x: Scalar = parameter(1.0, 0.8, 1.25, "1", "camera")
+    scale_y: Scalar = parameter(1.0, 0.8, 1.25, "1", "camera")
+    shear: Scalar = parameter(0.0, -0.2, 0.2, "1", "camera")
+    rotation_deg: Scalar = parameter(0.0, -15.0, 15.0, "deg", "camera")
+
+    def on_image(self, images: Tensor, window: Window) -> Tensor:
+        """Resample bicubically; irradiance keeps its values, what lies beyond the image is dark."""
+        size = images.new_tensor([window.width, -window.height])  # grids count rows downwards
+        # A grid tells for each pixel shown where on the true image it comes from, in half sizes.
+        back = torch.linalg.inv(self._matrix(images)) * size / size[:, None]
+        theta = torch.cat([back, images.new_zeros(2, 1)], dim=1)[None]
+        grid = affine_grid(theta, [1, 1, *images.shape[-2:]], align_corners=False)
+        return grid_sample(images[None], grid, mode="bicubic", padding_mode="zeros", align_corners=False)[0]
+
+    def _matrix(self, like: Tensor) -> Tensor:
+        """From where a point is to where it appears (2, 2), right and up."""
+        scale_x, scale_y, shear, degrees = (
+            torch.as_tensor(value, dtype=like.dtype, device=like.device)
+            for value in (self.scale_x, self.scale_y, self.shear, self.rotation_deg)
+        )
+        angle = degrees * (math.pi / 180)
+        cosine, sine = torch.cos(angle), torch.sin(angle)
+        turn = torch.stack([cosine, -sine, sine, cosine]).view(2, 2)
+        stretch = torch.stack([scale_x, scale_x * shear, torch.zeros_like(shear), scale_y]).view(2, 2)
+        return turn @ stretch

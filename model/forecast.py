@@ -1,0 +1,309 @@
+"""From shots to images: what photographs a model of the plant expects.
+
+A shot is one heliostat before one sun and one target. `align` turns the heliostats, with every effect on sun, mount and
+mirror already in place; what it gives back traces itself under any optics and any camera, as often as needed::
+
+    aligned = align(shots, effects)
+    images = aligned.images(optics, effects, View(96, 96))
+
+or, in one step, `forecast_shots`. Gradients with respect to an effect's parameters hold the alignment fixed.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from model.effects import JUELICH_LATITUDE, Effect, in_light_order
+from model.plant import Heliostat, TargetPlane
+from model.surface import DEGREE
+from model.tracing import Optics, Scene, Window, trace
+from model.tracing.alignment import settle
+
+Array = NDArray[np.float64]
+Tracer = Callable[[Scene, Window, Optics], Tensor]
+"""Irradiance (B, rows, columns) [W/m2] of a scene's B mirrors."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """One heliostat before one sun and one target.
+
+    Attributes
+    ----------
+    heliostat : Heliostat
+    control_points : (F, I, J, 3) [m]
+        The mirror, in its own coordinates, as `model.surface.control_points` or a measurement gives it.
+    sun : (3,)
+        Unit vector towards the recorded sun in ENU.
+    plane : TargetPlane
+    spot : (3,) [m] or None
+        Where the spot's centre of mass lies, in ENU: the heliostat is turned until it does.
+    angles : (2,) [rad] or None
+        The mount's axis angles, where no spot is given.
+    aim : (3,) [m] or None
+        Where the ray from the mirror's centre goes, where neither is given; the plane's centre without it.
+    degree : int
+        Of the surface's splines.
+    identifier : str
+    """
+
+    heliostat: Heliostat
+    control_points: Array
+    sun: Array
+    plane: TargetPlane
+    spot: Array | None = None
+    angles: Array | None = None
+    aim: Array | None = None
+    degree: int = DEGREE
+    identifier: str = ""
+
+    @property
+    def goal(self) -> Array:
+        """The point (3,) [m] in ENU that the spot, or the mirror's centre, shall be sent to."""
+        chosen = self.aim if self.spot is None else self.spot
+        return np.asarray(self.plane.center if chosen is None else chosen, dtype=np.float64)
+
+    @property
+    def kind(self) -> tuple[object, ...]:
+        """What shots must have in common to be traced at once."""
+        plane = (round(self.plane.width, 6), round(self.plane.height, 6))
+        return (*plane, self.degree, *self.control_points.shape, self.spot is None)
+
+
+@dataclass(frozen=True)
+class View:
+    """What is imaged of the targets, and how finely it is traced.
+
+    Attributes
+    ----------
+    rows, columns : int
+    window : float or None [m]
+        Side of a square about each spot; None for each whole target.
+    samples, padding, cones
+        As in `model.tracing.trace`.
+    """
+
+    rows: int = 96
+    columns: int = 96
+    window: float | None = None
+    samples: int = 20
+    padding: float = 0.25
+    cones: Literal["mirror", "facet"] = "mirror"
+
+    def of(self, plane: TargetPlane) -> Window:
+        """The window on one target."""
+        if self.window is None:
+            return Window.of(plane, self.rows, self.columns)
+        return Window(self.window, self.window, self.rows, self.columns, on_spot=True)
+
+    def trace(self, scene: Scene, window: Window, optics: Optics) -> Tensor:
+        """The convolution tracer, as finely as this view asks."""
+        flux = trace(scene, window, optics, samples=self.samples, padding=self.padding, cones=self.cones)
+        return flux.irradiance
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Aligned shots that are traced at once.
+
+    Attributes
+    ----------
+    rows : list of int
+        Their places among all shots.
+    plane : TargetPlane
+        One of theirs; all have its size.
+    scene : Scene
+    angles : (B, 2) [rad]
+    aims : (B, 3) [m]
+        Where their mirrors' centres aim.
+    """
+
+    rows: list[int]
+    plane: TargetPlane
+    scene: Scene
+    angles: Array
+    aims: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Aligned:
+    """Shots whose heliostats stand, under the geometry's effects, where their spots demand.
+
+    Attributes
+    ----------
+    groups : tuple of Group
+    """
+
+    groups: tuple[Group, ...]
+
+    @property
+    def aims(self) -> Array:
+        """Aim points (B, 3) [m] in ENU, in the shots' order."""
+        return _in_order([group.aims for group in self.groups], self.groups)
+
+    @property
+    def angles(self) -> Array:
+        """Axis angles (B, 2) [rad], in the shots' order."""
+        return _in_order([group.angles for group in self.groups], self.groups)
+
+    def flux(
+        self,
+        optics: Optics | None = None,
+        effects: Iterable[Effect] = (),
+        view: View | None = None,
+        tracer: Tracer | None = None,
+    ) -> Tensor:
+        """Irradiance (B, rows, columns) [W/m2] under optics to which the effects' are added.
+
+        ``tracer`` takes the place of the convolution tracer.
+        """
+        view, optics = view or View(), optics or Optics()
+        for effect in in_light_order(effects):
+            optics = effect.on_optics(optics)
+        by_tracer = tracer or view.trace
+        return self._ordered([by_tracer(group.scene, view.of(group.plane), optics) for group in self.groups])
+
+    def photographs(self, flux: Tensor, effects: Iterable[Effect], view: View | None = None) -> Tensor:
+        """What the effects of the camera make of ``flux`` (B, rows, columns), which was traced in the same view."""
+        view, ordered = view or View(), in_light_order(effects)
+        images = []
+        for group in self.groups:
+            image = flux[group.rows]
+            for effect in ordered:
+                image = effect.on_image(image, view.of(group.plane))
+            images.append(image)
+        return self._ordered(images)
+
+    def images(
+        self,
+        optics: Optics | None = None,
+        effects: Sequence[Effect] = (),
+        view: View | None = None,
+        tracer: Tracer | None = None,
+    ) -> Tensor:
+        """`flux`, then `photographs`: images (B, rows, columns)."""
+        return self.photographs(self.flux(optics, effects, view, tracer), effects, view)
+
+    def _ordered(self, parts: Sequence[Tensor]) -> Tensor:
+        """Parts of each group (b, ...) in the shots' order (B, ...)."""
+        places = torch.as_tensor([row for group in self.groups for row in group.rows])
+        return torch.cat(list(parts))[places.argsort()]
+
+
+def _in_order(parts: Sequence[Array], groups: Sequence[Group]) -> Array:
+    """Parts of each group (b, ...) in the shots' order (B, ...)."""
+    places = [row for group in groups for row in group.rows]
+    return np.concatenate(parts)[np.argsort(places)]
+
+
+def align(
+    shots: Sequence[Shot],
+    effects: Iterable[Effect] = (),
+    *,
+    latitude_deg: float = JUELICH_LATITUDE,
+    dtype: torch.dtype = torch.float32,
+    start: Aligned | None = None,
+) -> Aligned:
+    """Turn the heliostats of shots under the effects on sun, mount and mirror.
+
+    Parameters
+    ----------
+    shots : sequence of Shot
+    effects : iterable of Effect
+        Those on optics and camera are of no account here.
+    latitude_deg : float [deg]
+        Of the plant.
+    dtype : torch.dtype
+        In which it will be traced; the alignment itself is in double precision.
+    start : Aligned, optional
+        The same shots under effects that differ little: saves rounds.
+
+    Raises
+    ------
+    UnreachableError
+        Where no attitude reflects the sun to the spot.
+    """
+    ordered = in_light_order(effects)
+    kinds: dict[tuple[object, ...], list[int]] = {}
+    for row, shot in enumerate(shots):
+        kinds.setdefault(shot.kind, []).append(row)
+    aims = np.array([shot.goal for shot in shots]) if start is None else start.aims
+    return Aligned(
+        tuple(_align_group(shots, rows, ordered, latitude_deg, dtype, aims[rows]) for rows in kinds.values())
+    )
+
+
+def _align_group(
+    shots: Sequence[Shot],
+    rows: list[int],
+    effects: Sequence[Effect],
+    latitude_deg: float,
+    dtype: torch.dtype,
+    aims: Array,
+) -> Group:
+    """Align the shots of one kind."""
+    group = [shots[row] for row in rows]
+    heliostats = _altered([shot.heliostat for shot in group], effects)
+    suns = np.array([shot.sun for shot in group], dtype=np.float64)
+    for effect in effects:
+        suns = effect.on_sun(suns, latitude_deg)
+    points, planes, degree = [shot.control_points for shot in group], [shot.plane for shot in group], group[0].degree
+
+    def alter(scene: Scene) -> Scene:
+        for effect in effects:
+            scene = effect.on_scene(scene, heliostats)
+        return scene
+
+    if group[0].spot is None:
+        angles = _given_angles(group, heliostats, suns)
+    else:
+        goals = [shot.goal for shot in group]
+        angles, aims = settle(heliostats, points, suns, planes, goals, degree=degree, start=aims, alter=alter)
+    scene = Scene.build(heliostats, points, angles, suns, planes, degree=degree, dtype=dtype)
+    return Group(rows, planes[0], alter(scene), angles, aims)
+
+
+def _altered(heliostats: Sequence[Heliostat], effects: Sequence[Effect]) -> list[Heliostat]:
+    """The heliostats on their mounts as the effects leave them; one that comes twice stays one."""
+    altered: dict[int, Heliostat] = {}
+    for heliostat in heliostats:
+        if id(heliostat) not in altered:
+            mount = heliostat.mount
+            for effect in effects:
+                mount = effect.on_mount(mount)
+            altered[id(heliostat)] = replace(heliostat, mount=mount)
+    return [altered[id(heliostat)] for heliostat in heliostats]
+
+
+def _given_angles(shots: Sequence[Shot], heliostats: Sequence[Heliostat], suns: Array) -> Array:
+    """Axis angles (B, 2) [rad] of shots without a spot: as given, or by the aim of the mirror's centre."""
+    return np.array(
+        [
+            shot.angles if shot.angles is not None else heliostat.mount.align(heliostat.position, sun, shot.goal)
+            for shot, heliostat, sun in zip(shots, heliostats, suns, strict=True)
+        ]
+    )
+
+
+def forecast_shots(
+    shots: Sequence[Shot],
+    optics: Optics | None = None,
+    effects: Sequence[Effect] = (),
+    view: View | None = None,
+    *,
+    latitude_deg: float = JUELICH_LATITUDE,
+    dtype: torch.dtype = torch.float32,
+) -> Tensor:
+    """Images (B, rows, columns) that the model, with its effects, expects of shots, in W/m2 but for the camera.
+
+    Raises
+    ------
+    UnreachableError
+        Where no attitude reflects the sun to the spot.
+    """
+    return align(shots, effects, latitude_deg=latitude_deg, dtype=dtype).images(optics, effects, view)
