@@ -1,5 +1,6 @@
 """The application: settings in, FastAPI out."""
 
+import threading
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from importlib.metadata import PackageNotFoundError, version
@@ -8,11 +9,13 @@ from anyio import to_thread
 from fastapi import APIRouter, FastAPI
 from fastapi.routing import APIRoute
 
-from service import errors, openapi
-from service.middleware import BodyLimitMiddleware, RequestIdMiddleware
-from service.routers import forecasts, health, heliostats, measurements, plant, surfaces
+from service import documentation, errors, openapi, security
+from service.handlers import KINDS
+from service.middleware import BodyLimitMiddleware, DoorMiddleware, RequestIdMiddleware, SecurityHeadersMiddleware
+from service.routers import audit, forecasts, health, heliostats, jobs, measurements, plant, session, surfaces
 from service.runtime import Operations, Runtime
 from service.settings import Settings
+from service.workers import Kinds, Workers
 
 _DESCRIPTION = (
     "Post the target photographs of a solar tower, read back each heliostat's flux and surface, and forecast the "
@@ -31,11 +34,13 @@ def _operation_id(route: APIRoute) -> str:
     return route.name
 
 
-def create_app(settings: Settings, operations: Operations | None = None) -> FastAPI:
+def create_app(settings: Settings, operations: Operations | None = None, kinds: Kinds = KINDS) -> FastAPI:
     """The service for these settings.
 
     ``operations`` stands in for the model (`service.operations`) in tests. The store is opened, and an embedded SQLite
-    one migrated, when the application starts; a store that nobody migrated keeps it from starting.
+    one migrated, when the application starts; a store that nobody migrated keeps it from starting, and so does a door
+    that would stand open to other machines. Jobs of ``kinds`` can be asked for, and are worked at where the settings
+    say so.
     """
 
     @asynccontextmanager
@@ -45,8 +50,14 @@ def create_app(settings: Settings, operations: Operations | None = None) -> Fast
             if settings.migrates_on_start:
                 await to_thread.run_sync(runtime.database.upgrade)
             await to_thread.run_sync(runtime.database.require_current)
+            await to_thread.run_sync(security.require_closed_door, settings, runtime.database)
             app.state.runtime = runtime
-            yield
+            workers = Workers(runtime, kinds, settings.job_workers)
+            workers.start()
+            try:
+                yield
+            finally:
+                await to_thread.run_sync(workers.stop)
         finally:
             runtime.close()
 
@@ -57,14 +68,22 @@ def create_app(settings: Settings, operations: Operations | None = None) -> Fast
         lifespan=lifespan,
         generate_unique_id_function=_operation_id,
         redirect_slashes=False,
+        docs_url=None,  # service.documentation has its own page
+        redoc_url=None,
     )
+    app.state.stopping = threading.Event()
     v1 = APIRouter(prefix="/v1")
-    for module in (plant, heliostats, measurements, surfaces, forecasts):
+    for module in (plant, heliostats, measurements, surfaces, forecasts, audit):
         v1.include_router(module.router)
+    v1.include_router(jobs.make_router(kinds))
     app.include_router(v1)
-    app.include_router(health.router)
+    for router in (health.router, session.router, documentation.router):
+        app.include_router(router)
+    security.require_declared_roles(app)
     errors.install(app)
     openapi.install(app)
     app.add_middleware(BodyLimitMiddleware, settings=settings)
-    app.add_middleware(RequestIdMiddleware)
+    app.add_middleware(DoorMiddleware, settings=settings)
+    app.add_middleware(SecurityHeadersMiddleware)
+    app.add_middleware(RequestIdMiddleware)  # added last, it comes first
     return app

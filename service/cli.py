@@ -15,6 +15,7 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 from rich.table import Table
 
 from model.errors import InvalidInputError, ModelError
+from service.cli_keys import keys_app
 from service.faults import ServiceError
 from service.operations import Method
 from service.paint import MeasurementFolder, read_folder
@@ -201,6 +202,21 @@ def serve(
 
 
 @app.command()
+def worker(
+    count: Annotated[int | None, typer.Option(help="Jobs at a time; HELIOTWIN_JOB_WORKERS or 1.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print what it works at as JSON before it starts.")] = False,
+) -> None:
+    """Work at the jobs of the store that `serve` uses, in a process of its own."""
+    from service import server
+    from service.settings import Settings
+
+    settings = Settings() if count is None else Settings(job_workers=count)
+    if as_json:
+        typer.echo(json.dumps({"workers": settings.job_workers}))
+    server.work(settings)
+
+
+@app.command()
 def migrate(as_json: AsJson = False) -> None:
     """Bring the database to its newest schema."""
     from service import server
@@ -223,6 +239,9 @@ def demo(
     from service.demo import run_demo
 
     show(run_demo(data, out, console, quiet=as_json), as_json)
+
+
+app.add_typer(keys_app)
 
 
 def main() -> None:

@@ -19,8 +19,9 @@ from service.faults import SchemaError
 # Seconds that a writer waits for another on SQLite, and that a connection to PostgreSQL may take.
 _PATIENCE_S = 15
 
-# Beyond the five that are kept open; together they are enough for the 40 threads that Starlette runs routes in.
-_MORE_CONNECTIONS = 40
+# Beyond the five that are kept open; together they are enough for the 40 threads that Starlette runs routes in, those
+# that ask for keys, follow jobs and check readiness, and a few workers with their heartbeats.
+_MORE_CONNECTIONS = 64
 
 # Alembic keeps its context in module globals: one migration at a time in a process.
 _alembic = threading.Lock()

@@ -4,6 +4,7 @@ None of it holds a database connection: a route opens its session itself and clo
 from a dependency would keep its connection while the request waits for a thread, and threads would wait for it.
 """
 
+import threading
 from typing import Annotated
 
 from fastapi import Depends, Header, Path, Query, Request
@@ -12,6 +13,7 @@ from service import negotiation
 from service.faults import UnsupportedContentError
 from service.runtime import Runtime
 from service.schemas import MeasurementName, Name
+from service.security import Identity, Requires, Role
 
 
 async def get_runtime(request: Request) -> Runtime:
@@ -21,6 +23,28 @@ async def get_runtime(request: Request) -> Runtime:
 
 
 RuntimeDep = Annotated[Runtime, Depends(get_runtime)]
+
+
+# For a route's ``dependencies``: whoever has at least this role is let in.
+READ, INGEST, OPERATE, ADMIN = (Depends(Requires(role)) for role in Role)
+
+
+async def _identity(request: Request) -> Identity:
+    identity: Identity = request.state.identity
+    return identity
+
+
+IdentityDep = Annotated[Identity, Depends(_identity)]
+"""Who asks; for routes that `requires` a role."""
+
+
+async def _stopping(request: Request) -> threading.Event:
+    event: threading.Event = request.app.state.stopping
+    return event
+
+
+StoppingDep = Annotated[threading.Event, Depends(_stopping)]
+"""Set when the service is told to stop, so that answers without an end end."""
 
 
 NamePath = Annotated[Name, Path(description="Name of the heliostat or target.")]

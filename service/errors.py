@@ -19,6 +19,21 @@ logger = logging.getLogger("heliotwin.service")
 
 PROBLEM_MEDIA_TYPE = "application/problem+json"
 
+# Pages load what this service serves and nothing else, and no page of others can frame them; pictures may also stand
+# in the page itself, as those of Swagger UI do.
+SECURITY_HEADERS = {
+    "Content-Security-Policy": (
+        "default-src 'self'; img-src 'self' data:; object-src 'none'; base-uri 'none'; form-action 'self'; "
+        "frame-ancestors 'none'"
+    ),
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cache-Control": "no-store",
+}
+
 STATUS: dict[type[Exception], HTTPStatus] = {
     InvalidInputError: HTTPStatus.UNPROCESSABLE_ENTITY,
     UnreachableError: HTTPStatus.UNPROCESSABLE_ENTITY,
@@ -28,6 +43,7 @@ STATUS: dict[type[Exception], HTTPStatus] = {
     faults.ConflictError: HTTPStatus.CONFLICT,
     faults.NotAcceptableError: HTTPStatus.NOT_ACCEPTABLE,
     faults.TooLargeError: HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
+    faults.TooManyError: HTTPStatus.TOO_MANY_REQUESTS,
     faults.UnsupportedImageError: HTTPStatus.UNSUPPORTED_MEDIA_TYPE,
     faults.UnsupportedContentError: HTTPStatus.UNSUPPORTED_MEDIA_TYPE,
 }
@@ -71,6 +87,8 @@ def _field(location: Sequence[int | str]) -> str:
 
 def _on_known(request: Request, error: Exception) -> Response:
     status = next(STATUS[kind] for kind in type(error).__mro__ if kind in STATUS)
+    if isinstance(error, faults.TooManyError):
+        return problem(request.scope, status, str(error), {"Retry-After": "30"})
     if isinstance(error, faults.NotAcceptableError):
         return problem(request.scope, status, str(error), offered=list(error.offered))
     return problem(request.scope, status, str(error))
@@ -94,16 +112,22 @@ def _on_http(request: Request, error: Exception) -> Response:
     return problem(request.scope, error.status_code, detail, error.headers)
 
 
-def _on_database_away(request: Request, error: Exception) -> Response:
-    logger.error("database unavailable, request %s: %s", request_id(request.scope), error)
+def database_away(scope: Scope, error: Exception) -> Response:
+    """The answer while the database does not give one."""
+    logger.error("database unavailable, request %s: %s", request_id(scope), error)
     detail = "the database does not answer; try again later"
-    return problem(request.scope, HTTPStatus.SERVICE_UNAVAILABLE, detail, {"Retry-After": "5"})
+    return problem(scope, HTTPStatus.SERVICE_UNAVAILABLE, detail, {"Retry-After": "5"})
+
+
+def _on_database_away(request: Request, error: Exception) -> Response:
+    return database_away(request.scope, error)
 
 
 def _on_unexpected(request: Request, error: Exception) -> Response:
     logger.error("unexpected error, request %s", request_id(request.scope), exc_info=error)
     detail = "the service failed; report the request_id to its operator"
-    headers = {"X-Request-ID": request_id(request.scope)}  # this handler stands outside the middleware that adds it
+    # This handler stands outside the middleware that adds these.
+    headers = {"X-Request-ID": request_id(request.scope), **SECURITY_HEADERS}
     return problem(request.scope, HTTPStatus.INTERNAL_SERVER_ERROR, detail, headers)
 
 

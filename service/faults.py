@@ -17,6 +17,10 @@ class TooLargeError(ServiceError):
     """A body or an image exceeds its bound."""
 
 
+class TooManyError(ServiceError):
+    """More is asked at a time than is allowed; what is there must be done first."""
+
+
 class UnsupportedImageError(ServiceError):
     """An image file of a format that is not accepted."""
 
@@ -35,6 +39,14 @@ class NotAcceptableError(ServiceError):
 
 class StoreDamagedError(ServiceError):
     """What the store promised to keep is gone or altered: the operator's business, not the caller's."""
+
+
+class OpenDoorError(ServiceError):
+    """The service would be open to other machines without anybody's leave."""
+
+
+class NotStartedError(ServiceError):
+    """The service did not start."""
 
 
 class SchemaError(ServiceError):

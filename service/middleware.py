@@ -1,17 +1,23 @@
-"""What stands before every route: a request id, a log line, and a bound on the body."""
+"""What stands before every route: a request id, a log line, headers for browsers, the door, a bound on the body."""
 
 import logging
+import math
 import re
 import time
 import uuid
 from http import HTTPStatus
+from urllib.parse import urlsplit
 
-from fastapi import HTTPException
+from anyio import CapacityLimiter, to_thread
+from fastapi import HTTPException, Response
+from sqlalchemy.exc import OperationalError
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.errors import problem
-from service.settings import Settings
+from service import errors, security
+from service.errors import SECURITY_HEADERS, problem
+from service.limits import Buckets
+from service.settings import Settings, is_loopback
 
 logger = logging.getLogger("heliotwin.access")
 
@@ -45,6 +51,101 @@ class RequestIdMiddleware:
             await send(message)
 
         await self.app(scope, receive, send_with_id)
+
+
+class SecurityHeadersMiddleware:
+    """Tells browsers to load nothing from elsewhere, to guess no types and to show nothing in foreign frames."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """One ASGI call."""
+
+        async def send_with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                for name, value in SECURITY_HEADERS.items():
+                    headers.setdefault(name, value)
+            await send(message)
+
+        await self.app(scope, receive, send_with_headers)
+
+
+class DoorMiddleware:
+    """Finds out who asks, before anything of the body is read, and turns away who may not come in.
+
+    The request's `service.security.Identity` is left in its state for the routes. Whoever may come in is let in as
+    often as the settings allow; failed attempts count for the client's address.
+    """
+
+    def __init__(self, app: ASGIApp, settings: Settings) -> None:
+        self.app = app
+        self.settings = settings
+        self.buckets = Buckets(settings.requests_per_s, settings.requests_burst)
+        # Its own threads: a service that is busy with predictions still knows its keys.
+        self.threads = CapacityLimiter(8)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """One ASGI call."""
+        if scope["type"] == "http":
+            refusal = await self._refusal(scope)
+            if refusal is not None:
+                await refusal(scope, receive, send)
+                return
+        await self.app(scope, receive, send)
+
+    async def _refusal(self, scope: Scope) -> Response | None:
+        headers = Headers(scope=scope)
+        if is_loopback(self.settings.host) and not _is_loopback_name(headers.get("host", "")):
+            # Else a page whose name its owner lets point to 127.0.0.1 could read everything (DNS rebinding).
+            return problem(scope, HTTPStatus.FORBIDDEN, "Host: this service answers on this machine's own names only")
+        if scope["method"] not in ("GET", "HEAD", "OPTIONS") and _is_cross_site(headers):
+            return problem(scope, HTTPStatus.FORBIDDEN, "another site's page may not change anything here")
+        identity = None
+        if not security.is_public(scope["path"]):
+            try:
+                identity = await self._identify(scope, headers)
+            except OperationalError as error:
+                return errors.database_away(scope, error)
+        return self._too_often(scope, identity) or self._unknown(scope, identity)
+
+    async def _identify(self, scope: Scope, headers: Headers) -> security.Identity | None:
+        database, presented = scope["app"].state.runtime.database, security.presented_key(headers)
+        identity = await to_thread.run_sync(security.identify, database, self.settings, presented, limiter=self.threads)
+        scope.setdefault("state", {})["identity"] = identity
+        return identity
+
+    def _too_often(self, scope: Scope, identity: security.Identity | None) -> Response | None:
+        client = scope.get("client")
+        address = client[0] if client else ""
+        wait_s = self.buckets.wait_s(f"address {address}" if identity is None else f"key {identity.name}")
+        if not wait_s:
+            return None
+        headers = {"Retry-After": str(math.ceil(wait_s))}
+        return problem(scope, HTTPStatus.TOO_MANY_REQUESTS, "too many requests; wait as Retry-After says", headers)
+
+    def _unknown(self, scope: Scope, identity: security.Identity | None) -> Response | None:
+        if identity is not None or security.is_public(scope["path"]):
+            return None
+        detail = "present a valid key: Authorization: Bearer KEY; `heliotwin keys create` makes one"
+        return problem(scope, HTTPStatus.UNAUTHORIZED, detail, {"WWW-Authenticate": "Bearer"})
+
+
+def _is_loopback_name(host: str) -> bool:
+    try:
+        return is_loopback(urlsplit(f"//{host}").hostname or "")
+    except ValueError:
+        return False
+
+
+def _is_cross_site(headers: Headers) -> bool:
+    """Whether a browser says that the request comes from a page of another origin; other clients say nothing."""
+    fetched = headers.get("sec-fetch-site")
+    if fetched is not None:
+        return fetched not in ("same-origin", "none")
+    origin = headers.get("origin")
+    return origin is not None and origin.partition("://")[2] != headers.get("host")
 
 
 class BodyLimitMiddleware:

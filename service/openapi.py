@@ -11,15 +11,20 @@ from service.schemas import Problem
 
 _MEANINGS = {
     400: "The body could not be read.",
+    401: "A key is needed, and none that is valid was presented.",
+    403: "The key's role is not enough, or the request comes from another site's page.",
     404: "Something that the path or the body names is not stored.",
     406: "None of the media types in Accept is offered.",
     409: "The store is in no state to do this; the detail says what to do first.",
     413: "The body or the image is too large.",
     415: "The body or the image is of a format that is not taken.",
     422: "A field is wrong; the detail names it.",
+    429: "Too many requests, or too many jobs that wait; see Retry-After.",
     500: "The service failed.",
     503: "The database does not answer.",
 }
+
+_ANYWHERE = (401, 403, 422, 429, 500, 503)
 
 _TAGS = [
     {"name": "plant", "description": "The tower base, which everything is measured from, and its target planes."},
@@ -27,6 +32,9 @@ _TAGS = [
     {"name": "measurements", "description": "Target photographs: post them, read flux and quality back."},
     {"name": "surfaces", "description": "Mirror surfaces by version: predict them, read the history."},
     {"name": "forecasts", "description": "Flux maps on any plane."},
+    {"name": "jobs", "description": "Work that outlives a request: ask for it, follow it, cancel it."},
+    {"name": "audit", "description": "Who did what when."},
+    {"name": "session", "description": "For pages: a key in a cookie."},
     {"name": "health", "description": "For supervisors."},
 ]
 
@@ -34,10 +42,8 @@ _BINARY = {"type": "string", "format": "binary"}
 
 
 def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """Documented error answers of a route; every route may also fail with 422, 500 and 503."""
-    return {
-        status: {"model": Problem, "description": _MEANINGS[status]} for status in sorted({*statuses, 422, 500, 503})
-    }
+    """Documented error answers of a route; every route may also fail for other reasons of its own or the door's."""
+    return {status: {"model": Problem, "description": _MEANINGS[status]} for status in sorted({*statuses, *_ANYWHERE})}
 
 
 def arrays(description: str) -> dict[int | str, dict[str, Any]]:

@@ -13,16 +13,18 @@ from service.arrays import pack, unpack
 from service.faults import NotFoundError
 from service.pictures import flux_picture, surface_picture
 from service.schemas import (
+    AuditOut,
     ForecastSummary,
     HeliostatOut,
     HeliostatSummary,
+    JobOut,
     MeasurementOut,
     PlantOut,
     SurfaceOut,
     SurfaceSummary,
     TargetOut,
 )
-from service.tables import ForecastRow, HeliostatRow, MeasurementRow, PlantRow, SurfaceRow, TargetRow
+from service.tables import AuditRow, ForecastRow, HeliostatRow, JobRow, MeasurementRow, PlantRow, SurfaceRow, TargetRow
 
 # A flux map's sum where it is normalised (the paper's rule).
 _NORMALISED_SUM = 100.0
@@ -172,6 +174,30 @@ def forecast_summary(row: ForecastRow) -> ForecastSummary:
             "created_at": row.created_at,
         }
     )
+
+
+def job(row: JobRow) -> JobOut:
+    """A job as JSON."""
+    return JobOut.model_validate(row, from_attributes=True)
+
+
+def job_flux(row: JobRow, media_type: str) -> Response:
+    """The flux map of a job; NotFoundError where it has none."""
+    if row.arrays is None or row.result is None:
+        raise NotFoundError(f"job {row.id} ({row.kind}, {row.state}) has no flux map")
+    flux, name = unpack(row.arrays)["flux"], f"job-{row.id}-flux"
+    if media_type == negotiation.PNG:
+        plane = row.result["plane"]
+        title = f"job {row.id}, {row.result['heliostats']} heliostats"
+        return _file(flux_picture(flux, (plane["width"], plane["height"]), "W/m²", title), media_type, f"{name}.png")
+    if media_type != negotiation.JSON:
+        return _file(row.arrays, media_type, f"{name}.npz")
+    return _json(job(row), flux=flux)
+
+
+def audit_entry(row: AuditRow) -> AuditOut:
+    """An entry of the audit trail as JSON."""
+    return AuditOut.model_validate(row, from_attributes=True)
 
 
 def _flux_of(row: ForecastRow) -> NDArray[np.float32]:

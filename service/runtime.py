@@ -62,6 +62,8 @@ class Runtime:
     database: Database
     images: ImageStore
     operations: Operations
+    job_came: threading.Semaphore = field(default_factory=lambda: threading.Semaphore(0))
+    """Released when a job is queued in this process, so that its workers need not wait until they look again."""
     _gate: threading.Semaphore = field(default_factory=lambda: threading.Semaphore(2))
 
     @classmethod

@@ -6,6 +6,7 @@ Numbers are finite, unknown keys are refused, and names fit a pattern that is sa
 from datetime import UTC, datetime
 from typing import Annotated, Any, Generic, Literal, Self, TypeVar
 
+import numpy as np
 from pydantic import (
     AfterValidator,
     AwareDatetime,
@@ -19,6 +20,7 @@ from pydantic import (
     model_validator,
 )
 
+from model.plant import TargetPlane
 from service.names import IDENTIFIER, NAME
 
 Name = Annotated[
@@ -39,6 +41,7 @@ MeasurementName = Annotated[
 Kind = Literal["raw", "cropped", "flux", "flux-centered"]
 Source = Literal["measured", "network", "refined", "imported"]
 Method = Literal["network", "refined"]
+State = Literal["queued", "running", "done", "failed", "cancelled"]
 
 Metres = Annotated[float, Field(ge=-1e6, le=1e6)]
 Position = Annotated[tuple[Metres, Metres, Metres], Field(description="East, north, up of the tower base [m].")]
@@ -212,6 +215,17 @@ class Plane(Model):
     width: Extent = Field(description="[m]")
     height: Extent = Field(description="[m]")
 
+    def named(self, name: str) -> TargetPlane:
+        """The model's plane of this name."""
+        return TargetPlane(
+            name=name,
+            center=np.array(self.center),
+            normal=np.array(self.normal),
+            up=np.array(self.up),
+            width=self.width,
+            height=self.height,
+        )
+
 
 class Corners(Model):
     """A target by its corners as seen from the field, in WGS84 (latitude [deg], longitude [deg], altitude [m])."""
@@ -378,6 +392,11 @@ def _square(value: Any) -> Any:
 
 
 Side = Annotated[int, Field(ge=8, le=1024)]
+Resolution = Annotated[
+    tuple[Side, Side],
+    BeforeValidator(_square),
+    Field(description="Rows and columns of the map, or one number for both."),
+]
 Version = Annotated[int, Field(ge=1, le=2**31 - 1)]
 
 
@@ -395,9 +414,7 @@ class ForecastIn(Model):
         default="current", description="The heliostat's current surface, the ideal one, or a version."
     )
     dni_w_m2: float = Field(default=1000.0, gt=0, le=2000, description="Direct normal irradiance [W/m2].")
-    resolution: Annotated[tuple[Side, Side], BeforeValidator(_square)] = Field(
-        default=(256, 256), description="Rows and columns of the map, or one number for both."
-    )
+    resolution: Resolution = (256, 256)
     window: float | None = Field(
         default=None,
         ge=0.01,
@@ -439,6 +456,43 @@ class ForecastOut(ForecastSummary):
     """A computed flux map."""
 
     flux: list[Any] = Field(description="Rows from the top, columns from the left as seen from the lit side.")
+
+
+# --- jobs -------------------------------------------------------------------------------------------------------------
+
+
+class JobOut(BaseModel):
+    """A job as it stands."""
+
+    id: int
+    kind: str
+    state: State = Field(description="queued, running, then for good done, failed or cancelled.")
+    payload: dict[str, Any] = Field(description="What was asked.")
+    progress: float = Field(description="Share that is done, 0 to 1 [1].")
+    message: str = Field(description="What is being done.")
+    attempts: int = Field(description="How often it was begun.")
+    cancel_requested: bool = Field(description="It ends as soon as its worker sees this.")
+    reason: str | None = Field(description="Why it failed, or why it is tried again.")
+    result: dict[str, Any] | None = Field(description="What a done job gave; by its kind.")
+    created_by: str = Field(description="Name of the key that asked for it.")
+    created_at: datetime
+    not_before: datetime = Field(description="When it is tried next at the earliest.")
+    started_at: datetime | None
+    finished_at: datetime | None
+
+
+# --- audit trail ------------------------------------------------------------------------------------------------------
+
+
+class AuditOut(BaseModel):
+    """An entry of the audit trail."""
+
+    id: int
+    at: datetime
+    actor: str = Field(description="Name of the key; `local` where none is demanded, `cli` and the user elsewhere.")
+    action: str = Field(examples=["key.withdrawn"])
+    subject: str = Field(examples=["key calibration"])
+    detail: dict[str, Any]
 
 
 # --- health and problems ----------------------------------------------------------------------------------------------

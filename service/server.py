@@ -1,12 +1,19 @@
-"""Running the service: what the command line's ``serve`` and ``migrate`` call."""
+"""Running the service: what the command line's ``serve``, ``worker`` and ``migrate`` call."""
 
 import logging
+import signal
+import threading
+from types import FrameType
 
 import uvicorn
 
 from service.app import create_app
 from service.database import Database
+from service.faults import NotStartedError
+from service.handlers import KINDS
+from service.runtime import Runtime
 from service.settings import Settings
+from service.workers import Kinds, Workers
 
 _FORMAT = "%(asctime)s %(levelname)s %(name)s %(message)s"
 # Seconds that requests under way get to finish when the service is told to stop.
@@ -15,11 +22,31 @@ _GRACE_S = 30
 _KEEP_ALIVE_S = 75
 
 
+class _Server(uvicorn.Server):
+    """Ends streams without an end when it is told to stop, instead of waiting for their readers."""
+
+    def __init__(self, config: uvicorn.Config, stopping: threading.Event) -> None:
+        super().__init__(config)
+        self._stopping = stopping
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """On SIGTERM or SIGINT."""
+        self._stopping.set()
+        super().handle_exit(sig, frame)
+
+
 def serve(settings: Settings) -> None:
-    """Run the service until it is told to stop; an embedded SQLite store is migrated first."""
+    """Run the service until it is told to stop; an embedded SQLite store is migrated first.
+
+    Raises
+    ------
+    NotStartedError
+        Where the store or the door keeps it from starting.
+    """
     logging.basicConfig(level=settings.log_level.upper(), format=_FORMAT)
-    uvicorn.run(
-        create_app(settings),
+    app = create_app(settings)
+    config = uvicorn.Config(
+        app,
         host=settings.host,
         port=settings.port,
         log_config=None,  # ours above
@@ -28,6 +55,28 @@ def serve(settings: Settings) -> None:
         timeout_graceful_shutdown=_GRACE_S,
         timeout_keep_alive=_KEEP_ALIVE_S,
     )
+    server = _Server(config, app.state.stopping)
+    try:
+        server.run()
+    except SystemExit as refusal:  # uvicorn's way to say that the application or the port failed
+        raise NotStartedError("the service could not start; the log above says why") from refusal
+
+
+def work(settings: Settings, kinds: Kinds = KINDS) -> None:
+    """Work at the store's jobs, ``job_workers`` at a time, until SIGTERM or SIGINT; one under way is put back."""
+    logging.basicConfig(level=settings.log_level.upper(), format=_FORMAT)
+    runtime = Runtime.from_settings(settings)
+    try:
+        runtime.database.require_current()
+        workers = Workers(runtime, kinds, settings.job_workers)
+        stopping = threading.Event()
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, lambda *_: stopping.set())
+        workers.start()
+        stopping.wait()
+        workers.stop()
+    finally:
+        runtime.close()
 
 
 def migrate(settings: Settings) -> str:

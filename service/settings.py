@@ -2,9 +2,9 @@
 
 import ipaddress
 from pathlib import Path
-from typing import Literal, Self
+from typing import Literal
 
-from pydantic import Field, SecretStr, field_validator, model_validator
+from pydantic import Field, SecretStr, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 from sqlalchemy import URL, make_url
 from sqlalchemy.exc import ArgumentError
@@ -47,7 +47,7 @@ class Settings(BaseSettings):
     port: int = Field(default=8000, ge=1, le=65535)
     allow_open_network: bool = Field(
         default=False,
-        description="Acknowledges that whoever reaches a non-loopback host may read and write everything.",
+        description="Unsafe: while no key was made, whoever reaches a non-loopback host may read and write everything.",
     )
     max_image_bytes: int = Field(default=32 * 2**20, ge=1024, description="Largest image accepted [bytes].")
     max_image_pixels: int = Field(
@@ -56,8 +56,27 @@ class Settings(BaseSettings):
     max_json_bytes: int = Field(
         default=2**20, ge=1024, description="Largest request body that is not an image [bytes]."
     )
+    requests_per_s: float = Field(
+        default=200.0, gt=0, le=1e6, description="Requests of one key, or one client without a key, each second."
+    )
+    requests_burst: int = Field(default=400, ge=1, le=10**6, description="Most of them at once after a pause.")
     parallel_computations: int = Field(
         default=2, ge=1, le=64, description="Measurements, predictions and tracings at a time."
+    )
+    job_workers: int = Field(
+        default=1, ge=0, le=64, description="Jobs that `serve` works at itself at a time; 0 where `worker` does."
+    )
+    job_lease_s: float = Field(
+        default=30.0, ge=0.5, le=3600, description="A worker that was silent for so long [s] has lost its job."
+    )
+    job_poll_s: float = Field(default=0.5, ge=0.05, le=60, description="How often workers look for jobs [s].")
+    job_attempts: int = Field(default=3, ge=1, le=20, description="How often a job is tried before it has failed.")
+    job_retry_s: float = Field(
+        default=5.0, ge=0, le=600, description="Pause before the second attempt [s]; it doubles from then on."
+    )
+    max_queued_jobs: int = Field(default=1000, ge=1, description="Most jobs that may wait.")
+    import_root: Path | None = Field(
+        default=None, description="Folder whose subfolders jobs may import; without it no job imports."
     )
     log_level: LogLevel = "info"
 
@@ -73,15 +92,6 @@ class Settings(BaseSettings):
         if backend not in _DRIVERS:
             raise ValueError(f"must be a sqlite or postgresql URL, not {backend}")
         return value
-
-    @model_validator(mode="after")
-    def _refuse_open_door(self) -> Self:
-        if not is_loopback(self.host) and not self.allow_open_network:
-            raise ValueError(
-                f"host {self.host} is reachable from other machines and the service asks nobody who they are: "
-                "listen on 127.0.0.1 or set HELIOTWIN_ALLOW_OPEN_NETWORK=true"
-            )
-        return self
 
     @property
     def password(self) -> SecretStr | None:

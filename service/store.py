@@ -47,7 +47,7 @@ class Change(StrEnum):
     UNCHANGED = "unchanged"
 
 
-def _insert(session: Session, row: Base) -> bool:
+def insert(session: Session, row: Base) -> bool:
     """Insert ``row`` unless a unique constraint forbids it; False where another writer was first."""
     try:
         with session.begin_nested():
@@ -94,7 +94,7 @@ def put_plant(session: Session, name: str, origin: ArrayLike) -> Change:
     values = {"name": name, "latitude_deg": latitude, "longitude_deg": longitude, "altitude_m": altitude}
     plant = session.get(PlantRow, 1)
     if plant is None:
-        if _insert(session, PlantRow(id=1, **values)):
+        if insert(session, PlantRow(id=1, **values)):
             return Change.NEW
         plant = get_plant(session)
     if plant.origin != (latitude, longitude, altitude) and _has_positions(session):
@@ -144,7 +144,7 @@ def put_heliostat(
     row = find_heliostat(session, name)
     if row is None:
         row = HeliostatRow(name=name, **values)
-        if _insert(session, row):
+        if insert(session, row):
             return row, Change.NEW
         row = get_heliostat(session, name)
     return row, _assign(row, values)
@@ -190,7 +190,7 @@ def put_target(
     row = find_target(session, plane.name)
     if row is None:
         row = TargetRow(name=plane.name, corners=corners, **values)
-        if _insert(session, row):
+        if insert(session, row):
             return row, Change.NEW
         row = get_target(session, plane.name)
     moved = any(getattr(row, name) != value for name, value in values.items())
@@ -304,7 +304,7 @@ def recent_measurements(session: Session, heliostat: HeliostatRow, limit: int) -
 
 def _put_image(session: Session, image: NewImage) -> None:
     if session.get(ImageRow, image.sha256) is None:
-        _insert(session, ImageRow(**asdict(image)))
+        insert(session, ImageRow(**asdict(image)))
 
 
 def _free_identifier(session: Session, heliostat: HeliostatRow, new: NewMeasurement) -> str:
@@ -369,7 +369,7 @@ def add_measurement(session: Session, heliostat: HeliostatRow, new: NewMeasureme
         if existing is not None:
             return existing, False
         row = _measurement_row(heliostat, _free_identifier(session, heliostat, new), new)
-        if _insert(session, row):
+        if insert(session, row):
             session.refresh(row, ["target", "image"])
             return row, True
     raise ConflictError("too many writers on the same measurement; try again")
@@ -450,7 +450,7 @@ def add_surface(
                 return existing, False
         last = session.scalar(select(func.max(SurfaceRow.version)).where(SurfaceRow.heliostat_id == heliostat.id))
         row = _surface_row(heliostat, (last or 0) + 1, new, content)
-        if _insert(session, row):
+        if insert(session, row):
             return row, True
     raise ConflictError("too many writers on the same heliostat's surfaces; try again")
 

@@ -5,7 +5,7 @@ them.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from typing import TYPE_CHECKING, Any
@@ -17,10 +17,11 @@ from sqlalchemy.orm import Session
 from model.errors import ImageRefusedError, InvalidInputError
 from model.frames import sun_direction, wgs84_to_enu
 from model.plant import Heliostat, TargetPlane
-from service import store
+from service import audit, store
 from service.arrays import pack, unpack
 from service.faults import ConflictError, NotFoundError, TooLargeError
 from service.images import digest, media_type
+from service.keys import RESERVED
 from service.runtime import Operations, Runtime
 from service.store import NewImage, NewMeasurement, NewSurface
 from service.tables import ForecastRow, HeliostatRow, MeasurementRow, SurfaceRow
@@ -224,10 +225,13 @@ def predict_surface(
     method: "Method" = "network",
     measurements: Sequence[str] | None = None,
     images: int = 8,
+    actor: str = RESERVED,
+    also: Callable[[Session, SurfaceRow], None] | None = None,
 ) -> SurfaceRow:
     """Predict a heliostat's surface from stored measurements and keep it as its next version.
 
-    It is valid from when the newest of its images was taken, where that is known, else from now.
+    It is valid from when the newest of its images was taken, where that is known, else from now. ``actor`` is who
+    asked for it. ``also`` writes in the same transaction; what it raises undoes the surface too.
 
     Raises
     ------
@@ -247,7 +251,11 @@ def predict_surface(
     with runtime.database.writing() as session:
         row = store.get_heliostat(session, heliostat_name)
         used = [store.get_measurement(session, row, name) for name in predicted.used]
-        return store.add_surface(session, row, _new_surface(method, predicted, used))[0]
+        surface, _ = store.add_surface(session, row, _new_surface(method, predicted, used))
+        audit.record(session, actor, "surface.predicted", f"heliostat {heliostat_name}", version=surface.version)
+        if also is not None:
+            also(session, surface)
+        return surface
 
 
 def _new_surface(method: str, predicted: "SurfacePrediction", used: list[MeasurementRow]) -> NewSurface:
@@ -307,31 +315,18 @@ def _plane(session: Session, request: ForecastRequest) -> TargetPlane:
     return store.target_plane(store.get_target(session, request.target))
 
 
-def _forecast_row(request: ForecastRequest, plane: TargetPlane, traced: "Forecast") -> ForecastRow:
-    right, up = _plain(traced.center_of_mass)  # null where no light comes near the plane
-    geometry = {name: _plain(getattr(plane, name)) for name in ("center", "normal", "up", "width", "height")}
-    return ForecastRow(
-        target_name=request.target,
-        plane=geometry,
-        sun_azimuth_deg=request.sun_azimuth_deg,
-        sun_elevation_deg=request.sun_elevation_deg,
-        aim_point_m=None if request.aim is None else list(request.aim),
-        dni_w_m2=request.dni,
-        window_m=request.window,
-        normalised=request.normalised,
-        rows=traced.flux.shape[0],
-        columns=traced.flux.shape[1],
-        peak_w_m2=float(traced.peak),
-        power_w=float(traced.power),
-        center_right_m=right,
-        center_up_m=up,
-        model_version=traced.model_version,
-        flux=pack({"flux": np.asarray(traced.flux, np.float32)}),
-    )
+@dataclass(frozen=True, eq=False)
+class Traced:
+    """A flux map with the stored things that it was made from; ``surface`` is None for the ideal one."""
+
+    heliostat: HeliostatRow
+    surface: SurfaceRow | None
+    plane: TargetPlane
+    forecast: "Forecast"
 
 
-def make_forecast(runtime: Runtime, request: ForecastRequest) -> ForecastRow:
-    """Compute a flux map and keep it.
+def trace_request(runtime: Runtime, request: ForecastRequest) -> Traced:
+    """Compute a flux map.
 
     Raises
     ------
@@ -345,12 +340,45 @@ def make_forecast(runtime: Runtime, request: ForecastRequest) -> ForecastRow:
         heliostat = load_heliostat(session, row)
         plane = _plane(session, request)
         surface = _chosen_surface(session, row, request.surface)
-    traced = _trace(runtime, heliostat, None if surface is None else unpack(surface.arrays)["z"], request, plane)
-    forecast = _forecast_row(request, plane, traced)
-    forecast.heliostat_id = row.id
-    forecast.surface_id = None if surface is None else surface.id
+    z = None if surface is None else unpack(surface.arrays)["z"]
+    return Traced(row, surface, plane, _trace(runtime, heliostat, z, request, plane))
+
+
+def plane_as_json(plane: TargetPlane) -> dict[str, Any]:
+    """A plane's geometry, as forecasts keep it [m]."""
+    return {name: _plain(getattr(plane, name)) for name in ("center", "normal", "up", "width", "height")}
+
+
+def _forecast_row(request: ForecastRequest, traced: Traced) -> ForecastRow:
+    forecast = traced.forecast
+    right, up = _plain(forecast.center_of_mass)  # null where no light comes near the plane
+    return ForecastRow(
+        heliostat_id=traced.heliostat.id,
+        surface_id=None if traced.surface is None else traced.surface.id,
+        target_name=request.target,
+        plane=plane_as_json(traced.plane),
+        sun_azimuth_deg=request.sun_azimuth_deg,
+        sun_elevation_deg=request.sun_elevation_deg,
+        aim_point_m=None if request.aim is None else list(request.aim),
+        dni_w_m2=request.dni,
+        window_m=request.window,
+        normalised=request.normalised,
+        rows=forecast.flux.shape[0],
+        columns=forecast.flux.shape[1],
+        peak_w_m2=float(forecast.peak),
+        power_w=float(forecast.power),
+        center_right_m=right,
+        center_up_m=up,
+        model_version=forecast.model_version,
+        flux=pack({"flux": np.asarray(forecast.flux, np.float32)}),
+    )
+
+
+def make_forecast(runtime: Runtime, request: ForecastRequest) -> ForecastRow:
+    """Compute a flux map and keep it; raises what `trace_request` raises."""
+    row = _forecast_row(request, trace_request(runtime, request))
     with runtime.database.writing() as session:
-        return store.add_forecast(session, forecast)
+        return store.add_forecast(session, row)
 
 
 def _trace(

@@ -5,9 +5,8 @@ from typing import Annotated
 from fastapi import APIRouter, Body, Depends, Path, Query, Response, status
 
 from service import representations, store
-from service.dependencies import Limit, MediaType, RuntimeDep, require_json
+from service.dependencies import OPERATE, READ, Limit, MediaType, RuntimeDep, require_json
 from service.openapi import arrays, problems
-from service.routers.plant import rectangle
 from service.schemas import ForecastIn, ForecastSummary, Name, Page, Version
 from service.workflows import ForecastRequest, make_forecast
 
@@ -25,7 +24,7 @@ def _request(body: ForecastIn) -> ForecastRequest:
     return ForecastRequest(
         heliostat=body.heliostat,
         target=body.target,
-        plane=None if body.plane is None else rectangle("plane", body.plane),
+        plane=None if body.plane is None else body.plane.named("plane"),
         sun_azimuth_deg=body.sun.azimuth_deg,
         sun_elevation_deg=body.sun.elevation_deg,
         aim=body.aim_point,
@@ -41,7 +40,7 @@ def _request(body: ForecastIn) -> ForecastRequest:
     "",
     status_code=status.HTTP_201_CREATED,
     responses=problems(404, 409, 413, 415),
-    dependencies=[Depends(require_json)],
+    dependencies=[OPERATE, Depends(require_json)],
 )
 def post_forecast(
     request: Annotated[ForecastIn, Body(examples=[_EXAMPLE])], runtime: RuntimeDep, response: Response
@@ -52,7 +51,7 @@ def post_forecast(
     return representations.forecast_summary(row)
 
 
-@router.get("", responses=problems(404))
+@router.get("", responses=problems(404), dependencies=[READ])
 def list_forecasts(
     runtime: RuntimeDep,
     limit: Limit = 100,
@@ -67,7 +66,7 @@ def list_forecasts(
     return Page(items=items, next=str(items[-1].id) if len(rows) > limit else None)
 
 
-@router.get("/{number}", responses={**problems(404, 406), **arrays("`flux` (rows, columns).")})
+@router.get("/{number}", responses={**problems(404, 406), **arrays("`flux` (rows, columns).")}, dependencies=[READ])
 def get_forecast(
     number: Annotated[Version, Path(description="Id of the forecast.")], runtime: RuntimeDep, media_type: MediaType
 ) -> Response:

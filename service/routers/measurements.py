@@ -7,6 +7,8 @@ from pydantic import Json
 
 from service import representations, store
 from service.dependencies import (
+    INGEST,
+    READ,
     Limit,
     MeasurementPath,
     MediaType,
@@ -54,7 +56,7 @@ def _bytes(upload: UploadFile, limit: int) -> bytes:
         **problems(400, 404, 409, 413, 415),
         200: {"model": MeasurementOut, "description": "This image was there already; nothing changed."},
     },
-    dependencies=[Depends(require_multipart)],
+    dependencies=[INGEST, Depends(require_multipart)],
 )
 def post_measurement(
     name: NamePath,
@@ -76,7 +78,7 @@ def post_measurement(
     return representations.measurement(name, row)
 
 
-@router.get("", responses=problems(404))
+@router.get("", responses=problems(404), dependencies=[READ])
 def list_measurements(
     name: NamePath,
     runtime: RuntimeDep,
@@ -91,7 +93,7 @@ def list_measurements(
     return Page(items=items, next=items[-1].id if len(rows) > limit else None)
 
 
-@router.get("/{measurement}", responses=problems(404))
+@router.get("/{measurement}", responses=problems(404), dependencies=[READ])
 def get_measurement(name: NamePath, measurement: MeasurementPath, runtime: RuntimeDep) -> MeasurementOut:
     """A measurement with its quality record."""
     with runtime.database.reading() as session:
@@ -103,6 +105,7 @@ def get_measurement(name: NamePath, measurement: MeasurementPath, runtime: Runti
     "/{measurement}/image",
     response_class=Response,
     responses={**problems(404), 200: {"description": "The file as it was sent.", "content": {"image/*": {}}}},
+    dependencies=[READ],
 )
 def get_image(name: NamePath, measurement: MeasurementPath, runtime: RuntimeDep) -> Response:
     """The image as it was sent."""
@@ -112,7 +115,9 @@ def get_image(name: NamePath, measurement: MeasurementPath, runtime: RuntimeDep)
     return Response(runtime.images.read(row.image_sha256), media_type=row.image.media_type, headers=headers)
 
 
-@router.get("/{measurement}/flux", responses={**problems(404, 406), **arrays("`flux` and `centered`.")})
+@router.get(
+    "/{measurement}/flux", responses={**problems(404, 406), **arrays("`flux` and `centered`.")}, dependencies=[READ]
+)
 def get_flux(name: NamePath, measurement: MeasurementPath, runtime: RuntimeDep, media_type: MediaType) -> Response:
     """The measured flux: over the whole target (256 x 256), and 64 x 64 about the centre of mass with sum 100."""
     with runtime.database.reading() as session:

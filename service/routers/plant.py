@@ -2,33 +2,20 @@
 
 from typing import Any
 
-import numpy as np
 from fastapi import APIRouter, Body, Depends, Response, status
 from sqlalchemy.orm import Session
 
 from model.frames import wgs84_to_enu
 from model.plant import TargetPlane
-from service import representations, store
-from service.dependencies import NamePath, RuntimeDep, require_json
+from service import audit, representations, store
+from service.dependencies import OPERATE, READ, IdentityDep, NamePath, RuntimeDep, require_json
 from service.openapi import problems
-from service.schemas import Corners, Page, Plane, PlantOut, TargetIn, TargetOut, TowerMeasurements
+from service.schemas import Corners, Page, PlantOut, TargetIn, TargetOut, TowerMeasurements
 
 router = APIRouter(tags=["plant"])
 
 _CORNERS = ("upper_left", "upper_right", "lower_left", "lower_right")
 _PLANE_EXAMPLE = {"plane": {"center": [0, -3.2, 35.9], "normal": [0, 1, 0], "width": 8.6, "height": 7.2}}
-
-
-def rectangle(name: str, plane: Plane) -> TargetPlane:
-    """The model's plane of a requested one."""
-    return TargetPlane(
-        name=name,
-        center=np.array(plane.center),
-        normal=np.array(plane.normal),
-        up=np.array(plane.up),
-        width=plane.width,
-        height=plane.height,
-    )
 
 
 def _from_corners(session: Session, name: str, corners: Corners) -> TargetPlane:
@@ -41,34 +28,35 @@ def _paint_corners(document: dict[str, Any], name: str) -> dict[str, list[float]
     return {corner: [float(value) for value in coordinates[corner]] for corner in _CORNERS}
 
 
-@router.get("/plant", responses=problems(409))
+@router.get("/plant", responses=problems(409), dependencies=[READ])
 def get_plant(runtime: RuntimeDep) -> PlantOut:
     """The plant's name and the tower base."""
     with runtime.database.reading() as session:
         return representations.plant(store.get_plant(session))
 
 
-@router.put("/plant", responses=problems(409, 413, 415), dependencies=[Depends(require_json)])
-def put_plant(document: TowerMeasurements, runtime: RuntimeDep) -> PlantOut:
+@router.put("/plant", responses=problems(409, 413, 415), dependencies=[OPERATE, Depends(require_json)])
+def put_plant(document: TowerMeasurements, runtime: RuntimeDep, identity: IdentityDep) -> PlantOut:
     """Set the tower base and all planar targets from PAINT's tower measurements; repeating it changes nothing."""
     from service.paint import read_targets
 
     origin, targets = read_targets(document.raw)
     with runtime.database.writing() as session:
-        store.put_plant(session, document.power_plant_properties.ID, origin)
+        change = store.put_plant(session, document.power_plant_properties.ID, origin)
+        audit.record(session, identity.name, "plant.set", f"plant {document.power_plant_properties.ID}", change=change)
         for name, plane in targets.items():
             store.put_target(session, plane, _paint_corners(document.raw, name))
         return representations.plant(store.get_plant(session))
 
 
-@router.get("/targets", responses=problems())
+@router.get("/targets", responses=problems(), dependencies=[READ])
 def list_targets(runtime: RuntimeDep) -> Page[TargetOut]:
     """All target planes."""
     with runtime.database.reading() as session:
         return Page(items=[representations.target(row) for row in store.list_targets(session)], next=None)
 
 
-@router.get("/targets/{name}", responses=problems(404))
+@router.get("/targets/{name}", responses=problems(404), dependencies=[READ])
 def get_target(name: NamePath, runtime: RuntimeDep) -> TargetOut:
     """A target plane."""
     with runtime.database.reading() as session:
@@ -78,13 +66,14 @@ def get_target(name: NamePath, runtime: RuntimeDep) -> TargetOut:
 @router.put(
     "/targets/{name}",
     responses={**problems(409, 413, 415), 201: {"model": TargetOut, "description": "It is new."}},
-    dependencies=[Depends(require_json)],
+    dependencies=[OPERATE, Depends(require_json)],
 )
 def put_target(
     name: NamePath,
     request: TargetIn = Body(examples=[_PLANE_EXAMPLE]),
     *,
     runtime: RuntimeDep,
+    identity: IdentityDep,
     response: Response,
 ) -> TargetOut:
     """Set a target plane, by its rectangle [m] or by its four corners in WGS84."""
@@ -94,8 +83,9 @@ def put_target(
             corners = {corner: list(getattr(request.corners, corner)) for corner in _CORNERS}
         else:
             assert request.plane is not None  # the schema wants one of both
-            plane, corners = rectangle(name, request.plane), None
+            plane, corners = request.plane.named(name), None
         row, change = store.put_target(session, plane, corners)
+        audit.record(session, identity.name, "target.set", f"target {name}", change=change)
         if change is store.Change.NEW:
             response.status_code = status.HTTP_201_CREATED
         return representations.target(row)

@@ -6,7 +6,7 @@ from typing import Annotated
 from fastapi import APIRouter, Body, Depends, Path, Query, Response, status
 
 from service import representations, store
-from service.dependencies import Limit, MediaType, NamePath, RuntimeDep, require_json
+from service.dependencies import OPERATE, READ, IdentityDep, Limit, MediaType, NamePath, RuntimeDep, require_json
 from service.openapi import arrays, problems
 from service.runtime import Runtime
 from service.schemas import Moment, Page, SurfaceIn, SurfaceOut, SurfaceSummary, Version
@@ -19,21 +19,27 @@ router = APIRouter(prefix="/heliostats/{name}/surfaces", tags=["surfaces"])
     "",
     status_code=status.HTTP_201_CREATED,
     responses=problems(404, 409, 413, 415),
-    dependencies=[Depends(require_json)],
+    dependencies=[OPERATE, Depends(require_json)],
 )
 def post_surface(
     name: NamePath,
     runtime: RuntimeDep,
+    identity: IdentityDep,
     response: Response,
     request: Annotated[SurfaceIn, Body(examples=[{"method": "network", "images": 4}])],
 ) -> SurfaceOut:
     """Predict the surface from stored measurements and keep it as the next version."""
-    row = predict_surface(runtime, name, request.method, request.measurements, request.images)
+    row = predict_surface(runtime, name, request.method, request.measurements, request.images, identity.name)
     response.headers["Location"] = f"/v1/heliostats/{name}/surfaces/{row.version}"
     return representations.surface_full(name, row)
 
 
-@router.get("", responses={**problems(404, 406), **arrays("With `at`: the surface itself.")}, response_model=None)
+@router.get(
+    "",
+    responses={**problems(404, 406), **arrays("With `at`: the surface itself.")},
+    response_model=None,
+    dependencies=[READ],
+)
 def list_surfaces(
     name: NamePath,
     runtime: RuntimeDep,
@@ -59,13 +65,17 @@ def _at(runtime: Runtime, name: str, moment: datetime | None, media_type: str) -
     return representations.surface(name, row, media_type)
 
 
-@router.get("/current", responses={**problems(404, 406), **arrays("`control_points`, `z`, `z_std` [m].")})
+@router.get(
+    "/current", responses={**problems(404, 406), **arrays("`control_points`, `z`, `z_std` [m].")}, dependencies=[READ]
+)
 def get_current_surface(name: NamePath, runtime: RuntimeDep, media_type: MediaType) -> Response:
     """The surface that is valid now."""
     return _at(runtime, name, None, media_type)
 
 
-@router.get("/{version}", responses={**problems(404, 406), **arrays("`control_points`, `z`, `z_std` [m].")})
+@router.get(
+    "/{version}", responses={**problems(404, 406), **arrays("`control_points`, `z`, `z_std` [m].")}, dependencies=[READ]
+)
 def get_surface(
     name: NamePath,
     version: Annotated[Version, Path(description="Number of the version, from 1.")],

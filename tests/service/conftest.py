@@ -32,6 +32,8 @@ with warnings.catch_warnings():
     from fastapi.testclient import TestClient
 
 POSTGRES = os.environ.get("HELIOTWIN_TEST_POSTGRES", "postgresql://postgres@127.0.0.1:5432/postgres")
+# No workers beside the test, and no bound on how fast it asks.
+QUIET: dict[str, Any] = {"job_workers": 0, "requests_per_s": 1e6, "requests_burst": 10**6}
 ORIGIN = (50.913421122592574, 6.387824755874856, 87.0)
 
 
@@ -154,12 +156,12 @@ def operations() -> FakeOperations:
 
 @pytest.fixture
 def settings(tmp_path: Path) -> Settings:
-    return Settings(data_dir=tmp_path / "data", max_image_bytes=200_000, max_image_pixels=500_000)
+    return Settings(data_dir=tmp_path / "data", max_image_bytes=200_000, max_image_pixels=500_000, **QUIET)
 
 
 def client_of(app: FastAPI) -> TestClient:
     """A client that sees a failure as the caller would, instead of its exception."""
-    return TestClient(app, raise_server_exceptions=False)
+    return TestClient(app, base_url="http://127.0.0.1", raise_server_exceptions=False)
 
 
 @pytest.fixture
@@ -185,7 +187,9 @@ def client(bare: TestClient, tower: dict[str, Any], properties: dict[str, Any]) 
 @pytest.fixture(scope="session")
 def refusing(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
     """A service for requests that must be refused: shared, because they change nothing; checked at the end."""
-    settings = Settings(data_dir=tmp_path_factory.mktemp("refusing"), max_image_bytes=200_000, max_image_pixels=500_000)
+    settings = Settings(
+        data_dir=tmp_path_factory.mktemp("refusing"), max_image_bytes=200_000, max_image_pixels=500_000, **QUIET
+    )
     with client_of(create_app(settings, FakeOperations())) as client:
         client.put("/v1/plant", json=tower_document())
         client.put("/v1/heliostats/AA39", json=properties_document())

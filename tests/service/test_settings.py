@@ -39,16 +39,14 @@ def test_password_comes_from_its_file(tmp_path: Path):
     assert "s3" not in str(settings.database)
 
 
-@pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.1.5", "plant.example"])
-def test_open_door_needs_an_acknowledgement(host: str):
-    with pytest.raises(ValidationError, match="HELIOTWIN_ALLOW_OPEN_NETWORK"):
-        Settings(host=host)
-    assert Settings(host=host, allow_open_network=True).host == host
-
-
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.9.9.9", "::1", "localhost"])
 def test_loopback_is_known(host: str):
     assert is_loopback(host)
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.1.5", "plant.example", "127.0.0.1.example", ""])
+def test_anything_else_may_be_reached_by_others(host: str):
+    assert not is_loopback(host)
 
 
 @pytest.mark.parametrize("url", ["mysql://a/b", "nonsense", "", "postgresql"])

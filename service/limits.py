@@ -1,0 +1,32 @@
+"""How often somebody may ask: a token bucket for each."""
+
+import time
+from collections import OrderedDict
+from collections.abc import Callable
+
+# Buckets that are kept; the one unused for longest goes first.
+_MOST = 10_000
+
+
+class Buckets:
+    """Each name has a bucket of ``burst`` tokens that fills at ``rate_per_s``; a request takes one.
+
+    For one event loop: nothing here waits, so nothing needs a lock.
+    """
+
+    def __init__(self, rate_per_s: float, burst: int, clock: Callable[[], float] = time.monotonic) -> None:
+        self.rate_per_s = rate_per_s
+        self.burst = burst
+        self._clock = clock
+        self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()
+
+    def wait_s(self, name: str) -> float:
+        """Take a token of ``name``: 0 where there was one, else the seconds until there is."""
+        at = self._clock()
+        tokens, since = self._buckets.pop(name, (float(self.burst), at))
+        tokens = min(float(self.burst), tokens + (at - since) * self.rate_per_s)
+        has_one = tokens >= 1
+        self._buckets[name] = (tokens - 1 if has_one else tokens, at)
+        if len(self._buckets) > _MOST:
+            self._buckets.popitem(last=False)
+        return 0.0 if has_one else (1 - tokens) / self.rate_per_s
