@@ -185,9 +185,7 @@ def allowed_folder(root: Path | None, folder: str) -> Path:
         raise InvalidInputError(f"folder: there is no folder {folder!r} under the one that may be imported")
     for entry in path.rglob("*"):
         if entry.is_symlink() and not entry.resolve().is_relative_to(top):
-            raise InvalidInputError(
-                f"folder: {entry.relative_to(top)} is a link that leads outside; copy what it names"
-            )
+            raise InvalidInputError(f"folder: {entry.relative_to(top)} leads outside; copy what it links to")
     return path
 
 

@@ -11,7 +11,7 @@ from service.app import create_app
 from service.database import Database
 from service.faults import NotStartedError
 from service.handlers import KINDS
-from service.runtime import Runtime
+from service.runtime import Operations, Runtime
 from service.settings import Settings
 from service.workers import Kinds, Workers
 
@@ -62,10 +62,10 @@ def serve(settings: Settings) -> None:
         raise NotStartedError("the service could not start; the log above says why") from refusal
 
 
-def work(settings: Settings, kinds: Kinds = KINDS) -> None:
+def work(settings: Settings, kinds: Kinds = KINDS, operations: Operations | None = None) -> None:
     """Work at the store's jobs, ``job_workers`` at a time, until SIGTERM or SIGINT; one under way is put back."""
     logging.basicConfig(level=settings.log_level.upper(), format=_FORMAT)
-    runtime = Runtime.from_settings(settings)
+    runtime = Runtime.from_settings(settings, operations)
     try:
         runtime.database.require_current()
         workers = Workers(runtime, kinds, settings.job_workers)

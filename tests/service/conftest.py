@@ -2,6 +2,8 @@
 
 import json
 import os
+import random
+import socket
 import uuid
 import warnings
 from collections.abc import Callable, Iterator
@@ -35,6 +37,15 @@ POSTGRES = os.environ.get("HELIOTWIN_TEST_POSTGRES", "postgresql://postgres@127.
 # No workers beside the test, and no bound on how fast it asks.
 QUIET: dict[str, Any] = {"job_workers": 0, "requests_per_s": 1e6, "requests_burst": 10**6}
 ORIGIN = (50.913421122592574, 6.387824755874856, 87.0)
+
+
+def free_port() -> int:
+    """A port to listen on, below those that the system gives to outgoing connections at any moment."""
+    while True:
+        port = random.randint(20_000, 30_000)
+        with socket.socket() as probe:
+            if probe.connect_ex(("127.0.0.1", port)):
+                return port
 
 
 # --- databases --------------------------------------------------------------------------------------------------------
@@ -143,7 +154,8 @@ class FakeOperations:
         if options["aim"] is not None and options["aim"][2] < 0:
             raise UnreachableError("the aim point lies behind the mirror")
         flux = np.full(options["resolution"], 2.0, dtype=np.float32)
-        return Forecast(flux=flux, center_of_mass=np.array([0.1, 0.2]), peak=2.0, power=50.0)
+        center = np.array([0.1, 0.2])
+        return Forecast(flux=flux, center_of_mass=center, peak=2.0, power=50.0, model_version="fake")
 
 
 @pytest.fixture

@@ -2,7 +2,6 @@
 
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -14,14 +13,9 @@ import pytest
 from service.server import migrate
 from service.settings import Settings
 
+from .conftest import free_port
+
 _SERVE = "from service.server import serve; from service.settings import Settings; serve(Settings())"
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
 
 
 def _wait(url: str, process: subprocess.Popen[bytes]) -> httpx.Response:
@@ -35,7 +29,7 @@ def _wait(url: str, process: subprocess.Popen[bytes]) -> httpx.Response:
 
 
 def test_process_starts_answers_and_stops(tmp_path: Path):
-    port = _free_port()
+    port = free_port()
     root = str(Path(__file__).parents[2])
     environment = os.environ | {
         "HELIOTWIN_PORT": str(port),
