@@ -1,75 +1,188 @@
-"""How well a run predicts surfaces it never saw: ``python -m training.evaluate --run runs/best``.
+"""How well surfaces are predicted that nobody has learnt from, as the paper tells it: ``python -m training.evaluate``.
 
-Held-out measured surfaces are placed over the field, photographed under random suns, predicted, and traced again under
-new suns. Beside the network stand the ideal surface and the mean surface of the training heliostats, which a network
-that has learnt anything must beat.
+Held-out measured surfaces stand all over the field (`training.cases`), are photographed, predicted from their images,
+and traced again under new suns. Beside the network and the refinement stand the ideal surface, the paper's network
+trained here, and the mean surface of the training heliostats, which alone is not far from the truth: a network that
+does not clearly beat it has learnt nothing.
+
+Tables in Markdown go to the standard output; they, every case's outcome and the plots to ``out/evaluation``.
 """
 
 import argparse
 import json
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from model.metrics import flux_accuracy, surface_error
 from model.network.architecture import MAX_IMAGES
-from training.render import Camera, render
-from training.train import Run, TrainConfig
+from model.network.predictor import WEIGHTS
+from training import plots
+from training.cases import Case, make_cases
+from training.figures import Figures, Outcome, markdown, median_error, outcomes_of, shown
+from training.methods import Method, always, by_network, by_refinement, held_out_of
+from training.render import Camera, CleanCamera, load_field
+from training.surfaces import load_surfaces, untilted
+from training.train import TrainConfig
 
 Array = NDArray[np.float64]
 
+PAPER = "paper (Lewen et al. 2024)"
+PAPERS_NETWORK = "paper's network, trained here"
+REFINEMENT = "refinement"
 
-def _accuracy(predicted: Array, truth: Array, run: Run, seed: int) -> float:
-    """Mean flux accuracy of surfaces (B, 4, 8, 8) [m] against the true ones at four suns the prediction did not see."""
-    forecast, measured = (
-        render(z, 4, run.field, run.config.situations, None, torch.device("cpu"), seed)[0] for z in (predicted, truth)
-    )
-    pairs = zip(forecast.flatten(0, 1).numpy(), measured.flatten(0, 1).numpy(), strict=True)
-    return float(np.mean([flux_accuracy(b, a) for a, b in pairs]))
+DISTANCES = (0, 75, 125, 200, 300)
+"""Edges [m] of the bins of errors over distance."""
 
 
-def _errors(predicted: Array, truth: Array) -> dict[str, float]:
-    """Median, mean and quartiles [mm] of the error of control heights."""
-    errors = np.array([surface_error(p, t) * 1e3 for p, t in zip(predicted, truth, strict=True)])
-    names = ("min", "q1", "median", "q3", "max")
-    figures = dict(zip(names, np.quantile(errors, [0, 0.25, 0.5, 0.75, 1]), strict=True))
-    return {name: round(float(value), 4) for name, value in {**figures, "mean": errors.mean()}.items()}
+@dataclass(frozen=True)
+class Evaluation:
+    """All that is found out, by method; the series hold median errors [mm].
+
+    ``over_distance`` has a value for each bin of `DISTANCES`, ``over_inputs`` for 1 to 8 images, of the first ``few``
+    cases, which are the only ones that refinement, which takes seconds, was tried on.
+    """
+
+    outcomes: dict[str, list[Outcome]]
+    over_inputs: dict[str, list[float]]
+    few: int
+
+    @property
+    def figures(self) -> dict[str, Figures]:
+        """Figures of each method; the ideal surface comes first among them."""
+        ideal = next(iter(self.outcomes.values()))
+        return {name: Figures.of(found, ideal) for name, found in self.outcomes.items()}
+
+    @property
+    def over_distance(self) -> dict[str, list[float]]:
+        """Median errors [mm] in each bin; NaN where no case lies."""
+        return {name: _by_distance(found) for name, found in self.outcomes.items()}
+
+    def tables(self) -> str:
+        """Figures, errors over distance, errors over the number of images, in Markdown."""
+        ranges = [f"{low} to {high}" for low, high in pairwise(DISTANCES)]
+        images = [str(n) for n in range(1, MAX_IMAGES + 1)]
+        return "\n".join(
+            [
+                self._figures_table(),
+                _series_table("distance [m]: median error [mm]", ranges, self.over_distance),
+                _series_table(f"images: median error of {self.few} cases [mm]", images, self.over_inputs),
+            ]
+        )
+
+    def _figures_table(self) -> str:
+        figures = self.figures
+
+        def row(name: str, get: Callable[[Figures], float | None], paper: str = "", form: str = ".3f") -> list[str]:
+            return [name, *(shown(get(f), form) for f in figures.values()), paper]
+
+        def error(name: str, paper: str = "") -> list[str]:
+            return row(f"error, {name} [mm]", lambda f: f.mae_mm[name], paper)
+
+        rows = [
+            row("cases", lambda f: f.cases, form=".0f"),
+            error("median", "0.14"),
+            *(error(name) for name in ("mean", "min", "q1", "q3", "max")),
+            row("flux accuracy at new suns, median", lambda f: f.flux_accuracy_median, "0.92 (ideal surface 0.67)"),
+            row("flux accuracy at new suns, mean", lambda f: f.flux_accuracy),
+            row("the same 18 m west and 15 m higher, mean", lambda f: f.flux_accuracy_elsewhere),
+            row("cases of less accuracy than the ideal surface's", lambda f: f.worse_than_ideal, form=".1%"),
+            row("heights within their 90 % intervals", lambda f: f.covered, form=".1%"),
+        ]
+        return markdown(["", *figures, PAPER], rows)
 
 
-@torch.no_grad()
-def predict(run: Run, truth: Array, images: int, camera: Camera | None, seed: int) -> Array:
-    """Surfaces (B, 4, 8, 8) [m] that the run's averaged network sees in rendered images of true ones."""
-    flux, shots = render(truth, images, run.field, run.config.situations, camera, torch.device("cpu"), seed)
-    return run.predict(flux, shots).double().numpy()
+def _by_distance(outcomes: Sequence[Outcome]) -> list[float]:
+    bins = np.digitize([o.distance_m for o in outcomes], DISTANCES[1:-1])
+    errors = np.array([o.mae_mm for o in outcomes])
+    return [float(np.median(errors[bins == b])) if (bins == b).any() else np.nan for b in range(len(DISTANCES) - 1)]
 
 
-def evaluate(run: Run, repeats: int = 16, seed: int = 100) -> dict[str, Any]:
-    """Figures on the held-out heliostats, each placed ``repeats`` times in the field."""
-    truth = run.held_out.repeat(repeats, axis=0)
-    mean = np.broadcast_to(run.surfaces.mean(axis=0), truth.shape)
-    surfaces = {
-        "ideal surface": np.zeros_like(truth),
-        "mean surface": mean,
-        "network, 8 clean images": predict(run, truth, MAX_IMAGES, None, seed),
-        "network, 8 images of imperfect cameras": predict(run, truth, MAX_IMAGES, run.config.camera, seed),
-        "network, 1 clean image": predict(run, truth, 1, None, seed),
-    }
+def _series_table(name: str, steps: Sequence[str], series: dict[str, list[float]]) -> str:
+    rows = [[step, *(shown(values[i]) for values in series.values())] for i, step in enumerate(steps)]
+    return markdown([name, *series], rows)
+
+
+def evaluate(methods: dict[str, Method], cases: list[Case], few: int) -> Evaluation:
+    """Try all methods, the ideal surface first, on all cases; the refinement, and fewer images, on the first few."""
+    outcomes: dict[str, list[Outcome]] = {}
+    inputs: dict[str, list[float]] = {}
+    for name, method in methods.items():
+        print(f"{name} ...", file=sys.stderr, flush=True)
+        outcomes[name] = outcomes_of(method, cases[:few] if name == REFINEMENT else cases)
+        fewer = [median_error(method, cases[:few], images) for images in range(1, MAX_IMAGES)]
+        inputs[name] = [*fewer, float(np.median([o.mae_mm for o in outcomes[name][:few]]))]
+    return Evaluation(outcomes, inputs, few)
+
+
+def compared(network: Path, paper: Path, mean: Array) -> dict[str, Method]:
+    """All that is compared; without the paper's network where it has not been trained on the same surfaces."""
+    methods = {"ideal surface": always(np.zeros_like(mean)), "mean surface": always(mean)}
+    if not (paper / "checkpoint.pt").is_file():
+        print(f"the paper's network is left out: no run in {paper}", file=sys.stderr)
+    elif set(held_out_of(paper)) != set(held_out_of(network)):
+        print(f"the paper's network is left out: {paper} holds other surfaces out", file=sys.stderr)
+    else:
+        methods[PAPERS_NETWORK] = by_network(paper)
+    best = by_network(network)
     return {
-        name: {"mae_mm": _errors(z, truth), "flux_accuracy": round(_accuracy(z, truth, run, seed + 1), 4)}
-        for name, z in surfaces.items()
+        **methods,
+        "network, one look": by_network(network, looks=1),
+        "network": best,
+        REFINEMENT: by_refinement(best),
     }
+
+
+def draw(evaluation: Evaluation, methods: dict[str, Method], cases: list[Case], out: Path) -> None:
+    """Errors over distance and over images; surfaces in the best, the median and the worst case of the refinement."""
+    middle = [(low + high) / 2 for low, high in pairwise(DISTANCES)]
+    images = list(range(1, MAX_IMAGES + 1))
+    error = "median error of control heights [mm]"
+    plots.lines({n: (middle, e) for n, e in evaluation.over_distance.items()}, "distance [m]", error).savefig(
+        out / "error-over-distance.png"
+    )
+    plots.lines({n: (images, e) for n, e in evaluation.over_inputs.items()}, "images", error).savefig(
+        out / "error-over-images.png"
+    )
+    order = np.argsort([o.mae_mm for o in evaluation.outcomes[REFINEMENT]])
+    rows = {}
+    for name, index in zip(("best", "median", "worst"), order[[0, len(order) // 2, -1]], strict=True):
+        case = cases[index]
+        shapes = {n: methods[n](case, MAX_IMAGES)[0] for n in ("network", REFINEMENT)}
+        rows[f"{name}: {case.surface}, {case.distance:.0f} m"] = {"deflectometry": case.truth, **shapes}
+    plots.surfaces(rows).savefig(out / "surfaces.png")
 
 
 def main() -> None:
-    """Print the figures of one run."""
+    """Print the tables; write them, every outcome and the plots."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--run", type=Path, default=Path("runs/best"))
+    parser.add_argument("--data", type=Path, default=Path(TrainConfig().data))
+    parser.add_argument("--network", type=Path, default=WEIGHTS, help="an ONNX file beside its card, or a run's folder")
+    parser.add_argument("--paper", type=Path, default=Path("runs/paper"), help="folder of the paper's network's run")
+    parser.add_argument("--cases", type=int, default=128)
+    parser.add_argument("--refined", type=int, default=24, help="how many cases are refined, from 1 to 8 images each")
+    parser.add_argument("--camera", choices=("clean", "imperfect"), default="clean")
+    parser.add_argument("--out", type=Path, default=Path("out/evaluation"))
     arguments = parser.parse_args()
-    run = Run(TrainConfig.read(arguments.run / "config.json"), arguments.run, torch.device("cpu"))
-    print(json.dumps(evaluate(run), indent=1))
+    surfaces, names = load_surfaces(arguments.data)
+    held_out = [names.index(name) for name in held_out_of(arguments.network)]
+    mean = untilted(np.delete(surfaces, held_out, axis=0).mean(axis=0))
+    camera = CleanCamera() if arguments.camera == "clean" else Camera()
+    field, apart = load_field(arguments.data), [names[i] for i in held_out]
+    cases = make_cases(surfaces[held_out], apart, field, arguments.cases, camera)
+    methods = compared(arguments.network, arguments.paper, mean)
+    evaluation = evaluate(methods, cases, min(arguments.refined, len(cases)))
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    (arguments.out / "evaluation.md").write_text(evaluation.tables(), encoding="utf-8")
+    found = {"network": str(arguments.network), "camera": arguments.camera, **asdict(evaluation)}
+    found["figures"] = {name: asdict(figures) for name, figures in evaluation.figures.items()}
+    (arguments.out / "evaluation.json").write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    draw(evaluation, methods, cases, arguments.out)
+    print(evaluation.tables())
 
 
 if __name__ == "__main__":

@@ -18,8 +18,11 @@ from torch import nn
 from model.network.architecture import CONDITIONS, IMAGE_SIZE, MAX_IMAGES
 from model.network.predictor import INPUTS, WEIGHTS, SurfacePredictor
 from model.surface import COLUMNS, FACETS, ROWS
-from training.evaluate import evaluate
-from training.train import Run, TrainConfig
+from training.cases import make_cases
+from training.figures import Figures, outcomes_of
+from training.methods import always, by_onnx
+from training.render import CleanCamera
+from training.train import Run
 
 PARITY_MM = 1e-4
 """Largest difference between torch and onnxruntime that is let through [mm]."""
@@ -94,11 +97,28 @@ def parity(network: nn.Module, path: Path) -> float:
     return worst
 
 
-def model_card(run: Run, difference: float, note: str) -> dict[str, Any]:
+def evaluation(run: Run, path: Path, count: int = 128) -> dict[str, Any]:
+    """Figures of the exported network, and of the surfaces that it must beat, on ``count`` held-out mirrors."""
+    clean, imperfect = (
+        make_cases(run.held_out, run.held_out_names, run.field, count, camera)
+        for camera in (CleanCamera(), run.config.camera)
+    )
+    network, mean = by_onnx(SurfacePredictor(path), run.config.looks), run.mean.double().numpy()
+    outcomes = {
+        "ideal surface": outcomes_of(always(np.zeros_like(mean)), clean),
+        "mean surface": outcomes_of(always(mean), clean),
+        "network, 8 clean images": outcomes_of(network, clean),
+        "network, 8 images of imperfect cameras": outcomes_of(network, imperfect),
+        "network, 1 clean image": outcomes_of(network, clean, images=1),
+    }
+    return {name: asdict(Figures.of(found, outcomes["ideal surface"])) for name, found in outcomes.items()}
+
+
+def model_card(run: Run, path: Path, difference: float, note: str) -> dict[str, Any]:
     """What the weights are, what they were trained on and how well they do; ``note`` tells what the config does not."""
     network = run.average
     return {
-        "name": "surface-network",
+        "name": path.stem,
         "task": "mirror surface (4 x 8 x 8 control heights) from 1 to 8 flux images of one heliostat",
         "parameters": sum(p.numel() for p in network.parameters()),
         "trained_on": {
@@ -111,7 +131,7 @@ def model_card(run: Run, difference: float, note: str) -> dict[str, Any]:
         },
         "config": asdict(run.config),
         "onnx_parity_mm": difference,
-        "evaluation": evaluate(run),
+        "evaluation": evaluation(run, path),
         "limits": "Four-facet mirrors of the Juelich kind, flux in 4 m x 4 m windows; other mirrors are out of domain.",
     }
 
@@ -123,13 +143,13 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=WEIGHTS)
     parser.add_argument("--note", default="", help="what happened in the run that its config does not tell")
     arguments = parser.parse_args()
-    run = Run(TrainConfig.read(arguments.run / "config.json"), arguments.run, torch.device("cpu"))
+    run = Run.open(arguments.run)
     network = rounded(run.average.to(memory_format=torch.contiguous_format))
     export(network, arguments.out)
     difference = parity(network, arguments.out)
     if not math.isfinite(difference) or difference > PARITY_MM:
         raise SystemExit(f"ONNX differs from torch by {difference:.2e} mm, more than {PARITY_MM:.0e}")
-    card = model_card(run, difference, arguments.note)
+    card = model_card(run, arguments.out, difference, arguments.note)
     arguments.out.with_suffix(".json").write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
     print(json.dumps(card["evaluation"], indent=1))
     print(f"{arguments.out}: {arguments.out.stat().st_size / 1e6:.1f} MB, parity {difference:.1e} mm")

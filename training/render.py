@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,8 @@ from torch.nn import functional
 from model.frames import sun_direction_at
 from model.network.architecture import CONDITIONS
 from model.network.inputs import GUESS_SAMPLES, conditions
-from model.plant import Heliostat
+from model.observation import FLUX_SHAPE, Observation, scene_of
+from model.plant import Heliostat, TargetPlane
 from model.sunshape import Buie, transfer_table
 from model.surface import control_points
 from model.tracing import Optics, Scene, Window, trace
@@ -22,6 +23,9 @@ from model.tracing import Optics, Scene, Window, trace
 Array = NDArray[np.float64]
 
 JUELICH_LATITUDE = 50.913
+
+TOWER_TOP = (0.0, 0.0, 55.0)
+"""What heliostats are canted for [m]: the receiver of Juelich, about."""
 
 TENSORS = ("control_points", "attitude", "center", "sun", "plane_center", "plane_axes")
 """What a scene holds for each mirror."""
@@ -56,10 +60,14 @@ class Situations:
             found = np.concatenate([found, directions[directions[:, 2] > np.sin(np.radians(self.min_elevation_deg))]])
         return found[:count]
 
+    def heliostats(self, positions: Array, rng: np.random.Generator) -> list[Heliostat]:
+        """Heliostats at positions (N, 3) [m], each canted to a random focus."""
+        focal = np.linalg.norm(positions - TOWER_TOP, axis=-1) * rng.uniform(*self.focus, len(positions))
+        return [Heliostat.juelich("synthetic", p, f) for p, f in zip(positions, focal, strict=True)]
+
     def shots(self, field: Array, count: int, images: int, rng: np.random.Generator, device: torch.device) -> "Shots":
         """``count`` heliostats at random places (N, 3) [m] of the field, each before ``images`` suns and aims."""
-        positions = field[rng.integers(len(field), size=count)]
-        focal = np.linalg.norm(positions - [0.0, 0.0, 55.0], axis=-1) * rng.uniform(*self.focus, count)
+        heliostats = self.heliostats(field[rng.integers(len(field), size=count)], rng)
         total = count * images
         aims = np.stack(
             [
@@ -69,7 +77,6 @@ class Situations:
             ],
             axis=-1,
         )
-        heliostats = [Heliostat.juelich("synthetic", p, f) for p, f in zip(positions, focal, strict=True)]
         return Shots.of(heliostats, self.suns(total, rng), aims, device)
 
 
@@ -181,6 +188,39 @@ class Camera:
         noise = torch.randn(image.shape, generator=seed, device=device)
         image = image + noise * draw(0, self.noise, 1, 1)
         return torch.round(image.clamp(0, 1) * 255) / 255
+
+
+@dataclass(frozen=True)
+class CleanCamera:
+    """A camera that adds noise of standard deviation ``noise`` [of the peak] and rounds to 8 bits, nothing else."""
+
+    noise: float = 0.01
+
+    def photograph(self, scene: Scene, device: torch.device, rng: np.random.Generator) -> Tensor:
+        """Flux images (B, 64, 64), sum 100, 4 m about the spot's centre."""
+        flux = trace(scene, Window(on_spot=True), samples=48).irradiance
+        noise = torch.as_tensor(rng.normal(0, self.noise, flux.shape), dtype=flux.dtype, device=device)
+        image = flux / flux.amax(dim=(1, 2), keepdim=True) + noise
+        return normalized(torch.round(image.clamp(0, 1) * 255))
+
+
+def places(suns: Array, planes: Sequence[TargetPlane]) -> list[Observation]:
+    """Observations to be: suns (N, 3) and N target planes, at whose centres the spots lie; nothing is seen yet."""
+    blank = np.ones(FLUX_SHAPE, np.float32)
+    return [Observation(blank, s, p, p.center, str(i)) for i, (s, p) in enumerate(zip(suns, planes, strict=True))]
+
+
+def observe(
+    heliostat: Heliostat,
+    z: Array,
+    shots: Sequence[Observation],
+    camera: Camera | CleanCamera,
+    rng: np.random.Generator,
+) -> list[Observation]:
+    """What a camera sees of a heliostat with heights ``z`` (4, 8, 8) [m] at `places`."""
+    with torch.no_grad():
+        images = camera.photograph(scene_of(heliostat, shots, [z]), torch.device("cpu"), rng).numpy()
+    return [replace(shot, flux=image) for shot, image in zip(shots, images, strict=True)]
 
 
 def normalized(flux: Tensor) -> Tensor:

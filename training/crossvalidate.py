@@ -1,0 +1,91 @@
+"""How far the figures depend on which mirrors are held out: ``python -m training.crossvalidate``.
+
+The measured surfaces are few. Every heliostat is held out in one fold; mean surface and prior are estimated from the
+others, and refinement starts from that mean. Networks take hours each: they are cross-validated only where all folds
+have been trained, fold K by::
+
+    python -m training.train --config training/configs/best.json --fold K --run runs/fold-K
+"""
+
+import argparse
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from training.cases import make_cases
+from training.figures import Figures, markdown, outcomes_of
+from training.methods import Method, always, by_network, by_refinement, held_out_of
+from training.prior import estimate
+from training.render import CleanCamera, load_field
+from training.surfaces import load_surfaces, split_by_heliostat, untilted
+from training.train import TrainConfig
+
+Array = NDArray[np.float64]
+
+ROWS: dict[str, Callable[[Figures], float]] = {
+    "error, median [mm]": lambda f: f.mae_mm["median"],
+    "error, mean [mm]": lambda f: f.mae_mm["mean"],
+    "flux accuracy at new suns, mean": lambda f: f.flux_accuracy,
+    "the same 18 m west and 15 m higher, mean": lambda f: f.flux_accuracy_elsewhere,
+    "share of cases of less accuracy than the ideal surface's": lambda f: f.worse_than_ideal,
+}
+
+
+def methods_of(surfaces: Array, network: Path | None) -> dict[str, Method]:
+    """What is cross-validated, estimated from the training surfaces (N, 4, 8, 8) [m] of one fold."""
+    mean = untilted(surfaces.mean(axis=0))
+    methods = {"ideal surface": always(np.zeros_like(mean)), "mean surface": always(mean)}
+    if network is not None:
+        methods["network"] = by_network(network)
+    return {**methods, "refinement from the mean": by_refinement(always(mean), estimate(surfaces))}
+
+
+def validate(data: Path, fold: int, places: int, network: Path | None) -> dict[str, Figures]:
+    """Figures of each method on one fold, each of its mirrors at so many places of the field."""
+    config = TrainConfig()
+    surfaces, names = load_surfaces(data)
+    train, held_out = split_by_heliostat(len(surfaces), config.held_out, config.seed, fold)
+    apart = [names[i] for i in held_out]
+    if network is not None and held_out_of(network) != apart:
+        raise SystemExit(f"{network} was trained with other surfaces held out than fold {fold}")
+    count = places * len(held_out)
+    cases = make_cases(surfaces[held_out], apart, load_field(data), count, CleanCamera(), seed=1000 + fold)
+    outcomes = {name: outcomes_of(m, cases) for name, m in methods_of(surfaces[train], network).items()}
+    return {name: Figures.of(found, outcomes["ideal surface"]) for name, found in outcomes.items()}
+
+
+def table(folds: list[dict[str, Figures]]) -> str:
+    """Means over the folds and standard deviations between them, in Markdown."""
+    rows = []
+    for row, get in ROWS.items():
+        values = {name: [get(fold[name]) for fold in folds] for name in folds[0]}
+        rows.append([row, *(f"{np.mean(v):.3f} ± {np.std(v, ddof=1):.3f}" for v in values.values())])
+    return markdown([f"mean ± standard deviation of {len(folds)} folds", *folds[0]], rows)
+
+
+def main() -> None:
+    """Print the table, and what in it is not cross-validated."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, default=Path(TrainConfig().data))
+    parser.add_argument("--runs", type=Path, default=Path("runs"), help="where the networks' fold-K lie")
+    parser.add_argument("--places", type=int, default=1, help="in the field, for each mirror")
+    arguments = parser.parse_args()
+    count = -(-len(load_surfaces(arguments.data)[1]) // TrainConfig().held_out)
+    networks: list[Path | None] = [arguments.runs / f"fold-{fold}" for fold in range(count)]
+    if not all(run is not None and (run / "checkpoint.pt").is_file() for run in networks):
+        networks = [None] * count
+    folds = []
+    for fold, network in enumerate(networks):
+        print(f"fold {fold} ...", file=sys.stderr, flush=True)
+        folds.append(validate(arguments.data, fold, arguments.places, network))
+    print(table(folds))
+    print("Cross-validated: mean surface, prior, refinement" + ("." if networks[0] is None else ", network."))
+    if networks[0] is None:
+        print(f"Not cross-validated: the network, as {arguments.runs} does not hold fold-0 to fold-{count - 1}.")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,104 @@
+"""What predicted surfaces are worth: outcomes of single cases, figures of many, tables of them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.metrics import flux_accuracy, surface_error
+from model.network.architecture import MAX_IMAGES
+from model.observation import render_observations
+from training.cases import NEW_SUNS, Case
+from training.methods import Method
+
+Array = NDArray[np.float64]
+
+WITHIN_90 = 1.645
+"""Half width of a normal distribution's 90 % interval, in standard deviations."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What one surface of one case is worth.
+
+    ``mae_mm`` is the error of its control heights; the accuracies are means over the new suns, on the source target and
+    elsewhere; ``covered`` is the share of control heights within their 90 % interval.
+    """
+
+    surface: str
+    distance_m: float
+    mae_mm: float
+    accuracy: float
+    accuracy_elsewhere: float
+    covered: float | None
+
+
+def judge(case: Case, z: Array, z_std: Array | None) -> Outcome:
+    """Compare a predicted surface (4, 8, 8) [m], and its standard deviation, with the true one."""
+    truth, forecast = (render_observations(case.heliostat, case.forecasts, s).clip(min=0) for s in (case.truth, z))
+    accuracies = [flux_accuracy(a, b) for a, b in zip(truth, forecast, strict=True)]
+    return Outcome(
+        surface=case.surface,
+        distance_m=case.distance,
+        mae_mm=surface_error(z, case.truth) * 1e3,
+        accuracy=float(np.mean(accuracies[:NEW_SUNS])),
+        accuracy_elsewhere=float(np.mean(accuracies[NEW_SUNS:])),
+        covered=None if z_std is None else float((np.abs(z - case.truth) < WITHIN_90 * z_std).mean()),
+    )
+
+
+def outcomes_of(method: Method, cases: Sequence[Case], images: int = MAX_IMAGES) -> list[Outcome]:
+    """The outcome of a method in each case."""
+    return [judge(case, *method(case, images)) for case in cases]
+
+
+def median_error(method: Method, cases: Sequence[Case], images: int) -> float:
+    """Median error [mm] of control heights from so many images."""
+    return float(np.median([surface_error(method(case, images)[0], case.truth) for case in cases])) * 1e3
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What the outcomes of one method come to.
+
+    Accuracies are means unless they say otherwise; ``worse_than_ideal`` is the share of cases whose accuracy lies below
+    that of the ideal surface.
+    """
+
+    cases: int
+    mae_mm: dict[str, float]
+    flux_accuracy: float
+    flux_accuracy_median: float
+    flux_accuracy_elsewhere: float
+    worse_than_ideal: float
+    covered: float | None
+
+    @classmethod
+    def of(cls, outcomes: Sequence[Outcome], ideal: Sequence[Outcome]) -> "Figures":
+        """Figures of outcomes beside those of the ideal surface in the same cases, and perhaps more."""
+        errors = np.array([o.mae_mm for o in outcomes])
+        quantiles = dict(zip(("min", "q1", "median", "q3", "max"), np.quantile(errors, np.arange(5) / 4), strict=True))
+        accuracies = [o.accuracy for o in outcomes]
+        worse = [o.accuracy < i.accuracy for o, i in zip(outcomes, ideal, strict=False)]
+        covered = [o.covered for o in outcomes if o.covered is not None]
+        return cls(
+            cases=len(outcomes),
+            mae_mm={name: round(float(v), 4) for name, v in {**quantiles, "mean": errors.mean()}.items()},
+            flux_accuracy=round(float(np.mean(accuracies)), 4),
+            flux_accuracy_median=round(float(np.median(accuracies)), 4),
+            flux_accuracy_elsewhere=round(float(np.mean([o.accuracy_elsewhere for o in outcomes])), 4),
+            worse_than_ideal=round(float(np.mean(worse)), 4),
+            covered=round(float(np.mean(covered)), 4) if covered else None,
+        )
+
+
+def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+
+
+def shown(value: float | None, form: str = ".3f") -> str:
+    """A number for a table; nothing for what is not known."""
+    return "" if value is None or np.isnan(value) else format(value, form)
