@@ -130,19 +130,23 @@ def forecast(
     folder: Folder,
     out: Out,
     surfaces: Annotated[str, typer.Option(help="measured, ideal, or a folder that predict wrote.")] = "measured",
-    effects: Annotated[Path | None, typer.Option(help="JSON file of effects to apply.", metavar="FILE")] = None,
+    effects: Annotated[
+        Path | None,
+        typer.Option(help="JSON file of effects to add to the declared ones, or a study's report.", metavar="FILE"),
+    ] = None,
     window: Annotated[
         float | None, typer.Option(help="Side [m] of the accuracy's window; by the spot if not given.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Flux on the whole target for each measurement [W/m2]: OUT/H/ID-forecast.npz and OUT/forecast.json."""
-    from service.folder import check_effects, forecast_folder
+    from service.folder import forecast_folder
+    from service.paint import read_effects
 
-    check_effects(effects)
+    added = () if effects is None else read_effects(effects)
     source = read_folder(folder)
     with progress(_count(source, with_images=False), "forecast") as step:
-        report = forecast_folder(source, out, surfaces, window, step)
+        report = forecast_folder(source, out, surfaces, window, step, added)
     table = make_table("Forecasts", "measurement", "accuracy", "window [m]", "outside", "peak [kW/m2]")
     for key, entry in report["measurements"].items():
         compared = "accuracy" in entry

@@ -5,7 +5,7 @@ report that it also writes there. A verb fails only if nothing is left.
 """
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
@@ -14,6 +14,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from model.effects import Effect, effect_to_json, model_version
 from model.errors import InvalidInputError, ModelError
 from model.imaging import ImageKind, MeasuredFlux, decode_image
 from model.metrics import compare_on_target, surface_error
@@ -23,7 +24,7 @@ from model.plant import Heliostat, TargetPlane
 from model.surface import split_canting
 from service import operations
 from service.operations import Method
-from service.paint import IMAGE_KINDS, Measurement, MeasurementFolder, measured_heights, read_json, read_surface
+from service.paint import IMAGE_KINDS, Measurement, MeasurementFolder, measured_heights, read_surface
 
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]
@@ -241,20 +242,13 @@ def _surface(folder: MeasurementFolder, heliostat: Heliostat, surfaces: str) -> 
     return found
 
 
-def check_effects(path: Path | None) -> None:
-    """Refuse an effects file that asks for more than this version can do."""
-    if path is None:
-        return
-    content = read_json(path)
-    effects = content.get("effects") if isinstance(content, dict) else content
-    if effects:
-        raise InvalidInputError(f"{path}: 'effects' must be empty; this version knows no effect yet")
-
-
 def forecast_measurement(
-    folder: MeasurementFolder, measurement: Measurement, surface: tuple[Array, int] | None
+    folder: MeasurementFolder,
+    measurement: Measurement,
+    surface: tuple[Array, int] | None,
+    effects: Sequence[Effect] = (),
 ) -> operations.Forecast:
-    """Flux over the whole target of a measurement.
+    """Flux over the whole target of a measurement, with ``effects`` besides those that are declared.
 
     The heliostat is aligned by its measured spot; without one by its motors; without those at the target's centre.
     """
@@ -269,6 +263,8 @@ def forecast_measurement(
         angles=None if motors is None else heliostat.mount.angles_from_motors(motors),
         optics=folder.optics,
         surface=surface,
+        effects=[*folder.effects, *effects],
+        latitude_deg=float(folder.plant.origin[0]),
     )
 
 
@@ -299,11 +295,21 @@ def forecast_folder(
     surfaces: str = "measured",
     window: float | None = None,
     progress: Progress = quiet,
+    effects: Sequence[Effect] = (),
 ) -> dict[str, Any]:
-    """Forecast every measurement of a folder; ``OUT/H/ID-forecast.npz`` and ``OUT/forecast.json``."""
+    """Forecast every measurement of a folder; ``OUT/H/ID-forecast.npz`` and ``OUT/forecast.json``.
+
+    ``effects`` come in addition to those that the folder declares.
+    """
     if surfaces not in ("measured", "ideal") and not Path(surfaces).is_dir():
         raise InvalidInputError(f"--surfaces must be 'measured', 'ideal' or a folder of predictions, got {surfaces!r}")
-    report: dict[str, Any] = {"surfaces": surfaces, "measurements": {}, "skipped": {}}
+    report: dict[str, Any] = {
+        "surfaces": surfaces,
+        "model_version": model_version([*folder.effects, *effects]),
+        "effects": [effect_to_json(effect) for effect in (*folder.effects, *effects)],
+        "measurements": {},
+        "skipped": {},
+    }
     for name, heliostat in folder.plant.heliostats.items():
         try:
             surface = _surface(folder, heliostat, surfaces)
@@ -316,7 +322,7 @@ def forecast_folder(
         for measurement in measurements:
             progress(measurement.key)
             try:
-                entry = _forecast_entry(folder, measurement, surface, out, window)
+                entry = _forecast_entry(folder, measurement, surface, effects, out, window)
             except ModelError as error:
                 report["skipped"][measurement.key] = str(error)
                 continue
@@ -331,11 +337,12 @@ def _forecast_entry(
     folder: MeasurementFolder,
     measurement: Measurement,
     surface: tuple[Array, int] | None,
+    effects: Sequence[Effect],
     out: Path,
     window: float | None,
 ) -> dict[str, Any]:
     """Write the forecast of one measurement and give back its entry in ``forecast.json``."""
-    traced = forecast_measurement(folder, measurement, surface)
+    traced = forecast_measurement(folder, measurement, surface, effects)
     path = out / measurement.heliostat / f"{measurement.identifier}-forecast.npz"
     path.parent.mkdir(parents=True, exist_ok=True)
     np.savez_compressed(path, flux=traced.flux)

@@ -8,7 +8,9 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
+from model.effects import JUELICH_LATITUDE, Effect, model_version
 from model.errors import InvalidInputError
+from model.forecast import Shot, View, align
 from model.imaging import ImageKind, MeasuredFlux
 from model.imaging import measure as measure_image
 from model.network.predictor import default_predictor
@@ -16,8 +18,8 @@ from model.observation import Observation, SurfacePrediction
 from model.plant import Heliostat, TargetPlane
 from model.refinement import refine
 from model.surface import DEGREE, control_points
-from model.tracing import Optics, Scene, Window, trace
-from model.tracing.alignment import align_to_spots
+from model.tracing import Optics
+from model.tracing.convolution import central_rays
 
 Array = NDArray[np.float64]
 Method = Literal["network", "refined"]
@@ -25,8 +27,8 @@ Method = Literal["network", "refined"]
 SAMPLES = 64
 """Points along each side of a facet: measured surfaces of 20 x 20 control points converge to 0.2 % (L1)."""
 
-MODEL_VERSION = "1:none"
-"""Version of the plant's model and the effects it holds: none until a study's effect is adopted."""
+MODEL_VERSION = model_version(())
+"""Version of a plant's model that holds no effect."""
 
 
 def measure(
@@ -71,6 +73,7 @@ class Forecast:
     power : float [W]
         On the imaged part of the plane.
     model_version : str
+        Version of the plant's model and the effects it holds.
     """
 
     flux: NDArray[np.float32]
@@ -93,8 +96,10 @@ def forecast(
     window: float | None = None,
     optics: Optics | None = None,
     surface: tuple[ArrayLike, int] | None = None,
+    effects: Sequence[Effect] = (),
+    latitude_deg: float = JUELICH_LATITUDE,
 ) -> Forecast:
-    """Trace the flux of a heliostat on a plane.
+    """Trace the flux of a heliostat on a plane, as its model, with its effects, expects a camera to show it.
 
     Parameters
     ----------
@@ -113,6 +118,9 @@ def forecast(
         Side of a square about the spot; the whole plane unless given.
     surface : (control points (F, I, J, 3) [m], degree), optional
         A measured surface in place of ``z``.
+    effects : sequence of Effect
+    latitude_deg : float [deg]
+        Of the plant.
 
     Raises
     ------
@@ -120,27 +128,27 @@ def forecast(
         Where no attitude reflects the sun to the plane.
     """
     points, degree = (control_points(heliostat, z), DEGREE) if surface is None else surface
-    direction = np.asarray(sun, dtype=np.float64)
-    if spot is not None:
-        turned = align_to_spots([heliostat], [points], direction[None], [plane], np.array([spot]), degree=degree)[0]
-    elif angles is not None:
-        turned = np.asarray(angles, dtype=np.float64)
-    else:
-        goal = plane.center if aim is None else np.asarray(aim, dtype=np.float64)
-        turned = heliostat.mount.align(heliostat.position, direction, goal)
-    scene = Scene.build(
-        [heliostat], [points], turned[None], direction[None], [plane], degree=degree, dtype=torch.float64
+    shot = Shot(
+        heliostat,
+        np.asarray(points, dtype=np.float64),
+        np.asarray(sun, dtype=np.float64),
+        plane,
+        spot=None if spot is None else np.asarray(spot, dtype=np.float64),
+        angles=None if angles is None else np.asarray(angles, dtype=np.float64),
+        aim=None if aim is None else np.asarray(aim, dtype=np.float64),
+        degree=degree,
     )
-    rows, columns = resolution
-    view = Window.of(plane, rows, columns) if window is None else Window(window, window, rows, columns, on_spot=True)
+    view = View(*resolution, window=window, samples=SAMPLES, padding=0.5, cones="facet")
+    aligned = align([shot], effects, latitude_deg=latitude_deg, dtype=torch.float64)
     with torch.no_grad():
-        traced = trace(scene, view, optics, samples=SAMPLES, cones="facet")
+        traced = aligned.images(optics, effects, view)
+        center = central_rays(aligned.groups[0].scene, SAMPLES).spot
     # Frequency space leaves ripples of some 1e-5 of the peak below zero.
-    flux = traced.irradiance[0].clamp(min=0).float().numpy()
-    pixel_x, pixel_y = view.pixel
+    flux = traced[0].clamp(min=0).float().numpy()
     return Forecast(
         flux=flux,
-        center_of_mass=traced.spot[0].numpy(),
+        center_of_mass=center[0].numpy(),
         peak=float(flux.max()),
-        power=float(flux.sum(dtype=np.float64) * pixel_x * pixel_y),
+        power=float(flux.sum(dtype=np.float64) * np.prod(view.of(plane).pixel)),
+        model_version=model_version(effects),
     )

@@ -13,6 +13,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from model.effects import Effect, effects_from_json
 from model.errors import InvalidInputError
 from model.frames import sun_direction
 from model.mount import LinearActuator, Mount
@@ -241,6 +242,8 @@ class MeasurementFolder:
         Its targets, and every heliostat that has a properties file.
     optics : Optics
         The declared model (``twin.json``), Buie's sun with 0.02 without one.
+    effects : tuple of Effect
+        Those of the declared model.
     skipped : dict
         Heliostats and measurements that are there but could not be read, with the reason.
     """
@@ -248,6 +251,7 @@ class MeasurementFolder:
     root: Path
     plant: Plant
     optics: Optics
+    effects: tuple[Effect, ...]
     skipped: dict[str, str]
 
     def measurements(self, heliostat: str, with_images: bool = True) -> list[Measurement]:
@@ -347,15 +351,28 @@ def read_folder(root: Path, heliostats: list[str] | None = None) -> MeasurementF
     if not found:
         raise InvalidInputError(f"{root}: no heliostat with a readable 'Properties/*heliostat-properties.json'")
     plant = Plant(towers[0].name.removesuffix("-tower-measurements.json"), origin, targets, found)
-    return MeasurementFolder(root, plant, read_declared(root / "twin.json"), skipped)
+    return MeasurementFolder(root, plant, *read_declared(root / "twin.json"), skipped)
 
 
-def read_declared(path: Path) -> Optics:
-    """The optics that ``twin.json`` declares; the defaults where there is no such file."""
+def read_declared(path: Path) -> tuple[Optics, tuple[Effect, ...]]:
+    """The optics and the effects that ``twin.json`` declares; the defaults where there is no such file."""
     if not path.is_file():
-        return Optics()
+        return Optics(), ()
     declared = _get(read_json(path), str(path), "declared")
-    if declared.get("effects"):
-        raise InvalidInputError(f"{path}: 'effects' can only be empty; this version applies none")
+    if not isinstance(declared, dict):
+        raise InvalidInputError(f"{path}: 'declared' must be a JSON object")
     sun = declared.get("sun")
-    return Optics() if sun is None else Optics(sun_shape=_sun_shape(sun, str(path)))
+    optics = Optics() if sun is None else Optics(sun_shape=_sun_shape(sun, str(path)))
+    return optics, _effects(declared.get("effects", []), path)
+
+
+def read_effects(path: Path) -> tuple[Effect, ...]:
+    """Effects of a JSON file: a list, or an object with ``effects``, such as a study's report."""
+    return _effects(read_json(path), path)
+
+
+def _effects(data: Any, path: Path) -> tuple[Effect, ...]:
+    try:
+        return tuple(effects_from_json(data))
+    except InvalidInputError as error:
+        raise InvalidInputError(f"{path}: {error}") from None

@@ -72,6 +72,23 @@ def test_forecast_reaches_the_goal_on_real_images(stj, tmp_path):
     assert "AD37" in report["skipped"]
 
 
+def test_effects_of_a_file_change_the_forecast(made_plant, tmp_path):
+    """As a list, or as a study reports them; they come in addition to what the folder declares."""
+    name = "slope_error"
+    (tmp_path / "list.json").write_text(json.dumps([{"name": name, "parameters": {"sigma_mrad": 2.0}}]))
+    value = {"value": 2.0, "ci95": [1.9, 2.1], "unit": "mrad"}
+    report = {"verdict": "effect", "effects": [{"name": name, "parameters": {"sigma_mrad": value}}]}
+    (tmp_path / "report.json").write_text(json.dumps(report))
+    plain = succeeds("forecast", made_plant, "--out", tmp_path / "plain")
+    spread = succeeds("forecast", made_plant, "--out", tmp_path / "l", "--effects", tmp_path / "list.json")
+    again = succeeds("forecast", made_plant, "--out", tmp_path / "r", "--effects", tmp_path / "report.json")
+    assert (plain["model_version"], spread["model_version"]) == ("1:none", "2:slope_error")
+    assert spread == again
+    peaks = [[entry["peak_w_m2"] for entry in r["measurements"].values()] for r in (plain, spread)]
+    assert (np.array(peaks[1]) < 0.9 * np.array(peaks[0])).all()
+    assert spread["effects"] == [{"name": name, "parameters": {"sigma_mrad": 2.0}}]
+
+
 @pytest.mark.parametrize("number", [2, 5])
 def test_contract_on_undeclared_sets(undeclared, tmp_path, number):
     folder = undeclared / f"set-{number}"

@@ -4,6 +4,7 @@ import h5py
 import numpy as np
 import pytest
 
+from model.effects import effect_to_json
 from model.errors import InvalidInputError
 from model.metrics import surface_error
 from model.sunshape import Buie, Gaussian, Pillbox
@@ -80,11 +81,20 @@ def test_deflectometry_h5_is_fitted(tmp_path):
 )
 def test_declared_sun(tmp_path, sun, shape):
     (tmp_path / "twin.json").write_text(json.dumps({"declared": {"sun": sun, "effects": []}}))
-    assert read_declared(tmp_path / "twin.json").sun_shape == shape
+    optics, effects = read_declared(tmp_path / "twin.json")
+    assert optics.sun_shape == shape
+    assert effects == ()
 
 
 def test_undeclared_sun_is_buies(tmp_path):
-    assert read_declared(tmp_path / "twin.json").sun_shape == Buie(0.02)
+    assert read_declared(tmp_path / "twin.json")[0].sun_shape == Buie(0.02)
+
+
+def test_declared_effects(tmp_path):
+    effects = [{"name": "soiling", "parameters": {"reflectivity_ratio": {"AA39": [1.0, 0.8, 1.0, 0.9]}}}]
+    (tmp_path / "twin.json").write_text(json.dumps({"declared": {"effects": effects}}))
+    _, declared = read_declared(tmp_path / "twin.json")
+    assert [effect_to_json(effect) for effect in declared] == effects
 
 
 @pytest.mark.parametrize(
@@ -94,7 +104,9 @@ def test_undeclared_sun_is_buies(tmp_path):
         ("{}", "'declared' is missing"),
         ('{"declared": {"sun": {"shape": "square"}}}', "'shape' must be"),
         ('{"declared": {"sun": {"shape": "buie", "circumsolar_ratio": NaN}}}', "finite number"),
-        ('{"declared": {"effects": [{"name": "soiling"}]}}', "effects"),
+        ('{"declared": {"effects": [{"name": "dust"}]}}', "twin.json: effect 'dust' is unknown"),
+        ('{"declared": {"effects": [{"name": "slope_error", "parameters": {"sigma_mrad": 9}}]}}', "sigma_mrad"),
+        ('{"declared": []}', "'declared' must be a JSON object"),
     ],
 )
 def test_bad_declarations_name_the_field(tmp_path, content, says):
