@@ -1,9 +1,10 @@
 PYTHON ?= python3.11
+RUN ?= runs/best
 VENV := .venv
 BIN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test serve lint bench clean
+.PHONY: help install demo test serve lint bench train clean
 
 help: ## list the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -31,6 +32,12 @@ serve: install ## the service on http://127.0.0.1:8000
 
 bench: install ## the figures of RESULTS.md
 	$(BIN)/python -m tests.benchmarks
+
+train: install ## the shipped weights from scratch, in hours: network, prior, export, evaluation; resumes what is in RUN
+	$(BIN)/python -m training.train --config training/configs/best.json --run $(RUN)
+	$(BIN)/python -m training.prior --run $(RUN)
+	$(BIN)/python -m training.export --run $(RUN)
+	$(BIN)/python -m training.evaluate
 
 clean: ## remove the virtual environment and everything that was made
 	rm -rf $(VENV) out build *.egg-info

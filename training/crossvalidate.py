@@ -25,12 +25,13 @@ from training.train import TrainConfig
 
 Array = NDArray[np.float64]
 
-ROWS: dict[str, Callable[[Figures], float]] = {
+ROWS: dict[str, Callable[[Figures], float | None]] = {
     "error, median [mm]": lambda f: f.mae_mm["median"],
     "error, mean [mm]": lambda f: f.mae_mm["mean"],
     "flux accuracy at new suns, mean": lambda f: f.flux_accuracy,
     "the same 18 m west and 15 m higher, mean": lambda f: f.flux_accuracy_elsewhere,
     "share of cases of less accuracy than the ideal surface's": lambda f: f.worse_than_ideal,
+    "share of heights within their 90 % intervals": lambda f: f.covered,
 }
 
 
@@ -61,8 +62,8 @@ def table(folds: list[dict[str, Figures]]) -> str:
     """Means over the folds and standard deviations between them, in Markdown."""
     rows = []
     for row, get in ROWS.items():
-        values = {name: [get(fold[name]) for fold in folds] for name in folds[0]}
-        rows.append([row, *(f"{np.mean(v):.3f} ± {np.std(v, ddof=1):.3f}" for v in values.values())])
+        values = [[v for fold in folds if (v := get(fold[name])) is not None] for name in folds[0]]
+        rows.append([row, *(f"{np.mean(v):.3f} ± {np.std(v, ddof=1):.3f}" if v else "" for v in values)])
     return markdown([f"mean ± standard deviation of {len(folds)} folds", *folds[0]], rows)
 
 

@@ -7,15 +7,18 @@ import numpy as np
 import torch
 
 from model.frames import sun_direction
+from model.network.architecture import MAX_IMAGES
 from model.network.predictor import SurfacePredictor
 from model.plant import Heliostat, TargetPlane
 from model.refinement import default_prior
 from model.surface import control_points
 from model.tracing import Scene, Window, trace
 from model.tracing.montecarlo import trace_montecarlo
-from tests.benchmarks.surfaces import photographs
+from training.render import CleanCamera, Situations, observe, places
 
 BATCH = 64
+
+TARGET = TargetPlane("t", np.array([0.0, 0, 40]), np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), 8, 8)
 
 
 def seconds(work: Callable[[], object], repeats: int) -> float:
@@ -33,11 +36,10 @@ def scene(count: int, device: str) -> Scene:
     """Random mirrors at 100 m under one sun."""
     rng, prior = np.random.default_rng(0), default_prior()
     heliostat = Heliostat.juelich("synthetic", np.array([20.0, 95.0, 1.8]), 100.0)
-    plane = TargetPlane("t", np.array([0.0, 0, 40]), np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), 8, 8)
     suns = np.tile(sun_direction(25.0, 40.0), (count, 1))
-    angles = np.tile(heliostat.mount.align(heliostat.position, suns[0], plane.center), (count, 1))
+    angles = np.tile(heliostat.mount.align(heliostat.position, suns[0], TARGET.center), (count, 1))
     points = [control_points(heliostat, prior.surface(rng.normal(size=len(prior.basis)))) for _ in range(count)]
-    return Scene.build([heliostat] * count, points, angles, suns, [plane] * count, device=device)
+    return Scene.build([heliostat] * count, points, angles, suns, [TARGET] * count, device=device)
 
 
 def main() -> None:
@@ -65,7 +67,9 @@ def main() -> None:
 
             print(f"  convolution on {torch.cuda.get_device_name()}: {seconds(on_gpu, 10) / 4096 * 1e3:.4f} ms a flux")
     predictor, mirror = SurfacePredictor(threads=1), Heliostat.juelich("synthetic", np.array([20.0, 95.0, 1.8]), 100.0)
-    images = photographs(mirror, default_prior().mean, np.random.default_rng(0))
+    rng = np.random.default_rng(0)
+    shots = places(Situations().suns(MAX_IMAGES, rng), [TARGET] * MAX_IMAGES)
+    images = observe(mirror, default_prior().mean, shots, CleanCamera(), rng)
     taken = seconds(lambda: predictor.predict(mirror, images), 20) * 1e3
     print(f"  network, one heliostat, 8 images, 1 core, tracing of its guesses included: {taken:.1f} ms")
 
