@@ -20,7 +20,7 @@ from training.figures import Figures, markdown, outcomes_of
 from training.methods import Method, always, by_network, by_refinement, held_out_of
 from training.prior import estimate
 from training.render import CleanCamera, load_field
-from training.surfaces import load_surfaces, split_by_heliostat, untilted
+from training.surfaces import load_surfaces, split_by_heliostat
 from training.train import TrainConfig
 
 Array = NDArray[np.float64]
@@ -37,7 +37,7 @@ ROWS: dict[str, Callable[[Figures], float | None]] = {
 
 def methods_of(surfaces: Array, network: Path | None) -> dict[str, Method]:
     """What is cross-validated, estimated from the training surfaces (N, 4, 8, 8) [m] of one fold."""
-    mean = untilted(surfaces.mean(axis=0))
+    mean = surfaces.mean(axis=0)
     methods = {"ideal surface": always(np.zeros_like(mean)), "mean surface": always(mean)}
     if network is not None:
         methods["network"] = by_network(network)

@@ -26,7 +26,7 @@ from training.cases import Case, make_cases
 from training.figures import Figures, Outcome, markdown, median_error, outcomes_of, shown
 from training.methods import Method, always, by_network, by_refinement, held_out_of
 from training.render import Camera, CleanCamera, load_field
-from training.surfaces import load_surfaces, untilted
+from training.surfaces import load_surfaces
 from training.train import TrainConfig
 
 Array = NDArray[np.float64]
@@ -140,20 +140,18 @@ def compared(network: Path, paper: Path, mean: Array) -> dict[str, Method]:
 def draw(evaluation: Evaluation, methods: dict[str, Method], cases: list[Case], out: Path) -> None:
     """Errors over distance and over images; surfaces in the best, the median and the worst case of the refinement."""
     middle = [(low + high) / 2 for low, high in pairwise(DISTANCES)]
-    images = list(range(1, MAX_IMAGES + 1))
+    images = range(1, MAX_IMAGES + 1)
+    over_distance = {name: (middle, errors) for name, errors in evaluation.over_distance.items()}
+    over_images = {name: (images, errors) for name, errors in evaluation.over_inputs.items()}
     error = "median error of control heights [mm]"
-    plots.lines({n: (middle, e) for n, e in evaluation.over_distance.items()}, "distance [m]", error).savefig(
-        out / "error-over-distance.png"
-    )
-    plots.lines({n: (images, e) for n, e in evaluation.over_inputs.items()}, "images", error).savefig(
-        out / "error-over-images.png"
-    )
+    plots.lines(over_distance, "distance [m]", error).savefig(out / "error-over-distance.png")
+    plots.lines(over_images, "images", error).savefig(out / "error-over-images.png")
     order = np.argsort([o.mae_mm for o in evaluation.outcomes[REFINEMENT]])
     rows = {}
-    for name, index in zip(("best", "median", "worst"), order[[0, len(order) // 2, -1]], strict=True):
+    for rank, index in zip(("best", "median", "worst"), order[[0, len(order) // 2, -1]], strict=True):
         case = cases[index]
-        shapes = {n: methods[n](case, MAX_IMAGES)[0] for n in ("network", REFINEMENT)}
-        rows[f"{name}: {case.surface}, {case.distance:.0f} m"] = {"deflectometry": case.truth, **shapes}
+        predicted = {name: methods[name](case, MAX_IMAGES)[0] for name in ("network", REFINEMENT)}
+        rows[f"{rank}: {case.surface}, {case.distance:.0f} m"] = {"deflectometry": case.truth, **predicted}
     plots.surfaces(rows).savefig(out / "surfaces.png")
 
 
@@ -170,12 +168,12 @@ def main() -> None:
     arguments = parser.parse_args()
     surfaces, names = load_surfaces(arguments.data)
     held_out = [names.index(name) for name in held_out_of(arguments.network)]
-    mean = untilted(np.delete(surfaces, held_out, axis=0).mean(axis=0))
+    mean = np.delete(surfaces, held_out, axis=0).mean(axis=0)
     camera = CleanCamera() if arguments.camera == "clean" else Camera()
     field, apart = load_field(arguments.data), [names[i] for i in held_out]
     cases = make_cases(surfaces[held_out], apart, field, arguments.cases, camera)
     methods = compared(arguments.network, arguments.paper, mean)
-    evaluation = evaluate(methods, cases, min(arguments.refined, len(cases)))
+    evaluation = evaluate(methods, cases, min(max(arguments.refined, 1), len(cases)))
     arguments.out.mkdir(parents=True, exist_ok=True)
     (arguments.out / "evaluation.md").write_text(evaluation.tables(), encoding="utf-8")
     found = {"network": str(arguments.network), "camera": arguments.camera, **asdict(evaluation)}

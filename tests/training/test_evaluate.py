@@ -8,13 +8,14 @@ import torch
 
 from model.metrics import surface_error
 from model.network.architecture import MAX_IMAGES, NetworkConfig
+from model.network.predictor import WEIGHTS, default_predictor
 from training import crossvalidate, plots
 from training.cases import ELSEWHERE, MAX_DISTANCE, SOURCE, Case, make_cases, within_reach
 from training.evaluate import DISTANCES, PAPERS_NETWORK, REFINEMENT, compared, draw, evaluate
 from training.figures import Figures, outcomes_of
-from training.methods import always, by_network, by_run, held_out_of
+from training.methods import always, by_network, by_onnx, by_run, held_out_of
 from training.render import Camera, CleanCamera, load_field
-from training.surfaces import load_surfaces, split_by_heliostat, untilted
+from training.surfaces import load_surfaces, split_by_heliostat
 from training.train import Run, TrainConfig
 
 SMALL = NetworkConfig(encoder_channels=(8, 16, 16), features=32, heads=2, style_features=8, decoder_channels=16)
@@ -100,6 +101,14 @@ def test_a_runs_folder_is_evaluated_from_as_many_images_as_asked(run, cases):
     assert held_out_of(run.folder) == run.held_out_names
 
 
+def test_the_exported_network_is_asked_as_the_product_asks_it(cases):
+    z, z_std = by_onnx(default_predictor(), looks=1)(cases[0], 2)
+    expected = default_predictor().predict(cases[0].heliostat, cases[0].observations[:2], looks=1)
+    np.testing.assert_array_equal(z, expected.z)
+    assert z_std is not None
+    assert len(held_out_of(WEIGHTS)) == 8
+
+
 def test_tables_and_plots_of_an_evaluation(run, cases, tmp_path, capsys):
     mean = run.mean.double().numpy()
     methods = compared(run.folder, tmp_path / "nowhere", mean)
@@ -156,7 +165,7 @@ def test_cross_validation_tells_the_spread_between_folds(surfaces, cases):
     values = [fold["ideal surface"].mae_mm["mean"] for fold in folds]
     assert f"{np.mean(values):.3f} ± {np.std(values, ddof=1):.3f}" in crossvalidate.table(folds)
     methods = crossvalidate.methods_of(surfaces[:20], None)
-    np.testing.assert_allclose(methods["mean surface"](cases[0], 8)[0], untilted(surfaces[:20].mean(axis=0)))
+    np.testing.assert_allclose(methods["mean surface"](cases[0], 8)[0], surfaces[:20].mean(axis=0))
     assert "network" not in methods
 
 
