@@ -9,7 +9,7 @@ mirror already in place; what it gives back traces itself under any optics and a
 or, in one step, `forecast_shots`. Gradients with respect to an effect's parameters hold the alignment fixed.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -70,9 +70,8 @@ class Shot:
 
     @property
     def kind(self) -> tuple[object, ...]:
-        """What shots must have in common to be traced at once."""
-        plane = (round(self.plane.width, 6), round(self.plane.height, 6))
-        return (*plane, self.degree, *self.control_points.shape, self.spot is None)
+        """What shots must have in common to be aligned at once."""
+        return (self.degree, *self.control_points.shape, self.spot is None)
 
 
 @dataclass(frozen=True)
@@ -109,14 +108,13 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Aligned shots that are traced at once.
+    """Aligned shots whose mirrors are alike in their splines.
 
     Attributes
     ----------
     rows : list of int
         Their places among all shots.
-    plane : TargetPlane
-        One of theirs; all have its size.
+    planes : list of TargetPlane
     scene : Scene
     angles : (B, 2) [rad]
     aims : (B, 3) [m]
@@ -124,10 +122,17 @@ class Group:
     """
 
     rows: list[int]
-    plane: TargetPlane
+    planes: list[TargetPlane]
     scene: Scene
     angles: Array
     aims: Array
+
+    def windows(self, view: View) -> Iterator[tuple[Window, list[int]]]:
+        """Each window that the view has on their targets, with the places in this group of the shots that share it."""
+        places: dict[Window, list[int]] = {}
+        for place, plane in enumerate(self.planes):
+            places.setdefault(view.of(plane), []).append(place)
+        yield from places.items()
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,18 +171,19 @@ class Aligned:
         for effect in in_light_order(effects):
             optics = effect.on_optics(optics)
         by_tracer = tracer or view.trace
-        return self._ordered([by_tracer(group.scene, view.of(group.plane), optics) for group in self.groups])
+        return self._each_window(view, lambda group, window, rows: by_tracer(group.scene.subset(rows), window, optics))
 
     def photographs(self, flux: Tensor, effects: Iterable[Effect], view: View | None = None) -> Tensor:
         """What the effects of the camera make of ``flux`` (B, rows, columns), which was traced in the same view."""
-        view, ordered = view or View(), in_light_order(effects)
-        images = []
-        for group in self.groups:
-            image = flux[group.rows]
+        ordered = in_light_order(effects)
+
+        def photograph(group: Group, window: Window, rows: list[int]) -> Tensor:
+            image = flux[[group.rows[row] for row in rows]]
             for effect in ordered:
-                image = effect.on_image(image, view.of(group.plane))
-            images.append(image)
-        return self._ordered(images)
+                image = effect.on_image(image, window)
+            return image
+
+        return self._each_window(view or View(), photograph)
 
     def images(
         self,
@@ -189,10 +195,14 @@ class Aligned:
         """`flux`, then `photographs`: images (B, rows, columns)."""
         return self.photographs(self.flux(optics, effects, view, tracer), effects, view)
 
-    def _ordered(self, parts: Sequence[Tensor]) -> Tensor:
-        """Parts of each group (b, ...) in the shots' order (B, ...)."""
-        places = torch.as_tensor([row for group in self.groups for row in group.rows])
-        return torch.cat(list(parts))[places.argsort()]
+    def _each_window(self, view: View, act: Callable[[Group, Window, list[int]], Tensor]) -> Tensor:
+        """What ``act`` makes (b, ...) of the shots in each window of each group, in the shots' order (B, ...)."""
+        parts, places = [], []
+        for group in self.groups:
+            for window, rows in group.windows(view):
+                parts.append(act(group, window, rows))
+                places += [group.rows[row] for row in rows]
+        return torch.cat(parts)[torch.as_tensor(places).argsort()]
 
 
 def _in_order(parts: Sequence[Array], groups: Sequence[Group]) -> Array:
@@ -261,11 +271,11 @@ def _align_group(
 
     if group[0].spot is None:
         angles = _given_angles(group, heliostats, suns)
+        scene = Scene.build(heliostats, points, angles, suns, planes, degree=degree, dtype=torch.float64)
     else:
         goals = [shot.goal for shot in group]
-        angles, aims = settle(heliostats, points, suns, planes, goals, degree=degree, start=aims, alter=alter)
-    scene = Scene.build(heliostats, points, angles, suns, planes, degree=degree, dtype=dtype)
-    return Group(rows, planes[0], alter(scene), angles, aims)
+        angles, aims, scene = settle(heliostats, points, suns, planes, goals, degree=degree, start=aims, alter=alter)
+    return Group(rows, planes, alter(scene.to(dtype)), angles, aims)
 
 
 def _altered(heliostats: Sequence[Heliostat], effects: Sequence[Effect]) -> list[Heliostat]:

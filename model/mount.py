@@ -31,7 +31,8 @@ _UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 def rotation(axis: ArrayLike, angle: ArrayLike) -> Array:
     """Rotation matrices (..., 3, 3) about ``axis`` (..., 3) by ``angle`` (...) [rad], right-handed (Rodrigues)."""
     direction = np.asarray(axis, dtype=np.float64)
-    x, y, z = np.moveaxis(direction / np.linalg.norm(direction, axis=-1, keepdims=True), -1, 0)
+    unit = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
+    x, y, z = unit[..., 0], unit[..., 1], unit[..., 2]
     theta = np.asarray(angle, dtype=np.float64)[..., None, None]
     zero = np.zeros_like(x)
     cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*x.shape, 3, 3)
@@ -228,7 +229,7 @@ class Mount:
         phase, swing = np.arctan2(sine, cosine), np.arccos(np.clip(ratio, -1, 1))
         both = np.stack([phase + swing, phase - swing], axis=-1)
         both = np.arctan2(np.sin(both), np.cos(both))
-        t2 = np.take_along_axis(both, np.abs(both).argmin(axis=-1)[..., None], axis=-1)[..., 0]
+        t2 = np.where(np.abs(both[..., 0]) <= np.abs(both[..., 1]), both[..., 0], both[..., 1])
         turned = _apply(rotation(second, t2), zero)
         before = turned - _dot(turned, first)[..., None] * first
         after = goal - _dot(goal, first)[..., None] * first

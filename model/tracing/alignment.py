@@ -23,10 +23,14 @@ TOLERANCE = 1e-5
 
 
 class Alignment(NamedTuple):
-    """Axis angles (B, 2) [rad] and the points (B, 3) [m] in ENU that the mirrors' centres aim at."""
+    """Axis angles (B, 2) [rad], the points (B, 3) [m] in ENU that the mirrors' centres aim at, and the aligned scene.
+
+    The scene is in double precision and without what ``alter`` changes.
+    """
 
     angles: Array
     aims: Array
+    scene: Scene
 
 
 def align_to_spots(
@@ -95,4 +99,4 @@ def settle(
         attitude = mount.attitude(angles)
         turned = {"attitude": attitude, "center": mount.mirror_center(positions, attitude)}
         scene = scene.with_(**{name: torch.as_tensor(values) for name, values in turned.items()})
-    return Alignment(angles, aims)
+    return Alignment(angles, aims, scene)

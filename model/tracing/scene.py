@@ -1,7 +1,7 @@
 """Scenes: what both tracers trace. A batch of mirrors, each with its pose, its sun and its target plane."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 import torch
@@ -147,6 +147,8 @@ class Scene:
         mount = Mount.stack([heliostat.mount for heliostat in heliostats])
         attitudes = mount.attitude(angles)
         centers = mount.mirror_center([heliostat.position for heliostat in heliostats], attitudes)
+        different = {id(plane): plane for plane in planes}  # few planes, many mirrors
+        axes = {key: plane.axes for key, plane in different.items()}
 
         def tensor(values: object) -> Tensor:
             return torch.as_tensor(np.asarray(values), dtype=dtype, device=device)
@@ -157,7 +159,7 @@ class Scene:
             center=tensor(centers),
             sun=tensor(suns),
             plane_center=tensor([plane.center for plane in planes]),
-            plane_axes=tensor([plane.axes for plane in planes]),
+            plane_axes=tensor([axes[id(plane)] for plane in planes]),
             degree=degree,
             first_axis=tensor(mount.first_axis),
         )
@@ -171,27 +173,31 @@ class Scene:
         """How many mirrors are traced."""
         return self.sun.shape[0]
 
+    def repeated(self, times: int) -> "Scene":
+        """The same mirrors ``times`` over, one whole batch after another."""
+        return self._each(lambda tensor: tensor.repeat(times, *[1] * (tensor.ndim - 1)))
+
+    def subset(self, rows: Sequence[int]) -> "Scene":
+        """Some of the mirrors, in this order."""
+        return self if list(rows) == list(range(self.batch)) else self._each(lambda tensor: tensor[list(rows)])
+
+    def to(self, dtype: torch.dtype) -> "Scene":
+        """The same scene in another precision."""
+        return self._each(lambda tensor: tensor.to(dtype))
+
+    def _each(self, change: Callable[[Tensor], Tensor]) -> "Scene":
+        """The same scene with every tensor changed."""
+        tensors = {f.name: getattr(self, f.name) for f in fields(self)}
+        return self.with_(**{name: change(value) for name, value in tensors.items() if isinstance(value, Tensor)})
+
     def by_facet(self) -> "Scene":
         """The same facets as mirrors of their own, those of one mirror following one another (B * F mirrors)."""
         facets = self.control_points.shape[1]
+        apart = self._each(lambda tensor: tensor.repeat_interleave(facets, dim=0))
         points = self.control_points.expand(self.batch, -1, -1, -1, -1).flatten(0, 1)[:, None]
-        shares = self.facet_reflectivity
-
-        def each(tensor: Tensor) -> Tensor:
-            return tensor.repeat_interleave(facets, dim=0)
-
-        return Scene(
-            control_points=points,
-            attitude=each(self.attitude),
-            center=each(self.center),
-            sun=each(self.sun),
-            plane_center=each(self.plane_center),
-            plane_axes=each(self.plane_axes),
-            degree=self.degree,
-            facet_reflectivity=None if shares is None else shares.reshape(-1, 1),
-            first_axis=None if self.first_axis is None else each(self.first_axis),
-            blocked_below=None if self.blocked_below is None else each(self.blocked_below),
-        )
+        if self.facet_reflectivity is None:
+            return apart.with_(control_points=points)
+        return apart.with_(control_points=points, facet_reflectivity=self.facet_reflectivity.reshape(-1, 1))
 
     def in_plane(self) -> tuple[Tensor, Tensor]:
         """Control points (B, F, 3, I, J) [m] and suns (B, 3) in the frame of each target plane.

@@ -345,7 +345,7 @@ def test_gradients_agree_with_finite_differences(make, value):
     def total(parameter: torch.Tensor) -> torch.Tensor:
         effect = make(parameter)
         scene = effect.on_scene(held.scene, heliostats)
-        return (view.trace(scene, view.of(held.plane), effect.on_optics(Optics())) * weights).sum()
+        return (view.trace(scene, view.of(held.planes[0]), effect.on_optics(Optics())) * weights).sum()
 
     start = torch.tensor(value, dtype=torch.float64, requires_grad=True)
     total(start).backward()

@@ -64,7 +64,7 @@ def test_unlike_shots_come_back_in_their_order():
     mixed = [a, wide, b, aimed, coarse, still, c]
     view, effects = View(40, 32, samples=8), [*GEOMETRY, SlopeError(1.0), Background(0.1, 0.05, 0.0)]
     together = align(mixed, effects)
-    assert len(together.groups) == 4
+    assert len(together.groups) == 3
     images = together.images(None, effects, view)
     assert images.shape == (7, 40, 32)
     for image, angles, shot in zip(images, together.angles, mixed, strict=True):
