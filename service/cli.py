@@ -211,13 +211,14 @@ def worker(
     as_json: Annotated[bool, typer.Option("--json", help="Print what it works at as JSON before it starts.")] = False,
 ) -> None:
     """Work at the jobs of the store that `serve` uses, in a process of its own."""
-    from service import server
+    from service.handlers import KINDS
     from service.settings import Settings
+    from service.workers import work
 
     settings = Settings() if count is None else Settings(job_workers=count)
     if as_json:
         typer.echo(json.dumps({"workers": settings.job_workers}))
-    server.work(settings)
+    work(settings, KINDS)
 
 
 @app.command()

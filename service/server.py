@@ -1,21 +1,16 @@
-"""Running the service: what the command line's ``serve``, ``worker`` and ``migrate`` call."""
+"""Running the service: what the command line's ``serve`` and ``migrate`` call."""
 
-import logging
-import signal
 import threading
 from types import FrameType
 
 import uvicorn
 
+from service import logs
 from service.app import create_app
 from service.database import Database
 from service.faults import NotStartedError
-from service.handlers import KINDS
-from service.runtime import Operations, Runtime
 from service.settings import Settings
-from service.workers import Kinds, Workers
 
-_FORMAT = "%(asctime)s %(levelname)s %(name)s %(message)s"
 # Seconds that requests under way get to finish when the service is told to stop.
 _GRACE_S = 30
 # Seconds that an idle connection stays open: longer than clients and proxies usually keep one for their next request.
@@ -43,7 +38,7 @@ def serve(settings: Settings) -> None:
     NotStartedError
         Where the store or the door keeps it from starting.
     """
-    logging.basicConfig(level=settings.log_level.upper(), format=_FORMAT)
+    logs.set_up(settings)
     app = create_app(settings)
     config = uvicorn.Config(
         app,
@@ -60,23 +55,6 @@ def serve(settings: Settings) -> None:
         server.run()
     except SystemExit as refusal:  # uvicorn's way to say that the application or the port failed
         raise NotStartedError("the service could not start; the log above says why") from refusal
-
-
-def work(settings: Settings, kinds: Kinds = KINDS, operations: Operations | None = None) -> None:
-    """Work at the store's jobs, ``job_workers`` at a time, until SIGTERM or SIGINT; one under way is put back."""
-    logging.basicConfig(level=settings.log_level.upper(), format=_FORMAT)
-    runtime = Runtime.from_settings(settings, operations)
-    try:
-        runtime.database.require_current()
-        workers = Workers(runtime, kinds, settings.job_workers)
-        stopping = threading.Event()
-        for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, lambda *_: stopping.set())
-        workers.start()
-        stopping.wait()
-        workers.stop()
-    finally:
-        runtime.close()
 
 
 def migrate(settings: Settings) -> str:

@@ -3,6 +3,7 @@
 import logging
 import os
 import random
+import signal
 import socket
 import threading
 import time
@@ -18,11 +19,12 @@ from pydantic import BaseModel, ValidationError
 from sqlalchemy.exc import OperationalError, SQLAlchemyError, StatementError
 from sqlalchemy.orm import Session
 
-from model.errors import ModelError
-from service import jobs
+from model.errors import InvalidInputError, ModelError
+from service import jobs, logs
 from service.arrays import pack
 from service.faults import ServiceError
-from service.runtime import Runtime
+from service.runtime import Operations, Runtime
+from service.settings import Settings
 from service.tables import JobRow
 
 logger = logging.getLogger("heliotwin.jobs")
@@ -268,3 +270,29 @@ class Workers:
         until = time.monotonic() + _GRACE_S
         for thread in self._threads:
             thread.join(max(0.0, until - time.monotonic()))
+
+
+def work(settings: Settings, kinds: Kinds, operations: Operations | None = None) -> None:
+    """Work at the store's jobs, ``job_workers`` at a time, until SIGTERM or SIGINT; one under way is put back.
+
+    Raises
+    ------
+    InvalidInputError
+        Where ``job_workers`` is 0.
+    SchemaError
+        Where nobody migrated the store.
+    """
+    if not settings.job_workers:
+        raise InvalidInputError("job_workers: 0 works at nothing; give --count or HELIOTWIN_JOB_WORKERS")
+    logs.set_up(settings)
+    runtime = Runtime.from_settings(settings, operations)
+    try:
+        runtime.database.require_current()
+        workers, stopping = Workers(runtime, kinds, settings.job_workers), threading.Event()
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, lambda *_: stopping.set())
+        workers.start()
+        stopping.wait()
+        workers.stop()
+    finally:
+        runtime.close()

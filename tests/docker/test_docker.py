@@ -64,7 +64,8 @@ def test_services_start_in_order(compose: dict[str, Any]):
 def test_what_compose_names_exists(compose: dict[str, Any]):
     for service in compose["services"].values():
         for volume in service.get("volumes", []):
-            assert volume.split(":")[0] in compose["volumes"]
+            source = volume.split(":")[0]
+            assert source in compose["volumes"] or source.startswith("./")
         assert set(service.get("secrets", [])) <= set(compose["secrets"])
         if "build" in service:
             assert (DOCKER / service["build"]["context"] / service["build"]["dockerfile"]).is_file()
@@ -79,7 +80,7 @@ def test_no_secret_is_in_the_file(compose: dict[str, Any]):
 
 
 def test_containers_have_no_more_rights_than_they_need(compose: dict[str, Any]):
-    for name in ("migrate", "service"):
+    for name in ("migrate", "service", "worker"):
         service = compose["services"][name]
         assert service["read_only"] is True
         assert service["cap_drop"] == ["ALL"]
@@ -90,13 +91,27 @@ def test_containers_have_no_more_rights_than_they_need(compose: dict[str, Any]):
 def test_environment_makes_valid_settings(compose: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     secret = tmp_path / "database_password"
     secret.write_text("p@ss:word\n", encoding="utf-8")
-    for name in ("migrate", "service"):
+    for name in ("migrate", "service", "worker"):
         for key, value in compose["services"][name]["environment"].items():
             monkeypatch.setenv(key, value.replace(SECRET, str(secret)))
         settings = Settings(_env_file=None)  # type: ignore[call-arg]  # pydantic-settings' own argument
         assert settings.database.drivername == "postgresql+psycopg"
         assert settings.database.password == "p@ss:word"
         assert not settings.migrates_on_start
+        for key in compose["services"][name]["environment"]:
+            monkeypatch.delenv(key)
+
+
+def test_jobs_are_worked_at_by_the_worker_alone(compose: dict[str, Any]):
+    """The worker sees the images that the service stores, and reads the folders that it may import."""
+    service, worker = compose["services"]["service"], compose["services"]["worker"]
+    assert service["environment"]["HELIOTWIN_JOB_WORKERS"] == "0"
+    assert "HELIOTWIN_JOB_WORKERS" not in worker["environment"]
+    assert worker["command"] == ["worker"]
+    assert set(service["volumes"]) < set(worker["volumes"])
+    (imports,) = set(worker["volumes"]) - set(service["volumes"])
+    assert imports.endswith(f":{worker['environment']['HELIOTWIN_IMPORT_ROOT']}:ro")
+    assert worker["depends_on"] == service["depends_on"]
 
 
 # --- Dockerfile -------------------------------------------------------------------------------------------------------

@@ -12,10 +12,9 @@ from sqlalchemy.exc import OperationalError
 from model.errors import InvalidInputError
 from service.runtime import Operations
 from service.schemas import Model
-from service.server import work
 from service.settings import Settings
 from service.tables import AuditRow
-from service.workers import Context, Kind, Kinds, Result
+from service.workers import Context, Kind, Kinds, Result, work
 
 
 class SquareIn(Model):

@@ -61,10 +61,11 @@ def test_foreign_keys_hold(database: Database):
 def test_values_are_checked_by_the_database(database: Database):
     found = {
         check["name"]
-        for table in ("plant", "measurements", "surfaces")
+        for table in Base.metadata.tables
         for check in inspect(database.engine).get_check_constraints(table)
     }
-    assert found == {"ck_plant_single", "ck_measurements_kind", "ck_surfaces_source"}
+    expected = {"ck_plant_single", "ck_measurements_kind", "ck_surfaces_source", "ck_jobs_state", "ck_api_keys_role"}
+    assert found == expected
 
 
 def test_moments_come_back_in_utc(database: Database):
