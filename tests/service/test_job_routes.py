@@ -16,10 +16,12 @@ import uvicorn
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
+from service import jobs
 from service.app import create_app
-from service.handlers import KINDS
+from service.handlers import KINDS, PredictionsIn, predict_many
 from service.settings import Settings
 from service.tables import JobRow
+from service.workers import Context
 
 from .conftest import QUIET, FakeOperations, Post, client_of, free_port, png
 from .job_kinds import TEST_KINDS
@@ -66,6 +68,51 @@ def test_predictions_make_one_version_each_and_name_what_they_skip(client: TestC
     assert client.get("/v1/heliostats/AA39/surfaces/1").status_code == 200
     again = finish(client, client.post("/v1/jobs/predictions", json={"heliostats": ["AA39", "AA39"]}))
     assert again["result"] == {"surfaces": {"AA39": 2}, "skipped": {}}
+
+
+def test_surfaces_of_a_job_that_is_begun_again_are_not_made_again(
+    client: TestClient, post: Post, properties: Any, operations: FakeOperations, monkeypatch: pytest.MonkeyPatch
+):
+    client.put("/v1/heliostats/AB01", json=properties)
+    post(png(1))
+    post(png(2), heliostat="AB01")
+    predict, calls = operations.predict, []
+
+    def fails_the_second_time(*arguments: Any) -> Any:
+        calls.append(1)
+        if len(calls) == 2:
+            raise ZeroDivisionError
+        return predict(*arguments)
+
+    monkeypatch.setattr(operations, "predict", fails_the_second_time)
+    job = finish(client, client.post("/v1/jobs/predictions", json={}))
+    assert (job["state"], job["attempts"]) == ("done", 2)
+    assert job["result"]["surfaces"] == {"AA39": 1, "AB01": 1}
+    assert len(calls) == 3
+    for name in ("AA39", "AB01"):
+        assert len(client.get(f"/v1/heliostats/{name}/surfaces").json()["items"]) == 1
+
+
+def test_surface_of_a_late_worker_is_not_stored(
+    app: FastAPI, client: TestClient, post: Post, operations: FakeOperations
+):
+    """While it computed, its lease ran out and another took the job: its surface is undone with its step."""
+    post()
+    runtime = app.state.runtime
+    with runtime.database.writing() as session:
+        session.add(JobRow(kind="later", payload={}, created_by="a"))
+    with runtime.database.writing() as session:
+        row = jobs.claim(session, ["later"], "late", 60, 3)
+        assert row is not None
+        lease = jobs.lease_of(row)
+        jobs.release(session, lease)
+    with runtime.database.writing() as session:
+        jobs.claim(session, ["later"], "fresh", 60, 3)
+    context = Context(runtime, lease, "a", threading.Event(), _reported=[time.monotonic()])
+    with pytest.raises(jobs.LeaseLostError):
+        predict_many(context, PredictionsIn())
+    assert len(operations.predictions) == 1
+    assert client.get("/v1/heliostats/AA39/surfaces").json()["items"] == []
 
 
 def test_predictions_without_any_image_fail_with_the_reason(client: TestClient):
