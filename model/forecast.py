@@ -163,7 +163,7 @@ class Aligned:
         view: View | None = None,
         tracer: Tracer | None = None,
     ) -> Tensor:
-        """Irradiance (B, rows, columns) [W/m2] under optics to which the effects' are added.
+        """Irradiance (B, rows, columns) [W/m2] under optics, the same for all shots, to which the effects' are added.
 
         ``tracer`` takes the place of the convolution tracer.
         """

@@ -1,4 +1,32 @@
-"""Axis tilt: the mount's foundation does not stand as surveyed."""
+"""Axis tilt: the mount's foundation does not stand as surveyed.
+
+What it is
+    Foundations settle and pylons lean. Both axes are turned with the ground, about north by ``north_deg``, then about
+    up by ``up_deg``, right-handed: for a first axis that points east, a positive ``north_deg`` lowers its east end
+    and a positive ``up_deg`` turns that end towards the north. A tilt about the first axis itself only shifts its
+    zero.
+
+Source
+    Tilted axes in kinematic models: Baheti and Scott, *Design of self-calibrating controllers for heliostats in a
+    solar power plant*, IEEE Transactions on Automatic Control 25 (1980); ARTIST's deviations ``first_joint_tilt_n`` and ``_u``.
+
+In an image
+    With the spot brought back to its place the normal is where sun and target demand it, whatever the axes do. What
+    is left of the tilt is that the mirror is rolled about its normal, by up to the tilt's size or a little more, and
+    its image with it: a turn about the spot's middle.
+
+What it scales with
+    The roll is a function of the two axis angles: it grows as the normal comes near the first axis (low suns in east
+    and west) and does not depend on distance. Round spots do not show it.
+
+What it is confused with
+    - Registration rotation: the same angle in every image, also in those of a mirror that stands square.
+    - Wrong sun positions: roll the image too, and change the incidence; compare morning with afternoon, where a clock
+      error changes its sense.
+    - Canting: changes the image in the mirror's own frame.
+    Without spots to align by, a tilt of a degree moves the spot by metres, which is how kinematic calibration finds
+    it.
+"""
 
 from dataclasses import dataclass
 from typing import ClassVar

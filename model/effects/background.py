@@ -1,4 +1,32 @@
-"""Background: light on the target, or counts in the camera, that the heliostat did not send."""
+"""Background: light on the target, or counts in the camera, that the heliostat did not send.
+
+What it is
+    The target is lit by sky and sun, by other heliostats' stray light, and the camera adds its black level. What is
+    left after an imperfect subtraction is a plane in shares of the image's peak::
+
+        seen = light + peak * (level + gradient_x * x + gradient_y * y)
+
+    with x to the right and y upwards, from -1 to 1 over the image. The level is negative where too much was
+    subtracted.
+
+Source
+    Radiometry; the subtraction of an image of the empty target, and what it leaves, in Roeger et al., *Techniques to
+    measure solar flux density distribution on large-scale receivers*, J. Solar Energy Engineering 136 (2014).
+
+In an image
+    Corners that ought to be dark are grey, brighter to one side. Normalised to the same energy, the spot itself looks
+    too dim.
+
+What it scales with
+    The ratio of daylight to the spot: strongest for far and for blocked heliostats, whose spots are faint. It follows
+    the target and the hour, not the heliostat.
+
+What it is confused with
+    - The sun's aureole: falls off with the distance from the spot and grows with the slant range.
+    - A gamma below one: lifts faint light, but leaves black black.
+    - A spot that is cut off by the window: spill has the spot's shape.
+    Images whose background the separation has taken out (`model.imaging`) show little of it.
+"""
 
 from dataclasses import dataclass
 from typing import ClassVar

@@ -1,4 +1,29 @@
-"""Camera blur: a lens out of focus, air that shimmers."""
+"""Camera blur: a lens out of focus, air that shimmers.
+
+What it is
+    Defocus, the lens's aberrations, the roughness of the target's paint, hot air between tower and camera, and the
+    resampling of a rectified image smear it by a Gaussian of ``sigma_m`` on the target, the same in all directions.
+
+Source
+    The point spread function and its transfer function, as in Goodman, *Introduction to Fourier Optics*; that many
+    small causes make a Gaussian is the central limit theorem. For targets of solar towers: Roeger et al., *Techniques
+    to measure solar flux density distribution on large-scale receivers*, J. Solar Energy Engineering 136 (2014).
+
+In an image
+    All detail is smoothed, the target's printed marks and edges too. The spot's variance grows by sigma squared in
+    either direction; its energy and its place stay.
+
+What it scales with
+    Nothing of the heliostat: the same in metres for near and far ones, for any sun and incidence, and for all images
+    of a camera on one target.
+
+What it is confused with
+    - Slope error, sun shape, jitter: grow in proportion to the slant range. A set with heliostats at several
+      distances tells them apart, one with a single distance cannot.
+    - A response with gamma below one: fattens spots without smoothing what is fine.
+
+Light is mirrored at the image's edges, where the camera would have seen what lies beyond; so none is lost.
+"""
 
 import math
 from dataclasses import dataclass

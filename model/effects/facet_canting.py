@@ -1,4 +1,30 @@
-"""Canting error: facets that lean against the pose they are known in."""
+"""Canting error: facets that lean against the pose they are known in.
+
+What it is
+    A heliostat's facets are screwed to its frame and canted so that their images fall together. Screws settle, frames
+    twist, and a facet that was replaced was never measured. Each facet is turned rigidly about its own centre, which
+    adds ``x_mrad`` to its slope along the mirror's x and ``y_mrad`` along its y.
+
+Source
+    Rigid rotation to first order (`model.surface.canted`); ways to measure canting are reviewed by Ren et al., *A
+    review of available methods for the alignment of mirror facets of solar concentrator in solar thermal power
+    system*, Renewable and Sustainable Energy Reviews 32 (2014).
+
+In an image
+    The image of a facet as a whole moves by twice the angle times the slant range. One facet that is off draws a
+    second spot or an ear; several make the spot look astigmatic or hollow. What a single facet draws keeps its shape.
+
+What it scales with
+    In proportion to the slant range; fixed in the mirror's frame, so that the ears turn on the target as the mirror
+    rolls. It stays with the heliostat and does not depend on elevation.
+
+What it is confused with
+    - A common tilt of all facets: invisible, for the alignment by the spot takes it back. Only differences are found.
+    - Waviness: has structure within each facet.
+    - Gravity bending: moves facets outwards and inwards by the same rule for all heliostats, and follows elevation.
+    - Blocking and soiling: take light away without moving the rest.
+    - A wrong clock or tilted axis: rolls the whole image instead of parting it.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

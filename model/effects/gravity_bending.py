@@ -1,4 +1,34 @@
-"""Gravity bending: the mirror sags under its own weight, the more the flatter it lies."""
+"""Gravity bending: the mirror sags under its own weight, the more the flatter it lies.
+
+What it is
+    Frame and facets bend between and beyond their supports. The part of the weight that presses on the mirror is that
+    along its normal, the sine of the normal's elevation; a mirror that stands upright does not sag, one that faces
+    the zenith sags fully. The sag is taken as a paraboloid over the whole mirror::
+
+        z -= amplitude * sin(elevation of the normal) * (r / r_edge)**2
+
+    with r the distance from the mirror's centre and r_edge half the mirror's width, the middle of its left and right
+    edges. A positive amplitude lowers the edges, which makes the mirror convex and its focus longer. It is
+    added to the surface as that is known; how far a measured surface already sagged as it was measured is not undone.
+
+Source
+    Moya and Ho, *Modeling and validation of heliostat deformation due to static loading*, ASME ES2011-54216; Yuan,
+    Christian, Ho, *Compensation of gravity induced heliostat deflections for improved optical performance*, J. Solar
+    Energy Engineering 137 (2015). The paraboloid is the lowest term of a plate's deflection.
+
+In an image
+    A change of focus: the spot grows or shrinks as a whole, in both directions. Off axis the change is one of
+    astigmatism as well.
+
+What it scales with
+    The sine of the normal's elevation, so high suns and near heliostats show it most; a slope of 2 amplitude / r_edge
+    at the edge, which moves light by twice that times the slant range.
+
+What it is confused with
+    - Canting: the same at any elevation, and each heliostat's own.
+    - Slope error, sun shape: blur the image without focusing it; they never make a spot smaller.
+    - A registration scale: resizes the image, independent of sun and distance.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

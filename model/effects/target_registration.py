@@ -1,4 +1,32 @@
-"""Target registration: the target's corners were not found where they are."""
+"""Target registration: the target's corners were not found where they are.
+
+What it is
+    A photograph is rectified by the corners of the target. Corners that are off by some pixels, or a target that was
+    surveyed with the wrong size, leave an affine error: a point (x, y) [m, right and up of the centre] appears at::
+
+        R(rotation_deg) (scale_x * (x + shear * y), scale_y * y)
+
+    with R turning anticlockwise. A shift is no part of it, since images are aligned by their spots.
+
+Source
+    The hierarchy of plane transformations in Hartley and Zisserman, *Multiple View Geometry in Computer Vision*,
+    section 2.4.
+
+In an image
+    The spot is wider, flatter, leaning or turned, with all its detail, and so are the target's edges and marks.
+    Irradiance keeps its values: energy on the image grows with the area, scale_x * scale_y.
+
+What it scales with
+    Nothing of the heliostat: the same for all of them on one target, at any distance and sun. Two targets of one
+    camera have errors of their own.
+
+What it is confused with
+    - Gravity and focus errors: resize the spot, but differently at every distance and elevation, and not its blurred
+      rim alike.
+    - Blur in one direction (jitter): adds a variance, where a scale multiplies it; compare small and large spots.
+    - Axis tilt: turns images by an angle that depends on the mount's position; a registration's is always the same.
+    - A wrong aspect of the pixels is scale_x against scale_y.
+"""
 
 import math
 from dataclasses import dataclass

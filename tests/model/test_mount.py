@@ -41,6 +41,23 @@ def test_alignment_reflects_the_sun_onto_the_aim(name):
     assert np.arccos(min(1.0, out @ toward)) < 1e-7
 
 
+def test_a_stack_turns_each_mirror_by_its_own_mount():
+    suns, aims = sun_direction([30.0, -20.0, 10.0], 40.0), np.array([[1.0, 0, 40], [0, 0, 38], [-1, 0, 39]])
+    positions, mounts = RNG.uniform(20, 80, (3, 3)), list(MOUNTS.values())
+    stack = Mount.stack(mounts)
+    angles = stack.align(positions, suns, aims)
+    for index, mount in enumerate(mounts):
+        alone = mount.align(positions[index], suns[index], aims[index])
+        np.testing.assert_allclose(angles[index], alone, atol=1e-12)
+        attitude = mount.attitude(alone)
+        np.testing.assert_allclose(stack.attitude(angles)[index], attitude, atol=1e-12)
+        np.testing.assert_allclose(
+            stack.mirror_center(positions, stack.attitude(angles))[index],
+            mount.mirror_center(positions[index], attitude),
+            atol=1e-9,
+        )
+
+
 def test_the_mount_rolls_the_mirror():
     """Same normal, different roll: some degrees at noon, many at low sun (DESIGN.md, section 4.3)."""
     normal = random_normals(1)[0]
