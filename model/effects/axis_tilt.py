@@ -8,7 +8,8 @@ What it is
 
 Source
     Tilted axes in kinematic models: Baheti and Scott, *Design of self-calibrating controllers for heliostats in a
-    solar power plant*, IEEE Transactions on Automatic Control 25 (1980); ARTIST's deviations ``first_joint_tilt_n`` and ``_u``.
+    solar power plant*, IEEE Transactions on Automatic Control 25 (1980); ARTIST's deviations ``first_joint_tilt_n``
+    and ``first_joint_tilt_u``.
 
 In an image
     With the spot brought back to its place the normal is where sun and target demand it, whatever the axes do. What
