@@ -97,9 +97,6 @@ class DoorMiddleware:
 
     async def _refusal(self, scope: Scope) -> Response | None:
         headers = Headers(scope=scope)
-        if is_loopback(self.settings.host) and not _is_loopback_name(headers.get("host", "")):
-            # Else a page whose name its owner lets point to 127.0.0.1 could read everything (DNS rebinding).
-            return problem(scope, HTTPStatus.FORBIDDEN, "Host: this service answers on this machine's own names only")
         if scope["method"] not in ("GET", "HEAD", "OPTIONS") and _is_cross_site(headers):
             return problem(scope, HTTPStatus.FORBIDDEN, "another site's page may not change anything here")
         identity = None
@@ -108,7 +105,13 @@ class DoorMiddleware:
                 identity = await self._identify(scope, headers)
             except OperationalError as error:
                 return errors.database_away(scope, error)
+        if identity == security.LOCAL and self._is_rebound(headers):
+            return problem(scope, HTTPStatus.FORBIDDEN, "Host: without a key use one of this machine's own names")
         return self._too_often(scope, identity) or self._unknown(scope, identity)
+
+    def _is_rebound(self, headers: Headers) -> bool:
+        """Whether a page may have reached this machine by a name that its owner lets point here (DNS rebinding)."""
+        return is_loopback(self.settings.host) and not _is_loopback_name(headers.get("host", ""))
 
     async def _identify(self, scope: Scope, headers: Headers) -> security.Identity | None:
         database, presented = scope["app"].state.runtime.database, security.presented_key(headers)

@@ -53,6 +53,10 @@ class Identity:
     role: Role
 
 
+LOCAL = Identity(keys.RESERVED, Role.ADMIN)
+"""Whoever comes without a key where none is demanded."""
+
+
 def is_public(path: str) -> bool:
     """Whether a path is open to everybody."""
     return any(path == public or path.startswith(f"{public}/") for public in PUBLIC)
@@ -82,7 +86,7 @@ def identify(database: Database, settings: Settings, presented: str | None) -> I
             row = keys.find(session, presented)
             return None if row is None else Identity(row.name, Role(row.role))
         if may_be_open(settings) and not keys.any_made(session):
-            return Identity(keys.RESERVED, Role.ADMIN)
+            return LOCAL
     return None
 
 

@@ -1,6 +1,7 @@
 """Workers: threads that take jobs, run their handlers, and see that each ends exactly once."""
 
 import logging
+import math
 import os
 import random
 import signal
@@ -55,7 +56,7 @@ class Result:
     arrays: Mapping[str, NDArray[np.generic]] | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class Context:
     """A handler's view of its job.
 
@@ -70,7 +71,7 @@ class Context:
     stopping: threading.Event
     cancelled: threading.Event = field(default_factory=threading.Event)
     lost: threading.Event = field(default_factory=threading.Event)
-    _reported: list[float] = field(default_factory=lambda: [-np.inf])
+    reported_s: float = -math.inf
 
     def check(self) -> None:
         """Raise `LeaseLostError`, `CancelRequestedError` or `WorkerStoppingError` where the work shall end."""
@@ -84,9 +85,9 @@ class Context:
     def report(self, progress: float, message: str = "") -> None:
         """Say how far the job is, 0 to 1, and what is being done; raises what `check` raises."""
         self.check()
-        if time.monotonic() - self._reported[0] < _REPORT_EVERY_S:
+        if time.monotonic() - self.reported_s < _REPORT_EVERY_S:
             return
-        self._reported[0] = time.monotonic()
+        self.reported_s = time.monotonic()
         with self.runtime.database.writing() as session:
             if jobs.report(session, self.lease, progress, message):
                 self.cancelled.set()
@@ -139,7 +140,6 @@ class Worker:
             except SQLAlchemyError as error:
                 logger.error("%s: the database does not answer: %s", self.name, error)
                 worked = False
-                self.stopping.wait(self.runtime.settings.job_poll_s)
             if not worked:
                 self.runtime.job_came.acquire(timeout=self.runtime.settings.job_poll_s)
 

@@ -108,7 +108,7 @@ def test_surface_of_a_late_worker_is_not_stored(
         jobs.release(session, lease)
     with runtime.database.writing() as session:
         jobs.claim(session, ["later"], "fresh", 60, 3)
-    context = Context(runtime, lease, "a", threading.Event(), _reported=[time.monotonic()])
+    context = Context(runtime, lease, "a", threading.Event(), reported_s=time.monotonic())
     with pytest.raises(jobs.LeaseLostError):
         predict_many(context, PredictionsIn())
     assert len(operations.predictions) == 1

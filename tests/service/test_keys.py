@@ -252,6 +252,12 @@ def test_foreign_names_of_this_machine_are_refused(bare: TestClient, host: str):
     assert bare.get("/v1/heliostats", headers={"Host": host}).status_code in (400, 403)
 
 
+def test_any_name_will_do_with_a_key(app: FastAPI, bare: TestClient):
+    """A proxy on the same machine passes on the name that the plant knows the service by."""
+    headers = bearer(make_key(app, "first")) | {"Host": "plant.example"}
+    assert bare.get("/v1/heliostats", headers=headers).status_code == 200
+
+
 @pytest.mark.parametrize("host", ["localhost", "localhost:8000", "127.0.0.1:8000", "[::1]:8000"])
 def test_own_names_of_this_machine_are_known(bare: TestClient, host: str):
     assert bare.get("/v1/heliostats", headers={"Host": host}).status_code == 200
@@ -438,6 +444,7 @@ def test_keys_by_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert capsys.readouterr().err.count("\n") == 1
     assert heliotwin("keys", "create", "a b", "--role", "read") == 2
     assert heliotwin("keys", "create", "x", "--role", "root") == 2
+    assert heliotwin("worker", "--count", "0") == 2
 
 
 def test_serve_refuses_to_stand_open(
