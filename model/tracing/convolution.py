@@ -203,7 +203,7 @@ def _interpolate(table: Tensor, frequency: Tensor) -> Tensor:
 
 
 def _cone_transfer(rays: Rays, optics: Optics, right: Tensor, up: Tensor, table: Tensor) -> Tensor:
-    """Transfer function (B, R, C/2+1) of the reflected cone on the target plane.
+    """Transfer function (B, R, C/2+1) of the reflected cone, and of its swing with the mount, on the target plane.
 
     A ray tilted by a small angle e (a vector across the beam d) meets the plane, whose normal is z, shifted by
     R (e - d e_z / d_z). The frequency f on the plane therefore sees the angular frequency g = R (f - z (d.f) / d_z),

@@ -3,12 +3,15 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from model.effects.gravity_bending import GravityBending
 from service.demo_plant import write_plant
+from service.folder import forecast_folder
 from service.paint import read_folder
 
 
@@ -72,21 +75,20 @@ def test_forecast_reaches_the_goal_on_real_images(stj, tmp_path):
     assert "AD37" in report["skipped"]
 
 
-def test_effects_of_a_file_change_the_forecast(made_plant, tmp_path):
-    """As a list, or as a study reports them; they come in addition to what the folder declares."""
-    name = "slope_error"
-    (tmp_path / "list.json").write_text(json.dumps([{"name": name, "parameters": {"sigma_mrad": 2.0}}]))
-    value = {"value": 2.0, "ci95": [1.9, 2.1], "unit": "mrad"}
-    report = {"verdict": "effect", "effects": [{"name": name, "parameters": {"sigma_mrad": value}}]}
-    (tmp_path / "report.json").write_text(json.dumps(report))
-    plain = succeeds("forecast", made_plant, "--out", tmp_path / "plain")
-    spread = succeeds("forecast", made_plant, "--out", tmp_path / "l", "--effects", tmp_path / "list.json")
-    again = succeeds("forecast", made_plant, "--out", tmp_path / "r", "--effects", tmp_path / "report.json")
-    assert (plain["model_version"], spread["model_version"]) == ("1:none", "2:slope_error")
-    assert spread == again
-    peaks = [[entry["peak_w_m2"] for entry in r["measurements"].values()] for r in (plain, spread)]
-    assert (np.array(peaks[1]) < 0.9 * np.array(peaks[0])).all()
-    assert spread["effects"] == [{"name": name, "parameters": {"sigma_mrad": 2.0}}]
+def test_effects_of_a_studys_report_are_added_to_the_declared_ones(made_plant, tmp_path):
+    sigma = {"sigma_mrad": {"value": 2.0, "ci95": [1.9, 2.1], "unit": "mrad"}}
+    found = {"verdict": "effect", "effects": [{"name": "slope_error", "parameters": sigma}]}
+    (tmp_path / "report.json").write_text(json.dumps(found))
+    folder = read_folder(made_plant, ["AB12"])
+    plain = forecast_folder(folder, tmp_path / "plain")
+    declared = forecast_folder(replace(folder, effects=(GravityBending(3.0),)), tmp_path / "declared")
+    added = succeeds("forecast", made_plant, "--out", tmp_path / "added", "--effects", tmp_path / "report.json")
+    versions = [report["model_version"] for report in (plain, declared, added)]
+    assert versions == ["1:none", "2:gravity_bending", "2:slope_error"]
+    assert added["effects"] == [{"name": "slope_error", "parameters": {"sigma_mrad": 2.0}}]
+    for key, entry in plain["measurements"].items():
+        assert added["measurements"][key]["peak_w_m2"] < 0.9 * entry["peak_w_m2"]
+        assert declared["measurements"][key]["peak_w_m2"] != pytest.approx(entry["peak_w_m2"], rel=0.01)
 
 
 @pytest.mark.parametrize("number", [2, 5])
