@@ -27,8 +27,10 @@ def make_router(kinds: Kinds) -> APIRouter:
     router = APIRouter(prefix="/jobs", tags=["jobs"])
     for kind in kinds.values():
         _add_creator(router, kind)
-    _add_reading(router)
-    return router
+    both = APIRouter()
+    both.include_router(router)
+    both.include_router(_existing)
+    return both
 
 
 def _add_creator(router: APIRouter, kind: Kind[Any]) -> None:
@@ -63,61 +65,67 @@ def _add_creator(router: APIRouter, kind: Kind[Any]) -> None:
     )(create)
 
 
-def _add_reading(router: APIRouter) -> None:
-    @router.get("", responses=problems(), dependencies=[READ])
-    def list_jobs(
-        runtime: RuntimeDep,
-        limit: Limit = 100,
-        after: Annotated[Version | None, Query(description="The last id of the page before.")] = None,
-        state: Annotated[State | None, Query(description="Only jobs in this state.")] = None,
-        kind: KindName = None,
-    ) -> Page[JobOut]:
-        """Jobs, newest first."""
-        with runtime.database.reading() as session:
-            rows = jobs.list_jobs(session, limit + 1, after, state, kind)
-        items = [representations.job(row) for row in rows[:limit]]
-        return Page(items=items, next=str(items[-1].id) if len(rows) > limit else None)
+_existing = APIRouter(prefix="/jobs", tags=["jobs"])
 
-    @router.get("/{number}", responses=problems(404), dependencies=[READ])
-    def get_job(number: Number, runtime: RuntimeDep) -> JobOut:
-        """A job with its progress, and its result when it is done."""
-        with runtime.database.reading() as session:
-            return representations.job(jobs.get_job(session, number))
 
-    @router.get(
-        "/{number}/flux",
-        responses={**problems(404, 406), **arrays("`flux` (rows, columns) [W/m2].")},
-        dependencies=[READ],
-    )
-    def get_job_flux(number: Number, runtime: RuntimeDep, media_type: MediaType) -> Response:
-        """The flux map of a job that gave one."""
-        with runtime.database.reading() as session:
-            row = jobs.get_job(session, number, arrays=True)
-        return representations.job_flux(row, media_type)
+@_existing.get("", responses=problems(), dependencies=[READ])
+def list_jobs(
+    runtime: RuntimeDep,
+    limit: Limit = 100,
+    after: Annotated[Version | None, Query(description="The last id of the page before.")] = None,
+    state: Annotated[State | None, Query(description="Only jobs in this state.")] = None,
+    kind: KindName = None,
+) -> Page[JobOut]:
+    """Jobs, newest first."""
+    with runtime.database.reading() as session:
+        rows = jobs.list_jobs(session, limit + 1, after, state, kind)
+    items = [representations.job(row) for row in rows[:limit]]
+    return Page(items=items, next=str(items[-1].id) if len(rows) > limit else None)
 
-    @router.get(
-        "/{number}/events",
-        response_class=Response,
-        responses={
-            **problems(404),
-            200: {"description": "Server-sent events `progress` and `end`.", "content": {"text/event-stream": {}}},
-            204: {"description": "The job has ended and Last-Event-ID was its last event."},
-        },
-        dependencies=[READ],
-    )
-    def get_job_events(
-        number: Number,
-        runtime: RuntimeDep,
-        stopping: StoppingDep,
-        last_event_id: Annotated[str | None, Header(alias="Last-Event-ID", description="Go on after this one.")] = None,
-    ) -> Response:
-        """The job each time it changes, as server-sent events, until it ends."""
-        return events.stream(runtime, number, last_event_id, stopping)
 
-    @router.post("/{number}/cancel", responses=problems(404, 409), dependencies=[OPERATE])
-    def cancel_job(number: Number, runtime: RuntimeDep, identity: IdentityDep) -> JobOut:
-        """Cancel a job: at once where it waits; a running one ends at its next report."""
-        with runtime.database.writing() as session:
-            row = jobs.cancel(session, number)
-            audit.record(session, identity.name, "job.cancelled", f"job {number}", kind=row.kind)
-            return representations.job(row)
+@_existing.get("/{number}", responses=problems(404), dependencies=[READ])
+def get_job(number: Number, runtime: RuntimeDep) -> JobOut:
+    """A job with its progress, and its result when it is done."""
+    with runtime.database.reading() as session:
+        return representations.job(jobs.get_job(session, number))
+
+
+@_existing.get(
+    "/{number}/flux",
+    responses={**problems(404, 406), **arrays("`flux` (rows, columns) [W/m2].")},
+    dependencies=[READ],
+)
+def get_job_flux(number: Number, runtime: RuntimeDep, media_type: MediaType) -> Response:
+    """The flux map of a job that gave one."""
+    with runtime.database.reading() as session:
+        row = jobs.get_job(session, number, arrays=True)
+    return representations.job_flux(row, media_type)
+
+
+@_existing.get(
+    "/{number}/events",
+    response_class=Response,
+    responses={
+        **problems(404),
+        200: {"description": "Server-sent events `progress` and `end`.", "content": {"text/event-stream": {}}},
+        204: {"description": "The job has ended and Last-Event-ID was its last event."},
+    },
+    dependencies=[READ],
+)
+def get_job_events(
+    number: Number,
+    runtime: RuntimeDep,
+    stopping: StoppingDep,
+    last_event_id: Annotated[str | None, Header(alias="Last-Event-ID", description="Go on after this one.")] = None,
+) -> Response:
+    """The job each time it changes, as server-sent events, until it ends."""
+    return events.stream(runtime, number, last_event_id, stopping)
+
+
+@_existing.post("/{number}/cancel", responses=problems(404, 409), dependencies=[OPERATE])
+def cancel_job(number: Number, runtime: RuntimeDep, identity: IdentityDep) -> JobOut:
+    """Cancel a job: at once where it waits; a running one ends at its next report."""
+    with runtime.database.writing() as session:
+        row = jobs.cancel(session, number)
+        audit.record(session, identity.name, "job.cancelled", f"job {number}", kind=row.kind)
+        return representations.job(row)
