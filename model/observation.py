@@ -7,10 +7,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from model.effects import Effect
 from model.errors import InvalidInputError
+from model.forecast import Aligned, Shot, View, align
 from model.plant import Heliostat, TargetPlane
 from model.surface import control_points
-from model.tracing import Optics, Scene, Window, trace
+from model.tracing import Optics, Scene
 from model.tracing.alignment import align_to_spots
 
 FLUX_SHAPE = (64, 64)
@@ -99,23 +101,34 @@ def scene_of(
     return Scene.build([heliostat] * count, points, angles, suns, targets, dtype=dtype)
 
 
+def align_observations(
+    heliostat: Heliostat,
+    observations: Sequence[Observation],
+    z: NDArray[np.float64],
+    effects: Sequence[Effect] = (),
+) -> Aligned:
+    """The heliostat with surface ``z`` (4, 8, 8) [m] turned so that its spots lie where the M were observed.
+
+    A tilt of the whole mirror is taken back by the mount and leaves no trace.
+    """
+    points = control_points(heliostat, z)
+    return align([Shot(heliostat, points, o.sun, o.target, spot=o.center_of_mass) for o in observations], effects)
+
+
 def render_observations(
     heliostat: Heliostat,
     observations: Sequence[Observation],
-    surfaces: Sequence[NDArray[np.float64]],
+    z: NDArray[np.float64],
     optics: Optics | None = None,
+    effects: Sequence[Effect] = (),
     *,
     samples: int = 24,
 ) -> NDArray[np.float64]:
-    """What each of K surfaces (4, 8, 8) [m] would have thrown on the M targets: fluxes (K, M, 64, 64), sum 100.
-
-    Every surface is aligned anew: a tilt of the whole mirror is taken back by the mount and leaves no trace.
-    """
-    scene = scene_of(heliostat, observations, surfaces)
+    """What a surface ``z`` (4, 8, 8) [m] would have thrown where M fluxes were observed: (M, 64, 64), sum 100."""
+    view = View(*FLUX_SHAPE, window=FLUX_WINDOW, samples=samples)
     with torch.no_grad():
-        window = Window(FLUX_WINDOW, FLUX_WINDOW, on_spot=True)
-        flux = trace(scene, window, optics, samples=samples, padding=0.25).normalized()
-    return flux.double().numpy().reshape(len(surfaces), len(observations), *flux.shape[1:])
+        flux = align_observations(heliostat, observations, z, effects).images(optics, effects, view).double()
+    return (100 * flux / flux.sum(dim=(1, 2), keepdim=True)).numpy()
 
 
 def spread_suns(suns: NDArray[np.float64], count: int) -> list[int]:

@@ -186,9 +186,11 @@ class Run:
         loss = error + c.slope_weight * slopes + c.spread_weight * likelihood
         loss.backward()  # type: ignore[no-untyped-call]
         parallel.average_gradients(self.network.parameters())
-        nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
-        self.optimizer.step()
-        self._update_average()
+        norm = nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
+        # One batch in thousands overflows; its step would be the end of the run.
+        if torch.isfinite(norm):
+            self.optimizer.step()
+            self._update_average()
         self.step += 1
         return float(error.detach())
 

@@ -11,6 +11,7 @@ import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
 
+from model.effects import Effect
 from model.errors import InvalidInputError
 from model.network.architecture import MAX_IMAGES
 from model.network.inputs import GUESS_SAMPLES, conditions
@@ -60,10 +61,11 @@ class SurfacePredictor:
         heliostat: Heliostat,
         observations: Sequence[Observation],
         optics: Optics | None = None,
+        effects: Sequence[Effect] = (),
         *,
         looks: int = LOOKS,
     ) -> SurfacePrediction:
-        """The surface of a heliostat from one to eight of its images.
+        """The surface of a heliostat from one to eight of its images, as a model with these optics and effects sees it.
 
         Raises
         ------
@@ -82,7 +84,7 @@ class SurfacePredictor:
         }
         z = default_prior().mean
         for _ in range(looks):
-            traced = render_observations(heliostat, observations, [z], optics, samples=GUESS_SAMPLES)[0]
+            traced = render_observations(heliostat, observations, z, optics, effects, samples=GUESS_SAMPLES)
             z, z_std = (
                 values[0] for values in self.look({**inputs, "guess_flux": _filled(traced), "guess": z[None] * 1e3})
             )
@@ -92,7 +94,7 @@ class SurfacePredictor:
             control_points=control_points(heliostat, z),
             method="network",
             weights=self.name,
-            misfit=misfit(heliostat, observations, z, optics),
+            misfit=misfit(heliostat, observations, z, optics, effects),
             used=tuple(o.identifier for o in observations),
         )
 
