@@ -231,7 +231,7 @@ def write_surface(out: Path, name: str, predicted: SurfacePrediction) -> None:
 # --- forecast ---------------------------------------------------------------------------------------------------------
 
 
-def _surface(folder: MeasurementFolder, heliostat: Heliostat, surfaces: str) -> tuple[Array, int] | None:
+def surface_of(folder: MeasurementFolder, heliostat: Heliostat, surfaces: str) -> tuple[Array, int] | None:
     """The surface to trace: None for the ideal one; refused where it is missing."""
     if surfaces == "ideal":
         return None
@@ -312,7 +312,7 @@ def forecast_folder(
     }
     for name, heliostat in folder.plant.heliostats.items():
         try:
-            surface = _surface(folder, heliostat, surfaces)
+            surface = surface_of(folder, heliostat, surfaces)
         except ModelError as error:
             report["skipped"][name] = str(error)
             continue

@@ -145,11 +145,12 @@ class Run:
 
     def look(self, network: nn.Module, flux: Tensor, shots: Shots, guess: Tensor) -> tuple[Tensor, Tensor]:
         """Heights and spread (B, 4, 8, 8) [mm] after one look at flux (B, M, 64, 64), from guesses (B, 4, 8, 8) [m]."""
+        # Geometry does not bear sixteen bits: all of it stays outside of autocast.
         with torch.no_grad():
-            guess_flux = shots.trace(guess)
+            guess_flux, conditions = shots.trace(guess), shots.conditions()
         mask = torch.ones(flux.shape[:2], device=self.device)
         with torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=self.config.bfloat16 and network.training):
-            heights, spread = network(flux, shots.conditions(), mask, guess_flux, guess * 1e3)
+            heights, spread = network(flux, conditions, mask, guess_flux, guess * 1e3)
         return heights.float(), spread.float()
 
     @torch.no_grad()

@@ -1,0 +1,198 @@
+"""The loop: fit every candidate, keep the one that images it never saw gain from, and go on from there."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.effects import CATALOGUE, JUELICH_LATITUDE, Effect
+from model.errors import InvalidInputError
+from model.forecast import View
+from model.study.fitting import Fitter
+from model.study.judging import Gain, Split, accuracies, paired_gain, split
+from model.study.photographs import RESOLUTION, Forecaster, Photograph, spot_window
+from model.study.report import Candidate, Found, Study
+from model.study.unknowns import Unknowns
+from model.tracing import Optics
+
+Array = NDArray[np.float64]
+
+LEAST_IMAGES = 4
+
+
+@dataclass(frozen=True)
+class StudyOptions:
+    """How a study is made.
+
+    ``least_gain`` of accuracy is what an effect must bring to be worth its place in a model; at the ``most`` so many
+    effects are added. ``window`` [m] is that of the spots unless given. ``candidates`` are names of the catalogue.
+    """
+
+    candidates: tuple[str, ...] = tuple(CATALOGUE)
+    least_gain: float = 0.004
+    most: int = 3
+    window: float | None = None
+    latitude_deg: float = JUELICH_LATITUDE
+    fit_view: View = field(default_factory=lambda: View(72, 72, samples=12, padding=0.125))
+    view: View = field(default_factory=lambda: View(128, 128, samples=24))
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """A model with some kinds of effect, fitted: values (P,), their spread (P,), accuracy (H,) of held-out images."""
+
+    unknowns: Unknowns
+    values: Array
+    spread: Array
+    accuracy: Array
+
+    @property
+    def effects(self) -> list[Effect]:
+        """The fitted effects."""
+        return self.unknowns.effects(self.values)
+
+
+class _Loop:
+    """One study while it goes on."""
+
+    def __init__(
+        self, photographs: Sequence[Photograph], optics: Optics, declared: Sequence[Effect], options: StudyOptions
+    ) -> None:
+        self.photographs, self.options = photographs, options
+        self.window = options.window or spot_window(photographs)
+        self.split: Split = split(photographs)
+        self.facets = tuple(sorted({(p.heliostat, len(p.shot.control_points)) for p in photographs}))
+
+        def forecaster(rows: NDArray[np.int64], view: View) -> Forecaster:
+            chosen = [photographs[row] for row in rows]
+            return Forecaster(chosen, optics, declared, self.window, view, options.latitude_deg)
+
+        self.fit = forecaster(self.split.fit, options.fit_view)
+        self.own = forecaster(self.split.own, options.fit_view) if len(self.split.own) else None
+        self.judge = forecaster(self.split.held_out, options.view)
+        self.measured = self.judge.measured(RESOLUTION)
+        self.heliostats = np.array([photographs[row].heliostat for row in self.split.held_out])
+
+    def trial(self, kinds: Sequence[type[Effect]], start: Trial | None = None) -> Trial:
+        """Fit kinds of effect together, from where ``start`` has fitted some of them, and judge them."""
+        whole = Unknowns(tuple(kinds), self.facets)
+        trial = Trial(whole, whole.neutral, np.zeros(len(whole.all)), np.empty(0))
+        if start is not None:
+            trial = replace(trial, values=start.unknowns.put(start.values, whole))
+        known = set() if start is None else set(start.unknowns.kinds)
+        if kinds:
+            trial = self._fitted(trial, Fitter(self.fit), whole, known)
+        if self.own is not None and whole.own.kinds:
+            shared = [e for e in trial.effects if type(e) not in whole.own.kinds]
+            trial = self._fitted(trial, Fitter(self.own, shared), whole.own, known)
+        return replace(trial, accuracy=self.accuracy(trial.effects))
+
+    @staticmethod
+    def _fitted(trial: Trial, fitter: Fitter, unknowns: Unknowns, known: set[type[Effect]]) -> Trial:
+        """The trial with those unknowns fitted that the fitter's photographs can tell of."""
+        local = unknowns.of(sorted(set(fitter.heliostats.tolist())))
+        free = np.array([u.effect not in known for u in local.all], dtype=bool)
+        fit = fitter.fit(local, trial.unknowns.put(trial.values, local), free)
+        values, spread = trial.values.copy(), trial.spread.copy()
+        places = [trial.unknowns.all.index(u) for u in local.all]
+        values[places], spread[places] = fit.values, fit.spread
+        return replace(trial, values=values, spread=spread)
+
+    def accuracy(self, effects: Sequence[Effect]) -> Array:
+        """Accuracy (H,) of the held-out images under effects."""
+        return accuracies(self.measured, self.judge.cuts(effects))
+
+    def gain(self, after: Trial, before: Trial) -> Gain:
+        """What ``after`` is better by on held-out images."""
+        return paired_gain(after.accuracy - before.accuracy, self.heliostats)
+
+    def counts(self, gain: Gain) -> bool:
+        """Whether a gain is both significant and worth having."""
+        return gain.low > 0 and gain.mean >= self.options.least_gain
+
+    def choose(self, trials: dict[str, Trial], current: Trial) -> tuple[str, list[str]] | None:
+        """The candidate to add and its look-alikes, or None.
+
+        Of those that no held-out image tells from the best one the simplest is taken.
+        """
+        worthy = {name: t for name, t in trials.items() if self.counts(self.gain(t, current))}
+        if not worthy:
+            return None
+        best = max(worthy.values(), key=lambda t: t.accuracy.mean())
+        alike = [name for name, t in worthy.items() if t is best or not self.counts(self.gain(best, t))]
+        alike.sort(key=lambda name: (len(worthy[name].values), -worthy[name].accuracy.mean()))
+        return alike[0], alike[1:]
+
+    def without_idle(self, current: Trial) -> Trial:
+        """The trial without effects that a later one has made idle."""
+        for kind in current.unknowns.kinds[:-1]:
+            rest = [k for k in current.unknowns.kinds if k is not kind]
+            less = self.trial(rest, current)
+            if not self.counts(self.gain(current, less)):
+                current = less
+        return current
+
+
+def study(
+    photographs: Sequence[Photograph],
+    optics: Optics,
+    effects: Sequence[Effect] = (),
+    options: StudyOptions | None = None,
+    progress: Callable[[str], None] = lambda message: None,
+) -> Study:
+    """Which effects photographs demand that a model with these optics and effects lacks, and what they buy.
+
+    Parameters
+    ----------
+    photographs : sequence of Photograph
+        With surfaces that are believed; at least four, better several heliostats under many suns.
+    optics, effects
+        The declared model.
+    progress : callable
+        Told what is being fitted.
+
+    Raises
+    ------
+    InvalidInputError
+        For too few photographs or two of one name.
+    UnreachableError
+        Where no attitude reflects the sun to a measured spot.
+    """
+    options = options or StudyOptions()
+    if len(photographs) < LEAST_IMAGES:
+        raise InvalidInputError(f"a study takes at least {LEAST_IMAGES} photographs, got {len(photographs)}")
+    if len({p.key for p in photographs}) < len(photographs):
+        raise InvalidInputError("photographs of a study must have identifiers of their own")
+    loop = _Loop(photographs, optics, effects, options)
+    declared = {effect.name for effect in effects}
+    before = current = loop.trial([])
+    found: list[Found] = []
+    candidates: list[Candidate] = []
+    left = [name for name in options.candidates if name not in declared]
+    for _ in range(options.most):
+        trials = {}
+        for name in left:
+            progress(name)
+            trials[name] = loop.trial([*current.unknowns.kinds, CATALOGUE[name]], current)
+        candidates = candidates or [Candidate.of(n, t.accuracy, loop.gain(t, before)) for n, t in trials.items()]
+        chosen = loop.choose(trials, current)
+        if chosen is None:
+            break
+        name, others = chosen
+        found.append(Found(name, loop.gain(trials[name], current), others))
+        current = loop.without_idle(trials[name])
+        found = [f for f in found if CATALOGUE[f.name] in current.unknowns.kinds]
+        left.remove(name)
+    held_out = [photographs[row] for row in loop.split.held_out]
+    return Study(
+        photographs=held_out,
+        fitted=len(photographs) - len(held_out),
+        window=loop.window,
+        measured=loop.measured,
+        before=loop.judge.cuts([]),
+        after=loop.judge.cuts(current.effects),
+        found=[f.fitted(current.unknowns, current.values, current.spread) for f in found],
+        candidates=sorted(candidates, key=lambda c: -c.accuracy_after),
+        effects=current.effects,
+    )

@@ -1,0 +1,200 @@
+"""What a study found: DESIGN.md, section 7, and what an operator wants to know besides."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.effects import CATALOGUE, Effect
+from model.study.judging import Gain, accuracies, rank_correlation
+from model.study.photographs import Photograph
+from model.study.unknowns import Unknowns
+
+Array = NDArray[np.float64]
+Verdict = Literal["effect", "none", "unexplained"]
+
+TOLERANCE = 0.025
+"""Error that forecasts of a complete model keep beside the images' noise: two tracers, resampling, surfaces of finite
+resolution. Residuals up to here are no sign of an effect."""
+
+SHARE = 1 / 3
+"""Share of the error beyond noise that the effects found must remove for the verdict to rest on them."""
+
+COVARIATES: dict[str, Callable[[Photograph], float]] = {
+    "sun elevation": lambda p: p.elevation_deg,
+    "sun azimuth": lambda p: p.azimuth_deg,
+    "slant range": lambda p: p.slant_range,
+    "height of the target": lambda p: float(p.shot.plane.center[2]),
+}
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One effect of the catalogue, fitted alone: mean accuracy of held-out images and its gain in standard errors."""
+
+    name: str
+    accuracy_after: float
+    score: float
+
+    @classmethod
+    def of(cls, name: str, accuracy: Array, gain: Gain) -> "Candidate":
+        """From held-out accuracies (H,) and their gain."""
+        return cls(name, float(accuracy.mean()), gain.score)
+
+
+@dataclass(frozen=True)
+class Found:
+    """An effect that was found, what it gained when it was added, and what could not be told from it.
+
+    ``parameters`` are nested as in the report: name, then heliostat where it belongs to one, then a list over facets.
+    """
+
+    name: str
+    gain: Gain
+    lookalikes: list[str]
+    parameters: dict[str, Any] = field(default_factory=dict)
+
+    def fitted(self, unknowns: Unknowns, values: Array, spread: Array) -> "Found":
+        """With its final parameters and their 95 % intervals, cut to their bounds."""
+        kind = CATALOGUE[self.name]
+        low, high = unknowns.bounds
+        intervals = np.stack([values - 1.96 * spread, values + 1.96 * spread], axis=-1)
+        intervals = np.clip(intervals, low[:, None], high[:, None])
+        value = unknowns.nested(kind, [round(float(v), 6) for v in values])
+        ci95 = unknowns.nested(kind, [[round(float(v), 6) for v in interval] for interval in intervals])
+        parameters = {p.name: {"value": value[p.name], "ci95": ci95[p.name], "unit": p.unit} for p in kind.parameters()}
+        return replace(self, parameters=parameters)
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """The outcome of a study.
+
+    Attributes
+    ----------
+    photographs : sequence of Photograph
+        The H held-out ones, by which it was judged.
+    fitted : int
+        How many others were fitted.
+    window : float [m]
+        Side of the squares that were compared.
+    measured, before, after : (H, 64, 64)
+        Cuts of sum one: photographs, forecasts of the declared model, forecasts with the effects found.
+    found : list of Found
+    candidates : list of Candidate
+        Every effect alone, the best first.
+    effects : list of Effect
+        The effects found, ready to be adopted.
+    """
+
+    photographs: Sequence[Photograph]
+    fitted: int
+    window: float
+    measured: Array
+    before: Array
+    after: Array
+    found: list[Found]
+    candidates: list[Candidate]
+    effects: list[Effect]
+
+    @cached_property
+    def accuracy_before(self) -> Array:
+        """Accuracy (H,) of the declared model."""
+        return accuracies(self.measured, self.before)
+
+    @cached_property
+    def accuracy_after(self) -> Array:
+        """Accuracy (H,) with the effects found."""
+        return accuracies(self.measured, self.after)
+
+    @cached_property
+    def noise_floor(self) -> float:
+        """Mean error that the images' noise alone makes."""
+        return float(np.mean([p.noise_share(self.window) for p in self.photographs]))
+
+    @property
+    def unexplained_share(self) -> float:
+        """Share of the error beyond noise that is left with the effects found; one where none was found."""
+        first, last = (self._beyond_noise(a) for a in (self.accuracy_before, self.accuracy_after))
+        return float(np.clip(last / max(first, 1e-9), 0, 1))
+
+    def _beyond_noise(self, accuracy: Array) -> float:
+        return max(0.0, 1 - float(accuracy.mean()) - self.noise_floor)
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether an effect explains the residual, there is none to explain, or none does."""
+        if self.found and self.unexplained_share <= 1 - SHARE:
+            return "effect"
+        return "unexplained" if self._beyond_noise(self.accuracy_after) > TOLERANCE else "none"
+
+    def covariates(self) -> dict[str, float]:
+        """Rank correlation of the error that is left with what may drive it, the strongest first."""
+        error = 1 - self.accuracy_after
+        values = {name: np.array([of(p) for p in self.photographs]) for name, of in COVARIATES.items()}
+        found = {name: round(rank_correlation(error, v), 3) for name, v in values.items()}
+        return dict(sorted(found.items(), key=lambda item: -abs(item[1])))
+
+    def residual_map(self) -> Array:
+        """Mean of measured minus forecast (64, 64) with the effects found, in shares of the measured peaks."""
+        peaks = self.measured.max(axis=(1, 2), keepdims=True)
+        return np.asarray(((self.measured - self.after) / peaks).mean(axis=0))
+
+    def conclusion(self) -> str:
+        """One plain sentence."""
+        before, after = float(self.accuracy_before.mean()), float(self.accuracy_after.mean())
+        names = " and ".join(f.name.replace("_", " ") for f in self.found)
+        if self.verdict == "effect":
+            alike = [name.replace("_", " ") for f in self.found for name in f.lookalikes]
+            doubt = f"; these images cannot tell it from {', '.join(alike)}" if alike else ""
+            return (
+                f"The images demand {names}: accuracy on held-out images rises from {before:.3f} to {after:.3f}{doubt}."
+            )
+        if self.verdict == "none":
+            return (
+                f"The declared model explains the images: accuracy {before:.3f}, no effect improves it significantly."
+            )
+        part = f"; {names} explains part of it ({after:.3f})" if names else ""
+        return f"Something is missing that no effect of the catalogue explains: accuracy {before:.3f}{part}."
+
+    def to_json(self) -> dict[str, Any]:
+        """The report of DESIGN.md, section 7."""
+        return {
+            "verdict": self.verdict,
+            "conclusion": self.conclusion(),
+            "images": {"fit": self.fitted, "held_out": len(self.photographs)},
+            "window_m": self.window,
+            "before": self._summary(self.accuracy_before),
+            "after": self._summary(self.accuracy_after),
+            "noise_floor": round(self.noise_floor, 5),
+            "unexplained_share": round(self.unexplained_share, 4),
+            "effects": [_effect(f) for f in self.found],
+            "candidates": [
+                {"name": c.name, "accuracy_after": round(c.accuracy_after, 5), "score": round(c.score, 2)}
+                for c in self.candidates
+            ],
+            "residual": {
+                "covariates": self.covariates(),
+                "mean_map_8x8": self.residual_map().reshape(8, 8, 8, 8).mean(axis=(1, 3)).round(4).tolist(),
+            },
+        }
+
+    def _summary(self, accuracy: Array) -> dict[str, Any]:
+        return {
+            "accuracy_mean": round(float(accuracy.mean()), 5),
+            "accuracy_median": round(float(np.median(accuracy)), 5),
+            "per_image": {p.key: round(float(a), 5) for p, a in zip(self.photographs, accuracy, strict=True)},
+        }
+
+
+def _effect(found: Found) -> dict[str, Any]:
+    gain = found.gain
+    return {
+        "name": found.name,
+        "parameters": found.parameters,
+        "accuracy_gain": {"mean": round(gain.mean, 5), "ci95": [round(gain.low, 5), round(gain.high, 5)]},
+        "lookalikes": found.lookalikes,
+    }
