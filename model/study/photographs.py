@@ -72,12 +72,12 @@ class Photograph:
         return float(np.linalg.norm(self.shot.heliostat.position - self.shot.plane.center))
 
     def noise_share(self, window: float) -> float:
-        """The error (one minus accuracy) that this image's noise alone makes, by the grain of the image itself."""
-        image = np.asarray(self.image, dtype=np.float64)
-        size = (self.shot.plane.width, self.shot.plane.height)
-        variance = flux_window(noise_variance(image), size, center_of_mass(image, size), window, RESOLUTION)
-        total = flux_window(image, size, center_of_mass(image, size), window, RESOLUTION).sum()
-        return float(np.sqrt(2 / np.pi) * np.sqrt(variance).sum() / total)
+        """The error (one minus accuracy) that this image's noise alone makes, by the grain of its own cut.
+
+        In the cut, because pixels of a camera that was resampled share their noise.
+        """
+        (image,) = cut([self.image], [self.shot.plane], window, RESOLUTION)
+        return float(np.sqrt(2 / np.pi) * np.sqrt(noise_variance(image)).sum())
 
 
 def noise_variance(image: Array, bins: int = 12) -> Array:

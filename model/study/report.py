@@ -16,12 +16,15 @@ from model.study.unknowns import Unknowns
 Array = NDArray[np.float64]
 Verdict = Literal["effect", "none", "unexplained"]
 
-TOLERANCE = 0.025
-"""Error that forecasts of a complete model keep beside the images' noise: two tracers, resampling, surfaces of finite
-resolution. Residuals up to here are no sign of an effect."""
+BASELINE = 0.013
+"""Error that forecasts of a complete model keep beside the images' noise, by undeclared sets that hold no effect: two
+tracers, resampling, surfaces of finite resolution."""
+
+TOLERANCE = 0.006
+"""Error beyond noise and baseline up to which nothing is to be explained."""
 
 SHARE = 1 / 3
-"""Share of the error beyond noise that the effects found must remove for the verdict to rest on them."""
+"""Share of that error which the effects found must remove for the verdict to rest on them."""
 
 COVARIATES: dict[str, Callable[[Photograph], float]] = {
     "sun elevation": lambda p: p.elevation_deg,
@@ -117,19 +120,20 @@ class Study:
 
     @property
     def unexplained_share(self) -> float:
-        """Share of the error beyond noise that is left with the effects found; one where none was found."""
-        first, last = (self._beyond_noise(a) for a in (self.accuracy_before, self.accuracy_after))
-        return float(np.clip(last / max(first, 1e-9), 0, 1))
+        """Share of the error beyond noise and baseline that is left with the effects found; zero where there is none."""
+        first, last = (self._excess(accuracy) for accuracy in (self.accuracy_before, self.accuracy_after))
+        return min(1.0, last / first) if first > 0 else 0.0
 
-    def _beyond_noise(self, accuracy: Array) -> float:
-        return max(0.0, 1 - float(accuracy.mean()) - self.noise_floor)
+    def _excess(self, accuracy: Array) -> float:
+        """Mean error beyond noise and baseline."""
+        return max(0.0, 1 - float(accuracy.mean()) - self.noise_floor - BASELINE)
 
     @property
     def verdict(self) -> Verdict:
         """Whether an effect explains the residual, there is none to explain, or none does."""
         if self.found and self.unexplained_share <= 1 - SHARE:
             return "effect"
-        return "unexplained" if self._beyond_noise(self.accuracy_after) > TOLERANCE else "none"
+        return "unexplained" if self._excess(self.accuracy_after) > TOLERANCE else "none"
 
     def covariates(self) -> dict[str, float]:
         """Rank correlation of the error that is left with what may drive it, the strongest first."""

@@ -10,7 +10,7 @@ from model.effects import CATALOGUE, effect_from_json, effect_to_json, effects_f
 from model.effects.axis_tilt import AxisTilt
 from model.effects.blocking import Blocking
 from model.effects.facet_canting import FacetCanting
-from model.effects.gravity_bending import GravityBending
+from model.effects.gravity_bending import REFERENCE, GravityBending
 from model.effects.slope_error import SlopeError
 from model.effects.soiling import Soiling
 from model.effects.sun_position import SunPosition
@@ -171,7 +171,7 @@ def test_axis_tilt_turns_both_axes_right_handed():
 # --- mirror -----------------------------------------------------------------------------------------------------------
 
 
-def test_gravity_lowers_the_edge_by_the_amplitude_where_the_mirror_lies():
+def test_gravity_bends_the_mirror_to_a_paraboloid_from_where_it_was_measured():
     one = shot(z=waves())
     bent, straight = (scene_of(one, *effects) for effects in ([GravityBending(6.0)], []))
     sine = float(bent.attitude[0, 2, 2])
@@ -182,7 +182,7 @@ def test_gravity_lowers_the_edge_by_the_amplitude_where_the_mirror_lies():
 
     before, after = surface(straight), surface(bent)
     radius = np.linalg.norm(before[..., :2], axis=-1) / 1.61
-    np.testing.assert_allclose(before[..., 2] - after[..., 2], 6e-3 * sine * radius**2, atol=2e-8)
+    np.testing.assert_allclose(before[..., 2] - after[..., 2], 6e-3 * (sine - REFERENCE) * radius**2, atol=2e-8)
     np.testing.assert_allclose(after[..., :2], before[..., :2], atol=1e-12)
 
 
@@ -191,8 +191,9 @@ def test_gravity_follows_the_mirrors_attitude():
     amplitude, sag = GravityBending(5.0), []
     for elevation in (15.0, 60.0):
         scenes = [scene_of(shot(sun_direction(10.0, elevation)), *e) for e in ([amplitude], [])]
-        edge = (scenes[1].control_points - scenes[0].control_points)[0, :, 2].max()
-        sag.append(float(edge) / float(scenes[0].attitude[0, 2, 2]))
+        sunk = (scenes[1].control_points - scenes[0].control_points)[0, :, 2]
+        edge = sunk.flatten()[sunk.abs().argmax()]
+        sag.append(float(edge) / (float(scenes[0].attitude[0, 2, 2]) - REFERENCE))
     assert sag[0] == pytest.approx(sag[1], rel=1e-6)
     assert sag[0] == pytest.approx(5e-3 * (1.61**2 + 1.28**2) / 1.61**2, rel=1e-3)
 
