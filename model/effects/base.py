@@ -89,10 +89,13 @@ class Effect:
         As in DESIGN.md, section 5.
     stage : {"geometry", "optics", "image"}
         What must be done anew when a parameter changes: the alignment of the mirrors, the tracing, or only the image.
+    guesses : tuple of dict
+        Parameters to begin a fit from, where those near neutral lead nowhere one by one.
     """
 
     name: ClassVar[str]
     stage: ClassVar[Stage]
+    guesses: ClassVar[tuple[dict[str, float], ...]] = ()
 
     def __post_init__(self) -> None:
         for p in self.parameters():

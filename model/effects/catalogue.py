@@ -11,6 +11,7 @@ from model.effects.background import Background
 from model.effects.base import Effect, Parameter
 from model.effects.blocking import Blocking
 from model.effects.camera_blur import CameraBlur
+from model.effects.camera_ghost import CameraGhost
 from model.effects.camera_response import CameraResponse
 from model.effects.facet_canting import FacetCanting
 from model.effects.gravity_bending import GravityBending
@@ -36,6 +37,7 @@ CATALOGUE: dict[str, type[Effect]] = {
         TrackingJitter,
         Background,
         CameraBlur,
+        CameraGhost,
         CameraResponse,
         TargetRegistration,
     )

@@ -45,7 +45,6 @@ from model.plant import Heliostat
 from model.surface import basis, greville
 from model.tracing.scene import Scene
 
-
 REFERENCE = 0.5
 """Sine of the normal's elevation at which mirrors have the surfaces that are known."""
 

@@ -108,7 +108,7 @@ class Fitter:
             single = begin.copy()
             single[places] = chosen[places]
             found.append(single)
-        candidates = [begin, *found, chosen]
+        candidates = [begin, *found, chosen, *self._guesses(unknowns, begin, free)]
         costs = [self.cost(unknowns, c, self.residuals(unknowns, c)) for c in candidates]
         order = np.argsort(costs)
         unique: list[Array] = []
@@ -116,6 +116,18 @@ class Fitter:
             if not any(np.array_equal(candidates[index], other) for other in unique):
                 unique.append(candidates[index])
         return unique
+
+    def _guesses(self, unknowns: Unknowns, begin: Array, free: NDArray[np.bool_]) -> list[Array]:
+        """``begin`` with each of the free effects' own guesses."""
+        guessed = []
+        for kind in unknowns.kinds:
+            for guess in kind.guesses:
+                values = begin.copy()
+                for place, unknown in enumerate(unknowns.all):
+                    if free[place] and unknown.effect is kind:
+                        values[place] = guess.get(unknown.parameter.name, values[place])
+                guessed.append(values)
+        return guessed
 
     def _energies(self, unknowns: Unknowns, places: list[int], residuals: Array) -> Array:
         """Sum of squares (len(places),) over the images that feel each unknown."""

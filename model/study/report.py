@@ -120,7 +120,7 @@ class Study:
 
     @property
     def unexplained_share(self) -> float:
-        """Share of the error beyond noise and baseline that is left with the effects found; zero where there is none."""
+        """Share of the error beyond noise and baseline that the effects found leave; zero where there is none."""
         first, last = (self._excess(accuracy) for accuracy in (self.accuracy_before, self.accuracy_after))
         return min(1.0, last / first) if first > 0 else 0.0
 

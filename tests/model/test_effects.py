@@ -54,7 +54,7 @@ def test_the_catalogue_is_the_contract():
         name: {p.name: (p.low, p.high, p.unit, p.scope) for p in effect.parameters()}
         for name, effect in CATALOGUE.items()
     }
-    assert len(bounds) == 13
+    assert len(bounds) == 14
     assert bounds["sun_shape"] == {"circumsolar_ratio": (0, 0.5, "1", "set")}
     assert bounds["slope_error"] == bounds["tracking_jitter"] == {"sigma_mrad": (0, 4, "mrad", "set")}
     assert bounds["facet_canting"] == dict.fromkeys(("x_mrad", "y_mrad"), (-5, 5, "mrad", "facet"))

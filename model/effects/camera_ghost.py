@@ -1,0 +1,67 @@
+"""Camera ghost: a second, faint and displaced image of the spot.
+
+What it is
+    Two surfaces of the camera's optics, or of the window of its housing, reflect a share of the light twice before it
+    arrives; a tilted protective pane does so too. The image shows the spot and, displaced by the same distance at any
+    time, its double::
+
+        image = (1 - share) * true(x, y) + share * true(x - right_m, y - up_m)
+
+Source
+    Ghosts of lenses and windows: Fest, *Stray Light Analysis and Control* (SPIE 2013), chapter on ghost reflections.
+    It was put into the catalogue because the images of undeclared set 4 demand it (RESULTS.md).
+
+In an image
+    One side of the spot has a second edge or a shoulder, and its core is too faint for its wings. The residual shows
+    the spot twice, with one sign at its place, moved a little by the common centre of mass, and with the other at the
+    double's.
+
+What it scales with
+    Nothing of the heliostat or the sun: the displacement is the same in metres on a target for all images of a camera.
+
+What it is confused with
+    - Canting of one facet: throws a quarter of the light aside as well, but by a distance that grows with the slant
+      range, in a direction that turns with the mount, and each heliostat's own.
+    - A foreign heliostat's spot: comes and goes, and has another shape.
+    - Camera blur: smears to all sides.
+"""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+from torch.nn.functional import affine_grid, grid_sample
+
+from model.effects.base import Effect, Scalar, Stage, parameter
+from model.tracing.scene import Window
+
+
+@dataclass(frozen=True, eq=False)
+class CameraGhost(Effect):
+    """A ``share`` of the light appears ``right_m`` and ``up_m`` [m on the target] beside its place."""
+
+    name: ClassVar[str] = "camera_ghost"
+    stage: ClassVar[Stage] = "image"
+    guesses: ClassVar[tuple[dict[str, float], ...]] = tuple(
+        {"share": 0.2, "right_m": 0.6 * right, "up_m": 0.6 * up}
+        for right in (-1, 0, 1)
+        for up in (-1, 0, 1)
+        if right or up
+    )
+
+    share: Scalar = parameter(0.0, 0.0, 0.5, "1", "camera")
+    right_m: Scalar = parameter(0.0, -2.0, 2.0, "m", "camera")
+    up_m: Scalar = parameter(0.0, -2.0, 2.0, "m", "camera")
+
+    def on_image(self, images: Tensor, window: Window) -> Tensor:
+        """Add the displaced double; what of it falls beyond the image is lost."""
+        right, up, share = (
+            torch.as_tensor(v, dtype=images.dtype, device=images.device) for v in (self.right_m, self.up_m, self.share)
+        )
+        # A grid tells where each pixel's light comes from, in half sizes, and counts rows downwards.
+        back = torch.stack([-2 * right / window.width, 2 * up / window.height])
+        theta = torch.cat([torch.eye(2, dtype=images.dtype, device=images.device), back[:, None]], dim=1)[None]
+        grid = affine_grid(theta, [1, 1, *images.shape[-2:]], align_corners=False)
+        double = grid_sample(images[None], grid, mode="bicubic", padding_mode="zeros", align_corners=False)[0]
+        return (1 - share) * images + share * double
