@@ -12,6 +12,8 @@ from fastapi.routing import APIRoute
 from service import documentation, errors, openapi, security
 from service.handlers import KINDS
 from service.middleware import BodyLimitMiddleware, DoorMiddleware, RequestIdMiddleware, SecurityHeadersMiddleware
+from service.pages import field, forecast, heliostat, login
+from service.pages import jobs as job_pages
 from service.routers import audit, forecasts, health, heliostats, jobs, measurements, plant, session, surfaces
 from service.runtime import Operations, Runtime
 from service.settings import Settings
@@ -52,12 +54,14 @@ def create_app(settings: Settings, operations: Operations | None = None, kinds: 
             await to_thread.run_sync(runtime.database.require_current)
             await to_thread.run_sync(security.require_closed_door, settings, runtime.database)
             app.state.runtime = runtime
+            app.state.field = field.FieldBook(runtime)
             workers = Workers(runtime, kinds, settings.job_workers)
             workers.start()
             try:
                 yield
             finally:
                 await to_thread.run_sync(workers.stop)
+                await to_thread.run_sync(app.state.field.close)
         finally:
             runtime.close()
 
@@ -79,6 +83,8 @@ def create_app(settings: Settings, operations: Operations | None = None, kinds: 
     app.include_router(v1)
     for router in (health.router, session.router, documentation.router):
         app.include_router(router)
+    for page in (login, field, heliostat, forecast, job_pages):
+        app.include_router(page.router)
     security.require_declared_roles(app)
     errors.install(app)
     openapi.install(app)

@@ -14,6 +14,7 @@ from starlette.types import Scope
 
 from model.errors import ImageRefusedError, InvalidInputError, ModelError, UnreachableError
 from service import faults
+from service.pages import rendering as pages
 
 logger = logging.getLogger("heliotwin.service")
 
@@ -64,7 +65,7 @@ def request_id(scope: Scope) -> str:
 def problem(
     scope: Scope, status: int, detail: str, headers: Mapping[str, str] | None = None, **extension: Any
 ) -> Response:
-    """A problem document as a response; ASCII, so that any text in it can be sent."""
+    """A problem document as a response, ASCII, so that any text in it can be sent; as a page where a person asks."""
     document = {
         "type": "about:blank",
         "title": HTTPStatus(status).phrase,
@@ -74,6 +75,10 @@ def problem(
         "request_id": request_id(scope),
         **extension,
     }
+    if pages.wants_page(scope):
+        answer = pages.error_page(scope, document)
+        answer.headers.update(headers or {})
+        return answer
     return Response(
         json.dumps(document), status_code=status, headers=dict(headers or {}), media_type=PROBLEM_MEDIA_TYPE
     )

@@ -19,8 +19,9 @@ from sqlalchemy import Select, and_, func, or_, select
 from sqlalchemy.orm import Session, undefer
 
 from model.errors import InvalidInputError
-from service import store
+from service import audit, store
 from service.faults import ConflictError, NotFoundError, TooManyError
+from service.runtime import Runtime
 from service.tables import JobRow, JobStepRow, now
 
 ENDED = ("done", "failed", "cancelled")
@@ -89,6 +90,19 @@ def add_job(
     return known, False
 
 
+def ask_for(
+    runtime: Runtime, kind: str, payload: dict[str, Any], actor: str, idempotency_key: str | None = None
+) -> JobRow:
+    """Queue a job as `add_job` does, with its entry in the audit trail, and wake a worker of this process."""
+    with runtime.database.writing() as session:
+        most = runtime.settings.max_queued_jobs
+        row, is_new = add_job(session, kind, payload, actor, idempotency_key, most)
+        if is_new:
+            audit.record(session, actor, "job.created", f"job {row.id}", kind=kind)
+    runtime.job_came.release()
+    return row
+
+
 def _count_queued(session: Session) -> int:
     return session.scalars(select(func.count()).select_from(JobRow).where(JobRow.state == "queued")).one()
 
@@ -145,6 +159,14 @@ def cancel(session: Session, number: int) -> JobRow:
         row.cancel_requested = True
         row.revision += 1
     return row
+
+
+def cancel_for(runtime: Runtime, number: int, actor: str) -> JobRow:
+    """Cancel a job as `cancel` does, with its entry in the audit trail."""
+    with runtime.database.writing() as session:
+        row = cancel(session, number)
+        audit.record(session, actor, "job.cancelled", f"job {number}", kind=row.kind)
+        return row
 
 
 # --- taking a job -----------------------------------------------------------------------------------------------------

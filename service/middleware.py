@@ -17,6 +17,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from service import errors, security
 from service.errors import SECURITY_HEADERS, problem
 from service.limits import Buckets
+from service.pages import rendering
 from service.settings import Settings, is_loopback
 
 logger = logging.getLogger("heliotwin.access")
@@ -131,8 +132,17 @@ class DoorMiddleware:
     def _unknown(self, scope: Scope, identity: security.Identity | None) -> Response | None:
         if identity is not None or security.is_public(scope["path"]):
             return None
+        if rendering.wants_page(scope) and scope["method"] == "GET":
+            return self._login(scope)
         detail = "present a valid key: Authorization: Bearer KEY; `heliotwin keys create` makes one"
         return problem(scope, HTTPStatus.UNAUTHORIZED, detail, {"WWW-Authenticate": "Bearer"})
+
+    def _login(self, scope: Scope) -> Response:
+        """A browser is sent to the page for keys; htmx, which would show that page inside of another, goes there."""
+        path = rendering.login_path(scope)
+        if "hx-request" in Headers(scope=scope):
+            return Response(status_code=HTTPStatus.UNAUTHORIZED, headers={"HX-Redirect": path})
+        return rendering.go_to(path)
 
 
 def _is_loopback_name(host: str) -> bool:

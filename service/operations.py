@@ -14,10 +14,10 @@ from model.forecast import Shot, View, align
 from model.imaging import ImageKind, MeasuredFlux
 from model.imaging import measure as measure_image
 from model.network.predictor import default_predictor
-from model.observation import Observation, SurfacePrediction
+from model.observation import Observation, SurfacePrediction, render_observations
 from model.plant import Heliostat, TargetPlane
 from model.refinement import refine
-from model.surface import DEGREE, control_points
+from model.surface import COLUMNS, DEGREE, FACETS, ROWS, control_points
 from model.tracing import Optics
 from model.tracing.convolution import central_rays
 
@@ -58,6 +58,15 @@ def predict(
         return by_network
     refined = refine(heliostat, observations, by_network.z, optics=optics)
     return replace(refined, weights=f"{by_network.weights}+{refined.weights}")
+
+
+def render(heliostat: Heliostat, observations: Sequence[Observation], z: ArrayLike | None) -> Array:
+    """What a surface (4, 8, 8) [m], None the ideal one, would have thrown where M fluxes were observed.
+
+    (M, 64, 64), each with sum 100, in the observations' own windows.
+    """
+    heights = np.zeros((FACETS, ROWS, COLUMNS)) if z is None else np.asarray(z, dtype=np.float64)
+    return render_observations(heliostat, observations, heights)
 
 
 @dataclass(frozen=True, eq=False)

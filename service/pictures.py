@@ -28,13 +28,20 @@ def flux_picture(flux: NDArray[np.floating], size: tuple[float, float] | None, u
     return _png(figure)
 
 
+def mirror_heights(z: NDArray[np.floating], samples: int = 48) -> NDArray[np.float64]:
+    """Heights (4, samples, samples) [mm] of control heights (4, 8, 8) [m], on even steps of each facet.
+
+    Control heights crowd towards the facet's edges; a picture shall not.
+    """
+    across, along = (basis(count, DEGREE, np.linspace(0, 1, samples))[0] for count in np.shape(z)[1:])
+    return across @ np.asarray(z, dtype=np.float64) @ along.T * 1e3
+
+
 def surface_picture(z: NDArray[np.floating], title: str) -> bytes:
     """A surface of control heights (4, 8, 8) [m] as a map in mm, its facets as they are seen from the front."""
     figure = Figure(figsize=(6.4, 5), layout="constrained")
     panes = figure.subplots(2, 2).ravel()
-    # Control heights crowd towards the facet's edges; the picture shows the surface on even steps.
-    across, along = (basis(count, DEGREE, np.linspace(0, 1, 48))[0] for count in np.shape(z)[1:])
-    heights = across @ np.asarray(z, dtype=np.float64) @ along.T * 1e3
+    heights = mirror_heights(z)
     bound = max(float(np.abs(heights).max()), 1e-3)
     for pane, facet, name in zip(panes, heights, _FACETS, strict=True):
         # i runs with x and j with y, so columns are i and rows, from below, are j

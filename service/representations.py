@@ -200,7 +200,7 @@ def audit_entry(row: AuditRow) -> AuditOut:
     return AuditOut.model_validate(row, from_attributes=True)
 
 
-def _flux_of(row: ForecastRow) -> NDArray[np.float32]:
+def flux_of(row: ForecastRow) -> NDArray[np.float32]:
     """The map in the unit that was asked for."""
     flux = unpack(row.flux)["flux"]
     total = float(flux.sum(dtype=np.float64))
@@ -209,7 +209,7 @@ def _flux_of(row: ForecastRow) -> NDArray[np.float32]:
 
 def forecast(row: ForecastRow, media_type: str) -> Response:
     """A forecast as the client wants it."""
-    flux = _flux_of(row)
+    flux = flux_of(row)
     name = f"{row.heliostat.name}-forecast-{row.id}"
     if media_type == negotiation.PNG:
         unit = "flux [% per pixel]" if row.normalised else "W/m²"

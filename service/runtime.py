@@ -1,7 +1,7 @@
 """What a running service holds: settings, database, image store, and the model behind one narrow door."""
 
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib import import_module
@@ -14,9 +14,11 @@ from service.images import ImageStore
 from service.settings import Settings
 
 if TYPE_CHECKING:  # these bring the tracer's libraries with them, which take seconds to load
+    from model.effects import Effect
     from model.imaging import ImageKind, MeasuredFlux
     from model.observation import Observation, SurfacePrediction
     from model.plant import Heliostat, TargetPlane
+    from model.study import Photograph, Study, StudyOptions
     from model.tracing import Optics
     from service.operations import Forecast, Method
 
@@ -30,9 +32,19 @@ class Operations(Protocol):
         """Flux, centre of mass and quality of a photograph."""
 
     def predict(
-        self, heliostat: "Heliostat", observations: Sequence["Observation"], method: "Method" = "network"
+        self,
+        heliostat: "Heliostat",
+        observations: Sequence["Observation"],
+        method: "Method" = "network",
+        *,
+        effects: Sequence["Effect"] = (),
     ) -> "SurfacePrediction":
         """A surface from observations."""
+
+    def render(
+        self, heliostat: "Heliostat", observations: Sequence["Observation"], z: NDArray[Any] | None
+    ) -> NDArray[Any]:
+        """What a surface would have thrown where fluxes were observed."""
 
     def forecast(
         self,
@@ -45,8 +57,20 @@ class Operations(Protocol):
         resolution: tuple[int, int] = (256, 256),
         window: float | None = None,
         optics: "Optics | None" = None,
+        effects: Sequence["Effect"] = (),
+        latitude_deg: float = ...,
     ) -> "Forecast":
         """The flux of a heliostat on a plane."""
+
+    def study(
+        self,
+        photographs: Sequence["Photograph"],
+        optics: "Optics",
+        effects: Sequence["Effect"] = (),
+        options: "StudyOptions | None" = None,
+        progress: Callable[[str], None] = ...,
+    ) -> "Study":
+        """Which effects photographs demand that a model with these optics and effects lacks."""
 
 
 def load_operations() -> Operations:

@@ -24,7 +24,7 @@ from service.tables import ROLES
 
 COOKIE = "heliotwin_key"
 
-PUBLIC = ("/livez", "/readyz", "/openapi.json", "/docs", "/session")
+PUBLIC = ("/livez", "/readyz", "/openapi.json", "/docs", "/session", "/login", "/logout", "/static")
 """Paths that need no key, with all that lies below them; none shows or changes anything of the plant."""
 
 

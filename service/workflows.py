@@ -17,11 +17,12 @@ from sqlalchemy.orm import Session
 from model.errors import ImageRefusedError, InvalidInputError
 from model.frames import sun_direction, wgs84_to_enu
 from model.plant import Heliostat, TargetPlane
-from service import audit, store
+from service import audit, models, store
 from service.arrays import pack, unpack
 from service.faults import ConflictError, NotFoundError, TooLargeError
 from service.images import digest, media_type
 from service.keys import RESERVED
+from service.models import PlantModel
 from service.runtime import Operations, Runtime
 from service.store import NewImage, NewMeasurement, NewSurface
 from service.tables import ForecastRow, HeliostatRow, MeasurementRow, SurfaceRow
@@ -76,14 +77,14 @@ class _Reading:
     center_of_mass: NDArray[Any] | None = None
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """``value`` as JSON knows it; figures that are not finite become null."""
     if isinstance(value, dict):
-        return {str(key): _plain(entry) for key, entry in value.items()}
+        return {str(key): plain(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple | np.ndarray):
-        return [_plain(entry) for entry in value]
+        return [plain(entry) for entry in value]
     if isinstance(value, np.generic):
-        return _plain(value.item())
+        return plain(value.item())
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
@@ -94,7 +95,7 @@ def _read(operations: Operations, pixels: NDArray[Any], photograph: Photograph, 
     except ImageRefusedError as refusal:
         quality = {"accepted": False, "reason": refusal.reason, "detail": refusal.detail}
         return _Reading(accepted=False, reason=refusal.reason, quality=quality)
-    quality = _plain(asdict(measured.quality))
+    quality = plain(asdict(measured.quality))
     return _Reading(
         accepted=bool(measured.quality.accepted),
         reason=measured.quality.reason or None,
@@ -128,7 +129,7 @@ def _new_measurement(photograph: Photograph, image: NewImage, reading: _Reading,
         motor_position=photograph.motor_position,
         taken_at=photograph.taken_at,
         focal_spot_wgs84=photograph.focal_spot_wgs84,
-        corners_px=None if photograph.corners is None else {"corners": _plain(photograph.corners)},
+        corners_px=None if photograph.corners is None else {"corners": plain(photograph.corners)},
         center_of_mass=reading.center_of_mass,
         flux=reading.flux,
         centered=reading.centered,
@@ -170,15 +171,23 @@ def ingest(runtime: Runtime, heliostat_name: str, photograph: Photograph, data: 
 # --- a surface --------------------------------------------------------------------------------------------------------
 
 
-def choose_measurements(session: Session, heliostat: HeliostatRow, count: int) -> list[MeasurementRow]:
-    """Up to ``count`` accepted measurements for a prediction: recent, and with the sun at different places.
+def choose_measurements(
+    session: Session,
+    heliostat: HeliostatRow,
+    count: int,
+    since: datetime | None = None,
+    until: datetime | None = None,
+) -> list[MeasurementRow]:
+    """Up to ``count`` accepted measurements of a time: recent, and with the sun at different places.
 
     Raises
     ------
     ConflictError
         Where the heliostat has none.
     """
-    recent = store.recent_measurements(session, heliostat, _RECENT * count)
+    recent = store.recent_measurements(session, heliostat, _RECENT * count, since, until)
+    if not recent and (since or until):
+        raise ConflictError(f"heliostat {heliostat.name} has no accepted measurement of this time")
     if not recent:
         raise ConflictError(f"heliostat {heliostat.name} has no accepted measurement; post target images of it first")
     from model.observation import spread_suns
@@ -195,7 +204,7 @@ def _named_measurements(session: Session, heliostat: HeliostatRow, names: Sequen
     return rows
 
 
-def _spot(row: MeasurementRow, plane: TargetPlane, origin: tuple[float, float, float]) -> NDArray[np.float64]:
+def spot_of(row: MeasurementRow, plane: TargetPlane, origin: tuple[float, float, float]) -> NDArray[np.float64]:
     """Centre of mass in ENU: as measured, else as it was given, else the target's centre."""
     if row.center_right_m is not None and row.center_up_m is not None:
         return plane.to_enu((row.center_right_m, row.center_up_m))
@@ -204,7 +213,8 @@ def _spot(row: MeasurementRow, plane: TargetPlane, origin: tuple[float, float, f
     return np.array(plane.center)
 
 
-def _observation(row: MeasurementRow, origin: tuple[float, float, float]) -> "Observation":
+def observation_of(row: MeasurementRow, origin: tuple[float, float, float]) -> "Observation":
+    """What an accepted measurement, loaded with its arrays, shows the model."""
     from model.observation import Observation
 
     plane = store.target_plane(row.target)
@@ -212,7 +222,7 @@ def _observation(row: MeasurementRow, origin: tuple[float, float, float]) -> "Ob
     return Observation(
         flux=unpack(row.arrays or b"")["centered"],
         sun=sun_direction(row.sun_azimuth_deg, row.sun_elevation_deg),
-        center_of_mass=_spot(row, plane, origin),
+        center_of_mass=spot_of(row, plane, origin),
         target=plane,
         motor_position=None if None in motors else np.array(motors),
         identifier=row.identifier,
@@ -227,16 +237,18 @@ def predict_surface(
     images: int = 8,
     actor: str = RESERVED,
     also: Callable[[Session, SurfaceRow], None] | None = None,
+    model_version: int | None = None,
 ) -> SurfaceRow:
     """Predict a heliostat's surface from stored measurements and keep it as its next version.
 
     It is valid from when the newest of its images was taken, where that is known, else from now. ``actor`` is who
-    asked for it. ``also`` writes in the same transaction; what it raises undoes the surface too.
+    asked for it. ``also`` writes in the same transaction; what it raises undoes the surface too. ``model_version`` is
+    the plant's model that explains the images, by default the current one.
 
     Raises
     ------
     NotFoundError, ConflictError
-        Where the heliostat or a measurement is not stored, or none is accepted.
+        Where the heliostat, a measurement or the model is not stored, or no measurement is accepted.
     """
     with runtime.database.reading() as session:
         row = store.get_heliostat(session, heliostat_name)
@@ -245,20 +257,24 @@ def predict_surface(
         if measurements is None:
             measurements = [measurement.identifier for measurement in choose_measurements(session, row, images)]
         chosen = _named_measurements(session, row, measurements)
-    observations = [_observation(measurement, origin) for measurement in chosen]
+        model = models.get_model(session, model_version)
+    observations = [observation_of(measurement, origin) for measurement in chosen]
     with runtime.computing() as operations:
-        predicted = operations.predict(heliostat, observations, method)
+        predicted = operations.predict(heliostat, observations, method, effects=model.effects)
     with runtime.database.writing() as session:
         row = store.get_heliostat(session, heliostat_name)
         used = [store.get_measurement(session, row, name) for name in predicted.used]
-        surface, _ = store.add_surface(session, row, _new_surface(method, predicted, used))
-        audit.record(session, actor, "surface.predicted", f"heliostat {heliostat_name}", version=surface.version)
+        surface, _ = store.add_surface(session, row, _new_surface(method, model, predicted, used))
+        about = {"version": surface.version, "model": model.version}
+        audit.record(session, actor, "surface.predicted", f"heliostat {heliostat_name}", **about)
         if also is not None:
             also(session, surface)
         return surface
 
 
-def _new_surface(method: str, predicted: "SurfacePrediction", used: list[MeasurementRow]) -> NewSurface:
+def _new_surface(
+    method: str, model: PlantModel, predicted: "SurfacePrediction", used: list[MeasurementRow]
+) -> NewSurface:
     return NewSurface(
         source=method,
         z=predicted.z,
@@ -266,6 +282,7 @@ def _new_surface(method: str, predicted: "SurfacePrediction", used: list[Measure
         control_points=predicted.control_points,
         valid_from=max((row.taken_at for row in used if row.taken_at is not None), default=None),
         model=predicted.weights,
+        model_version=model.version,
         measurements=used,
         misfit=predicted.misfit,
     )
@@ -280,7 +297,7 @@ class ForecastRequest:
 
     ``sun_azimuth_deg`` counts from south, positive to the east. ``aim`` (3,) [m] is by default the plane's centre.
     ``surface``: "current", "ideal" or a version. ``window`` [m]: the side of a square about the centre of mass that is
-    mapped; the whole plane without it.
+    mapped; the whole plane without it. ``model_version`` is the plant's model, by default the current one.
     """
 
     heliostat: str
@@ -294,6 +311,7 @@ class ForecastRequest:
     resolution: tuple[int, int] = (256, 256)
     window: float | None = None
     normalised: bool = False
+    model_version: int | None = None
 
 
 def _chosen_surface(session: Session, heliostat: HeliostatRow, choice: str | int) -> SurfaceRow | None:
@@ -322,6 +340,7 @@ class Traced:
     heliostat: HeliostatRow
     surface: SurfaceRow | None
     plane: TargetPlane
+    model: PlantModel
     forecast: "Forecast"
 
 
@@ -331,7 +350,7 @@ def trace_request(runtime: Runtime, request: ForecastRequest) -> Traced:
     Raises
     ------
     NotFoundError, ConflictError
-        Where heliostat, target or surface version is not stored, or no surface is current.
+        Where heliostat, target, model or surface version is not stored, or no surface is current.
     UnreachableError
         Where the heliostat cannot reflect the sun to the aim point, or light does not reach the plane's lit side.
     """
@@ -340,18 +359,20 @@ def trace_request(runtime: Runtime, request: ForecastRequest) -> Traced:
         heliostat = load_heliostat(session, row)
         plane = _plane(session, request)
         surface = _chosen_surface(session, row, request.surface)
+        model, latitude_deg = models.get_model(session, request.model_version), store.get_plant(session).latitude_deg
     z = None if surface is None else unpack(surface.arrays)["z"]
-    return Traced(row, surface, plane, _trace(runtime, heliostat, z, request, plane))
+    forecast = _trace(runtime, heliostat, z, request, plane, model, latitude_deg)
+    return Traced(row, surface, plane, model, forecast)
 
 
 def plane_as_json(plane: TargetPlane) -> dict[str, Any]:
     """A plane's geometry, as forecasts keep it [m]."""
-    return {name: _plain(getattr(plane, name)) for name in ("center", "normal", "up", "width", "height")}
+    return {name: plain(getattr(plane, name)) for name in ("center", "normal", "up", "width", "height")}
 
 
 def _forecast_row(request: ForecastRequest, traced: Traced) -> ForecastRow:
     forecast = traced.forecast
-    right, up = _plain(forecast.center_of_mass)  # null where no light comes near the plane
+    right, up = plain(forecast.center_of_mass)  # null where no light comes near the plane
     return ForecastRow(
         heliostat_id=traced.heliostat.id,
         surface_id=None if traced.surface is None else traced.surface.id,
@@ -369,7 +390,7 @@ def _forecast_row(request: ForecastRequest, traced: Traced) -> ForecastRow:
         power_w=float(forecast.power),
         center_right_m=right,
         center_up_m=up,
-        model_version=forecast.model_version,
+        model_version=traced.model.version,
         flux=pack({"flux": np.asarray(forecast.flux, np.float32)}),
     )
 
@@ -382,7 +403,13 @@ def make_forecast(runtime: Runtime, request: ForecastRequest) -> ForecastRow:
 
 
 def _trace(
-    runtime: Runtime, heliostat: Heliostat, z: NDArray[Any] | None, request: ForecastRequest, plane: TargetPlane
+    runtime: Runtime,
+    heliostat: Heliostat,
+    z: NDArray[Any] | None,
+    request: ForecastRequest,
+    plane: TargetPlane,
+    model: PlantModel,
+    latitude_deg: float,
 ) -> "Forecast":
     from model.tracing import Optics
 
@@ -396,4 +423,6 @@ def _trace(
             resolution=request.resolution,
             window=request.window,
             optics=Optics(dni=request.dni),
+            effects=model.effects,
+            latitude_deg=latitude_deg,
         )

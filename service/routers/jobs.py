@@ -4,7 +4,7 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Header, Path, Query, Response, status
 
-from service import audit, events, jobs, representations
+from service import events, jobs, representations
 from service.dependencies import OPERATE, READ, IdentityDep, Limit, MediaType, RuntimeDep, StoppingDep, require_json
 from service.openapi import arrays, problems
 from service.schemas import JobOut, Page, State, Version
@@ -44,13 +44,7 @@ def _add_creator(router: APIRouter, kind: Kind[Any]) -> None:
         idempotency_key: IdempotencyKey = None,
     ) -> JobOut:
         document = payload.model_dump(mode="json")  # type: ignore[attr-defined]
-        with runtime.database.writing() as session:
-            row, is_new = jobs.add_job(
-                session, kind.name, document, identity.name, idempotency_key, runtime.settings.max_queued_jobs
-            )
-            if is_new:
-                audit.record(session, identity.name, "job.created", f"job {row.id}", kind=kind.name)
-        runtime.job_came.release()
+        row = jobs.ask_for(runtime, kind.name, document, identity.name, idempotency_key)
         response.headers["Location"] = f"/v1/jobs/{row.id}"
         return representations.job(row)
 
@@ -125,7 +119,4 @@ def get_job_events(
 @_existing.post("/{number}/cancel", responses=problems(404, 409), dependencies=[OPERATE])
 def cancel_job(number: Number, runtime: RuntimeDep, identity: IdentityDep) -> JobOut:
     """Cancel a job: at once where it waits; a running one ends at its next report."""
-    with runtime.database.writing() as session:
-        row = jobs.cancel(session, number)
-        audit.record(session, identity.name, "job.cancelled", f"job {number}", kind=row.kind)
-        return representations.job(row)
+    return representations.job(jobs.cancel_for(runtime, number, identity.name))

@@ -8,10 +8,28 @@ from fastapi import APIRouter, Form, HTTPException, Request, Response, status
 from service import security
 from service.dependencies import RuntimeDep
 from service.openapi import problems
+from service.runtime import Runtime
 
 router = APIRouter(tags=["session"])
 
 _LASTS_S = 12 * 3600
+
+
+def require_valid(runtime: Runtime, key: str) -> None:
+    """401 unless the key opens something."""
+    if security.identify(runtime.database, runtime.settings, key) is None:
+        raise HTTPException(HTTPStatus.UNAUTHORIZED, "this key is not valid", {"WWW-Authenticate": "Bearer"})
+
+
+def keep_key(response: Response, request: Request, key: str) -> None:
+    """Put a key into the browser's cookie for half a day."""
+    secure = request.url.scheme == "https"
+    response.set_cookie(security.COOKIE, key, max_age=_LASTS_S, httponly=True, samesite="strict", secure=secure)
+
+
+def forget_key(response: Response) -> None:
+    """Take the cookie back."""
+    response.delete_cookie(security.COOKIE, httponly=True, samesite="strict")
 
 
 @router.post("/session", status_code=status.HTTP_204_NO_CONTENT, responses=problems(413))
@@ -22,14 +40,11 @@ def post_session(
     response: Response,
 ) -> None:
     """Keep a valid key in a cookie for half a day; it stops working at once when the key is withdrawn."""
-    if security.identify(runtime.database, runtime.settings, key) is None:
-        raise HTTPException(HTTPStatus.UNAUTHORIZED, "this key is not valid", {"WWW-Authenticate": "Bearer"})
-    response.set_cookie(
-        security.COOKIE, key, max_age=_LASTS_S, httponly=True, samesite="strict", secure=request.url.scheme == "https"
-    )
+    require_valid(runtime, key)
+    keep_key(response, request, key)
 
 
 @router.delete("/session", status_code=status.HTTP_204_NO_CONTENT, responses=problems())
 def delete_session(response: Response) -> None:
     """Forget the key."""
-    response.delete_cookie(security.COOKIE, httponly=True, samesite="strict")
+    forget_key(response)

@@ -145,9 +145,12 @@ class FakeOperations:
             control_points=np.stack([z, z, z], axis=-1),
             method=method,
             weights="fake-000000000000",
-            misfit=0.05,
+            misfits=(0.05,) * len(observations),
             used=tuple(observation.identifier for observation in observations),
         )
+
+    def render(self, heliostat: Heliostat, observations: list[Observation], z: Any) -> Any:
+        return np.stack([observation.flux for observation in observations])
 
     def forecast(self, heliostat: Heliostat, z: Any, sun: Any, plane: TargetPlane, **options: Any) -> Forecast:
         self.forecasts.append({"heliostat": heliostat.name, "z": z, "sun": sun, "plane": plane, **options})

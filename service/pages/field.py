@@ -1,0 +1,342 @@
+"""The field: every heliostat on a map, coloured by what its twin is worth, and the same as a table."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from fastapi import APIRouter, Depends, Query, Request
+from fastapi.responses import HTMLResponse
+from sqlalchemy import func, select
+from sqlalchemy.orm import Session
+
+from service.accuracy import RECENT, AccuracyBook, State
+from service.arrays import unpack
+from service.dependencies import READ, RuntimeDep
+from service.pages.figures import Scale, scale_of
+from service.pages.rendering import render
+from service.runtime import Runtime
+from service.tables import HeliostatRow, JobRow, MeasurementRow, PlantRow, SurfaceRow, TargetRow, now
+
+router = APIRouter(include_in_schema=False, dependencies=[READ])
+
+# Surfaces that are read at a time, to bound memory.
+_CHUNK = 200
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Of a surface [mm]: root mean square over the mirror of its deviation, and of its standard deviation if known."""
+
+    deviation_mm: float
+    uncertainty_mm: float | None
+
+
+def figures_of(arrays: bytes) -> Figures:
+    """The figures of a stored surface."""
+    unpacked = unpack(arrays)
+    z, z_std = unpacked["z"], unpacked["z_std"]
+    uncertainty = float(np.sqrt(np.mean(z_std**2)) * 1e3)
+    return Figures(float(np.sqrt(np.mean(z**2)) * 1e3), uncertainty or None)
+
+
+@dataclass(frozen=True)
+class Current:
+    """A heliostat's current surface, without its arrays."""
+
+    id: int
+    version: int
+    source: str
+    valid_from: datetime
+    misfit: float | None
+
+    @property
+    def age_days(self) -> float | None:
+        """Since it describes the mirror; a measured one may be of unknown age, for which 1970 stands."""
+        return None if self.valid_from.year <= 1970 else (now() - self.valid_from).total_seconds() / 86400
+
+
+@dataclass(frozen=True)
+class Line:
+    """A heliostat in the field; what is None is not known (yet)."""
+
+    name: str
+    east_m: float
+    north_m: float
+    photographs: int = 0
+    refused: int = 0
+    newest: int | None = None
+    surface: Current | None = None
+    figures: Figures | None = None
+    accuracy: float | None = None
+
+    @property
+    def state(self) -> State | None:
+        """What its accuracy depends on; None where there is nothing to compare."""
+        if self.surface is None or self.newest is None:
+            return None
+        return State(self.name, self.surface.id, self.newest)
+
+
+@dataclass(frozen=True)
+class Metric:
+    """What the map can be coloured by; dark is always the end that deserves a look."""
+
+    name: str
+    label: str
+    unit: str
+    digits: int
+    colours: str
+    about: str
+    value: Callable[[Line], float | None]
+
+
+def _deviation(line: Line) -> float | None:
+    return None if line.figures is None else line.figures.deviation_mm
+
+
+def _uncertainty(line: Line) -> float | None:
+    return None if line.figures is None else line.figures.uncertainty_mm
+
+
+def _misfit(line: Line) -> float | None:
+    return None if line.surface is None or line.surface.misfit is None else line.surface.misfit * 100
+
+
+def _age(line: Line) -> float | None:
+    return None if line.surface is None else line.surface.age_days
+
+
+def _accuracy(line: Line) -> float | None:
+    return None if line.accuracy is None else line.accuracy * 100
+
+
+MetricName = Literal["deviation", "uncertainty", "misfit", "age", "accuracy"]
+
+METRICS: dict[str, Metric] = {
+    metric.name: metric
+    for metric in (
+        Metric(
+            "accuracy",
+            "Forecast accuracy",
+            "%",
+            1,
+            "viridis",
+            f"Mean agreement of forecast and measured flux on up to {RECENT} newest photographs, with today's surface.",
+            _accuracy,
+        ),
+        Metric(
+            "deviation",
+            "Surface error",
+            "mm",
+            3,
+            "viridis_r",
+            "How far the mirror is from its ideal shape: root mean square of the heights.",
+            _deviation,
+        ),
+        Metric(
+            "uncertainty",
+            "Surface uncertainty",
+            "mm",
+            3,
+            "viridis_r",
+            "How well the surface is known: root mean square of the heights' standard deviations.",
+            _uncertainty,
+        ),
+        Metric(
+            "misfit",
+            "Surface misfit",
+            "%",
+            1,
+            "viridis_r",
+            "What the surface leaves unexplained of the photographs that it was made from.",
+            _misfit,
+        ),
+        Metric("age", "Age of the surface", "days", 0, "viridis_r", "Since the surface describes the mirror.", _age),
+    )
+}
+
+
+# --- what the store knows of all heliostats ---------------------------------------------------------------------------
+
+
+def _current_surfaces(session: Session) -> dict[int, Current]:
+    query = select(
+        SurfaceRow.heliostat_id,
+        SurfaceRow.id,
+        SurfaceRow.version,
+        SurfaceRow.source,
+        SurfaceRow.valid_from,
+        SurfaceRow.misfit,
+    )
+    # In this order the current one of each heliostat comes last and stays.
+    query = query.where(SurfaceRow.valid_from <= now()).order_by(SurfaceRow.valid_from, SurfaceRow.version)
+    return {row.heliostat_id: Current(*row[1:]) for row in session.execute(query)}
+
+
+def _photographs(session: Session) -> dict[tuple[int, bool], tuple[int, int]]:
+    """How many photographs each heliostat has, accepted or not, and the id of the newest."""
+    row = MeasurementRow
+    query = select(row.heliostat_id, row.accepted, func.count(), func.max(row.id)).group_by(
+        row.heliostat_id, row.accepted
+    )
+    return {(heliostat, accepted): (count, newest) for heliostat, accepted, count, newest in session.execute(query)}
+
+
+def read_lines(session: Session) -> list[Line]:
+    """All heliostats in the order of their names, without what arrays would tell."""
+    surfaces, photographs = _current_surfaces(session), _photographs(session)
+    columns = select(HeliostatRow.id, HeliostatRow.name, HeliostatRow.east_m, HeliostatRow.north_m)
+    lines = []
+    for number, name, east, north in session.execute(columns.order_by(HeliostatRow.name)):
+        accepted, newest = photographs.get((number, True), (0, None))
+        refused, _ = photographs.get((number, False), (0, None))
+        lines.append(Line(name, east, north, accepted + refused, refused, newest, surfaces.get(number)))
+    return lines
+
+
+class FieldBook:
+    """What takes arrays to tell of each heliostat: computed once, kept in memory."""
+
+    def __init__(self, runtime: Runtime) -> None:
+        self._runtime = runtime
+        self._accuracies = AccuracyBook(runtime)
+        self._figures: dict[int, Figures] = {}
+
+    def close(self) -> None:
+        """End what is under way."""
+        self._accuracies.close()
+
+    def _figures_of(self, session: Session, surfaces: Sequence[int]) -> dict[int, Figures]:
+        missing = [number for number in surfaces if number not in self._figures]
+        fresh: dict[int, Figures] = {}
+        for start in range(0, len(missing), _CHUNK):
+            chunk = select(SurfaceRow.id, SurfaceRow.arrays).where(SurfaceRow.id.in_(missing[start : start + _CHUNK]))
+            fresh.update((number, figures_of(arrays)) for number, arrays in session.execute(chunk))
+        # One assignment, so that two requests at a time do no harm; surfaces that are no longer current are let go.
+        self._figures = {**{number: self._figures[number] for number in surfaces if number not in missing}, **fresh}
+        return self._figures
+
+    def read(self, session: Session) -> tuple[list[Line], int]:
+        """All heliostats, and how many accuracies are still being worked out."""
+        lines = read_lines(session)
+        figures = self._figures_of(session, [line.surface.id for line in lines if line.surface is not None])
+        accuracies, pending = self._accuracies.look_up(line.state for line in lines if line.state is not None)
+        return [
+            replace(
+                line,
+                figures=None if line.surface is None else figures.get(line.surface.id),
+                accuracy=accuracies.get(line.name),
+            )
+            for line in lines
+        ], pending
+
+
+async def _book(request: Request) -> FieldBook:
+    book: FieldBook = request.app.state.field
+    return book
+
+
+FieldBookDep = Annotated[FieldBook, Depends(_book)]
+
+
+# --- the map ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Dot:
+    """A heliostat on the drawn map, in the drawing's units; without a colour where its value is not known."""
+
+    line: Line
+    x: float
+    y: float
+    value: float | None
+    colour: str | None
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """The field from above, north up: size, dots with their radius, the tower, and a bar for its length."""
+
+    width: float
+    height: float
+    radius: float
+    dots: list[Dot]
+    tower: tuple[float, float]
+    bar_m: float
+    bar: float
+    has_names: bool
+
+
+_WIDTH = 720.0
+_MARGIN = 34.0
+
+
+def _round_length(metres: float) -> float:
+    """The largest of 1, 2 or 5 times a power of ten that is not longer."""
+    power: float = 10.0 ** math.floor(math.log10(metres))
+    return max(factor * power for factor in (1, 2, 5) if factor * power <= metres)
+
+
+def draw(lines: Sequence[Line], metric: Metric, scale: Scale) -> Drawing:
+    """The map of ``lines``; the tower stands at the origin and is always on it."""
+    east = np.array([line.east_m for line in lines] + [0.0])
+    north = np.array([line.north_m for line in lines] + [0.0])
+    spans = max(float(np.ptp(east)), 1.0), max(float(np.ptp(north)), 1.0)
+    per_metre = min((_WIDTH - 2 * _MARGIN) / spans[0], (_WIDTH - 2 * _MARGIN) / spans[1])
+    width, height = (max(span * per_metre, 200.0) + 2 * _MARGIN for span in spans)
+    x = width / 2 + (east - (east.max() + east.min()) / 2) * per_metre
+    y = height / 2 - (north - (north.max() + north.min()) / 2) * per_metre
+    values = [metric.value(line) for line in lines]
+    dots = [
+        Dot(line, float(x[i]), float(y[i]), value, None if value is None else scale.colour(value))
+        for i, (line, value) in enumerate(zip(lines, values, strict=True))
+    ]
+    bar_m = _round_length(width / 4 / per_metre)
+    radius = min(max(0.35 * math.sqrt(width * height / max(len(lines), 1)), 3.0), 12.0)
+    tower = float(x[-1]), float(y[-1])
+    return Drawing(width, height, radius, dots, tower, bar_m, bar_m * per_metre, len(lines) <= 60)
+
+
+def _worst_first(lines: Sequence[Line], metric: Metric) -> list[Line]:
+    """Those without a value last, each group by name."""
+    sign = 1.0 if metric.name == "accuracy" else -1.0
+    valued = [(sign * value, line.name, line) for line in lines if (value := metric.value(line)) is not None]
+    return [line for *_, line in sorted(valued)] + [line for line in lines if metric.value(line) is None]
+
+
+def _totals(session: Session) -> dict[str, Any]:
+    plant = session.get(PlantRow, 1)
+    running = select(func.count()).select_from(JobRow).where(JobRow.state.in_(("queued", "running")))
+    return {
+        "plant": None if plant is None else plant.name,
+        "targets": session.scalars(select(func.count()).select_from(TargetRow)).one(),
+        "live_jobs": session.scalars(running).one(),
+    }
+
+
+@router.get("/")
+def get_field(
+    request: Request, runtime: RuntimeDep, book: FieldBookDep, metric: Annotated[MetricName, Query()] = "accuracy"
+) -> HTMLResponse:
+    """The field map and its table."""
+    chosen = METRICS[metric]
+    with runtime.database.reading() as session:
+        lines, pending = book.read(session)
+        totals = _totals(session)
+    values = [value for line in lines if (value := chosen.value(line)) is not None]
+    scale = scale_of(values, chosen.colours, f"{chosen.label} [{chosen.unit}]", 5 * 10.0**-chosen.digits)
+    return render(
+        request,
+        "field.html",
+        **totals,
+        lines=_worst_first(lines, chosen),
+        metrics=METRICS,
+        metric=chosen,
+        values=values,
+        scale=scale,
+        drawing=draw(lines, chosen, scale) if lines else None,
+        pending=pending,
+    )

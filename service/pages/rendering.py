@@ -1,0 +1,148 @@
+"""Templates to answers: what every page knows, and how it writes numbers and moments."""
+
+import hashlib
+import json
+from datetime import UTC, datetime
+from functools import cache
+from http import HTTPStatus
+from importlib.resources import files
+from typing import Any
+from urllib.parse import quote
+
+from fastapi import Request, Response
+from fastapi.responses import HTMLResponse, RedirectResponse
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+from starlette.datastructures import Headers
+from starlette.types import Scope
+
+from service.security import Identity, Role
+
+ASSETS = files("service").joinpath("static")
+"""Styles and scripts."""
+
+# What htmx may do: no code from text, no styles of its own, which the content security policy would refuse. It shows
+# errors' answers too.
+_HTMX = {
+    "allowEval": False,
+    "includeIndicatorStyles": False,
+    "selfRequestsOnly": True,
+    "historyCacheSize": 0,
+    "responseHandling": [
+        {"code": "204", "swap": False},
+        {"code": "[23]..", "swap": True},
+        {"code": "[45]..", "swap": True, "error": True},
+    ],
+}
+
+# Where htmx puts an error, whatever part of the page it asked for: `base.html` has room for it.
+_NOTICE = {"HX-Retarget": "#notice", "HX-Reswap": "innerHTML", "HX-Reselect": ".alert", "HX-Push-Url": "false"}
+
+
+# How print separates thousands and writes a minus.
+_SIGNS = {ord(","): "\N{NARROW NO-BREAK SPACE}", ord("-"): "\N{MINUS SIGN}"}
+
+
+def figure(value: float | None, digits: int = 2, unit: str = "") -> str:
+    """A number with its unit; a dash where there is none."""
+    if value is None:
+        return "–"
+    # Adding zero takes the sign from what rounds to it.
+    text = f"{round(value, digits) + 0.0:,.{digits}f}".replace(",", "\N{NARROW NO-BREAK SPACE}").replace(
+        "-", "\N{MINUS SIGN}"
+    )
+    return f"{text}\N{NO-BREAK SPACE}{unit}" if unit else text
+
+
+def percent(value: float | None, digits: int = 1) -> str:
+    """A share in percent."""
+    return figure(None if value is None else value * 100, digits, "%")
+
+
+def moment(value: datetime | None) -> str | Markup:
+    """A moment in UTC; a dash where it is not known, which 1970 stands for."""
+    if value is None or value.year <= 1970:
+        return "–"
+    utc = value.astimezone(UTC)
+    return Markup('<time datetime="{}">{}</time>').format(utc.isoformat(), utc.strftime("%Y-%m-%d %H:%M UTC"))
+
+
+def power(watts: float) -> str:
+    """A power, in kW where that reads better."""
+    return figure(watts / 1e3, 2, "kW") if abs(watts) >= 1000 else figure(watts, 0, "W")
+
+
+def irradiance(watts_m2: float) -> str:
+    """An irradiance, in kW/m² where that reads better."""
+    return figure(watts_m2 / 1e3, 2, "kW/m²") if abs(watts_m2) >= 1000 else figure(watts_m2, 0, "W/m²")
+
+
+@cache
+def asset(name: str) -> str:
+    """The path of a style or script; another for other content, so that browsers may keep it."""
+    digest = hashlib.sha256(ASSETS.joinpath(name).read_bytes()).hexdigest()[:12]
+    return f"/static/{name}?v={digest}"
+
+
+def _environment() -> Environment:
+    environment = Environment(
+        loader=PackageLoader("service.pages"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters.update(
+        figure=figure, percent=percent, moment=moment, power=power, irradiance=irradiance, path=lambda v: quote(v, "")
+    )
+    environment.globals.update(asset=asset, htmx_settings=json.dumps(_HTMX))
+    return environment
+
+
+_templates = _environment()
+
+
+def _page(scope: Scope, template: str, status: int, context: dict[str, Any]) -> HTMLResponse:
+    identity: Identity | None = scope.get("state", {}).get("identity")
+    may_operate = identity is not None and identity.role.includes(Role.OPERATE)
+    text = _templates.get_template(template).render(
+        context, identity=identity, may_operate=may_operate, here=scope.get("path", "")
+    )
+    return HTMLResponse(text, status)
+
+
+def render(request: Request, template: str, **context: Any) -> HTMLResponse:
+    """A page."""
+    return _page(request.scope, template, HTTPStatus.OK, context)
+
+
+def go_to(path: str) -> Response:
+    """An answer to a form: look there. htmx takes the part that it asked for from that page."""
+    return RedirectResponse(path, HTTPStatus.SEE_OTHER)
+
+
+def leave_for(request: Request, path: str) -> Response:
+    """The same where the answer is another page as a whole, which htmx has to be told."""
+    return Response(headers={"HX-Redirect": path}) if "hx-request" in request.headers else go_to(path)
+
+
+def wants_page(scope: Scope) -> bool:
+    """Whether a person's browser asks, and not for a part of the REST interface."""
+    headers = Headers(scope=scope)
+    is_browser = "text/html" in headers.get("accept", "") or "hx-request" in headers
+    return is_browser and not scope.get("path", "").startswith("/v1/")
+
+
+def error_page(scope: Scope, document: dict[str, Any]) -> HTMLResponse:
+    """A problem document for a person: a page, or for htmx the sentence alone."""
+    is_part = "hx-request" in Headers(scope=scope)
+    page = _page(scope, "alert.html" if is_part else "error.html", document["status"], {"problem": document})
+    page.headers.update(_NOTICE if is_part else {})
+    return page
+
+
+def login_path(scope: Scope) -> str:
+    """Where a browser without a key goes, and comes back from."""
+    wanted = scope.get("path", "/")
+    query = scope.get("query_string", b"").decode("ascii", "replace")
+    return f"/login?next={quote(f'{wanted}?{query}' if query else wanted, '')}"
