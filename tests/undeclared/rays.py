@@ -1,0 +1,269 @@
+"""Light thrown ray by ray through a disturbed world.
+
+Written from the physics alone: no effect and no tracer of the model takes part, and attitude, surface and sun have their
+own formulas here. A mirror is strewn with points; at each the mirror's normal, and how it just now swings, is drawn; and
+each sends on the light of some random directions of the sun's disc and aureole by the law of reflection.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import BSpline
+from scipy.spatial.transform import Rotation
+
+from model.plant import Facet, Heliostat, TargetPlane
+from tests.undeclared.world import Values, World
+
+Array = NDArray[np.float64]
+Rays = NDArray[np.float32]
+
+DISC, AUREOLE = 4.65e-3, 43.6e-3
+"""Where the sun's disc and its aureole end [rad]."""
+
+PIVOT = 0.175
+"""From the mount's pivot to the mirror's centre [m]."""
+
+KNOTS = np.concatenate([np.zeros(3), np.linspace(0, 1, 6), np.ones(3)])
+
+MEASURED_AT = np.radians(30.0)
+"""Elevation of the normal at which mirrors were measured, under their own weight."""
+
+CHUNK = 1024
+"""Mirror points whose rays are traced at a time: what fits into a core's cache."""
+
+
+def unit(vectors: Array) -> Array:
+    """Vectors (3,) or (3, n) of length one."""
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=0))
+
+
+# --- sun --------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Sun:
+    """Random directions near +z (3, n), and the light (n,) of each.
+
+    A quarter of them lie in the aureole, however little light that has, so that faint tails are as smooth as bright cores.
+    """
+
+    directions: Rays
+    light: Rays
+
+    @classmethod
+    def of(cls, world: World, rng: np.random.Generator, count: int = 1 << 20) -> "Sun":
+        """Buie's sun (Buie, Monger, Dey, Solar Energy 74 (2003), eqs. 6 to 9), perhaps behind the edge of a cloud."""
+        shares = np.array([3 * count // 4, count // 4])
+        rings = np.linspace(0, DISC, 2001), np.geomspace(DISC, AUREOLE, 4001)
+        thrown = [_ring(edges, world.circumsolar_ratio, share, rng) for edges, share in zip(rings, shares, strict=True)]
+        energy = np.array([ring[0] for ring in thrown])
+        light = np.repeat(energy / energy.sum() * count / shares, shares)
+        angle, turn = np.concatenate([ring[1] for ring in thrown]), rng.uniform(0, 2 * np.pi, count)
+        directions = np.array([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.cos(angle)])
+        light *= 1 - world.clouded * (directions[0] > 0)
+        order = rng.permutation(count)
+        return cls(directions[:, order].astype(np.float32), light[order].astype(np.float32))
+
+
+def _ring(edges: Array, ratio: float, count: int, rng: np.random.Generator) -> tuple[float, Array]:
+    """Energy between the first and the last of ``edges`` [rad], and random angles (count,) that share it evenly."""
+    theta = 1e3 * (edges[1:] + edges[:-1]) / 2
+    if edges[-1] <= DISC:
+        radiance = np.cos(0.326 * theta) / np.cos(0.308 * theta)
+    else:
+        kappa = 0.9 * np.log(13.5 * ratio) * ratio**-0.3
+        gamma = 2.2 * np.log(0.52 * ratio) * ratio**0.43 - 0.1
+        radiance = np.exp(kappa) * theta**gamma
+    energy = np.concatenate([[0.0], np.cumsum(radiance * theta * np.diff(edges))])
+    return float(energy[-1]), np.interp(rng.random(count) * energy[-1], energy, edges)
+
+
+# --- mirror -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Mirror points (3, n) [m], area vectors (3, n) [m2] and the facets (n,) that they lie on."""
+
+    places: Array
+    areas: Array
+    facets: NDArray[np.int64]
+
+    def bent(self, hessian: Array) -> "Points":
+        """With z raised by the quadratic form of ``hessian`` (2, 2) [1/m] over the mirror."""
+        return Points(*_bent(self.places, self.areas, hessian), self.facets)
+
+
+def _bent(places: Array, areas: Array, hessian: Array) -> tuple[Array, Array]:
+    slopes = hessian @ places[:2]
+    rise = (places[:2] * slopes).sum(axis=0) / 2
+    return np.vstack([places[:2], places[2] + rise]), np.vstack([areas[:2] - areas[2] * slopes, areas[2]])
+
+
+def _splines(places: Array) -> tuple[Array, Array]:
+    """Cubic B-splines of eight control points and their slopes, each (n, 8), at ``places`` (n,) in [0, 1]."""
+    splines = BSpline(KNOTS, np.eye(8), 3)
+    return splines(places), splines.derivative()(places)
+
+
+def _facet(facet: Facet, heights: Array, tilt: Array, curvature: float, u: Array, v: Array) -> tuple[Array, Array]:
+    """Points and area vectors of a facet in mirror coordinates at the grid ``u`` by ``v``; ``tilt`` (2,) [rad]."""
+    half = np.array([np.linalg.norm(facet.canting_x), np.linalg.norm(facet.canting_y)])
+    (value_u, slope_u), (value_v, slope_v) = _splines(u), _splines(v)
+    x, y = (axis.ravel() for axis in np.meshgrid((2 * u - 1) * half[0], (2 * v - 1) * half[1], indexing="ij"))
+    by_x = (slope_u @ heights @ value_v.T).ravel() / (2 * half[0])
+    by_y = (value_u @ heights @ slope_v.T).ravel() / (2 * half[1])
+    cell = 4 * half.prod() / (len(u) * len(v))
+    places = np.array([x, y, (value_u @ heights @ value_v.T).ravel()])
+    places, areas = _bent(places, cell * np.array([-by_x, -by_y, np.ones_like(x)]), curvature * np.eye(2))
+    along, normal = unit(facet.canting_x), unit(np.cross(facet.canting_x, facet.canting_y))
+    frame = np.column_stack([along, np.cross(normal, along), normal])
+    turn = frame @ Rotation.from_rotvec([tilt[1], -tilt[0], 0.0]).as_matrix()
+    return turn @ places + facet.position[:, None], turn @ areas
+
+
+# --- the mirror before the sun ----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Exposure:
+    """One heliostat of a world, its ``index`` there, as it throws its light onto ``goal`` (3,) [m] on a target.
+
+    ``heights`` (4, 8, 8) [m] are what was measured of the mirror over its canted facets; ``sun`` (3,) is the true one;
+    ``warmth`` says by how many standard deviations the day is warmer than usual.
+    """
+
+    world: World
+    index: int
+    heliostat: Heliostat
+    heights: Array
+    sun: Array
+    plane: TargetPlane
+    goal: Array
+    warmth: float = 0.0
+
+    def mirror(self, side: int, rng: np.random.Generator | None = None) -> Points:
+        """Points of the mirror at rest, in its own coordinates, ``side`` squared a facet in even cells."""
+        tilts = 1e-3 * self._own(self.world.canting_mrad, 4, 2)
+        curvatures = self._own(self.world.curvature, 4)
+        parts = []
+        for part in zip(self.heliostat.facets, self.heights, tilts, curvatures, strict=True):
+            u, v = ((np.arange(side) + (0.5 if rng is None else rng.random(side))) / side for _ in "uv")
+            parts.append(_facet(*part, u, v))
+        places, areas = (np.concatenate(arrays, axis=1) for arrays in zip(*parts, strict=True))
+        twist = 1e-3 * self.world.twist_mrad_m * self.warmth
+        return Points(places, areas, np.repeat(np.arange(4), side**2)).bent(twist * np.array([[0.0, 1], [1, 0]]))
+
+    def light(self, points: Points) -> Array:
+        """Share (n,) of the light that points reflect and that nothing takes away."""
+        line = (self._own(self.world.hidden) - 0.5) * self.heliostat.height
+        return self._own(self.world.reflectivity, 4)[points.facets] * (points.places[1] >= line)
+
+    def _own(self, values: Values, *shape: int) -> Array:
+        """What belongs to this heliostat of a disturbance."""
+        array = np.asarray(values)
+        return np.broadcast_to(array[self.index] if array.ndim else array, shape)
+
+    @property
+    def first_axis(self) -> Array:
+        """Where the first axis, east by the plans, really points: the ground is turned about north, then about up."""
+        return Rotation.from_euler("yz", self.world.tilt_deg, degrees=True).apply([1.0, 0.0, 0.0])
+
+    @property
+    def target_axes(self) -> Array:
+        """Rows right, up and normal (3, 3) of the target as it is seen from the field."""
+        return np.array([np.cross(self.plane.up, self.plane.normal), self.plane.up, self.plane.normal])
+
+    def facing(self, aim: Array) -> "Pose":
+        """The mirror turned so that its centre sends the sun to ``aim`` (3,) [m]."""
+        center = self.heliostat.position
+        for _ in range(5):
+            normal = unit(self.sun + unit(aim - center))
+            center = self.heliostat.position + PIVOT * normal
+        # The second axis, perpendicular to the first, is the mirror's own upward direction.
+        upward = unit(np.cross(normal, self.first_axis))
+        return Pose(np.column_stack([np.cross(upward, normal), upward, normal]), center)
+
+    def sagging(self, points: Points, pose: "Pose") -> Points:
+        """Points of a mirror whose edges hang by the share of its weight that presses on it more than when measured."""
+        pressing = pose.attitude[2, 2] - np.sin(MEASURED_AT)
+        return points.bent(-2e-3 * self.world.sag_mm * pressing / (self.heliostat.width / 2) ** 2 * np.eye(2))
+
+    def stand(self) -> "Pose":
+        """The pose in which the centre of mass of the light lies at the goal."""
+        points, aim = self.mirror(16), self.goal
+        light = self.light(points)
+        for _ in range(6):
+            pose = self.facing(aim)
+            bent = self.sagging(points, pose)
+            places, areas = (self.target_axes @ a for a in pose.in_sight(bent, self.plane))
+            sun = (self.target_axes @ self.sun)[:, None]
+            weight = light * (areas * sun).sum(axis=0)
+            right, up = land(places, reflected(unit(areas), sun)) @ weight / weight.sum()
+            miss = self.target_axes @ (self.goal - self.plane.center) - [right, up, 0.0]
+            aim = aim + miss[:2] @ self.target_axes[:2]
+        return pose
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """Mirror coordinates to east-north-up (3, 3), and the mirror's centre (3,) [m]."""
+
+    attitude: Array
+    center: Array
+
+    def in_sight(self, points: Points, plane: TargetPlane) -> tuple[Array, Array]:
+        """Points [m] from the target's centre and area vectors, each (3, n), in east-north-up."""
+        return self.attitude @ points.places + (self.center - plane.center)[:, None], self.attitude @ points.areas
+
+
+def reflected(normals: Array, suns: Array) -> Array:
+    """Directions (3, n) of light that comes from ``suns`` (3, n)."""
+    return np.asarray(2 * (normals * suns).sum(axis=0) * normals - suns)
+
+
+def land(places: Array, directions: Array) -> Array:
+    """Where light from ``places`` (3, n) meets the plane z = 0, (2, n)."""
+    return np.asarray(places[:2] - places[2] / directions[2] * directions[:2])
+
+
+def throw(exposure: Exposure, sun: Sun, side: int, fan: int, rng: np.random.Generator) -> Iterator[tuple[Rays, Rays]]:
+    """Hits (2, n) [m], right and up of the target's centre, and their light (n,), some thousand at a time.
+
+    ``side`` squared points a facet send on ``fan`` rays each.
+    """
+    places, normals, weight = _swung(exposure, side, rng)
+    toward = exposure.target_axes @ exposure.sun
+    across = unit(np.cross(toward, [1.0, 0.0, 0.0]))
+    frame = np.column_stack([across, np.cross(toward, across), toward])
+    # Reflection of directions about the sun, point by point: 2 n n^T - 1.
+    mirrors = (2 * np.einsum("in,jn->nij", normals, normals) - np.eye(3)) @ frame
+    order = rng.permutation(len(weight))
+    for start in range(0, len(order), CHUNK):
+        some = order[start : start + CHUNK]
+        first = rng.integers(sun.light.size - len(some) * fan)
+        chosen = slice(first, first + len(some) * fan)
+        suns = sun.directions[:, chosen].reshape(3, len(some), fan).transpose(1, 0, 2)
+        out = mirrors[some].astype(np.float32) @ suns
+        hits = land(places[:, some, None].astype(np.float32), out.transpose(1, 0, 2))
+        light = weight[some, None].astype(np.float32) * sun.light[chosen].reshape(len(some), fan)
+        yield hits.reshape(2, -1), light.ravel()
+
+
+def _swung(exposure: Exposure, side: int, rng: np.random.Generator) -> tuple[Array, Array, Array]:
+    """Places (3, n) [m], normals (3, n) and collected light (n,) of mirror points in the target's frame."""
+    world, pose, axes = exposure.world, exposure.stand(), exposure.target_axes
+    points = exposure.sagging(exposure.mirror(side, rng), pose)
+    places, areas = (axes @ a for a in pose.in_sight(points, exposure.plane))
+    weight = exposure.light(points) * (areas * (axes @ exposure.sun)[:, None]).sum(axis=0).clip(min=0)
+    count = weight.size
+    swings = [(exposure.first_axis, world.first_axis_mrad), (pose.attitude[:, 1], world.second_axis_mrad)]
+    swing = 1e-3 * sum(np.outer(axes @ axis, sigma * rng.standard_normal(count)) for axis, sigma in swings)
+    center = (axes @ (pose.center - exposure.plane.center))[:, None]
+    normals = unit(areas)
+    normals = unit(
+        normals + np.cross(swing, normals, axis=0) + 1e-3 * world.roughness_mrad * rng.standard_normal((3, count))
+    )
+    return places + np.cross(swing, places - center, axis=0), normals, weight
