@@ -34,6 +34,11 @@ app = typer.Typer(
 
 Folder = Annotated[Path, typer.Argument(help="Measurement folder in PAINT's layout.", metavar="DIR")]
 Out = Annotated[Path, typer.Option("--out", help="Folder to write to.", metavar="OUT")]
+Surfaces = Annotated[str, typer.Option(help="measured, ideal, or a folder that predict wrote.")]
+EffectsFile = Annotated[
+    Path | None,
+    typer.Option("--effects", help="Effects to add to the declared ones: JSON, or a study's report.", metavar="FILE"),
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the report as JSON on standard output.")]
 
 
@@ -129,11 +134,8 @@ def predict(
 def forecast(
     folder: Folder,
     out: Out,
-    surfaces: Annotated[str, typer.Option(help="measured, ideal, or a folder that predict wrote.")] = "measured",
-    effects: Annotated[
-        Path | None,
-        typer.Option(help="JSON file of effects to add to the declared ones, or a study's report.", metavar="FILE"),
-    ] = None,
+    surfaces: Surfaces = "measured",
+    effects: EffectsFile = None,
     window: Annotated[
         float | None, typer.Option(help="Side [m] of the accuracy's window; by the spot if not given.")
     ] = None,
@@ -161,6 +163,55 @@ def forecast(
         table.add_section()
         table.add_row("mean", f"{report['accuracy_mean']:.3f}")
     show(report, as_json, table)
+
+
+@app.command()
+def study(
+    folder: Folder,
+    out: Annotated[Path, typer.Option("--out", help="JSON file to write the report to.", metavar="REPORT.json")],
+    page: Annotated[
+        Path | None, typer.Option("--html", help="Write the report as one web page, too.", metavar="FILE")
+    ] = None,
+    surfaces: Surfaces = "measured",
+    effects: EffectsFile = None,
+    as_json: AsJson = False,
+) -> None:
+    """Which physical effect the photographs demand that the declared model lacks, and what it buys: REPORT.json."""
+    from service.folder import write_json
+    from service.paint import read_effects
+    from service.study import study_folder
+    from service.study_page import study_page
+
+    for path in filter(None, (out, page)):
+        if path.is_dir():
+            raise InvalidInputError(f"{path} is a folder; name a file to write to")
+    added = () if effects is None else read_effects(effects)
+    source = read_folder(folder)
+    with progress(None, "study") as step:
+        done = study_folder(source, surfaces, effects=added, progress=step)
+    report = done.to_json()
+    write_json(out, report)
+    if page is not None:
+        page.parent.mkdir(parents=True, exist_ok=True)
+        page.write_text(study_page(done.study, folder.resolve().name, done.skipped), encoding="utf-8")
+    show(report, as_json, _study_table(report))
+    if not as_json:
+        typer.echo(done.study.conclusion())
+
+
+def _study_table(report: dict[str, Any]) -> Table:
+    """Every candidate alone, the best first, and where the model stands before and after."""
+    table = make_table(f"Study: {report['verdict']}", "effect", "accuracy", "score", "found")
+    found = {effect["name"]: effect["accuracy_gain"] for effect in report["effects"]}
+    for candidate in report["candidates"]:
+        gain = found.get(candidate["name"])
+        interval = "" if gain is None else f"gain {gain['ci95'][0]:.3f} to {gain['ci95'][1]:.3f}"
+        accuracy, score = f"{candidate['accuracy_after']:.3f}", f"{candidate['score']:.1f}"
+        table.add_row(candidate["name"], accuracy, score, interval)
+    table.add_section()
+    for name in ("before", "after"):
+        table.add_row(f"all, {name}", f"{report[name]['accuracy_mean']:.3f}")
+    return table
 
 
 @app.command("import")

@@ -164,7 +164,7 @@ def predict_heliostat(
     if not usable:
         reason = f"every image was refused: {next(iter(refused.values()))}" if refused else "no image"
         raise InvalidInputError(reason)
-    predicted = operations.predict(heliostat, choose(usable, images), method, folder.optics)
+    predicted = operations.predict(heliostat, choose(usable, images), method, folder.optics, folder.effects)
     entry: dict[str, Any] = {
         "method": method,
         "weights": predicted.weights,
@@ -229,6 +229,12 @@ def write_surface(out: Path, name: str, predicted: SurfacePrediction) -> None:
 
 
 # --- forecast ---------------------------------------------------------------------------------------------------------
+
+
+def check_surfaces(surfaces: str) -> None:
+    """Refuse a choice of surfaces that is none of those that verbs know."""
+    if surfaces not in ("measured", "ideal") and not Path(surfaces).is_dir():
+        raise InvalidInputError(f"--surfaces must be 'measured', 'ideal' or a folder of predictions, got {surfaces!r}")
 
 
 def surface_of(folder: MeasurementFolder, heliostat: Heliostat, surfaces: str) -> tuple[Array, int] | None:
@@ -301,8 +307,7 @@ def forecast_folder(
 
     ``effects`` come in addition to those that the folder declares.
     """
-    if surfaces not in ("measured", "ideal") and not Path(surfaces).is_dir():
-        raise InvalidInputError(f"--surfaces must be 'measured', 'ideal' or a folder of predictions, got {surfaces!r}")
+    check_surfaces(surfaces)
     report: dict[str, Any] = {
         "surfaces": surfaces,
         "model_version": model_version([*folder.effects, *effects]),

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from model.imaging.window import center_of_mass
 from model.plant import Heliostat, TargetPlane
 from model.study import Photograph, Study, StudyOptions, study
 from model.surface import DEGREE, control_points
-from service.folder import measure, read_image, surface_of
+from service.folder import check_surfaces, measure, read_image, surface_of
 from service.paint import Measurement, MeasurementFolder
 
 CENTERED_SIDE = 6.1
@@ -26,6 +27,10 @@ class FolderStudy:
 
     study: Study
     skipped: dict[str, str]
+
+    def to_json(self) -> dict[str, Any]:
+        """The study's report, with what was skipped where something was."""
+        return {**self.study.to_json(), **({"skipped": self.skipped} if self.skipped else {})}
 
 
 def photographs_of(folder: MeasurementFolder, surfaces: str = "measured") -> tuple[list[Photograph], dict[str, str]]:
@@ -93,6 +98,7 @@ def study_folder(
     InvalidInputError
         Where too few photographs have a surface; it says what was left out.
     """
+    check_surfaces(surfaces)
     photographs, skipped = photographs_of(folder, surfaces)
     try:
         found = study(photographs, folder.optics, [*folder.effects, *effects], options, progress)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.effects import CATALOGUE, Effect
+from model.study.advice import told_apart_by
 from model.study.judging import Gain, accuracies, rank_correlation
 from model.study.photographs import Photograph
 from model.study.unknowns import Unknowns
@@ -201,4 +202,5 @@ def _effect(found: Found) -> dict[str, Any]:
         "parameters": found.parameters,
         "accuracy_gain": {"mean": round(gain.mean, 5), "ci95": [round(gain.low, 5), round(gain.high, 5)]},
         "lookalikes": found.lookalikes,
+        "told_apart_by": {name: told_apart_by(found.name, name) for name in found.lookalikes},
     }

@@ -1,0 +1,47 @@
+"""Which photographs tell effects apart that a study could not: those under which one changes and the other does not.
+
+Drawn from what each effect scales with, which its own file says at length.
+"""
+
+PHOTOGRAPHS = {
+    "distance": "a near and a far heliostat under the same sun",
+    "heliostat": "several heliostats within the same hour",
+    "elevation": "the same heliostat under a high and a low sun",
+    "side": "heliostats east and west of the tower within the same hour",
+    "roll": "the same heliostat in the early morning, at noon and in the late afternoon",
+    "weather": "the same heliostats on another day of other haze and wind",
+    "camera": "a spot on another target or with another camera and exposure",
+}
+"""What varies, and the photographs that vary it; those that tell most come first."""
+
+SCALES_WITH: dict[str, frozenset[str]] = {
+    name: frozenset(factors.split())
+    for name, factors in {
+        "sun_position": "roll side",
+        "axis_tilt": "roll",
+        "facet_canting": "distance heliostat roll",
+        "gravity_bending": "distance elevation",
+        "soiling": "heliostat",
+        "blocking": "heliostat elevation",
+        "sun_shape": "distance weather",
+        "slope_error": "distance heliostat",
+        "tracking_jitter": "distance roll weather",
+        "background": "weather camera",
+        "camera_blur": "camera",
+        "camera_ghost": "camera",
+        "camera_response": "camera",
+        "target_registration": "camera",
+    }.items()
+}
+"""What changes each effect's mark in an image; what is not named leaves it alone."""
+
+SAME_SCALING = "a lamp or an edge of known shape on the target, for both effects are the camera's own"
+
+MOST = 2
+
+
+def told_apart_by(first: str, second: str) -> str:
+    """The photographs that would tell two effects of the catalogue apart."""
+    differ = SCALES_WITH[first] ^ SCALES_WITH[second]
+    wanted = [photographs for factor, photographs in PHOTOGRAPHS.items() if factor in differ]
+    return ", and ".join(wanted[:MOST]) or SAME_SCALING
