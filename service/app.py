@@ -14,7 +14,7 @@ from service.handlers import KINDS
 from service.middleware import BodyLimitMiddleware, DoorMiddleware, RequestIdMiddleware, SecurityHeadersMiddleware
 from service.pages import field, forecast, heliostat, login
 from service.pages import jobs as job_pages
-from service.routers import audit, forecasts, health, heliostats, jobs, measurements, plant, session, surfaces
+from service.routers import audit, forecasts, health, heliostats, jobs, measurements, plant, session, studies, surfaces
 from service.runtime import Operations, Runtime
 from service.settings import Settings
 from service.workers import Kinds, Workers
@@ -77,7 +77,7 @@ def create_app(settings: Settings, operations: Operations | None = None, kinds: 
     )
     app.state.stopping = threading.Event()
     v1 = APIRouter(prefix="/v1")
-    for module in (plant, heliostats, measurements, surfaces, forecasts, audit):
+    for module in (plant, heliostats, measurements, surfaces, forecasts, studies, audit):
         v1.include_router(module.router)
     v1.include_router(jobs.make_router(kinds))
     app.include_router(v1)

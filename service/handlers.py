@@ -8,14 +8,16 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 from sqlalchemy import select
 
 from model.errors import InvalidInputError, ModelError
 from model.plant import TargetPlane
+from service import models, store
 from service.faults import ConflictError, ServiceError
 from service.runtime import Runtime
-from service.schemas import Method, Model, Name, Plane, Position, Resolution, Sun
+from service.schemas import Method, Model, ModelVersion, Moment, Name, Plane, Position, Resolution, Sun
+from service.studies import StudyRequest, Surfaces, study_row, study_store
 from service.tables import HeliostatRow
 from service.workers import Context, Kind, Kinds, Result
 from service.workflows import ForecastRequest, Traced, plane_as_json, predict_surface, trace_request
@@ -51,15 +53,17 @@ class PredictionsIn(Model):
     heliostats: Heliostats = None
     method: Method = Field(default="network", description="network: at once; refined: fitted through the ray tracer.")
     images: int = Field(default=8, ge=1, le=8, description="How many measurements to take of each heliostat.")
+    model_version: ModelVersion = None
 
 
 def predict_many(context: Context, payload: PredictionsIn) -> Result:
     """A new surface version for each heliostat, once each however often the job is begun."""
     names, done = _names(context.runtime, payload.heliostats), context.steps()
+    version = _model_number(context.runtime, payload.model_version)
     for index, name in enumerate(names):
         context.report(index / len(names), name)
         if name not in done:
-            _predict_step(context, payload, name)
+            _predict_step(context, payload, name, version)
     steps = context.steps()
     skipped = {name: step["skipped"] for name, step in steps.items() if "skipped" in step}
     versions = {name: step["version"] for name, step in steps.items() if "version" in step}
@@ -67,7 +71,13 @@ def predict_many(context: Context, payload: PredictionsIn) -> Result:
     return Result({"surfaces": versions, "skipped": skipped})
 
 
-def _predict_step(context: Context, payload: PredictionsIn, name: str) -> None:
+def _model_number(runtime: Runtime, wanted: int | None) -> int:
+    """The version of the plant's model that is wanted, or the current one: the same for all heliostats of a job."""
+    with runtime.database.reading() as session:
+        return models.get_model(session, wanted).number
+
+
+def _predict_step(context: Context, payload: PredictionsIn, name: str, model_version: int) -> None:
     try:
         predict_surface(
             context.runtime,
@@ -76,6 +86,7 @@ def _predict_step(context: Context, payload: PredictionsIn, name: str) -> None:
             images=payload.images,
             actor=context.created_by,
             also=lambda session, row: context.keep(session, name, {"version": row.version}),
+            model_version=model_version,
         )
     except _SKIPPED as error:
         with context.runtime.database.writing() as session:
@@ -100,6 +111,7 @@ class FleetForecastIn(Model):
     )
     dni_w_m2: float = Field(default=1000.0, gt=0, le=2000, description="Direct normal irradiance [W/m2].")
     resolution: Resolution = (256, 256)
+    model_version: ModelVersion = None
 
     @model_validator(mode="after")
     def _one(self) -> Self:
@@ -107,7 +119,7 @@ class FleetForecastIn(Model):
             raise ValueError("give either target or plane")
         return self
 
-    def request(self, name: str) -> ForecastRequest:
+    def request(self, name: str, model_version: int) -> ForecastRequest:
         """The same for one heliostat."""
         return ForecastRequest(
             heliostat=name,
@@ -119,25 +131,27 @@ class FleetForecastIn(Model):
             surface=self.surface,
             dni=self.dni_w_m2,
             resolution=self.resolution,
+            model_version=model_version,
         )
 
 
 def forecast_fleet(context: Context, payload: FleetForecastIn) -> Result:
     """The sum of the heliostats' flux maps [W/m2]; nobody's light is blocked by a neighbour."""
     names = _names(context.runtime, payload.heliostats)
+    version = _model_number(context.runtime, payload.model_version)
     flux = np.zeros(payload.resolution)
     skipped: dict[str, str] = {}
     traced: Traced | None = None
     for index, name in enumerate(names):
         context.report(index / len(names), name)
         try:
-            traced = trace_request(context.runtime, payload.request(name))
+            traced = trace_request(context.runtime, payload.request(name, version))
             flux += traced.forecast.flux
         except _SKIPPED as error:
             skipped[name] = str(error)
     _require_some(len(names) - len(skipped), skipped)
     assert traced is not None
-    figures = _figures(flux, traced.plane) | {"model_version": traced.forecast.model_version}
+    figures = _figures(flux, traced.plane) | {"model_version": traced.model.version}
     counts = {"heliostats": len(names) - len(skipped), "skipped": skipped}
     return Result(figures | counts, {"flux": flux.astype(np.float32)})
 
@@ -149,6 +163,58 @@ def _figures(flux: np.ndarray[Any, Any], plane: TargetPlane) -> dict[str, Any]:
         "power_w": float(flux.sum() * pixel_m2),
         "plane": plane_as_json(plane),
     }
+
+
+# --- studies ----------------------------------------------------------------------------------------------------------
+
+
+class StudyIn(Model):
+    """Find the effect that stored photographs demand and the plant's current model lacks."""
+
+    heliostats: list[Name] | None = Field(
+        default=None, min_length=1, max_length=200, description="Names of heliostats; else some of all over the field."
+    )
+    most_heliostats: int = Field(
+        default=12, ge=1, le=200, description="How many heliostats to take where none is named, near ones and far ones."
+    )
+    surfaces: Surfaces = Field(
+        default="current",
+        description="measured: only heliostats with a measured surface; current: where there is none, the newest "
+        "prediction.",
+    )
+    images: int = Field(
+        default=12,
+        ge=2,
+        le=64,
+        description="Most photographs of each heliostat: the newest ones, spread over the sun's positions.",
+    )
+    since: Moment | None = Field(default=None, description="Only photographs from then on (time with zone).")
+    until: Moment | None = Field(default=None, description="Only photographs before then (time with zone).")
+    candidates: list[str] | None = Field(
+        default=None, min_length=1, max_length=100, description="Names of the effects to try; all without it."
+    )
+
+    @field_validator("candidates")
+    @classmethod
+    def _known(cls, names: list[str] | None) -> list[str] | None:
+        from model.effects import CATALOGUE  # late: it brings the tracer's libraries with it
+
+        if names is not None and not set(names) <= set(CATALOGUE):
+            raise ValueError(f"the catalogue of effects has {', '.join(CATALOGUE)}")
+        return None if names is None else list(dict.fromkeys(names))
+
+
+def make_study(context: Context, payload: StudyIn) -> Result:
+    """A study, stored once however often the job is begun."""
+    if "study" not in context.steps():
+        studied = study_store(context.runtime, StudyRequest(**payload.model_dump()), context.report)
+        options = payload.model_dump(mode="json")
+        row = study_row(studied, f"Study of job {context.lease.job_id}", options, context.created_by)
+        with context.runtime.database.writing() as session:
+            store.add_study(session, row)
+            about = {"study": row.id, "verdict": row.verdict, "conclusion": row.conclusion, "skipped": row.skipped}
+            context.keep(session, "study", about)
+    return Result(context.steps()["study"])
 
 
 # --- a measurement folder ---------------------------------------------------------------------------------------------
@@ -215,6 +281,7 @@ KINDS: Kinds = {
     for kind in (
         Kind("predictions", PredictionsIn, predict_many, "Predict the surfaces of many heliostats."),
         Kind("forecasts", FleetForecastIn, forecast_fleet, "Superpose the flux of many heliostats on one plane."),
+        Kind("studies", StudyIn, make_study, "Find the effect that photographs demand and the model lacks."),
         Kind("imports", ImportIn, import_allowed, "Load a measurement folder into the store."),
     )
 }

@@ -32,6 +32,10 @@ _TAGS = [
     {"name": "measurements", "description": "Target photographs: post them, read flux and quality back."},
     {"name": "surfaces", "description": "Mirror surfaces by version: predict them, read the history."},
     {"name": "forecasts", "description": "Flux maps on any plane."},
+    {
+        "name": "studies",
+        "description": "What photographs demand and the model lacks: find it, adopt it into the model, withdraw it.",
+    },
     {"name": "jobs", "description": "Work that outlives a request: ask for it, follow it, cancel it."},
     {"name": "audit", "description": "Who did what when."},
     {"name": "session", "description": "For pages: a key in a cookie."},

@@ -1,6 +1,6 @@
-"""What the command line, the demo and REST do, as plain functions from arrays to arrays: measure, predict, forecast."""
+"""What the command line, the demo and REST do, as plain functions: measure, predict, forecast, study."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -17,6 +17,8 @@ from model.network.predictor import default_predictor
 from model.observation import Observation, SurfacePrediction, render_observations
 from model.plant import Heliostat, TargetPlane
 from model.refinement import refine
+from model.study import Photograph, Study, StudyOptions
+from model.study import study as study_photographs
 from model.surface import COLUMNS, DEGREE, FACETS, ROWS, control_points
 from model.tracing import Optics
 from model.tracing.convolution import central_rays
@@ -43,8 +45,11 @@ def predict(
     observations: Sequence[Observation],
     method: Method = "network",
     optics: Optics | None = None,
+    effects: Sequence[Effect] = (),
 ) -> SurfacePrediction:
     """The mirror surface of a heliostat from its images, by the network alone or refined through the tracer.
+
+    ``optics`` and ``effects`` are those of the model that is believed.
 
     Raises
     ------
@@ -53,11 +58,12 @@ def predict(
     """
     if method not in ("network", "refined"):
         raise InvalidInputError(f"method must be 'network' or 'refined', got {method!r}")
-    by_network = default_predictor().predict(heliostat, observations)
+    predictor = default_predictor()
     if method == "network":
-        return by_network
-    refined = refine(heliostat, observations, by_network.z, optics=optics)
-    return replace(refined, weights=f"{by_network.weights}+{refined.weights}")
+        return predictor.predict(heliostat, observations, optics, effects)
+    start, _ = predictor.heights(heliostat, observations, optics, effects)
+    refined = refine(heliostat, observations, start, optics=optics, effects=effects)
+    return replace(refined, weights=f"{predictor.name}+{refined.weights}")
 
 
 def render(heliostat: Heliostat, observations: Sequence[Observation], z: ArrayLike | None) -> Array:
@@ -161,3 +167,14 @@ def forecast(
         power=float(flux.sum(dtype=np.float64) * np.prod(view.of(plane).pixel)),
         model_version=model_version(effects),
     )
+
+
+def study(
+    photographs: Sequence[Photograph],
+    optics: Optics,
+    effects: Sequence[Effect] = (),
+    options: StudyOptions | None = None,
+    progress: Callable[[str], None] = lambda message: None,
+) -> Study:
+    """Which effects photographs demand that a model with these optics and effects lacks; see `model.study.study`."""
+    return study_photographs(photographs, optics, effects, options, progress)

@@ -8,7 +8,7 @@ from fastapi.responses import JSONResponse
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
-from service import negotiation
+from service import models, negotiation
 from service.arrays import pack, unpack
 from service.faults import NotFoundError
 from service.pictures import flux_picture, surface_picture
@@ -19,12 +19,26 @@ from service.schemas import (
     HeliostatSummary,
     JobOut,
     MeasurementOut,
+    ModelOut,
     PlantOut,
+    StudyOut,
+    StudySummary,
     SurfaceOut,
     SurfaceSummary,
     TargetOut,
 )
-from service.tables import AuditRow, ForecastRow, HeliostatRow, JobRow, MeasurementRow, PlantRow, SurfaceRow, TargetRow
+from service.tables import (
+    AuditRow,
+    ForecastRow,
+    HeliostatRow,
+    JobRow,
+    MeasurementRow,
+    ModelRow,
+    PlantRow,
+    StudyRow,
+    SurfaceRow,
+    TargetRow,
+)
 
 # A flux map's sum where it is normalised (the paper's rule).
 _NORMALISED_SUM = 100.0
@@ -126,6 +140,7 @@ def surface_summary(heliostat_name: str, row: SurfaceRow) -> SurfaceSummary:
             "version": row.version,
             "source": row.source,
             "model": row.model,
+            "model_version": row.model_version,
             "created_at": row.created_at,
             "valid_from": row.valid_from,
             "measurements": [measurement.identifier for measurement in row.measurements],
@@ -174,6 +189,35 @@ def forecast_summary(row: ForecastRow) -> ForecastSummary:
             "created_at": row.created_at,
         }
     )
+
+
+def _study_fields(row: StudyRow, adopted: str | None) -> dict[str, Any]:
+    names = StudySummary.model_fields.keys() - {"adopted"}
+    return {name: getattr(row, name) for name in names} | {"adopted": adopted}
+
+
+def study_summary(row: StudyRow, adopted: str | None) -> StudySummary:
+    """A study without its figures; ``adopted`` is the version that stands for what it found."""
+    return StudySummary.model_validate(_study_fields(row, adopted))
+
+
+def study(row: StudyRow, adopted: str | None) -> StudyOut:
+    """A study, loaded with its report, as JSON."""
+    return StudyOut.model_validate({**row.report, **_study_fields(row, adopted), "skipped": row.skipped})
+
+
+def declared_model(is_current: bool) -> ModelOut:
+    """The model that nobody had to adopt."""
+    unknown = dict.fromkeys(("study", "adopted_at", "adopted_by", "withdrawn_at", "withdrawn_by"))
+    about = {"number": models.DECLARED, "version": models.version_name(models.DECLARED, ()), "effects": []}
+    return ModelOut.model_validate({**about, "is_current": is_current, **unknown})
+
+
+def model(row: ModelRow, is_current: bool) -> ModelOut:
+    """An adopted version of the plant's model."""
+    names = ModelOut.model_fields.keys() - {"is_current", "study"}
+    fields = {name: getattr(row, name) for name in names}
+    return ModelOut.model_validate({**fields, "is_current": is_current, "study": row.study_id})
 
 
 def job(row: JobRow) -> JobOut:

@@ -41,6 +41,7 @@ MeasurementName = Annotated[
 Kind = Literal["raw", "cropped", "flux", "flux-centered"]
 Source = Literal["measured", "network", "refined", "imported"]
 Method = Literal["network", "refined"]
+Verdict = Literal["effect", "none", "unexplained"]
 State = Literal["queued", "running", "done", "failed", "cancelled"]
 
 Metres = Annotated[float, Field(ge=-1e6, le=1e6)]
@@ -63,6 +64,12 @@ Moment = Annotated[
     AwareDatetime,
     Field(ge=datetime(1970, 1, 1, tzinfo=UTC), lt=datetime(9000, 1, 1, tzinfo=UTC)),
     AfterValidator(lambda moment: moment.astimezone(UTC)),
+]
+
+Version = Annotated[int, Field(ge=1, le=2**31 - 1)]
+ModelVersion = Annotated[
+    Version | None,
+    Field(description="Number of a version of the plant's model, see /v1/models; the current one without it."),
 ]
 
 Item = TypeVar("Item")
@@ -352,6 +359,7 @@ class SurfaceIn(Model):
         le=8,
         description="How many of the newest accepted ones to take, spread over the sun's positions.",
     )
+    model_version: ModelVersion = None
 
 
 class SurfaceSummary(BaseModel):
@@ -361,6 +369,9 @@ class SurfaceSummary(BaseModel):
     version: int
     source: Source
     model: str | None = Field(description="Name and hash of the network's weights.")
+    model_version: str | None = Field(
+        description="Version of the plant's model that it was predicted by; null: it was measured."
+    )
     created_at: datetime
     valid_from: datetime = Field(description="The mirror is taken to have this surface from then on.")
     measurements: list[str] = Field(description="Ids of the measurements that it was made from.")
@@ -397,7 +408,6 @@ Resolution = Annotated[
     BeforeValidator(_square),
     Field(description="Rows and columns of the map, or one number for both."),
 ]
-Version = Annotated[int, Field(ge=1, le=2**31 - 1)]
 
 
 class ForecastIn(Model):
@@ -422,6 +432,7 @@ class ForecastIn(Model):
         description="Side of a square about the centre of mass to map [m]; else the plane.",
     )
     normalised: bool = Field(default=False, description="Scale the map to a sum of 100 instead of W/m2.")
+    model_version: ModelVersion = None
 
     @model_validator(mode="after")
     def _one(self) -> Self:
@@ -448,7 +459,7 @@ class ForecastSummary(BaseModel):
     peak_w_m2: float = Field(description="Largest irradiance [W/m2].")
     power_w: float = Field(description="Power on the mapped area [W].")
     center_of_mass: tuple[float, float] | None = Field(description="Right and up of the plane's centre [m].")
-    model_version: str
+    model_version: str = Field(description="Version of the plant's model: its number and effects.")
     created_at: datetime
 
 
@@ -456,6 +467,72 @@ class ForecastOut(ForecastSummary):
     """A computed flux map."""
 
     flux: list[Any] = Field(description="Rows from the top, columns from the left as seen from the lit side.")
+
+
+# --- studies and models -----------------------------------------------------------------------------------------------
+
+
+class StudySummary(BaseModel):
+    """A study without its figures."""
+
+    id: int
+    created_at: datetime
+    created_by: str = Field(description="Name of the key that asked for it.")
+    options: dict[str, Any] = Field(description="What was asked.")
+    heliostats: list[str] = Field(description="Those whose photographs were studied.")
+    taken_from: datetime | None = Field(description="When the first photograph was taken, where that is known.")
+    taken_to: datetime | None = Field(description="When the last one was.")
+    model_version: str = Field(description="Version of the plant's model that the photographs were held against.")
+    adopted: str | None = Field(description="Version of the model that stands for what was found, unless withdrawn.")
+    verdict: Verdict = Field(description="effect: it is found; none: nothing is missing; unexplained: something is.")
+    conclusion: str
+
+
+class AccuracyOut(BaseModel):
+    """How well held-out photographs are forecast."""
+
+    accuracy_mean: float = Field(description="[1]")
+    accuracy_median: float = Field(description="[1]")
+    per_image: dict[str, float] = Field(description="By heliostat and measurement, `H/ID` [1].")
+
+
+class StudyOut(StudySummary):
+    """A study with its figures, and `skipped`: what it left out, with the reasons."""
+
+    model_config = ConfigDict(extra="allow")
+
+    images: dict[str, int] = Field(description="How many were fitted and how many judged the fit.")
+    before: AccuracyOut = Field(description="By the model that the study was made with.")
+    after: AccuracyOut = Field(description="With the effects that were found.")
+    noise_floor: float = Field(description="Error that the photographs' noise alone makes [1].")
+    unexplained_share: float = Field(description="Share of the error beyond the noise that is left [1].")
+    effects: list[dict[str, Any]] = Field(description="What was found: parameters with 95 % intervals, gain.")
+    candidates: list[dict[str, Any]] = Field(description="Every effect tried by itself, the best first.")
+    skipped: dict[str, str]
+
+
+class AdoptIn(Model):
+    """How to adopt what a study found."""
+
+    force: bool = Field(
+        default=False,
+        description="Also where its verdict is not `effect`, or another version of the model is current by now, which "
+        "it then takes the place of.",
+    )
+
+
+class ModelOut(BaseModel):
+    """A version of the plant's model."""
+
+    number: int = Field(description="Ask for it as `model_version`.")
+    version: str = Field(description="Number and names of its effects.", examples=["2:camera_response"])
+    is_current: bool = Field(description="Whether forecasts and predictions are made by it.")
+    effects: list[dict[str, Any]] = Field(description="Its effects with their parameters.")
+    study: int | None = Field(description="The study that it was adopted from; null: the declared model.")
+    adopted_at: datetime | None
+    adopted_by: str | None
+    withdrawn_at: datetime | None
+    withdrawn_by: str | None
 
 
 # --- jobs -------------------------------------------------------------------------------------------------------------

@@ -36,7 +36,8 @@ class Role(StrEnum):
     INGEST = ROLES[1]
     """Post photographs: the calibration system, which reads back flux, quality and surface."""
     OPERATE = ROLES[2]
-    """Predict, forecast, run and cancel jobs, change plant, targets and heliostats: operators, aim-point software."""
+    """Predict, forecast, study, adopt effects, run and cancel jobs, change plant, targets and heliostats: operators,
+    aim-point software."""
     ADMIN = ROLES[3]
     """Read the audit trail: whoever answers for the plant."""
 

@@ -27,6 +27,7 @@ from service.tables import (
     ImageRow,
     MeasurementRow,
     PlantRow,
+    StudyRow,
     SurfaceRow,
     TargetRow,
     now,
@@ -288,12 +289,22 @@ def list_measurements(
     return session.scalars(query).all()
 
 
-def recent_measurements(session: Session, heliostat: HeliostatRow, limit: int) -> list[MeasurementRow]:
+def recent_measurements(
+    session: Session,
+    heliostat: HeliostatRow,
+    limit: int,
+    since: datetime | None = None,
+    until: datetime | None = None,
+) -> list[MeasurementRow]:
     """The newest accepted measurements, one image of each, by when they were taken or else came."""
-    newest = func.coalesce(MeasurementRow.taken_at, MeasurementRow.created_at).desc()
+    moment = func.coalesce(MeasurementRow.taken_at, MeasurementRow.created_at)
     query = _measurements(heliostat).where(MeasurementRow.accepted, MeasurementRow.arrays.is_not(None))
+    if since is not None:
+        query = query.where(moment >= since)
+    if until is not None:
+        query = query.where(moment < until)
     # Images of the same measurement in another kind show the same spot again, hence the longer list.
-    query = query.order_by(newest, MeasurementRow.id.desc()).limit(len(PREFERENCE) * limit)
+    query = query.order_by(moment.desc(), MeasurementRow.id.desc()).limit(len(PREFERENCE) * limit)
     best: dict[str, MeasurementRow] = {}
     for row in session.scalars(query):
         key = row.external_id or row.identifier
@@ -393,6 +404,8 @@ class NewSurface:
         From when it describes the mirror; without it, from now.
     model : str
         Name and hash of the weights that made it.
+    model_version : str
+        Version of the plant's model that it was made with.
     measurements : the rows that it was made from
     misfit : float
     """
@@ -403,6 +416,7 @@ class NewSurface:
     control_points: NDArray[Any]
     valid_from: datetime | None = None
     model: str | None = None
+    model_version: str | None = None
     measurements: Sequence[MeasurementRow] = field(default=())
     misfit: float | None = None
 
@@ -427,6 +441,7 @@ def _surface_row(heliostat: HeliostatRow, version: int, new: NewSurface, content
         valid_from=new.valid_from or created,
         source=new.source,
         model=new.model,
+        model_version=new.model_version,
         misfit=new.misfit,
         content_sha256=content,
         arrays=pack({name: np.asarray(array, np.float64) for name, array in arrays.items()}),
@@ -469,6 +484,12 @@ def get_surface(session: Session, heliostat: HeliostatRow, version: int) -> Surf
     if row is None:
         raise NotFoundError(f"heliostat {heliostat.name} has no surface version {version}")
     return row
+
+
+def find_measured_surface(session: Session, heliostat: HeliostatRow) -> SurfaceRow | None:
+    """The newest version, with its arrays, that was measured and not predicted, or None."""
+    query = _surfaces(heliostat).where(SurfaceRow.source == "measured")
+    return session.scalar(query.order_by(SurfaceRow.version.desc()).limit(1).options(undefer(SurfaceRow.arrays)))
 
 
 def find_surface_at(session: Session, heliostat: HeliostatRow, moment: datetime) -> SurfaceRow | None:
@@ -514,6 +535,31 @@ def list_forecasts(
     if heliostat is not None:
         query = query.where(ForecastRow.heliostat_id == heliostat.id)
     return session.scalars(query.where(ForecastRow.id > after) if after else query).all()
+
+
+# --- studies ----------------------------------------------------------------------------------------------------------
+
+
+def add_study(session: Session, row: StudyRow) -> StudyRow:
+    """Store a study."""
+    session.add(row)
+    session.flush()
+    return row
+
+
+def get_study(session: Session, number: int, page: bool = False) -> StudyRow:
+    """A study with its report, and its ``page`` where wanted; NotFoundError where there is none."""
+    columns = [undefer(StudyRow.report), undefer(StudyRow.skipped), *([undefer(StudyRow.html)] if page else [])]
+    row = session.scalar(select(StudyRow).where(StudyRow.id == number).options(*columns))
+    if row is None:
+        raise NotFoundError(f"there is no study {number}")
+    return row
+
+
+def list_studies(session: Session, limit: int, after: int | None = None) -> Sequence[StudyRow]:
+    """Up to ``limit`` studies without their reports, newest first, those older than study ``after``."""
+    query = select(StudyRow).order_by(StudyRow.id.desc()).limit(limit)
+    return session.scalars(query.where(StudyRow.id < after) if after else query).all()
 
 
 # --- counts -----------------------------------------------------------------------------------------------------------

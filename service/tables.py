@@ -19,6 +19,7 @@ from sqlalchemy import (
     MetaData,
     String,
     Table,
+    Text,
     TypeDecorator,
     UniqueConstraint,
 )
@@ -36,6 +37,10 @@ KINDS = ("raw", "cropped", "flux", "flux-centered")
 SOURCES = ("measured", "network", "refined", "imported")
 STATES = ("queued", "running", "done", "failed", "cancelled")
 ROLES = ("read", "ingest", "operate", "admin")
+VERDICTS = ("effect", "none", "unexplained")
+
+MODEL_VERSION = 256
+"""Characters that name a version of the plant's model: its number and all effects of the catalogue."""
 
 # A missing JSON value is SQL's NULL, not the JSON text "null".
 _Json = JSON(none_as_null=True)
@@ -75,7 +80,13 @@ class Base(DeclarativeBase):
     """What all tables share: constraint names that migrations can refer to."""
 
     metadata = MetaData(naming_convention=_NAMING)
-    type_annotation_map = {datetime: UtcDateTime, dict[str, Any]: _Json, list[float]: _Json}  # noqa: RUF012
+    type_annotation_map = {  # noqa: RUF012
+        datetime: UtcDateTime,
+        dict[str, Any]: _Json,
+        list[dict[str, Any]]: _Json,
+        list[float]: _Json,
+        list[str]: _Json,
+    }
 
 
 class PlantRow(Base):
@@ -193,6 +204,7 @@ class SurfaceRow(Base):
     """One version of a heliostat's surface; npz ``z``, ``z_std`` (4, 8, 8) and ``control_points`` (4, 8, 8, 3) [m].
 
     ``content_sha256`` is set where the same content must not be stored twice (imports); predictions leave it empty.
+    ``model`` names the weights, ``model_version`` the plant's model with its effects that a prediction was made by.
     """
 
     __tablename__ = "surfaces"
@@ -210,6 +222,7 @@ class SurfaceRow(Base):
     valid_from: Mapped[datetime]
     source: Mapped[str] = mapped_column(String(16))
     model: Mapped[str | None] = mapped_column(String(128))
+    model_version: Mapped[str | None] = mapped_column(String(MODEL_VERSION))
     misfit: Mapped[float | None]
     content_sha256: Mapped[str | None] = mapped_column(String(64))
     arrays: Mapped[bytes] = mapped_column(LargeBinary, deferred=True)
@@ -241,12 +254,57 @@ class ForecastRow(Base):
     power_w: Mapped[float]
     center_right_m: Mapped[float | None]
     center_up_m: Mapped[float | None]
-    model_version: Mapped[str] = mapped_column(String(128))
+    model_version: Mapped[str] = mapped_column(String(MODEL_VERSION))
     flux: Mapped[bytes] = mapped_column(LargeBinary, deferred=True)
     created_at: Mapped[datetime] = mapped_column(default=now)
 
     heliostat: Mapped[HeliostatRow] = relationship(lazy="joined", innerjoin=True)
     surface: Mapped[SurfaceRow | None] = relationship(lazy="joined")
+
+
+class StudyRow(Base):
+    """A study of stored photographs: what was asked, what of it was looked at, and what it found.
+
+    ``model`` is the number of the plant's model that it was made with, ``report`` that of `model.study.Study.to_json`,
+    ``html`` the same as a page; a report from a file has no page. ``taken_from`` and ``taken_to`` are the first and the
+    last moment of its photographs.
+    """
+
+    __tablename__ = "studies"
+    __table_args__ = (_one_of("verdict", VERDICTS),)
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    created_at: Mapped[datetime] = mapped_column(default=now)
+    created_by: Mapped[str] = mapped_column(String(64))
+    options: Mapped[dict[str, Any]]
+    heliostats: Mapped[list[str]]
+    taken_from: Mapped[datetime | None]
+    taken_to: Mapped[datetime | None]
+    model: Mapped[int]
+    model_version: Mapped[str] = mapped_column(String(MODEL_VERSION))
+    verdict: Mapped[str] = mapped_column(String(16))
+    conclusion: Mapped[str] = mapped_column(Text)
+    report: Mapped[dict[str, Any]] = mapped_column(deferred=True)
+    skipped: Mapped[dict[str, Any]] = mapped_column(deferred=True)
+    html: Mapped[str | None] = mapped_column(Text, deferred=True)
+
+
+class ModelRow(Base):
+    """A version of the plant's model from the second on: the declared one, with all its ``effects``.
+
+    The first version is the declared model itself; it has no row, for nobody adopted it. Rows are never deleted.
+    """
+
+    __tablename__ = "models"
+
+    number: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
+    version: Mapped[str] = mapped_column(String(MODEL_VERSION))
+    effects: Mapped[list[dict[str, Any]]]
+    study_id: Mapped[int] = mapped_column(ForeignKey("studies.id"), index=True)
+    adopted_at: Mapped[datetime] = mapped_column(default=now)
+    adopted_by: Mapped[str] = mapped_column(String(64))
+    withdrawn_at: Mapped[datetime | None]
+    withdrawn_by: Mapped[str | None] = mapped_column(String(64))
 
 
 class JobRow(Base):

@@ -33,6 +33,7 @@ def _request(body: ForecastIn) -> ForecastRequest:
         resolution=body.resolution,
         window=body.window,
         normalised=body.normalised,
+        model_version=body.model_version,
     )
 
 

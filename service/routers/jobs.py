@@ -26,14 +26,15 @@ def make_router(kinds: Kinds) -> APIRouter:
     """The routes, with one to ask for a job of each of ``kinds``."""
     router = APIRouter(prefix="/jobs", tags=["jobs"])
     for kind in kinds.values():
-        _add_creator(router, kind)
+        add_creator(router, kind, f"/{kind.name}", f"post_{kind.name}_job")
     both = APIRouter()
     both.include_router(router)
     both.include_router(_existing)
     return both
 
 
-def _add_creator(router: APIRouter, kind: Kind[Any]) -> None:
+def add_creator(router: APIRouter, kind: Kind[Any], path: str, name: str) -> None:
+    """A route that asks for a job of this kind."""
     payload_type = kind.payload
 
     def create(
@@ -49,8 +50,8 @@ def _add_creator(router: APIRouter, kind: Kind[Any]) -> None:
         return representations.job(row)
 
     router.post(
-        f"/{kind.name}",
-        name=f"post_{kind.name}_job",
+        path,
+        name=name,
         summary=kind.summary,
         description=f"{kind.summary} Answers at once; follow the job under its Location.",
         status_code=status.HTTP_202_ACCEPTED,

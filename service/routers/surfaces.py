@@ -29,7 +29,15 @@ def post_surface(
     request: Annotated[SurfaceIn, Body(examples=[{"method": "network", "images": 4}])],
 ) -> SurfaceOut:
     """Predict the surface from stored measurements and keep it as the next version."""
-    row = predict_surface(runtime, name, request.method, request.measurements, request.images, identity.name)
+    row = predict_surface(
+        runtime,
+        name,
+        request.method,
+        request.measurements,
+        request.images,
+        identity.name,
+        model_version=request.model_version,
+    )
     response.headers["Location"] = f"/v1/heliostats/{name}/surfaces/{row.version}"
     return representations.surface_full(name, row)
 

@@ -123,6 +123,7 @@ class FakeOperations:
     predictions: list[list[Observation]] = field(default_factory=list)
     forecasts: list[dict[str, Any]] = field(default_factory=list)
     measured: int = 0
+    rendered: int = 0
 
     def measure(self, image: Any, kind: str, plane: TargetPlane, *, corners: Any = None) -> MeasuredFlux:
         self.measured += 1
@@ -135,7 +136,7 @@ class FakeOperations:
         return MeasuredFlux(Quality(accepted=True), flux, centered, np.array([0.5, -0.25]))
 
     def predict(
-        self, heliostat: Heliostat, observations: list[Observation], method: str = "network"
+        self, heliostat: Heliostat, observations: list[Observation], method: str = "network", *, effects: Any = ()
     ) -> SurfacePrediction:
         self.predictions.append(list(observations))
         z = np.linspace(-1e-3, 1e-3, 256).reshape(4, 8, 8)
@@ -150,6 +151,7 @@ class FakeOperations:
         )
 
     def render(self, heliostat: Heliostat, observations: list[Observation], z: Any) -> Any:
+        self.rendered += 1
         return np.stack([observation.flux for observation in observations])
 
     def forecast(self, heliostat: Heliostat, z: Any, sun: Any, plane: TargetPlane, **options: Any) -> Forecast:

@@ -78,11 +78,11 @@ def test_surfaces_of_a_job_that_is_begun_again_are_not_made_again(
     post(png(2), heliostat="AB01")
     predict, calls = operations.predict, []
 
-    def fails_the_second_time(*arguments: Any) -> Any:
+    def fails_the_second_time(*arguments: Any, **options: Any) -> Any:
         calls.append(1)
         if len(calls) == 2:
             raise ZeroDivisionError
-        return predict(*arguments)
+        return predict(*arguments, **options)
 
     monkeypatch.setattr(operations, "predict", fails_the_second_time)
     job = finish(client, client.post("/v1/jobs/predictions", json={}))

@@ -1,0 +1,250 @@
+"""Studies of what is stored: photographs and surfaces out of the store, a report into it."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import datetime
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from model.errors import InvalidInputError, ModelError
+from model.frames import sun_direction
+from model.plant import Heliostat, TargetPlane
+from service import models, store
+from service.arrays import unpack
+from service.faults import ConflictError, NotFoundError, ServiceError
+from service.models import PlantModel
+from service.runtime import Runtime
+from service.tables import HeliostatRow, MeasurementRow, StudyRow, SurfaceRow
+from service.workflows import choose_measurements, load_heliostat, plain, spot_of
+
+if TYPE_CHECKING:  # see `service.runtime`
+    from model.study import Photograph, Study
+
+Surfaces = Literal["measured", "current"]
+
+CENTERED_SIDE = 4.0
+"""Side [m] of a measurement's ``centered`` flux, all that there is of a photograph that shows no more."""
+
+# What one heliostat or photograph may lack without ending the study of the others.
+_SKIPPED = (ModelError, ServiceError)
+
+
+@dataclass(frozen=True)
+class StudyRequest:
+    """What to study.
+
+    ``heliostats``: by name; without it ``most_heliostats``, spread over the field. ``surfaces``: "measured", or
+    "current": the measured one where there is one, else the newest prediction. ``images`` of each heliostat at the
+    most, taken from ``since`` until before ``until``. ``candidates``: effects of the catalogue; all without it.
+    """
+
+    heliostats: Sequence[str] | None = None
+    surfaces: Surfaces = "current"
+    images: int = 12
+    most_heliostats: int = 12
+    since: datetime | None = None
+    until: datetime | None = None
+    candidates: Sequence[str] | None = None
+
+
+@dataclass(eq=False)
+class Material:
+    """What the store gives a study: photographs, what was left out, and when the photographs were taken."""
+
+    photographs: list["Photograph"] = field(default_factory=list)
+    skipped: dict[str, str] = field(default_factory=dict)
+    moments: list[datetime] = field(default_factory=list)
+
+    @property
+    def heliostats(self) -> list[str]:
+        """Those that photographs show."""
+        return sorted({photograph.heliostat for photograph in self.photographs})
+
+    @property
+    def span(self) -> tuple[datetime | None, datetime | None]:
+        """The first and the last moment that is known."""
+        return min(self.moments, default=None), max(self.moments, default=None)
+
+
+# --- out of the store -------------------------------------------------------------------------------------------------
+
+
+def gather(session: Session, request: StudyRequest) -> Material:
+    """The photographs that a request names, with the surfaces of their mirrors.
+
+    Raises
+    ------
+    NotFoundError
+        Where a heliostat that is named is not stored.
+    """
+    material = Material()
+    for row in _chosen_heliostats(session, request):
+        try:
+            _gather_heliostat(session, row, request, material)
+        except _SKIPPED as error:
+            material.skipped[row.name] = str(error)
+    return material
+
+
+def _chosen_heliostats(session: Session, request: StudyRequest) -> Sequence[HeliostatRow]:
+    """Those that are named; else of those with photographs and a surface, evenly over the distance from the tower."""
+    if request.heliostats is not None:
+        return [store.get_heliostat(session, name) for name in dict.fromkeys(request.heliostats)]
+    photographed = select(MeasurementRow.heliostat_id).where(MeasurementRow.accepted)
+    shaped = select(SurfaceRow.heliostat_id)
+    if request.surfaces == "measured":
+        shaped = shaped.where(SurfaceRow.source == "measured")
+    query = select(HeliostatRow).where(HeliostatRow.id.in_(photographed), HeliostatRow.id.in_(shaped))
+    rows = list(session.scalars(query))
+    rows.sort(key=lambda row: (np.hypot(row.east_m, row.north_m), row.name))
+    places = np.linspace(0, len(rows) - 1, min(len(rows), request.most_heliostats)).round().astype(int)
+    return [rows[place] for place in places]
+
+
+def _surface(session: Session, heliostat: HeliostatRow, surfaces: Surfaces) -> SurfaceRow:
+    measured = store.find_measured_surface(session, heliostat)
+    if measured is not None:
+        return measured
+    if surfaces == "measured":
+        raise NotFoundError(f"heliostat {heliostat.name} has no measured surface")
+    return store.get_surface_at(session, heliostat)
+
+
+def _gather_heliostat(session: Session, row: HeliostatRow, request: StudyRequest, material: Material) -> None:
+    from model.surface import control_points
+
+    heliostat, origin = load_heliostat(session, row), store.get_plant(session).origin
+    points = control_points(heliostat, unpack(_surface(session, row, request.surfaces).arrays)["z"])
+    for chosen in choose_measurements(session, row, request.images, request.since, request.until):
+        measurement = store.get_measurement(session, row, chosen.identifier, arrays=True)
+        try:
+            photograph = photograph_of(measurement, heliostat, points, origin)
+        except _SKIPPED as error:
+            material.skipped[f"{row.name}/{chosen.identifier}"] = str(error)
+            continue
+        material.photographs.append(photograph)
+        if measurement.taken_at is not None:
+            material.moments.append(measurement.taken_at)
+
+
+def photograph_of(
+    row: MeasurementRow, heliostat: Heliostat, points: np.ndarray[Any, Any], origin: tuple[float, float, float]
+) -> "Photograph":
+    """An accepted measurement, loaded with its arrays, as a study compares it; ``points`` (F, I, J, 3) [m]."""
+    from model.forecast import Shot
+    from model.study import Photograph
+
+    image, plane = _flux(row, origin)
+    shot = Shot(
+        heliostat,
+        points,
+        sun_direction(row.sun_azimuth_deg, row.sun_elevation_deg),
+        plane,
+        spot=spot_of(row, store.target_plane(row.target), origin),
+        identifier=f"{heliostat.name}/{row.identifier}",
+    )
+    return Photograph(shot, image)
+
+
+def _flux(row: MeasurementRow, origin: tuple[float, float, float]) -> tuple[np.ndarray[Any, Any], TargetPlane]:
+    """The flux over the whole target, or over the crop that is all there is."""
+    plane, arrays = store.target_plane(row.target), unpack(row.arrays or b"")
+    if "flux" in arrays:
+        return arrays["flux"].astype(np.float64), plane
+    if row.focal_spot_wgs84 is None:
+        raise InvalidInputError("a centred flux without 'focal_spot' has no place on the target")
+    crop = replace(plane, center=spot_of(row, plane, origin), width=CENTERED_SIDE, height=CENTERED_SIDE)
+    return arrays["centered"].astype(np.float64), crop
+
+
+# --- the study --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Studied:
+    """A study with what it was made of."""
+
+    request: StudyRequest
+    model: PlantModel
+    material: Material
+    study: "Study"
+
+
+def study_store(
+    runtime: Runtime, request: StudyRequest, progress: Callable[[float, str], None] = lambda share, message: None
+) -> Studied:
+    """Which effects the stored photographs demand beyond the plant's current model.
+
+    ``progress`` takes the share that is done, 0 to 1, and what is being fitted; what it raises ends the study.
+
+    Raises
+    ------
+    NotFoundError
+        Where a heliostat that is named is not stored.
+    ConflictError
+        Where too few photographs with a surface are stored; it says what was left out.
+    """
+    from model.study import StudyOptions
+    from model.tracing import Optics
+
+    with runtime.database.reading() as session:
+        model, latitude_deg = models.get_model(session), store.get_plant(session).latitude_deg
+        material = gather(session, request)
+    options = StudyOptions(latitude_deg=latitude_deg)
+    if request.candidates is not None:
+        options = replace(options, candidates=tuple(request.candidates))
+    _require_enough(material)
+    steps = _Steps(len(options.candidates) * options.most, progress)
+    with runtime.computing() as operations:
+        study = operations.study(material.photographs, Optics(), model.effects, options, steps)
+    return Studied(request, model, material, study)
+
+
+@dataclass(eq=False)
+class _Steps:
+    """Turns the names of what is done one after the other into shares of ``total``."""
+
+    total: int
+    progress: Callable[[float, str], None]
+    done: int = 0
+
+    def __call__(self, name: str) -> None:
+        self.progress(self.done / max(self.total, 1), name)
+        self.done += 1
+
+
+def _require_enough(material: Material) -> None:
+    from model.study.loop import LEAST_IMAGES
+
+    count = len(material.photographs)
+    if count < LEAST_IMAGES:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in list(material.skipped.items())[:5])
+        raise ConflictError(
+            f"a study takes at least {LEAST_IMAGES} photographs with surfaces, the store has {count}"
+            + (f" ({reasons})" if reasons else "")
+        )
+
+
+def study_row(studied: Studied, title: str, options: dict[str, Any], actor: str) -> StudyRow:
+    """The study as it is kept, with its page; ``options`` are those that were asked for, as JSON."""
+    from service.study_page import study_page
+
+    material, report = studied.material, plain(studied.study.to_json())
+    taken_from, taken_to = material.span
+    return StudyRow(
+        created_by=actor,
+        options=options,
+        heliostats=material.heliostats,
+        taken_from=taken_from,
+        taken_to=taken_to,
+        model=studied.model.number,
+        model_version=studied.model.version,
+        verdict=report["verdict"],
+        conclusion=report["conclusion"],
+        report=report,
+        skipped=material.skipped,
+        html=study_page(studied.study, title, material.skipped),
+    )
