@@ -1,0 +1,186 @@
+"""The closed loop on data: ``python -m tests.benchmarks.closed_loop``.
+
+The six sets of ``../shared/undeclared``; the real plant (AA39, AC43), studied as a folder and by leaving out one image
+at a time; and what the effect found buys where it matters: surfaces refined with it against deflectometry.
+"""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from model.effects import CATALOGUE, Effect, effect_from_json
+from model.forecast import View
+from model.metrics import flux_accuracy
+from model.observation import Observation, align_observations, render_observations
+from model.plant import Heliostat, TargetPlane
+from model.refinement import refine
+from model.study import Photograph, StudyOptions
+from model.study.fitting import Fitter
+from model.study.judging import accuracies
+from model.study.photographs import Forecaster
+from model.study.unknowns import Unknowns
+from service.folder import observe, surface_errors
+from service.paint import measured_heights, read_folder
+from service.study import photographs_of, study_folder
+from tests.benchmarks import data_folder
+from training.render import CleanCamera, Situations, load_field, places
+from training.surfaces import load_surfaces, split_by_heliostat
+
+HELIOSTATS = ["AA39", "AC43"]
+COMBINATIONS = (
+    (),
+    ("camera_response",),
+    ("gravity_bending",),
+    ("camera_response", "gravity_bending"),
+    ("camera_response", "soiling"),
+    ("camera_response", "facet_canting"),
+    ("camera_response", "sun_shape"),
+    ("camera_response", "target_registration"),
+)
+
+
+def plain(parameters: dict) -> str:
+    """Parameters of a report's effect in one line; of many the largest."""
+    parts = []
+    for name, entry in parameters.items():
+        if isinstance(entry["value"], dict):
+            flat = [v for values in entry["value"].values() for v in np.atleast_1d(values)]
+            parts.append(f"{name}: {len(flat)} values, largest {max(flat, key=abs):.2f} {entry['unit']}")
+        else:
+            low, high = entry["ci95"]
+            parts.append(f"{name} {entry['value']:.3f} [{low:.3f}, {high:.3f}] {entry['unit']}")
+    return "; ".join(parts)
+
+
+def studies(root: Path) -> None:
+    """Verdicts of all sets."""
+    print("| set | verdict | effect and 95 % interval | accuracy before | after | left of the error beyond noise |")
+    print("| --- | --- | --- | --- | --- | --- |")
+    folders = [(p, None) for p in sorted((root.parent / "undeclared").glob("set-*"))]
+    for folder, window in [*folders, (root, None), (root, 6.0)]:
+        names = HELIOSTATS if folder == root else None
+        study = study_folder(read_folder(folder, names), options=StudyOptions(window=window)).study
+        report = study.to_json()
+        found = "<br>".join(f"{e['name']}: {plain(e['parameters'])}" for e in report["effects"]) or "-"
+        label = f"AA39, AC43, {study.window:.0f} m" if names else folder.name
+        before, after = (report[key]["accuracy_mean"] for key in ("before", "after"))
+        share = report["unexplained_share"]
+        print(f"| {label} | {report['verdict']} | {found} | {before:.3f} | {after:.3f} | {share:.2f} |", flush=True)
+
+
+def left_out(photographs: Sequence[Photograph], kinds: tuple[str, ...], window: float) -> np.ndarray:
+    """Accuracy (N,) of each photograph under effects that were fitted to all others."""
+    folder_facets = tuple(sorted({(p.heliostat, len(p.shot.control_points)) for p in photographs}))
+    unknowns = Unknowns(tuple(CATALOGUE[kind] for kind in kinds), folder_facets)
+    optics = read_folder(data_folder(), HELIOSTATS).optics
+    accuracy = np.empty(len(photographs))
+    for index, photograph in enumerate(photographs):
+        rest = [p for p in photographs if p is not photograph]
+        effects: list[Effect] = []
+        if kinds:
+            fitter = Fitter(Forecaster(rest, optics, [], window, StudyOptions().fit_view))
+            effects = unknowns.effects(fitter.fit(unknowns, unknowns.neutral).values)
+        judge = Forecaster([photograph], optics, [], window, StudyOptions().view)
+        accuracy[index] = accuracies(judge.measured(), judge.cuts(effects))[0]
+    return accuracy
+
+
+def real_plant(root: Path) -> None:
+    """Leave-one-out accuracies of some combinations of effects."""
+    photographs, _ = photographs_of(read_folder(root, HELIOSTATS))
+    print("\nReal plant, 6 m window, each of 11 images forecast with effects fitted to the other ten")
+    print("| effects | mean | median | worst |")
+    print("| --- | --- | --- | --- |")
+    for kinds in COMBINATIONS:
+        values = left_out(photographs, kinds, 6.0)
+        label = " + ".join(kinds) or "none"
+        print(f"| {label} | {values.mean():.4f} | {np.median(values):.4f} | {values.min():.3f} |", flush=True)
+
+
+def refined_real(root: Path, effects: Sequence[Effect]) -> None:
+    """Surfaces of AA39 and AC43 from their photographs, with and without effects, against deflectometry."""
+    folder = read_folder(root, HELIOSTATS)
+    for name, heliostat in folder.plant.heliostats.items():
+        observed = [observe(folder, measurement) for measurement in folder.measurements(name)]
+        images = [o for o in observed if isinstance(o, Observation)]
+        measured = folder.measured_surface(name)
+        assert measured is not None
+        truth = measured_heights(heliostat, measured)
+        for label, model in (("without", []), ("with", list(effects))):
+            errors = surface_errors(refine(heliostat, images[:8], optics=folder.optics, effects=model).z, truth)
+            fresh = left_out_accuracy(heliostat, images, model) if len(images) > 2 else float("nan")
+            figures = " | ".join(f"{errors[k]:.3f}" for k in ("mae_mm", "mae_canting_mm", "mae_waviness_mm"))
+            print(f"| {name}, {len(images[:8])} photographs | {label} | {figures} | {fresh:.3f} |", flush=True)
+
+
+def left_out_accuracy(heliostat: Heliostat, images: list[Observation], effects: Sequence[Effect]) -> float:
+    """Mean accuracy of every fourth image under the surface refined from the others."""
+    kept = images[::4]
+    z = refine(heliostat, [o for o in images if o not in kept][:8], effects=effects).z
+    traced = render_observations(heliostat, kept, z, None, effects).clip(min=0)
+    return float(np.mean([flux_accuracy(o.flux, image) for o, image in zip(kept, traced, strict=True)]))
+
+
+def refined_simulated(root: Path, effects: Sequence[Effect], count: int) -> None:
+    """Held-out surfaces photographed by a camera that has the effects, refined with and without them."""
+    surfaces, _ = load_surfaces(root)
+    _, held_out = split_by_heliostat(len(surfaces), 8, 7)
+    field, rng, rows = load_field(root), np.random.default_rng(11), []
+    for index in held_out[:count]:
+        position = field[rng.integers(len(field))]
+        heliostat = Heliostat.juelich("synthetic", position, float(np.linalg.norm(position - [0, 0, 55])))
+        images = photograph(heliostat, surfaces[index], effects, rng)
+        predicted = [refine(heliostat, images, effects=model).z for model in ([], list(effects))]
+        rows.append([surface_errors(z, surfaces[index]) for z in predicted])
+    for column, label in enumerate(("without", "with")):
+        keys = ("mae_mm", "mae_canting_mm", "mae_waviness_mm")
+        figures = " | ".join(f"{np.mean([row[column][key] for row in rows]):.3f}" for key in keys)
+        print(f"| {count} held-out surfaces, 8 rendered images each | {label} | {figures} | |")
+
+
+def photograph(
+    heliostat: Heliostat, z: np.ndarray, effects: Sequence[Effect], rng: np.random.Generator
+) -> list[Observation]:
+    """Eight 8-bit images with 1 % noise of a mirror as a camera with effects shows it."""
+    suns = Situations().suns(8, rng)
+    centers = np.stack([rng.uniform(-10, 10, 8), np.zeros(8), rng.uniform(30, 55, 8)], axis=-1)
+    planes = [TargetPlane("t", c, np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), 8, 8) for c in centers]
+    shots = places(suns, planes)
+    view = View(64, 64, window=4.0, samples=48)
+    with torch.no_grad():
+        flux = align_observations(heliostat, shots, z, effects).images(None, effects, view).numpy()
+    images = []
+    for shot, image in zip(shots, flux, strict=True):
+        noisy = image / image.max() + rng.normal(0, CleanCamera().noise, image.shape)
+        digital = np.round(noisy.clip(0, 1) * 255).astype(np.float32)
+        images.append(
+            Observation(digital / digital.sum() * 100, shot.sun, shot.target, shot.center_of_mass, shot.identifier)
+        )
+    return images
+
+
+def main() -> None:
+    """Print every table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--simulated", type=int, default=8, help="held-out surfaces to refine")
+    arguments = parser.parse_args()
+    root = data_folder()
+    if not root.is_dir():
+        print(f"closed loop: no real measurements at {root}; set HELIOTWIN_STJ")
+        return
+    studies(root)
+    real_plant(root)
+    report = study_folder(read_folder(root, HELIOSTATS)).study.to_json()
+    found = [effect_from_json(entry) for entry in report["effects"]]
+    print("\nSurfaces refined with and without what the study found, errors against deflectometry [mm]")
+    print("| images | effect | all | canting | waviness | accuracy of images left out |")
+    print("| --- | --- | --- | --- | --- | --- |")
+    refined_real(root, found)
+    refined_simulated(root, found, arguments.simulated)
+
+
+if __name__ == "__main__":
+    main()
