@@ -1,7 +1,8 @@
 """How well the current surfaces forecast what was photographed: heliostat by heliostat, computed once and remembered.
 
 Forecast and photograph are compared in the photograph's own 4 m window about its centre of mass, as everywhere
-(DESIGN.md, section 7). A result holds until the heliostat gets another surface or another photograph.
+(DESIGN.md, section 7). A result holds until the heliostat gets another surface or
+another photograph, or the plant's model another version.
 """
 
 import logging
@@ -17,7 +18,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
 from model.errors import ModelError
-from service import store
+from service import models, store
 from service.arrays import unpack
 from service.faults import ServiceError
 from service.runtime import Runtime
@@ -72,13 +73,14 @@ def compare(runtime: Runtime, name: str, surface: SurfaceRow | None) -> list[Com
     with runtime.database.reading() as session:
         row = store.get_heliostat(session, name)
         heliostat, origin = load_heliostat(session, row), store.get_plant(session).origin
+        effects = models.get_model(session).effects
         rows = _newest(session, row)
     if not rows:
         return []
     observations = [observation_of(measurement, origin) for measurement in rows]
     z = None if surface is None else unpack(surface.arrays)["z"]
     with runtime.computing() as operations:
-        forecasts = operations.render(heliostat, observations, z)
+        forecasts = operations.render(heliostat, observations, z, effects)
     from model.metrics import flux_accuracy
 
     used = set() if surface is None else {measurement.id for measurement in surface.measurements}
@@ -90,11 +92,15 @@ def compare(runtime: Runtime, name: str, surface: SurfaceRow | None) -> list[Com
 
 @dataclass(frozen=True)
 class State:
-    """What a heliostat's accuracy depends on: its surface and its newest photograph, by their rows' ids."""
+    """What a heliostat's accuracy depends on.
+
+    Its surface and its newest photograph, by their rows' ids, and the version of the plant's model.
+    """
 
     heliostat: str
     surface: int
     newest: int
+    model: int
 
 
 class AccuracyBook:

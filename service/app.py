@@ -14,6 +14,7 @@ from service.handlers import KINDS
 from service.middleware import BodyLimitMiddleware, DoorMiddleware, RequestIdMiddleware, SecurityHeadersMiddleware
 from service.pages import field, forecast, heliostat, login
 from service.pages import jobs as job_pages
+from service.pages import studies as study_pages
 from service.routers import audit, forecasts, health, heliostats, jobs, measurements, plant, session, studies, surfaces
 from service.runtime import Operations, Runtime
 from service.settings import Settings
@@ -83,7 +84,7 @@ def create_app(settings: Settings, operations: Operations | None = None, kinds: 
     app.include_router(v1)
     for router in (health.router, session.router, documentation.router):
         app.include_router(router)
-    for page in (login, field, heliostat, forecast, job_pages):
+    for page in (login, field, heliostat, forecast, job_pages, study_pages):
         app.include_router(page.router)
     security.require_declared_roles(app)
     errors.install(app)

@@ -66,13 +66,15 @@ def predict(
     return replace(refined, weights=f"{predictor.name}+{refined.weights}")
 
 
-def render(heliostat: Heliostat, observations: Sequence[Observation], z: ArrayLike | None) -> Array:
+def render(
+    heliostat: Heliostat, observations: Sequence[Observation], z: ArrayLike | None, effects: Sequence[Effect] = ()
+) -> Array:
     """What a surface (4, 8, 8) [m], None the ideal one, would have thrown where M fluxes were observed.
 
     (M, 64, 64), each with sum 100, in the observations' own windows.
     """
     heights = np.zeros((FACETS, ROWS, COLUMNS)) if z is None else np.asarray(z, dtype=np.float64)
-    return render_observations(heliostat, observations, heights)
+    return render_observations(heliostat, observations, heights, effects=effects)
 
 
 @dataclass(frozen=True, eq=False)

@@ -42,7 +42,11 @@ class Operations(Protocol):
         """A surface from observations."""
 
     def render(
-        self, heliostat: "Heliostat", observations: Sequence["Observation"], z: NDArray[Any] | None
+        self,
+        heliostat: "Heliostat",
+        observations: Sequence["Observation"],
+        z: NDArray[Any] | None,
+        effects: Sequence["Effect"] = (),
     ) -> NDArray[Any]:
         """What a surface would have thrown where fluxes were observed."""
 

@@ -12,6 +12,7 @@ from fastapi.responses import HTMLResponse
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
+from service import models
 from service.accuracy import RECENT, AccuracyBook, State
 from service.arrays import unpack
 from service.dependencies import READ, RuntimeDep
@@ -72,12 +73,11 @@ class Line:
     figures: Figures | None = None
     accuracy: float | None = None
 
-    @property
-    def state(self) -> State | None:
-        """What its accuracy depends on; None where there is nothing to compare."""
+    def state(self, model: int) -> State | None:
+        """What its accuracy by this version of the model depends on; None where there is nothing to compare."""
         if self.surface is None or self.newest is None:
             return None
-        return State(self.name, self.surface.id, self.newest)
+        return State(self.name, self.surface.id, self.newest, model)
 
 
 @dataclass(frozen=True)
@@ -223,7 +223,9 @@ class FieldBook:
         """All heliostats, and how many accuracies are still being worked out."""
         lines = read_lines(session)
         figures = self._figures_of(session, [line.surface.id for line in lines if line.surface is not None])
-        accuracies, pending = self._accuracies.look_up(line.state for line in lines if line.state is not None)
+        model = models.current_number(session)
+        states = (line.state(model) for line in lines)
+        accuracies, pending = self._accuracies.look_up(state for state in states if state is not None)
         return [
             replace(
                 line,

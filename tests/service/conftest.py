@@ -121,6 +121,7 @@ class FakeOperations:
     """
 
     predictions: list[list[Observation]] = field(default_factory=list)
+    believed: list[Any] = field(default_factory=list)
     forecasts: list[dict[str, Any]] = field(default_factory=list)
     measured: int = 0
     rendered: int = 0
@@ -139,6 +140,7 @@ class FakeOperations:
         self, heliostat: Heliostat, observations: list[Observation], method: str = "network", *, effects: Any = ()
     ) -> SurfacePrediction:
         self.predictions.append(list(observations))
+        self.believed.append(effects)
         z = np.linspace(-1e-3, 1e-3, 256).reshape(4, 8, 8)
         return SurfacePrediction(
             z=z,
@@ -150,7 +152,7 @@ class FakeOperations:
             used=tuple(observation.identifier for observation in observations),
         )
 
-    def render(self, heliostat: Heliostat, observations: list[Observation], z: Any) -> Any:
+    def render(self, heliostat: Heliostat, observations: list[Observation], z: Any, effects: Any = ()) -> Any:
         self.rendered += 1
         return np.stack([observation.flux for observation in observations])
 

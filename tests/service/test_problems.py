@@ -27,7 +27,9 @@ def check(answer: Any, status: int) -> dict[str, Any]:
     return document
 
 
-@pytest.mark.parametrize("path", ["/nothing", "/v1", "/v1/nothing", "/v1/heliostats/", "/v1/heliostats/a/b", "/../etc/passwd"])
+@pytest.mark.parametrize(
+    "path", ["/nothing", "/v1", "/v1/nothing", "/v1/heliostats/", "/v1/heliostats/a/b", "/../etc/passwd"]
+)
 def test_unknown_path(refusing: TestClient, path: str):
     assert "docs" in check(refusing.get(path), 404)["detail"]
 
