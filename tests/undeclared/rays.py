@@ -1,8 +1,8 @@
 """Light thrown ray by ray through a disturbed world.
 
-Written from the physics alone: no effect and no tracer of the model takes part, and attitude, surface and sun have their
-own formulas here. A mirror is strewn with points; at each the mirror's normal, and how it just now swings, is drawn; and
-each sends on the light of some random directions of the sun's disc and aureole by the law of reflection.
+Written from the physics alone: no effect and no tracer of the model takes part, and attitude, surface and sun have
+their own formulas here. A mirror is strewn with points; at each of them the normal is drawn, and how the mirror swings
+just then; and each sends on the light of random directions of the sun's disc and aureole by the law of reflection.
 """
 
 from collections.abc import Iterator
@@ -46,7 +46,7 @@ def unit(vectors: Array) -> Array:
 class Sun:
     """Random directions near +z (3, n), and the light (n,) of each.
 
-    A quarter of them lie in the aureole, however little light that has, so that faint tails are as smooth as bright cores.
+    A quarter of them lie in the aureole, however little light that has, so that faint tails are smooth as well.
     """
 
     directions: Rays
