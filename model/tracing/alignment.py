@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
+from model.errors import UnreachableError
 from model.mount import Mount
 from model.plant import Heliostat, TargetPlane
 from model.surface import DEGREE
@@ -92,6 +93,8 @@ def settle(
         with torch.no_grad():
             traced = central_rays(scene if alter is None else alter(scene), samples).spot.numpy()
         missed = np.einsum("bij,bj->bi", axes, goal - center) - traced
+        if not np.isfinite(missed).all():
+            raise UnreachableError("a mirror sends no light to its target, so that its spot has no place")
         if np.abs(missed).max() < TOLERANCE:
             break
         aims += np.einsum("bi,bij->bj", missed, axes)

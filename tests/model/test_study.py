@@ -1,0 +1,311 @@
+"""The closed loop on photographs that the same forecaster made: what it finds is known."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+from model.effects import CATALOGUE, Effect
+from model.effects.blocking import Blocking
+from model.effects.camera_blur import CameraBlur
+from model.effects.facet_canting import FacetCanting
+from model.effects.slope_error import SlopeError
+from model.effects.sun_shape import SunShapeEffect
+from model.errors import InvalidInputError
+from model.forecast import Shot, View, forecast_shots
+from model.frames import sun_direction
+from model.plant import Heliostat
+from model.study import Photograph, StudyOptions, study
+from model.study.advice import PHOTOGRAPHS, SAME_SCALING, SCALES_WITH, told_apart_by
+from model.study.fitting import Fitter
+from model.study.judging import accuracies, paired_gain, rank_correlation, split
+from model.study.photographs import Forecaster, noise_variance, spot_window
+from model.study.unknowns import Unknowns
+from model.surface import control_points
+from model.tracing import Optics
+from tests.conftest import target
+
+PLACES = {"near": (-8.0, 45.0, 1.8), "far": (35.0, 110.0, 1.8), "middle": (-40.0, 75.0, 1.8)}
+SMALL = View(40, 40, samples=8, padding=0.125)
+FINE = View(96, 96, samples=12)
+CAMERA = View(256, 256, samples=12)
+QUICK = StudyOptions(candidates=("sun_shape", "gravity_bending"), fit_view=FINE)
+NOISE = 0.003
+
+
+def shots(heliostats: int = 2, count: int = 4) -> list[Shot]:
+    """Wavy mirrors under suns around the day."""
+    rng, plane, made = np.random.default_rng(7), target(), []
+    for name, place in list(PLACES.items())[:heliostats]:
+        distance = float(np.linalg.norm(np.array(place) - plane.center))
+        mirror = Heliostat.juelich(name, place, distance, facet_depth=0.0)
+        points = control_points(mirror, rng.normal(0, 2e-4, (4, 8, 8)))
+        for number, azimuth in enumerate(np.linspace(-60, 60, count)):
+            sun, spot = sun_direction(azimuth, 50 - abs(azimuth) / 2), plane.to_enu(rng.uniform(-0.3, 0.3, 2))
+            made.append(Shot(mirror, points, sun, plane, spot=spot, identifier=f"{name}/{number}"))
+    return made
+
+
+def photographs(
+    effects: Sequence[Effect] = (), noise: float = 0.0, view: View = CAMERA, heliostats: int = 2, count: int = 4
+) -> list[Photograph]:
+    """What the forecaster expects under ``effects``, with noise in shares of the peak."""
+    rng, taken = np.random.default_rng(3), shots(heliostats, count)
+    images = forecast_shots(taken, Optics(), effects, view).double().numpy()
+    images = images + noise * images.max(axis=(1, 2), keepdims=True) * rng.standard_normal(images.shape)
+    return [Photograph(shot, image) for shot, image in zip(taken, images, strict=True)]
+
+
+@pytest.fixture(scope="module")
+def clean() -> list[Photograph]:
+    return photographs(noise=NOISE)
+
+
+@pytest.fixture(scope="module")
+def hazy() -> list[Photograph]:
+    return photographs([SunShapeEffect(0.15)], noise=NOISE)
+
+
+# --- unknowns ---------------------------------------------------------------------------------------------------------
+
+
+def test_unknowns_become_effects_and_nested_parameters():
+    kinds = (FacetCanting, Blocking, SlopeError)
+    unknowns = Unknowns(kinds, (("A", 4), ("B", 2)))
+    assert len(unknowns.all) == 2 * (4 + 2) + 2 + 1
+    low, high = unknowns.bounds
+    values = low + (high - low) * np.linspace(0.1, 0.9, len(low))
+    canting, blocking, slope = unknowns.effects(values)
+    np.testing.assert_array_equal(canting.x_mrad["A"], values[:4])
+    np.testing.assert_array_equal(canting.y_mrad["B"], values[10:12])
+    assert blocking.lower_fraction == {"A": values[12], "B": values[13]}
+    assert slope.sigma_mrad == values[14]
+    assert unknowns.nested(FacetCanting, range(15))["x_mrad"] == {"A": [0, 1, 2, 3], "B": [4, 5]}
+
+
+def test_unknowns_go_into_others_by_what_they_are():
+    both = Unknowns((SlopeError, Blocking), (("A", 4), ("B", 4)))
+    one = Unknowns((Blocking, CameraBlur), (("B", 4),))
+    values = both.put(np.array([1.5, 0.2, 0.3]), one)
+    np.testing.assert_array_equal(values, [0.3, 0.0])
+    np.testing.assert_array_equal(one.put(values, both), [0.0, 0.0, 0.3])
+    assert both.own.kinds == (Blocking,)
+    assert [u.heliostat for u in both.of(["A"]).all] == [None, "A"]
+
+
+def test_unknowns_of_one_colour_belong_to_different_heliostats():
+    unknowns = Unknowns((FacetCanting, SlopeError), (("A", 4), ("B", 4)))
+    groups = list(unknowns.colours.values())
+    assert sorted(place for group in groups for place in group) == list(range(len(unknowns.all)))
+    for group in groups:
+        owners = [unknowns.all[place].heliostat for place in group]
+        assert len(set(owners)) == len(owners)
+
+
+# --- judging ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("heliostats", [1, 2, 3])
+def test_a_split_parts_images_and_keeps_one_heliostat_of_several(heliostats):
+    taken = photographs(view=SMALL, heliostats=heliostats, count=5)
+    parts = split(taken)
+    rows = np.concatenate([parts.fit, parts.own, parts.held_out])
+    assert sorted(rows) == list(range(len(taken)))
+    assert {taken[row].heliostat for row in parts.held_out} == set(list(PLACES)[:heliostats])
+    assert {taken[row].heliostat for row in parts.own} == ({"middle"} if heliostats == 3 else set())
+    assert not {taken[row].heliostat for row in parts.fit} & {taken[row].heliostat for row in parts.own}
+
+
+def test_accuracy_is_one_less_the_summed_difference():
+    a = np.zeros((2, 4, 4))
+    b = a.copy()
+    a[:, 0, 0] = b[0, 0, 0] = b[1, 3, 3] = 1.0
+    np.testing.assert_allclose(accuracies(a, b), [1.0, -1.0])
+
+
+def test_the_interval_of_a_gain_covers_the_truth_about_as_often_as_it_says():
+    """In 19 of 20 draws; percentiles of small samples promise a little too much."""
+    rng, heliostats = np.random.default_rng(0), np.repeat(["a", "b", "c"], 10)
+    covers = 0
+    for _ in range(200):
+        gain = paired_gain(rng.normal(0.02, 0.01, 30), heliostats, rounds=300)
+        covers += gain.low <= 0.02 <= gain.high
+    assert 170 <= covers <= 198
+
+
+def test_a_gain_has_its_sign_and_differences_between_heliostats_are_no_noise():
+    heliostats = np.repeat(["a", "b"], 8)
+    differences = np.where(heliostats == "a", 0.01, 0.05) + np.tile([-1e-4, 1e-4], 8)
+    better, worse = paired_gain(differences, heliostats), paired_gain(-differences, heliostats)
+    assert better.mean == pytest.approx(0.03)
+    assert 0.0299 < better.low < better.high < 0.0301
+    assert worse.high < 0
+    assert worse.score == pytest.approx(-better.score)
+
+
+def test_rank_correlation_knows_order_only():
+    values = np.array([0.1, 0.4, 0.2, 3.0])
+    assert rank_correlation(values, np.exp(values)) == pytest.approx(1.0)
+    assert rank_correlation(values, -values) == pytest.approx(-1.0)
+    assert rank_correlation(values, np.ones(4)) == 0.0
+
+
+# --- photographs ------------------------------------------------------------------------------------------------------
+
+
+def test_the_noise_of_an_image_is_read_from_its_grain():
+    """Read noise and counting noise that grows with the light, on a spot as smooth as the sun makes it."""
+    rng, x = np.random.default_rng(1), np.linspace(-1, 1, 128)
+    light = np.exp(-(x[:, None] ** 2 + x**2) / 0.15)
+    truth = 1e-4 + 4e-4 * light
+    found = noise_variance(light + np.sqrt(truth) * rng.standard_normal(light.shape))
+    np.testing.assert_allclose(found.mean(), truth.mean(), rtol=0.05)
+    bright = light > 0.5
+    np.testing.assert_allclose(found[bright].mean(), truth[bright].mean(), rtol=0.1)
+    assert noise_variance(light).mean() < 0.01 * truth.mean()
+
+
+def test_the_share_of_noise_is_the_error_it_makes(clean):
+    exact = photographs()
+    forecaster = Forecaster(clean, Optics(), [], 4.0, FINE)
+    truth = Forecaster(exact, Optics(), [], 4.0, FINE).measured()
+    errors = 1 - accuracies(forecaster.measured(), truth)
+    shares = [p.noise_share(4.0) for p in clean]
+    assert np.mean(shares) == pytest.approx(errors.mean(), rel=0.2)
+
+
+def test_the_window_holds_the_spots(clean, hazy):
+    assert spot_window(clean) in (4.0, 6.0)
+    assert spot_window(hazy) >= spot_window(clean)
+
+
+def test_a_forecaster_repeats_itself_whatever_it_has_kept(clean):
+    forecaster = Forecaster(clean, Optics(), [], 4.0, SMALL)
+    plain = forecaster.cuts([])
+    for effects in ([SlopeError(1.0)], [CameraBlur(0.2)], [FacetCanting(x_mrad={"near": np.array([2.0, 0, 0, -2])})]):
+        changed = forecaster.cuts(effects)
+        assert np.abs(changed - plain).sum(axis=(1, 2)).max() > 0.01
+        np.testing.assert_allclose(changed, Forecaster(clean, Optics(), [], 4.0, SMALL).cuts(effects), atol=1e-6)
+    np.testing.assert_allclose(forecaster.cuts([]), plain, atol=1e-6)
+
+
+# --- fitting ----------------------------------------------------------------------------------------------------------
+
+
+def fitted(truth: Effect) -> tuple[Unknowns, np.ndarray, np.ndarray]:
+    """Unknowns of a kind, their fit to forecasts that hold ``truth``, and the spread of it."""
+    forecaster = Forecaster(photographs([truth], view=SMALL), Optics(), [], 6.0, SMALL)
+    unknowns = Unknowns((type(truth),), (("far", 4), ("near", 4)))
+    fit = Fitter(forecaster).fit(unknowns, unknowns.neutral)
+    return unknowns, fit.values, fit.spread
+
+
+def test_a_fit_recovers_the_suns_shape():
+    _, values, spread = fitted(SunShapeEffect(0.12))
+    assert values[0] == pytest.approx(0.12, abs=0.004)
+    assert 0 <= spread[0] < 0.01
+
+
+def test_a_fit_recovers_the_canting_of_every_facet():
+    """But for the tilt that all facets of a mirror share, which the alignment takes back."""
+    rng = np.random.default_rng(4)
+    x, y = ({name: rng.uniform(-1, 1, 4) for name in ("far", "near")} for _ in range(2))
+    unknowns, values, _ = fitted(FacetCanting(x_mrad=x, y_mrad=y))
+    (found,) = unknowns.effects(values)
+    for truth, seen in ((x, found.x_mrad), (y, found.y_mrad)):
+        for name in truth:
+            np.testing.assert_allclose(seen[name] - seen[name].mean(), truth[name] - truth[name].mean(), atol=0.12)
+
+
+def test_where_the_model_fails_the_residual_is_infinite(clean):
+    """All light blocked, or the sun below the horizon: as wrong as can be, and no reason to stop."""
+    fitter = Fitter(Forecaster(clean, Optics(), [], 4.0, SMALL))
+    unknowns = Unknowns((CATALOGUE["soiling"],), (("far", 4), ("near", 4)))
+    dark = np.zeros(len(unknowns.all))
+    assert np.isinf(fitter.residuals(unknowns, dark)).all()
+    assert np.isnan(fitter.descend(unknowns, dark).spread).all()
+
+
+# --- study ------------------------------------------------------------------------------------------------------------
+
+
+def test_no_effect_is_found_in_clean_photographs(clean):
+    found = study(clean, Optics(), options=QUICK)
+    assert found.verdict == "none"
+    assert found.effects == found.found == []
+    np.testing.assert_array_equal(found.after, found.before)
+    assert "explains the images" in found.conclusion()
+
+
+def test_an_effect_is_found_with_its_parameter_and_what_it_buys(hazy):
+    told: list[str] = []
+    found = study(hazy, Optics(), options=QUICK, progress=told.append)
+    report = found.to_json()
+    assert found.verdict == "effect"
+    (effect,) = found.effects
+    assert isinstance(effect, SunShapeEffect)
+    ratio = report["effects"][0]["parameters"]["circumsolar_ratio"]
+    assert ratio["value"] == pytest.approx(0.15, abs=0.01)
+    assert ratio["ci95"][0] < ratio["value"] < ratio["ci95"][1]
+    gain = report["effects"][0]["accuracy_gain"]
+    assert 0 < gain["ci95"][0] <= gain["mean"] <= gain["ci95"][1]
+    rise = report["after"]["accuracy_mean"] - report["before"]["accuracy_mean"]
+    assert rise == pytest.approx(gain["mean"], abs=2e-5)
+    assert report["images"] == {"fit": 4, "held_out": 4}
+    assert [c["name"] for c in report["candidates"]] == ["sun_shape", "gravity_bending"]
+    assert set(told) == {"sun_shape", "gravity_bending"}
+
+
+def test_what_no_candidate_explains_is_said(hazy):
+    found = study(hazy, Optics(), options=replace(QUICK, candidates=("axis_tilt",)))
+    assert found.verdict == "unexplained"
+    assert found.unexplained_share == 1.0
+    assert [c.name for c in found.candidates] == ["axis_tilt"]
+    assert set(found.covariates()) == {"sun elevation", "sun azimuth", "slant range", "height of the target"}
+
+
+def test_what_is_declared_is_no_candidate(hazy):
+    found = study(hazy, Optics(), [SunShapeEffect(0.15)], QUICK)
+    assert found.verdict == "none"
+    assert [c.name for c in found.candidates] == ["gravity_bending"]
+
+
+def test_too_few_photographs_or_two_of_one_name_are_refused(clean):
+    with pytest.raises(InvalidInputError, match="at least 4 photographs, got 3"):
+        study(clean[:3], Optics())
+    with pytest.raises(InvalidInputError, match="identifiers of their own"):
+        study([*clean[:4], clean[0]], Optics())
+
+
+@pytest.mark.parametrize("image", [np.zeros((8, 8)), np.full((8, 8), np.nan), np.ones(8)], ids=["dark", "nan", "line"])
+def test_a_photograph_that_holds_no_image_is_named(clean, image):
+    with pytest.raises(InvalidInputError, match="photograph near/0"):
+        Photograph(clean[0].shot, image)
+
+
+# --- advice -----------------------------------------------------------------------------------------------------------
+
+
+def test_for_all_look_alikes_there_are_photographs_to_tell_them_apart():
+    assert set(SCALES_WITH) == set(CATALOGUE)
+    assert set().union(*SCALES_WITH.values()) == set(PHOTOGRAPHS)
+    for first, second in combinations(CATALOGUE, 2):
+        same = all(name.startswith("camera") or name == "target_registration" for name in (first, second))
+        assert (told_apart_by(first, second) == SAME_SCALING) == same
+        assert told_apart_by(first, second) == told_apart_by(second, first)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "says"),
+    [
+        ("sun_shape", "camera_blur", "a near and a far heliostat"),
+        ("sun_shape", "slope_error", "several heliostats within the same hour"),
+        ("gravity_bending", "facet_canting", "a high and a low sun"),
+        ("soiling", "blocking", "a high and a low sun"),
+        ("slope_error", "tracking_jitter", "in the early morning"),
+    ],
+)
+def test_photographs_vary_what_look_alikes_scale_with(first, second, says):
+    assert says in told_apart_by(first, second)
