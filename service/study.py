@@ -60,6 +60,9 @@ def _photograph(
     spot = measurement.spot
     if spot is None:
         spot = plane.to_enu(center_of_mass(image, (plane.width, plane.height)))
+    across, up = plane.to_plane(spot)
+    if abs(across) > plane.width / 2 or abs(up) > plane.height / 2:
+        raise InvalidInputError(f"{measurement.key}: 'focal_spot' lies off its target {measurement.target}")
     shot = Shot(heliostat, points, measurement.sun, plane, spot=spot, degree=degree, identifier=measurement.key)
     return Photograph(shot, image)
 
