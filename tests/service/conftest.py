@@ -82,8 +82,9 @@ def empty_url(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[URL]:
         yield URL.create("sqlite", database=str(tmp_path / "store.sqlite"))
         return
     url: URL = request.getfixturevalue("postgres_url")
-    yield url
     database = Database(url)
+    database.downgrade("base")  # from where another test left it
+    yield url
     database.downgrade("base")
     database.close()
 
