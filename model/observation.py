@@ -19,6 +19,9 @@ FLUX_SHAPE = (64, 64)
 FLUX_WINDOW = 4.0
 """Side [m] of the square that flux images show about their centre of mass (the paper's)."""
 
+TRUSTED_MISFIT = 0.2
+"""Misfit of an image up to which a surface explains it: twice what clean images leave, more than real ones do."""
+
 
 @dataclass(frozen=True, eq=False)
 class Observation:
@@ -65,8 +68,8 @@ class SurfacePrediction:
         "network" or "refined".
     weights : str
         Name and content hash of the weights that were used.
-    misfit : float
-        How badly the surface explains its own images: one minus the mean flux accuracy of re-rendering them.
+    misfits : tuple of float
+        How badly the surface explains each of its own images: one minus the flux accuracy of re-rendering it.
     used : tuple of str
         Identifiers of the images.
     """
@@ -76,8 +79,23 @@ class SurfacePrediction:
     control_points: NDArray[np.float64]
     method: str
     weights: str
-    misfit: float
+    misfits: tuple[float, ...]
     used: tuple[str, ...]
+
+    @property
+    def misfit(self) -> float:
+        """Mean of the images' misfits."""
+        return float(np.mean(self.misfits))
+
+    @property
+    def suspicious(self) -> tuple[str, ...]:
+        """Identifiers of the images that the surface does not explain."""
+        return tuple(name for name, misfit in zip(self.used, self.misfits, strict=True) if misfit > TRUSTED_MISFIT)
+
+    @property
+    def trusted(self) -> bool:
+        """Whether every image is explained: no wrong heliostat, no foreign spot, no mirror unlike those known."""
+        return not self.suspicious
 
 
 def scene_of(

@@ -26,12 +26,20 @@ It looks like nothing, but slopes and so images feel it: left out, it spoils one
 def estimate(surfaces: Array) -> SurfacePrior:
     """Mean and covariance of measured surfaces (N, 4, 8, 8) [m].
 
-    A tilt of the whole mirror is kept out: no image can show it.
+    A tilt of the whole mirror is kept apart: no image can show it.
     """
     mean = surfaces.mean(axis=0)
     measured = principal(shrunk(surfaces - mean) + FLOOR**2 * np.eye(mean.size))
     directions = untilted(np.concatenate([measured, canting_directions()]))
-    return SurfacePrior(untilted(mean), orthogonal(directions - directions.mean(axis=(2, 3), keepdims=True)))
+    basis = orthogonal(directions - directions.mean(axis=(2, 3), keepdims=True))
+    return SurfacePrior(untilted(mean), basis, tilts(surfaces))
+
+
+def tilts(surfaces: Array) -> Array:
+    """Tilts of the whole mirror along x and y (2, 4, 8, 8) [m], each as long as its root mean square in surfaces."""
+    modes = np.repeat(tilt_modes()[:, None], 4, axis=1)
+    slopes = surfaces.reshape(len(surfaces), -1) @ np.linalg.pinv(modes.reshape(2, -1))
+    return np.asarray(np.sqrt((slopes**2).mean(axis=0))[:, None, None, None] * modes)
 
 
 def shrunk(deviations: Array, share: float = FACET_SHARE) -> Array:
@@ -72,10 +80,11 @@ def canting_directions(sigma_mrad: float = 0.6) -> Array:
 
 
 def orthogonal(directions: Array) -> Array:
-    """Orthogonal directions (K, 4, 8, 8) [m] of the same covariance, the longest first."""
+    """Orthogonal directions (K, 4, 8, 8) [m] of the same covariance, the longest first, their largest height up."""
     flat = directions.reshape(len(directions), -1)
     _, singular, axes = np.linalg.svd(flat, full_matrices=False)
-    return np.asarray((singular[:, None] * axes)[singular > 1e-9].reshape(-1, *directions.shape[1:]))
+    signs = np.sign(axes[np.arange(len(axes)), np.abs(axes).argmax(axis=1)])
+    return np.asarray(((signs * singular)[:, None] * axes)[singular > 1e-9].reshape(-1, *directions.shape[1:]))
 
 
 def main() -> None:
@@ -88,7 +97,8 @@ def main() -> None:
     surfaces, _ = load_surfaces(Path(config.data))
     train, _ = split_by_heliostat(len(surfaces), config.held_out, config.seed, config.fold)
     prior = estimate(surfaces[train])
-    np.savez_compressed(arguments.out, mean=prior.mean.astype(np.float32), basis=prior.basis.astype(np.float32))
+    arrays = {name: getattr(prior, name).astype(np.float32) for name in ("mean", "basis", "hidden")}
+    np.savez_compressed(arguments.out, **arrays)
     print(f"{arguments.out}: {len(prior.basis)} directions")
 
 

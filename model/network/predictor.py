@@ -17,7 +17,7 @@ from model.network.architecture import MAX_IMAGES
 from model.network.inputs import GUESS_SAMPLES, conditions
 from model.observation import Observation, SurfacePrediction, render_observations, scene_of
 from model.plant import Heliostat
-from model.refinement import default_prior, misfit
+from model.refinement import default_prior, misfits
 from model.surface import FACETS, control_points
 from model.tracing import Optics
 
@@ -56,7 +56,7 @@ class SurfacePredictor:
         # The spread is the scale of a Laplace distribution, whose standard deviation is sqrt(2) of it.
         return heights.astype(np.float64) * 1e-3, spread.astype(np.float64) * 1e-3 * np.sqrt(2)
 
-    def predict(
+    def heights(
         self,
         heliostat: Heliostat,
         observations: Sequence[Observation],
@@ -64,14 +64,8 @@ class SurfacePredictor:
         effects: Sequence[Effect] = (),
         *,
         looks: int = LOOKS,
-    ) -> SurfacePrediction:
-        """The surface of a heliostat from one to eight of its images, as a model with these optics and effects sees it.
-
-        Raises
-        ------
-        InvalidInputError
-            Without images, with more than eight, or for a heliostat that does not have four facets.
-        """
+    ) -> tuple[Array, Array]:
+        """Heights and their standard deviation, each (4, 8, 8) [m], from one to eight images; see `predict`."""
         if not 1 <= len(observations) <= MAX_IMAGES:
             raise InvalidInputError(f"a prediction takes 1 to {MAX_IMAGES} images, got {len(observations)}")
         if len(heliostat.facets) != FACETS:
@@ -88,13 +82,32 @@ class SurfacePredictor:
             z, z_std = (
                 values[0] for values in self.look({**inputs, "guess_flux": _filled(traced), "guess": z[None] * 1e3})
             )
+        return z, z_std
+
+    def predict(
+        self,
+        heliostat: Heliostat,
+        observations: Sequence[Observation],
+        optics: Optics | None = None,
+        effects: Sequence[Effect] = (),
+        *,
+        looks: int = LOOKS,
+    ) -> SurfacePrediction:
+        """The surface of a heliostat from one to eight of its images, as a model with these optics and effects sees it.
+
+        Raises
+        ------
+        InvalidInputError
+            Without images, with more than eight, or for a heliostat that does not have four facets.
+        """
+        z, z_std = self.heights(heliostat, observations, optics, effects, looks=looks)
         return SurfacePrediction(
             z=z,
             z_std=z_std,
             control_points=control_points(heliostat, z),
             method="network",
             weights=self.name,
-            misfit=misfit(heliostat, observations, z, optics, effects),
+            misfits=misfits(heliostat, observations, z, optics, effects),
             used=tuple(o.identifier for o in observations),
         )
 

@@ -10,7 +10,7 @@ import numpy as np
 from model.network.predictor import default_predictor
 from model.observation import Observation
 from model.plant import Heliostat
-from model.refinement import misfit, refine
+from model.refinement import misfits, refine
 from service import folder as verbs
 from service.folder import choose, surface_errors
 from service.paint import MeasurementFolder, measured_heights, read_folder
@@ -33,7 +33,7 @@ def errors(heliostat: Heliostat, observations: list[Observation], truth: np.ndar
         print(
             f"  {heliostat.name} {label:<8} from {min(IMAGES, len(observations))} images: all {found['mae_mm']:.3f}  "
             f"canting {found['mae_canting_mm']:.3f}  waviness {found['mae_waviness_mm']:.3f}  "
-            f"flux accuracy on all images {1 - misfit(heliostat, observations, z):.3f}"
+            f"flux accuracy on all images {1 - np.mean(misfits(heliostat, observations, z)):.3f}"
         )
 
 
@@ -43,7 +43,7 @@ def left_out(heliostat: Heliostat, observations: list[Observation], truth: np.nd
     for index, image in enumerate(observations):
         others = observations[:index] + observations[index + 1 :]
         surfaces = {"ideal": np.zeros_like(truth), **predicted(heliostat, others), "measured": truth}
-        rows.append({name: 1 - misfit(heliostat, [image], z) for name, z in surfaces.items()})
+        rows.append({name: 1 - misfits(heliostat, [image], z)[0] for name, z in surfaces.items()})
     for name in rows[0]:
         values = np.array([row[name] for row in rows])
         figures = f"mean {values.mean():.3f}  median {np.median(values):.3f}  min {values.min():.3f}"

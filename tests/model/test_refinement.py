@@ -1,14 +1,17 @@
 """Refinement on rendered images of mirrors it knows only by their light."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from model.effects.camera_response import CameraResponse
 from model.errors import InvalidInputError
 from model.frames import sun_direction_at
 from model.metrics import surface_error
-from model.observation import Observation
+from model.observation import Observation, render_observations
 from model.plant import Heliostat
-from model.refinement import default_prior, misfit, refine
+from model.refinement import RefinementOptions, default_prior, misfits, refine
 from tests.conftest import flat_heliostat, target
 from tests.rendered import observe
 
@@ -28,7 +31,7 @@ def heliostat() -> Heliostat:
 @pytest.fixture(scope="module")
 def truth() -> np.ndarray:
     prior = default_prior()
-    return prior.surface(np.random.default_rng(8).normal(0, 0.9, len(prior.basis)))
+    return prior.surface(np.random.default_rng(3).normal(0, 0.5, len(prior.basis)))
 
 
 @pytest.fixture(scope="module")
@@ -37,29 +40,63 @@ def refined(heliostat, truth):
 
 
 def test_the_true_surface_is_approached(refined, truth):
-    """From the prior's mean alone; a mirror drawn from the wide prior is harder than a real one."""
+    """From the prior's mean alone; real mirrors keep to half of the wide prior, about."""
     assert surface_error(refined.z, truth) < 0.4 * surface_error(default_prior().mean, truth)
 
 
+def mean_misfit(heliostat: Heliostat, z: np.ndarray, truth: np.ndarray) -> float:
+    return float(np.mean(misfits(heliostat, images(heliostat, truth), z)))
+
+
 def test_the_images_are_explained_as_well_as_by_the_truth(refined, heliostat, truth):
-    assert refined.misfit < misfit(heliostat, images(heliostat, truth), truth) + 0.01
+    assert refined.misfit < mean_misfit(heliostat, truth, truth) + 0.01
 
 
 def test_the_uncertainty_covers_the_error(refined, truth):
     error = np.abs(refined.z - truth)
     assert (refined.z_std > 0).all()
-    assert 0.3 < np.mean(error < 1.645 * refined.z_std) <= 1
+    assert 0.7 < np.mean(error < 1.645 * refined.z_std) <= 1
+
+
+def test_no_image_narrows_the_tilt_of_the_whole_mirror(refined):
+    hidden = np.sqrt((default_prior().hidden ** 2).sum(axis=0))
+    assert hidden.max() > 1e-5
+    assert (refined.z_std > hidden).all()
 
 
 def test_misfit_tells_a_surface_from_another(heliostat, truth, refined):
-    assert refined.misfit < 0.08
-    assert misfit(heliostat, images(heliostat, truth), default_prior().mean) > 1.5 * refined.misfit
+    assert refined.trusted
+    assert mean_misfit(heliostat, default_prior().mean, truth) > 1.5 * refined.misfit
+
+
+def test_a_foreign_image_is_named(heliostat, truth):
+    """On one of six images another heliostat's spot lies beside: the others still agree, and that one is found out."""
+    observations = images(heliostat, truth)
+    observations[2] = replace(observations[2], flux=observations[2].flux + 0.5 * np.roll(observations[2].flux, 20, axis=1))
+    found = refine(heliostat, observations, options=RefinementOptions(rounds=2))
+    assert found.suspicious == ("2",)
+    assert not found.trusted
+
+
+def test_effects_that_are_believed_are_not_taken_for_shape(heliostat, truth):
+    """A camera's response that the model knows spoils the surface no more; one that it does not know does."""
+    response, options = [CameraResponse(gamma=0.6)], RefinementOptions(rounds=2)
+    seen = [
+        replace(o, flux=image.astype(np.float32))
+        for o, image in zip(
+            images(heliostat, truth),
+            render_observations(heliostat, images(heliostat, truth), truth, effects=response),
+            strict=True,
+        )
+    ]
+    known = refine(heliostat, seen, effects=response, options=options)
+    assert surface_error(known.z, truth) < 0.8 * surface_error(refine(heliostat, seen, options=options).z, truth)
 
 
 def test_prior_inverts_its_own_coefficients():
     prior = default_prior()
     c = np.random.default_rng(0).normal(size=len(prior.basis))
-    np.testing.assert_allclose(prior.coefficients(prior.surface(c)), c, rtol=1e-5)
+    np.testing.assert_allclose(prior.coefficients(prior.surface(c)), c, rtol=1e-4, atol=1e-5)
 
 
 def test_no_image_is_named(heliostat):

@@ -78,6 +78,12 @@ def test_prior_explains_measured_surfaces_and_holds_no_tilt_of_the_whole_mirror(
     assert np.sqrt((rest**2).mean()) < 0.1 * np.sqrt((flat**2).mean())
 
 
+def test_prior_hides_as_much_tilt_as_the_measured_surfaces_have(surfaces):
+    hidden = estimate(surfaces).hidden
+    np.testing.assert_allclose(untilted(hidden), 0, atol=1e-12)
+    np.testing.assert_allclose((hidden**2).sum(axis=0).mean(), ((surfaces - untilted(surfaces)) ** 2).mean(), rtol=0.05)
+
+
 def test_a_run_learns_saves_and_resumes(stj, tmp_path):
     config = TrainConfig(data=str(stj), steps=6, batch=4, warmup=2, network=SMALL, bfloat16=False)
     device = torch.device("cpu")
