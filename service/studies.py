@@ -9,7 +9,7 @@ import numpy as np
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from model.errors import InvalidInputError, ModelError
+from model.errors import InvalidInputError, ModelError, UnreachableError
 from model.frames import sun_direction
 from model.plant import Heliostat, TargetPlane
 from service import models, store
@@ -52,11 +52,11 @@ class StudyRequest:
 
 @dataclass(eq=False)
 class Material:
-    """What the store gives a study: photographs, what was left out, and when the photographs were taken."""
+    """What the store gives a study: photographs, what was left out, and when photographs were taken, by their keys."""
 
     photographs: list["Photograph"] = field(default_factory=list)
     skipped: dict[str, str] = field(default_factory=dict)
-    moments: list[datetime] = field(default_factory=list)
+    moments: dict[str, datetime] = field(default_factory=dict)
 
     @property
     def heliostats(self) -> list[str]:
@@ -66,7 +66,22 @@ class Material:
     @property
     def span(self) -> tuple[datetime | None, datetime | None]:
         """The first and the last moment that is known."""
-        return min(self.moments, default=None), max(self.moments, default=None)
+        known = [self.moments[p.key] for p in self.photographs if p.key in self.moments]
+        return min(known, default=None), max(known, default=None)
+
+    def without_untraceable(self) -> "Material":
+        """The same without photographs that no attitude of their heliostat can have made: one would end the study."""
+        from model.forecast import align
+
+        kept, skipped = [], dict(self.skipped)
+        for photograph in self.photographs:
+            try:
+                align([photograph.shot])
+            except UnreachableError as error:
+                skipped[photograph.key] = str(error)
+            else:
+                kept.append(photograph)
+        return replace(self, photographs=kept, skipped=skipped)
 
 
 # --- out of the store -------------------------------------------------------------------------------------------------
@@ -127,7 +142,7 @@ def _gather_heliostat(session: Session, row: HeliostatRow, request: StudyRequest
             continue
         material.photographs.append(photograph)
         if measurement.taken_at is not None:
-            material.moments.append(measurement.taken_at)
+            material.moments[photograph.key] = measurement.taken_at
 
 
 def photograph_of(
@@ -156,7 +171,10 @@ def _flux(row: MeasurementRow, origin: tuple[float, float, float]) -> tuple[np.n
         return arrays["flux"].astype(np.float64), plane
     if row.focal_spot_wgs84 is None:
         raise InvalidInputError("a centred flux without 'focal_spot' has no place on the target")
-    crop = replace(plane, center=spot_of(row, plane, origin), width=CENTERED_SIDE, height=CENTERED_SIDE)
+    spot = spot_of(row, plane, origin)
+    if (np.abs(plane.to_plane(spot)) > np.array([plane.width, plane.height]) / 2).any():
+        raise InvalidInputError(f"'focal_spot' lies off its target {plane.name}")
+    crop = replace(plane, center=spot, width=CENTERED_SIDE, height=CENTERED_SIDE)
     return arrays["centered"].astype(np.float64), crop
 
 
@@ -196,9 +214,10 @@ def study_store(
     options = StudyOptions(latitude_deg=latitude_deg)
     if request.candidates is not None:
         options = replace(options, candidates=tuple(request.candidates))
-    _require_enough(material)
     steps = _Steps(len(options.candidates) * options.most, progress)
     with runtime.computing() as operations:
+        material = material.without_untraceable()
+        _require_enough(material)
         study = operations.study(material.photographs, Optics(), model.effects, options, steps)
     return Studied(request, model, material, study)
 

@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, cast
@@ -246,6 +247,38 @@ def test_measured_surface_goes_before_a_newer_prediction(store_url: URL):
     flat_depth = np.ptp(control_points(both.photographs[-1].shot.heliostat)[0, :, :, 2])
     assert depth["AK08"] == pytest.approx(flat_depth)
     database.close()
+
+
+def test_photograph_that_cannot_have_been_is_left_out_by_name(filled: Database):
+    with filled.reading() as session:
+        material = gather(session, StudyRequest())
+    whole, behind = material.photographs[0], material.photographs[1]
+    shot = replace(behind.shot, plane=replace(TARGET, normal=-TARGET.normal))
+    odd = replace(material, photographs=[whole, replace(behind, shot=shot)])
+    left = odd.without_untraceable()
+    assert [p.key for p in left.photographs] == [whole.key]
+    assert set(left.skipped) == {behind.key}
+    assert left.span == (material.moments[whole.key],) * 2
+
+
+@pytest.mark.parametrize(("up", "reason"), [(None, "no place on the target"), (9.0, "off its target"), (0.5, None)])
+def test_centred_flux_needs_a_spot_on_its_target(database: Database, up: float | None, reason: str | None):
+    fill(database)
+    spot = None if up is None else tuple(float(v) for v in Plant("demo", ORIGIN).to_wgs84(TARGET.to_enu((0.25, up))))
+    with database.writing() as session:
+        row = store.get_heliostat(session, "AB12")
+        target = store.get_target(session, TARGET.name)
+        about = measurement(target, "centred", sun_direction(0, 40), np.ones((64, 64)), 20)
+        store.add_measurement(
+            session, row, replace(about, flux=None, center_of_mass=None, focal_spot_wgs84=spot, kind="flux-centered")
+        )
+        material = gather(session, StudyRequest(heliostats=["AB12"], since=BEGIN + timedelta(days=19)))
+    if reason is not None:
+        assert reason in material.skipped["AB12/centred"]
+        return
+    (photograph,) = material.photographs
+    assert (photograph.shot.plane.width, photograph.image.shape) == (4.0, (64, 64))
+    np.testing.assert_allclose(photograph.shot.plane.center, TARGET.to_enu((0.25, 0.5)), atol=1e-6)
 
 
 def test_too_few_photographs_end_the_job_with_the_reasons(client: TestClient):
