@@ -16,6 +16,7 @@ from rich.table import Table
 
 from model.errors import InvalidInputError, ModelError
 from service.cli_keys import keys_app
+from service.cli_models import models_app
 from service.faults import ServiceError
 from service.operations import Method
 from service.paint import MeasurementFolder, read_folder
@@ -180,7 +181,6 @@ def study(
     from service.folder import write_json
     from service.paint import read_effects
     from service.study import study_folder
-    from service.study_page import study_page
 
     for path in filter(None, (out, page)):
         if path.is_dir():
@@ -192,6 +192,8 @@ def study(
     report = done.to_json()
     write_json(out, report)
     if page is not None:
+        from service.study_page import study_page
+
         page.parent.mkdir(parents=True, exist_ok=True)
         page.write_text(study_page(done.study, folder.resolve().name, done.skipped), encoding="utf-8")
     show(report, as_json, _study_table(report))
@@ -298,6 +300,7 @@ def demo(
 
 
 app.add_typer(keys_app)
+app.add_typer(models_app)
 
 
 def main() -> None:
