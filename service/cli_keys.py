@@ -1,48 +1,18 @@
 """The commands ``heliotwin keys ...``."""
 
-import getpass
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Annotated
 
 import typer
 from rich.console import Console
 from rich.table import Table
-from sqlalchemy.orm import Session
 
 from service import keys
+from service.cli_store import AsJson, actor, writing
 
-AsJson = Annotated[bool, typer.Option("--json", help="Print as JSON on standard output.")]
 Name = Annotated[str, typer.Argument(help="Who will use it, for example `calibration`.", metavar="NAME")]
 
 keys_app = typer.Typer(name="keys", help="API keys: make, list, withdraw.", no_args_is_help=True)
-
-
-@contextmanager
-def _writing() -> Iterator[Session]:
-    """The store that the settings name; an embedded one is made and migrated first."""
-    from service.database import Database
-    from service.settings import Settings
-
-    settings = Settings()
-    settings.data_dir.mkdir(parents=True, exist_ok=True)
-    database = Database(settings.database)
-    try:
-        if settings.migrates_on_start:
-            database.upgrade()
-        database.require_current()
-        with database.writing() as session:
-            yield session
-    finally:
-        database.close()
-
-
-def _actor() -> str:
-    try:
-        return f"cli {getpass.getuser()}"[:64]
-    except (KeyError, OSError):  # a container's user may have no name
-        return "cli"
 
 
 @keys_app.command()
@@ -52,15 +22,15 @@ def create(
     as_json: AsJson = False,
 ) -> None:
     """Make a key and print it, this once."""
-    with _writing() as session:
-        key = keys.create(session, name, role, _actor())
+    with writing() as session:
+        key = keys.create(session, name, role, actor())
     typer.echo(json.dumps({"name": name, "role": role, "key": key}) if as_json else key)
 
 
 @keys_app.command("list")
 def list_(as_json: AsJson = False) -> None:
     """All keys, by name and prefix; the keys themselves are not stored."""
-    with _writing() as session:
+    with writing() as session:
         rows = keys.list_keys(session)
     if as_json:
         fields = ("name", "role", "prefix", "created_at", "withdrawn_at")
@@ -78,6 +48,6 @@ def list_(as_json: AsJson = False) -> None:
 @keys_app.command()
 def withdraw(name: Name, as_json: AsJson = False) -> None:
     """Make a key useless from now on."""
-    with _writing() as session:
-        keys.withdraw(session, name, _actor())
+    with writing() as session:
+        keys.withdraw(session, name, actor())
     typer.echo(json.dumps({"withdrawn": name}) if as_json else f"{name} is withdrawn")

@@ -7,6 +7,7 @@ from fastapi import Response
 from fastapi.responses import JSONResponse
 from numpy.typing import NDArray
 from pydantic import BaseModel
+from sqlalchemy.orm import Session
 
 from service import models, negotiation
 from service.arrays import pack, unpack
@@ -218,6 +219,13 @@ def model(row: ModelRow, is_current: bool) -> ModelOut:
     names = ModelOut.model_fields.keys() - {"is_current", "study"}
     fields = {name: getattr(row, name) for name in names}
     return ModelOut.model_validate({**fields, "is_current": is_current, "study": row.study_id})
+
+
+def all_models(session: Session) -> list[ModelOut]:
+    """All versions of the plant's model, oldest first, withdrawn ones too."""
+    current = models.current_number(session)
+    adopted = [model(row, row.number == current) for row in models.list_models(session)]
+    return [declared_model(current == models.DECLARED), *adopted]
 
 
 def job(row: JobRow) -> JobOut:

@@ -472,6 +472,31 @@ class ForecastOut(ForecastSummary):
 # --- studies and models -----------------------------------------------------------------------------------------------
 
 
+class AccuracyOut(BaseModel):
+    """How well held-out photographs are forecast."""
+
+    accuracy_mean: float = Field(description="[1]")
+    accuracy_median: float = Field(description="[1]")
+    per_image: dict[str, float] = Field(description="By heliostat and measurement, `H/ID` [1].")
+
+
+class StudyReport(BaseModel):
+    """What a study found; the report of `heliotwin study` is one, too."""
+
+    model_config = ConfigDict(extra="allow")
+
+    verdict: Verdict = Field(description="effect: it is found; none: nothing is missing; unexplained: something is.")
+    conclusion: str = ""
+    images: dict[str, int] = Field(description="How many were fitted and how many judged the fit.")
+    before: AccuracyOut = Field(description="By the model that the study was made with.")
+    after: AccuracyOut = Field(description="With the effects that were found.")
+    noise_floor: float = Field(description="Error that the photographs' noise alone makes [1].")
+    unexplained_share: float = Field(description="Share of the error beyond the noise that is left [1].")
+    effects: list[dict[str, Any]] = Field(description="What was found: parameters with 95 % intervals, gain.")
+    candidates: list[dict[str, Any]] = Field(description="Every effect tried by itself, the best first.")
+    skipped: dict[str, str] = Field(default={}, description="What was left out, with the reasons.")
+
+
 class StudySummary(BaseModel):
     """A study without its figures."""
 
@@ -488,27 +513,8 @@ class StudySummary(BaseModel):
     conclusion: str
 
 
-class AccuracyOut(BaseModel):
-    """How well held-out photographs are forecast."""
-
-    accuracy_mean: float = Field(description="[1]")
-    accuracy_median: float = Field(description="[1]")
-    per_image: dict[str, float] = Field(description="By heliostat and measurement, `H/ID` [1].")
-
-
-class StudyOut(StudySummary):
-    """A study with its figures, and `skipped`: what it left out, with the reasons."""
-
-    model_config = ConfigDict(extra="allow")
-
-    images: dict[str, int] = Field(description="How many were fitted and how many judged the fit.")
-    before: AccuracyOut = Field(description="By the model that the study was made with.")
-    after: AccuracyOut = Field(description="With the effects that were found.")
-    noise_floor: float = Field(description="Error that the photographs' noise alone makes [1].")
-    unexplained_share: float = Field(description="Share of the error beyond the noise that is left [1].")
-    effects: list[dict[str, Any]] = Field(description="What was found: parameters with 95 % intervals, gain.")
-    candidates: list[dict[str, Any]] = Field(description="Every effect tried by itself, the best first.")
-    skipped: dict[str, str]
+class StudyOut(StudySummary, StudyReport):
+    """A study with its report."""
 
 
 class AdoptIn(Model):

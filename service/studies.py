@@ -6,6 +6,7 @@ from datetime import datetime
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+from pydantic import ValidationError
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
@@ -17,6 +18,7 @@ from service.arrays import unpack
 from service.faults import ConflictError, NotFoundError, ServiceError
 from service.models import PlantModel
 from service.runtime import Runtime
+from service.schemas import StudyReport
 from service.tables import HeliostatRow, MeasurementRow, StudyRow, SurfaceRow
 from service.workflows import choose_measurements, load_heliostat, plain, spot_of
 
@@ -266,4 +268,33 @@ def study_row(studied: Studied, title: str, options: dict[str, Any], actor: str)
         report=report,
         skipped=material.skipped,
         html=study_page(studied.study, title, material.skipped),
+    )
+
+
+def row_of_report(document: Any, name: str, model: PlantModel, actor: str) -> StudyRow:
+    """A report of `heliotwin study`, read from the file ``name``, as a study that was made with ``model``.
+
+    Raises
+    ------
+    InvalidInputError
+        Where it is no such report.
+    """
+    from model.effects import effects_from_json
+
+    try:
+        report = StudyReport.model_validate(document)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise InvalidInputError(f"{name}: {'.'.join(map(str, first['loc'])) or 'report'}: {first['msg']}") from None
+    effects_from_json(report.effects)
+    return StudyRow(
+        created_by=actor,
+        options={"report": name},
+        heliostats=sorted({key.partition("/")[0] for key in report.before.per_image}),
+        model=model.number,
+        model_version=model.version,
+        verdict=report.verdict,
+        conclusion=report.conclusion,
+        report=plain(document),
+        skipped=report.skipped,
     )

@@ -99,9 +99,7 @@ def _current(session: Session) -> ModelOut:
 def list_models(runtime: RuntimeDep) -> Page[ModelOut]:
     """All versions of the plant's model, oldest first, withdrawn ones too."""
     with runtime.database.reading() as session:
-        current = models.current_number(session)
-        adopted = [representations.model(row, row.number == current) for row in models.list_models(session)]
-    return Page(items=[representations.declared_model(current == models.DECLARED), *adopted], next=None)
+        return Page(items=representations.all_models(session), next=None)
 
 
 @router.get("/models/current", responses=problems(), dependencies=[READ])

@@ -1,7 +1,9 @@
 """Versions of the plant's model: which is current, who may change it, and what is made by it."""
 
+import json
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any, cast
 
 import pytest
@@ -18,6 +20,7 @@ from service.tables import MODEL_VERSION, AuditRow, StudyRow
 from service.workers import Worker
 
 from .conftest import ORIGIN, FakeOperations, Post, png
+from .test_keys import heliotwin
 
 GAMMA = {"name": "camera_response", "parameters": {"gamma": {"value": 0.8, "ci95": [0.78, 0.82], "unit": "1"}}}
 SLOPE = {"name": "slope_error", "parameters": {"sigma_mrad": {"value": 1.5, "ci95": [1.4, 1.6], "unit": "mrad"}}}
@@ -30,11 +33,10 @@ FORECAST = {
 }
 
 
-def study_row(*effects: dict[str, Any], model: int = 1, verdict: str | None = None) -> StudyRow:
-    """A study of AA39 that found these effects."""
+def report_of(*effects: dict[str, Any], verdict: str = "effect") -> dict[str, Any]:
+    """The report of a study that found these effects."""
     accuracy = {"accuracy_mean": 0.9, "accuracy_median": 0.9, "per_image": {"AA39/1": 0.9}}
-    verdict = verdict or ("effect" if effects else "none")
-    report = {
+    return {
         "verdict": verdict,
         "conclusion": "It is so.",
         "images": {"fit": 4, "held_out": 4},
@@ -45,6 +47,11 @@ def study_row(*effects: dict[str, Any], model: int = 1, verdict: str | None = No
         "effects": list(effects),
         "candidates": [],
     }
+
+
+def study_row(*effects: dict[str, Any], model: int = 1, verdict: str | None = None) -> StudyRow:
+    """A study of AA39 that found these effects."""
+    verdict = verdict or ("effect" if effects else "none")
     return StudyRow(
         created_by="tester",
         options={},
@@ -53,7 +60,7 @@ def study_row(*effects: dict[str, Any], model: int = 1, verdict: str | None = No
         model_version=f"{model}:",
         verdict=verdict,
         conclusion="It is so.",
-        report=report,
+        report=report_of(*effects, verdict=verdict),
         skipped={},
     )
 
@@ -301,3 +308,47 @@ def test_version_that_is_not_there_is_not_found(client: TestClient, post: Post):
     job = client.post("/v1/jobs/predictions", json={"model_version": 7}).headers["Location"]
     work(client)
     assert "no version 7" in client.get(job).json()["reason"]
+
+
+# --- the command line -------------------------------------------------------------------------------------------------
+
+
+def test_report_of_a_folder_is_adopted_and_withdrawn_by_the_command_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setenv("HELIOTWIN_DATA_DIR", str(tmp_path / "data"))
+    file = tmp_path / "report.json"
+    file.write_text(json.dumps(report_of(GAMMA)))
+    assert heliotwin("models", "adopt", str(file), "--json") == 0
+    assert json.loads(capsys.readouterr().out) == {"study": 1, "version": "2:camera_response"}
+    assert heliotwin("models", "list", "--json") == 0
+    listed = json.loads(capsys.readouterr().out)
+    assert [(entry["number"], entry["is_current"]) for entry in listed] == [(1, False), (2, True)]
+    assert listed[1]["adopted_by"].startswith("cli")
+    assert heliotwin("models", "withdraw", "1") == 0
+    assert capsys.readouterr().out.strip() == "1:none is current"
+    assert heliotwin("models", "withdraw", "1") == 1
+    assert heliotwin("models", "list") == 0
+    assert "2:camera_response" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("document", "word"),
+    [
+        ([], "report"),
+        (report_of(GAMMA) | {"verdict": "perhaps"}, "verdict"),
+        (report_of(GAMMA) | {"before": 3}, "before"),
+        (report_of({"name": "magic"}), "magic"),
+        (report_of({"name": "slope_error", "parameters": {"sigma_mrad": 99}}), "sigma_mrad"),
+    ],
+)
+def test_file_that_is_no_report_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], document: Any, word: str
+):
+    monkeypatch.setenv("HELIOTWIN_DATA_DIR", str(tmp_path / "data"))
+    file = tmp_path / "report.json"
+    file.write_text(json.dumps(document))
+    assert heliotwin("models", "adopt", str(file)) == 2
+    assert word in capsys.readouterr().err
+    assert heliotwin("models", "list", "--json") == 0
+    assert len(json.loads(capsys.readouterr().out)) == 1
