@@ -106,10 +106,10 @@ def generate(
     return MeasurementSet(world, truth, recorded, images)
 
 
-def mirrors(data: Path, count: int = 200, seed: int = 1) -> Array:
-    """Surfaces (count, 4, 8, 8) [m]: mixtures of the measured ones, or of the shipped prior where there are no data."""
+def mirrors(data: Path | None = None, count: int = 200, seed: int = 1) -> Array:
+    """Surfaces (count, 4, 8, 8) [m]: mixtures of the measured ones, samples of the shipped prior without such data."""
     rng = np.random.default_rng(seed)
-    if (data / "surfaces.npz").is_file():
+    if data is not None and (data / "surfaces.npz").is_file():
         return Augmentation().sample(load_surfaces(data)[0], count, rng)
     prior = default_prior()
     return np.array([prior.surface(rng.normal(size=len(prior.basis))) for _ in range(count)])

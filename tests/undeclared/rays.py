@@ -30,6 +30,9 @@ KNOTS = np.concatenate([np.zeros(3), np.linspace(0, 1, 6), np.ones(3)])
 MEASURED_AT = np.radians(30.0)
 """Elevation of the normal at which mirrors were measured, under their own weight."""
 
+TUBE = 0.4
+"""Sag of a mirror's left and right edges, which the torque tube bears, to that of the upper and lower ones."""
+
 CHUNK = 1024
 """Mirror points whose rays are traced at a time: what fits into a core's cache."""
 
@@ -189,7 +192,8 @@ class Exposure:
     def sagging(self, points: Points, pose: "Pose") -> Points:
         """Points of a mirror whose edges hang by the share of its weight that presses on it more than when measured."""
         pressing = pose.attitude[2, 2] - np.sin(MEASURED_AT)
-        return points.bent(-2e-3 * self.world.sag_mm * pressing / (self.heliostat.width / 2) ** 2 * np.eye(2))
+        edges = np.array([self.heliostat.width, self.heliostat.height]) / 2
+        return points.bent(-2e-3 * self.world.sag_mm * pressing * np.diag([TUBE, 1.0] / edges**2))
 
     def stand(self) -> "Pose":
         """The pose in which the centre of mass of the light lies at the goal."""

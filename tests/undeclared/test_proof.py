@@ -1,0 +1,81 @@
+"""A small part of ``python -m tests.benchmarks.study``: effects that the model does not declare are found."""
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from model.effects import CATALOGUE
+from model.forecast import View, forecast_shots
+from model.metrics import compare_on_target
+from model.study import Photograph, study
+from model.tracing import Optics
+from tests.undeclared import world
+from tests.undeclared.generator import MeasurementSet, generate, mirrors
+
+STRONG = 2
+
+
+@cache
+def measured(case: str) -> MeasurementSet:
+    """A small set with few rays."""
+    return generate(case, STRONG, 5, mirrors(count=8), heliostats=3, shots=5, side=128, fan=16)
+
+
+@cache
+def report(case: str) -> dict[str, Any]:
+    """The study of a small set."""
+    made = measured(case)
+    photographs = [Photograph(shot, image) for shot, image in zip(made.shots, made.images, strict=True)]
+    return study(photographs, Optics()).to_json()
+
+
+def test_the_generator_has_every_effect_of_the_catalogue():
+    assert set(world.CATALOGUE) == set(CATALOGUE)
+
+
+@pytest.mark.parametrize("case", ["clean", *world.CATALOGUE])
+def test_the_model_with_the_truth_explains_what_the_generator_throws(case):
+    """Generator and model share no code, so that each is a test of the other."""
+    made = generate(case, STRONG, 3, mirrors(count=8), heliostats=2, shots=1, side=128, fan=16)
+    forecasts = forecast_shots(made.shots, None, made.effects, View(96, 96)).numpy()
+    for shot, image, forecast in zip(made.shots, made.images, forecasts, strict=True):
+        size = (shot.plane.width, shot.plane.height)
+        assert compare_on_target(image, forecast, size, 4.0, 32).accuracy > 0.975
+
+
+def test_nothing_is_found_in_clean_images():
+    assert report("clean")["verdict"] == "none"
+    assert report("clean")["effects"] == []
+
+
+@pytest.mark.parametrize(
+    ("case", "parameter", "error"),
+    [
+        ("camera_response", "gamma", 0.03),
+        ("sun_shape", "circumsolar_ratio", 0.03),
+        ("gravity_bending", "amplitude_mm", 0.3),
+    ],
+)
+def test_a_strong_effect_is_found_with_its_parameter(case, parameter, error):
+    (truth,) = measured(case).truth
+    found = report(case)["effects"]
+    assert report(case)["verdict"] == "effect"
+    assert [effect["name"] for effect in found] == [case]
+    assert found[0]["parameters"][parameter]["value"] == pytest.approx(truth["parameters"][parameter], abs=error)
+    assert report(case)["after"]["accuracy_mean"] > report(case)["before"]["accuracy_mean"] + 0.02
+
+
+def test_canting_is_found_facet_by_facet():
+    (truth,) = measured("facet_canting").truth
+    found = report("facet_canting")["effects"]
+    assert [effect["name"] for effect in found] == ["facet_canting"]
+    for axis in ("x_mrad", "y_mrad"):
+        for heliostat, tilts in truth["parameters"][axis].items():
+            value = np.array(found[0]["parameters"][axis]["value"][heliostat])
+            np.testing.assert_allclose(value - value.mean(), tilts, atol=0.1)
+
+
+def test_what_no_effect_describes_is_not_taken_for_nothing():
+    assert report("facet_focus")["verdict"] != "none"
