@@ -131,7 +131,7 @@ def compared(network: Path, paper: Path, mean: Array) -> dict[str, Method]:
     best = by_network(network)
     return {
         **methods,
-        "network, one look": by_network(network, looks=1),
+        "network, two looks": by_network(network, looks=2),
         "network": best,
         REFINEMENT: by_refinement(best),
     }

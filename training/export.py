@@ -103,7 +103,7 @@ def evaluation(run: Run, path: Path, count: int = 128) -> dict[str, Any]:
         make_cases(run.held_out, run.held_out_names, run.field, count, camera)
         for camera in (CleanCamera(), run.config.camera)
     )
-    network, mean = by_onnx(SurfacePredictor(path), run.config.looks), run.mean.double().numpy()
+    network, mean = by_onnx(SurfacePredictor(path)), run.mean.double().numpy()
     outcomes = {
         "ideal surface": outcomes_of(always(np.zeros_like(mean)), clean),
         "mean surface": outcomes_of(always(mean), clean),

@@ -26,8 +26,12 @@ Array = NDArray[np.float64]
 INPUTS = ("flux", "conditions", "mask", "guess_flux", "guess")
 """What one look takes, by the names of `SurfaceNetwork.forward`, with a batch of eight images each."""
 
-LOOKS = 2
-"""How often the network sees what its own guess would throw; the first guess is the mean surface."""
+LOOKS = 1
+"""How often the network sees what a guess would throw, the mean surface and then its own.
+
+It was trained for two looks, and the second one still does a little harm (RESULTS.md): its own guesses leave residuals
+that it has not yet learnt to read.
+"""
 
 WEIGHTS = Path(__file__).parents[1] / "weights" / "surface-network.onnx"
 

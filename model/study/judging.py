@@ -11,6 +11,9 @@ from model.study.photographs import Photograph
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
+FEW = 3
+"""Images of a heliostat from which on they tell how much they scatter."""
+
 SEVERAL = 3
 """Heliostats from which on one of them is kept from the fits of what all have in common."""
 
@@ -69,11 +72,17 @@ class Gain:
 def paired_gain(differences: Array, heliostats: NDArray[np.str_], rounds: int = 2000, seed: int = 0) -> Gain:
     """Bootstrap of the mean of paired differences (N,), images drawn anew within each heliostat.
 
+    Heliostats with fewer than `FEW` images are drawn from together: one alone would seem to be certain.
+
     Source: Efron and Tibshirani 1993, *An Introduction to the Bootstrap*, chapters 8 and 13.
     """
     rng, total = np.random.default_rng(seed), np.zeros(rounds)
-    for name in np.unique(heliostats):
-        own = differences[heliostats == name]
+    names, members, counts = np.unique(heliostats, return_inverse=True, return_counts=True)
+    groups = np.where(counts < FEW, -1, np.arange(len(names)))[members]
+    if (groups == -1).sum() < FEW:
+        groups[:] = 0
+    for group in np.unique(groups):
+        own = differences[groups == group]
         total += own[rng.integers(len(own), size=(rounds, len(own)))].sum(axis=1)
     means = total / len(differences)
     low, high = np.quantile(means, [0.025, 0.975])

@@ -34,7 +34,7 @@ class StudyOptions:
     most: int = 3
     window: float | None = None
     latitude_deg: float = JUELICH_LATITUDE
-    fit_view: View = field(default_factory=lambda: View(72, 72, samples=12, padding=0.125))
+    fit_view: View = field(default_factory=lambda: View(96, 96, samples=16, padding=0.125))
     view: View = field(default_factory=lambda: View(128, 128, samples=24))
 
 

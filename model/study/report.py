@@ -151,10 +151,12 @@ class Study:
     def conclusion(self) -> str:
         """One plain sentence."""
         before, after = float(self.accuracy_before.mean()), float(self.accuracy_after.mean())
-        names = " and ".join(f.name.replace("_", " ") for f in self.found)
+        names = " and ".join(_plain(f.name) for f in self.found)
         if self.verdict == "effect":
-            alike = [name.replace("_", " ") for f in self.found for name in f.lookalikes]
-            doubt = f"; these images cannot tell it from {', '.join(alike)}" if alike else ""
+            doubts = [
+                f"{_plain(f.name)} from {', '.join(map(_plain, f.lookalikes))}" for f in self.found if f.lookalikes
+            ]
+            doubt = f"; these images cannot tell {' nor '.join(doubts)}" if doubts else ""
             return (
                 f"The images demand {names}: accuracy on held-out images rises from {before:.3f} to {after:.3f}{doubt}."
             )
@@ -193,6 +195,10 @@ class Study:
             "accuracy_median": round(float(np.median(accuracy)), 5),
             "per_image": {p.key: round(float(a), 5) for p, a in zip(self.photographs, accuracy, strict=True)},
         }
+
+
+def _plain(name: str) -> str:
+    return name.replace("_", " ")
 
 
 def _effect(found: Found) -> dict[str, Any]:
