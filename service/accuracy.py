@@ -73,14 +73,14 @@ def compare(runtime: Runtime, name: str, surface: SurfaceRow | None) -> list[Com
     with runtime.database.reading() as session:
         row = store.get_heliostat(session, name)
         heliostat, origin = load_heliostat(session, row), store.get_plant(session).origin
-        effects = models.get_model(session).effects
+        model = models.get_model(session)
         rows = _newest(session, row)
     if not rows:
         return []
     observations = [observation_of(measurement, origin) for measurement in rows]
     z = None if surface is None else unpack(surface.arrays)["z"]
     with runtime.computing() as operations:
-        forecasts = operations.render(heliostat, observations, z, effects)
+        forecasts = operations.render(heliostat, observations, z, model.optics, model.effects)
     from model.metrics import flux_accuracy
 
     used = set() if surface is None else {measurement.id for measurement in surface.measurements}

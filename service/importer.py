@@ -11,7 +11,7 @@ from model.surface import control_points
 from service import store
 from service.faults import ConflictError, TooLargeError, UnsupportedImageError
 from service.folder import Progress, quiet
-from service.paint import IMAGE_KINDS, Measurement, MeasurementFolder, measured_heights, read_json
+from service.paint import IMAGE_KINDS, Measurement, MeasurementFolder, declared_json, measured_heights, read_json
 from service.runtime import Runtime
 from service.workflows import Photograph, ingest
 
@@ -29,6 +29,9 @@ def import_folder(runtime: Runtime, folder: MeasurementFolder, progress: Progres
     skipped: dict[str, str] = {}
     with runtime.database.writing() as session:
         counts[f"plants {store.put_plant(session, folder.plant.name, folder.plant.origin)}"] += 1
+        declared = declared_json(folder.root / "twin.json")
+        if declared:
+            counts[f"declared models {store.put_declared(session, declared)}"] += 1
         for plane in folder.plant.targets.values():
             counts[f"targets {store.put_target(session, plane)[1]}"] += 1
     for name in folder.plant.heliostats:

@@ -17,6 +17,7 @@ from service.tables import ModelRow, PlantRow, StudyRow, now
 
 if TYPE_CHECKING:  # see `service.runtime`
     from model.effects import Effect
+    from model.tracing import Optics
 
 DECLARED = 1
 """Number of the declared model, which has no effect but the declared ones."""
@@ -24,15 +25,16 @@ DECLARED = 1
 
 @dataclass(frozen=True, eq=False)
 class PlantModel:
-    """The plant's model as it is computed with."""
+    """The plant's model as it is computed with: declared optics, declared and adopted effects."""
 
     number: int
     version: str
+    optics: "Optics"
     effects: tuple["Effect", ...]
 
 
 def version_name(number: int, effects: Sequence["Effect"]) -> str:
-    """``number:names``, the names as `model.effects.model_version` has them."""
+    """``number:names``, the names of adopted effects as `model.effects.model_version` has them."""
     from model.effects import model_version
 
     return f"{number}:{model_version(effects).partition(':')[2]}"
@@ -66,13 +68,22 @@ def current_number(session: Session) -> int:
 
 def get_model(session: Session, number: int | None = None) -> PlantModel:
     """A version of the plant's model, by default the current one; NotFoundError where there is none."""
+    from service.paint import parse_declared
+
     number = current_number(session) if number is None else number
+    plant, adopted = session.get(PlantRow, 1), _adopted_effects(session, number)
+    optics, declared = parse_declared({} if plant is None else plant.declared or {}, "the plant")
+    return PlantModel(number, version_name(number, adopted), optics, (*declared, *adopted))
+
+
+def _adopted_effects(session: Session, number: int) -> tuple["Effect", ...]:
+    """The effects of a version beside the declared ones."""
     if number == DECLARED:
-        return PlantModel(DECLARED, version_name(DECLARED, ()), ())
+        return ()
     row = session.get(ModelRow, number)
     if row is None:
         raise NotFoundError(f"model_version: the plant's model has no version {number}; see /v1/models")
-    return PlantModel(number, row.version, _effects(row.effects))
+    return _effects(row.effects)
 
 
 def _effects(data: Any) -> tuple["Effect", ...]:
@@ -111,7 +122,7 @@ def adopt(session: Session, number: int, actor: str, force: bool = False) -> Mod
             f"study {number} was made with version {study.model} of the model, {current} is current; "
             "make another study, or force it to put this one in place of the current model"
         )
-    row = _next_version(session, study, (*get_model(session, study.model).effects, *found), actor)
+    row = _next_version(session, study, (*_adopted_effects(session, study.model), *found), actor)
     names = [effect.name for effect in found]
     audit.record(session, actor, "effect.adopted", f"study {number}", model=row.version, effects=names)
     return row

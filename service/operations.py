@@ -67,14 +67,18 @@ def predict(
 
 
 def render(
-    heliostat: Heliostat, observations: Sequence[Observation], z: ArrayLike | None, effects: Sequence[Effect] = ()
+    heliostat: Heliostat,
+    observations: Sequence[Observation],
+    z: ArrayLike | None,
+    optics: Optics | None = None,
+    effects: Sequence[Effect] = (),
 ) -> Array:
     """What a surface (4, 8, 8) [m], None the ideal one, would have thrown where M fluxes were observed.
 
     (M, 64, 64), each with sum 100, in the observations' own windows.
     """
     heights = np.zeros((FACETS, ROWS, COLUMNS)) if z is None else np.asarray(z, dtype=np.float64)
-    return render_observations(heliostat, observations, heights, effects=effects)
+    return render_observations(heliostat, observations, heights, optics, effects)
 
 
 @dataclass(frozen=True, eq=False)

@@ -356,23 +356,30 @@ def read_folder(root: Path, heliostats: list[str] | None = None) -> MeasurementF
 
 def read_declared(path: Path) -> tuple[Optics, tuple[Effect, ...]]:
     """The optics and the effects that ``twin.json`` declares; the defaults where there is no such file."""
-    if not path.is_file():
-        return Optics(), ()
-    declared = _get(read_json(path), str(path), "declared")
+    return parse_declared(declared_json(path), str(path))
+
+
+def declared_json(path: Path) -> Any:
+    """What ``twin.json`` declares; an empty object where there is no such file."""
+    return _get(read_json(path), str(path), "declared") if path.is_file() else {}
+
+
+def parse_declared(declared: Any, where: str) -> tuple[Optics, tuple[Effect, ...]]:
+    """Optics and effects of a declared model, which ``where`` holds."""
     if not isinstance(declared, dict):
-        raise InvalidInputError(f"{path}: 'declared' must be a JSON object")
+        raise InvalidInputError(f"{where}: 'declared' must be a JSON object")
     sun = declared.get("sun")
-    optics = Optics() if sun is None else Optics(sun_shape=_sun_shape(sun, str(path)))
-    return optics, _effects(declared.get("effects", []), path)
+    optics = Optics() if sun is None else Optics(sun_shape=_sun_shape(sun, where))
+    return optics, _effects(declared.get("effects", []), where)
 
 
 def read_effects(path: Path) -> tuple[Effect, ...]:
     """Effects of a JSON file: a list, or an object with ``effects``, such as a study's report."""
-    return _effects(read_json(path), path)
+    return _effects(read_json(path), str(path))
 
 
-def _effects(data: Any, path: Path) -> tuple[Effect, ...]:
+def _effects(data: Any, where: str) -> tuple[Effect, ...]:
     try:
         return tuple(effects_from_json(data))
     except InvalidInputError as error:
-        raise InvalidInputError(f"{path}: {error}") from None
+        raise InvalidInputError(f"{where}: {error}") from None

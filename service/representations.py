@@ -62,7 +62,7 @@ def _pair(first: float | None, second: float | None) -> tuple[float, float] | No
 
 def plant(row: PlantRow) -> PlantOut:
     """A plant as JSON."""
-    return PlantOut(name=row.name, origin_wgs84=row.origin)
+    return PlantOut(name=row.name, origin_wgs84=row.origin, declared=row.declared)
 
 
 def heliostat_summary(row: HeliostatRow) -> HeliostatSummary:

@@ -36,7 +36,7 @@ class Operations(Protocol):
         heliostat: "Heliostat",
         observations: Sequence["Observation"],
         method: "Method" = "network",
-        *,
+        optics: "Optics | None" = None,
         effects: Sequence["Effect"] = (),
     ) -> "SurfacePrediction":
         """A surface from observations."""
@@ -46,6 +46,7 @@ class Operations(Protocol):
         heliostat: "Heliostat",
         observations: Sequence["Observation"],
         z: NDArray[Any] | None,
+        optics: "Optics | None" = None,
         effects: Sequence["Effect"] = (),
     ) -> NDArray[Any]:
         """What a surface would have thrown where fluxes were observed."""

@@ -161,6 +161,9 @@ class PlantOut(BaseModel):
     origin_wgs84: tuple[float, float, float] = Field(
         description="Tower base: latitude [deg], longitude [deg], altitude [m]."
     )
+    declared: dict[str, Any] | None = Field(
+        description="What is declared of its model, as in twin.json; null: Buie's sun with a ratio of 0.02, no effects."
+    )
 
 
 class KinematicsProperties(BaseModel):

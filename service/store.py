@@ -103,6 +103,21 @@ def put_plant(session: Session, name: str, origin: ArrayLike) -> Change:
     return _assign(plant, values)
 
 
+def put_declared(session: Session, declared: dict[str, Any]) -> Change:
+    """Set what is declared of the plant's model, in the form of ``twin.json``.
+
+    Raises
+    ------
+    ConflictError
+        Where studies were made with another: what they found adds to that.
+    """
+    plant = get_plant(session)
+    studied = session.scalar(select(StudyRow.id).limit(1)) is not None
+    if studied and (plant.declared or {}) != declared:
+        raise ConflictError("the declared model is fixed: studies were made with it; adopt what they find instead")
+    return _assign(plant, {"declared": declared})
+
+
 def _has_positions(session: Session) -> bool:
     return any(session.scalar(select(table.id).limit(1)) is not None for table in (HeliostatRow, TargetRow))
 

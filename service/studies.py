@@ -208,7 +208,6 @@ def study_store(
         Where too few photographs with a surface are stored; it says what was left out.
     """
     from model.study import StudyOptions
-    from model.tracing import Optics
 
     with runtime.database.reading() as session:
         model, latitude_deg = models.get_model(session), store.get_plant(session).latitude_deg
@@ -220,7 +219,7 @@ def study_store(
     with runtime.computing() as operations:
         material = material.without_untraceable()
         _require_enough(material)
-        study = operations.study(material.photographs, Optics(), model.effects, options, steps)
+        study = operations.study(material.photographs, model.optics, model.effects, options, steps)
     return Studied(request, model, material, study)
 
 

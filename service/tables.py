@@ -90,7 +90,10 @@ class Base(DeclarativeBase):
 
 
 class PlantRow(Base):
-    """The plant: one row, written before anything that needs its origin."""
+    """The plant: one row, written before anything that needs its origin.
+
+    ``declared`` is what ``twin.json`` declares of its model (DESIGN.md, section 6); the defaults without it.
+    """
 
     __tablename__ = "plant"
     __table_args__ = (CheckConstraint("id = 1", name="single"),)
@@ -100,6 +103,7 @@ class PlantRow(Base):
     latitude_deg: Mapped[float]
     longitude_deg: Mapped[float]
     altitude_m: Mapped[float]
+    declared: Mapped[dict[str, Any] | None]
 
     @property
     def origin(self) -> tuple[float, float, float]:

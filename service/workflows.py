@@ -6,7 +6,7 @@ them.
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
@@ -260,7 +260,7 @@ def predict_surface(
         model = models.get_model(session, model_version)
     observations = [observation_of(measurement, origin) for measurement in chosen]
     with runtime.computing() as operations:
-        predicted = operations.predict(heliostat, observations, method, effects=model.effects)
+        predicted = operations.predict(heliostat, observations, method, model.optics, model.effects)
     with runtime.database.writing() as session:
         row = store.get_heliostat(session, heliostat_name)
         used = [store.get_measurement(session, row, name) for name in predicted.used]
@@ -411,8 +411,6 @@ def _trace(
     model: PlantModel,
     latitude_deg: float,
 ) -> "Forecast":
-    from model.tracing import Optics
-
     with runtime.computing() as operations:
         return operations.forecast(
             heliostat,
@@ -422,7 +420,7 @@ def _trace(
             aim=None if request.aim is None else np.array(request.aim),
             resolution=request.resolution,
             window=request.window,
-            optics=Optics(dni=request.dni),
+            optics=replace(model.optics, dni=request.dni),
             effects=model.effects,
             latitude_deg=latitude_deg,
         )

@@ -1,4 +1,4 @@
-"""Studies, versions of the plant's model, and the version that each surface was made by."""
+"""Studies, the declared model and the versions that came after it, and the version that each surface was made by."""
 
 import sqlalchemy as sa
 from alembic import op
@@ -45,6 +45,7 @@ def upgrade() -> None:
     )
     op.create_index(op.f("ix_models_study_id"), "models", ["study_id"], unique=False)
 
+    op.add_column("plant", sa.Column("declared", sa.JSON(none_as_null=True), nullable=True))
     op.add_column("surfaces", sa.Column("model_version", sa.String(length=256), nullable=True))
     # All surfaces so far that came from photographs were made by the declared model.
     op.execute("UPDATE surfaces SET model_version = '1:none' WHERE source IN ('network', 'refined')")
@@ -54,6 +55,7 @@ def upgrade() -> None:
 def downgrade() -> None:
     _resize_model_version(256, 128)
     op.drop_column("surfaces", "model_version")
+    op.drop_column("plant", "declared")
     op.drop_table("models")
     op.drop_table("studies")
 

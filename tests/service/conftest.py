@@ -138,7 +138,12 @@ class FakeOperations:
         return MeasuredFlux(Quality(accepted=True), flux, centered, np.array([0.5, -0.25]))
 
     def predict(
-        self, heliostat: Heliostat, observations: list[Observation], method: str = "network", *, effects: Any = ()
+        self,
+        heliostat: Heliostat,
+        observations: list[Observation],
+        method: str = "network",
+        optics: Any = None,
+        effects: Any = (),
     ) -> SurfacePrediction:
         self.predictions.append(list(observations))
         self.believed.append(effects)
@@ -153,7 +158,9 @@ class FakeOperations:
             used=tuple(observation.identifier for observation in observations),
         )
 
-    def render(self, heliostat: Heliostat, observations: list[Observation], z: Any, effects: Any = ()) -> Any:
+    def render(
+        self, heliostat: Heliostat, observations: list[Observation], z: Any, optics: Any = None, effects: Any = ()
+    ) -> Any:
         self.rendered += 1
         return np.stack([observation.flux for observation in observations])
 

@@ -1,10 +1,14 @@
+import json
 from pathlib import Path
 
-from service import store
+from model.sunshape import Pillbox
+from service import models, store
 from service.importer import import_folder
 from service.paint import read_folder
 from service.runtime import Runtime
 from service.settings import Settings
+
+from .conftest import properties_document, tower_document
 
 
 def test_a_second_import_changes_nothing(stj: Path, tmp_path: Path):
@@ -26,3 +30,22 @@ def test_a_second_import_changes_nothing(stj: Path, tmp_path: Path):
     assert stored["measurements"] == 54
     assert first["skipped"] == second["skipped"]
     assert first["skipped"]["AA39/156500"] == "no image"
+
+
+def test_declared_model_of_a_folder_is_the_store_s(tmp_path: Path):
+    declared = {"sun": {"shape": "pillbox", "half_angle_mrad": 4.65}, "effects": []}
+    properties = tmp_path / "folder" / "AA39" / "Properties" / "AA39-heliostat-properties.json"
+    properties.parent.mkdir(parents=True)
+    properties.write_text(json.dumps(properties_document()))
+    (tmp_path / "folder" / "plant-tower-measurements.json").write_text(json.dumps(tower_document()))
+    (tmp_path / "folder" / "twin.json").write_text(json.dumps({"declared": declared}))
+    runtime = Runtime.from_settings(Settings(data_dir=tmp_path / "data"))
+    try:
+        runtime.database.upgrade()
+        folder = read_folder(tmp_path / "folder")
+        for outcome in ("changed", "unchanged"):
+            assert import_folder(runtime, folder)["counts"][f"declared models {outcome}"] == 1
+        with runtime.database.reading() as session:
+            assert models.get_model(session).optics.sun_shape == folder.optics.sun_shape == Pillbox(4.65e-3)
+    finally:
+        runtime.close()

@@ -12,6 +12,7 @@ from fastapi.testclient import TestClient
 from sqlalchemy import URL, select, text
 
 from model.effects import CATALOGUE, model_version
+from model.sunshape import Gaussian
 from service import keys, models, store
 from service.database import Database
 from service.faults import ConflictError, NotFoundError
@@ -89,6 +90,24 @@ def test_declared_model_is_the_first_version(database: Database):
         assert (model.number, model.version, model.effects) == (1, "1:none", ())
         with pytest.raises(NotFoundError, match="no version 2"):
             models.get_model(session, 2)
+
+
+DECLARED = {"sun": {"shape": "gaussian", "sigma_mrad": 2.0}, "effects": [GAMMA]}
+
+
+def test_declared_sun_and_effects_are_part_of_every_version(database: Database):
+    with database.writing() as session:
+        store.put_plant(session, "plant", ORIGIN)
+        assert store.put_declared(session, DECLARED) is store.Change.CHANGED
+        assert store.put_declared(session, DECLARED) is store.Change.UNCHANGED
+    assert adopt(database, add(database, SLOPE)) == "2:slope_error"
+    with database.reading() as session:
+        first, second = models.get_model(session, 1), models.get_model(session, 2)
+    assert (first.optics.sun_shape, second.optics.sun_shape) == (Gaussian(0.002), Gaussian(0.002))
+    assert [effect.name for effect in first.effects] == ["camera_response"]
+    assert [effect.name for effect in second.effects] == ["camera_response", "slope_error"]
+    with database.writing() as session, pytest.raises(ConflictError, match="studies were made with it"):
+        store.put_declared(session, {})
 
 
 def test_versions_build_upon_each_other_and_are_withdrawn_from_the_top(database: Database):
@@ -298,6 +317,15 @@ def test_everything_that_is_made_uses_the_model_that_is_asked_for(
         work(client)
         assert client.get("/v1/heliostats/AA39/surfaces/current").json()["model_version"] == version
     assert operations.forecasts[-1]["latitude_deg"] == pytest.approx(ORIGIN[0])
+
+
+def test_forecast_is_made_under_the_declared_sun(client: TestClient, stored: Database, operations: FakeOperations):
+    with stored.writing() as session:
+        store.put_declared(session, {"sun": {"shape": "gaussian", "sigma_mrad": 2.0}})
+    assert client.get("/v1/plant").json()["declared"]["sun"]["shape"] == "gaussian"
+    client.post("/v1/forecasts", json=FORECAST | {"dni_w_m2": 800})
+    optics = operations.forecasts[-1]["optics"]
+    assert (optics.sun_shape, optics.dni) == (Gaussian(0.002), 800)
 
 
 def test_version_that_is_not_there_is_not_found(client: TestClient, post: Post):
