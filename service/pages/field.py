@@ -25,6 +25,8 @@ router = APIRouter(include_in_schema=False, dependencies=[READ])
 
 # Surfaces that are read at a time, to bound memory.
 _CHUNK = 200
+# Heliostats in the table, unless somebody asks for the whole of it.
+_LISTED = 100
 
 
 @dataclass(frozen=True)
@@ -292,9 +294,10 @@ def draw(lines: Sequence[Line], metric: Metric, scale: Scale) -> Drawing:
     x = width / 2 + (east - (east.max() + east.min()) / 2) * per_metre
     y = height / 2 - (north - (north.max() + north.min()) / 2) * per_metre
     values = [metric.value(line) for line in lines]
+    colours = scale.names([math.nan if value is None else value for value in values])
     dots = [
-        Dot(line, float(x[i]), float(y[i]), value, None if value is None else scale.colour(value))
-        for i, (line, value) in enumerate(zip(lines, values, strict=True))
+        Dot(line, float(x[i]), float(y[i]), value, None if value is None else colour)
+        for i, (line, value, colour) in enumerate(zip(lines, values, colours, strict=True))
     ]
     bar_m = _round_length(width / 4 / per_metre)
     radius = min(max(0.35 * math.sqrt(width * height / max(len(lines), 1)), 3.0), 12.0)
@@ -321,24 +324,33 @@ def _totals(session: Session) -> dict[str, Any]:
 
 @router.get("/")
 def get_field(
-    request: Request, runtime: RuntimeDep, book: FieldBookDep, metric: Annotated[MetricName, Query()] = "accuracy"
+    request: Request,
+    runtime: RuntimeDep,
+    book: FieldBookDep,
+    metric: Annotated[MetricName, Query()] = "accuracy",
+    whole: Annotated[bool, Query()] = False,
 ) -> HTMLResponse:
-    """The field map and its table."""
+    """The field map and its table, or the ``whole`` table of a large field."""
     chosen = METRICS[metric]
     with runtime.database.reading() as session:
         lines, pending = book.read(session)
         totals = _totals(session)
     values = [value for line in lines if (value := chosen.value(line)) is not None]
+    # A large field takes its time and its page is long: it is asked for again the less often the more is left.
+    again_ms = min(max(1500, 30 * pending), 15_000)
     scale = scale_of(values, chosen.colours, f"{chosen.label} [{chosen.unit}]", 5 * 10.0**-chosen.digits)
     return render(
         request,
         "field.html",
         **totals,
-        lines=_worst_first(lines, chosen),
+        lines=lines,
+        listed=_worst_first(lines, chosen)[: None if whole else _LISTED],
+        whole=whole,
         metrics=METRICS,
         metric=chosen,
         values=values,
         scale=scale,
         drawing=draw(lines, chosen, scale) if lines else None,
         pending=pending,
+        again_ms=again_ms,
     )

@@ -46,9 +46,9 @@ class Scale:
         shares = (np.ma.masked_invalid(values) - self.low) / (self.high - self.low)
         return np.asarray(matplotlib.colormaps[self.colours](shares, bytes=True))
 
-    def colour(self, value: float) -> str:
-        """The colour of one number, as pages write it."""
-        return to_hex(self.pixels(np.array([value]))[0] / 255)
+    def names(self, values: Sequence[float]) -> list[str]:
+        """The colours of numbers, as pages write them."""
+        return ["#" + bytes(pixel[:3]).hex() for pixel in self.pixels(np.array(values))]
 
     @property
     def stops(self) -> list[tuple[float, str]]:

@@ -92,7 +92,7 @@ def _histories(listed: Sequence[Revision]) -> list[History]:
 def space_view(z: NDArray[Any], size: tuple[float, float]) -> str:
     """What `surface3d.js` draws: heights [mm] of each facet on an even grid, the mirror's size [m], and colours."""
     heights = mirror_heights(z, _SPACE_SAMPLES)
-    colours = [Scale("RdBu_r", 0, 1, "").colour(share) for share in np.linspace(0, 1, 33).tolist()]
+    colours = Scale("RdBu_r", 0, 1, "").names(np.linspace(0, 1, 33).tolist())
     return json.dumps({"size": size, "facets": np.round(heights, 4).tolist(), "colours": colours})
 
 

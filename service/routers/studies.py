@@ -54,7 +54,12 @@ def get_study(number: Number, runtime: RuntimeDep) -> StudyOut:
         return representations.study(row, _adopted(session, row))
 
 
-@router.get("/studies/{number}/report", responses=problems(404), response_class=HTMLResponse, dependencies=[READ])
+@router.get(
+    "/studies/{number}/report",
+    response_class=Response,
+    responses={**problems(404), 200: {"description": "A page that stands alone.", "content": {"text/html": {}}}},
+    dependencies=[READ],
+)
 def get_study_report(number: Number, runtime: RuntimeDep) -> HTMLResponse:
     """The study as a page for people."""
     with runtime.database.reading() as session:

@@ -9,7 +9,7 @@ import pytest
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
-from service import keys, security
+from service import keys, security, store
 from service.app import create_app
 from service.pages.field import METRICS
 from service.pages.login import own_path
@@ -17,6 +17,7 @@ from service.pages.rendering import ASSETS
 from service.settings import Settings
 
 from .conftest import QUIET, FakeOperations, client_of, png, poster, properties_document, tower_document
+from .test_studies_adopted import SLOPE, study_row
 
 HTML = {"Accept": "text/html,application/xhtml+xml"}
 HTMX = {"HX-Request": "true"}
@@ -39,6 +40,14 @@ def fill(client: TestClient) -> None:
     client.headers.update(HTML)
 
 
+def keep_study(app: FastAPI, *effects: dict[str, Any], **about: Any) -> int:
+    """A study that somebody made, with what no report of ours would hold."""
+    row = study_row(*effects, **about)
+    row.conclusion, row.html = "<img src=x onerror=alert(1)>", "<style>p{}</style><p>found</p><script>alert(1)</script>"
+    with app.state.runtime.database.writing() as session:
+        return store.add_study(session, row).id
+
+
 @pytest.fixture
 def pages(client: TestClient) -> TestClient:
     """A filled store."""
@@ -54,6 +63,7 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
         client.put("/v1/plant", json=tower_document())
         client.put("/v1/heliostats/AA39", json=properties_document())
         fill(client)
+        keep_study(client.app, SLOPE)  # type: ignore[arg-type]
         yield client
 
 
@@ -67,6 +77,8 @@ PATHS = (
     "/forecasts/1",
     "/jobs",
     "/jobs/1",
+    "/studies",
+    "/studies/1",
     "/login",
     "/nothing",
     "/heliostats/none",
@@ -100,7 +112,7 @@ def test_page_loads_nothing_from_elsewhere_and_runs_nothing_of_its_own(shown: Te
     for link in _LINK.findall(answer.text):
         assert re.match(r"/(?!/)|data:image/|#|\?", link) or ":" not in link, link
     # What the policy would refuse must not be there.
-    assert not re.search(r"<script(?![^>]* src=)|\son[a-z]+=|\sstyle=|<style|javascript:", answer.text)
+    assert not re.search(r"<script(?![^>]* src=)|<[^>]*\s(?:on[a-z]+|style)=|<style|javascript:", answer.text)
 
 
 @pytest.mark.parametrize("path", PATHS)
@@ -124,6 +136,10 @@ def test_what_senders_wrote_is_escaped(shown: TestClient):
     page = text_of(shown, "/jobs/1")
     assert "&lt;script&gt;alert(1)&lt;/script&gt;" in page
     assert "<script>alert" not in page
+    for path in ("/studies", "/studies/1"):
+        page = text_of(shown, path)
+        assert "&lt;img src=x" in page
+        assert "<img src=x" not in page
     for path in ("/?metric=<script>alert(1)</script>", "/heliostats/<script>alert(1)<script>", "/<script>alert(1)"):
         assert "<script>alert" not in shown.get(path).text
 
@@ -276,6 +292,68 @@ def test_jobs_are_asked_for_followed_and_cancelled(pages: TestClient):
     assert actions[:2] == ["job.cancelled", "job.created"]
 
 
+def test_report_of_a_study_stands_in_a_frame_that_runs_nothing(shown: TestClient):
+    page = text_of(shown, "/studies/1")
+    assert re.search(r'<iframe[^>]* sandbox src="/studies/1/report" title="Report of study 1">', page)
+    report = shown.get("/studies/1/report")
+    assert "<p>found</p>" in report.text
+    policy = report.headers["Content-Security-Policy"]
+    assert "default-src 'none'" in policy
+    assert "script-src" not in policy
+    assert policy.endswith("frame-ancestors 'self'; sandbox")
+    assert report.headers["X-Frame-Options"] == "SAMEORIGIN"
+
+
+def test_study_is_adopted_and_withdrawn(app: FastAPI, pages: TestClient):
+    number = keep_study(app, SLOPE)
+    assert "Adopt slope error" in text_of(pages, f"/studies/{number}")
+    assert pages.post(f"/studies/{number}/adopt", follow_redirects=False).status_code == 303
+    page = text_of(pages, f"/studies/{number}")
+    assert "Adopted as version 2" in page
+    assert "Withdraw it" in page
+    assert "version <strong>2</strong>: slope error" in text_of(pages, "/studies")
+    assert pages.post(f"/studies/{number}/withdraw", follow_redirects=False).status_code == 303
+    assert "version <strong>1</strong>: the declared model" in text_of(pages, "/studies")
+    assert pages.post(f"/studies/{number}/withdraw").status_code == 409
+    actions = [entry["action"] for entry in pages.get("/v1/audit").json()["items"]]
+    assert actions[:2] == ["effect.withdrawn", "effect.adopted"]
+
+
+def test_doubtful_study_is_adopted_by_who_says_so(app: FastAPI, pages: TestClient):
+    number, empty = keep_study(app, SLOPE, verdict="unexplained"), keep_study(app)
+    assert 'name="force" value="true" required' in text_of(pages, f"/studies/{number}")
+    refused = pages.post(f"/studies/{number}/adopt")
+    assert refused.status_code == 409
+    assert "unexplained" in refused.text
+    assert pages.post(f"/studies/{number}/adopt", data={"force": "true"}, follow_redirects=False).status_code == 303
+    assert "nothing to adopt" in text_of(pages, f"/studies/{empty}")
+
+
+def test_accuracy_is_told_anew_for_another_model(app: FastAPI, pages: TestClient, operations: FakeOperations):
+    number = keep_study(app, SLOPE)
+    settled(pages)
+    rendered = operations.rendered
+    assert pages.post(f"/studies/{number}/adopt", follow_redirects=False).status_code == 303
+    settled(pages)
+    assert operations.rendered == rendered + 1
+
+
+def test_study_is_asked_for(pages: TestClient):
+    assert pages.post("/studies", follow_redirects=False).headers["Location"] == "/jobs/2"
+    assert pages.get("/v1/jobs/2").json()["kind"] == "studies"
+
+
+def test_large_field_lists_the_worst_and_on_demand_all(bare: TestClient, properties: dict[str, Any]):
+    assert bare.put("/v1/plant", json=tower_document()).status_code == 200
+    for number in range(102):
+        assert bare.put(f"/v1/heliostats/H{number:03}", json=properties).status_code == 201
+    bare.headers.update(HTML)
+    page, whole = text_of(bare, "/"), text_of(bare, "/?whole=true")
+    assert (page.count('<th scope="row">'), whole.count('<th scope="row">')) == (100, 102)
+    assert page.count("<circle") == whole.count("<circle") == 102
+    assert "All 102 heliostats" in page
+
+
 def test_rest_answers_browsers_in_json_as_ever(shown: TestClient):
     answer = shown.get("/v1/heliostats/none")
     assert answer.headers["Content-Type"] == "application/problem+json"
@@ -320,7 +398,8 @@ def test_reader_sees_no_buttons_and_may_not_press_them(app: FastAPI, pages: Test
     assert "Predict" not in settled(pages)
     assert "Cancel" not in text_of(pages, "/jobs/1")
     assert "forecasts need the role operate" in text_of(pages, "/forecast")
-    for path in ("/forecast", "/jobs/predictions", "/jobs/1/cancel"):
+    assert "Study the photographs" not in text_of(pages, "/studies")
+    for path in ("/forecast", "/jobs/predictions", "/jobs/1/cancel", "/studies", "/studies/1/adopt"):
         answer = pages.post(path, data=form() if path == "/forecast" else {})
         assert answer.status_code == 403
         assert "needs operate" in answer.text
