@@ -9,12 +9,17 @@ import pytest
 from model.effects import CATALOGUE
 from model.forecast import View, forecast_shots
 from model.metrics import compare_on_target
-from model.study import Photograph, study
+from model.study import Photograph, StudyOptions, study
 from model.tracing import Optics
 from tests.undeclared import world
 from tests.undeclared.generator import MeasurementSet, generate, mirrors
 
 STRONG = 2
+
+OPTIONS = StudyOptions(
+    candidates=("sun_shape", "slope_error", "camera_response", "camera_blur", "background", "facet_canting"), most=2
+)
+"""Some of the catalogue, look-alikes among them: enough to be wrong, and few enough for a test."""
 
 
 @cache
@@ -28,7 +33,7 @@ def report(case: str) -> dict[str, Any]:
     """The study of a small set."""
     made = measured(case)
     photographs = [Photograph(shot, image) for shot, image in zip(made.shots, made.images, strict=True)]
-    return study(photographs, Optics()).to_json()
+    return study(photographs, Optics(), options=OPTIONS).to_json()
 
 
 def test_the_generator_has_every_effect_of_the_catalogue():
@@ -55,7 +60,6 @@ def test_nothing_is_found_in_clean_images():
     [
         ("camera_response", "gamma", 0.03),
         ("sun_shape", "circumsolar_ratio", 0.03),
-        ("gravity_bending", "amplitude_mm", 0.3),
     ],
 )
 def test_a_strong_effect_is_found_with_its_parameter(case, parameter, error):
