@@ -250,12 +250,12 @@ class _Posterior:
         """The mirror after a change (k,) of its first coefficients."""
         return self.state(state.c + np.pad(change, (0, len(state.c) - len(change))))
 
-    def climb(self, state: _State, noise: float, count: int, retraced: int = 1) -> tuple[_State, Array]:
-        """The state of the highest density near another, in the first coefficients, and the Jacobian (count, M, R, R).
+    def climb(self, state: _State, noise: float, jacobian: Array, retraced: int = 1) -> tuple[_State, Array]:
+        """The state of the highest density near another, in a Jacobian's (k, M, R, R) coefficients, and its Jacobian.
 
         Levenberg-Marquardt; the Jacobian is traced anew up to ``retraced`` times, where corrections no longer help.
         """
-        jacobian, cost, damping, fresh = self.jacobian(state, count), self.cost(state, noise), 0.1, True
+        cost, damping, fresh = self.cost(state, noise), 0.1, False
         for _ in range(self.options.steps):
             change = self.step(state, jacobian, noise, damping)
             trial = self.moved(state, change)
@@ -263,13 +263,13 @@ class _Posterior:
             gain = cost - trial_cost
             if gain > 0:
                 missed = trial.images - state.images - np.tensordot(change, jacobian, axes=1)
-                jacobian += change[:, None, None, None] / (change @ change) * missed
+                jacobian = jacobian + change[:, None, None, None] / (change @ change) * missed
                 state, cost = trial, trial_cost
             damping = max(damping / 5, 1e-4) if gain > 0 else damping * 4
             if gain >= LEAST_GAIN:
                 fresh = False
             elif not fresh and retraced:
-                jacobian, fresh, retraced = self.jacobian(state, count), True, retraced - 1
+                jacobian, fresh, retraced = self.jacobian(state, len(jacobian)), True, retraced - 1
             elif gain > 0 or damping > 100:
                 break
         return state, jacobian
@@ -277,10 +277,12 @@ class _Posterior:
     def summit(self, c: Array) -> tuple[_State, Array]:
         """The summit above coefficients (K,) and the Jacobian there: large features first, then all."""
         state, options = self.state(c), self.options
+        jacobian = self.jacobian(state, min(options.leading, len(c)))
         for noise in options.annealing:
-            state, _ = self.climb(state, noise, min(options.leading, len(c)))
-        for number in range(options.rounds):
-            state, jacobian = self.climb(state, self.noise(state, options.hope), len(c), retraced=int(number == 0))
+            state, jacobian = self.climb(state, noise, jacobian)
+        jacobian = self.jacobian(state, len(c))
+        for left in reversed(range(options.rounds)):
+            state, jacobian = self.climb(state, self.noise(state, options.hope), jacobian, retraced=int(left == 0))
         return state, jacobian
 
     def covariance(self, state: _State, jacobian: Array) -> Array:
