@@ -46,6 +46,6 @@ def test_declared_model_of_a_folder_is_the_store_s(tmp_path: Path):
         for outcome in ("changed", "unchanged"):
             assert import_folder(runtime, folder)["counts"][f"declared models {outcome}"] == 1
         with runtime.database.reading() as session:
-            assert models.get_model(session).optics.sun_shape == folder.optics.sun_shape == Pillbox(4.65e-3)
+            assert models.get_model(session).optics.sun_shape == folder.optics.sun_shape == Pillbox(4.65 * 1e-3)
     finally:
         runtime.close()
