@@ -26,7 +26,7 @@ from .conftest import QUIET, FakeOperations, client_of, free_port, png, poster, 
 
 playwright = pytest.importorskip("playwright.sync_api", reason="no browser driver: pip install playwright")
 expect = playwright.expect
-expect.set_options(timeout=15_000)
+expect.set_options(timeout=40_000)
 
 CHROMIUM = os.environ.get("HELIOTWIN_TEST_CHROMIUM") or shutil.which("chromium") or shutil.which("google-chrome")
 FLAGS = [
@@ -117,7 +117,7 @@ def browser() -> Iterator[Any]:
 def page(browser: Any, served: Served) -> Iterator[Any]:
     """A fresh browser window; at the end nothing went elsewhere, and no policy was broken."""
     context = browser.new_context(base_url=served.address, viewport=DESK)
-    context.set_default_timeout(15_000)
+    context.set_default_timeout(40_000)
     opened, elsewhere, complaints = context.new_page(), [], []
     context.on("request", lambda r: None if r.url.startswith((served.address, "data:")) else elsewhere.append(r.url))
     opened.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
