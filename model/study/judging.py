@@ -79,7 +79,7 @@ def paired_gain(differences: Array, heliostats: NDArray[np.str_], rounds: int = 
     rng, total = np.random.default_rng(seed), np.zeros(rounds)
     names, members, counts = np.unique(heliostats, return_inverse=True, return_counts=True)
     groups = np.where(counts < FEW, -1, np.arange(len(names)))[members]
-    if (groups == -1).sum() < FEW:
+    if 0 < (groups == -1).sum() < FEW:
         groups[:] = 0
     for group in np.unique(groups):
         own = differences[groups == group]
