@@ -72,7 +72,9 @@ def test_misfit_tells_a_surface_from_another(heliostat, truth, refined):
 def test_a_foreign_image_is_named(heliostat, truth):
     """On one of six images another heliostat's spot lies beside: the others still agree, and that one is found out."""
     observations = images(heliostat, truth)
-    observations[2] = replace(observations[2], flux=observations[2].flux + 0.5 * np.roll(observations[2].flux, 20, axis=1))
+    observations[2] = replace(
+        observations[2], flux=observations[2].flux + 0.5 * np.roll(observations[2].flux, 20, axis=1)
+    )
     found = refine(heliostat, observations, options=RefinementOptions(rounds=2))
     assert found.suspicious == ("2",)
     assert not found.trusted
