@@ -79,7 +79,7 @@ def compare(runtime: Runtime, name: str, surface: SurfaceRow | None) -> list[Com
         return []
     observations = [observation_of(measurement, origin) for measurement in rows]
     z = None if surface is None else unpack(surface.arrays)["z"]
-    with runtime.computing() as operations:
+    with runtime.computing("compare") as operations:
         forecasts = operations.render(heliostat, observations, z, model.optics, model.effects)
     from model.metrics import flux_accuracy
 

@@ -11,11 +11,24 @@ from fastapi.routing import APIRoute
 
 from service import documentation, errors, openapi, security
 from service.handlers import KINDS
+from service.metrics import listening, registry
 from service.middleware import BodyLimitMiddleware, DoorMiddleware, RequestIdMiddleware, SecurityHeadersMiddleware
 from service.pages import field, forecast, heliostat, login
 from service.pages import jobs as job_pages
 from service.pages import studies as study_pages
-from service.routers import audit, forecasts, health, heliostats, jobs, measurements, plant, session, studies, surfaces
+from service.routers import (
+    audit,
+    forecasts,
+    health,
+    heliostats,
+    jobs,
+    measurements,
+    metrics,
+    plant,
+    session,
+    studies,
+    surfaces,
+)
 from service.runtime import Operations, Runtime
 from service.settings import Settings
 from service.workers import Kinds, Workers
@@ -59,7 +72,8 @@ def create_app(settings: Settings, operations: Operations | None = None, kinds: 
             workers = Workers(runtime, kinds, settings.job_workers)
             workers.start()
             try:
-                yield
+                with listening(settings, registry(runtime)):
+                    yield
             finally:
                 await to_thread.run_sync(workers.stop)
                 await to_thread.run_sync(app.state.field.close)
@@ -82,7 +96,7 @@ def create_app(settings: Settings, operations: Operations | None = None, kinds: 
         v1.include_router(module.router)
     v1.include_router(jobs.make_router(kinds))
     app.include_router(v1)
-    for router in (health.router, session.router, documentation.router):
+    for router in (health.router, metrics.router, session.router, documentation.router):
         app.include_router(router)
     for page in (login, field, heliostat, forecast, job_pages, study_pages):
         app.include_router(page.router)

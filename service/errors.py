@@ -1,7 +1,9 @@
 """Every error as a problem document (RFC 9457), by one table from exception to HTTP status."""
 
+import errno
 import json
 import logging
+import sqlite3
 from collections.abc import Mapping, Sequence
 from http import HTTPStatus
 from typing import Any
@@ -47,7 +49,11 @@ STATUS: dict[type[Exception], HTTPStatus] = {
     faults.TooManyError: HTTPStatus.TOO_MANY_REQUESTS,
     faults.UnsupportedImageError: HTTPStatus.UNSUPPORTED_MEDIA_TYPE,
     faults.UnsupportedContentError: HTTPStatus.UNSUPPORTED_MEDIA_TYPE,
+    faults.StoreDamagedError: HTTPStatus.INTERNAL_SERVER_ERROR,
 }
+
+# PostgreSQL's code for a disk without room.
+_DISK_FULL = "53100"
 
 # What the caller may do about an error that comes without a sentence of its own.
 _REMEDIES = {
@@ -92,6 +98,8 @@ def _field(location: Sequence[int | str]) -> str:
 
 def _on_known(request: Request, error: Exception) -> Response:
     status = next(STATUS[kind] for kind in type(error).__mro__ if kind in STATUS)
+    if isinstance(error, faults.StoreDamagedError):
+        logger.error("%s, request %s", error, request_id(request.scope))
     if isinstance(error, faults.TooManyError):
         return problem(request.scope, status, str(error), {"Retry-After": "30"})
     if isinstance(error, faults.NotAcceptableError):
@@ -117,8 +125,27 @@ def _on_http(request: Request, error: Exception) -> Response:
     return problem(request.scope, error.status_code, detail, error.headers)
 
 
+def _is_full(error: BaseException) -> bool:
+    """Whether a disk, or the database's, has no room left."""
+    if isinstance(error, OSError):
+        return error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+    if isinstance(error, OperationalError):
+        origin: Any = error.orig
+        codes = (getattr(origin, "sqlite_errorcode", None), getattr(origin, "sqlstate", None))
+        return codes[0] == sqlite3.SQLITE_FULL or codes[1] == _DISK_FULL
+    return False
+
+
+def _no_room(scope: Scope, error: Exception) -> Response:
+    logger.error("no room left, request %s: %s", request_id(scope), error)
+    detail = "the store's disk is full and nothing was kept; try again when its operator has made room"
+    return problem(scope, HTTPStatus.INSUFFICIENT_STORAGE, detail, {"Retry-After": "60"})
+
+
 def database_away(scope: Scope, error: Exception) -> Response:
-    """The answer while the database does not give one."""
+    """The answer while the database does not give one, or can store no more."""
+    if _is_full(error):
+        return _no_room(scope, error)
     logger.error("database unavailable, request %s: %s", request_id(scope), error)
     detail = "the database does not answer; try again later"
     return problem(scope, HTTPStatus.SERVICE_UNAVAILABLE, detail, {"Retry-After": "5"})
@@ -128,8 +155,15 @@ def _on_database_away(request: Request, error: Exception) -> Response:
     return database_away(request.scope, error)
 
 
+def _on_os(request: Request, error: Exception) -> Response:
+    if _is_full(error):
+        return _no_room(request.scope, error)
+    raise error
+
+
 def _on_unexpected(request: Request, error: Exception) -> Response:
-    logger.error("unexpected error, request %s", request_id(request.scope), exc_info=error)
+    identity = request_id(request.scope)
+    logger.error("unexpected error, request %s", identity, exc_info=error, extra={"request_id": identity})
     detail = "the service failed; report the request_id to its operator"
     # This handler stands outside the middleware that adds these.
     headers = {"X-Request-ID": request_id(request.scope), **SECURITY_HEADERS}
@@ -143,4 +177,5 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(RequestValidationError, _on_validation)
     app.add_exception_handler(HTTPException, _on_http)
     app.add_exception_handler(OperationalError, _on_database_away)
+    app.add_exception_handler(OSError, _on_os)
     app.add_exception_handler(Exception, _on_unexpected)

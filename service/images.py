@@ -17,6 +17,9 @@ _SIGNATURES = {
 }
 
 
+_REMEDY = "post it again, or restore it from a back-up (`heliotwin check` lists all such images)"
+
+
 def media_type(data: bytes) -> str:
     """The image format by its first bytes, whatever its sender calls it.
 
@@ -58,10 +61,13 @@ class ImageStore:
         """Keep ``data`` and return its digest; on return it is on the disk, also after a power cut."""
         sha256 = digest(data)
         path = self.path(sha256)
-        # A file of another length is a leftover of a fault; writing it again repairs the store.
-        if not (path.is_file() and path.stat().st_size == len(data)):
+        if not self._holds(sha256):  # also where a fault has altered it: writing it again repairs the store
             self._write(path, data)
         return sha256
+
+    def _holds(self, sha256: str) -> bool:
+        path = self.path(sha256)
+        return path.is_file() and digest(path.read_bytes()) == sha256
 
     def _write(self, path: Path, data: bytes) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -88,7 +94,7 @@ class ImageStore:
         try:
             data = self.path(sha256).read_bytes()
         except FileNotFoundError as error:
-            raise StoreDamagedError(f"image {sha256} is missing from the store") from error
+            raise StoreDamagedError(f"image {sha256} is missing from the store; {_REMEDY}") from error
         if digest(data) != sha256:
-            raise StoreDamagedError(f"image {sha256} is damaged in the store")
+            raise StoreDamagedError(f"image {sha256} is damaged in the store; {_REMEDY}")
         return data

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Any
 
-from sqlalchemy import Select, and_, func, or_, select
+from sqlalchemy import Select, and_, delete, func, or_, select
 from sqlalchemy.orm import Session, undefer
 
 from model.errors import InvalidInputError
@@ -26,6 +26,10 @@ from service.tables import JobRow, JobStepRow, now
 
 ENDED = ("done", "failed", "cancelled")
 """States that a job does not leave."""
+
+
+LONGEST_PAUSE_S = 600.0
+"""Longest pause before a job is tried again [s]."""
 
 
 class LeaseLostError(Exception):
@@ -172,15 +176,17 @@ def cancel_for(runtime: Runtime, number: int, actor: str) -> JobRow:
 # --- taking a job -----------------------------------------------------------------------------------------------------
 
 
-def _claimable(kinds: Collection[str], at: datetime) -> Select[JobRow]:
-    waiting = and_(JobRow.state == "queued", JobRow.not_before <= at)
-    lost = and_(JobRow.state == "running", JobRow.lease_until < at)
+def _claimable(kinds: Collection[str], at: datetime, lease_s: float) -> Select[JobRow]:
+    """Jobs that may be taken; also where a moment lies so far ahead that the clock must have been set back since."""
+    too_late, too_long = at + timedelta(seconds=LONGEST_PAUSE_S), at + timedelta(seconds=2 * lease_s)
+    waiting = and_(JobRow.state == "queued", or_(JobRow.not_before <= at, JobRow.not_before > too_late))
+    lost = and_(JobRow.state == "running", or_(JobRow.lease_until < at, JobRow.lease_until > too_long))
     return select(JobRow).where(JobRow.kind.in_(kinds), or_(waiting, lost)).order_by(JobRow.id).limit(1)
 
 
-def has_claimable(session: Session, kinds: Collection[str]) -> bool:
+def has_claimable(session: Session, kinds: Collection[str], lease_s: float) -> bool:
     """Whether there is something to take, told without a lock."""
-    return session.scalar(_claimable(kinds, clock(session)).with_only_columns(JobRow.id)) is not None
+    return session.scalar(_claimable(kinds, clock(session), lease_s).with_only_columns(JobRow.id)) is not None
 
 
 def claim(session: Session, kinds: Collection[str], worker: str, lease_s: float, attempts: int) -> JobRow | None:
@@ -189,7 +195,7 @@ def claim(session: Session, kinds: Collection[str], worker: str, lease_s: float,
     A job that was tried ``attempts`` times and lost its worker each time ends failed: it may be what kills them.
     """
     at = clock(session)
-    while (row := session.scalar(_claimable(kinds, at).with_for_update(skip_locked=True))) is not None:
+    while (row := session.scalar(_claimable(kinds, at, lease_s).with_for_update(skip_locked=True))) is not None:
         if row.cancel_requested:
             _end(row, "cancelled", at)
         elif row.attempts >= attempts:
@@ -302,6 +308,19 @@ def release(session: Session, lease: Lease) -> None:
     row = _held(session, lease)
     row.attempts -= 1
     _requeue(row, clock(session))
+
+
+def purge(session: Session, age: timedelta, most: int = 500) -> int:
+    """Delete up to ``most`` jobs that ended longer than ``age`` ago, and say how many.
+
+    The newest job stays, so that no number is given twice.
+    """
+    newest = select(func.max(JobRow.id)).scalar_subquery()
+    ended = select(JobRow.id).where(JobRow.state.in_(ENDED), JobRow.finished_at < clock(session) - age)
+    numbers = session.scalars(ended.where(JobRow.id < newest).order_by(JobRow.id).limit(most)).all()
+    session.execute(delete(JobStepRow).where(JobStepRow.job_id.in_(numbers)))
+    session.execute(delete(JobRow).where(JobRow.id.in_(numbers)))
+    return len(numbers)
 
 
 def _requeue(row: JobRow, not_before: datetime) -> None:

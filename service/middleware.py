@@ -14,15 +14,19 @@ from sqlalchemy.exc import OperationalError
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service import errors, security
+from service import errors, logs, security
 from service.errors import SECURITY_HEADERS, problem
 from service.limits import Buckets
+from service.meters import REQUEST_SECONDS, REQUESTS
 from service.pages import rendering
 from service.settings import Settings, is_loopback
 
 logger = logging.getLogger("heliotwin.access")
 
-_REQUEST_ID = re.compile(r"^[A-Za-z0-9_-]{8,64}$")
+_REQUEST_ID = re.compile(r"[A-Za-z0-9_-]{8,64}")
+# Methods that are told apart in metrics, and paths that are asked for too often to log each time.
+_METHODS = ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS")
+_PROBES = ("/livez", "/readyz", "/metrics")
 # What multipart boundaries, part headers and the metadata may add to an image [bytes].
 _MULTIPART_OVERHEAD = 64 * 1024
 
@@ -39,19 +43,40 @@ class RequestIdMiddleware:
             await self.app(scope, receive, send)
             return
         given = Headers(scope=scope).get("x-request-id", "")
-        identity = given if _REQUEST_ID.match(given) else uuid.uuid4().hex
+        identity = given if _REQUEST_ID.fullmatch(given) else uuid.uuid4().hex
         scope.setdefault("state", {})["request_id"] = identity
         started = time.perf_counter()
 
         async def send_with_id(message: Message) -> None:
             if message["type"] == "http.response.start":
                 MutableHeaders(scope=message)["X-Request-ID"] = identity
-                took = (time.perf_counter() - started) * 1e3
-                path = scope["path"].encode("unicode_escape").decode()
-                logger.info("%s %s %s %d %.1f ms", identity, scope["method"], path, message["status"], took)
+                _note(scope, message["status"], time.perf_counter() - started)
             await send(message)
 
-        await self.app(scope, receive, send_with_id)
+        with logs.bound(request_id=identity):
+            await self.app(scope, receive, send_with_id)
+
+
+def _note(scope: Scope, status: int, took_s: float) -> None:
+    """Log a request and count it."""
+    path, identity = scope["path"], scope["state"].get("identity")
+    level = logging.DEBUG if path in _PROBES else logging.INFO
+    extra = {"method": scope["method"], "path": path, "status": status, "ms": round(took_s * 1e3, 1)}
+    extra["key"] = None if identity is None else identity.name
+    logger.log(level, "%s %s %d %.1f ms", scope["method"], path, status, took_s * 1e3, extra=extra)
+    method = scope["method"] if scope["method"] in _METHODS else "other"
+    route = _template(scope)
+    REQUESTS.labels(method, route, status).inc()
+    REQUEST_SECONDS.labels(method, route).observe(took_s)
+
+
+def _template(scope: Scope) -> str:
+    """The path as its route declares it, ``/v1/heliostats/{name}``; "none" where there is no route."""
+    path: str | None = getattr(scope.get("route"), "path", None)
+    if path is None:
+        return "none"
+    # A router that was included tells its own path only.
+    return path if not scope["path"].startswith("/v1/") or path.startswith("/v1/") else f"/v1{path}"
 
 
 class SecurityHeadersMiddleware:

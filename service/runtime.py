@@ -2,13 +2,14 @@
 
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from numpy.typing import NDArray
 
+from service import meters
 from service.database import Database
 from service.images import ImageStore
 from service.settings import Settings
@@ -108,10 +109,13 @@ class Runtime:
         )
 
     @contextmanager
-    def computing(self) -> Iterator[Operations]:
-        """The model, while no more than ``parallel_computations`` callers use it."""
-        with self._gate:
-            yield self.operations
+    def computing(self, operation: str) -> Iterator[Operations]:
+        """The model, while no more than ``parallel_computations`` callers use it; ``operation`` names the meter."""
+        with ExitStack() as held:
+            with meters.timed(meters.WAITING_SECONDS, "wait"):
+                held.enter_context(self._gate)
+            with meters.timed(meters.MODEL_SECONDS.labels(operation), operation):
+                yield self.operations
 
     def close(self) -> None:
         """Close the database's connections."""

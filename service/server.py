@@ -5,7 +5,7 @@ from types import FrameType
 
 import uvicorn
 
-from service import logs
+from service import logs, telemetry
 from service.app import create_app
 from service.database import Database
 from service.faults import NotStartedError
@@ -39,6 +39,7 @@ def serve(settings: Settings) -> None:
         Where the store or the door keeps it from starting.
     """
     logs.set_up(settings)
+    telemetry.set_up(settings, "heliotwin")
     app = create_app(settings)
     config = uvicorn.Config(
         app,

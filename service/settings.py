@@ -78,7 +78,24 @@ class Settings(BaseSettings):
     import_root: Path | None = Field(
         default=None, description="Folder whose subfolders jobs may import; without it no job imports."
     )
+    job_retention_days: float = Field(
+        default=90.0, ge=0, le=36500, description="Jobs that ended so long ago [days] are deleted; 0 keeps all."
+    )
     log_level: LogLevel = "info"
+    log_format: Literal["text", "json"] = Field(default="text", description="json: one object a line.")
+    metrics_port: int | None = Field(
+        default=None,
+        ge=1,
+        le=65535,
+        description="A port of its own for this process's metrics, without a key; `worker` has no other.",
+    )
+    metrics_host: str = Field(default="127.0.0.1", description="Address that this port listens on.")
+    metrics_heliostats: int = Field(
+        default=1000, ge=0, le=100_000, description="Most heliostats whose drift is told, the worst ones."
+    )
+    otlp_endpoint: str | None = Field(
+        default=None, pattern="^https?://", description="OpenTelemetry collector for traces; needs heliotwin[otel]."
+    )
 
     @field_validator("database_url")
     @classmethod

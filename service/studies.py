@@ -216,7 +216,7 @@ def study_store(
     if request.candidates is not None:
         options = replace(options, candidates=tuple(request.candidates))
     steps = _Steps(len(options.candidates) * options.most, progress)
-    with runtime.computing() as operations:
+    with runtime.computing("study") as operations:
         material = material.without_untraceable()
         _require_enough(material)
         study = operations.study(material.photographs, model.optics, model.effects, options, steps)

@@ -236,6 +236,18 @@ class SurfaceRow(Base):
     )
 
 
+class DriftRow(Base):
+    """Flux accuracy [1] of a heliostat's current surface on its newest photograph, when that came (`service.drift`)."""
+
+    __tablename__ = "drift"
+
+    heliostat_id: Mapped[int] = mapped_column(ForeignKey("heliostats.id"), primary_key=True, autoincrement=False)
+    measurement_id: Mapped[int] = mapped_column(ForeignKey("measurements.id"))
+    surface_id: Mapped[int] = mapped_column(ForeignKey("surfaces.id"))
+    taken_at: Mapped[datetime]
+    accuracy: Mapped[float]
+
+
 class ForecastRow(Base):
     """A computed flux map: its inputs, its npz ``flux`` (rows, columns) float32 [W/m2] and its figures."""
 

@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from datetime import timedelta
 from functools import partial
 from typing import Any, Generic, TypeVar
 
@@ -21,9 +22,11 @@ from sqlalchemy.exc import OperationalError, SQLAlchemyError, StatementError
 from sqlalchemy.orm import Session
 
 from model.errors import InvalidInputError, ModelError
-from service import jobs, logs
+from service import jobs, logs, telemetry
 from service.arrays import pack
 from service.faults import ServiceError
+from service.meters import JOB_ATTEMPTS, JOB_SECONDS, PROCESS, timed
+from service.metrics import listening
 from service.runtime import Operations, Runtime
 from service.settings import Settings
 from service.tables import JobRow
@@ -32,8 +35,8 @@ logger = logging.getLogger("heliotwin.jobs")
 
 # Seconds between two writes of a job's progress: what a person can follow, and little for the database.
 _REPORT_EVERY_S = 0.5
-# Longest pause before a job is tried again [s].
-_LONGEST_PAUSE_S = 600.0
+# Seconds between two looks for jobs that are old enough to be deleted.
+_PURGE_EVERY_S = 3600.0
 # Seconds that jobs under way get to reach their next report when the workers are told to stop.
 _GRACE_S = 20.0
 
@@ -118,8 +121,20 @@ Kinds = Mapping[str, Kind[Any]]
 
 def pause_s(attempt: int, base_s: float, generator: random.Random) -> float:
     """Seconds before attempt ``attempt`` + 1: doubled each time, and spread so that not all come back at once."""
-    longest: float = min(_LONGEST_PAUSE_S, base_s * 2 ** (attempt - 1))
+    longest: float = min(jobs.LONGEST_PAUSE_S, base_s * 2 ** (attempt - 1))
     return longest * generator.uniform(0.5, 1.0)
+
+
+@dataclass(frozen=True)
+class _Ending:
+    """How an attempt ended, and what writes that."""
+
+    outcome: str
+    write: Callable[[Session], None]
+
+
+def _failed(lease: jobs.Lease, reason: str) -> _Ending:
+    return _Ending("failed", lambda session: jobs.fail(session, lease, reason))
 
 
 class Worker:
@@ -131,11 +146,13 @@ class Worker:
         self.name = name
         self.stopping = stopping
         self._random = random.Random(name)
+        self._purged_s = -math.inf
 
     def run(self) -> None:
         """Work; a database that is away is waited for."""
         while not self.stopping.is_set():
             try:
+                self._purge()
                 worked = self.work()
             except SQLAlchemyError as error:
                 logger.error("%s: the database does not answer: %s", self.name, error)
@@ -143,24 +160,45 @@ class Worker:
             if not worked:
                 self.runtime.job_came.acquire(timeout=self.runtime.settings.job_poll_s)
 
+    def _purge(self) -> None:
+        """Delete old jobs, now and then, a few at a time."""
+        settings = self.runtime.settings
+        if not settings.job_retention_days or time.monotonic() - self._purged_s < _PURGE_EVERY_S:
+            return
+        with self.runtime.database.writing() as session:
+            count = jobs.purge(session, timedelta(days=settings.job_retention_days))
+        if count:
+            logger.info("%s: %d jobs deleted that ended %g days ago", self.name, count, settings.job_retention_days)
+            return  # there may be more
+        self._purged_s = time.monotonic()
+
     def work(self) -> bool:
         """Take a job, if there is one, and bring it to an end; whether there was one."""
         job = self._claim()
         if job is None:
             return False
         context = Context(self.runtime, jobs.lease_of(job), job.created_by, self.stopping)
-        logger.info("%s: job %d (%s), attempt %d", self.name, job.id, job.kind, job.attempts)
+        with logs.bound(job=job.id, kind=job.kind), timed(JOB_SECONDS.labels(job.kind), f"job {job.kind}"):
+            logger.info("%s: job %d (%s), attempt %d", self.name, job.id, job.kind, job.attempts)
+            outcome = self._attempt(context, job)
+        JOB_ATTEMPTS.labels(job.kind, outcome).inc()
+        return True
+
+    def _attempt(self, context: Context, job: JobRow) -> str:
+        """Work at the job, store how that ended, and name it."""
         try:
             with self._heart(context):
-                self._store(context, self._outcome(context, job))
+                ending = self._ending(context, job)
+                self._store(context, ending.write)
+                return ending.outcome
         except jobs.LeaseLostError:
             logger.warning("%s: job %d went to another worker", self.name, job.id)
-        return True
+            return "lost"
 
     def _claim(self) -> JobRow | None:
         settings, database = self.runtime.settings, self.runtime.database
         with database.reading() as session:
-            if not jobs.has_claimable(session, self.kinds):
+            if not jobs.has_claimable(session, self.kinds, settings.job_lease_s):
                 return None
         with database.writing() as session:
             return jobs.claim(session, self.kinds, self.name, settings.job_lease_s, settings.job_attempts)
@@ -190,39 +228,38 @@ class Worker:
             except SQLAlchemyError as error:  # the next beat may succeed before the lease runs out
                 logger.warning("%s: no heartbeat of job %d: %s", self.name, context.lease.job_id, error)
 
-    def _outcome(self, context: Context, job: JobRow) -> Callable[[Session], None]:
-        """Run the handler; what is to be written of how it ended."""
+    def _ending(self, context: Context, job: JobRow) -> _Ending:
+        """Run the handler; how that ended."""
         lease, kind = context.lease, self.kinds[job.kind]
         try:
             result = kind.handler(context, kind.payload.model_validate(job.payload))
             arrays = None if result.arrays is None else pack(result.arrays)
-            return lambda session: jobs.finish(session, lease, result.figures, arrays)
+            return _Ending("done", lambda session: jobs.finish(session, lease, result.figures, arrays))
         except jobs.LeaseLostError:
             raise
         except CancelRequestedError:
-            return lambda session: jobs.stop(session, lease)
+            return _Ending("cancelled", lambda session: jobs.stop(session, lease))
         except WorkerStoppingError:
-            return lambda session: jobs.release(session, lease)
+            return _Ending("released", lambda session: jobs.release(session, lease))
         except (ModelError, ServiceError) as error:  # trying again would find the same
-            message = str(error)
-            return lambda session: jobs.fail(session, lease, message)
+            return _failed(lease, str(error))
         except ValidationError:
-            return lambda session: jobs.fail(session, lease, "its payload is not one that this version takes")
+            return _failed(lease, "its payload is not one that this version takes")
         except Exception as error:  # a handler's fault must end with its job, not with the worker
             logger.exception("%s: job %d failed in attempt %d", self.name, job.id, job.attempts)
             return self._after_fault(lease, job.attempts, error)
 
-    def _after_fault(self, lease: jobs.Lease, attempts: int, error: Exception) -> Callable[[Session], None]:
+    def _after_fault(self, lease: jobs.Lease, attempts: int, error: Exception) -> _Ending:
         """Try again later, or give up; the reason names the fault's type only, the log has the rest."""
         settings, fault = self.runtime.settings, type(error).__name__
         if attempts >= settings.job_attempts:
-            reason = (
-                f"failed {attempts} times, the last time by {fault}; the worker's log has more of job {lease.job_id}"
+            return _failed(
+                lease,
+                f"failed {attempts} times, the last time by {fault}; the worker's log has more of job {lease.job_id}",
             )
-            return lambda session: jobs.fail(session, lease, reason)
         delay = pause_s(attempts, settings.job_retry_s, self._random)
         reason = f"attempt {attempts} failed by {fault}; tried again in {delay:.0f} s"
-        return lambda session: jobs.retry(session, lease, reason, delay)
+        return _Ending("retried", lambda session: jobs.retry(session, lease, reason, delay))
 
     def _store(self, context: Context, write: Callable[[Session], None]) -> None:
         """Write how the job ended; while the database is away, again and again until the lease is lost."""
@@ -285,14 +322,16 @@ def work(settings: Settings, kinds: Kinds, operations: Operations | None = None)
     if not settings.job_workers:
         raise InvalidInputError("job_workers: 0 works at nothing; give --count or HELIOTWIN_JOB_WORKERS")
     logs.set_up(settings)
+    telemetry.set_up(settings, "heliotwin-worker")
     runtime = Runtime.from_settings(settings, operations)
     try:
         runtime.database.require_current()
         workers, stopping = Workers(runtime, kinds, settings.job_workers), threading.Event()
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: stopping.set())
-        workers.start()
-        stopping.wait()
-        workers.stop()
+        with listening(settings, PROCESS):
+            workers.start()
+            stopping.wait()
+            workers.stop()
     finally:
         runtime.close()

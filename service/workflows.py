@@ -22,6 +22,7 @@ from service.arrays import pack, unpack
 from service.faults import ConflictError, NotFoundError, TooLargeError
 from service.images import digest, media_type
 from service.keys import RESERVED
+from service.meters import PHOTOGRAPHS, REFUSALS
 from service.models import PlantModel
 from service.runtime import Operations, Runtime
 from service.store import NewImage, NewMeasurement, NewSurface
@@ -157,15 +158,30 @@ def ingest(runtime: Runtime, heliostat_name: str, photograph: Photograph, data: 
         known = store.find_measurement_of_image(session, heliostat, digest(data), photograph.kind)
         if known is not None:
             runtime.images.put(data)  # mends a file that the store has lost
+            PHOTOGRAPHS.labels("known").inc()
             return known, False
-    with runtime.computing() as operations:
+    with runtime.computing("measure") as operations:
         pixels = _decode(runtime, data)
         reading = _read(operations, pixels, photograph, plane)
     height, width = pixels.shape[:2]
     image = NewImage(runtime.images.put(data), kind_of_file, len(data), width, height)
     with runtime.database.writing() as session:
         heliostat = store.get_heliostat(session, heliostat_name)
-        return store.add_measurement(session, heliostat, _new_measurement(photograph, image, reading, session))
+        new = _new_measurement(photograph, image, reading, session)
+        row, is_new = store.add_measurement(session, heliostat, new)
+    _watch(runtime, heliostat_name, row, is_new)
+    return row, is_new
+
+
+def _watch(runtime: Runtime, heliostat_name: str, row: MeasurementRow, is_new: bool) -> None:
+    """Count a photograph that is stored, and hold it against the current twin."""
+    from service import drift  # late: it stands on this module
+
+    if is_new and row.accepted:
+        drift.judge(runtime, heliostat_name, row)
+    elif is_new:
+        REFUSALS.labels(row.reason or "unknown").inc()
+    PHOTOGRAPHS.labels(("accepted" if row.accepted else "refused") if is_new else "known").inc()
 
 
 # --- a surface --------------------------------------------------------------------------------------------------------
@@ -259,7 +275,7 @@ def predict_surface(
         chosen = _named_measurements(session, row, measurements)
         model = models.get_model(session, model_version)
     observations = [observation_of(measurement, origin) for measurement in chosen]
-    with runtime.computing() as operations:
+    with runtime.computing(f"predict_{method}") as operations:
         predicted = operations.predict(heliostat, observations, method, model.optics, model.effects)
     with runtime.database.writing() as session:
         row = store.get_heliostat(session, heliostat_name)
@@ -411,7 +427,7 @@ def _trace(
     model: PlantModel,
     latitude_deg: float,
 ) -> "Forecast":
-    with runtime.computing() as operations:
+    with runtime.computing("forecast") as operations:
         return operations.forecast(
             heliostat,
             z,
