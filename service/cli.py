@@ -17,6 +17,7 @@ from rich.table import Table
 from model.errors import InvalidInputError, ModelError
 from service.cli_keys import keys_app
 from service.cli_models import models_app
+from service.cli_recovery import backup, check, restore
 from service.faults import ServiceError
 from service.operations import Method
 from service.paint import MeasurementFolder, read_folder
@@ -275,14 +276,19 @@ def worker(
 
 
 @app.command()
-def migrate(as_json: AsJson = False) -> None:
-    """Bring the database to its newest schema."""
+def migrate(
+    to: Annotated[
+        str, typer.Option(help="An older revision to go back to; what only newer ones can hold is lost.")
+    ] = "head",
+    as_json: AsJson = False,
+) -> None:
+    """Bring the database to its newest schema, or back to an older one."""
     from service import server
     from service.settings import Settings
 
     settings = Settings()
     settings.data_dir.mkdir(parents=True, exist_ok=True)
-    report = {"revision": server.migrate(settings)}
+    report = {"revision": server.migrate(settings, to)}
     show(report, as_json)
     console.print(f"the schema stands at {report['revision']}", highlight=False)
 
@@ -299,6 +305,8 @@ def demo(
     show(run_demo(data, out, console, quiet=as_json), as_json)
 
 
+for _command in (backup, restore, check):
+    app.command()(_command)
 app.add_typer(keys_app)
 app.add_typer(models_app)
 

@@ -113,6 +113,10 @@ class Database:
         with self.engine.connect() as connection:
             return MigrationContext.configure(connection).get_current_revision()
 
+    def revisions(self) -> list[str]:
+        """All versions of the schema that this code knows, the oldest first."""
+        return [script.revision for script in ScriptDirectory.from_config(alembic_config()).walk_revisions()][::-1]
+
     def is_current(self) -> bool:
         """Whether the schema is at the newest version that this code knows."""
         return self.revision() == ScriptDirectory.from_config(alembic_config()).get_current_head()

@@ -5,6 +5,7 @@ from types import FrameType
 
 import uvicorn
 
+from model.errors import InvalidInputError
 from service import logs, telemetry
 from service.app import create_app
 from service.database import Database
@@ -58,11 +59,21 @@ def serve(settings: Settings) -> None:
         raise NotStartedError("the service could not start; the log above says why") from refusal
 
 
-def migrate(settings: Settings) -> str:
-    """Bring the store's schema to its newest version and return that version."""
+def migrate(settings: Settings, to: str = "head") -> str:
+    """Bring the store's schema to its newest version, or back to an older one, and return that version.
+
+    Raises
+    ------
+    InvalidInputError
+        Where this version knows no such revision.
+    """
     database = Database(settings.database)
     try:
-        database.upgrade()
+        known = database.revisions()
+        if to not in (*known, "head"):
+            raise InvalidInputError(f"--to {to}: must be head or one of {', '.join(known)}")
+        is_back = to != "head" and database.revision() in known[known.index(to) :]
+        (database.downgrade if is_back else database.upgrade)(to)
         return database.revision() or "base"
     finally:
         database.close()
