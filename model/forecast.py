@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from model.effects import JUELICH_LATITUDE, Effect, in_light_order
+from model.mount import Mount
 from model.plant import Heliostat, TargetPlane
 from model.surface import DEGREE
 from model.tracing import Optics, Scene, Window, trace
@@ -258,7 +259,7 @@ def _align_group(
 ) -> Group:
     """Align the shots of one kind."""
     group = [shots[row] for row in rows]
-    heliostats = _altered([shot.heliostat for shot in group], effects)
+    heliostats = altered([shot.heliostat for shot in group], effects)
     suns = np.array([shot.sun for shot in group], dtype=np.float64)
     for effect in effects:
         suns = effect.on_sun(suns, latitude_deg)
@@ -278,7 +279,7 @@ def _align_group(
     return Group(rows, planes, alter(scene.to(dtype)), angles, aims)
 
 
-def _altered(heliostats: Sequence[Heliostat], effects: Sequence[Effect]) -> list[Heliostat]:
+def altered(heliostats: Sequence[Heliostat], effects: Sequence[Effect]) -> list[Heliostat]:
     """The heliostats on their mounts as the effects leave them; one that comes twice stays one."""
     altered: dict[int, Heliostat] = {}
     for heliostat in heliostats:
@@ -292,12 +293,13 @@ def _altered(heliostats: Sequence[Heliostat], effects: Sequence[Effect]) -> list
 
 def _given_angles(shots: Sequence[Shot], heliostats: Sequence[Heliostat], suns: Array) -> Array:
     """Axis angles (B, 2) [rad] of shots without a spot: as given, or by the aim of the mirror's centre."""
-    return np.array(
-        [
-            shot.angles if shot.angles is not None else heliostat.mount.align(heliostat.position, sun, shot.goal)
-            for shot, heliostat, sun in zip(shots, heliostats, suns, strict=True)
-        ]
-    )
+    angles = np.array([(np.nan, np.nan) if shot.angles is None else shot.angles for shot in shots], dtype=np.float64)
+    aimed = [row for row, shot in enumerate(shots) if shot.angles is None]
+    if aimed:
+        mount = Mount.stack([heliostats[row].mount for row in aimed])
+        positions, goals = ([heliostats[row].position for row in aimed], [shots[row].goal for row in aimed])
+        angles[aimed] = mount.align(positions, suns[aimed], goals)
+    return angles
 
 
 def forecast_shots(

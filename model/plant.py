@@ -1,4 +1,4 @@
-"""What a plant is made of: facets, heliostats, target planes.
+"""What a plant is made of: facets, heliostats, target planes, receivers.
 
 Plain frozen data in numpy; the tracers turn it into batched tensors (`model.tracing.scene`).
 """
@@ -116,6 +116,18 @@ class Heliostat:
         return np.array([facet.position for facet in self.facets]), axes, half_sizes
 
 
+def _orient(surface: "TargetPlane | Cylinder", kind: str) -> None:
+    """Make ``normal`` and ``up`` unit vectors, ``up`` perpendicular to ``normal``, and check them and ``center``."""
+    normal, up = _vector(f"{kind} normal", surface.normal), _vector(f"{kind} up", surface.up)
+    normal = normal / max(float(np.linalg.norm(normal)), 1e-300)
+    up = up - (up @ normal) * normal
+    if np.linalg.norm(normal) < 0.5 or np.linalg.norm(up) < 1e-6:
+        raise InvalidInputError(f"{kind} {surface.name}: normal must not vanish and up must not be parallel to it")
+    object.__setattr__(surface, "center", _vector(f"{kind} center", surface.center))
+    object.__setattr__(surface, "normal", _vector(f"{kind} normal", normal))
+    object.__setattr__(surface, "up", _vector(f"{kind} up", up / np.linalg.norm(up)))
+
+
 @dataclass(frozen=True, eq=False)
 class TargetPlane:
     """A rectangle that light falls on: a calibration target, or any plane to forecast on.
@@ -142,14 +154,7 @@ class TargetPlane:
     def __post_init__(self) -> None:
         if not (0 < self.width < 1e4 and 0 < self.height < 1e4):
             raise InvalidInputError(f"target {self.name}: width and height must be positive metres")
-        normal, up = _vector("target normal", self.normal), _vector("target up", self.up)
-        normal = normal / max(float(np.linalg.norm(normal)), 1e-300)
-        up = up - (up @ normal) * normal
-        if np.linalg.norm(normal) < 0.5 or np.linalg.norm(up) < 1e-6:
-            raise InvalidInputError(f"target {self.name}: normal must not vanish and up must not be parallel to it")
-        object.__setattr__(self, "center", _vector("target center", self.center))
-        object.__setattr__(self, "normal", _vector("target normal", normal))
-        object.__setattr__(self, "up", _vector("target up", up / np.linalg.norm(up)))
+        _orient(self, "target")
 
     @classmethod
     def from_corners(
@@ -188,6 +193,66 @@ class TargetPlane:
 
 
 @dataclass(frozen=True, eq=False)
+class Cylinder:
+    """A receiver that is a part of a cylinder, or all of it, lit from outside.
+
+    Its map is the surface unrolled: rows along the axis, columns over the angle, evenly.
+
+    Attributes
+    ----------
+    name : str
+    center : (3,) [m]
+        The middle of the lit surface, in ENU; the axis runs ``radius`` behind it.
+    normal : (3,)
+        Unit normal there, away from the axis.
+    up : (3,)
+        Unit vector along the axis, upwards in the map; made perpendicular to ``normal``.
+    radius, height : float [m]
+    opening_deg : float [deg]
+        The angle that the lit surface spans, half of it to each side of the middle; 360 all around.
+    """
+
+    name: str
+    center: Vector
+    normal: Vector
+    up: Vector
+    radius: float
+    height: float
+    opening_deg: float = 360.0
+
+    def __post_init__(self) -> None:
+        if not (0 < self.radius < 1e3 and 0 < self.height < 1e4):
+            raise InvalidInputError(f"receiver {self.name}: radius and height must be positive metres")
+        if not 0 < self.opening_deg <= 360:
+            raise InvalidInputError(f"receiver {self.name}: opening_deg must lie in (0, 360], got {self.opening_deg}")
+        _orient(self, "receiver")
+
+    @property
+    def right(self) -> Vector:
+        """Unit vector along the map's columns at its middle."""
+        return np.asarray(np.cross(self.up, self.normal))
+
+    @property
+    def width(self) -> float:
+        """Length of the lit arc [m]."""
+        return float(np.radians(self.opening_deg)) * self.radius
+
+    def tangent(self, angle: float, left: float, right: float) -> TargetPlane:
+        """The plane that touches the surface at ``angle`` [rad] from its middle, positive rightwards.
+
+        It reaches ``left`` and ``right`` [m] from the line where it touches.
+        """
+        normal = np.cos(angle) * self.normal + np.sin(angle) * self.right
+        touched = self.center + self.radius * (normal - self.normal)
+        aside = (right - left) / 2 * np.cross(self.up, normal)
+        return TargetPlane(self.name, touched + aside, normal, self.up, left + right, self.height)
+
+
+Receiver = TargetPlane | Cylinder
+"""What a field's light falls on."""
+
+
+@dataclass(frozen=True, eq=False)
 class Plant:
     """A tower with its heliostats and targets; ``origin`` (3,) is the tower base in WGS84 [deg, deg, m]."""
 
@@ -195,6 +260,7 @@ class Plant:
     origin: Vector
     targets: dict[str, TargetPlane] = field(default_factory=dict)
     heliostats: dict[str, Heliostat] = field(default_factory=dict)
+    receivers: dict[str, Cylinder] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "origin", _vector("plant origin", self.origin))

@@ -68,6 +68,8 @@ def _rays(
     facets = points[index].double().numpy()
     sun = _unit(suns[index].double().numpy())
     slope_error, jitter = (_sigma(v, scene, index) for v in (optics.slope_error, optics.tracking_jitter))
+    inside = scene.obstacles_in_plane()
+    obstacles = np.zeros((0, 3, 3)) if inside is None else inside[index].double().numpy()
     shares = rng.multinomial(count, np.full(len(facets), 1 / len(facets)))
     for facet, share in enumerate(shares):
         place, area = _mirror_points(np.moveaxis(facets[facet], 0, -1), scene.degree, share, rng)
@@ -83,6 +85,7 @@ def _rays(
             tilt = rng.normal(0, slope_error, (2, share, 1))
             normal = _unit(normal + tilt[0] * first + tilt[1] * second)
         out = 2 * (normal * toward_sun).sum(axis=-1, keepdims=True) * normal - toward_sun
+        weight = weight * _free(obstacles, place, toward_sun) * _free(obstacles, place, out)
         distance = -place[:, 2] / out[:, 2]
         hits = place[:, :2] + distance[:, None] * out[:, :2]
         ahead = (distance > 0) & (out[:, 2] < 0)
@@ -105,6 +108,18 @@ def _seen(scene: Scene, index: int, facet: int, place: Array) -> Array:
         upwards = turn @ scene.attitude[index, :, 1].double().numpy()
         share *= (place - center) @ upwards >= float(scene.blocked_below[index])
     return share
+
+
+def _free(obstacles: Array, place: Array, direction: Array) -> NDArray[np.bool_]:
+    """Which rays (n,) from points (n, 3) along directions (n, 3) meet no rectangle of ``obstacles`` (K, 3, 3)."""
+    free = np.ones(len(place), dtype=bool)
+    for center, right, up in obstacles:
+        normal = np.cross(right, up)
+        distance = (center - place) @ normal / (direction @ normal)
+        meets = place + distance[:, None] * direction - center
+        inside = (np.abs(meets @ right) < right @ right) & (np.abs(meets @ up) < up @ up)
+        free &= ~(inside & (distance > 0))
+    return free
 
 
 def _swung(scene: Scene, index: int, place: Array, area: Array, angle: Array) -> tuple[Array, Array]:

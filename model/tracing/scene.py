@@ -117,6 +117,8 @@ class Scene:
         The mount's first axis in ENU, about which tracking jitter turns the mirror.
     blocked_below : Tensor (B,) or None [m]
         Mirror y below which a neighbour takes the light away; None for free mirrors.
+    obstacles : Tensor (B, K, 3, 3) or None [m]
+        Rectangles in ENU, centre and half sides, that shade and block the mirrors (`model.neighbours`).
     """
 
     control_points: Tensor
@@ -129,6 +131,7 @@ class Scene:
     facet_reflectivity: Tensor | None = None
     first_axis: Tensor | None = None
     blocked_below: Tensor | None = None
+    obstacles: Tensor | None = None
 
     @classmethod
     def build(
@@ -209,3 +212,11 @@ class Scene:
         points = torch.einsum("bij,bfjuv->bfiuv", turn, self.control_points.expand(self.batch, -1, -1, -1, -1))
         sun = torch.einsum("bij,bj->bi", self.plane_axes, self.sun)
         return points + center[:, None, :, None, None], sun
+
+    def obstacles_in_plane(self) -> Tensor | None:
+        """Obstacles (B, K, 3, 3) [m] in the frame of each target plane."""
+        if self.obstacles is None:
+            return None
+        origin = torch.zeros_like(self.obstacles)
+        origin[..., 0, :] = self.plane_center[:, None]
+        return (self.obstacles - origin) @ self.plane_axes.transpose(-1, -2)[:, None]

@@ -1,0 +1,357 @@
+"""The light of a whole field on one receiver.
+
+Heliostats come in tiles, which an `Engine` works at in any number of threads or machines; what a tile gives is one map,
+so that memory does not grow with the field::
+
+    task = Superposition(receiver, resolution=(128, 128), optics=optics, effects=effects)
+    total = superpose(task, tiles(shots), Threads(2))
+
+Forecasts for a receiver are light in W/m2: effects of the camera, of stage "image", say how a photograph differs from
+the light and do not act here. Where neighbours are given (`model.neighbours`), their shadows are traced, and the
+effect `blocking`, which stands for their mean, does not act either.
+
+Approximation: the cone of the sun is taken at each mirror's centre. A cylinder is traced on planes
+that touch it.
+"""
+
+import math
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field, replace
+from itertools import islice
+from typing import Protocol, Self, TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from model.effects import JUELICH_LATITUDE, Effect
+from model.effects.blocking import Blocking
+from model.errors import ModelError, UnreachableError
+from model.forecast import Shot, align, altered
+from model.neighbours import Neighbours, outlines
+from model.plant import Cylinder, Heliostat, Receiver, TargetPlane
+from model.sunshape import transfer_table
+from model.tracing import Optics, Scene, Window
+from model.tracing.convolution import superpose as superpose_scene
+
+Array = NDArray[np.float64]
+Item = TypeVar("Item")
+Made = TypeVar("Made")
+Pending = TypeVar("Pending")
+
+
+class _Items(Protocol):
+    """What can be halved."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, part: slice) -> Self: ...
+
+
+Some = TypeVar("Some", bound=_Items)
+
+TILE = 32
+"""Heliostats of a tile: some milliseconds' work each, which is much against what handing a tile over costs."""
+
+STEP_DEG = 6.0
+"""Most [deg] between the planes that stand for a cylinder: they leave it by no more than 0.6 % of the radius."""
+
+# Pixels of maps that are traced at a time; each takes some 100 bytes, those beyond the edges included.
+_PIXELS = 2**20
+# Half angle [rad] of the cone in which light is followed beyond a map's edge: the sun's disc and the usual errors.
+_CONE = 8e-3
+# Cosine to a plane's normal below which light that grazes it is left out.
+_GRAZING = 0.02
+
+
+# --- one tile ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Tile:
+    """Some heliostats of a field.
+
+    Attributes
+    ----------
+    shots : sequence of Shot
+        Before one sun; their planes are of no account, their aims are.
+    obstacles : (B, K, 3, 3) [m] or None
+        The neighbours in the way of each, as `Neighbours.obstacles` gives them; None: nothing is.
+    """
+
+    shots: Sequence[Shot]
+    obstacles: Array | None = None
+
+    def __getitem__(self, part: slice) -> "Tile":
+        return Tile(self.shots[part], None if self.obstacles is None else self.obstacles[part])
+
+    def __len__(self) -> int:
+        return len(self.shots)
+
+
+@dataclass(frozen=True, eq=False)
+class FleetFlux:
+    """Superposed light.
+
+    Attributes
+    ----------
+    irradiance : (rows, columns) [W/m2]
+        Row 0 at the top; on a cylinder unrolled, even in height and angle.
+    power : float [W]
+        What the mirrors throw towards the receiver, whether it lands there or not.
+    heliostats : int
+        How many are in it.
+    skipped : dict
+        The reason why a heliostat is not, by its name.
+    """
+
+    irradiance: Array
+    power: float = 0.0
+    heliostats: int = 0
+    skipped: dict[str, str] = field(default_factory=dict)
+
+    def __add__(self, other: "FleetFlux") -> "FleetFlux":
+        return FleetFlux(
+            self.irradiance + other.irradiance,
+            self.power + other.power,
+            self.heliostats + other.heliostats,
+            self.skipped | other.skipped,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Superposition:
+    """What is to be made of every tile: call it with one.
+
+    Attributes
+    ----------
+    receiver : TargetPlane or Cylinder
+    resolution : (rows, columns)
+    optics : Optics
+    effects : tuple of Effect
+    latitude_deg : float [deg]
+        Of the plant.
+    samples : int
+        Points along each side of each facet.
+    """
+
+    receiver: Receiver
+    resolution: tuple[int, int] = (256, 256)
+    optics: Optics = field(default_factory=Optics)
+    effects: tuple[Effect, ...] = ()
+    latitude_deg: float = JUELICH_LATITUDE
+    samples: int = 16
+
+    def __call__(self, tile: Tile) -> FleetFlux:
+        """The light of a tile; heliostats that cannot send any there are skipped by name."""
+        total = FleetFlux(np.zeros(self.resolution))
+        for part, made in in_parts(self._trace, tile):
+            if isinstance(made, ModelError):
+                made = FleetFlux(np.zeros(self.resolution), skipped={part.shots[0].heliostat.name: str(made)})
+            total = total + made
+        return total
+
+    def _trace(self, tile: Tile) -> FleetFlux:
+        acting = [effect for effect in self.effects if effect.stage != "image"]
+        if tile.obstacles is not None:
+            acting = [effect for effect in acting if not isinstance(effect, Blocking)]
+        optics = self.optics
+        for effect in acting:
+            optics = effect.on_optics(optics)
+        table = transfer_table(optics.sun_shape, torch.float32, torch.device("cpu"))
+        flux, power = torch.zeros(self.resolution, dtype=torch.float64), 0.0
+        with torch.no_grad():
+            for group in align(tile.shots, acting, latitude_deg=self.latitude_deg).groups:
+                scene = group.scene
+                if tile.obstacles is not None:
+                    scene = scene.with_(obstacles=torch.as_tensor(tile.obstacles[group.rows]).to(scene.sun))
+                for image, thrown in self._images(scene, group.aims, optics, table):
+                    flux += image
+                    power += thrown
+        return FleetFlux(flux.numpy(), power, len(tile))
+
+    def _images(self, scene: Scene, aims: Array, optics: Optics, table: Tensor) -> Iterator[tuple[Tensor, float]]:
+        """Maps (rows, columns) [W/m2] and power [W], of as many mirrors at a time as memory is meant for."""
+        step = max(1, _PIXELS // (self.resolution[0] * self.resolution[1]))
+        for start in range(0, scene.batch, step):
+            rows = list(range(start, min(start + step, scene.batch)))
+            part = scene.subset(rows), aims[rows], optics, table
+            if isinstance(self.receiver, Cylinder):
+                image, power = self._on_cylinder(self.receiver, *part)
+            else:
+                image, power = self._on_plane(self.receiver, self.resolution[1], *part)
+            yield image, float(power.sum())
+
+    def _on_plane(
+        self, plane: TargetPlane, columns: int, scene: Scene, aims: Array, optics: Optics, table: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Map (rows, columns) [W/m2] and power (B,) [W] on a plane that takes the place of the scene's own."""
+        scene = scene.with_(
+            plane_center=torch.tensor(plane.center).to(scene.sun).expand(scene.batch, 3),
+            plane_axes=torch.tensor(plane.axes).to(scene.sun).expand(scene.batch, 3, 3),
+        )
+        directions, ranges = _beams(scene, aims)
+        beyond = float((ranges * _CONE / -(directions @ plane.normal).clip(max=-0.25)).max())
+        padding = max(0.1, beyond / plane.height), max(0.1, beyond / plane.width)
+        window = Window.of(plane, self.resolution[0], columns)
+        return superpose_scene(scene, window, optics, samples=self.samples, padding=padding, table=table)
+
+    def _on_cylinder(
+        self, cylinder: Cylinder, scene: Scene, aims: Array, optics: Optics, table: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Unrolled map (rows, columns) [W/m2] and power (B,) [W], plane by plane."""
+        image, power = torch.zeros(self.resolution), torch.zeros(scene.batch)
+        directions, seen = _beams(scene, aims)[0], np.zeros(scene.batch, dtype=bool)
+        for columns, shares, plane in tangents(cylinder, self.resolution[1]):
+            before = (scene.center.double().numpy() - plane.center) @ plane.normal > 0
+            lighting = np.flatnonzero(before & (directions @ plane.normal < -_GRAZING)).tolist()
+            if lighting:
+                lit = scene.subset(lighting), aims[lighting], optics, table
+                part, thrown = self._on_plane(plane, len(shares), *lit)
+                image[:, columns] += part * shares
+                power[lighting] = torch.maximum(power[lighting], thrown)
+                seen[lighting] = True
+        if not seen.all():
+            raise UnreachableError(
+                "a mirror stands behind the lit part of the receiver; leave it out or aim it elsewhere"
+            )
+        return image, power
+
+
+def _beams(scene: Scene, aims: Array) -> tuple[Array, Array]:
+    """Unit vectors (B, 3) from the mirrors to their aims (B, 3) [m], and the distances (B,) [m]."""
+    outgoing = aims - scene.center.double().numpy()
+    ranges = np.linalg.norm(outgoing, axis=1)
+    return outgoing / ranges[:, None], ranges
+
+
+def tangents(cylinder: Cylinder, columns: int) -> Iterator[tuple[slice, Tensor, TargetPlane]]:
+    """Planes that touch a cylinder, each with the columns of the map about it and its share (n,) in them.
+
+    Between the lines where two planes touch, their light is blended in proportion: the cosine of incidence goes from
+    column to column as it does on the cylinder.
+    """
+    step = np.radians(cylinder.opening_deg) / columns
+    count = min(columns, math.ceil(cylinder.opening_deg / STEP_DEG))
+    edges = np.linspace(0, columns, count + 1).round().astype(int)
+    for index, edge in enumerate(edges):
+        first, last = edges[max(index - 1, 0)], edges[min(index + 1, count)]
+        middles = np.arange(first, last) + 0.5
+        shares = np.interp(middles, edges, np.eye(count + 1)[index])
+        left, right = (edge - first) * step * cylinder.radius, (last - edge) * step * cylinder.radius
+        plane = cylinder.tangent((edge - columns / 2) * step, left, right)
+        yield slice(first, last), torch.as_tensor(shares, dtype=torch.float32), plane
+
+
+def in_parts(work: Callable[[Some], Made], items: Some) -> Iterator[tuple[Some, Made | ModelError]]:
+    """What ``work`` makes of items; halved where it fails, until those that it fails for stand alone with the error."""
+    try:
+        made: Made | ModelError = work(items)
+    except ModelError as error:
+        made = error
+    if not isinstance(made, ModelError) or len(items) == 1:
+        yield items, made
+    else:
+        half = len(items) // 2
+        yield from in_parts(work, items[:half])
+        yield from in_parts(work, items[half:])
+
+
+# --- the whole field --------------------------------------------------------------------------------------------------
+
+
+class Engine(Protocol):
+    """Works at items, in threads, processes or machines."""
+
+    def map(self, work: Callable[[Item], Made], items: Iterable[Item]) -> Iterator[Made]:
+        """What ``work`` makes of the items, in their order; no more than a few of them are drawn ahead."""
+
+
+def in_order(
+    submit: Callable[[Item], Pending], items: Iterable[Item], ahead: int, result: Callable[[Pending], Made]
+) -> Iterator[Made]:
+    """Results in the items' order, while up to ``ahead`` of them are under way."""
+    pending: deque[Pending] = deque()
+    for item in items:
+        pending.append(submit(item))
+        if len(pending) >= ahead:
+            yield result(pending.popleft())
+    while pending:
+        yield result(pending.popleft())
+
+
+@dataclass(frozen=True, eq=False)
+class Threads:
+    """The engine of one machine; PyTorch leaves Python's lock while it computes.
+
+    Attributes
+    ----------
+    count : int
+    turn : callable
+        Gives what each piece of work is done within: a place in a queue for the processor, say.
+    """
+
+    count: int = 2
+    turn: Callable[[], AbstractContextManager[object]] = nullcontext
+
+    def map(self, work: Callable[[Item], Made], items: Iterable[Item]) -> Iterator[Made]:
+        """As `Engine.map`."""
+
+        def one(item: Item) -> Made:
+            with self.turn():
+                return work(item)
+
+        with ThreadPoolExecutor(self.count) as pool:
+            yield from in_order(lambda item: pool.submit(one, item), items, 2 * self.count, Future.result)
+
+
+def tiles(shots: Iterable[Shot], neighbours: Neighbours | None = None, size: int = TILE) -> Iterator[Tile]:
+    """Tiles of ``size`` heliostats, with what of the neighbours stands in their way."""
+    remaining = iter(shots)
+    while some := list(islice(remaining, size)):
+        yield tile_of(some, neighbours)
+
+
+def tile_of(shots: Sequence[Shot], neighbours: Neighbours | None = None) -> Tile:
+    """One tile; what is none of the neighbours, because it cannot be aimed, is skipped when it is traced."""
+    if neighbours is None:
+        return Tile(shots)
+    return Tile(shots, neighbours.obstacles([shot.heliostat.name for shot in shots]))
+
+
+def standing(
+    field: Iterable[tuple[Heliostat, ArrayLike]],
+    sun: ArrayLike,
+    effects: Iterable[Effect] = (),
+    latitude_deg: float = JUELICH_LATITUDE,
+) -> Neighbours:
+    """The mirrors of heliostats with their aims (3,) [m] under the recorded ``sun`` (3,).
+
+    Those whose mounts cannot turn there are left out.
+    """
+    acting = list(effects)
+    true_sun = np.asarray(sun, dtype=np.float64)[None]
+    for effect in acting:
+        true_sun = effect.on_sun(true_sun, latitude_deg)
+
+    def stand(part: Sequence[tuple[Heliostat, ArrayLike]]) -> tuple[list[str], Array, Array]:
+        heliostats, aims = [one for one, _ in part], np.array([aim for _, aim in part], dtype=np.float64)
+        return [one.name for one in heliostats], outlines(altered(heliostats, acting), true_sun[0], aims), aims
+
+    remaining, found = iter(field), []
+    while some := list(islice(remaining, TILE)):
+        found += [made for _, made in in_parts(stand, some) if not isinstance(made, ModelError)]
+    return Neighbours.standing(found, true_sun[0])
+
+
+def superpose(task: Superposition, parts: Iterable[Tile], engine: Engine | None = None) -> FleetFlux:
+    """The light of all tiles on the task's receiver; the same to the last bit whatever the engine."""
+    total = FleetFlux(np.zeros(task.resolution))
+    for part in (engine or Threads()).map(task, parts):
+        total = total + part
+    # Frequency space leaves ripples of some 1e-5 of the peak below zero.
+    return replace(total, irradiance=total.irradiance.clip(min=0))
