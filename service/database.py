@@ -19,6 +19,9 @@ from service.faults import SchemaError
 # Seconds that a writer waits for another on SQLite, and that a connection to PostgreSQL may take.
 _PATIENCE_S = 15
 
+# A PostgreSQL server that vanished without a word is given up after about a minute, not after the system's two hours.
+_ALIVE = {"keepalives_idle": 30, "keepalives_interval": 10, "keepalives_count": 3, "tcp_user_timeout": 60_000}
+
 # Beyond the five that are kept open; together they are enough for the 40 threads that Starlette runs routes in, those
 # that ask for keys, follow jobs and check readiness, and a few workers with their heartbeats.
 _MORE_CONNECTIONS = 64
@@ -53,7 +56,7 @@ def _prepare_sqlite(engine: Engine) -> None:
 def make_engine(url: URL) -> Engine:
     """A connection pool for ``url``; SQLite with write-ahead log, durable commits and foreign keys."""
     if url.get_backend_name() != "sqlite":
-        connect = {"connect_timeout": _PATIENCE_S}
+        connect = {"connect_timeout": _PATIENCE_S, **_ALIVE}
         return create_engine(url, pool_pre_ping=True, connect_args=connect, max_overflow=_MORE_CONNECTIONS)
     if url.database:
         Path(url.database).parent.mkdir(parents=True, exist_ok=True)

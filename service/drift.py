@@ -14,7 +14,7 @@ from service import models, store
 from service.arrays import unpack
 from service.meters import ACCURACY
 from service.runtime import Runtime
-from service.tables import DriftRow, MeasurementRow, SurfaceRow, now
+from service.tables import DriftRow, MeasurementRow, SurfaceRow
 from service.workflows import load_heliostat, observation_of
 
 logger = logging.getLogger("heliotwin.service")
@@ -38,7 +38,7 @@ def judge(runtime: Runtime, heliostat: str, measurement: MeasurementRow) -> floa
 def _judge(runtime: Runtime, name: str, measurement: MeasurementRow) -> float | None:
     with runtime.database.reading() as session:
         row = store.get_heliostat(session, name)
-        surface = store.find_surface_at(session, row, now())
+        surface = store.find_surface_at(session, row)
         if surface is None:
             return None
         heliostat, origin = load_heliostat(session, row), store.get_plant(session).origin

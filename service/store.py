@@ -507,16 +507,22 @@ def find_measured_surface(session: Session, heliostat: HeliostatRow) -> SurfaceR
     return session.scalar(query.order_by(SurfaceRow.version.desc()).limit(1).options(undefer(SurfaceRow.arrays)))
 
 
-def find_surface_at(session: Session, heliostat: HeliostatRow, moment: datetime) -> SurfaceRow | None:
-    """The version, with its arrays, that was valid at ``moment``: the last to begin before it, or None."""
-    query = _surfaces(heliostat).where(SurfaceRow.valid_from <= moment)
+def find_surface_at(session: Session, heliostat: HeliostatRow, moment: datetime | None = None) -> SurfaceRow | None:
+    """The version, with its arrays, that was valid at ``moment``: the last to begin before it, or None.
+
+    Without a moment the last of all: what begins a little ahead, because a camera's clock is ahead of ours or ours was
+    set back, is current too.
+    """
+    query = _surfaces(heliostat)
+    if moment is not None:
+        query = query.where(SurfaceRow.valid_from <= moment)
     query = query.order_by(SurfaceRow.valid_from.desc(), SurfaceRow.version.desc()).limit(1)
     return session.scalar(query.options(undefer(SurfaceRow.arrays)))
 
 
 def get_surface_at(session: Session, heliostat: HeliostatRow, moment: datetime | None = None) -> SurfaceRow:
     """The version valid at ``moment``, by default now; NotFoundError where there is none."""
-    row = find_surface_at(session, heliostat, moment or now())
+    row = find_surface_at(session, heliostat, moment)
     if row is None:
         when = f"at {moment.isoformat()}" if moment else "yet"
         raise NotFoundError(f"heliostat {heliostat.name} has no surface {when}; POST to its surfaces to predict one")

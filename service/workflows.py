@@ -7,7 +7,7 @@ them.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from datetime import datetime
+from datetime import datetime, timedelta
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,7 +26,7 @@ from service.meters import PHOTOGRAPHS, REFUSALS
 from service.models import PlantModel
 from service.runtime import Operations, Runtime
 from service.store import NewImage, NewMeasurement, NewSurface
-from service.tables import ForecastRow, HeliostatRow, MeasurementRow, SurfaceRow
+from service.tables import ForecastRow, HeliostatRow, MeasurementRow, SurfaceRow, now
 
 if TYPE_CHECKING:  # see `service.runtime`
     from model.imaging import ImageKind
@@ -36,6 +36,9 @@ if TYPE_CHECKING:  # see `service.runtime`
 # The newest measurements, this many times as many as are wanted, stand for the mirror's present state; those that
 # are used are chosen among them for variety of the sun's position.
 _RECENT = 4
+
+# How far a camera's clock may be ahead of ours.
+_AHEAD = timedelta(days=1)
 
 
 def load_heliostat(session: Session, row: HeliostatRow) -> Heliostat:
@@ -137,6 +140,15 @@ def _new_measurement(photograph: Photograph, image: NewImage, reading: _Reading,
     )
 
 
+def _require_past(taken_at: datetime | None) -> None:
+    """A surface from a photograph of next year would stay the current one until then."""
+    if taken_at is not None and taken_at > now() + _AHEAD:
+        raise InvalidInputError(
+            f"taken_at: {taken_at.isoformat()} lies ahead of this machine's {now().isoformat(timespec='seconds')}; "
+            "set the clock that is wrong and post it again"
+        )
+
+
 def ingest(runtime: Runtime, heliostat_name: str, photograph: Photograph, data: bytes) -> tuple[MeasurementRow, bool]:
     """Measure and keep a photograph; the second value is False where it was there already.
 
@@ -147,11 +159,12 @@ def ingest(runtime: Runtime, heliostat_name: str, photograph: Photograph, data: 
     NotFoundError
         Where the heliostat or the target is not stored.
     InvalidInputError, UnsupportedImageError, TooLargeError
-        Where the file is no image that can be decoded safely; it is not kept.
+        Where the file is no image that can be decoded safely, or was taken in the future; it is not kept.
     ConflictError
         Where the external id belongs to another image of the same kind.
     """
     kind_of_file = media_type(data)
+    _require_past(photograph.taken_at)
     with runtime.database.reading() as session:
         heliostat = store.get_heliostat(session, heliostat_name)
         plane = store.target_plane(store.get_target(session, photograph.target_name))

@@ -174,7 +174,7 @@ def _current_surfaces(session: Session) -> dict[int, Current]:
         SurfaceRow.misfit,
     )
     # In this order the current one of each heliostat comes last and stays.
-    query = query.where(SurfaceRow.valid_from <= now()).order_by(SurfaceRow.valid_from, SurfaceRow.version)
+    query = query.order_by(SurfaceRow.valid_from, SurfaceRow.version)
     return {row.heliostat_id: Current(*row[1:]) for row in session.execute(query)}
 
 

@@ -151,7 +151,7 @@ def get_heliostat_page(
     """A heliostat with its current surface, or an earlier ``version``."""
     with runtime.database.reading() as session:
         row = store.get_heliostat(session, name)
-        today = store.find_surface_at(session, row, now())
+        today = store.find_surface_at(session, row)
         surface = today if version is None else store.get_surface(session, row, version)
         listed = versions(_newest_surfaces(session, row))
         photographs = _newest_photographs(session, row)

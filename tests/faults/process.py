@@ -1,0 +1,45 @@
+"""The service or a worker on a stand-in for the model: ``python -m tests.faults.process serve|worker``.
+
+The faults are real, the model is not: it answers at once, and predictions take as long as they are told. The clock is
+the machine's, moved by as many seconds as the file ``HELIOTWIN_FAULTS_CLOCK`` says.
+"""
+
+import os
+import sys
+import time
+from datetime import datetime, timedelta, tzinfo
+from pathlib import Path
+from typing import Any
+
+from service import runtime, server, tables
+from service.handlers import KINDS
+from service.settings import Settings
+from service.workers import work
+from tests.service.conftest import FakeOperations
+
+
+class SlowOperations(FakeOperations):
+    """Takes its time for a prediction."""
+
+    def predict(self, *arguments: Any, **options: Any) -> Any:
+        time.sleep(float(os.environ.get("HELIOTWIN_FAULTS_PAUSE_S", "0")))
+        return super().predict(*arguments, **options)
+
+
+class ShiftedClock(datetime):
+    """What `service.tables.now`, from which all of the service has the time, asks."""
+
+    @classmethod
+    def now(cls, tz: tzinfo | None = None) -> datetime:  # type: ignore[override]
+        file = os.environ.get("HELIOTWIN_FAULTS_CLOCK")
+        offset_s = float(Path(file).read_text() or 0) if file and Path(file).is_file() else 0.0
+        return datetime.now(tz) + timedelta(seconds=offset_s)
+
+
+if __name__ == "__main__":
+    tables.datetime = ShiftedClock  # type: ignore[misc]
+    runtime.load_operations = SlowOperations  # type: ignore[assignment]
+    if sys.argv[1] == "worker":
+        work(Settings(), KINDS)
+    else:
+        server.serve(Settings())
