@@ -28,7 +28,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from model.effects import JUELICH_LATITUDE, Effect
+from model.effects import JUELICH_LATITUDE, Effect, of_light
 from model.effects.blocking import Blocking
 from model.errors import ModelError, UnreachableError
 from model.forecast import Shot, align, altered
@@ -156,7 +156,7 @@ class Superposition:
         return total
 
     def _trace(self, tile: Tile) -> FleetFlux:
-        acting = [effect for effect in self.effects if effect.stage != "image"]
+        acting = of_light(self.effects)
         if tile.obstacles is not None:
             acting = [effect for effect in acting if not isinstance(effect, Blocking)]
         optics = self.optics

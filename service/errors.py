@@ -93,6 +93,8 @@ def problem(
 def _field(location: Sequence[int | str]) -> str:
     """A field's name without the part of the request that it stands in."""
     inner = location[1:] if location and location[0] in ("body", "path", "query", "header") else location
+    # Where a body may be one of several, the alternative that was taken stands in brackets.
+    inner = [part for part in inner if not str(part).startswith("(")]
     return ".".join(str(part) for part in inner) or "body"
 
 

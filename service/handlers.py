@@ -4,23 +4,26 @@ A new kind is its payload, its function and one line in `KINDS`; its route, its 
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 from sqlalchemy import select
+from sqlalchemy.orm import Session
 
 from model.errors import InvalidInputError, ModelError
-from model.plant import TargetPlane
+from model.frames import sun_direction
+from model.plant import Receiver
 from service import models, store
 from service.faults import ConflictError, ServiceError
 from service.runtime import Runtime
-from service.schemas import Method, Model, ModelVersion, Moment, Name, Plane, Position, Resolution, Sun
+from service.schemas import Method, Model, ModelVersion, Moment, Name, Plane, Position, ReceiverIn, Resolution, Sun
 from service.studies import StudyRequest, Surfaces, study_row, study_store
 from service.tables import HeliostatRow
 from service.workers import Context, Kind, Kinds, Result
-from service.workflows import ForecastRequest, Traced, plane_as_json, predict_surface, trace_request
+from service.workflows import predict_surface, receiver_as_json
 
 Heliostats = Annotated[
     list[Name] | None, Field(min_length=1, max_length=20_000, description="Names of heliostats; all without it.")
@@ -97,14 +100,26 @@ def _predict_step(context: Context, payload: PredictionsIn, name: str, model_ver
 
 
 class FleetForecastIn(Model):
-    """Superpose the flux of many heliostats on one plane."""
+    """Superpose the flux of many heliostats on one receiver: a plane, or a cylinder unrolled.
+
+    It is light in W/m2: effects that the model has of the camera do not act.
+    """
 
     heliostats: Heliostats = None
-    target: Name | None = Field(default=None, description="A stored target; either this or `plane`.")
-    plane: Plane | None = Field(default=None, description="Any plane; either this or `target`.")
+    target: Name | None = Field(
+        default=None, description="A stored target or receiver; either this, `plane` or `receiver`."
+    )
+    plane: Plane | None = Field(default=None, description="Any plane; either this, `target` or `receiver`.")
+    receiver: ReceiverIn | None = Field(default=None, description="Any cylinder; either this, `target` or `plane`.")
     sun: Sun
     aim_point: Position | None = Field(
-        default=None, description="Where all heliostats aim [m]; by default the plane's centre."
+        default=None, description="Where all heliostats aim [m]; by default the receiver's middle."
+    )
+    aim_points: dict[Name, Position] = Field(
+        default_factory=dict, max_length=20_000, description="Where single heliostats aim instead [m], by name."
+    )
+    neighbours: bool = Field(
+        default=True, description="Whether the mirrors of these heliostats shade and block each other."
     )
     surface: Literal["current", "ideal"] = Field(
         default="current", description="The heliostats' current surfaces, where one has none it is skipped; or ideal."
@@ -115,53 +130,52 @@ class FleetForecastIn(Model):
 
     @model_validator(mode="after")
     def _one(self) -> Self:
-        if (self.target is None) == (self.plane is None):
-            raise ValueError("give either target or plane")
+        if sum(value is not None for value in (self.target, self.plane, self.receiver)) != 1:
+            raise ValueError("give either target or plane, or receiver")
         return self
 
-    def request(self, name: str, model_version: int) -> ForecastRequest:
-        """The same for one heliostat."""
-        return ForecastRequest(
-            heliostat=name,
-            sun_azimuth_deg=self.sun.azimuth_deg,
-            sun_elevation_deg=self.sun.elevation_deg,
-            target=self.target,
-            plane=None if self.plane is None else self.plane.named("plane"),
-            aim=self.aim_point,
-            surface=self.surface,
-            dni=self.dni_w_m2,
-            resolution=self.resolution,
-            model_version=model_version,
-        )
+    def on(self, session: Session) -> Receiver:
+        """What the light falls on."""
+        if self.plane is not None:
+            return self.plane.named("plane")
+        if self.receiver is not None:
+            return self.receiver.named("receiver")
+        assert self.target is not None  # the schema wants one of the three
+        return store.get_target_or_receiver(session, self.target)
 
 
-def forecast_fleet(context: Context, payload: FleetForecastIn) -> Result:
-    """The sum of the heliostats' flux maps [W/m2]; nobody's light is blocked by a neighbour."""
+def forecast_field(context: Context, payload: FleetForecastIn) -> Result:
+    """The sum of the heliostats' flux maps [W/m2]."""
+    from service.fleet import Fleet, forecast_fleet  # late: they bring the tracer's libraries with them
+
     names = _names(context.runtime, payload.heliostats)
-    version = _model_number(context.runtime, payload.model_version)
-    flux = np.zeros(payload.resolution)
-    skipped: dict[str, str] = {}
-    traced: Traced | None = None
-    for index, name in enumerate(names):
-        context.report(index / len(names), name)
-        try:
-            traced = trace_request(context.runtime, payload.request(name, version))
-            flux += traced.forecast.flux
-        except _SKIPPED as error:
-            skipped[name] = str(error)
-    _require_some(len(names) - len(skipped), skipped)
-    assert traced is not None
-    figures = _figures(flux, traced.plane) | {"model_version": traced.model.version}
-    counts = {"heliostats": len(names) - len(skipped), "skipped": skipped}
-    return Result(figures | counts, {"flux": flux.astype(np.float32)})
+    with context.runtime.database.reading() as session:
+        receiver, origin = payload.on(session), store.get_plant(session).origin
+        model = models.get_model(session, payload.model_version)
+    fleet = Fleet(
+        names=names,
+        receiver=receiver,
+        sun=sun_direction(payload.sun.azimuth_deg, payload.sun.elevation_deg),
+        optics=replace(model.optics, dni=payload.dni_w_m2),
+        model=model,
+        origin=origin,
+        aim=np.array(receiver.center if payload.aim_point is None else payload.aim_point),
+        aims=payload.aim_points,
+        ideal=payload.surface == "ideal",
+    )
+    made = forecast_fleet(context.runtime, fleet, payload.resolution, payload.neighbours, context.report)
+    _require_some(made.heliostats, made.skipped)
+    figures = _figures(made.irradiance, receiver) | {"model_version": model.version, "reflected_w": made.power}
+    counts = {"heliostats": made.heliostats, "skipped": made.skipped}
+    return Result(figures | counts, {"flux": made.irradiance.astype(np.float32)})
 
 
-def _figures(flux: np.ndarray[Any, Any], plane: TargetPlane) -> dict[str, Any]:
-    pixel_m2 = plane.width * plane.height / flux.size
+def _figures(flux: np.ndarray[Any, Any], receiver: Receiver) -> dict[str, Any]:
+    pixel_m2 = receiver.width * receiver.height / flux.size
     return {
         "peak_w_m2": float(flux.max()),
         "power_w": float(flux.sum() * pixel_m2),
-        "plane": plane_as_json(plane),
+        "plane": receiver_as_json(receiver),
     }
 
 
@@ -280,7 +294,7 @@ KINDS: Kinds = {
     kind.name: kind
     for kind in (
         Kind("predictions", PredictionsIn, predict_many, "Predict the surfaces of many heliostats."),
-        Kind("forecasts", FleetForecastIn, forecast_fleet, "Superpose the flux of many heliostats on one plane."),
+        Kind("forecasts", FleetForecastIn, forecast_field, "Superpose the flux of many heliostats on one receiver."),
         Kind("studies", StudyIn, make_study, "Find the effect that photographs demand and the model lacks."),
         Kind("imports", ImportIn, import_allowed, "Load a measurement folder into the store."),
     )

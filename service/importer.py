@@ -34,6 +34,8 @@ def import_folder(runtime: Runtime, folder: MeasurementFolder, progress: Progres
             counts[f"declared models {store.put_declared(session, declared)}"] += 1
         for plane in folder.plant.targets.values():
             counts[f"targets {store.put_target(session, plane)[1]}"] += 1
+        for cylinder in folder.plant.receivers.values():
+            counts[f"receivers {store.put_receiver(session, cylinder)[1]}"] += 1
     for name in folder.plant.heliostats:
         progress(name)
         counts[f"heliostats {_put_heliostat(runtime, folder, name)}"] += 1

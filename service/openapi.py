@@ -27,11 +27,11 @@ _MEANINGS = {
 _ANYWHERE = (401, 403, 422, 429, 500, 503)
 
 _TAGS = [
-    {"name": "plant", "description": "The tower base, which everything is measured from, and its target planes."},
+    {"name": "plant", "description": "The tower base, which everything is measured from, its targets and receivers."},
     {"name": "heliostats", "description": "Where heliostats stand and how they are built (PAINT properties)."},
     {"name": "measurements", "description": "Target photographs: post them, read flux and quality back."},
     {"name": "surfaces", "description": "Mirror surfaces by version: predict them, read the history."},
-    {"name": "forecasts", "description": "Flux maps on any plane."},
+    {"name": "forecasts", "description": "Flux maps of one heliostat on any plane, or of a field on any receiver."},
     {
         "name": "studies",
         "description": "What photographs demand and the model lacks: find it, adopt it into the model, withdraw it.",

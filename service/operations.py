@@ -1,6 +1,6 @@
 """What the command line, the demo and REST do, as plain functions: measure, predict, forecast, study."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -10,12 +10,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from model.effects import JUELICH_LATITUDE, Effect, model_version
 from model.errors import InvalidInputError
+from model.fleet import Engine, FleetFlux, Superposition, Tile
+from model.fleet import superpose as superpose_tiles
 from model.forecast import Shot, View, align
 from model.imaging import ImageKind, MeasuredFlux
 from model.imaging import measure as measure_image
 from model.network.predictor import default_predictor
 from model.observation import Observation, SurfacePrediction, render_observations
-from model.plant import Heliostat, TargetPlane
+from model.plant import Heliostat, Receiver, TargetPlane
 from model.refinement import refine
 from model.study import Photograph, Study, StudyOptions
 from model.study import study as study_photographs
@@ -173,6 +175,21 @@ def forecast(
         power=float(flux.sum(dtype=np.float64) * np.prod(view.of(plane).pixel)),
         model_version=model_version(effects),
     )
+
+
+def superpose(
+    receiver: Receiver,
+    tiles: Iterable[Tile],
+    *,
+    resolution: tuple[int, int] = (256, 256),
+    optics: Optics | None = None,
+    effects: Sequence[Effect] = (),
+    latitude_deg: float = JUELICH_LATITUDE,
+    engine: Engine | None = None,
+) -> FleetFlux:
+    """The light [W/m2] of many heliostats on one receiver; see `model.fleet`."""
+    task = Superposition(receiver, resolution, optics or Optics(), tuple(effects), latitude_deg)
+    return superpose_tiles(task, tiles, engine)
 
 
 def study(

@@ -17,7 +17,7 @@ from model.effects import Effect, effects_from_json
 from model.errors import InvalidInputError
 from model.frames import sun_direction
 from model.mount import LinearActuator, Mount
-from model.plant import Facet, Heliostat, Plant, TargetPlane
+from model.plant import Cylinder, Facet, Heliostat, Plant, TargetPlane
 from model.sunshape import Buie, Gaussian, Pillbox, SunShape
 from model.surface import control_points, fit_heights, heights
 from model.tracing import Optics
@@ -164,7 +164,7 @@ def read_heliostat(name: str, properties: Any, origin: Array) -> Heliostat:
 def read_targets(tower: Any) -> tuple[Array, dict[str, TargetPlane]]:
     """Tower base (3,) in WGS84 and the planar targets of PAINT's ``tower-measurements.json``.
 
-    The cylindrical receiver is left out: it is no plane.
+    Cylinders are no planes; `read_receivers` has them.
     """
     where = "tower measurements"
     origin = _numbers(tower, where, "power_plant_properties", "coordinates", count=3)
@@ -180,6 +180,34 @@ def read_targets(tower: Any) -> tuple[Array, dict[str, TargetPlane]]:
     if not targets:
         raise InvalidInputError(f"{where}: no target of type 'planar'")
     return origin, targets
+
+
+def read_receivers(tower: Any) -> dict[str, Cylinder]:
+    """The cylindrical receivers of PAINT's ``tower-measurements.json``, convex ones that are surveyed.
+
+    Their inner corners are those of the lit surface: on its edge, a chord apart.
+    """
+    where = "tower measurements"
+    plant = Plant("", _numbers(tower, where, "power_plant_properties", "coordinates", count=3))
+    surveyed = {
+        name: entry
+        for name, entry in tower.items()
+        if isinstance(entry, dict) and entry.get("type") == "convex_cylinder" and "coordinates" in entry
+    }
+    return {name: _receiver(name, entry, f"{where}, {name}", plant) for name, entry in surveyed.items()}
+
+
+def _receiver(name: str, entry: Any, where: str, plant: Plant) -> Cylinder:
+    lower_left, lower_right, upper_left, upper_right = (
+        plant.to_enu(_numbers(entry, where, "coordinates", f"receiver_inner_{corner}", count=3))
+        for corner in ("lower_left", "lower_right", "upper_left", "upper_right")
+    )
+    radius, opening = _number(entry, where, "radius"), _number(entry, where, "opening_angle")
+    normal = _numbers(entry, where, "normal_vector", count=3)
+    up = (upper_left + upper_right - lower_left - lower_right) / 2
+    chord = (lower_left + lower_right + upper_left + upper_right) / 4
+    bulge = radius * (1 - np.cos(np.radians(opening) / 2)) * normal / np.linalg.norm(normal)
+    return Cylinder(name, chord + bulge, normal, up, radius, float(np.linalg.norm(up)), opening)
 
 
 def _spot(data: Any, where: str, plant: Plant) -> Array | None:
@@ -338,7 +366,8 @@ def read_folder(root: Path, heliostats: list[str] | None = None) -> MeasurementF
     towers = sorted(root.glob("*tower-measurements.json"))
     if not towers:
         raise InvalidInputError(f"{root}: no '*tower-measurements.json' at the root; is it a PAINT folder?")
-    origin, targets = read_targets(read_json(towers[0]))
+    tower = read_json(towers[0])
+    origin, targets = read_targets(tower)
     found: dict[str, Heliostat] = {}
     skipped: dict[str, str] = {}
     for path in sorted(root.glob("*/Properties/*heliostat-properties.json")):
@@ -350,7 +379,9 @@ def read_folder(root: Path, heliostats: list[str] | None = None) -> MeasurementF
                 skipped[name] = str(error)
     if not found:
         raise InvalidInputError(f"{root}: no heliostat with a readable 'Properties/*heliostat-properties.json'")
-    plant = Plant(towers[0].name.removesuffix("-tower-measurements.json"), origin, targets, found)
+    plant = Plant(
+        towers[0].name.removesuffix("-tower-measurements.json"), origin, targets, found, read_receivers(tower)
+    )
     return MeasurementFolder(root, plant, *read_declared(root / "twin.json"), skipped)
 
 

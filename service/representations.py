@@ -22,6 +22,7 @@ from service.schemas import (
     MeasurementOut,
     ModelOut,
     PlantOut,
+    ReceiverOut,
     StudyOut,
     StudySummary,
     SurfaceOut,
@@ -36,6 +37,7 @@ from service.tables import (
     MeasurementRow,
     ModelRow,
     PlantRow,
+    ReceiverRow,
     StudyRow,
     SurfaceRow,
     TargetRow,
@@ -87,6 +89,21 @@ def target(row: TargetRow) -> TargetOut:
             "width": row.width_m,
             "height": row.height_m,
             "corners": row.corners,
+        }
+    )
+
+
+def receiver(row: ReceiverRow) -> ReceiverOut:
+    """A cylindrical receiver as JSON."""
+    return ReceiverOut.model_validate(
+        {
+            "name": row.name,
+            "center": row.center_m,
+            "normal": row.normal,
+            "up": row.up,
+            "radius": row.radius_m,
+            "height": row.height_m,
+            "opening_deg": row.opening_deg,
         }
     )
 

@@ -1,7 +1,7 @@
 """What a running service holds: settings, database, image store, and the model behind one narrow door."""
 
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from importlib import import_module
@@ -16,9 +16,10 @@ from service.settings import Settings
 
 if TYPE_CHECKING:  # these bring the tracer's libraries with them, which take seconds to load
     from model.effects import Effect
+    from model.fleet import Engine, FleetFlux, Tile
     from model.imaging import ImageKind, MeasuredFlux
     from model.observation import Observation, SurfacePrediction
-    from model.plant import Heliostat, TargetPlane
+    from model.plant import Heliostat, Receiver, TargetPlane
     from model.study import Photograph, Study, StudyOptions
     from model.tracing import Optics
     from service.operations import Forecast, Method
@@ -67,6 +68,19 @@ class Operations(Protocol):
         latitude_deg: float = ...,
     ) -> "Forecast":
         """The flux of a heliostat on a plane."""
+
+    def superpose(
+        self,
+        receiver: "Receiver",
+        tiles: Iterable["Tile"],
+        *,
+        resolution: tuple[int, int] = (256, 256),
+        optics: "Optics | None" = None,
+        effects: Sequence["Effect"] = (),
+        latitude_deg: float = ...,
+        engine: "Engine | None" = None,
+    ) -> "FleetFlux":
+        """The light of many heliostats on one receiver."""
 
     def study(
         self,

@@ -20,7 +20,7 @@ from pydantic import (
     model_validator,
 )
 
-from model.plant import TargetPlane
+from model.plant import Cylinder, TargetPlane
 from service.names import IDENTIFIER, NAME
 
 Name = Annotated[
@@ -235,6 +235,43 @@ class Plane(Model):
             width=self.width,
             height=self.height,
         )
+
+
+class ReceiverIn(Model):
+    """A receiver that is a part of a cylinder, or all of it, lit from outside."""
+
+    center: Position = Field(description="The middle of the lit surface: east, north, up of the tower base [m].")
+    normal: Direction = Field(description="Normal there, away from the axis, east-north-up; of any length.")
+    up: Direction = Field(default=(0.0, 0.0, 1.0), description="Along the axis, upwards in the map.")
+    radius: Annotated[float, Field(ge=0.01, lt=1e3)] = Field(description="[m]")
+    height: Extent = Field(description="Along the axis [m].")
+    opening_deg: float = Field(
+        default=360.0, gt=0, le=360, description="Angle of the lit surface, half of it to each side of its middle."
+    )
+
+    def named(self, name: str) -> Cylinder:
+        """The model's receiver of this name."""
+        return Cylinder(
+            name=name,
+            center=np.array(self.center),
+            normal=np.array(self.normal),
+            up=np.array(self.up),
+            radius=self.radius,
+            height=self.height,
+            opening_deg=self.opening_deg,
+        )
+
+
+class ReceiverOut(BaseModel):
+    """A cylindrical receiver."""
+
+    name: str
+    center: tuple[float, float, float] = Field(description="The middle of the lit surface [m].")
+    normal: tuple[float, float, float] = Field(description="Unit normal there, away from the axis.")
+    up: tuple[float, float, float] = Field(description="Unit vector along the axis.")
+    radius: float = Field(description="[m]")
+    height: float = Field(description="[m]")
+    opening_deg: float = Field(description="Angle of the lit surface [deg].")
 
 
 class Corners(Model):

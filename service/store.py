@@ -16,7 +16,7 @@ from sqlalchemy import Select, func, select
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session, defer, undefer
 
-from model.plant import TargetPlane
+from model.plant import Cylinder, Receiver, TargetPlane
 from service import names
 from service.arrays import pack
 from service.faults import ConflictError, NotFoundError
@@ -27,6 +27,7 @@ from service.tables import (
     ImageRow,
     MeasurementRow,
     PlantRow,
+    ReceiverRow,
     StudyRow,
     SurfaceRow,
     TargetRow,
@@ -138,6 +139,12 @@ def get_heliostat(session: Session, name: str) -> HeliostatRow:
     return row
 
 
+def get_heliostats(session: Session, wanted: Sequence[str]) -> dict[str, HeliostatRow]:
+    """Those of some heliostats that are stored, by name."""
+    rows = session.scalars(select(HeliostatRow).where(HeliostatRow.name.in_(wanted)))
+    return {row.name: row for row in rows}
+
+
 def list_heliostats(session: Session, limit: int, after: str | None = None) -> Sequence[HeliostatRow]:
     """Up to ``limit`` heliostats in the order of their names, those after the name ``after``."""
     query = select(HeliostatRow).options(defer(HeliostatRow.properties)).order_by(HeliostatRow.name).limit(limit)
@@ -193,9 +200,11 @@ def put_target(
 ) -> tuple[TargetRow, Change]:
     """Keep a target plane under its name; ``corners`` are the WGS84 corners that it was made from, where known.
 
-    Raises `InvalidInputError` for a bad name.
+    Raises `InvalidInputError` for a bad name, ConflictError where a receiver has it.
     """
     names.require(names.NAME, plane.name, "target")
+    if find_receiver(session, plane.name) is not None:
+        raise ConflictError(f"name: {plane.name} is a receiver; choose another name for the target plane")
     values: dict[str, Any] = {
         "center_m": _floats(plane.center),
         "normal": _floats(plane.normal),
@@ -225,6 +234,76 @@ def target_plane(row: TargetRow) -> TargetPlane:
         width=row.width_m,
         height=row.height_m,
     )
+
+
+# --- receivers --------------------------------------------------------------------------------------------------------
+
+
+def list_receivers(session: Session) -> Sequence[ReceiverRow]:
+    """All receivers in the order of their names."""
+    return session.scalars(select(ReceiverRow).order_by(ReceiverRow.name)).all()
+
+
+def find_receiver(session: Session, name: str) -> ReceiverRow | None:
+    """The receiver of this name, or None."""
+    return session.scalar(select(ReceiverRow).where(ReceiverRow.name == name))
+
+
+def get_receiver(session: Session, name: str) -> ReceiverRow:
+    """The receiver of this name; NotFoundError where there is none."""
+    row = find_receiver(session, name)
+    if row is None:
+        raise NotFoundError(f"there is no receiver {name}; PUT it to /v1/receivers/{name} first")
+    return row
+
+
+def put_receiver(session: Session, cylinder: Cylinder) -> tuple[ReceiverRow, Change]:
+    """Keep a receiver under its name.
+
+    Raises
+    ------
+    InvalidInputError
+        For a bad name.
+    ConflictError
+        Where a target has that name.
+    """
+    names.require(names.NAME, cylinder.name, "receiver")
+    if find_target(session, cylinder.name) is not None:
+        raise ConflictError(f"name: {cylinder.name} is a target plane; choose another name for the receiver")
+    values: dict[str, Any] = {
+        "center_m": _floats(cylinder.center),
+        "normal": _floats(cylinder.normal),
+        "up": _floats(cylinder.up),
+        "radius_m": float(cylinder.radius),
+        "height_m": float(cylinder.height),
+        "opening_deg": float(cylinder.opening_deg),
+    }
+    row = find_receiver(session, cylinder.name)
+    if row is None:
+        row = ReceiverRow(name=cylinder.name, **values)
+        if insert(session, row):
+            return row, Change.NEW
+        row = get_receiver(session, cylinder.name)
+    return row, _assign(row, values)
+
+
+def receiver_cylinder(row: ReceiverRow) -> Cylinder:
+    """The model's receiver of a stored one."""
+    return Cylinder(
+        name=row.name,
+        center=np.array(row.center_m),
+        normal=np.array(row.normal),
+        up=np.array(row.up),
+        radius=row.radius_m,
+        height=row.height_m,
+        opening_deg=row.opening_deg,
+    )
+
+
+def get_target_or_receiver(session: Session, name: str) -> Receiver:
+    """The target plane or the cylinder of this name; NotFoundError where there is neither."""
+    row = find_receiver(session, name)
+    return target_plane(get_target(session, name)) if row is None else receiver_cylinder(row)
 
 
 # --- images and measurements ------------------------------------------------------------------------------------------
@@ -518,6 +597,17 @@ def find_surface_at(session: Session, heliostat: HeliostatRow, moment: datetime 
         query = query.where(SurfaceRow.valid_from <= moment)
     query = query.order_by(SurfaceRow.valid_from.desc(), SurfaceRow.version.desc()).limit(1)
     return session.scalar(query.options(undefer(SurfaceRow.arrays)))
+
+
+def current_surfaces(session: Session, heliostats: Sequence[int]) -> dict[int, bytes]:
+    """The arrays of what `find_surface_at` has without a moment, by the heliostats' ids, of those that have one."""
+    newest = func.row_number().over(
+        partition_by=SurfaceRow.heliostat_id, order_by=(SurfaceRow.valid_from.desc(), SurfaceRow.version.desc())
+    )
+    ranked = select(SurfaceRow.id, newest.label("place")).where(SurfaceRow.heliostat_id.in_(heliostats)).subquery()
+    first = select(ranked.c.id).where(ranked.c.place == 1)
+    rows = session.execute(select(SurfaceRow.heliostat_id, SurfaceRow.arrays).where(SurfaceRow.id.in_(first)))
+    return {row.heliostat_id: row.arrays for row in rows}
 
 
 def get_surface_at(session: Session, heliostat: HeliostatRow, moment: datetime | None = None) -> SurfaceRow:

@@ -142,6 +142,22 @@ class TargetRow(Base):
     updated_at: Mapped[datetime] = mapped_column(default=now, onupdate=now)
 
 
+class ReceiverRow(Base):
+    """A cylindrical receiver in ENU [m]; see `model.plant.Cylinder`."""
+
+    __tablename__ = "receivers"
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    name: Mapped[str] = mapped_column(String(64), unique=True)
+    center_m: Mapped[list[float]]
+    normal: Mapped[list[float]]
+    up: Mapped[list[float]]
+    radius_m: Mapped[float]
+    height_m: Mapped[float]
+    opening_deg: Mapped[float]
+    updated_at: Mapped[datetime] = mapped_column(default=now, onupdate=now)
+
+
 class ImageRow(Base):
     """An image file in the store, by its content."""
 

@@ -16,7 +16,7 @@ from sqlalchemy.orm import Session
 
 from model.errors import ImageRefusedError, InvalidInputError
 from model.frames import sun_direction, wgs84_to_enu
-from model.plant import Heliostat, TargetPlane
+from model.plant import Heliostat, Receiver, TargetPlane
 from service import audit, models, store
 from service.arrays import pack, unpack
 from service.faults import ConflictError, NotFoundError, TooLargeError
@@ -359,6 +359,10 @@ def _plane(session: Session, request: ForecastRequest) -> TargetPlane:
         return request.plane
     if request.target is None:
         raise InvalidInputError("target: give a stored target or a plane")
+    if store.find_receiver(session, request.target) is not None:
+        raise ConflictError(
+            f"target: {request.target} is a cylinder; leave heliostat out and give heliostats: [{request.heliostat!r}]"
+        )
     return store.target_plane(store.get_target(session, request.target))
 
 
@@ -394,9 +398,12 @@ def trace_request(runtime: Runtime, request: ForecastRequest) -> Traced:
     return Traced(row, surface, plane, model, forecast)
 
 
-def plane_as_json(plane: TargetPlane) -> dict[str, Any]:
-    """A plane's geometry, as forecasts keep it [m]."""
-    return {name: plain(getattr(plane, name)) for name in ("center", "normal", "up", "width", "height")}
+def receiver_as_json(receiver: Receiver) -> dict[str, Any]:
+    """A receiver's geometry, as forecasts keep it [m]; a cylinder's width is the length of its arc."""
+    plane = {name: plain(getattr(receiver, name)) for name in ("center", "normal", "up", "width", "height")}
+    if isinstance(receiver, TargetPlane):
+        return plane
+    return plane | {"radius": receiver.radius, "opening_deg": receiver.opening_deg}
 
 
 def _forecast_row(request: ForecastRequest, traced: Traced) -> ForecastRow:
@@ -406,7 +413,7 @@ def _forecast_row(request: ForecastRequest, traced: Traced) -> ForecastRow:
         heliostat_id=traced.heliostat.id,
         surface_id=None if traced.surface is None else traced.surface.id,
         target_name=request.target,
-        plane=plane_as_json(traced.plane),
+        plane=receiver_as_json(traced.plane),
         sun_azimuth_deg=request.sun_azimuth_deg,
         sun_elevation_deg=request.sun_elevation_deg,
         aim_point_m=None if request.aim is None else list(request.aim),
@@ -440,6 +447,8 @@ def _trace(
     model: PlantModel,
     latitude_deg: float,
 ) -> "Forecast":
+    from model.effects import of_light
+
     with runtime.computing("forecast") as operations:
         return operations.forecast(
             heliostat,
@@ -450,6 +459,7 @@ def _trace(
             resolution=request.resolution,
             window=request.window,
             optics=replace(model.optics, dni=request.dni),
-            effects=model.effects,
+            # A stored target is what the camera looks at; on any other plane there is only light.
+            effects=model.effects if request.plane is None else of_light(model.effects),
             latitude_deg=latitude_deg,
         )

@@ -8,6 +8,7 @@ from model.effects.catalogue import (
     effects_from_json,
     in_light_order,
     model_version,
+    of_light,
 )
 
 __all__ = [
@@ -22,5 +23,6 @@ __all__ = [
     "effects_from_json",
     "in_light_order",
     "model_version",
+    "of_light",
     "parameter",
 ]

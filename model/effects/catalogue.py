@@ -51,6 +51,11 @@ def in_light_order(effects: Iterable[Effect]) -> list[Effect]:
     return sorted(effects, key=lambda effect: order.get(effect.name, len(order)))
 
 
+def of_light(effects: Iterable[Effect]) -> list[Effect]:
+    """Those that act on light itself; the others say how the camera's photograph of it differs."""
+    return [effect for effect in effects if effect.stage != "image"]
+
+
 def model_version(effects: Iterable[Effect]) -> str:
     """Version of the plant's model and the effects it holds, ``1:none`` where it holds none."""
     names = [effect.name for effect in in_light_order(effects)]

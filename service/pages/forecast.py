@@ -20,7 +20,7 @@ from service.representations import flux_of
 from service.runtime import Runtime
 from service.schemas import Azimuth, Elevation, Model, Name, Sun, Version
 from service.security import Identity
-from service.tables import ForecastRow, HeliostatRow, PlantRow, TargetRow, now
+from service.tables import ForecastRow, HeliostatRow, PlantRow, ReceiverRow, TargetRow, now
 from service.workflows import ForecastRequest, make_forecast
 
 router = APIRouter(include_in_schema=False)
@@ -84,6 +84,7 @@ def _choices(session: Session) -> dict[str, Any]:
     return {
         "heliostats": session.scalars(select(HeliostatRow.name).order_by(HeliostatRow.name)).all(),
         "targets": session.scalars(select(TargetRow.name).order_by(TargetRow.name)).all(),
+        "receivers": session.scalars(select(ReceiverRow.name).order_by(ReceiverRow.name)).all(),
         "recent": session.scalars(newest).all(),
         "moment": now().strftime("%Y-%m-%dT%H:%M"),
     }

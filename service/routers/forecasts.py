@@ -1,18 +1,22 @@
 """Flux forecasts."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Body, Depends, Path, Query, Response, status
+from fastapi.responses import JSONResponse
+from pydantic import Discriminator, Tag
 
-from service import representations, store
-from service.dependencies import OPERATE, READ, Limit, MediaType, RuntimeDep, require_json
+from service import jobs, representations, store
+from service.dependencies import OPERATE, READ, IdentityDep, Limit, MediaType, RuntimeDep, require_json
+from service.handlers import FleetForecastIn
 from service.openapi import arrays, problems
-from service.schemas import ForecastIn, ForecastSummary, Name, Page, Version
+from service.routers.jobs import IdempotencyKey
+from service.schemas import ForecastIn, ForecastSummary, JobOut, Name, Page, Version
 from service.workflows import ForecastRequest, make_forecast
 
 router = APIRouter(prefix="/forecasts", tags=["forecasts"])
 
-_EXAMPLE = {
+_EXAMPLE: dict[str, Any] = {
     "heliostat": "AA39",
     "target": "multi_focus_tower",
     "sun": {"azimuth_deg": -20.0, "elevation_deg": 45.0},
@@ -37,16 +41,46 @@ def _request(body: ForecastIn) -> ForecastRequest:
     )
 
 
+def _alternative(body: Any) -> str:
+    """Which of the requests a body is meant to be."""
+    of_one = "heliostat" in body if isinstance(body, dict) else isinstance(body, ForecastIn)
+    return "(one)" if of_one else "(field)"
+
+
+Asked = Annotated[
+    Annotated[ForecastIn, Tag("(one)")] | Annotated[FleetForecastIn, Tag("(field)")],
+    Discriminator(_alternative),
+    Body(
+        openapi_examples={
+            "one heliostat": {"value": _EXAMPLE},
+            "the field": {"value": {name: _EXAMPLE[name] for name in ("target", "sun", "surface")}},
+        }
+    ),
+]
+
+
 @router.post(
     "",
     status_code=status.HTTP_201_CREATED,
-    responses=problems(404, 409, 413, 415),
+    response_model=ForecastSummary,
+    responses={
+        **problems(404, 409, 413, 415, 429),
+        202: {"model": JobOut, "description": "Of many heliostats: the job that superposes them, under its Location."},
+    },
     dependencies=[OPERATE, Depends(require_json)],
 )
 def post_forecast(
-    request: Annotated[ForecastIn, Body(examples=[_EXAMPLE])], runtime: RuntimeDep, response: Response
-) -> ForecastSummary:
-    """Compute a flux map and keep it; read the map itself from its own path."""
+    request: Asked, runtime: RuntimeDep, identity: IdentityDep, response: Response, key: IdempotencyKey = None
+) -> ForecastSummary | Response:
+    """Compute a flux map and keep it; read the map itself from its own path.
+
+    With `heliostat` it is that one's, at once. Without it the job of `/v1/jobs/forecasts` superposes all of the field,
+    or those in `heliostats`; its map is read from `/v1/jobs/{number}/flux`.
+    """
+    if isinstance(request, FleetForecastIn):
+        job = jobs.ask_for(runtime, "forecasts", request.model_dump(mode="json"), identity.name, key)
+        document = representations.job(job).model_dump(mode="json")
+        return JSONResponse(document, status.HTTP_202_ACCEPTED, {"Location": f"/v1/jobs/{job.id}"})
     row = make_forecast(runtime, _request(request))
     response.headers["Location"] = f"/v1/forecasts/{row.id}"
     return representations.forecast_summary(row)

@@ -19,6 +19,7 @@ from fastapi import FastAPI
 from sqlalchemy import URL, make_url
 
 from model.errors import UnreachableError
+from model.fleet import FleetFlux
 from model.imaging import MeasuredFlux, Quality
 from model.observation import Observation, SurfacePrediction
 from model.plant import Heliostat, TargetPlane
@@ -124,6 +125,7 @@ class FakeOperations:
     predictions: list[list[Observation]] = field(default_factory=list)
     believed: list[Any] = field(default_factory=list)
     forecasts: list[dict[str, Any]] = field(default_factory=list)
+    fleets: list[dict[str, Any]] = field(default_factory=list)
     measured: int = 0
     rendered: int = 0
 
@@ -171,6 +173,12 @@ class FakeOperations:
         flux = np.full(options["resolution"], 2.0, dtype=np.float32)
         center = np.array([0.1, 0.2])
         return Forecast(flux=flux, center_of_mass=center, peak=2.0, power=50.0, model_version="fake")
+
+
+    def superpose(self, receiver: Any, tiles: Any, **options: Any) -> FleetFlux:
+        self.fleets.append({"receiver": receiver, **options})
+        count = sum(len(tile) for tile in tiles)
+        return FleetFlux(np.full(options["resolution"], 2.0 * count), 60.0 * count, count)
 
 
 @pytest.fixture

@@ -130,6 +130,7 @@ def test_fleet_forecast_is_the_sum_of_its_heliostats(client: TestClient, propert
     assert job["result"]["peak_w_m2"] == 4.0
     area = job["result"]["plane"]["width"] * job["result"]["plane"]["height"]
     assert job["result"]["power_w"] == pytest.approx(4.0 * area)
+    assert job["result"]["reflected_w"] == 120.0
     path = f"/v1/jobs/{job['id']}/flux"
     npz = np.load(io.BytesIO(client.get(path, headers={"Accept": "application/x-npz"}).content), allow_pickle=False)
     np.testing.assert_array_equal(npz["flux"], np.full((16, 16), 4.0, np.float32))
