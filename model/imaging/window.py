@@ -12,10 +12,13 @@ from model.errors import InvalidInputError
 
 
 def overlap_matrix(source_edges: NDArray[np.float64], target_edges: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Share of each source cell that falls into each target cell (targets, sources), both given by ascending edges."""
-    low = np.maximum(target_edges[:-1, None], source_edges[None, :-1])
-    high = np.minimum(target_edges[1:, None], source_edges[None, 1:])
-    return np.asarray(np.maximum(high - low, 0.0) / np.diff(source_edges))
+    """Share of each source cell that falls into each target cell (..., targets, sources), both by ascending edges.
+
+    Edges may have leading axes, which broadcast.
+    """
+    low = np.maximum(target_edges[..., :-1, None], source_edges[..., None, :-1])
+    high = np.minimum(target_edges[..., 1:, None], source_edges[..., None, 1:])
+    return np.asarray(np.maximum(high - low, 0.0) / np.diff(source_edges)[..., None, :])
 
 
 def _axis_weights(pixels: int, extent: float, center: float, window: float, resolution: int) -> NDArray[np.float64]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from model.effects import Effect
 from model.errors import InvalidInputError, UnreachableError
 from model.study.photographs import Forecaster
-from model.study.unknowns import Unknowns
+from model.study.unknowns import Unknowns, copied
 
 Array = NDArray[np.float64]
 
@@ -23,8 +23,14 @@ TRUST = 0.03
 STARTS = (-0.4, -0.15, -0.05, 0.05, 0.15, 0.4)
 """Where fits of an unknown begin, in shares of its range away from neutral."""
 
-STEP = 2e-3
-"""Step of the differences, in shares of an unknown's range."""
+HOPELESS = 3
+"""Cost of a start, in costs of the best one, above which none is made from it."""
+
+AT_ONCE = 16
+"""Forecasts of all images that are traced at once, where they differ in mirrors alone."""
+
+STEP = 1e-2
+"""Step of the differences, in shares of an unknown's range: long enough to smooth what the tracer's grid leaves."""
 
 RESOLUTION = 32
 """Pixels a side in which fits compare; the sun has blurred all that is finer."""
@@ -40,23 +46,61 @@ class Fit:
 
 
 class Fitter:
-    """Fits unknowns to the photographs of a forecaster, beside effects that stay as they are."""
+    """Fits unknowns to the photographs of a forecaster, beside effects that stay as they are.
 
-    def __init__(self, forecaster: Forecaster, fixed: Sequence[Effect] = (), iterations: int = 8) -> None:
-        self.forecaster, self.fixed, self.iterations = forecaster, fixed, iterations
+    With a ``fine`` forecaster of the same photographs fits may be traced coarsely: what both differ by where a fit
+    begins, its grid's trace in the image, is taken off.
+    """
+
+    def __init__(
+        self,
+        forecaster: Forecaster,
+        fine: Forecaster | None = None,
+        fixed: Sequence[Effect] = (),
+        iterations: int = 8,
+    ) -> None:
+        self.forecaster, self.fine, self.fixed, self.iterations = forecaster, fine, fixed, iterations
         self.heliostats = np.array([p.heliostat for p in forecaster.photographs])
         self.measured = forecaster.measured(RESOLUTION)
         self.peaks = self.measured.max(axis=(1, 2))
 
     def residuals(self, unknowns: Unknowns, values: Array) -> Array:
         """Measured minus forecast (N, RESOLUTION**2) in units of `TRUST`; infinite where the model fails."""
+        return np.asarray(self.residuals_of(unknowns, values[None])[0])
+
+    def residuals_of(self, unknowns: Unknowns, trials: Array) -> Array:
+        """Residuals (M, N, RESOLUTION**2) of many trials (M, P), traced at once where only mirrors differ in them."""
+        shared = np.array([unknown.shared for unknown in unknowns.all])
+        _, group = np.unique(trials[:, shared], axis=0, return_inverse=True)
+        residuals = np.empty((len(trials), len(self.measured), RESOLUTION**2))
+        for one in np.unique(group):
+            rows = np.flatnonzero(group == one)
+            for part in np.array_split(rows, -(-len(rows) // AT_ONCE)):
+                residuals[part] = self._residuals_alike(unknowns, trials[part])
+        return residuals
+
+    def _residuals_alike(self, unknowns: Unknowns, trials: Array) -> Array:
+        """Residuals (M, N, RESOLUTION**2) of trials (M, P) with the same shared unknowns."""
+        count = len(trials)
+        copies, values = unknowns.copies(trials)
+        fixed = [copied(effect, count) for effect in self.fixed]
         try:
-            forecast = self.forecaster.cuts([*self.fixed, *unknowns.effects(values)], RESOLUTION)
+            forecast = self.forecaster.copies(count).cuts([*fixed, *copies.effects(values)], RESOLUTION)
         except (UnreachableError, InvalidInputError):
+            if count > 1:
+                return np.concatenate([self._residuals_alike(unknowns, trial[None]) for trial in trials])
             # A clock an hour off puts low suns below the horizon, and all light may be blocked: as wrong as can be.
-            return np.full((len(self.measured), RESOLUTION**2), np.inf)
-        difference = (self.measured - forecast) / self.peaks[:, None, None] / TRUST
-        return np.asarray(difference.reshape(len(difference), -1))
+            return np.full((1, len(self.measured), RESOLUTION**2), np.inf)
+        difference = self.measured - forecast.reshape(count, *self.measured.shape)
+        shares = difference / self.peaks[:, None, None] / TRUST
+        return np.asarray(shares.reshape(count, len(self.measured), -1))
+
+    def _take_off_grid(self, unknowns: Unknowns, begin: Array) -> None:
+        """Add to the measured images what the coarse forecast of ``begin`` differs by from the fine one."""
+        if self.fine is not None:
+            model = [*self.fixed, *unknowns.effects(begin)]
+            grid = self.forecaster.cuts(model, RESOLUTION) - self.fine.cuts(model, RESOLUTION)
+            self.measured = self.forecaster.measured(RESOLUTION) + grid
 
     def _pull(self, unknowns: Unknowns, values: Array) -> Array:
         """Distances (P,) from neutral in half ranges: holds what images cannot tell."""
@@ -70,52 +114,51 @@ class Fitter:
     def jacobian(self, unknowns: Unknowns, values: Array, residuals: Array) -> Array:
         """Derivatives of the residuals (P, N, RESOLUTION**2); unknowns of different heliostats are changed at once."""
         low, high = unknowns.bounds
+        steps = STEP * (high - low)
+        steps = np.where(values + steps > high, -steps, steps)
+        colours = list(unknowns.colours.values())
+        trials = np.tile(values, (len(colours), 1))
+        for trial, places in zip(trials, colours, strict=True):
+            trial[places] += steps[places]
         derivatives = np.zeros((len(values), *residuals.shape))
-        for places in unknowns.colours.values():
-            steps = STEP * (high - low)[places]
-            steps = np.where(values[places] + steps > high[places], -steps, steps)
-            changed = values.copy()
-            changed[places] += steps
-            response = self.residuals(unknowns, changed) - residuals
-            for place, step in zip(places, steps, strict=True):
-                heliostat = unknowns.all[place].heliostat
-                feels = np.full(len(residuals), True) if heliostat is None else self.heliostats == heliostat
-                derivatives[place, feels] = response[feels] / step
+        for places, response in zip(colours, self.residuals_of(unknowns, trials) - residuals, strict=True):
+            for place in places:
+                feels = self._feels(unknowns, place)
+                derivatives[place, feels] = response[feels] / steps[place]
         return derivatives
 
-    def starts(self, unknowns: Unknowns, begin: Array, free: NDArray[np.bool_]) -> list[Array]:
-        """Values to begin with, the best first: ``begin``, and its ``free`` unknowns one colour at a time elsewhere.
+    def _feels(self, unknowns: Unknowns, place: int) -> NDArray[np.bool_]:
+        """Which images (N,) an unknown changes."""
+        heliostat = unknowns.all[place].heliostat
+        return np.full(len(self.heliostats), True) if heliostat is None else self.heliostats == heliostat
+
+    def starts(self, unknowns: Unknowns, begin: Array, free: NDArray[np.bool_]) -> tuple[list[Array], list[float]]:
+        """Values to begin with and their costs, the best first: ``begin``, and its ``free`` unknowns elsewhere.
 
         Many effects are even in their parameter, and a fit from neutral would not move; some have several valleys.
-        Heliostats choose apart where they have unknowns of their own.
+        Each unknown is moved by itself; heliostats choose apart where they have unknowns of their own.
         """
         low, high = unknowns.bounds
-        base = self.residuals(unknowns, begin)
+        colours = [places for places in unknowns.colours.values() if free[places].all()]
+        if not colours:
+            return [begin], [0.0]
+        trials = np.tile(begin, (len(colours), 1 + len(STARTS), 1))
+        for moved, places in zip(trials, colours, strict=True):
+            moved[:, places] += np.array([0.0, *STARTS])[:, None] * (high - low)[places]
+        trials = np.clip(trials, low, high)
+        residuals = self.residuals_of(unknowns, trials.reshape(-1, len(begin)))
+        energies = (residuals**2).sum(axis=-1).reshape(*trials.shape[:2], -1)
         chosen, found = begin.copy(), []
-        for places in unknowns.colours.values():
-            if not free[places].all():
-                continue
-            trials = [(self._energies(unknowns, places, base), begin[places])]
-            for share in STARTS:
-                trial = begin.copy()
-                trial[places] = np.clip(begin[places] + share * (high - low)[places], low[places], high[places])
-                if np.array_equal(trial, begin):
-                    continue
-                trials.append((self._energies(unknowns, places, self.residuals(unknowns, trial)), trial[places]))
-            energies, options = np.array([t[0] for t in trials]), np.array([t[1] for t in trials])
-            best = energies.argmin(axis=0)
-            chosen[places] = options[best, np.arange(len(places))]
-            single = begin.copy()
-            single[places] = chosen[places]
-            found.append(single)
-        candidates = [begin, *found, chosen, *self._guesses(unknowns, begin, free)]
-        costs = [self.cost(unknowns, c, self.residuals(unknowns, c)) for c in candidates]
-        order = np.argsort(costs)
-        unique: list[Array] = []
-        for index in order:
-            if not any(np.array_equal(candidates[index], other) for other in unique):
-                unique.append(candidates[index])
-        return unique
+        for moved, energy, places in zip(trials, energies, colours, strict=True):
+            for place in places:
+                best = energy[:, self._feels(unknowns, place)].sum(axis=1).argmin()
+                chosen[place] = moved[best, place]
+            if unknowns.all[places[0]].shared:
+                found.append(np.where(np.isin(np.arange(len(begin)), places), chosen, begin))
+        candidates = np.unique([begin, *found, chosen, *self._guesses(unknowns, begin, free)], axis=0)
+        costs = [self.cost(unknowns, *c) for c in zip(candidates, self.residuals_of(unknowns, candidates), strict=True)]
+        order = np.argsort(costs, kind="stable")
+        return list(candidates[order]), [costs[index] for index in order]
 
     def _guesses(self, unknowns: Unknowns, begin: Array, free: NDArray[np.bool_]) -> list[Array]:
         """``begin`` with each of the free effects' own guesses."""
@@ -129,17 +172,13 @@ class Fitter:
                 guessed.append(values)
         return guessed
 
-    def _energies(self, unknowns: Unknowns, places: list[int], residuals: Array) -> Array:
-        """Sum of squares (len(places),) over the images that feel each unknown."""
-        by_image = (residuals**2).sum(axis=1)
-        owners = [unknowns.all[place].heliostat for place in places]
-        return np.array([by_image[self.heliostats == h].sum() if h is not None else by_image.sum() for h in owners])
-
     def fit(self, unknowns: Unknowns, begin: Array, free: NDArray[np.bool_] | None = None, tries: int = 2) -> Fit:
         """The best of the fits from the most promising starts; ``free`` (P,) are those that may start elsewhere."""
         free = np.full(len(begin), True) if free is None else free
-        starts = self.starts(unknowns, begin, free)[:tries]
-        return min((self.descend(unknowns, start) for start in starts), key=lambda fit: fit.cost)
+        self._take_off_grid(unknowns, begin)
+        starts, costs = self.starts(unknowns, begin, free)
+        hopeful = [start for start, cost in zip(starts, costs, strict=True) if not cost > HOPELESS * costs[0]][:tries]
+        return min((self.descend(unknowns, start) for start in hopeful), key=lambda fit: fit.cost)
 
     def descend(self, unknowns: Unknowns, values: Array) -> Fit:
         """The least cost near ``values`` (P,)."""
@@ -155,7 +194,7 @@ class Fitter:
             curvature = flat @ flat.T + np.diag(scale)
             gradient = flat @ residuals.ravel() + self._pull(unknowns, values) * np.sqrt(scale)
             before = cost
-            for _ in range(5):
+            for _ in range(3):
                 step = -np.linalg.solve(curvature + damping * np.diag(np.diag(curvature)), gradient)
                 trial = np.clip(values + step, low, high)
                 trial_residuals = self.residuals(unknowns, trial)

@@ -20,6 +20,9 @@ Array = NDArray[np.float64]
 
 LEAST_IMAGES = 4
 
+REFITTED = 3
+"""How many of the best candidates are fitted once more, jointly with the effects found before."""
+
 
 @dataclass(frozen=True)
 class StudyOptions:
@@ -34,7 +37,7 @@ class StudyOptions:
     most: int = 3
     window: float | None = None
     latitude_deg: float = JUELICH_LATITUDE
-    fit_view: View = field(default_factory=lambda: View(96, 96, samples=16, padding=0.125))
+    fit_view: View = field(default_factory=lambda: View(64, 64, samples=12, padding=0.125))
     view: View = field(default_factory=lambda: View(128, 128, samples=24))
 
 
@@ -68,29 +71,39 @@ class _Loop:
             chosen = [photographs[row] for row in rows]
             return Forecaster(chosen, optics, declared, self.window, view, options.latitude_deg)
 
-        self.fit = forecaster(self.split.fit, options.fit_view)
-        self.own = forecaster(self.split.own, options.fit_view) if len(self.split.own) else None
+        self.fit, self.own = (
+            (forecaster(rows, options.fit_view), forecaster(rows, options.view)) if len(rows) else None
+            for rows in (self.split.fit, self.split.own)
+        )
         self.judge = forecaster(self.split.held_out, options.view)
         self.measured = self.judge.measured(RESOLUTION)
         self.heliostats = np.array([photographs[row].heliostat for row in self.split.held_out])
+        self.noise = float(np.mean([photographs[row].noise_share(self.window) for row in self.split.held_out]))
 
-    def trial(self, kinds: Sequence[type[Effect]], start: Trial | None = None) -> Trial:
-        """Fit kinds of effect together, from where ``start`` has fitted some of them, and judge them."""
+    def trial(self, kinds: Sequence[type[Effect]], start: Trial | None = None, joint: bool = True) -> Trial:
+        """Fit kinds of effect, from where ``start`` has fitted some of them, and judge them.
+
+        All of them, unless ``joint`` is false: then those that ``start`` knows stay as they are.
+        """
         whole = Unknowns(tuple(kinds), self.facets)
         trial = Trial(whole, whole.neutral, np.zeros(len(whole.all)), np.empty(0))
+        known: set[type[Effect]] = set()
         if start is not None:
-            trial = replace(trial, values=start.unknowns.put(start.values, whole))
-        known = set() if start is None else set(start.unknowns.kinds)
-        if kinds:
-            trial = self._fitted(trial, Fitter(self.fit), whole, known)
-        if self.own is not None and whole.own.kinds:
-            shared = [e for e in trial.effects if type(e) not in whole.own.kinds]
-            trial = self._fitted(trial, Fitter(self.own, shared), whole.own, known)
+            values, spread = (start.unknowns.put(v, whole) for v in (start.values, start.spread))
+            trial, known = replace(trial, values=values, spread=spread), set(start.unknowns.kinds)
+        for pair, unknowns in ((self.fit, whole), (self.own, whole.own)):
+            moving = unknowns if joint else unknowns.without(known)
+            if pair is not None and moving.kinds:
+                trial = self._fitted(trial, pair, moving, known)
         return replace(trial, accuracy=self.accuracy(trial.effects))
 
     @staticmethod
-    def _fitted(trial: Trial, fitter: Fitter, unknowns: Unknowns, known: set[type[Effect]]) -> Trial:
-        """The trial with those unknowns fitted that the fitter's photographs can tell of."""
+    def _fitted(
+        trial: Trial, pair: tuple[Forecaster, Forecaster], unknowns: Unknowns, known: set[type[Effect]]
+    ) -> Trial:
+        """The trial with those unknowns fitted that the photographs of a pair can tell of."""
+        fixed = [effect for effect in trial.effects if type(effect) not in unknowns.kinds]
+        fitter = Fitter(*pair, fixed=fixed)
         local = unknowns.of(sorted(set(fitter.heliostats.tolist())))
         free = np.array([u.effect not in known for u in local.all], dtype=bool)
         fit = fitter.fit(local, trial.unknowns.put(trial.values, local), free)
@@ -98,6 +111,19 @@ class _Loop:
         places = [trial.unknowns.all.index(u) for u in local.all]
         values[places], spread[places] = fit.values, fit.spread
         return replace(trial, values=values, spread=spread)
+
+    def added(self, name: str, current: Trial) -> Trial:
+        """The current model with one more effect, fitted beside what is known."""
+        return self.trial([*current.unknowns.kinds, CATALOGUE[name]], current, joint=False)
+
+    def refitted(self, trials: dict[str, Trial]) -> dict[str, Trial]:
+        """Trials, the best of them fitted once more from where they are, jointly with what was known before."""
+        best = sorted(trials, key=lambda name: -trials[name].accuracy.mean())[:REFITTED]
+        return trials | {name: self.trial(trials[name].unknowns.kinds, trials[name]) for name in best}
+
+    def worth_adding_to(self, current: Trial) -> bool:
+        """Whether even the truth, which leaves the images' noise, could bring the gain that an effect must bring."""
+        return 1 - float(current.accuracy.mean()) - self.noise >= self.options.least_gain
 
     def accuracy(self, effects: Sequence[Effect]) -> Array:
         """Accuracy (H,) of the held-out images under effects."""
@@ -171,10 +197,13 @@ def study(
     candidates: list[Candidate] = []
     left = [name for name in options.candidates if name not in declared]
     for _ in range(options.most):
+        if found and not loop.worth_adding_to(current):
+            break
         trials = {}
         for name in left:
             progress(name)
-            trials[name] = loop.trial([*current.unknowns.kinds, CATALOGUE[name]], current)
+            trials[name] = loop.added(name, current)
+        trials = loop.refitted(trials)
         candidates = candidates or [Candidate.of(n, t.accuracy, loop.gain(t, before)) for n, t in trials.items()]
         chosen = loop.choose(trials, current)
         if chosen is None:

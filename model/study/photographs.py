@@ -2,7 +2,9 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,10 +13,13 @@ from numpy.typing import NDArray
 from model.effects import JUELICH_LATITUDE, Effect, effect_to_json
 from model.errors import InvalidInputError
 from model.forecast import Aligned, Shot, View, align
-from model.imaging.window import center_of_mass, flux_window
+from model.imaging.window import overlap_matrix
 from model.metrics import compare_on_target
 from model.plant import TargetPlane
-from model.tracing import Optics
+from model.study.noise import black_lift, grain_variance
+from model.study.unknowns import copied, copy_name
+from model.sunshape import transfer_table
+from model.tracing import Optics, Scene, Window, trace
 
 Array = NDArray[np.float64]
 
@@ -72,27 +77,13 @@ class Photograph:
         return float(np.linalg.norm(self.shot.heliostat.position - self.shot.plane.center))
 
     def noise_share(self, window: float) -> float:
-        """The error (one minus accuracy) that this image's noise alone makes, by the grain of its own cut.
-
-        In the cut, because pixels of a camera that was resampled share their noise.
-        """
-        (image,) = cut([self.image], [self.shot.plane], window, RESOLUTION)
-        return float(np.sqrt(2 / np.pi) * np.sqrt(noise_variance(image)).sum())
-
-
-def noise_variance(image: Array, bins: int = 12) -> Array:
-    """Variance of each pixel's noise (rows, columns), a line in its intensity: read noise, rounding and counting.
-
-    A mask that no plane and no slope answers leaves the grain (Immerkaer 1996, doi:10.1006/cviu.1996.0060).
-    """
-    lines = image[:-2] - 2 * image[1:-1] + image[2:]
-    grain = ((lines[:, :-2] - 2 * lines[:, 1:-1] + lines[:, 2:]) / 6) ** 2
-    inner = image[1:-1, 1:-1]
-    parts = np.array_split(np.argsort(inner, axis=None), bins)
-    levels = np.array([inner.ravel()[part].mean() for part in parts])
-    variances = np.array([grain.ravel()[part].mean() for part in parts])
-    slope, offset = np.polyfit(levels, variances, 1)
-    return np.asarray(np.clip(offset + slope * image, variances.min(), variances.max()))
+        """The error (one minus accuracy) that this image's noise alone makes, in a cut of side ``window`` [m]."""
+        images, planes = np.stack([self.image, black_lift(self.image)]), [self.shot.plane] * 2
+        seen, lift = windows(images, planes, centers(images[:1], planes[:1]).repeat(2, axis=0), window, RESOLUTION)
+        # A lift of the dark takes from the light's share of the sum.
+        lifted = lift - seen * lift.sum() / seen.sum()
+        grain = np.sqrt(2 / np.pi * grain_variance(seen))
+        return float(np.hypot(lifted, grain).sum() / seen.sum())
 
 
 def spot_window(photographs: Sequence[Photograph]) -> float:
@@ -107,20 +98,66 @@ def spot_window(photographs: Sequence[Photograph]) -> float:
     return WINDOWS[-1]
 
 
-def cut(images: Sequence[NDArray[np.floating]], planes: Sequence[TargetPlane], window: float, resolution: int) -> Array:
+def centers(images: NDArray[np.floating], planes: Sequence[TargetPlane]) -> Array:
+    """Centres of mass (N, 2) [m] of images (N, rows, columns), right and down of the planes' centres.
+
+    Raises
+    ------
+    InvalidInputError
+        Where an image holds no energy.
+    """
+    across, along = images.sum(axis=1), images.sum(axis=2)
+    total = across.sum(axis=1)
+    if not (total > 0).all():
+        raise InvalidInputError("an image without energy has no centre of mass")
+    shares = [line @ ((np.arange(line.shape[1]) + 0.5) / line.shape[1] - 0.5) / total for line in (across, along)]
+    return np.stack(shares, axis=1) * _sizes(planes)
+
+
+def windows(
+    images: NDArray[np.floating], planes: Sequence[TargetPlane], centers: Array, window: float, resolution: int
+) -> Array:
+    """Energy (N, resolution, resolution) of images (N, rows, columns) in squares about ``centers`` (N, 2) [m].
+
+    As `model.imaging.window.flux_window`, for many images at once.
+    """
+    down, across = (
+        overlap_matrix(
+            np.linspace(-0.5, 0.5, images.shape[2 - axis] + 1) * _sizes(planes)[:, axis, None],
+            centers[:, axis, None] + np.linspace(-window / 2, window / 2, resolution + 1),
+        )
+        for axis in (1, 0)
+    )
+    return np.asarray(down @ images @ across.transpose(0, 2, 1))
+
+
+def _sizes(planes: Sequence[TargetPlane]) -> Array:
+    """Widths and heights (N, 2) [m]."""
+    return np.array([(plane.width, plane.height) for plane in planes])
+
+
+def cut(images: NDArray[np.floating], planes: Sequence[TargetPlane], window: float, resolution: int) -> Array:
     """Windows (N, resolution, resolution) of sum one about each image's own centre of mass.
 
-    Position and exposure are free for every image, and this takes both out.
+    Position and exposure are free for every image (N, rows, columns), and this takes both out.
     """
-    cuts = np.empty((len(images), resolution, resolution))
-    for index, (image, plane) in enumerate(zip(images, planes, strict=True)):
-        size = (plane.width, plane.height)
-        cuts[index] = flux_window(image, size, center_of_mass(image, size), window, resolution)
+    cuts = windows(images, planes, centers(images, planes), window, resolution)
     return np.asarray(cuts / cuts.sum(axis=(1, 2), keepdims=True))
 
 
+def in_pixels(images: Array, rows: int, columns: int) -> Array:
+    """Energy of images (N, R, C) in the pixels (rows, columns) of a coarser camera; they are never made finer."""
+    if images.shape[1] <= rows and images.shape[2] <= columns:
+        return images
+    down, across = (
+        overlap_matrix(np.linspace(0, 1, size + 1), np.linspace(0, 1, min(size, count) + 1))
+        for size, count in zip(images.shape[1:], (rows, columns), strict=True)
+    )
+    return np.asarray(down @ images @ across.T)
+
+
 class Forecaster:
-    """Forecasts of photographs under any effects, cut as the photographs are; remembers what it has just aligned."""
+    """Forecasts of photographs under any effects, cut as the photographs are; remembers what it has just traced."""
 
     def __init__(
         self,
@@ -135,13 +172,35 @@ class Forecaster:
         self.window, self.view, self.latitude_deg = window, view, latitude_deg
         self.shots = [p.shot for p in photographs]
         self.planes = [shot.plane for shot in self.shots]
+        self.cameras = np.array([p.image.shape for p in photographs])
         self._aligned: dict[str, Aligned] = {}
         self._flux: dict[str, torch.Tensor] = {}
         self._start: Aligned | None = None
+        self._copies: dict[int, Forecaster] = {}
+
+    def copies(self, count: int) -> "Forecaster":
+        """The same of photographs that are there ``count`` times, of heliostats that are copies of the first.
+
+        What belongs to a heliostat may differ between copies; tracing them at once is several times faster than one by
+        one.
+        """
+        if count not in self._copies:
+            heliostats = {id(s.heliostat): s.heliostat for s in self.shots}
+            photographs = []
+            for number in range(count):
+                renamed = {k: replace(h, name=copy_name(h.name, number)) for k, h in heliostats.items()}
+                shots = [replace(s, heliostat=renamed[id(s.heliostat)]) for s in self.shots]
+                photographs += [Photograph(s, p.image) for s, p in zip(shots, self.photographs, strict=True)]
+            declared = [copied(effect, count) for effect in self.declared]
+            self._copies[count] = Forecaster(
+                photographs, self.optics, declared, self.window, self.view, self.latitude_deg
+            )
+        return self._copies[count]
 
     def measured(self, resolution: int = RESOLUTION) -> Array:
         """The photographs' cuts (N, resolution, resolution)."""
-        return cut([p.image for p in self.photographs], self.planes, self.window, resolution)
+        cuts = [cut(p.image[None], [p.shot.plane], self.window, resolution) for p in self.photographs]
+        return np.concatenate(cuts)
 
     def cuts(self, effects: Sequence[Effect], resolution: int = RESOLUTION) -> Array:
         """The forecasts' cuts (N, resolution, resolution) under the declared effects and these.
@@ -150,26 +209,44 @@ class Forecaster:
         ------
         UnreachableError
             Where effects on sun or mount leave a spot that no attitude reaches.
+        InvalidInputError
+            Where they leave no light.
         """
         model = [*self.declared, *effects]
         aligned, flux = self._traced(model)
         with torch.no_grad():
-            images = aligned.photographs(flux, model, self.view).double().numpy()
-        return cut(list(images.clip(min=0)), self.planes, self.window, resolution)
+            images = aligned.photographs(flux, model, self.view).double().numpy().clip(min=0)
+        cuts = np.empty((len(images), resolution, resolution))
+        for camera in np.unique(self.cameras, axis=0):
+            rows = np.flatnonzero((self.cameras == camera).all(axis=1))
+            planes = [self.planes[row] for row in rows]
+            cuts[rows] = cut(in_pixels(images[rows], *camera), planes, self.window, resolution)
+        return cuts
 
     def _traced(self, model: Sequence[Effect]) -> tuple[Aligned, torch.Tensor]:
         """Aligned shots and their flux; both are kept while only later stages change."""
         geometry = _name(model, ("geometry",))
         if geometry not in self._aligned:
-            fresh = align(self.shots, model, latitude_deg=self.latitude_deg, start=self._start)
-            self._start = self._start or fresh
-            self._aligned = {geometry: fresh}
+            # The one before differs little: fits go by small steps.
+            self._start = align(self.shots, model, latitude_deg=self.latitude_deg, start=self._start)
+            self._aligned = {geometry: self._start}
             self._flux = {}
         light = _name(model, ("geometry", "optics"))
         if light not in self._flux:
             with torch.no_grad():
-                self._flux = {light: self._aligned[geometry].flux(self.optics, model, self.view)}
+                self._flux = {light: self._aligned[geometry].flux(self.optics, model, self.view, self._trace)}
         return self._aligned[geometry], self._flux[light]
+
+    def _trace(self, scene: Scene, window: Window, optics: Optics) -> torch.Tensor:
+        """As `View.trace` does it, with the sun's transfer table kept."""
+        sun: Any = optics.sun_shape  # all are frozen dataclasses of numbers, which the protocol cannot say
+        view, table = self.view, _table(sun, scene.sun.dtype)
+        return trace(scene, window, optics, samples=view.samples, padding=view.padding, table=table).irradiance
+
+
+@lru_cache(maxsize=64)
+def _table(sun: Any, dtype: torch.dtype) -> torch.Tensor:
+    return transfer_table(sun, dtype, torch.device("cpu"))
 
 
 def _name(effects: Sequence[Effect], stages: tuple[str, ...]) -> str:

@@ -17,12 +17,9 @@ from model.study.unknowns import Unknowns
 Array = NDArray[np.float64]
 Verdict = Literal["effect", "none", "unexplained"]
 
-BASELINE = 0.013
-"""Error that forecasts of a complete model keep beside the images' noise, by undeclared sets that hold no effect: two
-tracers, resampling, surfaces of finite resolution."""
-
 TOLERANCE = 0.006
-"""Error beyond noise and baseline up to which nothing is to be explained."""
+"""Error beyond the images' noise up to which nothing is to be explained: undeclared sets that hold no effect, and sets
+whose effects are known, keep less (two tracers, resampling, surfaces of finite resolution)."""
 
 SHARE = 1 / 3
 """Share of that error which the effects found must remove for the verdict to rest on them."""
@@ -121,13 +118,13 @@ class Study:
 
     @property
     def unexplained_share(self) -> float:
-        """Share of the error beyond noise and baseline that the effects found leave; zero where there is none."""
+        """Share of the error beyond noise that the effects found leave; zero where there is none to speak of."""
         first, last = (self._excess(accuracy) for accuracy in (self.accuracy_before, self.accuracy_after))
-        return min(1.0, last / first) if first > 0 else 0.0
+        return min(1.0, last / first) if first > TOLERANCE else 0.0
 
     def _excess(self, accuracy: Array) -> float:
-        """Mean error beyond noise and baseline."""
-        return max(0.0, 1 - float(accuracy.mean()) - self.noise_floor - BASELINE)
+        """Mean error beyond noise."""
+        return max(0.0, 1 - float(accuracy.mean()) - self.noise_floor)
 
     @property
     def verdict(self) -> Verdict:

@@ -1,7 +1,7 @@
 """Effects as numbers to be fitted, and back."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -106,15 +106,47 @@ class Unknowns:
         known = dict(zip(self.all, values, strict=True))
         return np.array([known.get(u, u.parameter.neutral) for u in into.all])
 
+    def copies(self, trials: Array) -> tuple["Unknowns", Array]:
+        """Unknowns of as many copies of the heliostats as trials (M, P), and their values.
+
+        The trials must have what heliostats share in common.
+        """
+        copies = Unknowns(self.kinds, tuple((copy_name(h, m), n) for m in range(len(trials)) for h, n in self.facets))
+        known = {
+            replace(u, heliostat=None if u.heliostat is None else copy_name(u.heliostat, m)): value
+            for m, values in enumerate(trials)
+            for u, value in zip(self.all, values, strict=True)
+        }
+        return copies, np.array([known[u] for u in copies.all])
+
     @property
     def own(self) -> "Unknowns":
         """Those that belong to heliostats."""
         kinds = [k for k in self.kinds if all(p.scope in ("heliostat", "facet") for p in k.parameters())]
         return Unknowns(tuple(kinds), self.facets)
 
+    def without(self, kinds: Iterable[type[Effect]]) -> "Unknowns":
+        """Those of other kinds."""
+        return Unknowns(tuple(k for k in self.kinds if k not in set(kinds)), self.facets)
+
     def of(self, heliostats: Sequence[str]) -> "Unknowns":
         """The same kinds for fewer heliostats."""
         return Unknowns(self.kinds, tuple((name, count) for name, count in self.facets if name in heliostats))
+
+
+def copy_name(heliostat: str, number: int) -> str:
+    """Name of a copy of a heliostat."""
+    return f"{heliostat}#{number}"
+
+
+def copied(effect: Effect, count: int) -> Effect:
+    """An effect whose heliostats are there ``count`` times."""
+    changes = {
+        p.name: {copy_name(h, m): v for m in range(count) for h, v in getattr(effect, p.name).items()}
+        for p in effect.parameters()
+        if p.scope in ("heliostat", "facet")
+    }
+    return replace(effect, **changes)
 
 
 def _arrays(parameters: Mapping[str, object]) -> dict[str, object]:

@@ -89,9 +89,9 @@ def generate(
     surfaces: Array,
     *,
     heliostats: int = 4,
-    shots: int = 9,
+    shots: int = 6,
     side: int = 192,
-    fan: int = 32,
+    fan: int = 24,
 ) -> MeasurementSet:
     """A set of one case at strength ``level`` (0 to 2); a seed has the same plant, suns and aims in every case.
 
