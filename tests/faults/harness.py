@@ -85,8 +85,15 @@ def new_store(engine: str, folder: Path) -> Iterator[Store]:
 class Process:
     """A service, or a worker, on a store; `kill` ends it by SIGKILL."""
 
-    def __init__(self, store: Store, what: str = "serve", **environment: str) -> None:
-        self.port = free_port()
+    def __init__(
+        self,
+        store: Store,
+        what: str = "serve",
+        module: str = "tests.faults.process",
+        port: int | None = None,
+        **environment: str,
+    ) -> None:
+        self.port = port or free_port()
         self.base = f"http://127.0.0.1:{self.port}"
         settings = {
             "HELIOTWIN_DATA_DIR": str(store.folder),
@@ -101,12 +108,13 @@ class Process:
             "HELIOTWIN_LOG_LEVEL": "error",
         }
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "tests.faults.process", what],
+            [sys.executable, "-m", module, what],
             cwd=ROOT,
             env=os.environ | settings | store.environment | environment,
             stderr=subprocess.DEVNULL,
         )
         self._what = what
+        self._clients: list[Client] = []
 
     def __enter__(self) -> Self:
         if self._what == "serve":
@@ -114,7 +122,14 @@ class Process:
         return self
 
     def __exit__(self, *_: object) -> None:
+        for client in self._clients:
+            client.http.close()
         self.end(signal.SIGTERM)
+
+    def client(self) -> "Client":
+        """A client of this service, closed with it."""
+        self._clients.append(Client(self.base))
+        return self._clients[-1]
 
     def is_alive(self) -> bool:
         assert self._process.poll() is None, "the process ended by itself"
@@ -122,6 +137,11 @@ class Process:
             return httpx.get(f"{self.base}/livez", timeout=10).status_code == 200
         except httpx.TransportError:
             return False
+
+    @property
+    def number(self) -> int:
+        """Of the process."""
+        return self._process.pid
 
     def kill(self) -> None:
         self.end(signal.SIGKILL)

@@ -68,12 +68,12 @@ class _Counter:
 # --- killed -----------------------------------------------------------------------------------------------------------
 
 
-def kill_during_ingest(store: Store, rounds: int = 3) -> str:
+def kill_during_ingest(store: Store, rounds: int = 2) -> str:
     """kill -9 of the service while four clients post; what it acknowledged is there when it is back."""
     seeds, kept, unanswered = _Counter(), {}, 0
     for number in range(rounds):
         with Process(store) as service:
-            client = Client(service.base)
+            client = service.client()
             client.kept = kept
             if not number:
                 client.set_up()
@@ -84,7 +84,7 @@ def kill_during_ingest(store: Store, rounds: int = 3) -> str:
                 time.sleep(0.2)
             unanswered += statuses[0]
     with Process(store) as service:
-        client = Client(service.base)
+        client = service.client()
         client.kept = kept
         count = client.require_kept()
         stored = len(client.measurements())
@@ -101,7 +101,7 @@ def kill_during_ingest(store: Store, rounds: int = 3) -> str:
 def kill_during_job(store: Store, heliostats: int = 8) -> str:
     """kill -9 of a worker in the midst of a job; another takes it up, and each surface is there once."""
     with Process(store) as service:
-        client = Client(service.base)
+        client = service.client()
         names = client.set_up(heliostats)
         for seed, name in enumerate(names):
             assert client.post(png(seed), name).status_code == 201
@@ -146,7 +146,7 @@ def full_disk(store: Store) -> str:
         ballast = store.folder / "ballast"
         ballast.write_bytes(bytes(2 * 2**20))
         with Process(store) as service:
-            client, seeds = Client(service.base), _Counter()
+            client, seeds = service.client(), _Counter()
             client.set_up()
             refused = until(lambda: _refusal(client, seeds), "the disk is full")
             _fill(store.folder / "rest")
@@ -192,7 +192,7 @@ def database_gone(store: Store, away_s: float = 2.0) -> str:
     through = url.set(host="127.0.0.1", port=proxy.port).render_as_string(hide_password=False)
     behind = replace(store, url=through)
     with Process(behind, HELIOTWIN_JOB_WORKERS="1", HELIOTWIN_FAULTS_PAUSE_S="0.3") as service:
-        client = Client(service.base)
+        client = service.client()
         names = client.set_up(8)
         for seed, name in enumerate(names):
             assert client.post(png(10_000 + seed), name).status_code == 201
@@ -230,7 +230,7 @@ def database_gone(store: Store, away_s: float = 2.0) -> str:
 def duplicates_and_disorder(store: Store) -> str:
     """The same photographs from eight clients at once, in any order; then old ones after new ones."""
     with Process(store) as service:
-        client = Client(service.base)
+        client = service.client()
         client.set_up()
         posts = [seed for seed in range(10) for _ in range(8)]
         random.Random(1).shuffle(posts)
@@ -258,7 +258,7 @@ def clock_jumps(store: Store) -> str:
     clock.write_text("0")
     moved = replace(store, environment={"HELIOTWIN_FAULTS_CLOCK": str(clock)})
     with Process(moved) as service:
-        client, seeds = Client(service.base), _Counter()
+        client, seeds = service.client(), _Counter()
         names = client.set_up(4)
         for name in names:
             assert client.post(png(next(seeds)), name).status_code == 201
@@ -296,7 +296,7 @@ def clock_jumps(store: Store) -> str:
 def corrupt_images(store: Store) -> str:
     """One file altered, one cut off, one gone: three clear errors, all else works; posted again they are whole."""
     with Process(store) as service:
-        client = Client(service.base)
+        client = service.client()
         client.set_up()
         for seed in range(6):
             assert client.post(png(seed)).status_code == 201

@@ -1,0 +1,161 @@
+"""A calibration system's side of heliotwin, as an example to start from: Python 3.11, nothing else.
+
+    python example_client.py --url http://127.0.0.1:8000 --key-file ingest.key SPOOL [--predict]
+
+SPOOL/HELIOSTAT/NAME.png with its metadata in NAME.json beside it is sent, and moved to SPOOL/sent when the service has
+acknowledged it; what the service cannot take is moved to SPOOL/rejected with the reason in NAME.reason. An image whose
+metadata are not there yet is left for the next time. Ended at any moment and started again, it loses nothing; what it
+sends twice is stored once, for the same image again is the same measurement.
+With --predict (a key of role operate) each heliostat that got a photograph gets a new surface, and a forecast.
+"""
+
+import argparse
+import json
+import sys
+import time
+import urllib.error
+import urllib.request
+import uuid
+from pathlib import Path
+from typing import Any
+
+# Answers after which the same request may succeed later.
+AGAIN = (429, 500, 502, 503, 504, 507)
+LONGEST_PAUSE_S = 60.0
+
+
+class RejectedError(Exception):
+    """The service understood the request and does not take it; trying again would find the same."""
+
+
+class Heliotwin:
+    """The calls; each is tried until the service answers, with growing pauses."""
+
+    def __init__(self, url: str, key: str = "", patience_s: float = 3600.0) -> None:
+        self.url = url.rstrip("/")
+        self.key = key
+        self.patience_s = patience_s
+
+    def send_photograph(self, heliostat: str, image: bytes, metadata: dict[str, Any]) -> dict[str, Any]:
+        """The measurement that the photograph became; it is stored for good when this returns."""
+        boundary = uuid.uuid4().hex
+        parts = (
+            ('name="metadata"', b"application/json", json.dumps(metadata).encode()),
+            ('name="image"; filename="spot"', b"application/octet-stream", image),
+        )
+        body = b"".join(
+            b"--%b\r\nContent-Disposition: form-data; %b\r\nContent-Type: %b\r\n\r\n%b\r\n"
+            % (boundary.encode(), name.encode(), kind, content)
+            for name, kind, content in parts
+        )
+        body += b"--%b--\r\n" % boundary.encode()
+        return self.call(
+            "POST", f"/v1/heliostats/{heliostat}/measurements", body, f"multipart/form-data; boundary={boundary}"
+        )
+
+    def predict(self, heliostat: str) -> dict[str, Any]:
+        """A new version of the heliostat's surface from its newest photographs."""
+        return self.post(f"/v1/heliostats/{heliostat}/surfaces", {"method": "network"})
+
+    def forecast(self, heliostat: str, target: str, azimuth_deg: float, elevation_deg: float) -> dict[str, Any]:
+        """The flux of the current surface on a target, its peak [W/m2] and power [W] among others."""
+        sun = {"azimuth_deg": azimuth_deg, "elevation_deg": elevation_deg}
+        return self.post("/v1/forecasts", {"heliostat": heliostat, "target": target, "sun": sun})
+
+    def post(self, path: str, document: dict[str, Any]) -> dict[str, Any]:
+        """Send a JSON document."""
+        return self.call("POST", path, json.dumps(document).encode(), "application/json")
+
+    def get(self, path: str) -> dict[str, Any]:
+        """Read a resource."""
+        return self.call("GET", path)
+
+    def call(self, method: str, path: str, body: bytes | None = None, kind: str = "") -> dict[str, Any]:
+        """One request until it is answered; `RejectedError` where the answer is no."""
+        until, pause_s = time.monotonic() + self.patience_s, 0.5
+        while True:
+            try:
+                return self._ask(method, path, body, kind)
+            except urllib.error.HTTPError as error:
+                reason = _reason(error)
+                if error.code not in AGAIN:
+                    raise RejectedError(reason) from error
+                wait_s = max(pause_s, float(error.headers.get("Retry-After") or 0))
+            except OSError as error:  # no connection, or it broke: nobody knows whether the request arrived
+                reason, wait_s = str(error), pause_s
+            if time.monotonic() + wait_s > until:
+                raise TimeoutError(f"{method} {path}: {reason}")
+            print(f"waiting {wait_s:.0f} s: {reason}", file=sys.stderr)
+            time.sleep(wait_s)
+            pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
+
+    def _ask(self, method: str, path: str, body: bytes | None, kind: str) -> dict[str, Any]:
+        headers = {"Accept": "application/json"}
+        if self.key:
+            headers["Authorization"] = f"Bearer {self.key}"
+        if kind:
+            headers["Content-Type"] = kind
+        request = urllib.request.Request(self.url + path, body, headers, method=method)
+        with urllib.request.urlopen(request, timeout=120) as answer:
+            document: dict[str, Any] = json.load(answer)
+            return document
+
+
+def _reason(error: urllib.error.HTTPError) -> str:
+    """What a problem document says, with the id that the service's log knows the request by."""
+    try:
+        document = json.load(error)
+        return f"{error.code}: {document['detail']} (request {document['request_id']})"
+    except (ValueError, KeyError):  # a proxy's answer
+        return f"{error.code} {error.reason}"
+
+
+def _move(image: Path, spool: Path, to: str) -> Path:
+    folder = spool / to / image.parent.name
+    folder.mkdir(parents=True, exist_ok=True)
+    for file in (image, image.with_suffix(".json")):
+        file.rename(folder / file.name)
+    return folder / image.name
+
+
+def send_all(service: Heliotwin, spool: Path) -> dict[str, str]:
+    """Send what lies in the spool, oldest first; the heliostats that got an accepted photograph, with its target."""
+    touched = {}
+    images = [path for path in spool.glob("*/*.png") if path.with_suffix(".json").is_file()]
+    for image in sorted(images, key=lambda path: path.stat().st_mtime):
+        heliostat, metadata = image.parent.name, json.loads(image.with_suffix(".json").read_text(encoding="utf-8"))
+        try:
+            measured = service.send_photograph(heliostat, image.read_bytes(), metadata)
+        except RejectedError as refusal:
+            _move(image, spool, "rejected").with_suffix(".reason").write_text(f"{refusal}\n", encoding="utf-8")
+            print(f"{heliostat}/{image.stem}: rejected, {refusal}")
+            continue
+        _move(image, spool, "sent")
+        if measured["accepted"]:
+            touched[heliostat] = metadata["target_name"]
+        print(
+            f"{heliostat}/{measured['id']}: {'accepted' if measured['accepted'] else 'refused, ' + measured['reason']}"
+        )
+    return touched
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Send the spool once."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("spool", type=Path)
+    parser.add_argument("--url", default="http://127.0.0.1:8000")
+    parser.add_argument("--key-file", type=Path, help="file with the API key")
+    parser.add_argument("--patience", type=float, default=3600.0, help="how long to try a request [s]")
+    parser.add_argument("--predict", action="store_true")
+    options = parser.parse_args(arguments)
+    key = options.key_file.read_text(encoding="utf-8").strip() if options.key_file else ""
+    service = Heliotwin(options.url, key, options.patience)
+    touched = send_all(service, options.spool)
+    for heliostat, target in touched.items() if options.predict else ():
+        surface = service.predict(heliostat)
+        forecast = service.forecast(heliostat, target, azimuth_deg=0.0, elevation_deg=45.0)
+        print(f"{heliostat}: surface {surface['version']}, forecast peak {forecast['peak_w_m2']:.0f} W/m2")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,111 @@
+"""The example client against a live service: it sends all, loses nothing, and says why something is not taken."""
+
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import pytest
+
+from service import keys
+from service.database import Database
+from tests.faults.harness import Process, Store
+from tests.service.conftest import free_port, metadata, png
+
+CLIENT = Path(__file__).parents[2] / "docker" / "example_client.py"
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
+    """A store with a plant and two heliostats."""
+    store = Store(tmp_path_factory.mktemp("client") / "data", None)
+    with Process(store) as service:
+        service.client().set_up(2)
+    return store
+
+
+@pytest.fixture(scope="module")
+def service(store: Store) -> Iterator[Process]:
+    with Process(store) as running:
+        yield running
+
+
+def make_key(store: Store, folder: Path, role: str) -> Path:
+    database = Database(store.settings.database)
+    with database.writing() as session:
+        key = keys.create(session, f"{role}-{folder.name}"[:32], role, "test")
+    database.close()
+    file = folder / f"{role}.key"
+    file.write_text(f"{key}\n")
+    return file
+
+
+def spool(folder: Path, count: int, first: int = 0) -> Path:
+    """A spool with photographs of two heliostats, one refused, and one of a target that is not known."""
+    root = folder / "spool"
+    for number in range(first, first + count):
+        place = root / f"H{number % 2}"
+        place.mkdir(parents=True, exist_ok=True)
+        (place / f"{number}.png").write_bytes(png(number, refused=number == first))
+        target = "nowhere" if number == first + 1 else "lower"
+        (place / f"{number}.json").write_text(json.dumps(metadata(id=f"m{number}", target_name=target)))
+    return root
+
+
+def run(base: str, key: Path, root: Path, *options: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-I", str(CLIENT), "--url", base, "--key-file", str(key), *options, str(root)]
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+
+
+def test_spool_is_sent_once_and_sorted(store: Store, service: Process, tmp_path: Path):
+    key, root = make_key(store, tmp_path, "operate"), spool(tmp_path, 6)
+    done = run(service.base, key, root, "--predict")
+    assert done.returncode == 0, done.stderr
+    assert "H0/m0: refused, no_spot" in done.stdout
+    assert "H0: surface 1, forecast peak" in done.stdout
+    assert len(list((root / "sent").glob("*/*.png"))) == 5
+    (reason,) = (root / "rejected").glob("*/*.reason")
+    assert "there is no target nowhere; known targets: lower, upper (request " in reason.read_text()
+    assert run(service.base, key, root).stdout == ""
+    with httpx.Client(base_url=service.base, headers={"Authorization": f"Bearer {key.read_text().strip()}"}) as http:
+        for file in (root / "sent").glob("*/*.png"):  # sent again, they are the same measurements
+            shutil.copy(file, root / file.parent.name / file.name)
+            shutil.copy(file.with_suffix(".json"), root / file.parent.name / file.with_suffix(".json").name)
+        assert run(service.base, key, root).returncode == 0
+        assert sum(len(http.get(f"/v1/heliostats/H{n}/measurements").json()["items"]) for n in range(2)) == 5
+
+
+def test_ingest_key_may_send_and_not_predict(store: Store, service: Process, tmp_path: Path):
+    key, root = make_key(store, tmp_path, "ingest"), spool(tmp_path, 4, first=10)
+    done = run(service.base, key, root, "--predict")
+    assert done.returncode == 1
+    assert "403" in done.stderr
+    assert len(list((root / "sent").glob("*/*.png"))) == 3
+
+
+def test_service_that_is_away_is_waited_for(store: Store, service: Process, tmp_path: Path):
+    key, root = make_key(store, tmp_path, "ingest"), spool(tmp_path, 4, first=20)
+    command = [sys.executable, "-I", str(CLIENT), "--key-file", str(key), str(root), "--url"]
+    port = free_port()
+    base = f"http://127.0.0.1:{port}"
+    process = subprocess.Popen([*command, base], stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert process.stderr is not None
+    assert "waiting" in process.stderr.readline()
+    assert len(list(root.glob("H*/*.png"))) == 4
+    with Process(store, port=port):
+        assert process.wait(60) == 0
+    process.communicate()
+    assert len(list((root / "sent").glob("*/*.png"))) == 3
+
+
+def test_patience_ends(tmp_path: Path):
+    root = spool(tmp_path, 2)
+    key = tmp_path / "no.key"
+    key.write_text("x")
+    done = run("http://127.0.0.1:9", key, root, "--patience", "0.1")
+    assert done.returncode == 1
+    assert "TimeoutError" in done.stderr
+    assert len(list(root.glob("H*/*.png"))) == 2
