@@ -135,9 +135,18 @@ async def _warm_up(base: str) -> None:
         assert not visitor.tally.failures, visitor.tally.failures
 
 
-async def _visits(base: str, tally: Tally, options: argparse.Namespace) -> None:
-    until_s = time.monotonic() + options.seconds
-    await asyncio.gather(*(_visit(base, tally, seed, until_s, options.pause) for seed in range(options.clients)))
+async def _visits(service: Process, tally: Tally, options: argparse.Namespace) -> list[float]:
+    """The visits of all clients; the service's memory [MB] after each fifth of the time."""
+    until_s, memory = time.monotonic() + options.seconds, []
+
+    async def watch() -> None:
+        for _ in range(5):
+            await asyncio.sleep(options.seconds / 5)
+            memory.append(_status(service.number, "VmRSS"))
+
+    visits = (_visit(service.base, tally, seed, until_s, options.pause) for seed in range(options.clients))
+    await asyncio.gather(watch(), *visits)
+    return memory
 
 
 def _status(number: int, name: str) -> float:
@@ -214,8 +223,9 @@ def main(arguments: list[str]) -> None:
             tally, number = Tally(), service.number
             memory, cpu_s = {"before": _status(number, "VmRSS")}, _cpu_s(number)
             own = resource.getrusage(resource.RUSAGE_SELF).ru_utime
-            asyncio.run(_visits(service.base, tally, options))
-            memory |= {"after": _status(number, "VmRSS"), "highest": _status(number, "VmHWM")}
+            grown = asyncio.run(_visits(service, tally, options))
+            memory |= {f"after {part}/5": value for part, value in enumerate(grown, start=1)}
+            memory["highest"] = _status(number, "VmHWM")
             spent = (_cpu_s(number) - cpu_s, resource.getrusage(resource.RUSAGE_SELF).ru_utime - own)
             _report(tally, options.seconds, memory, spent)
             _require_all(store, service.base, tally.acknowledged)
