@@ -127,7 +127,10 @@ class Database:
     def require_current(self) -> None:
         """Raise `SchemaError` unless the schema is at the newest version that this code knows."""
         if not self.is_current():
-            raise SchemaError(f"the store's schema is at {self.revision()}, not the newest: run `heliotwin migrate`")
+            raise SchemaError(
+                f"the store's schema is at {self.revision()}, this version works with {self.revisions()[-1]}: run "
+                "`heliotwin migrate`, or the version that fits"
+            )
 
     def close(self) -> None:
         """Close all pooled connections."""

@@ -12,12 +12,15 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from fnmatch import fnmatch
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jsonschema
 import pytest
 import yaml
 
+from service.metrics import registry
+from service.runtime import Runtime
 from service.settings import Settings
 
 ROOT = Path(__file__).parents[2]
@@ -66,6 +69,7 @@ def test_what_compose_names_exists(compose: dict[str, Any]):
         for volume in service.get("volumes", []):
             source = volume.split(":")[0]
             assert source in compose["volumes"] or source.startswith("./")
+            assert Path(source).suffix != ".yml" or (DOCKER / source).is_file()
         assert set(service.get("secrets", [])) <= set(compose["secrets"])
         if "build" in service:
             assert (DOCKER / service["build"]["context"] / service["build"]["dockerfile"]).is_file()
@@ -84,8 +88,9 @@ def test_containers_have_no_more_rights_than_they_need(compose: dict[str, Any]):
         service = compose["services"][name]
         assert service["read_only"] is True
         assert service["cap_drop"] == ["ALL"]
-    for port in compose["services"]["service"]["ports"]:
-        assert port.startswith("127.0.0.1:")
+    published = [port for service in compose["services"].values() for port in service.get("ports", [])]
+    assert len(published) == 2
+    assert all(port.startswith("127.0.0.1:") for port in published)
 
 
 def test_environment_makes_valid_settings(compose: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -112,6 +117,34 @@ def test_jobs_are_worked_at_by_the_worker_alone(compose: dict[str, Any]):
     (imports,) = set(worker["volumes"]) - set(service["volumes"])
     assert imports.endswith(f":{worker['environment']['HELIOTWIN_IMPORT_ROOT']}:ro")
     assert worker["depends_on"] == service["depends_on"]
+
+
+# --- Prometheus -------------------------------------------------------------------------------------------------------
+
+
+def test_prometheus_reads_where_the_services_tell(compose: dict[str, Any]):
+    scraped = yaml.safe_load((DOCKER / "prometheus.yml").read_text(encoding="utf-8"))["scrape_configs"]
+    targets = {target for job in scraped for static in job.get("static_configs", []) for target in static["targets"]}
+    found = [entry for job in scraped for entry in job.get("dns_sd_configs", [])]
+    targets |= {f"{name}:{entry['port']}" for entry in found for name in entry["names"]}
+    assert targets == {f"{name}:9100" for name in ("service", "worker")}
+    for name in ("service", "worker"):
+        assert compose["services"][name]["environment"]["HELIOTWIN_METRICS_PORT"] == "9100"
+    assert compose["services"]["prometheus"]["profiles"] == ["monitoring"]
+
+
+def test_alerts_ask_for_metrics_that_exist(tmp_path: Path):
+    runtime = Runtime.from_settings(Settings(data_dir=tmp_path), SimpleNamespace())  # type: ignore[arg-type]
+    runtime.database.upgrade()
+    names = {family.name for family in registry(runtime).collect()}
+    runtime.close()
+    names |= {f"{name}_total" for name in names}
+    rules = yaml.safe_load((DOCKER / "prometheus-rules.yml").read_text(encoding="utf-8"))["groups"][0]["rules"]
+    asked = {name for rule in rules for name in re.findall(r"heliotwin_\w+", rule["expr"])}
+    assert len(rules) == 6
+    assert asked <= names
+    told = set(re.findall(r"heliotwin_\w+", (DOCKER / "OPERATING.md").read_text(encoding="utf-8")))
+    assert told <= names
 
 
 # --- Dockerfile -------------------------------------------------------------------------------------------------------
@@ -189,7 +222,12 @@ def _of_compose(_dockerfile: list[tuple[str, str]], compose: dict[str, Any]) -> 
     return command
 
 
-@pytest.mark.parametrize("command_of", [_of_image, _of_compose])
+def _of_worker(_dockerfile: list[tuple[str, str]], compose: dict[str, Any]) -> list[str]:
+    command: list[str] = compose["services"]["worker"]["healthcheck"]["test"][1:]
+    return command
+
+
+@pytest.mark.parametrize("command_of", [_of_image, _of_compose, _of_worker])
 @pytest.mark.parametrize(("status", "is_healthy"), [(200, True), (503, False)])
 def test_health_check_command(
     dockerfile: list[tuple[str, str]],
@@ -201,7 +239,7 @@ def test_health_check_command(
     program, *arguments = command_of(dockerfile, compose)
     assert program == "python"
     with _answering(status) as port:
-        arguments = [argument.replace(":8000/", f":{port}/") for argument in arguments]
+        arguments = [re.sub(":(8000|9100)/", f":{port}/", argument) for argument in arguments]
         environment = os.environ | {"HELIOTWIN_PORT": str(port)}
         done = subprocess.run([sys.executable, *arguments], env=environment, capture_output=True, check=False)
     assert (done.returncode == 0) is is_healthy
@@ -214,6 +252,8 @@ _TRY = """
 import service, pathlib, sys
 assert pathlib.Path(service.__file__).is_relative_to(sys.argv[1]), service.__file__
 from service.server import migrate
+from service.metrics import registry
+from service.runtime import Runtime
 from service.settings import Settings
 print(migrate(Settings(data_dir=pathlib.Path(sys.argv[2]))))
 from model.network.predictor import default_predictor
