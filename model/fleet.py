@@ -353,5 +353,5 @@ def superpose(task: Superposition, parts: Iterable[Tile], engine: Engine | None 
     total = FleetFlux(np.zeros(task.resolution))
     for part in (engine or Threads()).map(task, parts):
         total = total + part
-    # Frequency space leaves ripples of some 1e-5 of the peak below zero.
+    # Frequency space leaves ripples below zero: 1e-5 of the peak, more where pixels are coarser than the spots.
     return replace(total, irradiance=total.irradiance.clip(min=0))

@@ -63,6 +63,12 @@ class Settings(BaseSettings):
     parallel_computations: int = Field(
         default=2, ge=1, le=64, description="Measurements, predictions and tracings at a time."
     )
+    ray_address: str | None = Field(
+        default=None,
+        min_length=1,
+        description="HOST:PORT of a Ray cluster that works at fleet forecasts, `local` for one of this machine's; "
+        "without it threads do.",
+    )
     job_workers: int = Field(
         default=1, ge=0, le=64, description="Jobs that `serve` works at itself at a time; 0 where `worker` does."
     )
