@@ -9,6 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+from scipy.optimize import lsq_linear
 
 from model.effects import Effect
 from model.errors import InvalidInputError, UnreachableError
@@ -18,7 +20,10 @@ from model.study.unknowns import Unknowns, copied
 Array = NDArray[np.float64]
 
 TRUST = 0.03
-"""Residual of a pixel [of the peak] that weighs as much as an unknown that is half its range away from neutral."""
+"""Residual of a pixel [of the peak] that weighs as much as an unknown that is `HELD` away from neutral."""
+
+HELD = 0.1
+"""Share of an unknown's range; it only counts for what images cannot tell, such as the tilt of all facets together."""
 
 STARTS = (-0.4, -0.15, -0.05, 0.05, 0.15, 0.4)
 """Where fits of an unknown begin, in shares of its range away from neutral."""
@@ -29,8 +34,8 @@ HOPELESS = 3
 AT_ONCE = 16
 """Forecasts of all images that are traced at once, where they differ in mirrors alone."""
 
-STEP = 1e-2
-"""Step of the differences, in shares of an unknown's range: long enough to smooth what the tracer's grid leaves."""
+STEP = 5e-3
+"""Step of the differences, in shares of an unknown's range."""
 
 RESOLUTION = 32
 """Pixels a side in which fits compare; the sun has blurred all that is finer."""
@@ -103,9 +108,9 @@ class Fitter:
             self.measured = self.forecaster.measured(RESOLUTION) + grid
 
     def _pull(self, unknowns: Unknowns, values: Array) -> Array:
-        """Distances (P,) from neutral in half ranges: holds what images cannot tell."""
+        """Distances (P,) from neutral: holds what images cannot tell."""
         low, high = unknowns.bounds
-        return np.asarray((values - unknowns.neutral) / ((high - low) / 2))
+        return np.asarray((values - unknowns.neutral) / (HELD * (high - low)))
 
     def cost(self, unknowns: Unknowns, values: Array, residuals: Array) -> float:
         """Half the sum of squares."""
@@ -183,7 +188,7 @@ class Fitter:
     def descend(self, unknowns: Unknowns, values: Array) -> Fit:
         """The least cost near ``values`` (P,)."""
         low, high = unknowns.bounds
-        scale = 4 / (high - low) ** 2
+        scale = 1 / (HELD * (high - low)) ** 2
         damping, residuals = 1e-2, self.residuals(unknowns, values)
         cost = self.cost(unknowns, values, residuals)
         if not np.isfinite(cost):
@@ -195,8 +200,8 @@ class Fitter:
             gradient = flat @ residuals.ravel() + self._pull(unknowns, values) * np.sqrt(scale)
             before = cost
             for _ in range(3):
-                step = -np.linalg.solve(curvature + damping * np.diag(np.diag(curvature)), gradient)
-                trial = np.clip(values + step, low, high)
+                damped = curvature + damping * np.diag(np.diag(curvature))
+                trial = values + _bounded_step(damped, gradient, low - values, high - values)
                 trial_residuals = self.residuals(unknowns, trial)
                 trial_cost = self.cost(unknowns, trial, trial_residuals)
                 if trial_cost < cost:
@@ -218,3 +223,13 @@ class Fitter:
         count = len(scores)
         filling = scores.T @ scores * count / max(1, count - len(jacobian) / max(1, len(np.unique(self.heliostats))))
         return np.sqrt(np.diag(bread @ filling @ bread))
+
+
+def _bounded_step(curvature: Array, gradient: Array, low: Array, high: Array) -> Array:
+    """The step (P,) between ``low`` and ``high`` (P,) to the least of a quadratic form.
+
+    A full step that was only cut at the bounds would go astray where unknowns make up for each other.
+    """
+    root = np.linalg.cholesky(curvature)
+    solution = lsq_linear(root.T, -solve_triangular(root, gradient, lower=True), (low, high), method="bvls")
+    return np.asarray(np.clip(solution.x, low, high))

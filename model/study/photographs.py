@@ -227,8 +227,10 @@ class Forecaster:
         """Aligned shots and their flux; both are kept while only later stages change."""
         geometry = _name(model, ("geometry",))
         if geometry not in self._aligned:
-            # The one before differs little: fits go by small steps.
-            self._start = align(self.shots, model, latitude_deg=self.latitude_deg, start=self._start)
+            # The one before differs little: fits go by small steps. Their differences take double precision.
+            self._start = align(
+                self.shots, model, latitude_deg=self.latitude_deg, dtype=torch.float64, start=self._start
+            )
             self._aligned = {geometry: self._start}
             self._flux = {}
         light = _name(model, ("geometry", "optics"))

@@ -131,7 +131,12 @@ class Study:
         """Whether an effect explains the residual, there is none to explain, or none does."""
         if self.found and self.unexplained_share <= 1 - SHARE:
             return "effect"
-        return "unexplained" if self._excess(self.accuracy_after) > TOLERANCE else "none"
+        return "unexplained" if self.incomplete else "none"
+
+    @property
+    def incomplete(self) -> bool:
+        """Whether more error than noise makes is left, whatever was found."""
+        return self._excess(self.accuracy_after) > TOLERANCE
 
     def covariates(self) -> dict[str, float]:
         """Rank correlation of the error that is left with what may drive it, the strongest first."""
@@ -154,8 +159,12 @@ class Study:
                 f"{_plain(f.name)} from {', '.join(map(_plain, f.lookalikes))}" for f in self.found if f.lookalikes
             ]
             doubt = f"; these images cannot tell {' nor '.join(doubts)}" if doubts else ""
+            rest = (
+                f"; {self.unexplained_share:.0%} of the error beyond noise stays unexplained" if self.incomplete else ""
+            )
             return (
-                f"The images demand {names}: accuracy on held-out images rises from {before:.3f} to {after:.3f}{doubt}."
+                f"The images demand {names}: accuracy on held-out images rises from {before:.3f} to {after:.3f}"
+                f"{doubt}{rest}."
             )
         if self.verdict == "none":
             return (

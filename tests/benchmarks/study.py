@@ -83,6 +83,8 @@ def answer(case: Case) -> Record:
         "change": change,
         "noise": report["noise_floor"],
         "unexplained": report["unexplained_share"],
+        "incomplete": found.incomplete,
+        "lookalikes": [effect["lookalikes"] for effect in report["effects"]],
         "errors": [error for effect in report["effects"] for error in errors(effect, made.truth)],
         "truth": made.truth,
         "effects": report["effects"],
@@ -131,9 +133,10 @@ def flat(value: Any) -> Array:
 
 @lru_cache(maxsize=1)
 def code() -> str:
-    """What names the state of everything that an answer depends on."""
+    """What names the state of the code that studies and makes the sets."""
     root = Path(__file__).parents[2]
-    files = sorted([*(root / "model").rglob("*.py"), *(root / "tests" / "undeclared").glob("*.py")])
+    folders = [root / "model" / "effects", root / "model" / "study", root / "tests" / "undeclared"]
+    files = sorted(file for folder in folders for file in folder.glob("*.py") if not file.name.startswith("test_"))
     return sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:12]
 
 
@@ -252,7 +255,11 @@ def summary(records: Sequence[Record]) -> Iterator[str]:
     yield f"{percent([first(r) for r in large])} %, among those found in {percent([among(r) for r in large])} %."
     yield f"Clean sets: {len(clean)}, false alarms {percent([r['verdict'] != 'none' for r in clean])} %."
     answers = Counter(r["verdict"] for r in outside)
-    yield f"Outside the catalogue: {len(outside)} sets, " + ", ".join(f"{v} {n}" for v, n in answers.items()) + "."
+    yield (
+        f"Outside the catalogue: {len(outside)} sets, " + ", ".join(f"{v} {n}" for v, n in answers.items()) + "; of the"
+    )
+    rest = [r["incomplete"] for r in outside if r["verdict"] == "effect"]
+    yield f"effects {percent(rest)} % are reported with an error that stays unexplained."
     yield f"A study takes {np.median([r['seconds'] for r in records]):.0f} s of one core."
 
 
