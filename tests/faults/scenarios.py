@@ -68,7 +68,7 @@ class _Counter:
 # --- killed -----------------------------------------------------------------------------------------------------------
 
 
-def kill_during_ingest(store: Store, rounds: int = 2) -> str:
+def kill_during_ingest(store: Store, rounds: int = 3) -> str:
     """kill -9 of the service while four clients post; what it acknowledged is there when it is back."""
     seeds, kept, unanswered = _Counter(), {}, 0
     for number in range(rounds):
