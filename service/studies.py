@@ -134,11 +134,13 @@ def _gather_heliostat(session: Session, row: HeliostatRow, request: StudyRequest
     from model.surface import control_points
 
     heliostat, origin = load_heliostat(session, row), store.get_plant(session).origin
-    points = control_points(heliostat, unpack(_surface(session, row, request.surfaces).arrays)["z"])
+    surface = _surface(session, row, request.surfaces)
+    points, seen = control_points(heliostat, unpack(surface.arrays)["z"]), {m.identifier for m in surface.measurements}
     for chosen in choose_measurements(session, row, request.images, request.since, request.until):
         measurement = store.get_measurement(session, row, chosen.identifier, arrays=True)
         try:
             photograph = photograph_of(measurement, heliostat, points, origin)
+            photograph = replace(photograph, seen=chosen.identifier in seen)
         except _SKIPPED as error:
             material.skipped[f"{row.name}/{chosen.identifier}"] = str(error)
             continue

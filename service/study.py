@@ -15,7 +15,7 @@ from model.plant import Heliostat, TargetPlane
 from model.study import Photograph, Study, StudyOptions, study
 from model.surface import DEGREE, control_points
 from service.folder import check_surfaces, measure, read_image, surface_of
-from service.paint import Measurement, MeasurementFolder
+from service.paint import Measurement, MeasurementFolder, read_json
 
 CENTERED_SIDE = 6.1
 """Side [m] of PAINT's ``flux-centered.png``."""
@@ -36,7 +36,7 @@ class FolderStudy:
 def photographs_of(folder: MeasurementFolder, surfaces: str = "measured") -> tuple[list[Photograph], dict[str, str]]:
     """What a folder gives a study, and what it does not: heliostats and measurements with the reasons."""
     photographs: list[Photograph] = []
-    skipped = dict(folder.skipped)
+    skipped, seen = dict(folder.skipped), predicted_from(surfaces)
     for name, heliostat in folder.plant.heliostats.items():
         try:
             surface = surface_of(folder, heliostat, surfaces)
@@ -46,10 +46,22 @@ def photographs_of(folder: MeasurementFolder, surfaces: str = "measured") -> tup
         points, degree = (control_points(heliostat), DEGREE) if surface is None else surface
         for measurement in folder.measurements(name):
             try:
-                photographs.append(_photograph(folder, measurement, heliostat, points, degree))
+                photograph = _photograph(folder, measurement, heliostat, points, degree)
+                photographs.append(replace(photograph, seen=measurement.identifier in seen.get(name, ())))
             except ModelError as error:
                 skipped[measurement.key] = str(error)
     return photographs, skipped
+
+
+def predicted_from(surfaces: str) -> dict[str, list[str]]:
+    """Identifiers of the photographs, by heliostat, that the surfaces of a folder of predictions were made from."""
+    path = Path(surfaces) / "predictions.json"
+    if surfaces in ("measured", "ideal") or not path.is_file():
+        return {}
+    try:
+        return {name: list(entry["images"]) for name, entry in read_json(path)["heliostats"].items()}
+    except (KeyError, TypeError, AttributeError):
+        raise InvalidInputError(f"{path} is not as `heliotwin predict` writes it") from None
 
 
 def _photograph(

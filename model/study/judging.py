@@ -37,11 +37,18 @@ class Split:
     held_out: Rows
 
 
+FRESH = 2
+"""Images that no surface was predicted from, from which on they alone judge."""
+
+
 def split(photographs: Sequence[Photograph]) -> Split:
     """Every second image of each heliostat, by the sun's elevation, judges; and one heliostat of several is kept apart.
 
-    The one that is kept apart is at the median distance: the others span it.
+    The one that is kept apart is at the median distance: the others span it. Images that surfaces were predicted from
+    do not judge; where fewer than `FRESH` others are left they have to, which the report says.
     """
+    seen = [p.seen for p in photographs]
+    judged_apart = any(seen) and seen.count(False) >= FRESH
     names = sorted({p.heliostat for p in photographs})
     distance = {name: np.mean([p.slant_range for p in photographs if p.heliostat == name]) for name in names}
     kept = sorted(names, key=lambda name: distance[name])[len(names) // 2] if len(names) >= SEVERAL else None
@@ -49,8 +56,11 @@ def split(photographs: Sequence[Photograph]) -> Split:
     for name in names:
         rows = [row for row, p in enumerate(photographs) if p.heliostat == name]
         rows.sort(key=lambda row: (photographs[row].elevation_deg, photographs[row].key))
-        parts["own" if name == kept else "fit"] += rows[::2]
-        parts["held_out"] += rows[1::2]
+        fitted = [row for row in rows if seen[row]] if judged_apart else rows[::2]
+        if not fitted:  # a heliostat none of whose images is seen, beside others
+            fitted = rows[::2]
+        parts["own" if name == kept else "fit"] += fitted
+        parts["held_out"] += [row for row in rows if row not in fitted]
     return Split(*(np.array(sorted(parts[part]), dtype=np.int64) for part in ("fit", "own", "held_out")))
 
 

@@ -42,10 +42,13 @@ class Photograph:
         With the measured spot; ``shot.identifier`` is unique.
     image : (rows, columns)
         Over the whole target, row 0 at the top, in any unit.
+    seen : bool
+        Whether the mirror's surface was predicted from it: such a surface flatters its own photographs.
     """
 
     shot: Shot
     image: NDArray[np.floating]
+    seen: bool = False
 
     def __post_init__(self) -> None:
         if self.image.ndim != 2 or not np.isfinite(self.image).all() or not self.image.sum() > 0:

@@ -134,6 +134,11 @@ class Study:
         return "unexplained" if self.incomplete else "none"
 
     @property
+    def flattered(self) -> int:
+        """How many of the judging images a surface was predicted from, for want of others."""
+        return sum(p.seen for p in self.photographs)
+
+    @property
     def incomplete(self) -> bool:
         """Whether more error than noise makes is left, whatever was found."""
         return self._excess(self.accuracy_after) > TOLERANCE
@@ -151,7 +156,15 @@ class Study:
         return np.asarray(((self.measured - self.after) / peaks).mean(axis=0))
 
     def conclusion(self) -> str:
-        """One plain sentence."""
+        """One plain sentence, and a second one where the images that judge are not independent of the surfaces."""
+        if not self.flattered:
+            return self._conclusion()
+        return (
+            f"{self._conclusion()} {self.flattered} of the {len(self.photographs)} images that judge are among those "
+            "that the surfaces were predicted from, which flatters both accuracies: predict from fewer, or take more."
+        )
+
+    def _conclusion(self) -> str:
         before, after = float(self.accuracy_before.mean()), float(self.accuracy_after.mean())
         names = " and ".join(_plain(f.name) for f in self.found)
         if self.verdict == "effect":
@@ -178,7 +191,11 @@ class Study:
         return {
             "verdict": self.verdict,
             "conclusion": self.conclusion(),
-            "images": {"fit": self.fitted, "held_out": len(self.photographs)},
+            "images": {
+                "fit": self.fitted,
+                "held_out": len(self.photographs),
+                **({"held_out_but_predicted_from": self.flattered} if self.flattered else {}),
+            },
             "window_m": self.window,
             "before": self._summary(self.accuracy_before),
             "after": self._summary(self.accuracy_after),

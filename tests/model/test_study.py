@@ -120,6 +120,22 @@ def test_a_split_parts_images_and_keeps_one_heliostat_of_several(heliostats):
     assert not {taken[row].heliostat for row in parts.fit} & {taken[row].heliostat for row in parts.own}
 
 
+def test_images_that_surfaces_were_predicted_from_judge_only_for_want_of_others():
+    taken = photographs(view=SMALL, heliostats=2, count=5)
+    unseen = {2, 3, 7}
+    parts = split([replace(p, seen=row not in unseen) for row, p in enumerate(taken)])
+    assert set(parts.held_out) == unseen
+    assert len(parts.fit) == len(taken) - len(unseen)
+    of_all = split([replace(p, seen=row != 2) for row, p in enumerate(taken)])
+    np.testing.assert_array_equal(of_all.held_out, split(taken).held_out)
+
+
+def test_a_report_says_where_the_judging_images_are_not_independent_of_the_surfaces(clean):
+    report = study([replace(p, seen=True) for p in clean], Optics(), options=QUICK).to_json()
+    assert report["images"]["held_out_but_predicted_from"] == report["images"]["held_out"] == 4
+    assert "flatters both accuracies" in report["conclusion"]
+
+
 def test_accuracy_is_one_less_the_summed_difference():
     a = np.zeros((2, 4, 4))
     b = a.copy()
