@@ -40,13 +40,14 @@ def adopt(
     force: Annotated[bool, typer.Option("--force", help="Also where its verdict is not `effect`.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Add what the study of a folder found to the store's current model, which is used from then on."""
+    """Add what the study of a folder found to the model it was made with, which is used from then on."""
     from service.paint import read_json
-    from service.studies import row_of_report
+    from service.studies import model_of_report, row_of_report
 
     document, name = read_json(report), report.name
     with writing() as session:
-        study = store.add_study(session, row_of_report(document, name, models.get_model(session), actor()))
+        model = model_of_report(session, document, name)
+        study = store.add_study(session, row_of_report(document, name, model, actor()))
         row = models.adopt(session, study.id, actor(), force)
     typer.echo(json.dumps({"study": study.id, "version": row.version}) if as_json else f"{row.version} is current")
 

@@ -76,6 +76,18 @@ def get_model(session: Session, number: int | None = None) -> PlantModel:
     return PlantModel(number, version_name(number, adopted), optics, (*declared, *adopted))
 
 
+def find_model(session: Session, effects: Sequence["Effect"]) -> PlantModel | None:
+    """The newest version that holds just these effects and is not withdrawn; None where there is none."""
+    from model.effects import effect_to_json, in_light_order
+
+    def plain(some: Sequence["Effect"]) -> list[dict[str, Any]]:
+        return [effect_to_json(effect) for effect in in_light_order(some)]
+
+    numbers = [row.number for row in list_models(session) if row.withdrawn_at is None]
+    versions = (get_model(session, number) for number in (*reversed(numbers), DECLARED))
+    return next((version for version in versions if plain(version.effects) == plain(effects)), None)
+
+
 def _adopted_effects(session: Session, number: int) -> tuple["Effect", ...]:
     """The effects of a version beside the declared ones."""
     if number == DECLARED:

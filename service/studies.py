@@ -272,6 +272,30 @@ def study_row(studied: Studied, title: str, options: dict[str, Any], actor: str)
     )
 
 
+def model_of_report(session: Session, document: Any, name: str) -> PlantModel:
+    """The version of the store's model that a folder's report was made with; the current one where it does not say.
+
+    Raises
+    ------
+    ConflictError
+        Where no version has the effects that the report took for known.
+    """
+    from model.effects import effects_from_json
+
+    known = document.get("model") if isinstance(document, dict) else None
+    if known is None:
+        return models.get_model(session)
+    effects = effects_from_json(known)
+    found = models.find_model(session, effects)
+    if found is None:
+        names = ", ".join(effect.name for effect in effects) or "none"
+        raise ConflictError(
+            f"{name} was made with other effects ({names}) than any version of the store's model has: "
+            "declare those in 'twin.json' and import the folder, or study what is stored"
+        )
+    return found
+
+
 def row_of_report(document: Any, name: str, model: PlantModel, actor: str) -> StudyRow:
     """A report of `heliotwin study`, read from the file ``name``, as a study that was made with ``model``.
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from model.effects import Effect
+from model.effects import Effect, effect_to_json
 from model.errors import InvalidInputError, ModelError
 from model.forecast import Shot
 from model.imaging.window import center_of_mass
@@ -23,14 +23,19 @@ CENTERED_SIDE = 6.1
 
 @dataclass(frozen=True, eq=False)
 class FolderStudy:
-    """A study, and what of the folder it left out, with the reasons."""
+    """A study, what of the folder it left out, with the reasons, and the effects that it took for known."""
 
     study: Study
     skipped: dict[str, str]
+    known: Sequence[Effect] = ()
 
     def to_json(self) -> dict[str, Any]:
-        """The study's report, with what was skipped where something was."""
-        return {**self.study.to_json(), **({"skipped": self.skipped} if self.skipped else {})}
+        """The study's report, the model it was made with, and what was skipped where something was."""
+        return {
+            **self.study.to_json(),
+            "model": {"effects": [effect_to_json(effect) for effect in self.known]},
+            **({"skipped": self.skipped} if self.skipped else {}),
+        }
 
 
 def photographs_of(folder: MeasurementFolder, surfaces: str = "measured") -> tuple[list[Photograph], dict[str, str]]:
@@ -115,9 +120,10 @@ def study_folder(
     """
     check_surfaces(surfaces)
     photographs, skipped = photographs_of(folder, surfaces)
+    known = [*folder.effects, *effects]
     try:
-        found = study(photographs, folder.optics, [*folder.effects, *effects], options, progress)
+        found = study(photographs, folder.optics, known, options, progress)
     except InvalidInputError as error:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in list(skipped.items())[:5])
         raise InvalidInputError(f"{error}" + (f" ({reasons})" if reasons else "")) from None
-    return FolderStudy(found, skipped)
+    return FolderStudy(found, skipped, known)

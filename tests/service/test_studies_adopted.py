@@ -360,6 +360,26 @@ def test_report_of_a_folder_is_adopted_and_withdrawn_by_the_command_line(
     assert "2:camera_response" in capsys.readouterr().out
 
 
+def test_report_is_adopted_into_the_version_that_it_was_made_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setenv("HELIOTWIN_DATA_DIR", str(tmp_path / "data"))
+    file = tmp_path / "report.json"
+
+    def adopt(found: dict[str, Any], known: list[dict[str, Any]]) -> int:
+        file.write_text(json.dumps(report_of(found) | {"model": {"effects": known}}))
+        return heliotwin("models", "adopt", str(file))
+
+    slope = {"name": "slope_error", "parameters": {"sigma_mrad": 0.5}}
+    assert adopt(slope, [GAMMA]) == 1
+    assert "camera_response" in capsys.readouterr().err
+    assert adopt(GAMMA, []) == 0
+    assert adopt(slope, [GAMMA]) == 0
+    capsys.readouterr()
+    assert adopt(slope, []) == 1  # made with version 1, and version 3 is current
+    assert "version 1" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("document", "word"),
     [
