@@ -27,7 +27,7 @@ from service.pages.rendering import render
 from service.pictures import mirror_heights
 from service.runtime import Runtime
 from service.schemas import Version
-from service.tables import HeliostatRow, MeasurementRow, SurfaceRow, now
+from service.tables import HeliostatRow, MeasurementRow, SurfaceRow
 
 router = APIRouter(include_in_schema=False, dependencies=[READ])
 logger = logging.getLogger("heliotwin.service")
