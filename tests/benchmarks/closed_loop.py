@@ -1,15 +1,18 @@
 """The closed loop on data: ``python -m tests.benchmarks.closed_loop``.
 
 The six sets of ``../shared/undeclared``; the real plant (AA39, AC43), studied as a folder and by leaving out one image
-at a time; and what the effect found buys where it matters: surfaces refined with it against deflectometry.
+at a time, with measured surfaces and with predicted ones; and what the effect found buys where it matters: surfaces
+refined with it against deflectometry. With ``--pictures DIR`` it draws the real plant before and after.
 """
 
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import torch
+from matplotlib.figure import Figure
 
 from model.effects import CATALOGUE, Effect, effect_from_json
 from model.forecast import View
@@ -17,12 +20,12 @@ from model.metrics import flux_accuracy
 from model.observation import Observation, align_observations, render_observations
 from model.plant import Heliostat, TargetPlane
 from model.refinement import refine
-from model.study import Photograph, StudyOptions
+from model.study import Photograph, Study, StudyOptions
 from model.study.fitting import Fitter
 from model.study.judging import accuracies
 from model.study.photographs import Forecaster
 from model.study.unknowns import Unknowns
-from service.folder import observe, surface_errors
+from service.folder import observe, predict_folder, surface_errors
 from service.paint import measured_heights, read_folder
 from service.study import photographs_of, study_folder
 from tests.benchmarks import data_folder
@@ -59,16 +62,52 @@ def studies(root: Path) -> None:
     """Verdicts of all sets."""
     print("| set | verdict | effect and 95 % interval | accuracy before | after | left of the error beyond noise |")
     print("| --- | --- | --- | --- | --- | --- |")
-    folders = [(p, None) for p in sorted((root.parent / "undeclared").glob("set-*"))]
-    for folder, window in [*folders, (root, None), (root, 6.0)]:
-        names = HELIOSTATS if folder == root else None
-        study = study_folder(read_folder(folder, names), options=StudyOptions(window=window)).study
-        report = study.to_json()
-        found = "<br>".join(f"{e['name']}: {plain(e['parameters'])}" for e in report["effects"]) or "-"
-        label = f"AA39, AC43, {study.window:.0f} m" if names else folder.name
-        before, after = (report[key]["accuracy_mean"] for key in ("before", "after"))
-        share = report["unexplained_share"]
-        print(f"| {label} | {report['verdict']} | {found} | {before:.3f} | {after:.3f} | {share:.2f} |", flush=True)
+    for folder in sorted((root.parent / "undeclared").glob("set-*")):
+        print(row(folder.name, study_folder(read_folder(folder)).study), flush=True)
+    for window in (4.0, 6.0):
+        print(row(f"AA39, AC43, {window:.0f} m", real_study(root, window)), flush=True)
+    with TemporaryDirectory() as predicted:
+        folder = read_folder(root, ["AA39"])
+        predict_folder(folder, Path(predicted), images=4)
+        print(row("AA39, surface predicted from 4 of its images", study_folder(folder, predicted).study), flush=True)
+
+
+def real_study(root: Path, window: float | None = None) -> Study:
+    """The study of the real plant's photographs with measured surfaces."""
+    return study_folder(read_folder(root, HELIOSTATS), options=StudyOptions(window=window)).study
+
+
+def row(label: str, study: Study) -> str:
+    """A study as a line of the table."""
+    report = study.to_json()
+    found = "<br>".join(f"{e['name']}: {plain(e['parameters'])}" for e in report["effects"]) or "-"
+    before, after = (report[key]["accuracy_mean"] for key in ("before", "after"))
+    share = report["unexplained_share"]
+    return f"| {label} | {report['verdict']} | {found} | {before:.3f} | {after:.3f} | {share:.2f} |"
+
+
+def picture(study: Study) -> Figure:
+    """Every held-out image: as measured, as forecast before and after, and both residuals, in shares of its peak."""
+    order = np.argsort(study.accuracy_before)
+    figure = Figure(figsize=(11, 2.1 * len(order)), layout="constrained")
+    grid = np.atleast_2d(figure.subplots(len(order), 5))
+    for axes, index in zip(grid, order, strict=True):
+        peak = study.measured[index].max()
+        measured, before, after = (cuts[index] / peak for cuts in (study.measured, study.before, study.after))
+        shown = {
+            study.photographs[index].key: measured,
+            f"before: {study.accuracy_before[index]:.3f}": before,
+            f"after: {study.accuracy_after[index]:.3f}": after,
+            "residual before": measured - before,
+            "residual after": measured - after,
+        }
+        for ax, (title, image) in zip(axes, shown.items(), strict=True):
+            signed = title.startswith("residual")
+            low, high = (-0.3, 0.3) if signed else (0.0, 1.0)
+            ax.imshow(image, cmap="RdBu_r" if signed else "inferno", vmin=low, vmax=high)
+            ax.set_title(title, fontsize=9)
+            ax.set_axis_off()
+    return figure
 
 
 def left_out(photographs: Sequence[Photograph], kinds: tuple[str, ...], window: float) -> np.ndarray:
@@ -81,7 +120,8 @@ def left_out(photographs: Sequence[Photograph], kinds: tuple[str, ...], window: 
         rest = [p for p in photographs if p is not photograph]
         effects: list[Effect] = []
         if kinds:
-            fitter = Fitter(Forecaster(rest, optics, [], window, StudyOptions().fit_view))
+            views = StudyOptions().fit_view, StudyOptions().view
+            fitter = Fitter(*(Forecaster(rest, optics, [], window, view) for view in views))
             effects = unknowns.effects(fitter.fit(unknowns, unknowns.neutral).values)
         judge = Forecaster([photograph], optics, [], window, StudyOptions().view)
         accuracy[index] = accuracies(judge.measured(), judge.cuts(effects))[0]
@@ -162,24 +202,37 @@ def photograph(
     return images
 
 
-def main() -> None:
-    """Print every table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--simulated", type=int, default=8, help="held-out surfaces to refine")
-    arguments = parser.parse_args()
-    root = data_folder()
-    if not root.is_dir():
-        print(f"closed loop: no real measurements at {root}; set HELIOTWIN_STJ")
-        return
-    studies(root)
-    real_plant(root)
-    report = study_folder(read_folder(root, HELIOSTATS)).study.to_json()
+def surfaces(root: Path, simulated: int) -> None:
+    """What the effect that the study of the real plant finds buys for surfaces."""
+    report = real_study(root).to_json()
     found = [effect_from_json(entry) for entry in report["effects"]]
     print("\nSurfaces refined with and without what the study found, errors against deflectometry [mm]")
     print("| images | effect | all | canting | waviness | accuracy of images left out |")
     print("| --- | --- | --- | --- | --- | --- |")
     refined_real(root, found)
-    refined_simulated(root, found, arguments.simulated)
+    refined_simulated(root, found, simulated)
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--only", choices=("studies", "plant", "surfaces", "pictures"), help="one part of it")
+    parser.add_argument("--simulated", type=int, default=8, help="held-out surfaces to refine")
+    parser.add_argument("--pictures", type=Path, help="a folder to draw real-plant.png into")
+    arguments = parser.parse_args()
+    root = data_folder()
+    if not root.is_dir():
+        print(f"closed loop: no real measurements at {root}; set HELIOTWIN_STJ")
+        return
+    if arguments.only in (None, "studies"):
+        studies(root)
+    if arguments.only in (None, "plant"):
+        real_plant(root)
+    if arguments.only in (None, "surfaces"):
+        surfaces(root, arguments.simulated)
+    if arguments.pictures is not None:
+        arguments.pictures.mkdir(parents=True, exist_ok=True)
+        picture(real_study(root)).savefig(arguments.pictures / "real-plant.png", dpi=60)
 
 
 if __name__ == "__main__":

@@ -196,6 +196,12 @@ def among(record: Record) -> bool:
     return set(record["name"].split("+")) <= set(record["found"])
 
 
+def undecided(record: Record) -> bool:
+    """Whether the true effect is not the first, but the report says that these images cannot tell the two apart."""
+    alike = record["lookalikes"][0] if record["lookalikes"] else []
+    return not first(record) and bool(set(record["name"].split("+")) & set(alike))
+
+
 def percent(values: Sequence[float]) -> str:
     """The mean as a percentage."""
     return f"{100 * np.mean(values):.0f}" if len(values) else "-"
@@ -252,14 +258,15 @@ def summary(records: Sequence[Record]) -> Iterator[str]:
     outside = [r for r in records if r["name"] in OUTSIDE]
     yield f"Noise alone costs {decimal([r['noise'] for r in records])} % of accuracy."
     yield f"Effects that change the forecast by more than twice that: {len(large)} sets; found first in"
-    yield f"{percent([first(r) for r in large])} %, among those found in {percent([among(r) for r in large])} %."
+    yield f"{percent([first(r) for r in large])} %, among those found in {percent([among(r) for r in large])} %;"
+    told = percent([undecided(r) for r in large])
+    yield f"named as a look-alike that these images cannot tell from the first in {told} %."
     yield f"Clean sets: {len(clean)}, false alarms {percent([r['verdict'] != 'none' for r in clean])} %."
-    answers = Counter(r["verdict"] for r in outside)
-    yield (
-        f"Outside the catalogue: {len(outside)} sets, " + ", ".join(f"{v} {n}" for v, n in answers.items()) + "; of the"
-    )
-    rest = [r["incomplete"] for r in outside if r["verdict"] == "effect"]
-    yield f"effects {percent(rest)} % are reported with an error that stays unexplained."
+    if outside:
+        answers = Counter(r["verdict"] for r in outside)
+        rest = [r["incomplete"] for r in outside if r["verdict"] == "effect"]
+        yield f"Outside the catalogue: {len(outside)} sets, " + ", ".join(f"{v} {n}" for v, n in answers.items()) + ";"
+        yield f"of those effects {percent(rest)} % are reported with an error that stays unexplained."
     yield f"A study takes {np.median([r['seconds'] for r in records]):.0f} s of one core."
 
 
