@@ -4,13 +4,14 @@ from datetime import UTC, datetime
 from typing import Any
 
 import pytest
+from alembic.script import ScriptDirectory
 from sqlalchemy import URL, Column, MetaData, Table, insert, inspect, select
 from sqlalchemy.types import JSON, Boolean, DateTime, Float, Integer, LargeBinary
 
-from service.database import Database
+from service.database import Database, alembic_config
 from service.tables import Base
 
-REVISIONS = Database(URL.create("sqlite")).revisions()
+REVISIONS = [script.revision for script in ScriptDirectory.from_config(alembic_config()).walk_revisions()][::-1]
 
 # Columns that take certain values only.
 _CHOSEN: dict[str, Any] = {
