@@ -232,7 +232,7 @@ def main() -> None:
         surfaces(root, arguments.simulated)
     if arguments.pictures is not None:
         arguments.pictures.mkdir(parents=True, exist_ok=True)
-        picture(real_study(root)).savefig(arguments.pictures / "real-plant.png", dpi=60)
+        picture(real_study(root)).savefig(arguments.pictures / "real-plant.png", dpi=50)
 
 
 if __name__ == "__main__":
