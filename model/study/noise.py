@@ -30,8 +30,10 @@ def grain_variance(image: Array, spacing: int = SPACING, bins: int = 12) -> Arra
     parts = np.array_split(np.argsort(inner, axis=None), bins)
     levels = np.array([inner.ravel()[part].mean() for part in parts])
     variances = np.array([grain.ravel()[part].mean() for part in parts])
-    slope, offset = np.polyfit(levels, variances, 1)
-    return np.asarray(np.clip(offset + slope * image, variances.min(), variances.max()))
+    lever = levels - levels.mean()
+    slope = lever @ variances / max(float(lever @ lever), 1e-30)  # an even image has one level
+    line = variances.mean() + slope * (image - levels.mean())
+    return np.asarray(np.clip(line, variances.min(), variances.max()))
 
 
 def _grain(image: Array, spacing: int) -> Array:
@@ -50,9 +52,11 @@ def black_lift(image: NDArray[np.floating]) -> Array:
     """
     above = np.asarray(image - image.min(), dtype=np.float64)
     black = above == 0
+    if min(above.shape) < BLOCK or not LEAST_BLACK <= black.mean() < 1:
+        return np.zeros_like(above)
     grey = ~maximum_filter(black, 3)[1:-1, 1:-1]
     faint = grey & (above <= np.quantile(above[~black], 0.25))[1:-1, 1:-1]
-    if black.mean() < LEAST_BLACK or not faint.any():
+    if not faint.any():
         return np.zeros_like(above)
     sigma = np.sqrt(_grain(above, 1)[faint].mean())
     share = uniform_filter(black.astype(np.float64), BLOCK, mode="nearest")

@@ -207,6 +207,11 @@ def test_the_share_of_noise_is_the_error_it_makes(camera):
     assert 0.5 < np.mean(shares) / np.mean(errors) < 1.35
 
 
+@pytest.mark.parametrize("image", [np.ones((64, 64)), np.ones((4, 4)), np.eye(16)], ids=["even", "tiny", "lines"])
+def test_noise_is_finite_whatever_the_image(image):
+    assert np.isfinite(Photograph(shots()[0], image).noise_share(4.0))
+
+
 def test_a_coarse_camera_is_forecast_in_its_own_pixels():
     taken = photographs()
     coarse = [Photograph(p.shot, in_pixels(p.image[None], 32, 32)[0]) for p in taken]
