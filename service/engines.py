@@ -75,5 +75,7 @@ def _joined(address: str) -> Any:
             try:
                 ray.init(address=address, log_to_driver=False, include_dashboard=False if address == "local" else None)
             except (ConnectionError, ValueError) as error:
-                raise ConflictError(f"ray_address: no cluster answers at {address}; start its head first") from error
+                raise ConflictError(
+                    f"ray_address: no cluster lets us in at {address}; start Ray there and here with one token"
+                ) from error
     return ray
