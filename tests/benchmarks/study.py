@@ -338,7 +338,7 @@ def main() -> None:
     text = [*summary(records), "", *table(records), "", *parameters(records)]
     text += [f"Answered by {states} states of the code."] if states > 1 else []
     (options.out / "study.md").write_text("\n".join(text) + "\n", encoding="utf-8")
-    matrix(records).savefig(options.out / "matrix.png", dpi=80)
+    matrix(records).savefig(options.out / "matrix.png", dpi=60)
     print("\n".join(text))
 
 
