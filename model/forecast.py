@@ -157,6 +157,15 @@ class Aligned:
         """Axis angles (B, 2) [rad], in the shots' order."""
         return _in_order([group.angles for group in self.groups], self.groups)
 
+    def raised(self, changes: Tensor) -> "Aligned":
+        """The same shots, all alike in their splines, with control points changed by (B, F, 3, I, J) [m].
+
+        The mounts stay where they are.
+        """
+        (group,) = self.groups
+        scene = group.scene.with_(control_points=group.scene.control_points + changes)
+        return Aligned((replace(group, scene=scene),))
+
     def flux(
         self,
         optics: Optics | None = None,

@@ -124,13 +124,17 @@ def align_observations(
     observations: Sequence[Observation],
     z: NDArray[np.float64],
     effects: Sequence[Effect] = (),
+    *,
+    start: Aligned | None = None,
 ) -> Aligned:
     """The heliostat with surface ``z`` (4, 8, 8) [m] turned so that its spots lie where the M were observed.
 
-    A tilt of the whole mirror is taken back by the mount and leaves no trace.
+    A tilt of the whole mirror is taken back by the mount and leaves no trace. ``start`` is what this gave for a surface
+    that differs little, and saves rounds.
     """
     points = control_points(heliostat, z)
-    return align([Shot(heliostat, points, o.sun, o.target, spot=o.center_of_mass) for o in observations], effects)
+    shots = [Shot(heliostat, points, o.sun, o.target, spot=o.center_of_mass) for o in observations]
+    return align(shots, effects, start=start)
 
 
 def render_observations(

@@ -210,6 +210,11 @@ def fit_heights(u: Array, v: Array, normals: Array, half_size: Array) -> Array:
     return np.asarray((solution - solution.mean()).reshape(ROWS, COLUMNS))
 
 
+def mirrored(z: Array) -> Array:
+    """The same mirrors (..., 4, 8, 8) with left and right exchanged."""
+    return np.asarray(z[..., [1, 0, 3, 2], ::-1, :])
+
+
 def split_canting(z: ArrayLike) -> tuple[Array, Array]:
     """Canting and waviness, two (..., 8, 8) [m] height fields that add up to ``z``.
 

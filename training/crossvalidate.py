@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from training.cases import make_cases
+from training.config import TrainConfig
 from training.figures import Figures, markdown, outcomes_of
 from training.methods import Method, always, by_network, by_refinement, held_out_of
 from training.prior import estimate
 from training.render import CleanCamera, load_field
 from training.surfaces import load_surfaces, split_by_heliostat
-from training.train import TrainConfig
 
 Array = NDArray[np.float64]
 

@@ -23,11 +23,11 @@ from model.network.architecture import MAX_IMAGES
 from model.network.predictor import WEIGHTS
 from training import plots
 from training.cases import Case, make_cases
+from training.config import TrainConfig
 from training.figures import Figures, Outcome, markdown, median_error, outcomes_of, shown
 from training.methods import Method, always, by_network, by_refinement, held_out_of
 from training.render import Camera, CleanCamera, load_field
 from training.surfaces import load_surfaces
-from training.train import TrainConfig
 
 Array = NDArray[np.float64]
 
@@ -131,7 +131,7 @@ def compared(network: Path, paper: Path, mean: Array) -> dict[str, Method]:
     best = by_network(network)
     return {
         **methods,
-        "network, two looks": by_network(network, looks=2),
+        "network, one look": by_network(network, looks=1),
         "network": best,
         REFINEMENT: by_refinement(best),
     }

@@ -37,7 +37,8 @@ def example(batch: int, images: int) -> tuple[torch.Tensor, ...]:
     mask = torch.zeros(batch, MAX_IMAGES)
     mask[:, :images] = 1
     guess = 0.3 * torch.randn(batch, FACETS, ROWS, COLUMNS, generator=generator)
-    return flux, conditions, mask, guess_flux, guess
+    descent = 0.05 * torch.randn(batch, MAX_IMAGES, FACETS, ROWS, COLUMNS, generator=generator)
+    return flux, conditions, mask, guess_flux, guess, descent * mask[:, :, None, None, None]
 
 
 def export(network: nn.Module, path: Path) -> None:

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.refinement import PRIOR, SurfacePrior
-from training.surfaces import load_surfaces, mirrored, rotated, split_by_heliostat, tilt_modes, untilted
-from training.train import TrainConfig
+from training.config import TrainConfig
+from training.surfaces import load_surfaces, split_by_heliostat, tilt_modes, untilted, with_symmetries
 
 Array = NDArray[np.float64]
 
@@ -50,8 +50,7 @@ def shrunk(deviations: Array, share: float = FACET_SHARE) -> Array:
     four times as many samples of 64 dimensions. The covariance is a mean of both, as shrinkage estimates are (Ledoit
     and Wolf 2004), and half and half fits mirrors best that were left out.
     """
-    half_turned, across = rotated(deviations), mirrored(deviations)
-    seen = np.concatenate([deviations, across, half_turned, rotated(across)]).reshape(-1, 256)
+    seen = with_symmetries(deviations).reshape(-1, 256)
     whole = seen.T @ seen / len(seen)
     facets = np.zeros_like(whole)
     for facet in range(4):

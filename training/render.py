@@ -12,8 +12,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from model.frames import sun_direction_at
-from model.network.architecture import CONDITIONS
-from model.network.inputs import GUESS_SAMPLES, conditions
+from model.network.architecture import CONDITIONS, IMAGE_SIZE
+from model.network.inputs import DESCENT_SAMPLES, DESCENT_SIZE, GUESS_SAMPLES, conditions, descents
 from model.observation import FLUX_SHAPE, Observation, scene_of
 from model.plant import Heliostat, TargetPlane
 from model.sunshape import Buie, transfer_table
@@ -26,6 +26,9 @@ JUELICH_LATITUDE = 50.913
 
 TOWER_TOP = (0.0, 0.0, 55.0)
 """What heliostats are canted for [m]: the receiver of Juelich, about."""
+
+CLEAREST_SKY, CLEAR_SKY = 1e-3, 0.02
+"""Circumsolar ratios: the least that is drawn, and the model's own, which the best camera still sees."""
 
 TENSORS = ("control_points", "attitude", "center", "sun", "plane_center", "plane_axes")
 """What a scene holds for each mirror."""
@@ -121,14 +124,21 @@ class Shots:
         return cls(ideal, tensor((raised - points)[:, :, 0, 0]), images)
 
     def scene(self, z: Tensor) -> Scene:
-        """The scene of surfaces ``z`` (B, 4, 8, 8) [m]."""
-        raised = torch.einsum("bfij,bfk->bfkij", z, self.lift).repeat_interleave(self.images, dim=0)
+        """The scene of surfaces ``z`` (B, 4, 8, 8) [m], or of other ones before each sun (B, images, 4, 8, 8)."""
+        if z.ndim == 4:
+            z = z[:, None].expand(-1, self.images, -1, -1, -1)
+        raised = torch.einsum("bmfij,bfk->bmfkij", z, self.lift).flatten(0, 1)
         return self.ideal.with_(control_points=self.ideal.control_points + raised)
 
-    def trace(self, z: Tensor, samples: int = GUESS_SAMPLES) -> Tensor:
-        """Flux (B, images, 64, 64), sum 100, of surfaces ``z`` (B, 4, 8, 8) [m], as no camera sees it."""
-        flux = trace(self.scene(z), Window(on_spot=True), samples=samples, padding=0.25).irradiance
-        return normalized(flux.clamp(min=0)).view(-1, self.images, *flux.shape[1:])
+    def trace(self, z: Tensor, samples: int = GUESS_SAMPLES, size: int = IMAGE_SIZE) -> Tensor:
+        """Flux (B, images, size, size), sum 100, of surfaces as `scene` takes them, as no camera sees it."""
+        window = Window(rows=size, columns=size, on_spot=True)
+        flux = trace(self.scene(z), window, samples=samples, padding=0.25).irradiance
+        return normalized(flux.clamp(min=0)).view(-1, self.images, size, size)
+
+    def descents(self, z: Tensor, flux: Tensor, basis: Tensor) -> Tensor:
+        """`model.network.inputs.descents` (B, images, 4, 8, 8) [m] from surfaces ``z`` (B, 4, 8, 8) [m]."""
+        return descents(lambda dz: self.trace(z[:, None] + dz, DESCENT_SAMPLES, DESCENT_SIZE), flux, basis)
 
     def conditions(self) -> Tensor:
         """What the network is told of each image (B, images, 12)."""
@@ -147,7 +157,8 @@ class Camera:
     """What separates a photograph from traced flux; every value is the limit or scale of a random draw.
 
     Circumsolar ratio and slope error [mrad] act on the light; gamma on the camera's response; ``warp`` [of the window]
-    on the registration; ``background`` and ``noise`` are shares of the peak.
+    on the registration; ``background`` and ``noise`` are shares of the peak. Good cameras are common and bad ones rare:
+    each batch has a uniform random number to the power of ``ease`` of all these limits.
     """
 
     circumsolar_ratio: float = 0.15
@@ -156,11 +167,22 @@ class Camera:
     warp: float = 0.015
     background: float = 0.02
     noise: float = 0.02
+    ease: float = 2.0
 
     def photograph(self, scene: Scene, device: torch.device, rng: np.random.Generator) -> Tensor:
         """Flux images (B, 64, 64), sum 100, 4 m about the spot's centre."""
+        return self._eased(rng.uniform() ** self.ease)._photograph(scene, device, rng)
+
+    def _eased(self, share: float) -> "Camera":
+        """The camera with a share of all limits."""
+        limits = {name: share * getattr(self, name) for name in ("slope_error_mrad", "warp", "background", "noise")}
+        clearest = min(CLEAR_SKY, self.circumsolar_ratio)
+        ratio = clearest + share * (self.circumsolar_ratio - clearest)
+        return replace(self, circumsolar_ratio=ratio, gamma=self.gamma**share, **limits)
+
+    def _photograph(self, scene: Scene, device: torch.device, rng: np.random.Generator) -> Tensor:
         count = scene.batch
-        chis = np.exp(rng.uniform(np.log(1e-3), np.log(self.circumsolar_ratio), 8))
+        chis = np.exp(rng.uniform(np.log(CLEAREST_SKY), np.log(self.circumsolar_ratio), 8))
         tables = torch.stack([transfer_table(Buie(float(c)), torch.float32, device) for c in chis])
         table = tables[torch.as_tensor(rng.integers(len(chis), size=count), device=device)]
         slope = torch.as_tensor(rng.uniform(0, self.slope_error_mrad * 1e-3, count), dtype=torch.float32, device=device)

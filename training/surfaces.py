@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from model.surface import greville, split_canting
+from model.surface import greville, mirrored, split_canting
 
 Array = NDArray[np.float64]
 
@@ -39,9 +39,10 @@ def rotated(z: Array) -> Array:
     return np.asarray(z[..., ::-1, ::-1, ::-1])
 
 
-def mirrored(z: Array) -> Array:
-    """The same mirrors (..., 4, 8, 8) with left and right exchanged."""
-    return np.asarray(z[..., [1, 0, 3, 2], ::-1, :])
+def with_symmetries(z: Array) -> Array:
+    """Mirrors (N, 4, 8, 8), then the same mirrored, turned, and both: (4 N, 4, 8, 8)."""
+    half_turned, across = rotated(z), mirrored(z)
+    return np.concatenate([z, across, half_turned, rotated(across)])
 
 
 @dataclass(frozen=True)
@@ -49,13 +50,16 @@ class Augmentation:
     """How far samples may stray from the measured surfaces.
 
     ``average`` is the share of samples that mix two or three heliostats, ``exchange`` the share whose facets come from
-    different ones; ``canting`` and ``waviness`` scale the two parts of the surface apart by up to that factor either
-    way, ``tilt_mrad`` adds canting at random, ``focus_mrad`` canting towards another focus: the measured heliostats
-    AA28 and AA39 lie off the others there, by what their properties call ideal.
+    different ones, ``fresh`` the share that is partly or wholly drawn from a Gaussian of the measured covariance, half
+    of it facet by facet: some forty mirrors and their mixtures could be learnt by heart. ``canting`` and ``waviness``
+    scale the two parts of the surface apart by up to that factor either way, ``tilt_mrad`` adds canting at random,
+    ``focus_mrad`` canting towards another focus: the measured heliostats AA28 and AA39 lie off the others there, by
+    what their properties call ideal.
     """
 
     average: float = 0.6
     exchange: float = 0.3
+    fresh: float = 0.6
     canting: float = 1.4
     waviness: float = 1.3
     tilt_mrad: float = 0.15
@@ -66,7 +70,7 @@ class Augmentation:
         z = self._averaged(surfaces, count, rng)
         other = self._averaged(surfaces, count, rng)
         exchanged = (rng.random((count, 1, 1, 1)) < self.exchange) & (rng.random((count, 4, 1, 1)) < 0.5)
-        z = np.where(exchanged, other, z)
+        z = self._freshened(np.where(exchanged, other, z), surfaces, rng)
         canting, waviness = split_canting(z)
         scale_canting, scale_waviness = (
             np.exp(rng.uniform(-1, 1, (count, 1, 1, 1)) * np.log(limit)) for limit in (self.canting, self.waviness)
@@ -83,6 +87,15 @@ class Augmentation:
         mixed = np.einsum("nk,nkfij->nfij", weights / np.linalg.norm(weights, axis=1, keepdims=True), chosen) + mean
         mixed = np.where(rng.random((count, 1, 1, 1)) < 0.5, rotated(mixed), mixed)
         return np.where(rng.random((count, 1, 1, 1)) < 0.5, mirrored(mixed), mixed)
+
+    def _freshened(self, z: Array, surfaces: Array, rng: np.random.Generator) -> Array:
+        """Samples (count, 4, 8, 8) [m], some of them blended with Gaussian ones in any proportion."""
+        mean = surfaces.mean(axis=0)
+        seen = with_symmetries(surfaces - mean)
+        whole, apart = (rng.standard_normal((len(z), facets, len(seen))) for facets in (1, 4))
+        drawn = np.einsum("cfn,nfij->cfij", (whole + apart) / np.sqrt(2 * len(seen)), seen)
+        share = rng.random((len(z), 1, 1, 1)) * (rng.random((len(z), 1, 1, 1)) < self.fresh)
+        return np.asarray(mean + np.sqrt(1 - share**2) * (z - mean) + share * drawn)
 
     def _tilts(self, count: int, rng: np.random.Generator) -> Array:
         inward = np.array([[1, -1], [-1, -1], [1, 1], [-1, 1]])

@@ -13,63 +13,20 @@ import copy
 import json
 import math
 import time
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from model.network.architecture import MAX_IMAGES, NetworkConfig, SurfaceNetwork
-from model.network.paper import PaperConfig, PaperNetwork
+from model.network.architecture import MAX_IMAGES, SurfaceNetwork
+from model.network.paper import PaperNetwork
 from training import parallel
-from training.render import Camera, Shots, Situations, load_field, render
-from training.surfaces import Augmentation, load_surfaces, split_by_heliostat, untilted
-
-
-@dataclass(frozen=True)
-class TrainConfig:
-    """Everything that decides a run; stored beside its result.
-
-    ``paper`` takes the place of ``network`` where it is given; ``looks`` is how often the network sees its own guess.
-    ``fold`` counts which ``held_out`` heliostats are kept back; ``batch`` is shared among processes.
-    """
-
-    data: str = "../shared/stj"
-    seed: int = 7
-    held_out: int = 8
-    fold: int = 0
-    steps: int = 20000
-    batch: int = 32
-    learning_rate: float = 3e-4
-    warmup: int = 300
-    weight_decay: float = 0.02
-    slope_weight: float = 0.5
-    spread_weight: float = 0.1
-    ema: float = 0.999
-    bfloat16: bool = True
-    looks: int = 2
-    network: NetworkConfig = field(default_factory=NetworkConfig)
-    paper: PaperConfig | None = None
-    augmentation: Augmentation = field(default_factory=Augmentation)
-    situations: Situations = field(default_factory=Situations)
-    camera: Camera = field(default_factory=Camera)
-
-    @classmethod
-    def read(cls, path: Path) -> "TrainConfig":
-        """A config from JSON; keys that are left out keep their defaults."""
-        values = json.loads(path.read_text(encoding="utf-8"))
-        parts = {
-            "network": NetworkConfig,
-            "paper": PaperConfig,
-            "augmentation": Augmentation,
-            "situations": Situations,
-            "camera": Camera,
-        }
-        for name, part in parts.items():
-            if values.get(name) is not None:
-                values[name] = part(**{k: tuple(v) if isinstance(v, list) else v for k, v in values[name].items()})
-        return cls(**values)
+from training.config import TrainConfig
+from training.prior import estimate
+from training.render import Shots, load_field, render
+from training.surfaces import load_surfaces, split_by_heliostat
 
 
 def loss_terms(heights: Tensor, spread: Tensor, truth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -95,8 +52,10 @@ class Run:
         self.surfaces, self.held_out = surfaces[train], surfaces[held_out]
         self.held_out_names = [self.names[i] for i in held_out]
         self.field = load_field(Path(config.data))
-        mean = untilted(self.surfaces.mean(axis=0))
-        self.mean = torch.as_tensor(mean, dtype=torch.float32, device=device)
+        prior = estimate(self.surfaces)
+        self.mean, self.basis = (
+            torch.as_tensor(values, dtype=torch.float32, device=device) for values in (prior.mean, prior.basis)
+        )
         torch.manual_seed(config.seed)
         network = SurfaceNetwork(config.network) if config.paper is None else PaperNetwork(config.paper)
         self.network = network.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -119,6 +78,13 @@ class Run:
         self.average.load_state_dict(state["average"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.step = state["step"]
+
+    def start_from(self, checkpoint: Path) -> None:
+        """Begin with the averaged weights of another run of the same network; a run that has begun goes on instead."""
+        if self.step == 0:
+            state = torch.load(checkpoint, map_location=self.device, weights_only=True)
+            self.network.load_state_dict(state["average"])
+            self.average.load_state_dict(state["average"])
 
     def save(self) -> None:
         """Write the config and the checkpoint; a crash while writing leaves the old one."""
@@ -148,9 +114,10 @@ class Run:
         # Geometry does not bear sixteen bits: all of it stays outside of autocast.
         with torch.no_grad():
             guess_flux, conditions = shots.trace(guess), shots.conditions()
+            descent = shots.descents(guess, flux, self.basis)
         mask = torch.ones(flux.shape[:2], device=self.device)
         with torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=self.config.bfloat16 and network.training):
-            heights, spread = network(flux, conditions, mask, guess_flux, guess * 1e3)
+            heights, spread = network(flux, conditions, mask, guess_flux, guess * 1e3, descent * 1e3)
         return heights.float(), spread.float()
 
     @torch.no_grad()
@@ -240,13 +207,17 @@ def main() -> None:
     parser.add_argument("--run", "--folder", type=Path, default=Path("runs/best"), help="folder of the run")
     parser.add_argument("--minutes", type=float, default=float("inf"), help="stop after so many minutes")
     parser.add_argument("--fold", type=int, help="which heliostats to keep back, for a cross-validation")
+    parser.add_argument("--start", type=Path, help="checkpoint of another run, whose weights to begin with")
     parser.add_argument("--device", help="a GPU where there is one, unless given")
     arguments = parser.parse_args()
     config = TrainConfig.read(arguments.config) if arguments.config else TrainConfig()
     if arguments.fold is not None:
         config = replace(config, fold=arguments.fold)
     with parallel.team(arguments.device) as device:
-        Run(config, arguments.run, device).train(arguments.minutes)
+        run = Run(config, arguments.run, device)
+        if arguments.start is not None:
+            run.start_from(arguments.start)
+        run.train(arguments.minutes)
 
 
 if __name__ == "__main__":

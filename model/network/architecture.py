@@ -1,17 +1,20 @@
 """The network: flux images of one heliostat in, its mirror surface out.
 
-Beside each image it sees what a guess of the surface would throw there, traced, and it says how the guess must change.
-The first guess is the mean surface; its own answer is the next guess, so that it may look twice.
+Beside each image it sees what a guess of the surface would throw there, traced, and in which direction the guess would
+have to change for the image to come out as measured; it says how far and where else. The first guess is the mean
+surface; its own answer is the next guess, so that it may look again.
 
 Each pair of images passes the same convolutional encoder, whose weights are modulated by that image's geometry and
-demodulated as in StyleGAN2; attention pools any number of images, in any order, into one set of styles w+; a StyleGAN2
-decoder grows them into the control heights of the facets. Read it from top to bottom.
+demodulated as in StyleGAN2; attention pools any number of images, in any order, into one vector; a StyleGAN2 decoder
+grows its styles w+ into the control heights of the facets. Read it from top to bottom.
 
 Source: Lewen et al. 2024, *Inverse Deep Learning Ray Tracing for Heliostat Surface Prediction* (the idea: encoder with
 weight demodulation, w+, StyleGAN2 decoder); Karras et al. 2020, *Analyzing and Improving the Image Quality of StyleGAN*
 (modulation and demodulation). Ours differs in that images are encoded one by one and pooled, instead of stacked as
-channels (`model.network.paper`), which makes their number and order free, and in the guess, which turns the question
-"what mirror is this?" into the easier "what is wrong with this mirror?".
+channels (`model.network.paper`), which makes their number and order free, and in the guess and its descent, which turn
+the question "what mirror is this?" into the easier "what is wrong with this mirror?". What to make of a descent is
+learnt as in learned gradient schemes (Adler and Oktem 2017, *Solving ill-posed inverse problems using iterative deep
+neural networks*).
 """
 
 from dataclasses import dataclass
@@ -39,6 +42,7 @@ class NetworkConfig:
     encoder_channels: tuple[int, int, int] = (64, 128, 256)
     features: int = 256
     heads: int = 4
+    depth: int = 3
     style_layers: int = 3
     style_features: int = 32
     decoder_channels: int = 128
@@ -123,33 +127,49 @@ def _channels(flux: Tensor) -> Tensor:
     return torch.stack([flux * 8, torch.sqrt(flux.clamp(min=0) * 8)], dim=1)
 
 
-class Pooling(nn.Module):
-    """Attention among a heliostat's images, then one vector for all; blind to order, masked for missing ones."""
+class Attention(nn.Module):
+    """A heliostat's images look at one another: a transformer's block, masked for missing images."""
 
-    def __init__(self, config: NetworkConfig) -> None:
+    def __init__(self, width: int, heads: int) -> None:
         super().__init__()
-        self.heads = config.heads
-        width = config.features
+        self.heads = heads
         self.norm = nn.LayerNorm(width)
         self.to_qkv = nn.Linear(width, 3 * width)
         self.mix = nn.Linear(width, width)
         self.mlp = nn.Sequential(
             nn.LayerNorm(width), nn.Linear(width, 2 * width), nn.GELU(), nn.Linear(2 * width, width)
         )
-        self.to_weight = nn.Linear(width, 1)
 
-    def forward(self, features: Tensor, mask: Tensor) -> Tensor:
-        """(B, M, features) and mask (B, M), one where there is an image, to (B, features)."""
+    def forward(self, features: Tensor, hidden: Tensor) -> Tensor:
+        """(B, M, width) to the same; ``hidden`` (B, M) is zero, very negative where there is no image."""
         batch, images, width = features.shape
         qkv = self.to_qkv(self.norm(features)).view(batch, images, 3, self.heads, width // self.heads)
         q, k, v = qkv.permute(2, 0, 3, 1, 4)
-        hidden = (mask - 1) * 1e4
         scores = q @ k.transpose(-1, -2) * (width // self.heads) ** -0.5 + hidden[:, None, None, :]
         mixed = (scores.softmax(dim=-1) @ v).transpose(1, 2).reshape(batch, images, width)
         features = features + self.mix(mixed)
         features = features + self.mlp(features)
-        weights = (self.to_weight(features)[..., 0] + hidden).softmax(dim=-1)
-        pooled: Tensor = (features * weights[..., None]).sum(dim=1)
+        return features
+
+
+class Pooling(nn.Module):
+    """Attention among a heliostat's images, then one vector for all; blind to order.
+
+    Each feature has its own weights: one image may tell most of one facet, another of the next.
+    """
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.blocks = nn.ModuleList([Attention(config.features, config.heads) for _ in range(config.depth)])
+        self.to_weights = nn.Linear(config.features, config.features)
+
+    def forward(self, features: Tensor, mask: Tensor) -> Tensor:
+        """(B, M, features) and mask (B, M), one where there is an image, to (B, features)."""
+        hidden = (mask - 1) * 1e4
+        for block in self.blocks:
+            features = block(features, hidden)
+        weights = (self.to_weights(features) + hidden[..., None]).softmax(dim=1)
+        pooled: Tensor = (features * weights).sum(dim=1)
         return pooled
 
 
@@ -171,7 +191,7 @@ class Decoder(nn.Module):
                 x = functional.interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=False)
             x = activate(conv(x, styles[:, layer]))
         heights, log_spread = self.to_heights(x, styles[:, -1]).chunk(2, dim=1)
-        return heights - heights.mean(dim=(2, 3), keepdim=True), log_spread
+        return heights, log_spread
 
 
 class SurfaceNetwork(nn.Module):
@@ -183,9 +203,12 @@ class SurfaceNetwork(nn.Module):
     def __init__(self, config: NetworkConfig, scale: float = 0.35) -> None:
         super().__init__()
         self.config, self.scale = config, scale
+        points = FACETS * ROWS * COLUMNS
         self.encoder = Encoder(config)
+        self.from_descent = nn.Linear(points, config.features)
         self.pooling = Pooling(config)
-        self.from_guess = nn.Linear(FACETS * ROWS * COLUMNS, config.features)
+        self.from_guess = nn.Linear(points, config.features)
+        self.from_step = nn.Linear(points, config.features)
         self.to_styles = nn.Sequential(
             nn.LayerNorm(config.features),
             nn.Linear(config.features, config.features),
@@ -193,9 +216,13 @@ class SurfaceNetwork(nn.Module):
             nn.Linear(config.features, config.style_layers * config.style_features),
         )
         self.decoder = Decoder(config)
+        # What is nearly linear in the images passes by the narrow styles.
+        self.bypass = nn.Linear(config.features + points, points)
+        nn.init.zeros_(self.bypass.weight)
+        nn.init.zeros_(self.bypass.bias)
 
     def forward(
-        self, flux: Tensor, conditions: Tensor, mask: Tensor, guess_flux: Tensor, guess: Tensor
+        self, flux: Tensor, conditions: Tensor, mask: Tensor, guess_flux: Tensor, guess: Tensor, descent: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Predict.
 
@@ -209,14 +236,23 @@ class SurfaceNetwork(nn.Module):
         guess_flux : Tensor (B, M, 64, 64)
             What the guessed surface throws there, likewise.
         guess : Tensor (B, 4, 8, 8) [mm]
+        descent : Tensor (B, M, 4, 8, 8) [mm]
+            Each image's share in a step of steepest descent from the guess (`model.network.inputs.descents`), zero
+            where there is no image.
 
         Returns
         -------
         heights, spread : Tensor (B, 4, 8, 8) [mm]
             Facet mean zero; the spread is the scale of a Laplace distribution of the error.
         """
+        shares = descent.flatten(2) / self.scale
+        step = shares.sum(dim=1)
         features = self.encoder(flux.flatten(0, 1), guess_flux.flatten(0, 1), conditions.flatten(0, 1))
-        pooled = self.pooling(features.view(*mask.shape, -1), mask) + self.from_guess(guess.flatten(1) / self.scale)
+        alone = shares * mask.sum(dim=1)[:, None, None]
+        pooled = self.pooling(features.view(*mask.shape, -1) + self.from_descent(alone), mask)
+        pooled = pooled + self.from_guess(guess.flatten(1) / self.scale) + self.from_step(step)
         styles = self.to_styles(pooled).view(-1, self.config.style_layers, self.config.style_features)
         heights, log_spread = self.decoder(styles)
+        heights = heights + self.bypass(torch.cat([pooled, step], dim=1)).view_as(heights)
+        heights = heights - heights.mean(dim=(2, 3), keepdim=True)
         return guess + self.scale * heights, self.scale * torch.exp(log_spread.clamp(-6, 2))

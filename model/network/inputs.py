@@ -1,4 +1,10 @@
-"""What the network is told about each image besides the flux: how mirror slopes and places map onto the target."""
+"""What the network is told about each image besides the flux.
+
+How slopes and places of the mirror map onto the target (`conditions`), and how a guessed surface would have to change
+for the image to come out as measured (`descents`).
+"""
+
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -8,6 +14,63 @@ from model.tracing.scene import Scene
 
 GUESS_SAMPLES = 16
 """Points along each side of a facet with which the flux of a guessed surface is traced for the network."""
+
+MIRRORED_CONDITIONS = (1, -1, -1, 1) * 2 + (1,) * 4
+"""Signs by which `conditions` change where the world is mirrored, left and right exchanged."""
+
+DESCENT_SIZE = 32
+"""Rows and columns of the images that are differentiated: the sun has blurred all that is finer."""
+
+DESCENT_SAMPLES = 12
+"""Points along each side of a facet for the same."""
+
+DESCENT_NOISE = 0.03
+"""Standard deviation of a pixel [of the peak] that a descent counts with."""
+
+STEP_HEIGHT = 3e-5
+"""Height [m, root mean square] by which a surface is changed to take a difference of its images."""
+
+
+def descents(trace: Callable[[Tensor], Tensor], flux: Tensor, basis: Tensor) -> Tensor:
+    """A step of steepest descent from a guess, in each image's share: heights (B, M, 4, 8, 8) [m].
+
+    The gradient of the images' misfit, seen through a surface prior (steepest in standard deviations, not in metres),
+    as far down as the images would fall in line with it. The shares add up to the step.
+
+    Parameters
+    ----------
+    trace : callable
+        Images (B, M, R, R), sum 100, of the guess changed by heights (B, M, 4, 8, 8) [m], for each image apart;
+        differentiable.
+    flux : Tensor (B, M, n R, n R)
+        The measured images, sum 100.
+    basis : Tensor (K, 4, 8, 8) [m]
+        Directions of the prior, each as long as its standard deviation.
+    """
+    directions = basis.flatten(1)
+    with torch.enable_grad():
+        changes = torch.zeros(*flux.shape[:2], *basis.shape[1:], device=flux.device, requires_grad=True)
+        guessed = trace(changes)
+        measured = _binned(flux, guessed.shape[-1])
+        unit = DESCENT_NOISE * measured.amax(dim=(2, 3), keepdim=True)
+        misfit = (((measured - guessed) / unit) ** 2).sum() / 2
+        (gradient,) = torch.autograd.grad(misfit, changes)
+    downhill = -gradient.flatten(2) @ directions.T
+    along = downhill.sum(dim=1)
+    along = along / along.norm(dim=1, keepdim=True).clamp(min=1e-12)
+    heights = (along @ directions).view(-1, 1, *basis.shape[1:])
+    step = STEP_HEIGHT / heights.square().mean(dim=(1, 2, 3, 4)).sqrt().clamp(min=1e-12)
+    with torch.no_grad():
+        moved = trace((step[:, None, None, None, None] * heights).expand_as(changes)) - guessed.detach()
+        curvature = (moved / unit).square().sum(dim=(1, 2, 3)) / step**2
+    shares = downhill / (1 + curvature)[:, None, None]
+    return torch.einsum("bmk,kfij->bmfij", shares, basis)
+
+
+def _binned(images: Tensor, size: int) -> Tensor:
+    """Images (B, M, n R, n R) in R = ``size`` pixels a side, their sums kept."""
+    factor = images.shape[-1] // size
+    return images.reshape(*images.shape[:2], size, factor, size, factor).sum(dim=(3, 5))
 
 
 def _project(vectors: Tensor, direction: Tensor) -> Tensor:
@@ -22,10 +85,10 @@ def conditions(scene: Scene) -> Tensor:
     with the factor two of reflection taken out (4 numbers); how a place on the mirror moves it (4); the logarithm of
     the slant range over 100 m; the cosine of incidence; the ideal canting across x and y [5 mrad].
     """
-    control_points, sun = scene.in_plane()
+    control_points, center, sun = scene.in_plane()
     axes = (scene.plane_axes @ scene.attitude).transpose(1, 2)
     mirror = sample(control_points, 1, scene.degree)
-    center = mirror.points.mean(-1)
+    center = center + mirror.points.mean(-1)
     normal = axes[:, 2]
     cosine = (normal * sun).sum(-1, keepdim=True)
     beam = 2 * cosine * normal - sun

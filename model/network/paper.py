@@ -53,9 +53,9 @@ class PaperNetwork(nn.Module):
         )
 
     def forward(
-        self, flux: Tensor, conditions: Tensor, mask: Tensor, guess_flux: Tensor, guess: Tensor
+        self, flux: Tensor, conditions: Tensor, mask: Tensor, guess_flux: Tensor, guess: Tensor, descent: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Predict from 1 to 8 images (B, M, 64, 64) as `SurfaceNetwork` does; the guess's flux is not looked at."""
+        """Predict from 1 to 8 images (B, M, 64, 64) as `SurfaceNetwork` does; guess and descent are not looked at."""
         missing = MAX_IMAGES - flux.shape[1]
         x = nn.functional.pad(flux * mask[:, :, None, None], (0, 0, 0, 0, 0, missing)) * 8
         known = torch.cat([conditions * mask[:, :, None], mask[:, :, None]], dim=2)
@@ -64,4 +64,5 @@ class PaperNetwork(nn.Module):
             x = activate(conv(x, style))
         styles = self.to_styles(x.flatten(1)).view(-1, self.config.style_layers, self.config.style_features)
         heights, log_spread = self.decoder(styles)
+        heights = heights - heights.mean(dim=(2, 3), keepdim=True)
         return guess + self.scale * heights, self.scale * torch.exp(log_spread.clamp(-6, 2))

@@ -3,34 +3,50 @@
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import onnxruntime
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from model.effects import Effect
 from model.errors import InvalidInputError
+from model.forecast import Aligned, View
 from model.network.architecture import MAX_IMAGES
-from model.network.inputs import GUESS_SAMPLES, conditions
-from model.observation import Observation, SurfacePrediction, render_observations, scene_of
+from model.network.inputs import (
+    DESCENT_SAMPLES,
+    DESCENT_SIZE,
+    GUESS_SAMPLES,
+    MIRRORED_CONDITIONS,
+    conditions,
+    descents,
+)
+from model.observation import (
+    FLUX_SHAPE,
+    FLUX_WINDOW,
+    Observation,
+    SurfacePrediction,
+    align_observations,
+)
 from model.plant import Heliostat
 from model.refinement import default_prior, misfits
-from model.surface import FACETS, control_points
+from model.surface import FACETS, control_points, mirrored
 from model.tracing import Optics
 
 Array = NDArray[np.float64]
 
-INPUTS = ("flux", "conditions", "mask", "guess_flux", "guess")
+INPUTS = ("flux", "conditions", "mask", "guess_flux", "guess", "descent")
 """What one look takes, by the names of `SurfaceNetwork.forward`, with a batch of eight images each."""
 
-LOOKS = 1
-"""How often the network sees what a guess would throw, the mean surface and then its own.
+LOOKS = 3
+"""How often the network sees what a guess would throw: the mean surface first, then its own answers.
 
-It was trained for two looks, and the second one still does a little harm (RESULTS.md): its own guesses leave residuals
-that it has not yet learnt to read.
+It was trained for two looks; the third still gains a little, with the last one taken twice (`mirrored_inputs`).
 """
 
 WEIGHTS = Path(__file__).parents[1] / "weights" / "surface-network.onnx"
@@ -74,18 +90,15 @@ class SurfacePredictor:
             raise InvalidInputError(f"a prediction takes 1 to {MAX_IMAGES} images, got {len(observations)}")
         if len(heliostat.facets) != FACETS:
             raise InvalidInputError(f"the network knows mirrors of {FACETS} facets, {heliostat.name} has other")
-        measured = np.array([o.flux for o in observations])
-        inputs = {
-            "flux": _filled(measured),
-            "conditions": _filled(conditions(scene_of(heliostat, observations)).numpy()),
-            "mask": _filled(np.ones(len(observations))),
-        }
-        z = default_prior().mean
-        for _ in range(looks):
-            traced = render_observations(heliostat, observations, z, optics, effects, samples=GUESS_SAMPLES)
-            z, z_std = (
-                values[0] for values in self.look({**inputs, "guess_flux": _filled(traced), "guess": z[None] * 1e3})
-            )
+        z, guess = default_prior().mean, None
+        for left in reversed(range(looks)):
+            guess = _Guess.of(heliostat, observations, z, effects, None if guess is None else guess.aligned)
+            inputs = guess.inputs(optics, effects)
+            if left:
+                z = self.look(inputs)[0][0]
+        swapped = mirrored_inputs(inputs)
+        both = self.look({name: np.concatenate([inputs[name], swapped[name]]) for name in INPUTS})
+        z, z_std = ((values[0] + mirrored(values[1])) / 2 for values in both)
         return z, z_std
 
     def predict(
@@ -114,6 +127,77 @@ class SurfacePredictor:
             misfits=misfits(heliostat, observations, z, optics, effects),
             used=tuple(o.identifier for o in observations),
         )
+
+
+@dataclass(frozen=True, eq=False)
+class _Guess:
+    """A guessed surface (4, 8, 8) [m] of a heliostat, which stands as it must for its M observations."""
+
+    heliostat: Heliostat
+    observations: Sequence[Observation]
+    z: Array
+    aligned: Aligned
+
+    @classmethod
+    def of(
+        cls,
+        heliostat: Heliostat,
+        observations: Sequence[Observation],
+        z: Array,
+        effects: Sequence[Effect],
+        start: Aligned | None,
+    ) -> "_Guess":
+        """A guess under effects on sun, mount and mirror; ``start`` is that of another guess and saves rounds."""
+        return cls(heliostat, observations, z, align_observations(heliostat, observations, z, effects, start=start))
+
+    def inputs(self, optics: Optics | None, effects: Sequence[Effect]) -> dict[str, NDArray[Any]]:
+        """`INPUTS` of one look under a model with these optics and effects."""
+        ideal = control_points(self.heliostat)
+        normal = torch.as_tensor(control_points(self.heliostat, np.ones_like(self.z)) - ideal, dtype=torch.float32)
+        flux = np.array([o.flux for o in self.observations])
+
+        def trace(changes: Tensor) -> Tensor:
+            """Images (1, M, R, R), sum 100, of the guess changed by heights (1, M, 4, 8, 8) [m]."""
+            raised = torch.einsum("mfij,fijk->mfkij", changes[0], normal)
+            view = View(DESCENT_SIZE, DESCENT_SIZE, window=FLUX_WINDOW, samples=DESCENT_SAMPLES)
+            return _normalized(self.aligned.raised(raised).images(optics, effects, view))[None]
+
+        with torch.no_grad():
+            view = View(*FLUX_SHAPE, window=FLUX_WINDOW, samples=GUESS_SAMPLES)
+            guess_flux = _normalized(self.aligned.images(optics, effects, view)).numpy()
+        basis = torch.as_tensor(default_prior().basis, dtype=torch.float32)
+        descent = descents(trace, torch.as_tensor(flux[None], dtype=torch.float32), basis)[0].numpy()
+        # What is told of the geometry is that of the ideal mirror, as in training.
+        scene = self.aligned.groups[0].scene
+        points = torch.as_tensor(ideal, dtype=torch.float32).movedim(-1, -3).expand_as(scene.control_points)
+        return {
+            "flux": _filled(flux),
+            "conditions": _filled(conditions(scene.with_(control_points=points)).numpy()),
+            "mask": _filled(np.ones(len(flux))),
+            "guess_flux": _filled(guess_flux),
+            "guess": self.z[None] * 1e3,
+            "descent": _filled(descent * 1e3),
+        }
+
+
+def mirrored_inputs(inputs: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """`INPUTS` of the mirrored world, left and right exchanged.
+
+    Physics makes no difference between it and ours, a network does a little: the mean of its answers to both errs less.
+    """
+    return {
+        "flux": inputs["flux"][..., ::-1],
+        "conditions": inputs["conditions"] * np.array(MIRRORED_CONDITIONS, dtype=np.float32),
+        "mask": inputs["mask"],
+        "guess_flux": inputs["guess_flux"][..., ::-1],
+        "guess": mirrored(inputs["guess"]),
+        "descent": mirrored(inputs["descent"]),
+    }
+
+
+def _normalized(images: Tensor) -> Tensor:
+    """Images (M, R, R) scaled to a sum of 100."""
+    return 100 * images / images.sum(dim=(1, 2), keepdim=True)
 
 
 def _filled(values: NDArray[Any]) -> NDArray[np.float32]:

@@ -102,9 +102,9 @@ def central_rays(scene: Scene, samples: int) -> Rays:
     UnreachableError
         Where a mirror shows its back to the sun or to the target.
     """
-    control_points, sun = scene.in_plane()
+    control_points, center, sun = scene.in_plane()
     mirror = sample(control_points, samples, scene.degree)
-    points, normals = mirror.points, mirror.area_vectors
+    points, normals = mirror.points + center[..., None], mirror.area_vectors
     facing = (normals * sun[..., None]).sum(-2)
     # Reflection without square roots: the area vectors need no normalising.
     scale = 2 * facing / (normals * normals).sum(-2)

@@ -64,8 +64,8 @@ def _rays(
     scene: Scene, index: int, optics: Optics, count: int, rng: np.random.Generator
 ) -> Iterator[tuple[Array, Array]]:
     """Hits (n, 2) [m] on the plane and the projected mirror area (n,) [m2] of each, facet by facet."""
-    points, suns = scene.in_plane()
-    facets = points[index].double().numpy()
+    points, centers, suns = scene.in_plane()
+    facets = (points[index].double() + centers[index].double()[:, None, None]).numpy()
     sun = _unit(suns[index].double().numpy())
     slope_error, jitter = (_sigma(v, scene, index) for v in (optics.slope_error, optics.tracking_jitter))
     inside = scene.obstacles_in_plane()

@@ -202,16 +202,18 @@ class Scene:
             return apart.with_(control_points=points)
         return apart.with_(control_points=points, facet_reflectivity=self.facet_reflectivity.reshape(-1, 1))
 
-    def in_plane(self) -> tuple[Tensor, Tensor]:
-        """Control points (B, F, 3, I, J) [m] and suns (B, 3) in the frame of each target plane.
+    def in_plane(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Control points (B, F, 3, I, J) [m] about their mirrors' centres, the centres (B, 3) [m], suns (B, 3).
 
-        Splines are affine invariant, so turning the few control points turns all their samples.
+        All in the frame of each target plane. Splines are affine invariant, so turning the few control points turns all
+        their samples. The centres, a hundred metres away, are for the caller to add to those: slopes are differences
+        of microns, which single precision would lose beside them.
         """
         turn = self.plane_axes @ self.attitude
-        center = torch.einsum("bij,bj->bi", self.plane_axes, self.center - self.plane_center)
         points = torch.einsum("bij,bfjuv->bfiuv", turn, self.control_points.expand(self.batch, -1, -1, -1, -1))
+        center = torch.einsum("bij,bj->bi", self.plane_axes, self.center - self.plane_center)
         sun = torch.einsum("bij,bj->bi", self.plane_axes, self.sun)
-        return points + center[:, None, :, None, None], sun
+        return points, center, sun
 
     def obstacles_in_plane(self) -> Tensor | None:
         """Obstacles (B, K, 3, 3) [m] in the frame of each target plane."""

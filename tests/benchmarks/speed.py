@@ -10,7 +10,7 @@ from model.frames import sun_direction
 from model.network.architecture import MAX_IMAGES
 from model.network.predictor import SurfacePredictor
 from model.plant import Heliostat, TargetPlane
-from model.refinement import default_prior
+from model.refinement import default_prior, refine
 from model.surface import control_points
 from model.tracing import Scene, Window, trace
 from model.tracing.montecarlo import trace_montecarlo
@@ -70,8 +70,13 @@ def main() -> None:
     rng = np.random.default_rng(0)
     shots = places(Situations().suns(MAX_IMAGES, rng), [TARGET] * MAX_IMAGES)
     images = observe(mirror, default_prior().mean, shots, CleanCamera(), rng)
-    taken = seconds(lambda: predictor.predict(mirror, images), 20) * 1e3
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    taken = seconds(lambda: predictor.heights(mirror, images), 20) * 1e3
     print(f"  network, one heliostat, 8 images, 1 core, tracing of its guesses included: {taken:.1f} ms")
+    torch.set_num_threads(threads)
+    taken = seconds(lambda: refine(mirror, images), 3)
+    print(f"  refinement, one heliostat, 8 images: {taken:.1f} s")
 
 
 if __name__ == "__main__":

@@ -6,14 +6,16 @@ from model.errors import InvalidInputError
 from model.network.architecture import CONDITIONS, MAX_IMAGES, NetworkConfig, SurfaceNetwork
 from model.network.inputs import conditions
 from model.network.paper import PaperConfig, PaperNetwork
-from model.network.predictor import INPUTS, SurfacePredictor, default_predictor, model_card
+from model.network.predictor import INPUTS, SurfacePredictor, default_predictor, mirrored_inputs, model_card
 from model.observation import Observation, spread_suns
 from model.plant import TargetPlane
-from model.surface import control_points
+from model.refinement import default_prior
+from model.surface import control_points, mirrored
 from model.tracing import Scene
 from model.tracing.convolution import central_rays
 from tests.conftest import flat_heliostat, target
 from training.export import PARITY_MM, example, export, parity, rounded
+from training.render import Shots, Situations
 
 SMALL = NetworkConfig(encoder_channels=(8, 16, 16), features=32, heads=2, style_features=8, decoder_channels=16)
 
@@ -25,11 +27,11 @@ def network() -> torch.nn.Module:
 
 
 def test_order_of_images_does_not_matter(network):
-    flux, geometry, mask, guess_flux, guess = example(3, MAX_IMAGES)
+    flux, geometry, mask, guess_flux, guess, descent = example(3, MAX_IMAGES)
     order = torch.randperm(MAX_IMAGES)
     with torch.no_grad():
-        straight = network(flux, geometry, mask, guess_flux, guess)
-        shuffled = network(flux[:, order], geometry[:, order], mask, guess_flux[:, order], guess)
+        straight = network(flux, geometry, mask, guess_flux, guess, descent)
+        shuffled = network(flux[:, order], geometry[:, order], mask, guess_flux[:, order], guess, descent[:, order])
     for a, b in zip(straight, shuffled, strict=True):
         torch.testing.assert_close(a, b, atol=1e-5, rtol=1e-5)
 
@@ -37,11 +39,11 @@ def test_order_of_images_does_not_matter(network):
 @pytest.mark.parametrize("kind", ["ours", "paper"])
 def test_what_stands_where_there_is_no_image_does_not_matter(network, kind):
     network = network if kind == "ours" else PaperNetwork(PaperConfig(channels=16, decoder_channels=16)).eval()
-    flux, geometry, mask, guess_flux, guess = example(2, 3)
+    flux, geometry, mask, guess_flux, guess, descent = example(2, 3)
     noise = torch.where(mask[..., None, None] > 0, flux, torch.rand_like(flux))
     with torch.no_grad():
-        full, other = (network(f, geometry, mask, guess_flux, guess)[0] for f in (flux, noise))
-        alone = network(*(values[:, :3] for values in (flux, geometry, mask, guess_flux)), guess)[0]
+        full, other = (network(f, geometry, mask, guess_flux, guess, descent)[0] for f in (flux, noise))
+        alone = network(*(values[:, :3] for values in (flux, geometry, mask, guess_flux)), guess, descent[:, :3])[0]
     torch.testing.assert_close(full, other)
     torch.testing.assert_close(full, alone, atol=1e-5, rtol=1e-5)
 
@@ -51,7 +53,7 @@ def test_the_answer_keeps_facet_means_and_its_spread_is_positive(network):
     with torch.no_grad():
         heights, spread = network(*inputs)
     assert heights.shape == spread.shape == (2, 4, 8, 8)
-    torch.testing.assert_close(heights.mean(dim=(2, 3)), inputs[-1].mean(dim=(2, 3)), atol=1e-6, rtol=0)
+    torch.testing.assert_close(heights.mean(dim=(2, 3)), inputs[-2].mean(dim=(2, 3)), atol=1e-6, rtol=0)
     assert (spread > 0).all()
 
 
@@ -85,6 +87,44 @@ def test_conditions_say_how_slopes_and_places_move_light():
     np.testing.assert_allclose(told[6:8], place, atol=5e-3)
     assert told.shape == (CONDITIONS,)
     assert told[8] == pytest.approx(np.log(float(rays[0].slant_range) / 100), abs=1e-3)
+
+
+def test_a_descent_leads_towards_the_surface_that_threw_the_images():
+    rng, prior = np.random.default_rng(0), default_prior()
+    suns = Situations().suns(4, rng)
+    shots = Shots.of([flat_heliostat(focal_length=75.0)], suns, np.tile([0.0, 0.0, 40.0], (4, 1)), torch.device("cpu"))
+    mean, basis = (torch.as_tensor(values, dtype=torch.float32) for values in (prior.mean[None], prior.basis))
+    truth = torch.as_tensor(prior.surface(rng.normal(size=len(prior.basis)))[None], dtype=torch.float32)
+    flux = shots.trace(truth)
+    descent = shots.descents(mean, flux, basis)
+    assert descent.shape == (1, 4, 4, 8, 8)
+    misfit = [float((shots.trace(z) - flux).square().sum()) for z in (mean, mean + descent.sum(dim=1))]
+    assert misfit[1] < 0.5 * misfit[0]
+    arrived = shots.descents(truth, flux, basis)
+    assert float(arrived.abs().max()) < 0.1 * float(descent.abs().max())
+
+
+def test_the_mirrored_world_is_told_as_such():
+    """A mirror image of everything, traced, gives what `mirrored_inputs` makes of the original."""
+    rng, prior = np.random.default_rng(0), default_prior()
+    suns, aims = Situations().suns(3, rng), np.tile([2.0, 0.0, 40.0], (3, 1))
+    z, basis = (torch.as_tensor(values, dtype=torch.float32) for values in (prior.mean[None], prior.basis))
+    truth = torch.as_tensor(prior.surface(rng.normal(size=len(prior.basis)))[None], dtype=torch.float32)
+    told = []
+    for sign in (1.0, -1.0):
+        flip = [sign, 1.0, 1.0]
+        heliostat = flat_heliostat((sign * 25.0, 70.0, 1.8), focal_length=75.0)
+        shots = Shots.of([heliostat], suns * flip, aims * flip, torch.device("cpu"))
+        surfaces = [values if sign > 0 else mirrored(values.numpy()).copy() for values in (z, truth)]
+        guess, thrower = (torch.as_tensor(values) for values in surfaces)
+        flux = shots.trace(thrower)
+        descent = shots.descents(guess, flux, basis)
+        mask, seen = torch.ones(1, 3), shots.trace(guess)
+        values = (flux, shots.conditions(), mask, seen, guess, descent)
+        told.append({name: value.numpy() for name, value in zip(INPUTS, values, strict=True)})
+    for name, expected in mirrored_inputs(told[0]).items():
+        scale = np.abs(expected).max()
+        np.testing.assert_allclose(told[1][name] / scale, expected / scale, atol=0.02, err_msg=name)
 
 
 def observation(identifier="1") -> Observation:

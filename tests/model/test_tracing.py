@@ -203,6 +203,16 @@ def test_window_follows_the_spot_and_the_batch():
     np.testing.assert_allclose(flux.irradiance[1], alone.irradiance[0], rtol=1e-9, atol=1e-9)
 
 
+def test_single_precision_keeps_the_slopes():
+    """Slopes are differences of microns; added to places a hundred metres away they would lose their last digits."""
+    far, z = flat_heliostat((60.0, 240.0, 1.8), focal_length=250.0), wavy()
+    single, double = (
+        trace(scene(far, z, dtype=dtype), Window(on_spot=True)).normalized().double()
+        for dtype in (torch.float32, torch.float64)
+    )
+    assert float((single - double).abs().max()) < 2e-4 * float(double.max())
+
+
 def test_gradients_agree_with_finite_differences():
     heliostat = flat_heliostat(focal_length=70.0)
     base = scene(heliostat, wavy())

@@ -11,12 +11,13 @@ from model.network.architecture import MAX_IMAGES, NetworkConfig
 from model.network.predictor import WEIGHTS, default_predictor
 from training import crossvalidate, plots
 from training.cases import ELSEWHERE, MAX_DISTANCE, SOURCE, Case, make_cases, within_reach
+from training.config import TrainConfig
 from training.evaluate import DISTANCES, PAPERS_NETWORK, REFINEMENT, compared, draw, evaluate
 from training.figures import Figures, outcomes_of
 from training.methods import always, by_network, by_onnx, by_run, held_out_of
 from training.render import Camera, CleanCamera, load_field
 from training.surfaces import load_surfaces, split_by_heliostat
-from training.train import Run, TrainConfig
+from training.train import Run
 
 SMALL = NetworkConfig(encoder_channels=(8, 16, 16), features=32, heads=2, style_features=8, decoder_channels=16)
 COUNT = 6

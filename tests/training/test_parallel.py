@@ -10,7 +10,8 @@ from torch import multiprocessing, nn
 
 from model.network.architecture import NetworkConfig
 from training import parallel
-from training.train import Run, TrainConfig
+from training.config import TrainConfig
+from training.train import Run
 
 SMALL = NetworkConfig(encoder_channels=(4, 8, 8), features=16, heads=2, style_features=8, decoder_channels=8)
 

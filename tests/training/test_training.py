@@ -1,6 +1,7 @@
 """Training end to end, small: surfaces, rendering, steps, resuming."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,11 +9,20 @@ import pytest
 import torch
 
 from model.network.architecture import NetworkConfig
-from model.surface import split_canting
+from model.surface import mirrored, split_canting
+from training.config import TrainConfig
 from training.prior import estimate
 from training.render import Camera, Situations, load_field, render
-from training.surfaces import Augmentation, load_surfaces, mirrored, rotated, split_by_heliostat, tilt_modes, untilted
-from training.train import Run, TrainConfig
+from training.surfaces import (
+    Augmentation,
+    load_surfaces,
+    rotated,
+    split_by_heliostat,
+    tilt_modes,
+    untilted,
+    with_symmetries,
+)
+from training.train import Run
 
 SMALL = NetworkConfig(encoder_channels=(8, 16, 16), features=32, heads=2, style_features=8, decoder_channels=16)
 
@@ -56,6 +66,19 @@ def test_samples_resemble_the_measured_surfaces(surfaces):
     for part, (low, high) in zip((0, 1), ((0.8, 2.5), (0.6, 1.6)), strict=True):
         ratio = split_canting(drawn)[part].std() / split_canting(surfaces)[part].std()
         assert low < ratio < high
+
+
+def test_fresh_samples_are_no_mixtures_of_the_measured_surfaces(surfaces):
+    """The span of the measured mirrors and their mirror images does not hold them."""
+    plain = Augmentation(exchange=0.0, tilt_mrad=0.0, focus_mrad=0.0, canting=1.0, waviness=1.0)
+    few = surfaces[:6]
+    span = np.linalg.svd(with_symmetries(few).reshape(-1, 256), full_matrices=False)[2]
+
+    def outside(fresh: float) -> float:
+        z = replace(plain, fresh=fresh).sample(few, 50, np.random.default_rng(1)).reshape(50, -1)
+        return float(np.linalg.norm(z - z @ span.T @ span) / np.linalg.norm(z))
+
+    assert outside(1.0) > 2 * outside(0.0)
 
 
 def test_rendered_images_are_normalised_and_reproducible(surfaces, stj):
@@ -102,6 +125,18 @@ def test_a_run_learns_saves_and_resumes(stj, tmp_path):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-6)
     assert TrainConfig.read(tmp_path / "half" / "config.json") == config
     assert np.isfinite(resumed.validate(repeats=1)).all()
+
+
+def test_a_run_starts_from_the_averaged_weights_of_another(stj, tmp_path):
+    config = TrainConfig(data=str(stj), steps=6, batch=2, warmup=2, network=SMALL, bfloat16=False)
+    first = Run(config, tmp_path / "first", torch.device("cpu"))
+    first.train_step()
+    first.save()
+    second = Run(replace(config, seed=8), tmp_path / "second", torch.device("cpu"))
+    second.start_from(tmp_path / "first" / "checkpoint.pt")
+    assert second.step == 0
+    for a, b in zip(first.average.parameters(), second.network.parameters(), strict=True):
+        torch.testing.assert_close(a, b)
 
 
 def test_unfinished_training_stops_when_time_is_up(stj, tmp_path):
