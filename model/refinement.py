@@ -27,15 +27,13 @@ from model.effects import Effect
 from model.errors import InvalidInputError
 from model.forecast import Aligned, View
 from model.metrics import flux_accuracy
+from model.network.inputs import STEP_HEIGHT
 from model.observation import FLUX_WINDOW, Observation, SurfacePrediction, align_observations, render_observations
 from model.plant import Heliostat
 from model.surface import control_points
 from model.tracing import Optics
 
 Array = NDArray[np.float64]
-
-STEP_HEIGHT = 3e-5
-"""Height [m, root mean square] by which a surface is changed to take a difference of its images."""
 
 BLOCK = 4
 """Pixels along the side of the patches in which residuals of images err together."""
@@ -101,7 +99,9 @@ class RefinementOptions:
     """How images are trusted.
 
     ``noise`` is the least standard deviation of a pixel as a share of the image's peak; what the images then turn out
-    to err by, times ``hope``, is taken instead where it is more, in several ``rounds``. ``annealing`` are the noises to
+    to err by, times ``hope``, is taken instead where it is more, in several ``rounds``. Errors of a model that lacks
+    something come in patches, in which pixels err together and must not be counted one by one: variance that blocks
+    of `BLOCK` pixels a side have beyond that of grain counts ``patches`` times. ``annealing`` are the noises to
     begin with, stage by stage, with the ``leading`` directions of the prior: images that are trusted little at first
     let the large features settle before the small ones are looked at. ``calibration`` is how many times the images'
     variance is counted in the uncertainty: the curvature at one summit knows nothing of others nearby. It was chosen
@@ -114,11 +114,12 @@ class RefinementOptions:
 
     noise: float = 0.005
     hope: float = 0.7
+    patches: float = 32.0
     rounds: int = 4
     annealing: tuple[float, ...] = (0.5, 0.1, 0.03)
     leading: int = 60
     steps: int = 16
-    calibration: float = 150.0
+    calibration: float = 30.0
     shift_m: float = 0.03
     exposure: float = 0.1
     background: float = 0.02
@@ -291,11 +292,7 @@ class _Posterior:
         return np.asarray(np.linalg.inv(curvature), dtype=np.float64)
 
     def noise(self, state: _State, share: float = 1.0) -> float:
-        """Standard deviation of a pixel, of the peak: a ``share`` of what the state leaves of the images.
-
-        Residuals of a model that lacks something are patches, not grains, and pixels counted one by one would be
-        trusted far too much: sums over blocks of ``BLOCK`` pixels a side say how many of them err together.
-        """
+        """Standard deviation of a pixel, of the peak: a ``share`` of what the state leaves of the images."""
         grain, patch = 0.0, 0.0
         for measured, image in zip(self.measured, state.images, strict=True):
             directions = _nuisance(image, self.options)
@@ -303,7 +300,8 @@ class _Posterior:
             residual -= directions @ np.linalg.lstsq(directions, residual, rcond=None)[0]
             grain += residual.var()
             patch += _binned(residual.reshape(1, *image.shape), image.shape[0] // BLOCK).var() / BLOCK**2
-        return max(self.options.noise, share * float(np.sqrt(max(grain, patch) / len(self.measured))))
+        variance = (grain + self.options.patches * max(0.0, patch - grain)) / len(self.measured)
+        return max(self.options.noise, share * float(np.sqrt(variance)))
 
 
 def _untilted(z: Array, ideal: Array) -> Array:
