@@ -183,8 +183,9 @@ def test_demo_leaves_table_pictures_report_and_store(tmp_path, stj, made_plant):
     report = json.loads((tmp_path / "demo" / "report.json").read_text())
     found = {entry["heliostat"]: entry for entry in report["heliostats"]}
     assert {"AA39", "AC43", "AD37"} <= set(found)
-    for method in ("network", "refined"):
-        assert found["AA39"][f"accuracy_{method}"] > found["AA39"]["accuracy_ideal"] + 0.1
+    # On photographs that were kept back the refined surface forecasts no worse than deflectometry's.
+    assert found["AA39"]["accuracy_network"] > found["AA39"]["accuracy_ideal"] + 0.1
+    assert found["AA39"]["accuracy_refined"] > found["AA39"]["accuracy_measured"] - 0.02
     for entry in found.values():
         for picture in entry["pictures"]:
             assert (tmp_path / "demo" / picture).read_bytes().startswith(b"\x89PNG")
