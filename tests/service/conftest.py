@@ -174,7 +174,6 @@ class FakeOperations:
         center = np.array([0.1, 0.2])
         return Forecast(flux=flux, center_of_mass=center, peak=2.0, power=50.0, model_version="fake")
 
-
     def superpose(self, receiver: Any, tiles: Any, **options: Any) -> FleetFlux:
         self.fleets.append({"receiver": receiver, **options})
         count = sum(len(tile) for tile in tiles)
