@@ -23,6 +23,10 @@ TRUSTED_MISFIT = 0.2
 """Misfit of an image up to which a surface explains it: twice what clean images leave, more than real ones do."""
 
 
+TRUSTED_STRANGENESS = 1.8
+"""Strangeness up to which a surface may be a mirror of this kind: one in a thousand is stranger (chi-squared, 8)."""
+
+
 @dataclass(frozen=True, eq=False)
 class Observation:
     """One measured flux image and where it was taken.
@@ -72,6 +76,8 @@ class SurfacePrediction:
         How badly the surface explains each of its own images: one minus the flux accuracy of re-rendering it.
     used : tuple of str
         Identifiers of the images.
+    strangeness : float
+        How far the surface lies from those measured before; one is usual (`SurfacePrior.strangeness`).
     """
 
     z: NDArray[np.float64]
@@ -81,6 +87,7 @@ class SurfacePrediction:
     weights: str
     misfits: tuple[float, ...]
     used: tuple[str, ...]
+    strangeness: float = 1.0
 
     @property
     def misfit(self) -> float:
@@ -94,8 +101,12 @@ class SurfacePrediction:
 
     @property
     def trusted(self) -> bool:
-        """Whether every image is explained: no wrong heliostat, no foreign spot, no mirror unlike those known."""
-        return not self.suspicious
+        """Whether every image is explained, and by a mirror like those known.
+
+        Not so for a foreign spot, a mirror of another kind, or images of another heliostat: a surface can often be bent
+        to explain those, but not a likely one.
+        """
+        return not self.suspicious and self.strangeness <= TRUSTED_STRANGENESS
 
 
 def scene_of(

@@ -41,6 +41,9 @@ BLOCK = 4
 LEAST_GAIN = 0.5
 """Gain of log posterior below which a climb ends."""
 
+LEADING = 8
+"""Directions of the prior that tell a strange surface: the longest, which every image shows."""
+
 PRIOR = Path(__file__).parent / "weights" / "surface-prior.npz"
 
 
@@ -81,6 +84,13 @@ class SurfacePrior:
     def surface(self, coefficients: Array) -> Array:
         """Heights (4, 8, 8) [m] of coefficients (K,)."""
         return np.asarray(self.mean + np.tensordot(coefficients, self.basis, axes=1))
+
+    def strangeness(self, z: Array) -> float:
+        """How far ``z`` (4, 8, 8) [m] lies from the mean: root mean square of its leading coefficients.
+
+        About one for a mirror of the kind that the prior was estimated from.
+        """
+        return float(np.sqrt((self.coefficients(z)[:LEADING] ** 2).mean()))
 
     def deviation(self, covariance: Array) -> Array:
         """Standard deviation (4, 8, 8) [m] of heights whose coefficients have a covariance (K, K)."""
@@ -359,6 +369,7 @@ def refine(
         weights=prior.name,
         misfits=misfits(heliostat, observations, z, optics, effects),
         used=tuple(o.identifier for o in observations),
+        strangeness=prior.strangeness(z),
     )
 
 

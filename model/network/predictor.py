@@ -126,6 +126,7 @@ class SurfacePredictor:
             weights=self.name,
             misfits=misfits(heliostat, observations, z, optics, effects),
             used=tuple(o.identifier for o in observations),
+            strangeness=default_prior().strangeness(z),
         )
 
 

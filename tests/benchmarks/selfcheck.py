@@ -1,8 +1,8 @@
 """Whether surfaces that should not be trusted are told from good ones: ``python -m tests.benchmarks.selfcheck``.
 
 Mirrors held out of training are photographed at places of the field, as they should be and with something wrong, and
-refined as the product does it. A prediction is trusted where it explains each of its images. Real photographs follow:
-AA39's and AC43's as their own and as each other's.
+refined as the product does it. A prediction is trusted where it explains each of its images by a mirror like those known.
+Real photographs follow: AA39's and AC43's as their own and as each other's.
 """
 
 import argparse
@@ -100,11 +100,13 @@ def line(label: str, cases: list[Case], predictions: list[SurfacePrediction]) ->
     mean, worst = (np.array([f(p.misfits) for p in predictions]) for f in (np.mean, np.max))
     doubted = sum(not p.trusted for p in predictions)
     errors = [surface_error(p.z, case.truth) * 1e3 for p, case in zip(predictions, cases, strict=True)]
+    strange = [p.strangeness for p in predictions]
     third = sum(p.suspicious == p.used[2:3] for p in predictions)
     return (
         f"  {label:<32} doubted {doubted:>2} of {len(mean):<3} third image alone {third:>2}   "
         f"misfit median {np.median(mean):.3f}   "
         f"worst image min {worst.min():.3f} median {np.median(worst):.3f} max {worst.max():.3f}   "
+        f"strangeness min {min(strange):.2f} median {np.median(strange):.2f} max {max(strange):.2f}   "
         f"error [mm] median {np.median(errors):.3f}"
     )
 
@@ -127,10 +129,12 @@ def photographed() -> None:
     for heliostat, _, _ in found:
         for owner, observations, _ in found:
             predicted = predict(heliostat, choose(observations, IMAGES), "refined")
-            print(
-                f"  {heliostat.name} from photographs of {owner.name}: {'trusted' if predicted.trusted else 'doubted'}"
-                f"   misfits {' '.join(f'{m:.3f}' for m in predicted.misfits)}"
+            verdict, shown = (
+                "trusted" if predicted.trusted else "doubted",
+                " ".join(f"{m:.3f}" for m in predicted.misfits),
             )
+            print(f"  {heliostat.name} from photographs of {owner.name}: {verdict}", end="   ")
+            print(f"strangeness {predicted.strangeness:.2f}   misfits {shown}")
 
 
 def main() -> None:
