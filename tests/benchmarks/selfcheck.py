@@ -1,7 +1,7 @@
 """Whether surfaces that should not be trusted are told from good ones: ``python -m tests.benchmarks.selfcheck``.
 
 Mirrors held out of training are photographed at places of the field, as they should be and with something wrong, and
-refined as the product does it. A prediction is trusted where it explains each of its images by a mirror like those known.
+refined as the product does it. A prediction is trusted where it explains all its images by a mirror like those known.
 Real photographs follow: AA39's and AC43's as their own and as each other's.
 """
 
