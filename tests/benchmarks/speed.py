@@ -8,12 +8,13 @@ import torch
 
 from model.frames import sun_direction
 from model.network.architecture import MAX_IMAGES
-from model.network.predictor import SurfacePredictor
+from model.network.predictor import INPUTS, LOOKS, SurfacePredictor
 from model.plant import Heliostat, TargetPlane
 from model.refinement import default_prior, refine
 from model.surface import control_points
 from model.tracing import Scene, Window, trace
 from model.tracing.montecarlo import trace_montecarlo
+from training.export import example
 from training.render import CleanCamera, Situations, observe, places
 
 BATCH = 64
@@ -72,8 +73,13 @@ def main() -> None:
     images = observe(mirror, default_prior().mean, shots, CleanCamera(), rng)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
-    taken = seconds(lambda: predictor.heights(mirror, images), 20) * 1e3
-    print(f"  network, one heliostat, 8 images, 1 core, tracing of its guesses included: {taken:.1f} ms")
+    one, two = ({n: v.numpy() for n, v in zip(INPUTS, example(batch, MAX_IMAGES), strict=True)} for batch in (1, 2))
+    # The looks before the last, which is taken at two worlds at once.
+    taken = seconds(lambda: [predictor.look(inputs) for inputs in [one] * (LOOKS - 1) + [two]], 20) * 1e3
+    print(f"  network, one heliostat, 8 images, 1 core, {LOOKS} looks: {taken:.1f} ms")
+    for looks in (1, LOOKS):
+        taken = seconds(lambda n=looks: predictor.heights(mirror, images, looks=n), 20) * 1e3
+        print(f"  the same with alignment and tracing of its guesses, looks {looks}: {taken:.1f} ms")
     torch.set_num_threads(threads)
     taken = seconds(lambda: refine(mirror, images), 3)
     print(f"  refinement, one heliostat, 8 images: {taken:.1f} s")
