@@ -3,10 +3,8 @@
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
 
 from model.effects import CATALOGUE, Parameter
@@ -14,7 +12,7 @@ from model.study import Study
 from model.study.advice import told_apart_by
 from model.study.report import Found
 from service.pages.figures import difference_map
-from service.pages.rendering import ASSETS, figure
+from service.pages.rendering import ASSETS, TEMPLATES
 from service.study_figures import accuracy_chart, pictures, scatters
 
 VERDICTS = {"effect": "Effect found", "none": "Nothing missing", "unexplained": "Not explained"}
@@ -92,7 +90,10 @@ def study_page(study: Study, title: str, skipped: Mapping[str, str] | None = Non
     """
     chart, sides = accuracy_chart(study), (study.window, study.window)
     left = difference_map("Mean residual with what was found", study.residual_map(), sides, "× peak")
-    return _template().render(
+    # The style is a file of our own, and `>` must stay what it is.
+    style = Markup(ASSETS.joinpath("app.css").read_text(encoding="utf-8"))
+    return TEMPLATES.get_template("study.html").render(
+        style=style,
         study=study,
         title=title,
         verdict=VERDICTS[study.verdict],
@@ -105,18 +106,3 @@ def study_page(study: Study, title: str, skipped: Mapping[str, str] | None = Non
         skipped=skipped or {},
         few=FEW,
     )
-
-
-@cache
-def _template() -> Template:
-    environment = Environment(
-        loader=PackageLoader("service.pages"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters.update(figure=figure, words=lambda name: name.replace("_", " "))
-    # The style is a file of our own, and `>` must stay what it is.
-    environment.globals.update(style=Markup(ASSETS.joinpath("app.css").read_text(encoding="utf-8")))
-    return environment.get_template("study.html")

@@ -48,9 +48,7 @@ def figure(value: float | None, digits: int = 2, unit: str = "") -> str:
     if value is None:
         return "–"
     # Adding zero takes the sign from what rounds to it.
-    text = f"{round(value, digits) + 0.0:,.{digits}f}".replace(",", "\N{NARROW NO-BREAK SPACE}").replace(
-        "-", "\N{MINUS SIGN}"
-    )
+    text = f"{round(value, digits) + 0.0:,.{digits}f}".translate(_SIGNS)
     return f"{text}\N{NO-BREAK SPACE}{unit}" if unit else text
 
 
@@ -93,19 +91,26 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.filters.update(
-        figure=figure, percent=percent, moment=moment, power=power, irradiance=irradiance, path=lambda v: quote(v, "")
+        figure=figure,
+        percent=percent,
+        moment=moment,
+        power=power,
+        irradiance=irradiance,
+        path=lambda value: quote(value, ""),
+        words=lambda name: name.replace("_", " "),
     )
     environment.globals.update(asset=asset, htmx_settings=json.dumps(_HTMX))
     return environment
 
 
-_templates = _environment()
+TEMPLATES = _environment()
+"""All templates: those of the pages, and that of a study's report."""
 
 
 def _page(scope: Scope, template: str, status: int, context: dict[str, Any]) -> HTMLResponse:
     identity: Identity | None = scope.get("state", {}).get("identity")
     may_operate = identity is not None and identity.role.includes(Role.OPERATE)
-    text = _templates.get_template(template).render(
+    text = TEMPLATES.get_template(template).render(
         context, identity=identity, may_operate=may_operate, here=scope.get("path", "")
     )
     return HTMLResponse(text, status)
