@@ -18,6 +18,7 @@ from service import store
 from service.arrays import unpack
 from service.engines import engine_of
 from service.models import PlantModel
+from service.progress import Report
 from service.runtime import Runtime
 from service.tables import HeliostatRow
 
@@ -72,7 +73,7 @@ class Fleet:
 
 
 def forecast_fleet(
-    runtime: Runtime, fleet: Fleet, resolution: tuple[int, int], neighbours: bool, report: Callable[[float, str], None]
+    runtime: Runtime, fleet: Fleet, resolution: tuple[int, int], neighbours: bool, report: Report
 ) -> FleetFlux:
     """The light of a fleet; ``neighbours`` block and shade each other, also those that lack a surface.
 

@@ -3,7 +3,7 @@
 A new kind is its payload, its function and one line in `KINDS`; its route, its documentation and the workers follow.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -18,6 +18,7 @@ from model.frames import sun_direction
 from model.plant import Receiver
 from service import models, store
 from service.faults import ConflictError, ServiceError
+from service.progress import Steps
 from service.runtime import Runtime
 from service.schemas import Method, Model, ModelVersion, Moment, Name, Plane, Position, ReceiverIn, Resolution, Sun
 from service.studies import StudyRequest, Surfaces, study_row, study_store
@@ -276,18 +277,8 @@ def import_allowed(context: Context, payload: ImportIn) -> Result:
 
     folder = read_folder(allowed_folder(context.runtime.settings.import_root, payload.folder))
     images = [len(item.images) for name in folder.plant.heliostats for item in folder.measurements(name, False)]
-    return Result(import_folder(context.runtime, folder, _steps(context, len(folder.plant.heliostats) + sum(images))))
-
-
-def _steps(context: Context, total: int) -> Callable[[str], None]:
-    """What reports the names of what is done one after the other as a share of ``total``."""
-    seen: list[str] = []
-
-    def step(name: str) -> None:
-        context.report(len(seen) / max(total, 1), name)
-        seen.append(name)
-
-    return step
+    steps = Steps(len(folder.plant.heliostats) + sum(images), context.report)
+    return Result(import_folder(context.runtime, folder, steps))
 
 
 KINDS: Kinds = {

@@ -1,6 +1,6 @@
 """Studies of what is stored: photographs and surfaces out of the store, a report into it."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from typing import TYPE_CHECKING, Any, Literal
@@ -17,6 +17,7 @@ from service import models, store
 from service.arrays import unpack
 from service.faults import ConflictError, NotFoundError, ServiceError
 from service.models import PlantModel
+from service.progress import Report, Steps
 from service.runtime import Runtime
 from service.schemas import StudyReport
 from service.tables import HeliostatRow, MeasurementRow, StudyRow, SurfaceRow
@@ -195,12 +196,10 @@ class Studied:
     study: "Study"
 
 
-def study_store(
-    runtime: Runtime, request: StudyRequest, progress: Callable[[float, str], None] = lambda share, message: None
-) -> Studied:
+def study_store(runtime: Runtime, request: StudyRequest, report: Report = lambda share, message: None) -> Studied:
     """Which effects the stored photographs demand beyond the plant's current model.
 
-    ``progress`` takes the share that is done, 0 to 1, and what is being fitted; what it raises ends the study.
+    ``report`` is told how far it is and what is being fitted; what it raises ends the study.
 
     Raises
     ------
@@ -217,25 +216,12 @@ def study_store(
     options = StudyOptions(latitude_deg=latitude_deg)
     if request.candidates is not None:
         options = replace(options, candidates=tuple(request.candidates))
-    steps = _Steps(len(options.candidates) * options.most, progress)
+    steps = Steps(len(options.candidates) * options.most, report)
     with runtime.computing("study") as operations:
         material = material.without_untraceable()
         _require_enough(material)
         study = operations.study(material.photographs, model.optics, model.effects, options, steps)
     return Studied(request, model, material, study)
-
-
-@dataclass(eq=False)
-class _Steps:
-    """Turns the names of what is done one after the other into shares of ``total``."""
-
-    total: int
-    progress: Callable[[float, str], None]
-    done: int = 0
-
-    def __call__(self, name: str) -> None:
-        self.progress(self.done / max(self.total, 1), name)
-        self.done += 1
 
 
 def _require_enough(material: Material) -> None:
