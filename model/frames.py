@@ -127,3 +127,14 @@ def sun_direction_at(declination_deg: ArrayLike, hour_angle_deg: ArrayLike, lati
         ),
         axis=-1,
     )
+
+
+def solar_time(direction: ArrayLike, latitude_deg: float) -> NDArray[np.float64]:
+    """Apparent solar time [h], noon at 12, of unit vectors (..., 3) in ENU towards the sun.
+
+    Inverts the hour angle of `sun_direction_at`: the sun turns by 15 degrees an hour.
+    """
+    east, north, up = np.moveaxis(np.asarray(direction, dtype=np.float64), -1, 0)
+    latitude = np.radians(latitude_deg)
+    toward_equator = up * np.cos(latitude) - north * np.sin(latitude)
+    return np.asarray(12 + np.degrees(np.arctan2(-east, toward_equator)) / 15)

@@ -83,6 +83,7 @@ def _put_image(runtime: Runtime, folder: MeasurementFolder, measurement: Measure
         sun_azimuth_deg=measurement.azimuth_deg,
         sun_elevation_deg=measurement.elevation_deg,
         external_id=measurement.identifier,
+        taken_at=measurement.taken_at,
         motor_position=None if motors is None else (float(motors[0]), float(motors[1])),
         focal_spot_wgs84=None if spot is None else tuple(float(v) for v in folder.plant.to_wgs84(spot)),  # type: ignore[arg-type]
     )

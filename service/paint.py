@@ -5,7 +5,8 @@ Source: the PAINT database of the Solar Tower Juelich, https://paint-database.or
 
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,8 @@ class Measurement:
     motor_position : (2,) [steps] or None
     images : dict
         Files by kind.
+    taken_at : datetime or None
+        With time zone; from PAINT's STAC item ``ID-calibration-item-stac.json`` where there is one.
     """
 
     identifier: str
@@ -53,6 +56,7 @@ class Measurement:
     spot: Array | None = None
     motor_position: Array | None = None
     images: dict[str, Path] = field(default_factory=dict)
+    taken_at: datetime | None = None
 
     @property
     def sun(self) -> Array:
@@ -248,6 +252,16 @@ def read_measurement(identifier: str, heliostat: str, data: Any, plant: Plant) -
     )
 
 
+def read_moment(item: Any, where: str) -> datetime:
+    """When a measurement was taken, of the contents of PAINT's STAC item; in UTC where it names no time zone."""
+    moment = _get(item, where, "properties", "datetime")
+    try:
+        taken_at = datetime.fromisoformat(moment)
+    except (TypeError, ValueError):
+        raise InvalidInputError(f"{where}: 'datetime' must be an ISO 8601 time, got {str(moment)[:80]}") from None
+    return taken_at if taken_at.tzinfo is not None else taken_at.replace(tzinfo=UTC)
+
+
 def _sun_shape(declared: Any, where: str) -> SunShape:
     shape = _get(declared, where, "shape")
     if shape == "buie":
@@ -297,6 +311,9 @@ class MeasurementFolder:
                 continue  # a sample that PAINT ships without a number; nothing could refer to it
             try:
                 measurement = read_measurement(identifier, heliostat, read_json(path), self.plant)
+                item = folder / f"{identifier}-calibration-item-stac.json"
+                if item.is_file():
+                    measurement = replace(measurement, taken_at=read_moment(read_json(item), str(item)))
             except InvalidInputError as error:
                 self.skipped[f"{heliostat}/{identifier}"] = str(error)
                 continue

@@ -59,7 +59,6 @@ class Material:
 
     photographs: list["Photograph"] = field(default_factory=list)
     skipped: dict[str, str] = field(default_factory=dict)
-    moments: dict[str, datetime] = field(default_factory=dict)
 
     @property
     def heliostats(self) -> list[str]:
@@ -69,7 +68,7 @@ class Material:
     @property
     def span(self) -> tuple[datetime | None, datetime | None]:
         """The first and the last moment that is known."""
-        known = [self.moments[p.key] for p in self.photographs if p.key in self.moments]
+        known = [p.taken_at for p in self.photographs if p.taken_at is not None]
         return min(known, default=None), max(known, default=None)
 
     def without_untraceable(self) -> "Material":
@@ -146,8 +145,6 @@ def _gather_heliostat(session: Session, row: HeliostatRow, request: StudyRequest
             material.skipped[f"{row.name}/{chosen.identifier}"] = str(error)
             continue
         material.photographs.append(photograph)
-        if measurement.taken_at is not None:
-            material.moments[photograph.key] = measurement.taken_at
 
 
 def photograph_of(
@@ -166,7 +163,7 @@ def photograph_of(
         spot=spot_of(row, store.target_plane(row.target), origin),
         identifier=f"{heliostat.name}/{row.identifier}",
     )
-    return Photograph(shot, image)
+    return Photograph(shot, image, taken_at=row.taken_at)
 
 
 def _flux(row: MeasurementRow, origin: tuple[float, float, float]) -> tuple[np.ndarray[Any, Any], TargetPlane]:

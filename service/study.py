@@ -81,7 +81,7 @@ def _photograph(
     if abs(across) > plane.width / 2 or abs(up) > plane.height / 2:
         raise InvalidInputError(f"{measurement.key}: 'focal_spot' lies off its target {measurement.target}")
     shot = Shot(heliostat, points, measurement.sun, plane, spot=spot, degree=degree, identifier=measurement.key)
-    return Photograph(shot, image)
+    return Photograph(shot, image, taken_at=measurement.taken_at)
 
 
 def _flux(folder: MeasurementFolder, measurement: Measurement) -> tuple[np.ndarray, TargetPlane]:
@@ -111,7 +111,7 @@ def study_folder(
     effects: Sequence[Effect] = (),
     progress: Callable[[str], None] = lambda message: None,
 ) -> FolderStudy:
-    """Which effect a folder's photographs demand beyond its declared model and ``effects``.
+    """Which effect a folder's photographs demand beyond its declared model and ``effects``, at its plant's latitude.
 
     Raises
     ------
@@ -121,6 +121,7 @@ def study_folder(
     check_surfaces(surfaces)
     photographs, skipped = photographs_of(folder, surfaces)
     known = [*folder.effects, *effects]
+    options = replace(options or StudyOptions(), latitude_deg=float(folder.plant.origin[0]))
     try:
         found = study(photographs, folder.optics, known, options, progress)
     except InvalidInputError as error:

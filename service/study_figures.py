@@ -1,12 +1,13 @@
 """What the page of a study draws, as plain numbers and small pictures, which its template turns into SVG."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from model.study import Photograph, Study
+from model.study.covariates import covariates_of
 from model.study.judging import rank_correlation
 from service.pages.figures import HeatMap, Scale, Tick, heat_map, ticks
 
@@ -109,12 +110,8 @@ def _fluxes(study: Study, photograph: Photograph) -> Array:
     return np.asarray(flux / flux[0].max())
 
 
-AXES: dict[str, Callable[[Photograph], float]] = {
-    "sun elevation [deg]": lambda p: p.elevation_deg,
-    "slant range [m]": lambda p: p.slant_range,
-    "sun azimuth [deg], east positive": lambda p: p.azimuth_deg,
-}
-"""What the error is drawn against."""
+DRAWN = ("sun elevation", "slant range", "solar time", "recorded time")
+"""The covariates that the error is drawn against, as far as they are known."""
 
 
 @dataclass(frozen=True)
@@ -140,12 +137,12 @@ class Scatter:
 
 
 def scatters(study: Study) -> list[Scatter]:
-    """The error of all held-out images against each of `AXES`."""
-    return [_scatter(study, label, of) for label, of in AXES.items()]
+    """The error of all held-out images against each of `DRAWN`."""
+    known = covariates_of(study.photographs, study.latitude_deg)
+    return [_scatter(study, f"{c.name} [{c.unit}]", values) for c, values in known.items() if c.name in DRAWN]
 
 
-def _scatter(study: Study, label: str, of: Callable[[Photograph], float]) -> Scatter:
-    x = np.array([of(p) for p in study.photographs])
+def _scatter(study: Study, label: str, x: Array) -> Scatter:
     before, after = 1 - study.accuracy_before, 1 - study.accuracy_after
     margin = 0.06 * float(np.ptp(x)) or 1.0
     low, high = float(x.min()) - margin, float(x.max()) + margin

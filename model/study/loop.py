@@ -224,4 +224,5 @@ def study(
         found=[f.fitted(current.unknowns, current.values, current.spread) for f in found],
         candidates=sorted(candidates, key=lambda c: -c.accuracy_after),
         effects=current.effects,
+        latitude_deg=options.latitude_deg,
     )

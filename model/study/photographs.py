@@ -3,6 +3,7 @@
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime
 from functools import lru_cache
 from typing import Any
 
@@ -44,11 +45,14 @@ class Photograph:
         Over the whole target, row 0 at the top, in any unit.
     seen : bool
         Whether the mirror's surface was predicted from it: such a surface flatters its own photographs.
+    taken_at : datetime or None
+        When it was taken, with time zone, where that was recorded.
     """
 
     shot: Shot
     image: NDArray[np.floating]
     seen: bool = False
+    taken_at: datetime | None = None
 
     def __post_init__(self) -> None:
         if self.image.ndim != 2 or not np.isfinite(self.image).all() or not self.image.sum() > 0:
@@ -193,7 +197,7 @@ class Forecaster:
             for number in range(count):
                 renamed = {k: replace(h, name=copy_name(h.name, number)) for k, h in heliostats.items()}
                 shots = [replace(s, heliostat=renamed[id(s.heliostat)]) for s in self.shots]
-                photographs += [Photograph(s, p.image) for s, p in zip(shots, self.photographs, strict=True)]
+                photographs += [replace(p, shot=s) for s, p in zip(shots, self.photographs, strict=True)]
             declared = [copied(effect, count) for effect in self.declared]
             self._copies[count] = Forecaster(
                 photographs, self.optics, declared, self.window, self.view, self.latitude_deg

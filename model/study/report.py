@@ -1,6 +1,6 @@
 """What a study found: DESIGN.md, section 7, and what an operator wants to know besides."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -8,8 +8,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from model.effects import CATALOGUE, Effect
+from model.effects import CATALOGUE, JUELICH_LATITUDE, Effect
 from model.study.advice import told_apart_by
+from model.study.covariates import covariates_of
 from model.study.judging import Gain, accuracies, rank_correlation
 from model.study.photographs import Photograph
 from model.study.unknowns import Unknowns
@@ -23,14 +24,6 @@ whose effects are known, keep less (two tracers, resampling, surfaces of finite 
 
 SHARE = 1 / 3
 """Share of that error which the effects found must remove for the verdict to rest on them."""
-
-COVARIATES: dict[str, Callable[[Photograph], float]] = {
-    "sun elevation": lambda p: p.elevation_deg,
-    "sun azimuth": lambda p: p.azimuth_deg,
-    "slant range": lambda p: p.slant_range,
-    "height of the target": lambda p: float(p.shot.plane.center[2]),
-}
-
 
 SHARED = 0.02
 """Standard deviation, of a parameter's distance from neutral, of what all images of a study err by together.
@@ -98,6 +91,8 @@ class Study:
         Every effect alone, the best first.
     effects : list of Effect
         The effects found, ready to be adopted.
+    latitude_deg : float [deg]
+        Of the plant.
     """
 
     photographs: Sequence[Photograph]
@@ -109,6 +104,7 @@ class Study:
     found: list[Found]
     candidates: list[Candidate]
     effects: list[Effect]
+    latitude_deg: float = JUELICH_LATITUDE
 
     @cached_property
     def accuracy_before(self) -> Array:
@@ -155,8 +151,8 @@ class Study:
     def covariates(self) -> dict[str, float]:
         """Rank correlation of the error that is left with what may drive it, the strongest first."""
         error = 1 - self.accuracy_after
-        values = {name: np.array([of(p) for p in self.photographs]) for name, of in COVARIATES.items()}
-        found = {name: round(rank_correlation(error, v), 3) for name, v in values.items()}
+        known = covariates_of(self.photographs, self.latitude_deg)
+        found = {covariate.name: round(rank_correlation(error, v), 3) for covariate, v in known.items()}
         return dict(sorted(found.items(), key=lambda item: -abs(item[1])))
 
     def residual_map(self) -> Array:

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from model.errors import InvalidInputError
-from model.frames import enu_to_wgs84, sun_angles, sun_direction, sun_direction_at, wgs84_to_enu
+from model.frames import enu_to_wgs84, solar_time, sun_angles, sun_direction, sun_direction_at, wgs84_to_enu
 
 ORIGIN = (50.913421122592574, 6.387824755874856, 87.0)
 
@@ -48,3 +48,9 @@ def test_noon_at_the_equinox_stands_at_the_complement_of_the_latitude():
 def test_bad_coordinates_are_refused(bad):
     with pytest.raises(InvalidInputError, match="position"):
         wgs84_to_enu(bad, ORIGIN)
+
+
+@pytest.mark.parametrize("latitude_deg", [-33.0, 0.0, 50.9])
+def test_solar_time_is_noon_plus_an_hour_for_every_fifteen_degrees_at_any_season(latitude_deg):
+    suns = sun_direction_at([-23.4, 0.0, 23.4], [-60.0, 0.0, 37.5], latitude_deg)
+    np.testing.assert_allclose(solar_time(suns, latitude_deg), [8.0, 12.0, 14.5], atol=1e-12)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 from itertools import combinations
 
 import numpy as np
@@ -20,6 +21,7 @@ from model.frames import sun_direction
 from model.plant import Heliostat
 from model.study import Photograph, StudyOptions, study
 from model.study.advice import PHOTOGRAPHS, SAME_SCALING, SCALES_WITH, told_apart_by
+from model.study.covariates import RECORDED_TIME, covariates_of
 from model.study.fitting import Fitter
 from model.study.judging import accuracies, paired_gain, rank_correlation, split
 from model.study.noise import grain_variance
@@ -306,7 +308,26 @@ def test_what_no_candidate_explains_is_said(hazy):
     assert found.verdict == "unexplained"
     assert found.unexplained_share == 1.0
     assert [c.name for c in found.candidates] == ["axis_tilt"]
-    assert set(found.covariates()) == {"sun elevation", "sun azimuth", "slant range", "height of the target"}
+    assert set(found.covariates()) == {
+        "sun elevation",
+        "slant range",
+        "solar time",
+        "sun azimuth",
+        "height of the target",
+    }
+
+
+def test_an_error_that_grows_with_time_is_seen_where_times_were_recorded(hazy):
+    first = datetime(2026, 6, 1, 12, tzinfo=UTC)
+    dated = [replace(p, taken_at=first + timedelta(days=day)) for day, p in enumerate(hazy)]
+    found = study(dated, Optics(), options=replace(QUICK, candidates=("axis_tilt",)))
+    days = covariates_of(found.photographs, found.latitude_deg)[RECORDED_TIME]
+    assert days.min() == 0
+    np.testing.assert_allclose(days, np.round(days))
+    assert found.covariates()["recorded time"] == pytest.approx(
+        rank_correlation(1 - found.accuracy_after, days), abs=5e-4
+    )
+    assert RECORDED_TIME not in covariates_of([*found.photographs, hazy[0]], found.latitude_deg)
 
 
 def test_what_is_declared_is_no_candidate(hazy):

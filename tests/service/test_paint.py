@@ -1,4 +1,5 @@
 import json
+from datetime import UTC, datetime
 
 import h5py
 import numpy as np
@@ -16,6 +17,7 @@ from service.paint import (
     read_folder,
     read_heliostat,
     read_measurement,
+    read_moment,
     read_targets,
 )
 from tests.conftest import flat_heliostat
@@ -137,3 +139,14 @@ def test_bad_properties_name_the_field():
             read_heliostat("AA39", properties, origin)
     with pytest.raises(InvalidInputError, match="coordinates"):
         read_targets({"power_plant_properties": {}})
+
+
+@pytest.mark.parametrize("moment", ["2021-07-14T11:05:27Z", "2021-07-14T13:05:27+02:00", "2021-07-14T11:05:27"])
+def test_a_stac_item_tells_when_a_measurement_was_taken(moment):
+    assert read_moment({"properties": {"datetime": moment}}, "item") == datetime(2021, 7, 14, 11, 5, 27, tzinfo=UTC)
+
+
+@pytest.mark.parametrize("moment", [None, 5, "yesterday"])
+def test_a_stac_item_without_a_time_is_named(moment):
+    with pytest.raises(InvalidInputError, match="item: 'datetime' must be an ISO 8601 time"):
+        read_moment({"properties": {"datetime": moment}}, "item")
