@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from model.effects import Effect
 from model.errors import InvalidInputError
 from model.forecast import Aligned, Shot, View, align
+from model.images import normalized
 from model.plant import Heliostat, TargetPlane
 from model.surface import control_points
 from model.tracing import Optics, Scene
@@ -161,7 +162,7 @@ def render_observations(
     view = View(*FLUX_SHAPE, window=FLUX_WINDOW, samples=samples)
     with torch.no_grad():
         flux = align_observations(heliostat, observations, z, effects).images(optics, effects, view).double()
-    return (100 * flux / flux.sum(dim=(1, 2), keepdim=True)).numpy()
+    return normalized(flux).numpy()
 
 
 def spread_suns(suns: NDArray[np.float64], count: int) -> list[int]:

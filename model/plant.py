@@ -115,6 +115,11 @@ class Heliostat:
         axes = np.stack([x, np.cross(z, x), z], axis=-2)
         return np.array([facet.position for facet in self.facets]), axes, half_sizes
 
+    @property
+    def facet_normals(self) -> NDArray[np.float64]:
+        """Unit normals (F, 3) of the ideal facets in mirror coordinates: where a height above them points."""
+        return np.asarray(self.facet_frames[1][:, 2])
+
 
 def _orient(surface: "TargetPlane | Cylinder", kind: str) -> None:
     """Make ``normal`` and ``up`` unit vectors, ``up`` perpendicular to ``normal``, and check them and ``center``."""

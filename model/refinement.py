@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from model.effects import Effect
 from model.errors import InvalidInputError
 from model.forecast import Aligned, View
+from model.images import binned, normalized
 from model.metrics import flux_accuracy
 from model.network.inputs import STEP_HEIGHT
 from model.observation import FLUX_WINDOW, Observation, SurfacePrediction, align_observations, render_observations
@@ -185,21 +186,20 @@ class _Posterior:
         self.prior, self.options = prior, options
         self.optics, self.effects = model
         self.view = View(options.resolution, options.resolution, window=FLUX_WINDOW)
-        self.measured = _binned(np.array([o.flux for o in observations], dtype=np.float64), options.resolution)
+        self.measured = binned(np.array([o.flux for o in observations], dtype=np.float64), options.resolution)
         # The same height for each direction: small enough for images to be linear in it, large enough to stand out from
         # their last digits.
         height = np.sqrt((prior.basis**2).mean(axis=(1, 2, 3)))
         self.steps = np.clip(STEP_HEIGHT / height, 0.1, 4.0)
-        ideal = control_points(heliostat)
-        normals = control_points(heliostat, np.ones_like(prior.mean)) - ideal
-        changes = np.einsum("k,kfij,fijc->kfcij", self.steps, _untilted(prior.basis, ideal), normals)
+        untilted = _untilted(prior.basis, control_points(heliostat))
+        changes = np.einsum("k,kfij,fc->kfcij", self.steps, untilted, heliostat.facet_normals)
         self.changes = torch.as_tensor(changes, dtype=torch.float32)
 
     def _photographs(self, aligned: Aligned, samples: int) -> Array:
         """Images (B, R, R), sum 100, of mirrors that stand."""
         with torch.no_grad():
             images = aligned.images(self.optics, self.effects, replace(self.view, samples=samples)).double().numpy()
-        return np.asarray(100 * images / images.sum(axis=(1, 2), keepdims=True))
+        return normalized(images)
 
     def state(self, c: Array) -> _State:
         """The mirror of coefficients (K,) before its suns."""
@@ -309,7 +309,7 @@ class _Posterior:
             residual = (measured - image).ravel() / image.max()
             residual -= directions @ np.linalg.lstsq(directions, residual, rcond=None)[0]
             grain += residual.var()
-            patch += _binned(residual.reshape(1, *image.shape), image.shape[0] // BLOCK).var() / BLOCK**2
+            patch += binned(residual.reshape(1, *image.shape), image.shape[0] // BLOCK).var() / BLOCK**2
         variance = (grain + self.options.patches * max(0.0, patch - grain)) / len(self.measured)
         return max(self.options.noise, share * float(np.sqrt(variance)))
 
@@ -319,12 +319,6 @@ def _untilted(z: Array, ideal: Array) -> Array:
     modes = np.moveaxis(ideal[..., :2] - ideal[..., :2].mean(axis=(1, 2), keepdims=True), -1, 0).reshape(2, -1)
     flat = z.reshape(len(z), -1)
     return np.asarray((flat - flat @ np.linalg.pinv(modes) @ modes).reshape(z.shape))
-
-
-def _binned(images: Array, resolution: int) -> Array:
-    """Images (M, n, n) at ``resolution`` pixels a side, their sums kept."""
-    size = images.shape[-1] // resolution
-    return np.asarray(images.reshape(-1, resolution, size, resolution, size).sum(axis=(2, 4)))
 
 
 def refine(

@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from model.frames import sun_direction_at
+from model.images import normalized
 from model.network.architecture import CONDITIONS, IMAGE_SIZE
 from model.network.inputs import DESCENT_SAMPLES, DESCENT_SIZE, GUESS_SAMPLES, conditions, descents
 from model.observation import FLUX_SHAPE, Observation, scene_of
@@ -105,7 +106,7 @@ class Shots:
         """Shots of heliostats of one mount with suns and aims (B * images, 3) on targets that face north."""
         images, mount = len(suns) // len(heliostats), heliostats[0].mount
         points = np.array([control_points(h) for h in heliostats])
-        raised = np.array([control_points(h, np.ones((4, 8, 8))) for h in heliostats])
+        normals = np.array([h.facet_normals for h in heliostats])
         places = np.array([h.position for h in heliostats]).repeat(images, axis=0)
         attitude = mount.attitude(mount.align(places, suns, aims))
         axes = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
@@ -121,7 +122,7 @@ class Shots:
             plane_center=tensor(aims),
             plane_axes=tensor(axes).expand(len(suns), 3, 3),
         )
-        return cls(ideal, tensor((raised - points)[:, :, 0, 0]), images)
+        return cls(ideal, tensor(normals), images)
 
     def scene(self, z: Tensor) -> Scene:
         """The scene of surfaces ``z`` (B, 4, 8, 8) [m], or of other ones before each sun (B, images, 4, 8, 8)."""
@@ -243,11 +244,6 @@ def observe(
     with torch.no_grad():
         images = camera.photograph(scene_of(heliostat, shots, [z]), torch.device("cpu"), rng).numpy()
     return [replace(shot, flux=image) for shot, image in zip(shots, images, strict=True)]
-
-
-def normalized(flux: Tensor) -> Tensor:
-    """Images (..., R, C) scaled to a sum of 100."""
-    return 100 * flux / flux.sum(dim=(-2, -1), keepdim=True).clamp(min=1e-9)
 
 
 def render(

@@ -9,6 +9,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from model.images import binned
 from model.surface import sample
 from model.tracing.scene import Scene
 
@@ -51,7 +52,7 @@ def descents(trace: Callable[[Tensor], Tensor], flux: Tensor, basis: Tensor) -> 
     with torch.enable_grad():
         changes = torch.zeros(*flux.shape[:2], *basis.shape[1:], device=flux.device, requires_grad=True)
         guessed = trace(changes)
-        measured = _binned(flux, guessed.shape[-1])
+        measured = binned(flux, guessed.shape[-1])
         unit = DESCENT_NOISE * measured.amax(dim=(2, 3), keepdim=True)
         misfit = (((measured - guessed) / unit) ** 2).sum() / 2
         (gradient,) = torch.autograd.grad(misfit, changes)
@@ -65,12 +66,6 @@ def descents(trace: Callable[[Tensor], Tensor], flux: Tensor, basis: Tensor) -> 
         curvature = (moved / unit).square().sum(dim=(1, 2, 3)) / step**2
     shares = downhill / (1 + curvature)[:, None, None]
     return torch.einsum("bmk,kfij->bmfij", shares, basis)
-
-
-def _binned(images: Tensor, size: int) -> Tensor:
-    """Images (B, M, n R, n R) in R = ``size`` pixels a side, their sums kept."""
-    factor = images.shape[-1] // size
-    return images.reshape(*images.shape[:2], size, factor, size, factor).sum(dim=(3, 5))
 
 
 def _project(vectors: Tensor, direction: Tensor) -> Tensor:

@@ -3,7 +3,6 @@
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from torch import Tensor
 from model.effects import Effect
 from model.errors import InvalidInputError
 from model.forecast import Aligned, View
+from model.images import normalized
 from model.network.architecture import MAX_IMAGES
 from model.network.inputs import (
     DESCENT_SAMPLES,
@@ -90,12 +90,12 @@ class SurfacePredictor:
             raise InvalidInputError(f"a prediction takes 1 to {MAX_IMAGES} images, got {len(observations)}")
         if len(heliostat.facets) != FACETS:
             raise InvalidInputError(f"the network knows mirrors of {FACETS} facets, {heliostat.name} has other")
-        z, guess = default_prior().mean, None
-        for left in reversed(range(looks)):
-            guess = _Guess.of(heliostat, observations, z, effects, None if guess is None else guess.aligned)
-            inputs = guess.inputs(optics, effects)
-            if left:
-                z = self.look(inputs)[0][0]
+        sight = _Sight(heliostat, observations, optics, effects)
+        z = default_prior().mean
+        inputs = sight.inputs(z)
+        for _ in range(looks - 1):
+            z = self.look(inputs)[0][0]
+            inputs = sight.inputs(z)
         swapped = mirrored_inputs(inputs)
         both = self.look({name: np.concatenate([inputs[name], swapped[name]]) for name in INPUTS})
         z, z_std = ((values[0] + mirrored(values[1])) / 2 for values in both)
@@ -130,55 +130,54 @@ class SurfacePredictor:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class _Guess:
-    """A guessed surface (4, 8, 8) [m] of a heliostat, which stands as it must for its M observations."""
+class _Sight:
+    """What the network is shown of a heliostat's M observations under optics and effects, guess after guess."""
 
-    heliostat: Heliostat
-    observations: Sequence[Observation]
-    z: Array
-    aligned: Aligned
-
-    @classmethod
-    def of(
-        cls,
+    def __init__(
+        self,
         heliostat: Heliostat,
         observations: Sequence[Observation],
-        z: Array,
+        optics: Optics | None,
         effects: Sequence[Effect],
-        start: Aligned | None,
-    ) -> "_Guess":
-        """A guess under effects on sun, mount and mirror; ``start`` is that of another guess and saves rounds."""
-        return cls(heliostat, observations, z, align_observations(heliostat, observations, z, effects, start=start))
+    ) -> None:
+        self.heliostat, self.observations, self.optics, self.effects = heliostat, observations, optics, effects
+        self.flux = torch.as_tensor(np.array([o.flux for o in observations]), dtype=torch.float32)
+        self.normals = torch.as_tensor(heliostat.facet_normals, dtype=torch.float32)
+        self.basis = torch.as_tensor(default_prior().basis, dtype=torch.float32)
+        self.aligned: Aligned | None = None
 
-    def inputs(self, optics: Optics | None, effects: Sequence[Effect]) -> dict[str, NDArray[Any]]:
-        """`INPUTS` of one look under a model with these optics and effects."""
-        ideal = control_points(self.heliostat)
-        normal = torch.as_tensor(control_points(self.heliostat, np.ones_like(self.z)) - ideal, dtype=torch.float32)
-        flux = np.array([o.flux for o in self.observations])
-
-        def trace(changes: Tensor) -> Tensor:
-            """Images (1, M, R, R), sum 100, of the guess changed by heights (1, M, 4, 8, 8) [m]."""
-            raised = torch.einsum("mfij,fijk->mfkij", changes[0], normal)
-            view = View(DESCENT_SIZE, DESCENT_SIZE, window=FLUX_WINDOW, samples=DESCENT_SAMPLES)
-            return _normalized(self.aligned.raised(raised).images(optics, effects, view))[None]
-
+    def inputs(self, z: Array) -> dict[str, NDArray[Any]]:
+        """`INPUTS` of a look at a guessed surface (4, 8, 8) [m]."""
+        # The guess before differs little, and from its alignment few rounds are left.
+        self.aligned = align_observations(self.heliostat, self.observations, z, self.effects, start=self.aligned)
         with torch.no_grad():
-            view = View(*FLUX_SHAPE, window=FLUX_WINDOW, samples=GUESS_SAMPLES)
-            guess_flux = _normalized(self.aligned.images(optics, effects, view)).numpy()
-        basis = torch.as_tensor(default_prior().basis, dtype=torch.float32)
-        descent = descents(trace, torch.as_tensor(flux[None], dtype=torch.float32), basis)[0].numpy()
-        # What is told of the geometry is that of the ideal mirror, as in training.
-        scene = self.aligned.groups[0].scene
-        points = torch.as_tensor(ideal, dtype=torch.float32).movedim(-1, -3).expand_as(scene.control_points)
+            guess_flux = self._images(self.aligned, FLUX_SHAPE[0], GUESS_SAMPLES)
+        descent = descents(self._changed, self.flux[None], self.basis)[0]
         return {
-            "flux": _filled(flux),
-            "conditions": _filled(conditions(scene.with_(control_points=points)).numpy()),
-            "mask": _filled(np.ones(len(flux))),
-            "guess_flux": _filled(guess_flux),
-            "guess": self.z[None] * 1e3,
-            "descent": _filled(descent * 1e3),
+            "flux": _filled(self.flux.numpy()),
+            "conditions": _filled(self._conditions(self.aligned).numpy()),
+            "mask": _filled(np.ones(len(self.flux))),
+            "guess_flux": _filled(guess_flux.numpy()),
+            "guess": z[None] * 1e3,
+            "descent": _filled(descent.numpy() * 1e3),
         }
+
+    def _images(self, aligned: Aligned, size: int, samples: int) -> Tensor:
+        """Images (M, size, size), sum 100, of mirrors that stand."""
+        view = View(size, size, window=FLUX_WINDOW, samples=samples)
+        return normalized(aligned.images(self.optics, self.effects, view))
+
+    def _changed(self, changes: Tensor) -> Tensor:
+        """Images (1, M, R, R), sum 100, of the guess changed by heights (1, M, 4, 8, 8) [m]."""
+        assert self.aligned is not None
+        raised = self.aligned.raised(torch.einsum("mfij,fk->mfkij", changes[0], self.normals))
+        return self._images(raised, DESCENT_SIZE, DESCENT_SAMPLES)[None]
+
+    def _conditions(self, aligned: Aligned) -> Tensor:
+        """`conditions` (M, 12) of the ideal mirror where the guess stands, as in training."""
+        scene = aligned.groups[0].scene
+        points = torch.as_tensor(control_points(self.heliostat), dtype=torch.float32).movedim(-1, -3)
+        return conditions(scene.with_(control_points=points.expand_as(scene.control_points)))
 
 
 def mirrored_inputs(inputs: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
@@ -194,11 +193,6 @@ def mirrored_inputs(inputs: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any
         "guess": mirrored(inputs["guess"]),
         "descent": mirrored(inputs["descent"]),
     }
-
-
-def _normalized(images: Tensor) -> Tensor:
-    """Images (M, R, R) scaled to a sum of 100."""
-    return 100 * images / images.sum(dim=(1, 2), keepdim=True)
 
 
 def _filled(values: NDArray[Any]) -> NDArray[np.float32]:

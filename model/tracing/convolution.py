@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from model.errors import InvalidInputError, UnreachableError
+from model.images import normalized
 from model.neighbours import clear
 from model.sunshape import FREQUENCY_COUNT, FREQUENCY_STEP, transfer_table
 from model.surface import edge_basis, midpoint_basis, sample
@@ -49,9 +50,9 @@ class Flux:
     center: Tensor
     power: Tensor
 
-    def normalized(self, total: float = 100.0) -> Tensor:
-        """Flux (B, rows, columns) that sums to ``total`` (the paper's 100)."""
-        return total * self.irradiance / self.irradiance.sum(dim=(-2, -1), keepdim=True).clamp(min=1e-30)
+    def normalized(self) -> Tensor:
+        """Flux (B, rows, columns) that sums to 100 (the paper's rule)."""
+        return normalized(self.irradiance)
 
 
 @dataclass(frozen=True, eq=False)

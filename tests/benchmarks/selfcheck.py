@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from model.effects.soiling import Soiling
+from model.images import normalized
 from model.metrics import surface_error
 from model.network.predictor import WEIGHTS
 from model.observation import SurfacePrediction, render_observations
@@ -40,8 +41,8 @@ def seen(case: Case, images: Array, rng: np.random.Generator) -> Case:
     """The case with images (M, 64, 64), to which noise and 8 bits are added, in place of its own."""
     peak = images.max(axis=(1, 2), keepdims=True)
     noisy = np.round((images / peak + rng.normal(0, NOISE, images.shape)).clip(0, 1) * 255)
-    flux = 100 * noisy / noisy.sum(axis=(1, 2), keepdims=True)
-    observations = [replace(o, flux=f.astype(np.float32)) for o, f in zip(case.observations, flux, strict=True)]
+    fluxes = normalized(noisy).astype(np.float32)
+    observations = [replace(o, flux=flux) for o, flux in zip(case.observations, fluxes, strict=True)]
     return replace(case, observations=observations)
 
 
