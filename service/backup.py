@@ -12,7 +12,7 @@ import json
 import os
 import shutil
 import sqlite3
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
@@ -25,18 +25,13 @@ from model.errors import InvalidInputError
 from service.database import Database
 from service.faults import ConflictError, StoreDamagedError
 from service.images import ImageStore
+from service.progress import Progress, quiet
 from service.settings import Settings
 from service.tables import ImageRow
 
 _FORMAT = 1
 _MANIFEST, _SQLITE, _IMAGES, _LIST = "manifest.json", "database.sqlite", "images", "images.txt"
 _CHUNK = 2**20
-
-Step = Callable[[str], None]
-
-
-def _quiet(_name: str) -> None:
-    pass
 
 
 def images_of(settings: Settings) -> ImageStore:
@@ -52,7 +47,7 @@ def _sha256(path: Path) -> str:
 # --- taking one -------------------------------------------------------------------------------------------------------
 
 
-def back_up(settings: Settings, out: Path, step: Step = _quiet) -> dict[str, Any]:
+def back_up(settings: Settings, out: Path, step: Progress = quiet) -> dict[str, Any]:
     """Write a back-up of the store to the new folder ``out`` and return its manifest.
 
     Images that are missing or damaged in the store are listed under ``damaged``; the rest is backed up all the same.
@@ -82,7 +77,7 @@ def back_up(settings: Settings, out: Path, step: Step = _quiet) -> dict[str, Any
     return manifest
 
 
-def _write(database: Database, images: ImageStore, folder: Path, step: Step) -> dict[str, Any]:
+def _write(database: Database, images: ImageStore, folder: Path, step: Progress) -> dict[str, Any]:
     engine = database.url.get_backend_name()
     step("database")
     about = (_copy_sqlite if engine == "sqlite" else _copy_postgres)(database, folder)
@@ -96,7 +91,7 @@ def _write(database: Database, images: ImageStore, folder: Path, step: Step) -> 
     return manifest
 
 
-def _copy_image(images: ImageStore, folder: Path, sha256: str, step: Step) -> bool:
+def _copy_image(images: ImageStore, folder: Path, sha256: str, step: Progress) -> bool:
     step(sha256[:12])
     try:
         data = images.read(sha256)
@@ -163,7 +158,7 @@ def _copy_out(connection: Connection, name: str, columns: Sequence[str], path: P
 # --- putting one back -------------------------------------------------------------------------------------------------
 
 
-def restore(settings: Settings, folder: Path, step: Step = _quiet) -> dict[str, Any]:
+def restore(settings: Settings, folder: Path, step: Progress = quiet) -> dict[str, Any]:
     """Put a back-up into the empty store that the settings name, and return its manifest.
 
     Raises
@@ -217,7 +212,7 @@ def _require_empty(database: Database, images: ImageStore, folder: Path) -> None
             raise ConflictError(f"{images.root} holds images that are not of this back-up; name another data_dir")
 
 
-def _verify(manifest: dict[str, Any], folder: Path, step: Step) -> list[str]:
+def _verify(manifest: dict[str, Any], folder: Path, step: Progress) -> list[str]:
     """The digests of the back-up's images; InvalidInputError unless every file is what was written."""
     step("verification")
     bad = [name for name, sha256 in manifest["files"].items() if not _is(folder / name, sha256)]

@@ -19,7 +19,8 @@ from model.surface import control_points
 from model.tracing import Scene, Window
 from model.tracing.alignment import align_to_spots
 from model.tracing.montecarlo import trace_montecarlo
-from service.folder import Progress, quiet, write_json
+from service.folder import write_json
+from service.progress import Progress, quiet
 
 Array = NDArray[np.float64]
 

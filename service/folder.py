@@ -5,7 +5,7 @@ report that it also writes there. A verb fails only if nothing is left.
 """
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
@@ -25,18 +25,14 @@ from model.surface import split_canting
 from service import operations
 from service.operations import Method
 from service.paint import IMAGE_KINDS, Measurement, MeasurementFolder, measured_heights, read_surface
+from service.progress import Progress, quiet
 
 Array = NDArray[np.float64]
-Progress = Callable[[str], None]
 
 WINDOWS = (4.0, 6.0, 8.0)
 """Sides [m] of the accuracy's window: the paper's, unless more than `SPILL` of the measured energy lies outside."""
 
 SPILL = 0.01
-
-
-def quiet(_: str) -> None:
-    """A progress callback that says nothing."""
 
 
 def write_json(path: Path, content: Any) -> None:

@@ -10,8 +10,8 @@ from model.errors import ImageRefusedError, InvalidInputError
 from model.surface import control_points
 from service import store
 from service.faults import ConflictError, TooLargeError, UnsupportedImageError
-from service.folder import Progress, quiet
 from service.paint import IMAGE_KINDS, Measurement, MeasurementFolder, declared_json, measured_heights, read_json
+from service.progress import Progress, quiet
 from service.runtime import Runtime
 from service.workflows import Photograph, ingest
 

@@ -6,16 +6,16 @@ from typing import Any
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from service.backup import Step
 from service.database import Database
 from service.faults import StoreDamagedError
 from service.images import ImageStore
+from service.progress import Progress
 from service.tables import HeliostatRow, ImageRow, MeasurementRow
 
 _IMAGE = re.compile(r"[0-9a-f]{2}/[0-9a-f]{62}")
 
 
-def inspect_store(database: Database, images: ImageStore, step: Step) -> dict[str, Any]:
+def inspect_store(database: Database, images: ImageStore, step: Progress) -> dict[str, Any]:
     """Read every image that the database knows, and ask SQLite whether its file is sound.
 
     Returns
@@ -47,7 +47,7 @@ def is_sound(report: dict[str, Any]) -> bool:
     return not report["bad"] and not report["database"]
 
 
-def _reason(images: ImageStore, sha256: str, step: Step) -> str | None:
+def _reason(images: ImageStore, sha256: str, step: Progress) -> str | None:
     step(sha256[:12])
     try:
         images.read(sha256)

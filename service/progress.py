@@ -3,8 +3,15 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
+Progress = Callable[[str], None]
+"""Takes the name of what is done next."""
+
 Report = Callable[[float, str], None]
 """Takes the share that is done, 0 to 1, and what is being done; what it raises ends the work."""
+
+
+def quiet(_name: str) -> None:
+    """A progress callback that says nothing."""
 
 
 @dataclass(eq=False)
