@@ -8,7 +8,7 @@ another photograph, or the plant's model another version.
 import logging
 import threading
 from collections import OrderedDict
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from statistics import fmean
 from typing import Any
@@ -71,10 +71,17 @@ def compare(runtime: Runtime, name: str, surface: SurfaceRow | None) -> list[Com
         Where a photograph or the surface cannot be traced.
     """
     with runtime.database.reading() as session:
-        row = store.get_heliostat(session, name)
-        heliostat, origin = load_heliostat(session, row), store.get_plant(session).origin
-        model = models.get_model(session)
-        rows = _newest(session, row)
+        rows = _newest(session, store.get_heliostat(session, name))
+    return compare_measurements(runtime, name, rows, surface)
+
+
+def compare_measurements(
+    runtime: Runtime, name: str, rows: Sequence[MeasurementRow], surface: SurfaceRow | None
+) -> list[Comparison]:
+    """The same for accepted measurements of the heliostat, loaded with their arrays."""
+    with runtime.database.reading() as session:
+        heliostat = load_heliostat(session, store.get_heliostat(session, name))
+        origin, model = store.get_plant(session).origin, models.get_model(session)
     if not rows:
         return []
     observations = [observation_of(measurement, origin) for measurement in rows]

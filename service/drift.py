@@ -10,12 +10,11 @@ from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
 from model.errors import ModelError
-from service import models, store
-from service.arrays import unpack
+from service import store
+from service.accuracy import compare_measurements
 from service.meters import ACCURACY
 from service.runtime import Runtime
 from service.tables import DriftRow, MeasurementRow, SurfaceRow
-from service.workflows import load_heliostat, observation_of
 
 logger = logging.getLogger("heliotwin.service")
 
@@ -37,22 +36,14 @@ def judge(runtime: Runtime, heliostat: str, measurement: MeasurementRow) -> floa
 
 def _judge(runtime: Runtime, name: str, measurement: MeasurementRow) -> float | None:
     with runtime.database.reading() as session:
-        row = store.get_heliostat(session, name)
-        surface = store.find_surface_at(session, row)
-        if surface is None:
-            return None
-        heliostat, origin = load_heliostat(session, row), store.get_plant(session).origin
-        model = models.get_model(session)
-    from model.metrics import flux_accuracy  # late: see `service.runtime`
-
-    observation, z = observation_of(measurement, origin), unpack(surface.arrays)["z"]
-    with runtime.computing("compare") as operations:
-        (forecast,) = operations.render(heliostat, [observation], z, model.optics, model.effects)
-    accuracy = flux_accuracy(observation.flux, forecast)
-    ACCURACY.observe(accuracy)
+        surface = store.find_surface_at(session, store.get_heliostat(session, name))
+    if surface is None:
+        return None
+    (compared,) = compare_measurements(runtime, name, [measurement], surface)
+    ACCURACY.observe(compared.accuracy)
     with runtime.database.writing() as session:
-        _note(session, measurement, surface, accuracy)
-    return accuracy
+        _note(session, measurement, surface, compared.accuracy)
+    return compared.accuracy
 
 
 def _note(session: Session, measurement: MeasurementRow, surface: SurfaceRow, accuracy: float) -> None:
