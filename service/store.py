@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from enum import StrEnum
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -40,6 +40,8 @@ PREFERENCE = ("flux", "cropped", "raw", "flux-centered")
 # Rounds that a writer takes against others who write the same thing before it gives up.
 _ROUNDS = 8
 
+Named = TypeVar("Named", HeliostatRow, TargetRow, ReceiverRow)
+
 
 class Change(StrEnum):
     """What a write did."""
@@ -58,6 +60,16 @@ def insert(session: Session, row: Base) -> bool:
     except IntegrityError:
         return False
     return True
+
+
+def _insert_or_find(session: Session, row: Named) -> tuple[Named, bool]:
+    """``row``, inserted, or the one that has its name already; the second value is True where it is new."""
+    table = type(row)
+    query = select(table).where(table.name == row.name)
+    held = session.scalar(query)
+    if held is None and insert(session, row):
+        return row, True
+    return held or session.scalars(query).one(), False
 
 
 def _assign(row: Base, values: dict[str, Any]) -> Change:
@@ -164,13 +176,8 @@ def put_heliostat(
     names.require(names.NAME, name, "heliostat")
     east, north, up = _floats(position)
     values = {"properties": properties, "east_m": east, "north_m": north, "up_m": up}
-    row = find_heliostat(session, name)
-    if row is None:
-        row = HeliostatRow(name=name, **values)
-        if insert(session, row):
-            return row, Change.NEW
-        row = get_heliostat(session, name)
-    return row, _assign(row, values)
+    row, is_new = _insert_or_find(session, HeliostatRow(name=name, **values))
+    return row, Change.NEW if is_new else _assign(row, values)
 
 
 # --- targets ----------------------------------------------------------------------------------------------------------
@@ -212,12 +219,9 @@ def put_target(
         "width_m": float(plane.width),
         "height_m": float(plane.height),
     }
-    row = find_target(session, plane.name)
-    if row is None:
-        row = TargetRow(name=plane.name, corners=corners, **values)
-        if insert(session, row):
-            return row, Change.NEW
-        row = get_target(session, plane.name)
+    row, is_new = _insert_or_find(session, TargetRow(name=plane.name, corners=corners, **values))
+    if is_new:
+        return row, Change.NEW
     moved = any(getattr(row, name) != value for name, value in values.items())
     # Corners that are known stay known while the plane is the same.
     values["corners"] = corners if moved or corners is not None else row.corners
@@ -278,13 +282,8 @@ def put_receiver(session: Session, cylinder: Cylinder) -> tuple[ReceiverRow, Cha
         "height_m": float(cylinder.height),
         "opening_deg": float(cylinder.opening_deg),
     }
-    row = find_receiver(session, cylinder.name)
-    if row is None:
-        row = ReceiverRow(name=cylinder.name, **values)
-        if insert(session, row):
-            return row, Change.NEW
-        row = get_receiver(session, cylinder.name)
-    return row, _assign(row, values)
+    row, is_new = _insert_or_find(session, ReceiverRow(name=cylinder.name, **values))
+    return row, Change.NEW if is_new else _assign(row, values)
 
 
 def receiver_cylinder(row: ReceiverRow) -> Cylinder:

@@ -247,6 +247,16 @@ def test_imported_surface_is_stored_once(database: Database):
         assert [store.add_surface(session, heliostat, surface(1))[0].version for _ in range(2)] == [3, 4]
 
 
+def test_many_writers_of_one_heliostat_make_one(database: Database):
+    def write(_: int) -> Change:
+        with database.writing() as session:
+            return store.put_heliostat(session, "AA39", {"a": 1}, (1, 2, 3))[1]
+
+    with ThreadPoolExecutor(8) as pool:
+        changes = list(pool.map(write, range(16)))
+    assert sorted(changes) == [Change.NEW] + 15 * [Change.UNCHANGED]
+
+
 def test_many_writers_of_one_image_make_one_measurement(database: Database):
     with database.writing() as session:
         setup(session)
