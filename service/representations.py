@@ -1,5 +1,6 @@
 """From rows to what is sent: JSON models, npz files and pictures."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -18,9 +19,11 @@ from service.schemas import (
     ForecastSummary,
     HeliostatOut,
     HeliostatSummary,
+    Item,
     JobOut,
     MeasurementOut,
     ModelOut,
+    Page,
     PlantOut,
     ReceiverOut,
     StudyOut,
@@ -45,6 +48,12 @@ from service.tables import (
 
 # A flux map's sum where it is normalised (the paper's rule).
 _NORMALISED_SUM = 100.0
+
+
+def page(items: Sequence[Item], limit: int, mark: str = "id") -> Page[Item]:
+    """The first ``limit`` of items that are up to one more; after the last one's ``mark`` begins the next page."""
+    shown = list(items[:limit])
+    return Page(items=shown, next=str(getattr(shown[-1], mark)) if len(items) > limit else None)
 
 
 def _json(model: BaseModel, **arrays: Any) -> Response:

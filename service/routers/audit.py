@@ -21,5 +21,5 @@ def list_audit(
     """Who did what, newest first."""
     with runtime.database.reading() as session:
         rows = audit.entries(session, limit + 1, after)
-    items = [representations.audit_entry(row) for row in rows[:limit]]
-    return Page(items=items, next=str(items[-1].id) if len(rows) > limit else None)
+    items = [representations.audit_entry(row) for row in rows]
+    return representations.page(items, limit)

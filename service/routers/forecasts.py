@@ -97,8 +97,8 @@ def list_forecasts(
     with runtime.database.reading() as session:
         of = None if heliostat is None else store.get_heliostat(session, heliostat)
         rows = store.list_forecasts(session, limit + 1, after, of)
-    items = [representations.forecast_summary(row) for row in rows[:limit]]
-    return Page(items=items, next=str(items[-1].id) if len(rows) > limit else None)
+    items = [representations.forecast_summary(row) for row in rows]
+    return representations.page(items, limit)
 
 
 @router.get("/{number}", responses={**problems(404, 406), **arrays("`flux` (rows, columns).")}, dependencies=[READ])

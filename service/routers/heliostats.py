@@ -36,8 +36,8 @@ def list_heliostats(
     """Heliostats in the order of their names."""
     with runtime.database.reading() as session:
         rows = store.list_heliostats(session, limit + 1, after)
-    items = [representations.heliostat_summary(row) for row in rows[:limit]]
-    return Page(items=items, next=items[-1].name if len(rows) > limit else None)
+    items = [representations.heliostat_summary(row) for row in rows]
+    return representations.page(items, limit, "name")
 
 
 @router.post(

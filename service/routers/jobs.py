@@ -74,8 +74,8 @@ def list_jobs(
     """Jobs, newest first."""
     with runtime.database.reading() as session:
         rows = jobs.list_jobs(session, limit + 1, after, state, kind)
-    items = [representations.job(row) for row in rows[:limit]]
-    return Page(items=items, next=str(items[-1].id) if len(rows) > limit else None)
+    items = [representations.job(row) for row in rows]
+    return representations.page(items, limit)
 
 
 @_existing.get("/{number}", responses=problems(404), dependencies=[READ])

@@ -89,8 +89,8 @@ def list_measurements(
     """A heliostat's measurements in the order they came."""
     with runtime.database.reading() as session:
         rows = store.list_measurements(session, store.get_heliostat(session, name), limit + 1, after, accepted)
-    items = [representations.measurement(name, row) for row in rows[:limit]]
-    return Page(items=items, next=items[-1].id if len(rows) > limit else None)
+    items = [representations.measurement(name, row) for row in rows]
+    return representations.page(items, limit)
 
 
 @router.get("/{measurement}", responses=problems(404), dependencies=[READ])

@@ -42,8 +42,8 @@ def list_studies(
     """Studies, newest first."""
     with runtime.database.reading() as session:
         rows = store.list_studies(session, limit + 1, after)
-        items = [representations.study_summary(row, _adopted(session, row)) for row in rows[:limit]]
-    return Page(items=items, next=str(items[-1].id) if len(rows) > limit else None)
+        items = [representations.study_summary(row, _adopted(session, row)) for row in rows]
+    return representations.page(items, limit)
 
 
 @router.get("/studies/{number}", responses=problems(404), dependencies=[READ])

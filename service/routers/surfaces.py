@@ -63,8 +63,8 @@ def list_surfaces(
         return _at(runtime, name, at, media_type)
     with runtime.database.reading() as session:
         rows = store.list_surfaces(session, store.get_heliostat(session, name), limit + 1, after)
-    items = [representations.surface_summary(name, row) for row in rows[:limit]]
-    return Page(items=items, next=str(items[-1].version) if len(rows) > limit else None)
+    items = [representations.surface_summary(name, row) for row in rows]
+    return representations.page(items, limit, "version")
 
 
 def _at(runtime: Runtime, name: str, moment: datetime | None, media_type: str) -> Response:
