@@ -13,6 +13,7 @@ from model.effects.blocking import Blocking
 from model.effects.camera_blur import CameraBlur
 from model.effects.camera_ghost import CameraGhost
 from model.effects.camera_response import CameraResponse
+from model.effects.camera_shoulder import CameraShoulder
 from model.effects.facet_canting import FacetCanting
 from model.effects.gravity_bending import GravityBending
 from model.effects.slope_error import SlopeError
@@ -39,6 +40,7 @@ CATALOGUE: dict[str, type[Effect]] = {
         CameraBlur,
         CameraGhost,
         CameraResponse,
+        CameraShoulder,
         TargetRegistration,
     )
 }

@@ -30,6 +30,7 @@ SCALES_WITH: dict[str, frozenset[str]] = {
         "camera_blur": "camera",
         "camera_ghost": "camera",
         "camera_response": "camera",
+        "camera_shoulder": "camera",
         "target_registration": "camera",
     }.items()
 }

@@ -49,12 +49,12 @@ def scene_of(one: Shot, *effects) -> Scene:
 
 
 def test_the_catalogue_is_the_contract():
-    """DESIGN.md, section 5."""
+    """DESIGN.md, section 5; the closed loop added `camera_ghost` and `camera_shoulder`."""
     bounds = {
         name: {p.name: (p.low, p.high, p.unit, p.scope) for p in effect.parameters()}
         for name, effect in CATALOGUE.items()
     }
-    assert len(bounds) == 14
+    assert len(bounds) == 15
     assert bounds["sun_shape"] == {"circumsolar_ratio": (0, 0.5, "1", "set")}
     assert bounds["slope_error"] == bounds["tracking_jitter"] == {"sigma_mrad": (0, 4, "mrad", "set")}
     assert bounds["facet_canting"] == dict.fromkeys(("x_mrad", "y_mrad"), (-5, 5, "mrad", "facet"))
@@ -64,6 +64,7 @@ def test_the_catalogue_is_the_contract():
     assert bounds["soiling"] == {"reflectivity_ratio": (0, 1, "1", "facet")}
     assert bounds["blocking"] == {"lower_fraction": (0, 0.6, "1", "heliostat")}
     assert bounds["camera_response"] == {"gamma": (0.3, 3, "1", "camera"), "saturation": (0.3, 1, "1", "camera")}
+    assert bounds["camera_shoulder"] == {"compression": (0, 5, "1", "camera")}
     assert bounds["camera_blur"] == {"sigma_m": (0, 0.5, "m", "camera")}
     assert list(bounds["background"]) == ["level", "gradient_x", "gradient_y"]
     assert list(bounds["target_registration"]) == ["scale_x", "scale_y", "shear", "rotation_deg"]

@@ -7,6 +7,7 @@ import torch
 from model.effects.background import Background
 from model.effects.camera_blur import CameraBlur
 from model.effects.camera_response import CameraResponse
+from model.effects.camera_shoulder import CameraShoulder
 from model.effects.target_registration import TargetRegistration
 from model.tracing import Window
 
@@ -68,6 +69,21 @@ def test_a_gaussian_under_gamma_is_a_gaussian_of_another_width():
     np.testing.assert_allclose(seen, spot(sigma_x=0.5 * 2**0.5, sigma_y=0.35 * 2**0.5), rtol=0.01, atol=2.0)
 
 
+@pytest.mark.parametrize("compression", [1e-6, 5e-4, 2e-3, 1.0, 4.0])
+def test_shoulder_keeps_dark_and_peak_and_halves_light_where_it_should(compression):
+    """Half of the peak's counts belong to the light -ln((1 + exp(-c)) / 2) / c, which is half of it for c = 0."""
+    half = -np.log((1 + np.exp(-compression)) / 2) / compression
+    light = torch.tensor([0.0, half, 1.0], dtype=torch.float64).expand(1, 2, 3) * 700
+    seen = CameraShoulder(compression).on_image(light, WINDOW)
+    np.testing.assert_allclose(seen[0, 1], [0.0, 350.0, 700.0], atol=1e-4)
+
+
+def test_faint_light_under_a_shoulder_stays_in_proportion():
+    faint = torch.tensor([1e-5, 2e-5, 1.0], dtype=torch.float64).expand(1, 2, 3)
+    seen = CameraShoulder(1.5).on_image(faint, WINDOW)[0, 0]
+    np.testing.assert_allclose(seen[:2] / faint[0, 0, :2], 1.5 / (1 - np.exp(-1.5)), rtol=1e-4)
+
+
 def test_background_is_a_plane_in_shares_of_the_peak():
     image = spot()
     plane = (Background(0.05, 0.02, -0.01).on_image(image, WINDOW) - image)[0] / image.max()
@@ -97,6 +113,8 @@ def test_an_anticlockwise_turn_lifts_what_lies_to_the_right():
     [
         (CameraResponse, (1.3, 0.8)),
         (CameraResponse, (0.6, 1.0)),
+        (CameraShoulder, (1.2,)),
+        (CameraShoulder, (5e-4,)),
         (CameraBlur, (0.2,)),
         (Background, (0.1, 0.02, -0.03)),
         (TargetRegistration, (1.03, 0.97, 0.02, 3.0)),

@@ -68,6 +68,8 @@ def _developed(photons: Array, world: World, rng: np.random.Generator) -> Array:
     stray = _peak(photons) * (level + gradient_x * x - gradient_y * x[:, None])
     photons = photons + rng.poisson(stray.clip(min=0))
     share = (photons / _peak(photons)).clip(max=world.saturation) ** world.gamma
+    if world.compression:
+        share = 1 - np.exp(-world.compression * share)
     counts = 255 * share / share.max() + READ_NOISE * rng.standard_normal(share.shape)
     return np.round(counts).clip(0, 255)
 

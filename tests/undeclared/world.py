@@ -37,6 +37,7 @@ class World:
     hidden: Values = 0.0
     gamma: float = 1.0
     saturation: float = 1.0
+    compression: float = 0.0
     blur_m: float = 0.0
     stray: tuple[float, float, float] = (0.0, 0.0, 0.0)
     registration: tuple[float, float, float, float] = (1.0, 1.0, 0.0, 0.0)
@@ -114,6 +115,11 @@ def camera_response(level: int, names: Sequence[str], rng: np.random.Generator) 
     return {"gamma": gamma, "saturation": saturation}, {"gamma": gamma, "saturation": saturation}
 
 
+def camera_shoulder(level: int, names: Sequence[str], rng: np.random.Generator) -> Drawn:
+    compression = (0.12, 0.25, 0.5)[level]
+    return {"compression": compression}, {"compression": compression}
+
+
 def camera_blur(level: int, names: Sequence[str], rng: np.random.Generator) -> Drawn:
     sigma = (0.09, 0.13, 0.2)[level]
     return {"blur_m": sigma}, {"sigma_m": sigma}
@@ -181,6 +187,7 @@ CATALOGUE: dict[str, Draw] = {
         soiling,
         blocking,
         camera_response,
+        camera_shoulder,
         camera_blur,
         background,
         target_registration,
