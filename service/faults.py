@@ -1,5 +1,7 @@
 """What can go wrong in the service beside the model's errors; `service.errors` gives each its HTTP status."""
 
+from model.errors import ModelError
+
 
 class ServiceError(Exception):
     """Base of what the service raises on purpose; the message is for the caller."""
@@ -51,3 +53,7 @@ class NotStartedError(ServiceError):
 
 class SchemaError(ServiceError):
     """The database's schema is not the one that this code works with: the operator's business."""
+
+
+SKIPPED = (ModelError, ServiceError)
+"""What one heliostat or photograph may lack without ending the work on the others."""

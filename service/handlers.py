@@ -13,11 +13,11 @@ from pydantic import Field, field_validator, model_validator
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from model.errors import InvalidInputError, ModelError
+from model.errors import InvalidInputError
 from model.frames import sun_direction
 from model.plant import Receiver
 from service import models, store
-from service.faults import ConflictError, ServiceError
+from service.faults import SKIPPED, ConflictError
 from service.progress import Steps
 from service.runtime import Runtime
 from service.schemas import Method, Model, ModelVersion, Moment, Name, Plane, Position, ReceiverIn, Resolution, Sun
@@ -29,8 +29,6 @@ from service.workflows import predict_surface, receiver_as_json
 Heliostats = Annotated[
     list[Name] | None, Field(min_length=1, max_length=20_000, description="Names of heliostats; all without it.")
 ]
-# What one heliostat may lack without ending the work on the others.
-_SKIPPED = (ModelError, ServiceError)
 
 
 def _names(runtime: Runtime, wanted: Sequence[str] | None) -> list[str]:
@@ -92,7 +90,7 @@ def _predict_step(context: Context, payload: PredictionsIn, name: str, model_ver
             also=lambda session, row: context.keep(session, name, {"version": row.version}),
             model_version=model_version,
         )
-    except _SKIPPED as error:
+    except SKIPPED as error:
         with context.runtime.database.writing() as session:
             context.keep(session, name, {"skipped": str(error)})
 

@@ -10,12 +10,12 @@ from pydantic import ValidationError
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from model.errors import InvalidInputError, ModelError, UnreachableError
+from model.errors import InvalidInputError, UnreachableError
 from model.frames import sun_direction
 from model.plant import Heliostat, TargetPlane
 from service import models, store
 from service.arrays import unpack
-from service.faults import ConflictError, NotFoundError, ServiceError
+from service.faults import SKIPPED, ConflictError, NotFoundError
 from service.models import PlantModel
 from service.progress import Report, Steps
 from service.runtime import Runtime
@@ -30,9 +30,6 @@ Surfaces = Literal["measured", "current"]
 
 CENTERED_SIDE = 4.0
 """Side [m] of a measurement's ``centered`` flux, all that there is of a photograph that shows no more."""
-
-# What one heliostat or photograph may lack without ending the study of the others.
-_SKIPPED = (ModelError, ServiceError)
 
 
 @dataclass(frozen=True)
@@ -101,7 +98,7 @@ def gather(session: Session, request: StudyRequest) -> Material:
     for row in _chosen_heliostats(session, request):
         try:
             _gather_heliostat(session, row, request, material)
-        except _SKIPPED as error:
+        except SKIPPED as error:
             material.skipped[row.name] = str(error)
     return material
 
@@ -141,7 +138,7 @@ def _gather_heliostat(session: Session, row: HeliostatRow, request: StudyRequest
         try:
             photograph = photograph_of(measurement, heliostat, points, origin)
             photograph = replace(photograph, seen=chosen.identifier in seen)
-        except _SKIPPED as error:
+        except SKIPPED as error:
             material.skipped[f"{row.name}/{chosen.identifier}"] = str(error)
             continue
         material.photographs.append(photograph)
