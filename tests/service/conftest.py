@@ -4,9 +4,12 @@ import json
 import os
 import random
 import socket
+import threading
+import time
 import uuid
 import warnings
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,6 +18,7 @@ import cv2
 import numpy as np
 import psycopg
 import pytest
+import uvicorn
 from fastapi import FastAPI
 from sqlalchemy import URL, make_url
 
@@ -47,6 +51,30 @@ def free_port() -> int:
         with socket.socket() as probe:
             if probe.connect_ex(("127.0.0.1", port)):
                 return port
+
+
+def until(condition: Callable[[], bool], timeout_s: float = 30.0) -> None:
+    end = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < end, "it does not happen"
+        time.sleep(0.02)
+
+
+@contextmanager
+def serving(app: FastAPI, port: int | None = None, **options: Any) -> Iterator[str]:
+    """The service behind a real socket; yields its address."""
+    port = free_port() if port is None else port
+    server = uvicorn.Server(uvicorn.Config(app, host="127.0.0.1", port=port, log_config=None, **options))
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    try:
+        until(lambda: server.started)
+        yield f"http://127.0.0.1:{port}"
+    finally:
+        app.state.stopping.set()
+        server.should_exit = True
+        thread.join(30)
+    assert not thread.is_alive()
 
 
 # --- databases --------------------------------------------------------------------------------------------------------

@@ -2,7 +2,6 @@
 
 import json
 import struct
-import threading
 import zlib
 from collections.abc import Iterator
 from contextlib import suppress
@@ -12,7 +11,6 @@ from urllib.parse import quote
 
 import pytest
 import schemathesis
-import uvicorn
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from hypothesis import HealthCheck, Phase, given
@@ -23,8 +21,7 @@ from schemathesis.checks import not_a_server_error
 
 from service.settings import Settings
 
-from .conftest import QUIET, FakeOperations, Post, free_port, metadata, png, poster
-from .test_jobs import until
+from .conftest import QUIET, FakeOperations, Post, metadata, png, poster, serving
 
 JSON = {"Content-Type": "application/json"}
 
@@ -240,15 +237,8 @@ def served(app: FastAPI, client: TestClient, operations: FakeOperations) -> Iter
     sun = {"azimuth_deg": 0, "elevation_deg": 45}
     client.post("/v1/forecasts", json={"heliostat": "AA39", "target": "lower", "sun": sun, "resolution": 16})
     client.post(client.post("/v1/jobs/predictions", json={}).headers["Location"] + "/cancel")
-    port = free_port()
-    server = uvicorn.Server(uvicorn.Config(app, host="127.0.0.1", port=port, log_config=None, lifespan="off"))
-    thread = threading.Thread(target=server.run)
-    thread.start()
-    until(lambda: server.started)
-    yield f"http://127.0.0.1:{port}"
-    app.state.stopping.set()
-    server.should_exit = True
-    thread.join(30)
+    with serving(app, lifespan="off") as address:
+        yield address
 
 
 def try_operation(cases: Any) -> None:

@@ -12,7 +12,6 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-import uvicorn
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
@@ -23,9 +22,8 @@ from service.settings import Settings
 from service.tables import JobRow
 from service.workers import Context
 
-from .conftest import QUIET, FakeOperations, Post, client_of, free_port, png
+from .conftest import QUIET, FakeOperations, Post, client_of, png, serving, until
 from .job_kinds import TEST_KINDS
-from .test_jobs import until
 
 JSON = {"Content-Type": "application/json"}
 
@@ -260,16 +258,8 @@ def test_too_many_waiting_jobs_are_refused(app: FastAPI, client: TestClient):
 @pytest.fixture
 def server(app: FastAPI) -> Iterator[str]:
     """The service behind a real socket; yields its address."""
-    port = free_port()
-    running = uvicorn.Server(uvicorn.Config(app, host="127.0.0.1", port=port, log_config=None))
-    thread = threading.Thread(target=running.run)
-    thread.start()
-    until(lambda: running.started)
-    yield f"http://127.0.0.1:{port}"
-    app.state.stopping.set()
-    running.should_exit = True
-    thread.join(30)
-    assert not thread.is_alive()
+    with serving(app) as address:
+        yield address
 
 
 def read_events(url: str, last: str | None = None, most: int = 10**6) -> list[dict[str, str]]:

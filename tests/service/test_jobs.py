@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -26,7 +25,7 @@ from service.settings import Settings
 from service.tables import AuditRow, JobRow
 from service.workers import Worker, Workers, pause_s
 
-from .conftest import FakeOperations
+from .conftest import FakeOperations, until
 from .job_kinds import TEST_KINDS
 
 ROOT = Path(__file__).parents[2]
@@ -61,13 +60,6 @@ def marks(runtime: Runtime) -> list[str]:
     """The marks that parts of jobs left in the store."""
     with runtime.database.reading() as session:
         return sorted(session.scalars(select(AuditRow.subject).where(AuditRow.action == "part")))
-
-
-def until(condition: Callable[[], bool], timeout_s: float = 30.0) -> None:
-    end = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < end, "it does not happen"
-        time.sleep(0.02)
 
 
 def ended(runtime: Runtime, number: int) -> JobRow:

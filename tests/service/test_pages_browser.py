@@ -6,14 +6,12 @@ Needs Chromium, `HELIOTWIN_TEST_CHROMIUM` or one on the path, and its driver fro
 import os
 import shutil
 import threading
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
-import uvicorn
 from fastapi import FastAPI
 from sqlalchemy import delete
 
@@ -22,7 +20,17 @@ from service.app import create_app
 from service.settings import Settings
 from service.tables import KeyRow
 
-from .conftest import QUIET, FakeOperations, client_of, free_port, png, poster, properties_document, tower_document
+from .conftest import (
+    QUIET,
+    FakeOperations,
+    client_of,
+    free_port,
+    png,
+    poster,
+    properties_document,
+    serving,
+    tower_document,
+)
 
 playwright = pytest.importorskip("playwright.sync_api", reason="no browser driver: pip install playwright")
 expect = playwright.expect
@@ -88,19 +96,11 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     fill(create_app(settings, FakeOperations()))
     operations = GatedOperations()
     app = create_app(settings, operations)
-    server = uvicorn.Server(uvicorn.Config(app, port=settings.port, log_config=None, ws="none"))
-    thread = threading.Thread(target=server.run)
-    thread.start()
-    try:
-        while not server.started:
-            assert thread.is_alive()
-            time.sleep(0.02)
-        yield Served(app, f"http://127.0.0.1:{settings.port}", operations)
-    finally:
-        operations.gate.set()
-        app.state.stopping.set()
-        server.should_exit = True
-        thread.join()
+    with serving(app, settings.port, ws="none") as address:
+        try:
+            yield Served(app, address, operations)
+        finally:
+            operations.gate.set()
 
 
 @pytest.fixture(scope="module")
