@@ -1,5 +1,6 @@
 """The queue: each job ends exactly once, whoever dies, races, fails or is told to stop."""
 
+import itertools
 import os
 import random
 import signal
@@ -15,6 +16,7 @@ from typing import Any
 
 import pytest
 from sqlalchemy import URL, select, update
+from sqlalchemy.exc import OperationalError
 
 from model.errors import InvalidInputError
 from service import jobs
@@ -332,36 +334,28 @@ def test_stopped_worker_puts_its_job_back(runtime: Runtime):
     assert marks(runtime) == ["0", "1", "2", "3"]
 
 
-def test_worker_outlives_a_database_that_is_away(runtime: Runtime, monkeypatch: pytest.MonkeyPatch):
-    number = ask(runtime, value=6)
-    real, calls = jobs.has_claimable, [0]
+def away_twice(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    """The database does not answer the first two calls of this function of `service.jobs`."""
+    real, calls = getattr(jobs, name), itertools.count(1)
 
-    def fails_twice(*arguments: Any) -> bool:
-        from sqlalchemy.exc import OperationalError
-
-        calls[0] += 1
-        if calls[0] <= 2:
+    def fails_twice(*arguments: Any) -> Any:
+        if next(calls) <= 2:
             raise OperationalError("SELECT 1", {}, Exception("away"))
         return real(*arguments)
 
-    monkeypatch.setattr(jobs, "has_claimable", fails_twice)
+    monkeypatch.setattr(jobs, name, fails_twice)
+
+
+def test_worker_outlives_a_database_that_is_away(runtime: Runtime, monkeypatch: pytest.MonkeyPatch):
+    number = ask(runtime, value=6)
+    away_twice(monkeypatch, "has_claimable")
     with working(runtime):
         assert ended(runtime, number).state == "done"
 
 
 def test_end_is_stored_when_the_database_is_back(runtime: Runtime, monkeypatch: pytest.MonkeyPatch):
     number = ask(runtime, value=7)
-    real, calls = jobs.finish, [0]
-
-    def fails_twice(*arguments: Any) -> None:
-        from sqlalchemy.exc import OperationalError
-
-        calls[0] += 1
-        if calls[0] <= 2:
-            raise OperationalError("UPDATE", {}, Exception("away"))
-        real(*arguments)
-
-    monkeypatch.setattr(jobs, "finish", fails_twice)
+    away_twice(monkeypatch, "finish")
     worker = Worker(runtime, TEST_KINDS, "w", threading.Event())
     assert worker.work()
     row = look(runtime, number)
