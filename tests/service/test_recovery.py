@@ -163,6 +163,24 @@ def test_damaged_back_up_is_not_restored(runtime: Runtime, elsewhere: Settings, 
     assert not elsewhere.data_dir.exists() or not any(images_of(elsewhere).root.rglob("*"))
 
 
+def test_restore_that_is_interrupted_can_be_tried_again(
+    runtime: Runtime, elsewhere: Settings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def interrupt(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    back_up(runtime.settings, tmp_path / "one")
+    on_sqlite = elsewhere.database.get_backend_name() == "sqlite"
+    with monkeypatch.context() as broken:
+        broken.setattr("shutil.copyfile" if on_sqlite else "service.backup._copy_in", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            restore(elsewhere, tmp_path / "one")
+    restore(elsewhere, tmp_path / "one")
+    database = Database(elsewhere.database)
+    assert contents(database) == contents(runtime.database)
+    database.close()
+
+
 def test_damaged_image_in_the_store_ends_no_back_up(runtime: Runtime, elsewhere: Settings, tmp_path: Path):
     image = next(path for path in runtime.images.root.rglob("*") if path.is_file())
     _flip(image)
