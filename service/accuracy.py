@@ -173,6 +173,6 @@ class AccuracyBook:
             raise
         except (ModelError, ServiceError) as error:
             logger.warning("the accuracy of heliostat %s cannot be told: %s", state.heliostat, error)
-        except Exception:  # the thread goes on with the other heliostats
+        except Exception:  # whatever it is, the one thread that there is must live for the other heliostats
             logger.exception("the accuracy of heliostat %s cannot be told", state.heliostat)
         return None

@@ -29,7 +29,7 @@ def judge(runtime: Runtime, heliostat: str, measurement: MeasurementRow) -> floa
         return _judge(runtime, heliostat, measurement)
     except (ModelError, SQLAlchemyError) as error:
         logger.warning("the drift of heliostat %s cannot be told: %s", heliostat, error)
-    except Exception:
+    except Exception:  # whatever it is, the photograph is stored, and its sender must be told so
         logger.exception("the drift of heliostat %s cannot be told", heliostat)
     return None
 
