@@ -20,10 +20,7 @@ from model.study.unknowns import Unknowns, copied
 Array = NDArray[np.float64]
 
 TRUST = 0.03
-"""Residual of a pixel [of the peak] that weighs as much as an unknown that is `HELD` away from neutral."""
-
-HELD = 0.1
-"""Share of an unknown's range; it only counts for what images cannot tell, such as the tilt of all facets together."""
+"""Residual of a pixel [of the peak] that weighs as much as an unknown that is ``held`` away from neutral."""
 
 STARTS = (-0.4, -0.15, -0.05, 0.05, 0.15, 0.4)
 """Where fits of an unknown begin, in shares of its range away from neutral."""
@@ -109,8 +106,7 @@ class Fitter:
 
     def _pull(self, unknowns: Unknowns, values: Array) -> Array:
         """Distances (P,) from neutral: holds what images cannot tell."""
-        low, high = unknowns.bounds
-        return np.asarray((values - unknowns.neutral) / (HELD * (high - low)))
+        return np.asarray((values - unknowns.neutral) / unknowns.held)
 
     def cost(self, unknowns: Unknowns, values: Array, residuals: Array) -> float:
         """Half the sum of squares."""
@@ -188,7 +184,7 @@ class Fitter:
     def descend(self, unknowns: Unknowns, values: Array) -> Fit:
         """The least cost near ``values`` (P,)."""
         low, high = unknowns.bounds
-        scale = 1 / (HELD * (high - low)) ** 2
+        scale = 1 / unknowns.held**2
         damping, residuals = 1e-2, self.residuals(unknowns, values)
         cost = self.cost(unknowns, values, residuals)
         if not np.isfinite(cost):

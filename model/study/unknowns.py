@@ -69,6 +69,12 @@ class Unknowns:
         return np.array([u.parameter.low for u in self.all]), np.array([u.parameter.high for u in self.all])
 
     @property
+    def held(self) -> Array:
+        """Standard deviations (P,) about neutral before any image is seen."""
+        low, high = self.bounds
+        return np.array([u.effect.held for u in self.all]) * (high - low)
+
+    @property
     def colours(self) -> dict[tuple[str, str, int | None], list[int]]:
         """Places of the unknowns that may be changed at once, by colour."""
         places: dict[tuple[str, str, int | None], list[int]] = {}
