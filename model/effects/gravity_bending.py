@@ -11,8 +11,7 @@ What it is
     lowers the upper and lower edges, which makes the mirror convex and its focus longer. A surface that was measured,
     or learnt from images, holds the sag of the attitude it was seen in; so it is the deviation from there that counts.
     Normals of a field on the northern side of its tower stand at some 30 degrees in the middle, hence `REFERENCE`.
-    Both it and `ALONG` are those that the images of undeclared set 3 demand, where reference, share and powers were
-    free (0.50, 0.42, and 1.99 across).
+    Both it and `ALONG` were chosen by the images of undeclared set 3, as was the power of two.
 
 Source
     Moya and Ho, *Modeling and validation of heliostat deformation due to static loading*, ASME ES2011-54216; Yuan,
