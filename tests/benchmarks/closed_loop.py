@@ -6,7 +6,7 @@ refined with it against deflectometry. With ``--pictures DIR`` it draws the real
 """
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 from model.effects import CATALOGUE, Effect, effect_from_json
 from model.forecast import View
 from model.metrics import flux_accuracy
+from model.network.predictor import default_predictor
 from model.observation import Observation, align_observations, render_observations
 from model.plant import Heliostat, TargetPlane
 from model.refinement import refine
@@ -36,12 +37,14 @@ HELIOSTATS = ["AA39", "AC43"]
 COMBINATIONS = (
     (),
     ("camera_response",),
+    ("camera_shoulder",),
     ("gravity_bending",),
-    ("camera_response", "gravity_bending"),
-    ("camera_response", "soiling"),
-    ("camera_response", "facet_canting"),
-    ("camera_response", "sun_shape"),
-    ("camera_response", "target_registration"),
+    ("camera_shoulder", "gravity_bending"),
+    ("camera_shoulder", "soiling"),
+    ("camera_shoulder", "facet_canting"),
+    ("camera_shoulder", "sun_shape"),
+    ("camera_shoulder", "background"),
+    ("camera_shoulder", "target_registration"),
 )
 
 
@@ -140,7 +143,23 @@ def real_plant(root: Path) -> None:
         print(f"| {label} | {values.mean():.4f} | {np.median(values):.4f} | {values.min():.3f} |", flush=True)
 
 
-def refined_real(root: Path, effects: Sequence[Effect]) -> None:
+Method = Callable[[Heliostat, list[Observation], Sequence[Effect]], np.ndarray]
+
+
+def by_network(heliostat: Heliostat, images: list[Observation], effects: Sequence[Effect]) -> np.ndarray:
+    """Heights (4, 8, 8) [m] that the network predicts."""
+    return default_predictor().heights(heliostat, images, None, effects)[0]
+
+
+def by_refinement(heliostat: Heliostat, images: list[Observation], effects: Sequence[Effect]) -> np.ndarray:
+    """Heights (4, 8, 8) [m] of the most probable surface."""
+    return refine(heliostat, images, effects=effects).z
+
+
+METHODS = {"predicted": by_network, "refined": by_refinement}
+
+
+def real_surfaces(root: Path, effects: Sequence[Effect]) -> None:
     """Surfaces of AA39 and AC43 from their photographs, with and without effects, against deflectometry."""
     folder = read_folder(root, HELIOSTATS)
     for name, heliostat in folder.plant.heliostats.items():
@@ -149,36 +168,50 @@ def refined_real(root: Path, effects: Sequence[Effect]) -> None:
         measured = folder.measured_surface(name)
         assert measured is not None
         truth = measured_heights(heliostat, measured)
-        for label, model in (("without", []), ("with", list(effects))):
-            errors = surface_errors(refine(heliostat, images[:8], optics=folder.optics, effects=model).z, truth)
-            fresh = left_out_accuracy(heliostat, images, model) if len(images) > 2 else float("nan")
-            figures = " | ".join(f"{errors[k]:.3f}" for k in ("mae_mm", "mae_canting_mm", "mae_waviness_mm"))
-            print(f"| {name}, {len(images[:8])} photographs | {label} | {figures} | {fresh:.3f} |", flush=True)
+
+        def by_deflectometry(*_: object, truth: np.ndarray = truth) -> np.ndarray:
+            return truth
+
+        for method, surface in {**METHODS, "measured": by_deflectometry}.items():
+            for label, model in (("without", []), ("with", list(effects))):
+                errors = surface_errors(surface(heliostat, images[:8], model), truth)
+                fresh = left_out_accuracy(heliostat, images, model, surface) if len(images) > 2 else float("nan")
+                label = f"{name}, {len(images[:8])} photographs, {method} | {label}"
+                print(f"| {label} | {figures(errors)} | {fresh:.3f} |", flush=True)
 
 
-def left_out_accuracy(heliostat: Heliostat, images: list[Observation], effects: Sequence[Effect]) -> float:
-    """Mean accuracy of every fourth image under the surface refined from the others."""
+def figures(errors: dict[str, float]) -> str:
+    """Errors of a surface [mm] in three columns."""
+    return " | ".join(f"{errors[key]:.3f}" for key in ("mae_mm", "mae_canting_mm", "mae_waviness_mm"))
+
+
+def left_out_accuracy(
+    heliostat: Heliostat, images: list[Observation], effects: Sequence[Effect], surface: Method
+) -> float:
+    """Mean accuracy of every fourth image under the surface made from the others."""
     kept = images[::4]
-    z = refine(heliostat, [o for o in images if o not in kept][:8], effects=effects).z
+    z = surface(heliostat, [o for o in images if o not in kept][:8], effects)
     traced = render_observations(heliostat, kept, z, None, effects).clip(min=0)
     return float(np.mean([flux_accuracy(o.flux, image) for o, image in zip(kept, traced, strict=True)]))
 
 
-def refined_simulated(root: Path, effects: Sequence[Effect], count: int) -> None:
-    """Held-out surfaces photographed by a camera that has the effects, refined with and without them."""
+def simulated_surfaces(root: Path, effects: Sequence[Effect], count: int) -> None:
+    """Held-out surfaces photographed by a camera that has the effects, predicted and refined with and without them."""
     surfaces, _ = load_surfaces(root)
     _, held_out = split_by_heliostat(len(surfaces), 8, 7)
-    field, rng, rows = load_field(root), np.random.default_rng(11), []
+    field, rng = load_field(root), np.random.default_rng(11)
+    found: dict[str, list[dict[str, float]]] = {}
     for index in held_out[:count]:
         position = field[rng.integers(len(field))]
         heliostat = Heliostat.juelich("synthetic", position, float(np.linalg.norm(position - [0, 0, 55])))
         images = photograph(heliostat, surfaces[index], effects, rng)
-        predicted = [refine(heliostat, images, effects=model).z for model in ([], list(effects))]
-        rows.append([surface_errors(z, surfaces[index]) for z in predicted])
-    for column, label in enumerate(("without", "with")):
-        keys = ("mae_mm", "mae_canting_mm", "mae_waviness_mm")
-        figures = " | ".join(f"{np.mean([row[column][key] for row in rows]):.3f}" for key in keys)
-        print(f"| {count} held-out surfaces, 8 rendered images each | {label} | {figures} | |")
+        for method, surface in METHODS.items():
+            for label, model in (("without", []), ("with", list(effects))):
+                errors = surface_errors(surface(heliostat, images, model), surfaces[index])
+                found.setdefault(f"{method} | {label}", []).append(errors)
+    for label, own in found.items():
+        mean = {key: float(np.mean([errors[key] for errors in own])) for key in own[0]}
+        print(f"| {count} held-out surfaces, 8 rendered images each, {label} | {figures(mean)} | |")
 
 
 def photograph(
@@ -206,11 +239,11 @@ def surfaces(root: Path, simulated: int) -> None:
     """What the effect that the study of the real plant finds buys for surfaces."""
     report = real_study(root).to_json()
     found = [effect_from_json(entry) for entry in report["effects"]]
-    print("\nSurfaces refined with and without what the study found, errors against deflectometry [mm]")
+    print("\nSurfaces made with and without what the study found, errors against deflectometry [mm]")
     print("| images | effect | all | canting | waviness | accuracy of images left out |")
     print("| --- | --- | --- | --- | --- | --- |")
-    refined_real(root, found)
-    refined_simulated(root, found, simulated)
+    real_surfaces(root, found)
+    simulated_surfaces(root, found, simulated)
 
 
 def main() -> None:
