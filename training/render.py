@@ -11,13 +11,19 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
+from model.effects import Effect, in_light_order
+from model.effects.background import Background
+from model.effects.camera_response import CameraResponse
+from model.effects.camera_shoulder import CameraShoulder
+from model.effects.slope_error import SlopeError
+from model.effects.sun_shape import SunShapeEffect
+from model.effects.target_registration import TargetRegistration
 from model.frames import sun_direction_at
 from model.images import normalized
 from model.network.architecture import CONDITIONS, IMAGE_SIZE
 from model.network.inputs import DESCENT_SAMPLES, DESCENT_SIZE, GUESS_SAMPLES, conditions, descents
 from model.observation import FLUX_SHAPE, Observation, scene_of
 from model.plant import Heliostat, TargetPlane
-from model.sunshape import Buie, transfer_table
 from model.surface import control_points
 from model.tracing import Optics, Scene, Window, trace
 
@@ -155,62 +161,77 @@ class Shots:
 
 @dataclass(frozen=True)
 class Camera:
-    """What separates a photograph from traced flux; every value is the limit or scale of a random draw.
+    """What separates photographs from traced flux: effects of the catalogue, and noise.
 
-    Circumsolar ratio and slope error [mrad] act on the light; gamma on the camera's response; ``warp`` [of the window]
-    on the registration; ``background`` and ``noise`` are shares of the peak. Good cameras are common and bad ones rare:
-    each batch has a uniform random number to the power of ``ease`` of all these limits.
+    Photographs are taken in ``worlds`` of differing haze, roughness and camera, at random. Every other value is the
+    limit or scale of a random draw: circumsolar ratio and slope error [mrad] act on the light, gamma and compression on
+    the camera's response, ``warp`` [of the window] on registration and centring; ``background`` and ``noise`` are
+    shares of the peak. Good worlds are common and bad ones rare: each has a uniform random number to the power of
+    ``ease`` of all these limits.
     """
 
     circumsolar_ratio: float = 0.15
     slope_error_mrad: float = 0.8
     gamma: float = 1.25
+    compression: float = 1.5
     warp: float = 0.015
     background: float = 0.02
     noise: float = 0.02
     ease: float = 2.0
+    worlds: int = 8
 
     def photograph(self, scene: Scene, device: torch.device, rng: np.random.Generator) -> Tensor:
         """Flux images (B, 64, 64), sum 100, 4 m about the spot's centre."""
-        return self._eased(rng.uniform() ** self.ease)._photograph(scene, device, rng)
+        images = torch.empty(scene.batch, IMAGE_SIZE, IMAGE_SIZE, device=device)
+        for rows in np.array_split(rng.permutation(scene.batch), min(self.worlds, scene.batch)):
+            share = rng.uniform() ** self.ease
+            seen = self._seen(scene.subset(rows.tolist()), self.effects(share, rng))
+            images[rows] = self._developed(seen, share, rng)
+        return normalized(images)
 
-    def _eased(self, share: float) -> "Camera":
-        """The camera with a share of all limits."""
-        limits = {name: share * getattr(self, name) for name in ("slope_error_mrad", "warp", "background", "noise")}
+    def effects(self, share: float, rng: np.random.Generator) -> list[Effect]:
+        """Those of one world, drawn up to a ``share`` of the limits."""
+
+        def near_zero(limit: float) -> float:
+            return float(rng.uniform(-limit, limit) * share)
+
         clearest = min(CLEAR_SKY, self.circumsolar_ratio)
-        ratio = clearest + share * (self.circumsolar_ratio - clearest)
-        return replace(self, circumsolar_ratio=ratio, gamma=self.gamma**share, **limits)
+        haziest = clearest + share * (self.circumsolar_ratio - clearest)
+        scale_x, scale_y, shear, turn = (near_zero(self.warp) for _ in range(4))
+        return [
+            SunShapeEffect(float(np.exp(rng.uniform(np.log(CLEAREST_SKY), np.log(haziest))))),
+            SlopeError(rng.uniform(0, share * self.slope_error_mrad)),
+            Background(*(near_zero(self.background) for _ in range(3))),
+            CameraResponse(float(self.gamma ** near_zero(1.0))),
+            CameraShoulder(rng.uniform(0, share * self.compression)),
+            TargetRegistration(1 + scale_x, 1 + scale_y, shear, float(np.degrees(turn))),
+        ]
 
-    def _photograph(self, scene: Scene, device: torch.device, rng: np.random.Generator) -> Tensor:
-        count = scene.batch
-        chis = np.exp(rng.uniform(np.log(CLEAREST_SKY), np.log(self.circumsolar_ratio), 8))
-        tables = torch.stack([transfer_table(Buie(float(c)), torch.float32, device) for c in chis])
-        table = tables[torch.as_tensor(rng.integers(len(chis), size=count), device=device)]
-        slope = torch.as_tensor(rng.uniform(0, self.slope_error_mrad * 1e-3, count), dtype=torch.float32, device=device)
-        optics = Optics(slope_error=slope)
-        flux = trace(scene, Window(on_spot=True), optics, samples=16, padding=0.25, table=table).irradiance
-        return normalized(self._develop(flux.clamp(min=0), rng))
+    @staticmethod
+    def _seen(scene: Scene, effects: Sequence[Effect]) -> Tensor:
+        """Images (B, 64, 64) of a scene as effects on light and camera make them."""
+        window, optics = Window(on_spot=True), Optics()
+        for effect in effects:
+            optics = effect.on_optics(optics)
+        images = trace(scene, window, optics, samples=16, padding=0.25).irradiance.clamp(min=0)
+        for effect in in_light_order(effects):
+            images = effect.on_image(images, window)
+        return images
 
-    def _develop(self, flux: Tensor, rng: np.random.Generator) -> Tensor:
-        """Warp, gamma, background residue, noise and 8-bit rounding of images (B, R, C)."""
-        count, device = len(flux), flux.device
+    def _developed(self, images: Tensor, share: float, rng: np.random.Generator) -> Tensor:
+        """Errors of centring, noise and 8-bit rounding of images (B, R, C), in shares of their peaks."""
+        count, device = len(images), images.device
 
         def draw(low: float, high: float, *shape: int) -> Tensor:
-            return torch.as_tensor(rng.uniform(low, high, (count, *shape)), dtype=torch.float32, device=device)
+            return torch.as_tensor(share * rng.uniform(low, high, (count, *shape)), dtype=images.dtype, device=device)
 
-        affine = torch.eye(2, 3, device=device) + draw(-self.warp, self.warp, 2, 3)
-        grid = functional.affine_grid(affine, [count, 1, *flux.shape[1:]], align_corners=False)
-        image = functional.grid_sample(flux[:, None], grid, align_corners=False)[:, 0]
+        shift = torch.cat([torch.eye(2, device=device).expand(count, 2, 2), draw(-self.warp, self.warp, 2, 1)], dim=2)
+        grid = functional.affine_grid(shift, [count, 1, *images.shape[1:]], align_corners=False)
+        image = functional.grid_sample(images[:, None], grid, align_corners=False)[:, 0]
         image = image / image.amax(dim=(1, 2), keepdim=True).clamp(min=1e-9)
-        log_gamma = float(np.log(self.gamma))
-        image = image.clamp(min=1e-6) ** torch.exp(draw(-log_gamma, log_gamma, 1, 1))
-        ramp = torch.linspace(-1, 1, image.shape[-1], device=device)
-        level, tilt_x, tilt_y = (draw(-self.background, self.background, 1, 1) for _ in range(3))
-        image = image + level + tilt_x * ramp + tilt_y * ramp[:, None]
         seed = torch.Generator(device=device).manual_seed(int(rng.integers(2**31)))
         noise = torch.randn(image.shape, generator=seed, device=device)
-        image = image + noise * draw(0, self.noise, 1, 1)
-        return torch.round(image.clamp(0, 1) * 255) / 255
+        return torch.round((image + noise * draw(0, self.noise, 1, 1)).clamp(0, 1) * 255) / 255
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from model.effects import effect_to_json
 from model.network.architecture import NetworkConfig
 from model.surface import mirrored, split_canting
 from training.config import TrainConfig
@@ -90,6 +91,26 @@ def test_rendered_images_are_normalised_and_reproducible(surfaces, stj):
     torch.testing.assert_close(flux.sum(dim=(2, 3)), torch.full((3, 4), 100.0))
     torch.testing.assert_close(flux, again[0], rtol=0, atol=0)
     assert not torch.equal(flux, other[0])
+
+
+def test_a_perfect_camera_sees_what_was_traced(surfaces, stj):
+    perfect = Camera(0.02, 0.0, gamma=1.0, compression=0.0, warp=0.0, background=0.0, noise=0.0)
+    seen, traced = (
+        render(surfaces[:2], 4, load_field(stj), Situations(), camera, torch.device("cpu"), 3)[0]
+        for camera in (perfect, None)
+    )
+    assert float((seen - traced).abs().sum(dim=(2, 3)).max()) < 2.5  # of 100: the sun's haze is drawn, and 8 bits
+    assert not torch.equal(seen, traced)
+
+
+def test_worlds_of_a_camera_stay_within_its_limits():
+    camera, rng = Camera(gamma=1.2, compression=1.0), np.random.default_rng(0)
+    worlds = [{e.name: effect_to_json(e)["parameters"] for e in camera.effects(0.5, rng)} for _ in range(200)]
+    gammas = [world["camera_response"]["gamma"] for world in worlds]
+    assert 1.2**-0.5 <= min(gammas) < 0.93
+    assert 1.07 < max(gammas) <= 1.2**0.5
+    assert 0.4 < max(world["camera_shoulder"]["compression"] for world in worlds) <= 0.5
+    assert max(world["sun_shape"]["circumsolar_ratio"] for world in worlds) <= (0.02 + 0.15) / 2
 
 
 def test_prior_explains_measured_surfaces_and_holds_no_tilt_of_the_whole_mirror(surfaces):
