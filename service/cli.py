@@ -204,13 +204,13 @@ def study(
 
 def _study_table(report: dict[str, Any]) -> Table:
     """Every candidate alone, the best first, and where the model stands before and after."""
-    table = make_table(f"Study: {report['verdict']}", "effect", "accuracy", "score", "found")
-    found = {effect["name"]: effect["accuracy_gain"] for effect in report["effects"]}
+    table = make_table(f"Study: {report['verdict']}", "effect", "accuracy", "gain, 95 %", "score", "")
+    found = {effect["name"] for effect in report["effects"]}
     for candidate in report["candidates"]:
-        gain = found.get(candidate["name"])
-        interval = "" if gain is None else f"gain {gain['ci95'][0]:.3f} to {gain['ci95'][1]:.3f}"
+        low, high = candidate["accuracy_gain"]["ci95"]
         accuracy, score = f"{candidate['accuracy_after']:.3f}", f"{candidate['score']:.1f}"
-        table.add_row(candidate["name"], accuracy, score, interval)
+        mark = "found" if candidate["name"] in found else ""
+        table.add_row(candidate["name"], accuracy, f"{low:.3f} to {high:.3f}", score, mark)
     table.add_section()
     for name in ("before", "after"):
         table.add_row(f"all, {name}", f"{report[name]['accuracy_mean']:.3f}")

@@ -204,7 +204,9 @@ def study(
             progress(name)
             trials[name] = loop.added(name, current)
         trials = loop.refitted(trials)
-        candidates = candidates or [Candidate.of(n, t.accuracy, loop.gain(t, before)) for n, t in trials.items()]
+        candidates = candidates or [
+            Candidate(n, float(t.accuracy.mean()), loop.gain(t, before)) for n, t in trials.items()
+        ]
         chosen = loop.choose(trials, current)
         if chosen is None:
             break

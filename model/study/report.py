@@ -35,16 +35,11 @@ known effects (`tests.benchmarks.study`), where the median error of most paramet
 
 @dataclass(frozen=True)
 class Candidate:
-    """One effect of the catalogue, fitted alone: mean accuracy of held-out images and its gain in standard errors."""
+    """One effect of the catalogue, fitted alone: mean accuracy of held-out images and its gain."""
 
     name: str
     accuracy_after: float
-    score: float
-
-    @classmethod
-    def of(cls, name: str, accuracy: Array, gain: Gain) -> "Candidate":
-        """From held-out accuracies (H,) and their gain."""
-        return cls(name, float(accuracy.mean()), gain.score)
+    gain: Gain
 
 
 @dataclass(frozen=True)
@@ -208,7 +203,12 @@ class Study:
             "unexplained_share": round(self.unexplained_share, 4),
             "effects": [_effect(f) for f in self.found],
             "candidates": [
-                {"name": c.name, "accuracy_after": round(c.accuracy_after, 5), "score": round(c.score, 2)}
+                {
+                    "name": c.name,
+                    "accuracy_after": round(c.accuracy_after, 5),
+                    "score": round(c.gain.score, 2),
+                    "accuracy_gain": _gain(c.gain),
+                }
                 for c in self.candidates
             ],
             "residual": {
@@ -229,12 +229,15 @@ def _plain(name: str) -> str:
     return name.replace("_", " ")
 
 
+def _gain(gain: Gain) -> dict[str, Any]:
+    return {"mean": round(gain.mean, 5), "ci95": [round(gain.low, 5), round(gain.high, 5)]}
+
+
 def _effect(found: Found) -> dict[str, Any]:
-    gain = found.gain
     return {
         "name": found.name,
         "parameters": found.parameters,
-        "accuracy_gain": {"mean": round(gain.mean, 5), "ci95": [round(gain.low, 5), round(gain.high, 5)]},
+        "accuracy_gain": _gain(found.gain),
         "lookalikes": found.lookalikes,
         "told_apart_by": {name: told_apart_by(found.name, name) for name in found.lookalikes},
     }

@@ -300,6 +300,7 @@ def test_an_effect_is_found_with_its_parameter_and_what_it_buys(hazy):
     assert rise == pytest.approx(gain["mean"], abs=2e-5)
     assert report["images"] == {"fit": 4, "held_out": 4}
     assert [c["name"] for c in report["candidates"]] == ["sun_shape", "gravity_bending"]
+    assert report["candidates"][0]["accuracy_gain"] == gain
     assert set(told) == {"sun_shape", "gravity_bending"}
 
 
