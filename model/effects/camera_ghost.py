@@ -44,7 +44,8 @@ class CameraGhost(Effect):
     name: ClassVar[str] = "camera_ghost"
     stage: ClassVar[Stage] = "image"
     guesses: ClassVar[tuple[dict[str, float], ...]] = tuple(
-        {"share": 0.2, "right_m": 0.6 * right, "up_m": 0.6 * up}
+        {"share": 0.05, "right_m": size * right, "up_m": size * up}
+        for size in (0.4, 0.9)
         for right in (-1, 0, 1)
         for up in (-1, 0, 1)
         if right or up

@@ -24,6 +24,10 @@ REFITTED = 3
 """How many of the best candidates are fitted once more, jointly with the effects found before."""
 
 
+TELLING = 0.001
+"""Accuracy that one effect must gain more than another on the same images to be told from it."""
+
+
 @dataclass(frozen=True)
 class StudyOptions:
     """How a study is made.
@@ -137,6 +141,11 @@ class _Loop:
         """Whether a gain is both significant and worth having."""
         return gain.low > 0 and gain.mean >= self.options.least_gain
 
+    @staticmethod
+    def tells(gain: Gain) -> bool:
+        """Whether a gain of one effect over another is significant, and more than what fits may differ by."""
+        return gain.low > 0 and gain.mean >= TELLING
+
     def choose(self, trials: dict[str, Trial], current: Trial) -> tuple[str, list[str]] | None:
         """The candidate to add and its look-alikes, or None.
 
@@ -146,7 +155,7 @@ class _Loop:
         if not worthy:
             return None
         best = max(worthy.values(), key=lambda t: t.accuracy.mean())
-        alike = [name for name, t in worthy.items() if t is best or not self.counts(self.gain(best, t))]
+        alike = [name for name, t in worthy.items() if t is best or not self.tells(self.gain(best, t))]
         alike.sort(key=lambda name: (len(worthy[name].values), -worthy[name].accuracy.mean()))
         return alike[0], alike[1:]
 

@@ -34,8 +34,7 @@ def _seen(
 ) -> Iterable[tuple[Rays, Rays]]:
     """Where light that hits the target appears on the photograph, still in metres, and how bright."""
     half = np.array([[plane.width], [plane.height]], dtype=np.float32) / 2
-    on_target = (np.abs(hits) < half).all(axis=0)
-    hits, light = hits[:, on_target], light[on_target]
+    light = light * (np.abs(hits) < half).all(axis=0)
     if world.blur_m:
         hits = hits + np.float32(world.blur_m) * rng.standard_normal(hits.shape, dtype=np.float32)
     scale_x, scale_y, shear, turn = world.registration
