@@ -68,16 +68,19 @@ def studies(root: Path) -> None:
     for folder in sorted((root.parent / "undeclared").glob("set-*")):
         print(row(folder.name, study_folder(read_folder(folder)).study), flush=True)
     for window in (4.0, 6.0):
-        print(row(f"AA39, AC43, {window:.0f} m", real_study(root, window)), flush=True)
+        for label, without in (("", ()), (", without `camera_shoulder`", ("camera_shoulder",))):
+            print(row(f"AA39, AC43, {window:.0f} m{label}", real_study(root, window, without)), flush=True)
     with TemporaryDirectory() as predicted:
         folder = read_folder(root, ["AA39"])
         predict_folder(folder, Path(predicted), images=4)
         print(row("AA39, surface predicted from 4 of its images", study_folder(folder, predicted).study), flush=True)
 
 
-def real_study(root: Path, window: float | None = None) -> Study:
-    """The study of the real plant's photographs with measured surfaces."""
-    return study_folder(read_folder(root, HELIOSTATS), options=StudyOptions(window=window)).study
+def real_study(root: Path, window: float | None = None, without: Sequence[str] = ()) -> Study:
+    """The study of the real plant's photographs with measured surfaces and a catalogue without some effects."""
+    candidates = tuple(name for name in CATALOGUE if name not in without)
+    options = StudyOptions(window=window, candidates=candidates)
+    return study_folder(read_folder(root, HELIOSTATS), options=options).study
 
 
 def row(label: str, study: Study) -> str:
