@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -142,6 +142,7 @@ class _Sight:
     ) -> None:
         self.heliostat, self.observations, self.optics, self.effects = heliostat, observations, optics, effects
         self.flux = torch.as_tensor(np.array([o.flux for o in observations]), dtype=torch.float32)
+        self.ideal = torch.as_tensor(control_points(heliostat), dtype=torch.float32).movedim(-1, -3)
         self.normals = torch.as_tensor(heliostat.facet_normals, dtype=torch.float32)
         self.basis = torch.as_tensor(default_prior().basis, dtype=torch.float32)
         self.aligned: Aligned | None = None
@@ -149,13 +150,14 @@ class _Sight:
     def inputs(self, z: Array) -> dict[str, NDArray[Any]]:
         """`INPUTS` of a look at a guessed surface (4, 8, 8) [m]."""
         # The guess before differs little, and from its alignment few rounds are left.
-        self.aligned = align_observations(self.heliostat, self.observations, z, self.effects, start=self.aligned)
+        aligned = align_observations(self.heliostat, self.observations, z, self.effects, start=self.aligned)
+        self.aligned = aligned
         with torch.no_grad():
-            guess_flux = self._images(self.aligned, FLUX_SHAPE[0], GUESS_SAMPLES)
-        descent = descents(self._changed, self.flux[None], self.basis)[0]
+            guess_flux = self._images(aligned, FLUX_SHAPE[0], GUESS_SAMPLES)
+        descent = descents(partial(self._changed, aligned), self.flux[None], self.basis)[0]
         return {
             "flux": _filled(self.flux.numpy()),
-            "conditions": _filled(self._conditions(self.aligned).numpy()),
+            "conditions": _filled(self._conditions(aligned).numpy()),
             "mask": _filled(np.ones(len(self.flux))),
             "guess_flux": _filled(guess_flux.numpy()),
             "guess": z[None] * 1e3,
@@ -167,17 +169,15 @@ class _Sight:
         view = View(size, size, window=FLUX_WINDOW, samples=samples)
         return normalized(aligned.images(self.optics, self.effects, view))
 
-    def _changed(self, changes: Tensor) -> Tensor:
-        """Images (1, M, R, R), sum 100, of the guess changed by heights (1, M, 4, 8, 8) [m]."""
-        assert self.aligned is not None
-        raised = self.aligned.raised(torch.einsum("mfij,fk->mfkij", changes[0], self.normals))
+    def _changed(self, aligned: Aligned, changes: Tensor) -> Tensor:
+        """Images (1, M, R, R), sum 100, of mirrors that stand, changed by heights (1, M, 4, 8, 8) [m]."""
+        raised = aligned.raised(torch.einsum("mfij,fk->mfkij", changes[0], self.normals))
         return self._images(raised, DESCENT_SIZE, DESCENT_SAMPLES)[None]
 
     def _conditions(self, aligned: Aligned) -> Tensor:
         """`conditions` (M, 12) of the ideal mirror where the guess stands, as in training."""
         scene = aligned.groups[0].scene
-        points = torch.as_tensor(control_points(self.heliostat), dtype=torch.float32).movedim(-1, -3)
-        return conditions(scene.with_(control_points=points.expand_as(scene.control_points)))
+        return conditions(scene.with_(control_points=self.ideal.expand_as(scene.control_points)))
 
 
 def mirrored_inputs(inputs: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
