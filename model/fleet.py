@@ -31,7 +31,7 @@ from torch import Tensor
 from model.effects import JUELICH_LATITUDE, Effect, of_light
 from model.effects.blocking import Blocking
 from model.errors import ModelError, UnreachableError
-from model.forecast import Shot, align, altered
+from model.forecast import Shot, align, altered, optics_under
 from model.neighbours import Neighbours, outlines
 from model.plant import Cylinder, Heliostat, Receiver, TargetPlane
 from model.sunshape import transfer_table
@@ -159,9 +159,7 @@ class Superposition:
         acting = of_light(self.effects)
         if tile.obstacles is not None:
             acting = [effect for effect in acting if not isinstance(effect, Blocking)]
-        optics = self.optics
-        for effect in acting:
-            optics = effect.on_optics(optics)
+        optics = optics_under(acting, self.optics)
         table = transfer_table(optics.sun_shape, torch.float32, torch.device("cpu"))
         flux, power = torch.zeros(self.resolution, dtype=torch.float64), 0.0
         with torch.no_grad():

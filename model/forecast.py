@@ -107,6 +107,20 @@ class View:
         return flux.irradiance
 
 
+def optics_under(effects: Iterable[Effect], optics: Optics) -> Optics:
+    """The declared optics to what the light really meets under effects."""
+    for effect in in_light_order(effects):
+        optics = effect.on_optics(optics)
+    return optics
+
+
+def images_under(effects: Iterable[Effect], flux: Tensor, window: Window) -> Tensor:
+    """Irradiance (B, rows, columns) over ``window`` to what a camera with effects shows of it."""
+    for effect in in_light_order(effects):
+        flux = effect.on_image(flux, window)
+    return flux
+
+
 @dataclass(frozen=True, eq=False)
 class Group:
     """Aligned shots whose mirrors are alike in their splines.
@@ -177,21 +191,16 @@ class Aligned:
 
         ``tracer`` takes the place of the convolution tracer.
         """
-        view, optics = view or View(), optics or Optics()
-        for effect in in_light_order(effects):
-            optics = effect.on_optics(optics)
+        view, met = view or View(), optics_under(effects, optics or Optics())
         by_tracer = tracer or view.trace
-        return self._each_window(view, lambda group, window, rows: by_tracer(group.scene.subset(rows), window, optics))
+        return self._each_window(view, lambda group, window, rows: by_tracer(group.scene.subset(rows), window, met))
 
     def photographs(self, flux: Tensor, effects: Iterable[Effect], view: View | None = None) -> Tensor:
         """What the effects of the camera make of ``flux`` (B, rows, columns), which was traced in the same view."""
-        ordered = in_light_order(effects)
+        acting = list(effects)
 
         def photograph(group: Group, window: Window, rows: list[int]) -> Tensor:
-            image = flux[[group.rows[row] for row in rows]]
-            for effect in ordered:
-                image = effect.on_image(image, window)
-            return image
+            return images_under(acting, flux[[group.rows[row] for row in rows]], window)
 
         return self._each_window(view or View(), photograph)
 

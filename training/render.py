@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from model.effects import Effect, in_light_order
+from model.effects import Effect
 from model.effects.background import Background
 from model.effects.camera_response import CameraResponse
 from model.effects.camera_shoulder import CameraShoulder
 from model.effects.slope_error import SlopeError
 from model.effects.sun_shape import SunShapeEffect
 from model.effects.target_registration import TargetRegistration
+from model.forecast import images_under, optics_under
 from model.frames import sun_direction_at
 from model.images import normalized
 from model.network.architecture import CONDITIONS, IMAGE_SIZE
@@ -210,13 +211,9 @@ class Camera:
     @staticmethod
     def _seen(scene: Scene, effects: Sequence[Effect]) -> Tensor:
         """Images (B, 64, 64) of a scene as effects on light and camera make them."""
-        window, optics = Window(on_spot=True), Optics()
-        for effect in effects:
-            optics = effect.on_optics(optics)
-        images = trace(scene, window, optics, samples=16, padding=0.25).irradiance.clamp(min=0)
-        for effect in in_light_order(effects):
-            images = effect.on_image(images, window)
-        return images
+        window = Window(on_spot=True)
+        flux = trace(scene, window, optics_under(effects, Optics()), samples=16, padding=0.25).irradiance
+        return images_under(effects, flux.clamp(min=0), window)
 
     def _developed(self, images: Tensor, share: float, rng: np.random.Generator) -> Tensor:
         """Errors of centring, noise and 8-bit rounding of images (B, R, C), in shares of their peaks."""
