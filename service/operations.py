@@ -1,6 +1,6 @@
 """What the command line, the demo and REST do, as plain functions: measure, predict, forecast, study."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -24,6 +24,7 @@ from model.study import study as study_photographs
 from model.surface import COLUMNS, DEGREE, FACETS, ROWS, control_points
 from model.tracing import Optics
 from model.tracing.convolution import central_rays
+from service.progress import Progress, quiet
 
 Array = NDArray[np.float64]
 Method = Literal["network", "refined"]
@@ -197,7 +198,7 @@ def study(
     optics: Optics,
     effects: Sequence[Effect] = (),
     options: StudyOptions | None = None,
-    progress: Callable[[str], None] = lambda message: None,
+    progress: Progress = quiet,
 ) -> Study:
     """Which effects photographs demand that a model with these optics and effects lacks; see `model.study.study`."""
     return study_photographs(photographs, optics, effects, options, progress)

@@ -1,7 +1,7 @@
 """What a running service holds: settings, database, image store, and the model behind one narrow door."""
 
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from importlib import import_module
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from service import meters
 from service.database import Database
 from service.images import ImageStore
+from service.progress import Progress
 from service.settings import Settings
 
 if TYPE_CHECKING:  # these bring the tracer's libraries with them, which take seconds to load
@@ -88,7 +89,7 @@ class Operations(Protocol):
         optics: "Optics",
         effects: Sequence["Effect"] = (),
         options: "StudyOptions | None" = None,
-        progress: Callable[[str], None] = ...,
+        progress: Progress = ...,
     ) -> "Study":
         """Which effects photographs demand that a model with these optics and effects lacks."""
 

@@ -1,6 +1,6 @@
 """The study of a measurement folder: ``heliotwin study``."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from model.study import Photograph, Study, StudyOptions, study
 from model.surface import DEGREE, control_points
 from service.folder import check_surfaces, measure, read_image, surface_of
 from service.paint import Measurement, MeasurementFolder, read_json
+from service.progress import Progress, quiet
 
 CENTERED_SIDE = 6.1
 """Side [m] of PAINT's ``flux-centered.png``."""
@@ -109,7 +110,7 @@ def study_folder(
     surfaces: str = "measured",
     options: StudyOptions | None = None,
     effects: Sequence[Effect] = (),
-    progress: Callable[[str], None] = lambda message: None,
+    progress: Progress = quiet,
 ) -> FolderStudy:
     """Which effect a folder's photographs demand beyond its declared model and ``effects``, at its plant's latitude.
 
