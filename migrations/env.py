@@ -1,11 +1,11 @@
-"""How Alembic reaches the database: the connection that `service.database` hands in, or one from the settings."""
+"""How Alembic reaches the database: the connection that `service.store.database` hands in, or one from the settings."""
 
 from alembic import context
 from sqlalchemy import Connection, text
 
-from service.database import make_engine
-from service.settings import Settings
-from service.tables import Base
+from service.store.database import make_engine
+from service.base.settings import Settings
+from service.store.tables import Base
 
 # Any fixed number: it names the lock that lets one migration run at a time on PostgreSQL.
 _MIGRATION_LOCK = 0x68656C696F
@@ -17,7 +17,7 @@ def _migrate(connection: Connection) -> None:
         connection=connection,
         target_metadata=Base.metadata,
         render_as_batch=is_sqlite,
-        transactional_ddl=True,  # on SQLite too: service.database begins real transactions
+        transactional_ddl=True,  # on SQLite too: service.store.database begins real transactions
     )
     with context.begin_transaction():
         if not is_sqlite:

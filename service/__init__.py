@@ -1,1 +1,1 @@
-"""REST, storage, command line and PAINT import around `model`."""
+"""The service: eight rooms. base, drawing <- sources, store <- twin <- jobs <- web <- cli."""

@@ -26,9 +26,9 @@ from model.study.fitting import Fitter
 from model.study.judging import accuracies
 from model.study.photographs import Forecaster
 from model.study.unknowns import Unknowns
-from service.folder import observe, predict_folder, surface_errors
-from service.paint import measured_heights, read_folder
-from service.study import photographs_of, study_folder
+from service.cli.folder import observe, predict_folder, surface_errors
+from service.cli.folder_study import photographs_of, study_folder
+from service.sources.folder import measured_heights, read_folder
 from tests.benchmarks import data_folder
 from training.render import CleanCamera, Situations, load_field, places
 from training.surfaces import load_surfaces, split_by_heliostat

@@ -23,13 +23,15 @@ from model.refinement import default_prior
 from model.sunshape import Pillbox
 from model.surface import control_points
 from model.tracing import Optics
-from service import jobs, store
-from service.demo_plant import ORIGIN, properties
-from service.handlers import KINDS
-from service.runtime import Runtime
-from service.settings import Settings
-from service.store import NewSurface
-from service.workers import Worker
+from service import store
+from service.base.settings import Settings
+from service.cli.demo_plant import ORIGIN, properties
+from service.jobs.asking import ask_for
+from service.jobs.kinds import KINDS
+from service.jobs.worker import Worker
+from service.store import queue
+from service.store.surfaces import NewSurface
+from service.twin.runtime import Runtime
 from tests.field_rays import Land, onto_cylinder, onto_plane, trace_field
 
 AREA = 33.0
@@ -165,11 +167,11 @@ def stored_field() -> None:
                 z = prior.surface(rng.normal(size=len(prior.basis)))
                 store.add_surface(session, row, NewSurface("measured", z, 0 * z, control_points(one, z)))
         sun = {"azimuth_deg": SUN[0], "elevation_deg": SUN[1]}
-        job = jobs.ask_for(runtime, "forecasts", {"target": "plane", "sun": sun}, "bench", None)
+        job = ask_for(runtime, "forecasts", {"target": "plane", "sun": sun}, "bench", None)
         with Meter() as meter:
             Worker(runtime, KINDS, "bench", threading.Event()).work()
         with runtime.database.reading() as session:
-            result = jobs.get_job(session, job.id).result or {}
+            result = queue.get_job(session, job.id).result or {}
         print(f"  the same as a job of the service, SQLite: {meter}; {result['heliostats']} heliostats")
         runtime.close()
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from service.folder import forecast_folder
-from service.paint import read_folder
+from service.cli.folder import forecast_folder
+from service.sources.folder import read_folder
 from tests.benchmarks import data_folder
 
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from model.imaging import MeasuredFlux, center_of_mass, decode_image, measure
 from model.plant import Plant, TargetPlane
-from service.paint import read_json, read_targets
+from service.sources.documents import read_json, read_targets
 from tests.benchmarks import data_folder
 
 TOWER = "WRI1030197-tower-measurements.json"

@@ -29,8 +29,8 @@ from model.study import Photograph, Study, StudyOptions, study
 from model.study.judging import accuracies
 from model.study.photographs import Forecaster
 from model.tracing import Optics
-from service.paint import read_folder
-from service.study import study_folder
+from service.cli.folder_study import study_folder
+from service.sources.folder import read_folder
 from tests.benchmarks import data_folder
 from tests.undeclared.generator import MeasurementSet, generate, mirrors
 from tests.undeclared.world import CATALOGUE, OUTSIDE

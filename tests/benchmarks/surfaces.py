@@ -11,9 +11,9 @@ from model.network.predictor import default_predictor
 from model.observation import Observation
 from model.plant import Heliostat
 from model.refinement import misfits, refine
-from service import folder as verbs
-from service.folder import choose, surface_errors
-from service.paint import MeasurementFolder, measured_heights, read_folder
+from service.cli import folder as verbs
+from service.cli.folder import choose, surface_errors
+from service.sources.folder import MeasurementFolder, measured_heights, read_folder
 from tests.benchmarks import data_folder
 
 IMAGES = 8

@@ -10,8 +10,8 @@ from pathlib import Path
 import httpx
 import pytest
 
-from service import keys
-from service.database import Database
+from service.store import keys
+from service.store.database import Database
 from tests.faults.harness import Process, Store
 from tests.service.conftest import free_port, metadata, png
 

@@ -19,9 +19,9 @@ import jsonschema
 import pytest
 import yaml
 
-from service.metrics import registry
-from service.runtime import Runtime
-from service.settings import Settings
+from service.base.settings import Settings
+from service.twin.runtime import Runtime
+from service.web.metrics import registry
 
 ROOT = Path(__file__).parents[2]
 DOCKER = ROOT / "docker"

@@ -19,10 +19,10 @@ import httpx
 import psycopg
 from sqlalchemy import make_url
 
-from service.backup import images_of
-from service.database import Database
-from service.inspection import inspect_store
-from service.settings import Settings
+from service.base.settings import Settings
+from service.store.backup import images_of
+from service.store.check import inspect_store
+from service.store.database import Database
 from tests.service.conftest import POSTGRES, free_port, metadata, properties_document, tower_document
 
 ROOT = Path(__file__).parents[2]

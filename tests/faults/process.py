@@ -11,10 +11,12 @@ from datetime import datetime, timedelta, tzinfo
 from pathlib import Path
 from typing import Any
 
-from service import runtime, server, tables
-from service.handlers import KINDS
-from service.settings import Settings
-from service.workers import work
+from service.base.settings import Settings
+from service.jobs.kinds import KINDS
+from service.jobs.worker import work
+from service.store import tables
+from service.twin import runtime
+from service.web import server
 from tests.service.conftest import FakeOperations
 
 
@@ -27,7 +29,7 @@ class SlowOperations(FakeOperations):
 
 
 class ShiftedClock(datetime):
-    """What `service.tables.now`, from which all of the service has the time, asks."""
+    """What `service.store.tables.now`, from which all of the service has the time, asks."""
 
     @classmethod
     def now(cls, tz: tzinfo | None = None) -> datetime:  # type: ignore[override]

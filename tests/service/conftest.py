@@ -27,11 +27,11 @@ from model.fleet import FleetFlux
 from model.imaging import MeasuredFlux, Quality
 from model.observation import Observation, SurfacePrediction
 from model.plant import Heliostat, TargetPlane
-from service.app import create_app
-from service.database import Database
-from service.operations import Forecast
-from service.settings import Settings
-from service.tables import Base
+from service.base.settings import Settings
+from service.store.database import Database
+from service.store.tables import Base
+from service.twin.compute import Forecast
+from service.web.app import create_app
 
 with warnings.catch_warnings():
     # Starlette's client prefers the successor of httpx, which the environment does not hold.
@@ -145,7 +145,7 @@ def database(store_url: URL) -> Iterator[Database]:
 
 @dataclass
 class FakeOperations:
-    """Answers like `service.operations` at no cost, and remembers what it was asked.
+    """Answers like `service.twin.compute` at no cost, and remembers what it was asked.
 
     An image whose first pixel is 0 is refused; a forecast that aims below the ground is out of reach.
     """

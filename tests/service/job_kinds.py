@@ -10,11 +10,12 @@ from pydantic import Field
 from sqlalchemy.exc import OperationalError
 
 from model.errors import InvalidInputError
-from service.runtime import Operations
-from service.schemas import Model
-from service.settings import Settings
-from service.tables import AuditRow
-from service.workers import Context, Kind, Kinds, Result, work
+from service.base.fields import Model
+from service.base.settings import Settings
+from service.jobs.kind import Context, Kind, Kinds, Result
+from service.jobs.worker import work
+from service.store.tables import AuditRow
+from service.twin.runtime import Operations
 
 
 class SquareIn(Model):
@@ -49,10 +50,10 @@ def square(context: Context, payload: SquareIn) -> Result:
 
 
 def _attempt(context: Context) -> int:
-    from service import jobs
+    from service.store import queue
 
     with context.runtime.database.reading() as session:
-        return jobs.get_job(session, context.lease.job_id).attempts
+        return queue.get_job(session, context.lease.job_id).attempts
 
 
 TEST_KINDS: Kinds = {"squares": Kind("squares", SquareIn, square, "Square a number.")}

@@ -1,0 +1,1 @@
+"""What every room stands on: settings, logs, names, faults, types of fields."""

@@ -1,0 +1,167 @@
+"""Types of the fields that requests and answers share, with their bounds and units.
+
+Numbers are finite, unknown keys are refused, and names fit a pattern that is safe in paths and URLs.
+"""
+
+from datetime import UTC, datetime
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import AfterValidator, AwareDatetime, BaseModel, BeforeValidator, ConfigDict, Field, StringConstraints
+
+from model.plant import Cylinder, TargetPlane
+from service.base.names import IDENTIFIER, NAME
+
+Name = Annotated[
+    str,
+    StringConstraints(pattern=NAME),
+    Field(description="1 to 32 letters, digits, underscores and hyphens.", examples=["AA39"]),
+]
+
+Identifier = Annotated[
+    str,
+    StringConstraints(pattern=IDENTIFIER),
+    Field(description="1 to 64 letters, digits, underscores and hyphens.", examples=["205363"]),
+]
+
+MeasurementName = Annotated[
+    str,
+    StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,95}$"),
+    Field(description="The `id` of a measurement, as the service gave it.", examples=["205363"]),
+]
+
+Kind = Literal["raw", "cropped", "flux", "flux-centered"]
+Source = Literal["measured", "network", "refined", "imported"]
+Method = Literal["network", "refined"]
+Verdict = Literal["effect", "none", "unexplained"]
+State = Literal["queued", "running", "done", "failed", "cancelled"]
+Metres = Annotated[float, Field(ge=-1e6, le=1e6)]
+Position = Annotated[tuple[Metres, Metres, Metres], Field(description="East, north, up of the tower base [m].")]
+
+Direction = tuple[
+    Annotated[float, Field(ge=-1e3, le=1e3)],
+    Annotated[float, Field(ge=-1e3, le=1e3)],
+    Annotated[float, Field(ge=-1e3, le=1e3)],
+]
+
+Wgs84 = tuple[
+    Annotated[float, Field(ge=-90, le=90)],
+    Annotated[float, Field(ge=-180, le=180)],
+    Annotated[float, Field(ge=-1e4, le=1e5)],
+]
+
+Azimuth = Annotated[float, Field(ge=-360, le=360, description="Sun azimuth from south, positive to the east [deg].")]
+Elevation = Annotated[float, Field(gt=0, le=90, description="Sun elevation above the horizon [deg].")]
+Extent = Annotated[float, Field(ge=0.01, le=1e3)]
+
+Moment = Annotated[
+    AwareDatetime,
+    Field(ge=datetime(1970, 1, 1, tzinfo=UTC), lt=datetime(9000, 1, 1, tzinfo=UTC)),
+    AfterValidator(lambda moment: moment.astimezone(UTC)),
+]
+
+Version = Annotated[int, Field(ge=1, le=2**31 - 1)]
+
+ModelVersion = Annotated[
+    Version | None,
+    Field(description="Number of a version of the plant's model, see /v1/models; the current one without it."),
+]
+
+
+class Model(BaseModel):
+    """Base of the requests: finite numbers, no unknown keys."""
+
+    model_config = ConfigDict(allow_inf_nan=False, extra="forbid", frozen=True)
+
+
+class Plane(Model):
+    """A rectangle in space, seen from its lit side."""
+
+    center: Position
+    normal: Direction = Field(description="Normal of the lit side, east-north-up; need not be of unit length.")
+    up: Direction = Field(
+        default=(0.0, 0.0, 1.0), description="Upward direction of the image, not parallel to the normal."
+    )
+    width: Extent = Field(description="[m]")
+    height: Extent = Field(description="[m]")
+
+    def named(self, name: str) -> TargetPlane:
+        """The model's plane of this name."""
+        return TargetPlane(
+            name=name,
+            center=np.array(self.center),
+            normal=np.array(self.normal),
+            up=np.array(self.up),
+            width=self.width,
+            height=self.height,
+        )
+
+
+class ReceiverIn(Model):
+    """A receiver that is a part of a cylinder, or all of it, lit from outside."""
+
+    center: Position = Field(description="The middle of the lit surface: east, north, up of the tower base [m].")
+    normal: Direction = Field(description="Normal there, away from the axis, east-north-up; of any length.")
+    up: Direction = Field(default=(0.0, 0.0, 1.0), description="Along the axis, upwards in the map.")
+    radius: Annotated[float, Field(ge=0.01, lt=1e3)] = Field(description="[m]")
+    height: Extent = Field(description="Along the axis [m].")
+    opening_deg: float = Field(
+        default=360.0, gt=0, le=360, description="Angle of the lit surface, half of it to each side of its middle."
+    )
+
+    def named(self, name: str) -> Cylinder:
+        """The model's receiver of this name."""
+        return Cylinder(
+            name=name,
+            center=np.array(self.center),
+            normal=np.array(self.normal),
+            up=np.array(self.up),
+            radius=self.radius,
+            height=self.height,
+            opening_deg=self.opening_deg,
+        )
+
+
+class Sun(Model):
+    """Where the sun stands."""
+
+    azimuth_deg: Azimuth
+    elevation_deg: Elevation
+
+
+def _square(value: Any) -> Any:
+    return (value, value) if isinstance(value, int) and not isinstance(value, bool) else value
+
+
+Side = Annotated[int, Field(ge=8, le=1024)]
+
+Resolution = Annotated[
+    tuple[Side, Side],
+    BeforeValidator(_square),
+    Field(description="Rows and columns of the map, or one number for both."),
+]
+
+
+class AccuracyOut(BaseModel):
+    """How well held-out photographs are forecast."""
+
+    accuracy_mean: float = Field(description="[1]")
+    accuracy_median: float = Field(description="[1]")
+    per_image: dict[str, float] = Field(description="By heliostat and measurement, `H/ID` [1].")
+
+
+class StudyReport(BaseModel):
+    """What a study found; the report of `heliotwin study` is one, too."""
+
+    model_config = ConfigDict(extra="allow")
+
+    verdict: Verdict = Field(description="effect: it is found; none: nothing is missing; unexplained: something is.")
+    conclusion: str = ""
+    images: dict[str, int] = Field(description="How many were fitted and how many judged the fit.")
+    before: AccuracyOut = Field(description="By the model that the study was made with.")
+    after: AccuracyOut = Field(description="With the effects that were found.")
+    noise_floor: float = Field(description="Error that the photographs' noise alone makes [1].")
+    unexplained_share: float = Field(description="Share of the error beyond the noise that is left [1].")
+    effects: list[dict[str, Any]] = Field(description="What was found: parameters with 95 % intervals, gain.")
+    candidates: list[dict[str, Any]] = Field(description="Every effect tried by itself, the best first.")
+    skipped: dict[str, str] = Field(default={}, description="What was left out, with the reasons.")

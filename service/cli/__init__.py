@@ -1,0 +1,1 @@
+"""The command `heliotwin`: one file a group of verbs."""

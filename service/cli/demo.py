@@ -1,0 +1,287 @@
+"""The demonstration: photographs in, stored mirror surfaces and flux forecasts out, with a table and pictures."""
+
+import html
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from model.errors import ModelError
+from model.frames import sun_angles
+from model.imaging.window import center_of_mass, flux_window
+from model.metrics import flux_accuracy
+from model.network.architecture import MAX_IMAGES
+from model.observation import FLUX_WINDOW, Observation
+from model.plant import Heliostat
+from model.tracing import Optics
+from service.base.arrays import unpack
+from service.base.settings import Settings
+from service.cli.demo_plant import write_plant
+from service.cli.folder import choose, observe, surface_errors, write_json
+from service.drawing.pictures import comparison_picture, surface_picture
+from service.sources.folder import MeasurementFolder, measured_heights, read_folder
+from service.twin import compute
+from service.twin.compute import Method
+from service.twin.forecast import ForecastRequest, make_forecast
+from service.twin.importing import import_folder
+from service.twin.prediction import predict_surface
+from service.twin.runtime import Runtime
+
+Array = NDArray[np.float64]
+
+HELD_OUT = 4
+"""Every fourth image is kept from the prediction, to judge it by."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """What came out for one heliostat; accuracies are means over the judged images, errors in mm.
+
+    ``held_out`` says whether the judged images were kept from the prediction; with few images they cannot be.
+    """
+
+    heliostat: str
+    used: int
+    judged: int
+    held_out: bool
+    accuracy_ideal: float
+    accuracy_network: float
+    accuracy_refined: float
+    accuracy_measured: float | None
+    error_network_mm: float | None
+    error_refined_mm: float | None
+    pictures: tuple[str, ...]
+
+
+def run_demo(data: Path | None, out: Path, console: Console, quiet: bool = False) -> dict[str, Any]:
+    """Run the main job on the embedded plant or on a folder; everything it makes lies under ``out``."""
+    out.mkdir(parents=True, exist_ok=True)
+    with _bars(console, quiet) as bars:
+        root = data
+        if root is None:
+            root = out / "plant"
+            task = bars.add_task("photograph a plant", total=4)
+            write_plant(root, lambda name: bars.update(task, description=f"photograph {name}", advance=1))
+        folder = read_folder(root)
+        # A store holds one plant: demonstrations on different data under one folder keep out of each other's way.
+        store = out / f"store-{folder.plant.name}"
+        runtime = _open_store(store)
+        try:
+            count = sum(len(m.images) for name in folder.plant.heliostats for m in folder.measurements(name))
+            task = bars.add_task("import", total=count + len(folder.plant.heliostats))
+            imported = import_folder(runtime, folder, lambda name: bars.update(task, description=name, advance=1))
+            results, skipped = _predict_all(runtime, folder, out, bars)
+        finally:
+            runtime.close()
+    if not results:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in list(skipped.items())[:3])
+        raise ModelError(f"{root}: no heliostat had an image that could be used ({reasons})")
+    report = {
+        "data": str(root),
+        "store": imported["counts"],
+        "heliostats": [asdict(result) for result in results],
+        "skipped": {**skipped, **imported["skipped"]},
+    }
+    write_json(out / "report.json", report)
+    (out / "report.html").write_text(_page(report, results), encoding="utf-8")
+    if not quiet:
+        _print(console, results, out, store)
+    return report
+
+
+def _bars(console: Console, quiet: bool) -> Progress:
+    columns = (TextColumn("{task.description:<34}"), BarColumn(), TextColumn("{task.completed}/{task.total}"))
+    return Progress(*columns, TimeElapsedColumn(), console=console, disable=quiet)
+
+
+def _open_store(folder: Path) -> Runtime:
+    runtime = Runtime.from_settings(Settings(data_dir=folder, database_url=None, host="127.0.0.1"))
+    runtime.database.upgrade()
+    return runtime
+
+
+def _predict_all(
+    runtime: Runtime, folder: MeasurementFolder, out: Path, bars: Progress
+) -> tuple[list[Result], dict[str, str]]:
+    results, skipped = [], {}
+    task = bars.add_task("predict and forecast", total=len(folder.plant.heliostats))
+    for name in folder.plant.heliostats:
+        bars.update(task, description=f"predict and forecast {name}")
+        observed = [observe(folder, measurement) for measurement in folder.measurements(name)]
+        usable = [o for o in observed if isinstance(o, Observation)]
+        if usable:
+            results.append(_predict(runtime, folder, name, usable, out))
+        else:
+            skipped[name] = next((o for o in observed if isinstance(o, str)), "no image")
+        bars.update(task, advance=1)
+    return results, skipped
+
+
+def _split(observations: list[Observation]) -> tuple[list[Observation], list[Observation]]:
+    """Images to predict from and images to judge by; the same ones where there are fewer than four."""
+    if len(observations) < HELD_OUT:
+        return observations, observations
+    judged = observations[HELD_OUT - 1 :: HELD_OUT]
+    used = [o for o in observations if not any(o is j for j in judged)]
+    return choose(used, MAX_IMAGES), judged
+
+
+def _stored(runtime: Runtime, name: str, method: Method, used: Sequence[Observation]) -> Array:
+    """Predict from stored measurements, store the version, and give back its heights (4, 8, 8) [m]."""
+    row = predict_surface(runtime, name, method, [o.identifier for o in used])
+    return unpack(row.arrays)["z"].astype(np.float64)
+
+
+def _predict(
+    runtime: Runtime, folder: MeasurementFolder, name: str, observations: list[Observation], out: Path
+) -> Result:
+    heliostat = folder.plant.heliostats[name]
+    used, judged = _split(observations)
+    surfaces: dict[str, Array | None] = {"ideal": None}
+    surfaces["network"] = _stored(runtime, name, "network", used)
+    surfaces["refined"] = _stored(runtime, name, "refined", used)
+    _store_forecast(runtime, name, judged[0])
+    fluxes = {key: [_forecast(heliostat, o, folder.optics, (z, None)) for o in judged] for key, z in surfaces.items()}
+    errors: dict[str, dict[str, float]] = {}
+    measured = folder.measured_surface(name)
+    if measured is not None:
+        fluxes["measured"] = [_forecast(heliostat, o, folder.optics, (None, measured)) for o in judged]
+        truth = measured_heights(heliostat, measured)
+        errors = {key: surface_errors(z, truth) for key, z in surfaces.items() if z is not None}
+        surfaces["measured"] = truth
+    accuracies = {
+        key: float(np.mean([flux_accuracy(o.flux, f) for o, f in zip(judged, images, strict=True)]))
+        for key, images in fluxes.items()
+    }
+    return Result(
+        heliostat=name,
+        used=len(used),
+        judged=len(judged),
+        held_out=len(observations) >= HELD_OUT,
+        accuracy_ideal=accuracies["ideal"],
+        accuracy_network=accuracies["network"],
+        accuracy_refined=accuracies["refined"],
+        accuracy_measured=accuracies.get("measured"),
+        error_network_mm=errors.get("network", {}).get("mae_mm"),
+        error_refined_mm=errors.get("refined", {}).get("mae_mm"),
+        pictures=_draw(out, name, surfaces, judged, fluxes["refined"]),
+    )
+
+
+def _store_forecast(runtime: Runtime, name: str, observation: Observation) -> None:
+    """Keep one forecast, as the calibration system would ask for it."""
+    azimuth, elevation = sun_angles(observation.sun)
+    request = ForecastRequest(
+        heliostat=name,
+        sun_azimuth_deg=float(azimuth),
+        sun_elevation_deg=float(elevation),
+        target=observation.target.name,
+    )
+    make_forecast(runtime, request)
+
+
+def _forecast(
+    heliostat: Heliostat, observation: Observation, optics: Optics, surface: tuple[Array | None, Any]
+) -> Array:
+    """Forecast (64, 64) in the window of an observation, about its own centre of mass.
+
+    It is traced in a wider window first, because the centre of mass of an image is not quite that of its rays.
+    """
+    z, measured = surface
+    wide = 1.5 * FLUX_WINDOW
+    traced = compute.forecast(
+        heliostat,
+        z,
+        observation.sun,
+        observation.target,
+        spot=observation.center_of_mass,
+        resolution=(96, 96),
+        window=wide,
+        optics=optics,
+        surface=measured,
+    )
+    center = center_of_mass(traced.flux, (wide, wide))
+    return flux_window(traced.flux, (wide, wide), center, FLUX_WINDOW, 64)
+
+
+def _draw(
+    out: Path, name: str, surfaces: dict[str, Array | None], judged: list[Observation], forecasts: list[Array]
+) -> tuple[str, ...]:
+    """Surface maps, and measured beside forecast for every judged image; gives back their paths under ``out``."""
+    drawn = {
+        f"surfaces/{name}-{key}.png": surface_picture(z, f"{name}, {key}")
+        for key, z in surfaces.items()
+        if z is not None
+    }
+    for observation, flux in zip(judged, forecasts, strict=True):
+        title = f"{name}/{observation.identifier}: accuracy {flux_accuracy(observation.flux, flux):.3f}"
+        picture = comparison_picture(observation.flux, flux, FLUX_WINDOW, title)
+        drawn[f"flux/{name}-{observation.identifier}.png"] = picture
+    for path, content in drawn.items():
+        (out / path).parent.mkdir(parents=True, exist_ok=True)
+        (out / path).write_bytes(content)
+    return tuple(drawn)
+
+
+def _cell(value: float | None) -> str:
+    return "" if value is None else f"{value:.3f}"
+
+
+COLUMNS = ("name", "images", "ideal", "network", "refined", "measured", "net. mm", "ref. mm")
+CAPTION = (
+    "images: those predicted from + those kept to judge by; without + they are the same. ideal to measured: flux "
+    "accuracy with that surface; mm: error of the network's and the refined surface against the measured one"
+)
+
+
+def _row(result: Result) -> tuple[str, ...]:
+    images = f"{result.used} + {result.judged}" if result.held_out else str(result.used)
+    figures = (
+        result.accuracy_ideal,
+        result.accuracy_network,
+        result.accuracy_refined,
+        result.accuracy_measured,
+        result.error_network_mm,
+        result.error_refined_mm,
+    )
+    return (result.heliostat, images, *map(_cell, figures))
+
+
+def _print(console: Console, results: list[Result], out: Path, store: Path) -> None:
+    from service.cli.output import make_table
+
+    table = make_table("What the surfaces are worth", *COLUMNS)
+    table.caption, table.caption_justify = CAPTION, "left"
+    for result in results:
+        table.add_row(*_row(result))
+    console.print(table)
+    console.print(f"pictures and report: {out / 'report.html'}", highlight=False)
+    console.print(f"next: HELIOTWIN_DATA_DIR={store} heliotwin serve", highlight=False)
+
+
+def _page(report: dict[str, Any], results: list[Result]) -> str:
+    """A page of the table and the pictures; the pictures lie beside it."""
+    head = "".join(f"<th>{html.escape(c)}</th>" for c in COLUMNS)
+    rows = "".join("<tr>" + "".join(f"<td>{html.escape(c)}</td>" for c in _row(r)) + "</tr>" for r in results)
+    pictures = "".join(
+        f"<h2>{html.escape(r.heliostat)}</h2>"
+        + "".join(f'<img src="{html.escape(p)}" alt="{html.escape(Path(p).stem)}">' for p in r.pictures)
+        for r in results
+    )
+    skipped = "".join(
+        f"<li>{html.escape(name)}: {html.escape(reason)}</li>" for name, reason in report["skipped"].items()
+    )
+    return (
+        "<!doctype html><html lang=en><meta charset=utf-8><title>heliotwin demo</title>"
+        "<style>body{font:16px system-ui;margin:2rem;max-width:72rem}td,th{padding:.3rem .8rem;text-align:right}"
+        "td:first-child,th:first-child{text-align:left}img{max-width:100%;margin:.3rem}</style>"
+        f"<h1>heliotwin demo</h1><p>Data: {html.escape(report['data'])}. Accuracy is one minus the summed difference "
+        "of measured and forecast flux, in a 4 m window about the spot; errors are mean absolute differences of "
+        f"control heights. {html.escape(CAPTION)}.</p><table><tr>{head}</tr>{rows}</table>{pictures}"
+        f"<h2>Skipped</h2><ul>{skipped or '<li>none</li>'}</ul>"
+    )

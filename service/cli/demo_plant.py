@@ -1,0 +1,130 @@
+"""A small plant of the demonstration's own, written as a measurement folder: four heliostats, a target, photographs.
+
+The true mirrors are drawn from the surface prior, traced by the Monte Carlo tracer, which shares nothing with what
+predicts and forecasts, and photographed by a synthetic camera in perspective, with daylight, background and noise.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from model.frames import sun_angles, sun_direction_at
+from model.imaging.camera import CameraOptions, photograph
+from model.plant import Heliostat, Plant, TargetPlane
+from model.refinement import default_prior
+from model.surface import control_points
+from model.tracing import Scene, Window
+from model.tracing.alignment import align_to_spots
+from model.tracing.montecarlo import trace_montecarlo
+from service.base.progress import Progress, quiet
+from service.cli.folder import write_json
+
+Array = NDArray[np.float64]
+
+ORIGIN = np.array([50.9134, 6.3878, 87.0])
+POSITIONS = {
+    "AB12": (-44.0, 62.0, 1.7),
+    "AC31": (12.0, 41.0, 1.8),
+    "AF27": (38.0, 96.0, 1.9),
+    "AK08": (-72.0, 138.0, 1.8),
+}
+TARGET = TargetPlane(
+    "calibration_target", np.array([0.0, 0.0, 40.0]), np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]), 8.0, 7.0
+)
+IMAGES, RAYS, PIXELS = 8, 400_000, 112
+"""Photographs of each heliostat, rays and pixels along each side of each."""
+
+
+def properties(mirror: Heliostat, plant: Plant) -> dict[str, Any]:
+    """The heliostat as PAINT's ``heliostat-properties.json``."""
+    translations = {f"joint_translation_{axis}_{stage}": 0.0 for stage in (1, 2) for axis in "enu"}
+    return {
+        "heliostat_position": plant.to_wgs84(mirror.position).tolist(),
+        "height": mirror.height,
+        "width": mirror.width,
+        "initial_orientation": [0.0, -1.0, 0.0],
+        "kinematics_properties": {
+            "actuators": [{"type_axis": "ideal"}, {"type_axis": "ideal"}],
+            **translations,
+            "concentrator_translation_e": 0.0,
+            "concentrator_translation_n": float(mirror.mount.mirror_offset[2]),
+            "concentrator_translation_u": 0.0,
+        },
+        "facet_properties": {
+            "canting_type": "receiver canting",
+            "number_of_facets": len(mirror.facets),
+            "facets": [
+                {
+                    "translation_vector": facet.position.tolist(),
+                    "canting_e": facet.canting_x.tolist(),
+                    "canting_n": facet.canting_y.tolist(),
+                }
+                for facet in mirror.facets
+            ],
+        },
+    }
+
+
+def tower(plant: Plant) -> dict[str, Any]:
+    """The tower as PAINT's ``tower-measurements.json``."""
+    x, y = TARGET.width / 2, TARGET.height / 2
+    corners = {"upper_left": (-x, y), "upper_right": (x, y), "lower_left": (-x, -y), "lower_right": (x, -y)}
+    return {
+        "power_plant_properties": {"ID": plant.name, "coordinates": ORIGIN.tolist()},
+        TARGET.name: {
+            "type": "planar",
+            "normal_vector": TARGET.normal.tolist(),
+            "coordinates": {name: plant.to_wgs84(TARGET.to_enu(place)).tolist() for name, place in corners.items()},
+        },
+    }
+
+
+def suns(count: int, rng: np.random.Generator) -> Array:
+    """Unit vectors (count, 3): hours of the day through the seasons."""
+    hour_angle = np.linspace(-55, 55, count) + rng.uniform(-5, 5, count)
+    return sun_direction_at(rng.permutation(np.linspace(0, 22, count)), hour_angle, float(ORIGIN[0]))
+
+
+def photographs(
+    mirror: Heliostat, z: Array, count: int, rays: int, rng: np.random.Generator
+) -> tuple[Array, list[NDArray[np.uint8]]]:
+    """Suns (count, 3) and camera frames of one heliostat; its spot wanders about the target's centre."""
+    directions = suns(count, rng)
+    spots = TARGET.to_enu(rng.uniform(-0.6, 0.6, (count, 2)))
+    points, mirrors, planes = [control_points(mirror, z)] * count, [mirror] * count, [TARGET] * count
+    scene = Scene.build(mirrors, points, align_to_spots(mirrors, points, directions, planes, spots), directions, planes)
+    traced, _ = trace_montecarlo(scene, Window.of(TARGET, PIXELS, PIXELS), rays=rays, seed=int(rng.integers(2**31)))
+    frames = [
+        photograph(flux, TARGET, rng, CameraOptions(time_stamp=f"demo {mirror.name} image {index + 1}"))
+        for index, flux in enumerate(traced)
+    ]
+    return directions, frames
+
+
+def write_plant(
+    root: Path, progress: Progress = quiet, *, images: int = IMAGES, rays: int = RAYS, seed: int = 2024
+) -> None:
+    """Write the demonstration's measurement folder; the true surfaces lie in ``H/Deflectometry``."""
+    rng = np.random.default_rng(seed)
+    plant, prior = Plant("demo", ORIGIN), default_prior()
+    write_json(root / "demo-tower-measurements.json", tower(plant))
+    for number, (name, position) in enumerate(POSITIONS.items(), start=1):
+        progress(name)
+        mirror = Heliostat.juelich(name, position, float(np.linalg.norm(position - TARGET.center)))
+        z = prior.surface(rng.normal(0, 0.8, len(prior.basis)))
+        write_json(root / name / "Properties" / f"{name}-heliostat-properties.json", properties(mirror, plant))
+        (root / name / "Deflectometry").mkdir(parents=True, exist_ok=True)
+        (root / name / "Calibration").mkdir(parents=True, exist_ok=True)
+        points = control_points(mirror, z)
+        np.savez_compressed(
+            root / name / "Deflectometry" / f"{name}-nurbs-surface.npz", control_points=points, degrees=np.array([3, 3])
+        )
+        for index, (sun, frame) in enumerate(zip(*photographs(mirror, z, images, rays, rng), strict=True), start=1):
+            azimuth, elevation = sun_angles(sun)
+            stem = root / name / "Calibration" / f"{number}{index:02d}"
+            about = {"target_name": TARGET.name, "sun_azimuth": float(azimuth), "sun_elevation": float(elevation)}
+            write_json(stem.with_name(f"{stem.name}-calibration-properties.json"), about)
+            cv2.imwrite(str(stem.with_name(f"{stem.name}-raw.png")), cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))

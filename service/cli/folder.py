@@ -1,0 +1,356 @@
+"""The command line's verbs on a measurement folder: flux, predict, forecast.
+
+Each walks the heliostats, skips what lacks something and says why, writes its files under one folder and returns the
+report that it also writes there. A verb fails only if nothing is left.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.effects import Effect, effect_to_json, model_version
+from model.errors import InvalidInputError, ModelError
+from model.imaging import ImageKind, MeasuredFlux, decode_image
+from model.metrics import compare_on_target, surface_error
+from model.network.architecture import MAX_IMAGES
+from model.observation import Observation, SurfacePrediction, spread_suns
+from model.plant import Heliostat, TargetPlane
+from model.surface import split_canting
+from service.base.progress import Progress, quiet
+from service.sources.documents import IMAGE_KINDS, Measurement
+from service.sources.folder import MeasurementFolder, measured_heights, read_surface
+from service.twin import compute
+from service.twin.compute import Method
+
+Array = NDArray[np.float64]
+
+WINDOWS = (4.0, 6.0, 8.0)
+"""Sides [m] of the accuracy's window: the paper's, unless more than `SPILL` of the measured energy lies outside."""
+
+SPILL = 0.01
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write indented JSON, making the folder."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+
+def read_image(path: Path) -> NDArray[np.uint8]:
+    """Decode an image file; a file that is no image is named."""
+    try:
+        return decode_image(path.read_bytes())
+    except InvalidInputError as error:
+        raise InvalidInputError(f"{path}: {error}") from None
+
+
+@lru_cache(maxsize=512)
+def _measure(path: Path, kind: ImageKind, plane: TargetPlane) -> MeasuredFlux:
+    return compute.measure(read_image(path), kind, plane)
+
+
+def measure(folder: MeasurementFolder, measurement: Measurement, kind: str | None = None) -> MeasuredFlux:
+    """Flux of a measurement's most worked-out image, or of its image of one kind."""
+    chosen = kind or next(k for k in IMAGE_KINDS if k in measurement.images)
+    plane = folder.plant.targets[measurement.target]
+    return _measure(measurement.images[chosen], cast(ImageKind, chosen), plane)
+
+
+def _finish(folder: MeasurementFolder, report: dict[str, Any], path: Path, done: str) -> dict[str, Any]:
+    """Write the report with all that was skipped; refuse to call nothing a success."""
+    report["skipped"] = {**folder.skipped, **report["skipped"]}
+    write_json(path, report)
+    if not report[done]:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in list(report["skipped"].items())[:3])
+        raise ModelError(f"nothing was left to do, everything was skipped ({reasons}); see {path}")
+    return report
+
+
+# --- flux -------------------------------------------------------------------------------------------------------------
+
+
+def flux_folder(folder: MeasurementFolder, out: Path, progress: Progress = quiet) -> dict[str, Any]:
+    """Measure every camera frame or crop: ``OUT/H/ID-flux.png``, ``ID-flux-centered.npz``, ``quality.json``."""
+    report: dict[str, Any] = {"images": {}, "skipped": {}}
+    for name in folder.plant.heliostats:
+        measurements = folder.measurements(name)
+        if not measurements:
+            report["skipped"][name] = "no image"
+        for measurement in measurements:
+            progress(measurement.key)
+            kind = next((k for k in ("raw", "cropped", *IMAGE_KINDS) if k in measurement.images), "")
+            try:
+                measured = measure(folder, measurement, kind)
+            except ModelError as error:
+                report["skipped"][measurement.key] = str(error)
+                continue
+            entry = {"kind": kind, **asdict(measured.quality)}
+            if measured.flux is not None and measured.center_of_mass is not None:
+                spot = folder.plant.targets[measurement.target].to_enu(measured.center_of_mass)
+                entry["center_of_mass_m"] = [float(v) for v in measured.center_of_mass]
+                entry["center_of_mass_wgs84"] = [float(v) for v in folder.plant.to_wgs84(spot)]
+            _write_flux(out / name, measurement.identifier, measured)
+            report["images"][measurement.key] = entry
+    return _finish(folder, report, out / "quality.json", "images")
+
+
+def _write_flux(folder: Path, identifier: str, measured: MeasuredFlux) -> None:
+    """The flux over the whole target as an 8-bit picture, the centred window as numbers; nothing of a refused one."""
+    folder.mkdir(parents=True, exist_ok=True)
+    if measured.flux is not None:
+        write_gray(folder / f"{identifier}-flux.png", measured.flux)
+    if measured.centered is not None:
+        arrays = {"flux": measured.centered, "window_m": np.array(measured.window)}
+        if measured.center_of_mass is not None:
+            arrays["center_of_mass_m"] = measured.center_of_mass
+        np.savez_compressed(folder / f"{identifier}-flux-centered.npz", **arrays)  # type: ignore[arg-type]
+
+
+def write_gray(path: Path, image: NDArray[Any]) -> None:
+    """An 8-bit grey picture, the peak at 255."""
+    import cv2
+
+    scaled = np.round(np.asarray(image, dtype=np.float64) / max(float(image.max()), 1e-30) * 255).astype(np.uint8)
+    if not cv2.imwrite(str(path), scaled):
+        raise OSError(f"{path} could not be written")
+
+
+# --- predict ----------------------------------------------------------------------------------------------------------
+
+
+def observe(folder: MeasurementFolder, measurement: Measurement) -> Observation | str:
+    """What a measurement shows, or why it was refused."""
+    try:
+        measured = measure(folder, measurement)
+    except InvalidInputError as error:
+        return str(error)
+    if measured.centered is None:
+        return f"{measured.quality.reason}: {measured.quality.detail}"
+    target = folder.plant.targets[measurement.target]
+    spot = measurement.spot
+    if measured.center_of_mass is not None:
+        spot = target.to_enu(measured.center_of_mass)
+    return Observation(
+        flux=measured.centered,
+        sun=measurement.sun,
+        target=target,
+        center_of_mass=target.center if spot is None else spot,
+        identifier=measurement.identifier,
+        motor_position=measurement.motor_position,
+    )
+
+
+def choose(observations: list[Observation], count: int) -> list[Observation]:
+    """Up to ``count`` observations whose suns stand far apart."""
+    return [observations[i] for i in spread_suns(np.array([o.sun for o in observations]), count)]
+
+
+def predict_heliostat(
+    folder: MeasurementFolder, heliostat: Heliostat, method: Method, images: int
+) -> tuple[SurfacePrediction, dict[str, Any]]:
+    """Predict one heliostat's surface; the second value is its entry in ``predictions.json``."""
+    observed = {m.identifier: observe(folder, m) for m in folder.measurements(heliostat.name)}
+    usable = [o for o in observed.values() if isinstance(o, Observation)]
+    refused = {identifier: o for identifier, o in observed.items() if isinstance(o, str)}
+    if not usable:
+        reason = f"every image was refused: {next(iter(refused.values()))}" if refused else "no image"
+        raise InvalidInputError(reason)
+    predicted = compute.predict(heliostat, choose(usable, images), method, folder.optics, folder.effects)
+    entry: dict[str, Any] = {
+        "method": method,
+        "weights": predicted.weights,
+        "images": list(predicted.used),
+        "refused": refused,
+        "misfit": round(predicted.misfit, 4),
+        "trusted": predicted.trusted,
+        "strangeness": round(predicted.strangeness, 3),
+        "suspicious": list(predicted.suspicious),
+        "z_rms_mm": round(float(np.sqrt((predicted.z**2).mean()) * 1e3), 4),
+        "z_std_mean_mm": round(float(predicted.z_std.mean() * 1e3), 4),
+    }
+    measured = folder.measured_surface(heliostat.name)
+    if measured is not None:
+        entry["against_measured"] = surface_errors(predicted.z, measured_heights(heliostat, measured))
+    return predicted, entry
+
+
+def surface_errors(z: Array, truth: Array) -> dict[str, float]:
+    """Mean absolute errors [mm] of control heights: all, canting alone, waviness alone, and of the ideal surface."""
+    (canting, waviness), (true_canting, true_waviness) = split_canting(z), split_canting(truth)
+    errors = {
+        "mae_mm": surface_error(z, truth),
+        "mae_canting_mm": surface_error(canting, true_canting),
+        "mae_waviness_mm": surface_error(waviness, true_waviness),
+        "mae_ideal_mm": surface_error(np.zeros_like(truth), truth),
+    }
+    return {name: round(value * 1e3, 4) for name, value in errors.items()}
+
+
+def predict_folder(
+    folder: MeasurementFolder,
+    out: Path,
+    method: Method = "network",
+    images: int = MAX_IMAGES,
+    progress: Progress = quiet,
+) -> dict[str, Any]:
+    """Predict every heliostat's surface from up to ``images`` of its images; files as DESIGN.md, section 6."""
+    if not 1 <= images <= MAX_IMAGES:
+        raise InvalidInputError(f"--images must lie in 1 to {MAX_IMAGES}, got {images}")
+    report: dict[str, Any] = {"method": method, "heliostats": {}, "skipped": {}}
+    for name, heliostat in folder.plant.heliostats.items():
+        progress(name)
+        try:
+            predicted, entry = predict_heliostat(folder, heliostat, method, images)
+        except ModelError as error:
+            report["skipped"][name] = str(error)
+            continue
+        write_surface(out, name, predicted)
+        report["heliostats"][name] = entry
+    return _finish(folder, report, out / "predictions.json", "heliostats")
+
+
+def write_surface(out: Path, name: str, predicted: SurfacePrediction) -> None:
+    """``OUT/H/Deflectometry/H-nurbs-surface.npz``, readable as a measured surface."""
+    path = out / name / "Deflectometry" / f"{name}-nurbs-surface.npz"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(
+        path,
+        control_points=predicted.control_points,
+        z=predicted.z,
+        z_std=predicted.z_std,
+        degrees=np.array([3, 3]),
+    )
+
+
+# --- forecast ---------------------------------------------------------------------------------------------------------
+
+
+def check_surfaces(surfaces: str) -> None:
+    """Refuse a choice of surfaces that is none of those that verbs know."""
+    if surfaces not in ("measured", "ideal") and not Path(surfaces).is_dir():
+        raise InvalidInputError(f"--surfaces must be 'measured', 'ideal' or a folder of predictions, got {surfaces!r}")
+
+
+def surface_of(folder: MeasurementFolder, heliostat: Heliostat, surfaces: str) -> tuple[Array, int] | None:
+    """The surface to trace: None for the ideal one; refused where it is missing."""
+    if surfaces == "ideal":
+        return None
+    root = folder.root if surfaces == "measured" else Path(surfaces)
+    found = read_surface(root, heliostat)
+    if found is None:
+        raise InvalidInputError(f"no surface in {root / heliostat.name / 'Deflectometry'}")
+    return found
+
+
+def forecast_measurement(
+    folder: MeasurementFolder,
+    measurement: Measurement,
+    surface: tuple[Array, int] | None,
+    effects: Sequence[Effect] = (),
+) -> compute.Forecast:
+    """Flux over the whole target of a measurement, with ``effects`` besides those that are declared.
+
+    The heliostat is aligned by its measured spot; without one by its motors; without those at the target's centre.
+    """
+    heliostat, plane = folder.plant.heliostats[measurement.heliostat], folder.plant.targets[measurement.target]
+    motors = measurement.motor_position if heliostat.mount.actuators else None
+    return compute.forecast(
+        heliostat,
+        None,
+        measurement.sun,
+        plane,
+        spot=measurement.spot,
+        angles=None if motors is None else heliostat.mount.angles_from_motors(motors),
+        optics=folder.optics,
+        surface=surface,
+        effects=[*folder.effects, *effects],
+        latitude_deg=float(folder.plant.origin[0]),
+    )
+
+
+def accuracy_window(measured: NDArray[Any], size: tuple[float, float]) -> float:
+    """Side [m] of the smallest of `WINDOWS` that leaves out no more than `SPILL` of the measured energy."""
+    for window in WINDOWS:
+        if compare_on_target(measured, measured, size, window).measured_outside <= SPILL:
+            return window
+    return WINDOWS[-1]
+
+
+def compare(
+    folder: MeasurementFolder, measurement: Measurement, traced: compute.Forecast, window: float | None
+) -> dict[str, Any] | None:
+    """Accuracy of a forecast against the measurement's ``flux.png``, None where there is none."""
+    if "flux" not in measurement.images:
+        return None
+    measured = read_image(measurement.images["flux"]).astype(np.float64)
+    gray = measured.mean(axis=2) if measured.ndim == 3 else measured
+    plane = folder.plant.targets[measurement.target]
+    size = (plane.width, plane.height)
+    return asdict(compare_on_target(gray, traced.flux, size, window or accuracy_window(gray, size)))
+
+
+def forecast_folder(
+    folder: MeasurementFolder,
+    out: Path,
+    surfaces: str = "measured",
+    window: float | None = None,
+    progress: Progress = quiet,
+    effects: Sequence[Effect] = (),
+) -> dict[str, Any]:
+    """Forecast every measurement of a folder; ``OUT/H/ID-forecast.npz`` and ``OUT/forecast.json``.
+
+    ``effects`` come in addition to those that the folder declares.
+    """
+    check_surfaces(surfaces)
+    report: dict[str, Any] = {
+        "surfaces": surfaces,
+        "model_version": model_version([*folder.effects, *effects]),
+        "effects": [effect_to_json(effect) for effect in (*folder.effects, *effects)],
+        "measurements": {},
+        "skipped": {},
+    }
+    for name, heliostat in folder.plant.heliostats.items():
+        try:
+            surface = surface_of(folder, heliostat, surfaces)
+        except ModelError as error:
+            report["skipped"][name] = str(error)
+            continue
+        measurements = folder.measurements(name, with_images=False)
+        if not measurements:
+            report["skipped"][name] = "no measurement"
+        for measurement in measurements:
+            progress(measurement.key)
+            try:
+                entry = _forecast_entry(folder, measurement, surface, effects, out, window)
+            except ModelError as error:
+                report["skipped"][measurement.key] = str(error)
+                continue
+            report["measurements"][measurement.key] = entry
+    accuracies = [e["accuracy"] for e in report["measurements"].values() if "accuracy" in e]
+    report["accuracy_mean"] = float(np.mean(accuracies)) if accuracies else None
+    report["accuracy_median"] = float(np.median(accuracies)) if accuracies else None
+    return _finish(folder, report, out / "forecast.json", "measurements")
+
+
+def _forecast_entry(
+    folder: MeasurementFolder,
+    measurement: Measurement,
+    surface: tuple[Array, int] | None,
+    effects: Sequence[Effect],
+    out: Path,
+    window: float | None,
+) -> dict[str, Any]:
+    """Write the forecast of one measurement and give back its entry in ``forecast.json``."""
+    traced = forecast_measurement(folder, measurement, surface, effects)
+    path = out / measurement.heliostat / f"{measurement.identifier}-forecast.npz"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(path, flux=traced.flux)
+    entry: dict[str, Any] = {"target": measurement.target, "peak_w_m2": traced.peak, "power_w": traced.power}
+    comparison = compare(folder, measurement, traced, window)
+    return entry if comparison is None else {**entry, **comparison}

@@ -1,0 +1,45 @@
+"""The command ``heliotwin``."""
+
+import sys
+
+import typer
+from pydantic import ValidationError
+
+from model.errors import InvalidInputError, ModelError
+from service.base.faults import ServiceError
+from service.cli import keys, models, photographs, recovery, service
+
+app = typer.Typer(
+    name="heliotwin",
+    help="From a solar tower's target photographs to mirror surfaces and flux forecasts.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+for _group in (photographs, service, keys, models, recovery):
+    app.add_typer(_group.app)
+
+
+def main() -> None:
+    """Run the command; bad input ends with exit code 2 and one line, other failures of the model with 1."""
+    try:
+        app()
+    except InvalidInputError as error:
+        _fail(error, 2)
+    except ValidationError as error:
+        first = error.errors()[0]
+        _fail(f"setting {'.'.join(map(str, first['loc'])) or 'combination'}: {first['msg']}", 2)
+    except (ModelError, ServiceError, OSError) as error:
+        _fail(error, 1)
+
+
+def _fail(error: object, code: int) -> None:
+    typer.echo(f"heliotwin: {error}", err=True)
+    sys.exit(code)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,64 @@
+"""The commands ``heliotwin models ...``."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from service import store
+from service.cli.output import AsJson
+from service.cli.store import actor, writing
+from service.twin import versions
+
+app = typer.Typer(name="models", help="Versions of the plant's model: list, adopt, withdraw.", no_args_is_help=True)
+
+
+@app.command("list")
+def list_(as_json: AsJson = False) -> None:
+    """All versions, oldest first; the current one is the newest that is not withdrawn."""
+    from service.web.api.models import all_models
+
+    with writing() as session:
+        versions = all_models(session)
+    if as_json:
+        typer.echo(json.dumps([version.model_dump(mode="json") for version in versions], indent=1))
+        return
+    table = Table("version", "", "study", "adopted by", "withdrawn by")
+    for version in versions:
+        study = "" if version.study is None else str(version.study)
+        people = (version.adopted_by or "", version.withdrawn_by or "")
+        table.add_row(version.version, "current" if version.is_current else "", study, *people)
+    Console().print(table)
+
+
+@app.command()
+def adopt(
+    report: Annotated[Path, typer.Argument(help="Report of `heliotwin study`.", metavar="REPORT.json")],
+    force: Annotated[bool, typer.Option("--force", help="Also where its verdict is not `effect`.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Add what the study of a folder found to the model it was made with, which is used from then on."""
+    from service.sources.documents import read_json
+    from service.twin.study import model_of_report, row_of_report
+
+    document, name = read_json(report), report.name
+    with writing() as session:
+        model = model_of_report(session, document, name)
+        study = store.add_study(session, row_of_report(document, name, model, actor()))
+        row = versions.adopt(session, study.id, actor(), force)
+    typer.echo(json.dumps({"study": study.id, "version": row.version}) if as_json else f"{row.version} is current")
+
+
+@app.command()
+def withdraw(
+    study: Annotated[int, typer.Argument(help="The study that it was adopted from.", metavar="STUDY")],
+    as_json: AsJson = False,
+) -> None:
+    """Take back what was adopted from a study; the version before is current again."""
+    with writing() as session:
+        versions.withdraw(session, study, actor())
+        version = versions.get_model(session).version
+    typer.echo(json.dumps({"version": version}) if as_json else f"{version} is current")

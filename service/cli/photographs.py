@@ -1,0 +1,170 @@
+"""The verbs on a measurement folder: flux, predict, forecast, study."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.table import Table
+
+from model.errors import InvalidInputError
+from service.cli.output import AsJson, make_table, progress, show
+
+if TYPE_CHECKING:  # what reads folders brings the tracer's libraries with it, which take seconds to load
+    from service.sources.folder import MeasurementFolder
+    from service.twin.compute import Method
+
+app = typer.Typer()
+
+Folder = Annotated[Path, typer.Argument(help="Measurement folder in PAINT's layout.", metavar="DIR")]
+Out = Annotated[Path, typer.Option("--out", help="Folder to write to.", metavar="OUT")]
+Surfaces = Annotated[str, typer.Option(help="measured, ideal, or a folder that predict wrote.")]
+
+EffectsFile = Annotated[
+    Path | None,
+    typer.Option("--effects", help="Effects to add to the declared ones: JSON, or a study's report.", metavar="FILE"),
+]
+
+
+def _count(folder: "MeasurementFolder", with_images: bool = True) -> int:
+    return sum(len(folder.measurements(name, with_images)) for name in folder.plant.heliostats)
+
+
+@app.command()
+def flux(folder: Folder, out: Out, as_json: AsJson = False) -> None:
+    """Camera frames or crops to flux images: OUT/H/ID-flux.png, ID-flux-centered.npz, quality.json."""
+    from service.cli.folder import flux_folder
+    from service.sources.folder import read_folder
+
+    source = read_folder(folder)
+    with progress(_count(source), "flux") as step:
+        report = flux_folder(source, out, step)
+    table = make_table("Quality", "image", "accepted", "reason", "signal/background", "outside 4 m")
+    for key, entry in report["images"].items():
+        table.add_row(
+            key,
+            "yes" if entry["accepted"] else "no",
+            entry["reason"] or "",
+            f"{entry['signal_to_background']:.1f}",
+            f"{entry['energy_outside_window']:.3f}",
+        )
+    show(report, as_json, table)
+
+
+@app.command()
+def predict(
+    folder: Folder,
+    out: Out,
+    method: Annotated[
+        str, typer.Option(help="network, or refined: the network, then MAP through the tracer.")
+    ] = "network",
+    images: Annotated[int, typer.Option(help="Most images used for a heliostat, 1 to 8.")] = 8,
+    as_json: AsJson = False,
+) -> None:
+    """Mirror surfaces from images: OUT/H/Deflectometry/H-nurbs-surface.npz and OUT/predictions.json."""
+    from service.cli.folder import predict_folder
+    from service.sources.folder import read_folder
+
+    if method not in ("network", "refined"):
+        raise InvalidInputError(f"--method must be 'network' or 'refined', got {method!r}")
+    chosen: Method = "network" if method == "network" else "refined"
+    source = read_folder(folder)
+    with progress(len(source.plant.heliostats), "predict") as step:
+        report = predict_folder(source, out, chosen, images, step)
+    table = make_table("Surfaces", "heliostat", "images", "misfit", "rms [mm]", "error to measured [mm]")
+    for name, entry in report["heliostats"].items():
+        error = entry.get("against_measured", {}).get("mae_mm")
+        table.add_row(
+            name,
+            str(len(entry["images"])),
+            f"{entry['misfit']:.3f}",
+            f"{entry['z_rms_mm']:.3f}",
+            "" if error is None else f"{error:.3f}",
+        )
+    show(report, as_json, table)
+
+
+@app.command()
+def forecast(
+    folder: Folder,
+    out: Out,
+    surfaces: Surfaces = "measured",
+    effects: EffectsFile = None,
+    window: Annotated[
+        float | None, typer.Option(help="Side [m] of the accuracy's window; by the spot if not given.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Flux on the whole target for each measurement [W/m2]: OUT/H/ID-forecast.npz and OUT/forecast.json."""
+    from service.cli.folder import forecast_folder
+    from service.sources.documents import read_effects
+    from service.sources.folder import read_folder
+
+    added = () if effects is None else read_effects(effects)
+    source = read_folder(folder)
+    with progress(_count(source, with_images=False), "forecast") as step:
+        report = forecast_folder(source, out, surfaces, window, step, added)
+    table = make_table("Forecasts", "measurement", "accuracy", "window [m]", "outside", "peak [kW/m2]")
+    for key, entry in report["measurements"].items():
+        compared = "accuracy" in entry
+        table.add_row(
+            key,
+            f"{entry['accuracy']:.3f}" if compared else "",
+            f"{entry['window']:.0f}" if compared else "",
+            f"{entry['measured_outside']:.3f}" if compared else "",
+            f"{entry['peak_w_m2'] / 1000:.2f}",
+        )
+    if report["accuracy_mean"] is not None:
+        table.add_section()
+        table.add_row("mean", f"{report['accuracy_mean']:.3f}")
+    show(report, as_json, table)
+
+
+@app.command()
+def study(
+    folder: Folder,
+    out: Annotated[Path, typer.Option("--out", help="JSON file to write the report to.", metavar="REPORT.json")],
+    page: Annotated[
+        Path | None, typer.Option("--html", help="Write the report as one web page, too.", metavar="FILE")
+    ] = None,
+    surfaces: Surfaces = "measured",
+    effects: EffectsFile = None,
+    as_json: AsJson = False,
+) -> None:
+    """Which physical effect the photographs demand that the declared model lacks, and what it buys: REPORT.json."""
+    from service.cli.folder import write_json
+    from service.cli.folder_study import study_folder
+    from service.sources.documents import read_effects
+    from service.sources.folder import read_folder
+
+    for path in filter(None, (out, page)):
+        if path.is_dir():
+            raise InvalidInputError(f"{path} is a folder; name a file to write to")
+    added = () if effects is None else read_effects(effects)
+    source = read_folder(folder)
+    with progress(None, "study") as step:
+        done = study_folder(source, surfaces, effects=added, progress=step)
+    report = done.to_json()
+    write_json(out, report)
+    if page is not None:
+        from service.drawing.study_report import study_page
+
+        page.parent.mkdir(parents=True, exist_ok=True)
+        page.write_text(study_page(done.study, folder.resolve().name, done.skipped), encoding="utf-8")
+    show(report, as_json, _study_table(report))
+    if not as_json:
+        typer.echo(done.study.conclusion())
+
+
+def _study_table(report: dict[str, Any]) -> Table:
+    """Every candidate alone, the best first, and where the model stands before and after."""
+    table = make_table(f"Study: {report['verdict']}", "effect", "accuracy", "gain, 95 %", "score", "")
+    found = {effect["name"] for effect in report["effects"]}
+    for candidate in report["candidates"]:
+        low, high = candidate["accuracy_gain"]["ci95"]
+        accuracy, score = f"{candidate['accuracy_after']:.3f}", f"{candidate['score']:.1f}"
+        mark = "found" if candidate["name"] in found else ""
+        table.add_row(candidate["name"], accuracy, f"{low:.3f} to {high:.3f}", score, mark)
+    table.add_section()
+    for name in ("before", "after"):
+        table.add_row(f"all, {name}", f"{report[name]['accuracy_mean']:.3f}")
+    return table

@@ -1,0 +1,101 @@
+"""The verbs that run the service or fill its store: serve, worker, migrate, import, demo."""
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from service.cli.output import AsJson, console, make_table, progress, show
+from service.cli.photographs import Folder
+from service.store import database
+
+app = typer.Typer()
+
+
+@app.command("import")
+def import_(folder: Folder, as_json: AsJson = False) -> None:
+    """A measurement folder into the store; a second run changes nothing."""
+    from service.base.settings import Settings
+    from service.sources.folder import read_folder
+    from service.twin.importing import import_folder
+    from service.twin.runtime import Runtime
+
+    source = read_folder(folder)
+    runtime = Runtime.from_settings(Settings())
+    try:
+        if runtime.settings.migrates_on_start:
+            runtime.database.upgrade()
+        with progress(None, "import") as step:
+            report = import_folder(runtime, source, step)
+    finally:
+        runtime.close()
+    table = make_table("Imported", "what", "count")
+    for what, count in report["counts"].items():
+        table.add_row(what, str(count))
+    show(report, as_json, table)
+
+
+@app.command()
+def serve(
+    host: Annotated[str | None, typer.Option(help="Address to listen on; HELIOTWIN_HOST or 127.0.0.1.")] = None,
+    port: Annotated[int | None, typer.Option(help="Port to listen on; HELIOTWIN_PORT or 8000.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print where it listens as JSON before it starts.")] = False,
+) -> None:
+    """The REST service, on an embedded SQLite store unless HELIOTWIN_DATABASE_URL names another."""
+    from service.base.settings import Settings
+    from service.web import server
+
+    given: dict[str, Any] = {key: value for key, value in {"host": host, "port": port}.items() if value is not None}
+    settings = Settings(**given)
+    address = f"http://{settings.host}:{settings.port}"
+    if as_json:
+        typer.echo(json.dumps({"url": address, "docs": f"{address}/docs"}))
+    else:
+        console.print(f"heliotwin listens on {address}, its documentation on {address}/docs")
+    server.serve(settings)
+
+
+@app.command()
+def worker(
+    count: Annotated[int | None, typer.Option(help="Jobs at a time; HELIOTWIN_JOB_WORKERS or 1.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print what it works at as JSON before it starts.")] = False,
+) -> None:
+    """Work at the jobs of the store that `serve` uses, in a process of its own."""
+    from service.base.settings import Settings
+    from service.jobs.kinds import KINDS
+    from service.jobs.worker import work
+
+    settings = Settings() if count is None else Settings(job_workers=count)
+    if as_json:
+        typer.echo(json.dumps({"workers": settings.job_workers}))
+    work(settings, KINDS)
+
+
+@app.command()
+def migrate(
+    to: Annotated[
+        str, typer.Option(help="An older revision to go back to; what only newer ones can hold is lost.")
+    ] = "head",
+    as_json: AsJson = False,
+) -> None:
+    """Bring the database to its newest schema, or back to an older one."""
+    from service.base.settings import Settings
+
+    settings = Settings()
+    settings.data_dir.mkdir(parents=True, exist_ok=True)
+    report = {"revision": database.migrate(settings, to)}
+    show(report, as_json)
+    console.print(f"the schema stands at {report['revision']}", highlight=False)
+
+
+@app.command()
+def demo(
+    data: Annotated[Path | None, typer.Option(help="A measurement folder instead of the embedded plant.")] = None,
+    out: Annotated[Path, typer.Option(help="Folder to write to.")] = Path("out/demo"),
+    as_json: AsJson = False,
+) -> None:
+    """The main job on an embedded plant, or on a measurement folder, with pictures and a report."""
+    from service.cli.demo import run_demo
+
+    show(run_demo(data, out, console, quiet=as_json), as_json)

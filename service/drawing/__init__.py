@@ -1,0 +1,1 @@
+"""Pictures, charts and the report of a study, which can be mailed."""

@@ -1,0 +1,179 @@
+"""What the pages draw: maps, colour bars, the field and histories as plain numbers, which templates turn into SVG."""
+
+import base64
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import matplotlib
+import numpy as np
+from matplotlib.colors import to_hex
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
+
+from service.drawing.pictures import mirror_heights
+
+Array = NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class Tick:
+    """A labelled place on an axis: 0 at its low end, 1 at its high end."""
+
+    at: float
+    label: str
+
+
+def ticks(low: float, high: float, most: int = 5) -> tuple[Tick, ...]:
+    """Round numbers between ``low`` and ``high``."""
+    values = MaxNLocator(most, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high)
+    slack = 1e-9 * (high - low)
+    inside = [value for value in values if low - slack <= value <= high + slack]
+    return tuple(Tick((value - low) / (high - low), f"{round(value, 12) + 0.0:g}") for value in inside)
+
+
+@dataclass(frozen=True)
+class Scale:
+    """From numbers to colours: a colour map of matplotlib's between two numbers."""
+
+    colours: str
+    low: float
+    high: float
+    label: str
+
+    def pixels(self, values: Array) -> NDArray[np.uint8]:
+        """Red, green, blue and opacity (..., 4) of numbers; what is not finite is not drawn."""
+        shares = (np.ma.masked_invalid(values) - self.low) / (self.high - self.low)
+        return np.asarray(matplotlib.colormaps[self.colours](shares, bytes=True))
+
+    def names(self, values: Sequence[float]) -> list[str]:
+        """The colours of numbers, as pages write them."""
+        return ["#" + bytes(pixel[:3]).hex() for pixel in self.pixels(np.array(values))]
+
+    @property
+    def stops(self) -> list[tuple[float, str]]:
+        """Places [0, 1] and colours for a gradient."""
+        return [(share, to_hex(matplotlib.colormaps[self.colours](share))) for share in np.linspace(0, 1, 12).tolist()]
+
+    @property
+    def ticks(self) -> tuple[Tick, ...]:
+        """For a colour bar."""
+        return ticks(self.low, self.high)
+
+
+def scale_of(values: Sequence[float], colours: str, label: str, least: float) -> Scale:
+    """A scale over all ``values``, which are not negative; it spans at least ``least``, lest noise be coloured."""
+    low, high = (min(values), max(values)) if values else (0.0, least)
+    if high - low < least:
+        low = max((low + high - least) / 2, 0.0)
+        high = low + least
+    return Scale(colours, low, high, label)
+
+
+@dataclass(frozen=True)
+class HeatMap:
+    """A coloured map over a rectangle.
+
+    Attributes
+    ----------
+    title : str
+        What a person who does not see it is told.
+    picture : str
+        The map as a data URL.
+    width, height : float [m]
+        Of the rectangle; its middle is the origin.
+    scale : Scale
+    """
+
+    title: str
+    picture: str
+    width: float
+    height: float
+    scale: Scale
+
+    @property
+    def x_ticks(self) -> tuple[Tick, ...]:
+        """To the right of the middle [m]."""
+        return ticks(-self.width / 2, self.width / 2)
+
+    @property
+    def y_ticks(self) -> tuple[Tick, ...]:
+        """Up from the middle [m]."""
+        return ticks(-self.height / 2, self.height / 2)
+
+
+def _data_url(pixels: NDArray[np.uint8]) -> str:
+    encoded = cv2.imencode(".png", pixels[..., [2, 1, 0, 3]])[1]
+    return "data:image/png;base64," + base64.b64encode(encoded.tobytes()).decode()
+
+
+def heat_map(title: str, values: Array, size: tuple[float, float], scale: Scale) -> HeatMap:
+    """A map of ``values`` (rows from the top, columns) over ``size``, width and height [m]."""
+    return HeatMap(title, _data_url(scale.pixels(values)), *size, scale)
+
+
+def flux_map(title: str, flux: Array, size: tuple[float, float], unit: str, top: float | None = None) -> HeatMap:
+    """A flux map, dark where there is none; ``top`` ends its scale, else its own peak."""
+    peak = float(flux.max()) if top is None else top
+    return heat_map(title, flux, size, Scale("inferno", 0.0, max(peak, 1e-9), unit))
+
+
+def difference_map(title: str, difference: Array, size: tuple[float, float], unit: str) -> HeatMap:
+    """A map of differences, white where there is none."""
+    bound = max(float(np.abs(difference).max()), 1e-9)
+    return heat_map(title, difference, size, Scale("RdBu_r", -bound, bound, unit))
+
+
+def mirror_image(heights: Array) -> Array:
+    """Heights (4, i along x, j along y) as one image seen from the front, rows from the top, thin gaps between facets.
+
+    PAINT's order of facets: upper left, upper right, lower left, lower right.
+    """
+    upper_left, upper_right, lower_left, lower_right = (facet.T[::-1] for facet in heights)
+    gap = np.full((upper_left.shape[0], 1), np.nan)
+    rows = [np.hstack([left, gap, right]) for left, right in ((upper_left, upper_right), (lower_left, lower_right))]
+    return np.vstack([rows[0], np.full((1, rows[0].shape[1]), np.nan), rows[1]])
+
+
+def surface_map(title: str, z: Array, size: tuple[float, float]) -> HeatMap:
+    """A surface of control heights (4, 8, 8) [m] in mm."""
+    heights = mirror_heights(z)
+    bound = max(float(np.abs(heights).max()), 1e-3)
+    return heat_map(title, mirror_image(heights), size, Scale("RdBu_r", -bound, bound, "mm"))
+
+
+def uncertainty_map(title: str, z_std: Array, size: tuple[float, float]) -> HeatMap:
+    """Standard deviations (4, 8, 8) [m] in mm."""
+    heights = mirror_heights(z_std)
+    return heat_map(title, mirror_image(heights), size, Scale("viridis_r", 0.0, max(float(heights.max()), 1e-3), "mm"))
+
+
+@dataclass(frozen=True)
+class Point:
+    """A value in a history: 0 to 1 from left to right and from bottom to top, with what it says."""
+
+    x: float
+    y: float
+    label: str
+    name: str
+
+
+@dataclass(frozen=True)
+class History:
+    """Values in the order they came, for a line; ``ticks`` belong to the upright axis."""
+
+    title: str
+    unit: str
+    points: tuple[Point, ...]
+    ticks: tuple[Tick, ...]
+
+
+def history(title: str, unit: str, named: Sequence[tuple[str, float]], digits: int) -> History:
+    """Values with their names, evenly spaced, over an axis from zero."""
+    top = max([value for _, value in named] + [1e-9]) * 1.1
+    step = 1 / max(len(named) - 1, 1)
+    points = tuple(
+        Point(index * step if len(named) > 1 else 0.5, value / top, f"{value:.{digits}f} {unit}", name)
+        for index, (name, value) in enumerate(named)
+    )
+    return History(title, unit, points, ticks(0.0, top, 4))

@@ -1,0 +1,155 @@
+"""What the page of a study draws, as plain numbers and small pictures, which its template turns into SVG."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.study import Photograph, Study
+from model.study.covariates import covariates_of
+from model.study.judging import rank_correlation
+from service.drawing.charts import HeatMap, Scale, Tick, heat_map, ticks
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Image:
+    """A held-out image: accuracy before and after, and where those lie on the chart, 0 to 1 from left to right."""
+
+    photograph: Photograph
+    before: float
+    after: float
+    at_before: float
+    at_after: float
+
+
+@dataclass(frozen=True)
+class Chart:
+    """The accuracy of all held-out images by heliostat; ``noise`` is where noise alone would leave them."""
+
+    groups: dict[str, list[Image]]
+    ticks: tuple[Tick, ...]
+    noise: float
+
+    @property
+    def images(self) -> list[Image]:
+        """All of them."""
+        return [image for group in self.groups.values() for image in group]
+
+
+def accuracy_chart(study: Study) -> Chart:
+    """Every held-out image before and after, by heliostat and, within it, by rising sun."""
+    before, after = study.accuracy_before, study.accuracy_after
+    low = float(np.floor(min(before.min(), after.min()) * 20) / 20)
+
+    def place(accuracy: float) -> float:
+        return (accuracy - low) / (1 - low)
+
+    groups: dict[str, list[Image]] = {}
+    found = zip(study.photographs, before.tolist(), after.tolist(), strict=True)
+    for photograph, one, other in sorted(found, key=lambda f: (f[0].heliostat, f[0].elevation_deg)):
+        image = Image(photograph, one, other, place(one), place(other))
+        groups.setdefault(photograph.heliostat, []).append(image)
+    return Chart(groups, ticks(low, 1.0), place(1 - study.noise_floor))
+
+
+@dataclass(frozen=True)
+class Row:
+    """One image in squares, by what they show."""
+
+    rank: str
+    image: Image
+    squares: dict[str, HeatMap]
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """Rows of squares of ``window`` [m], and the two scales that all of them share."""
+
+    rows: list[Row]
+    window: float
+    flux: Scale
+    residual: Scale
+
+
+def pictures(study: Study, images: Sequence[Image]) -> Pictures:
+    """The worst, the median and the best image of the declared model, in shares of each one's measured peak.
+
+    What an effect changes is shown where one was found.
+    """
+    order = sorted(images, key=lambda image: image.before)
+    chosen = {"Worst": order[0], "Median": order[len(order) // 2], "Best": order[-1]}
+    fluxes = [_fluxes(study, image.photograph) for image in chosen.values()]
+    top = max(float(flux.max()) for flux in fluxes)
+    bound = max(float(np.abs(flux[0] - flux[1:]).max()) for flux in fluxes)
+    flux_scale = Scale("inferno", 0.0, top, "of the measured peak")
+    residual_scale = Scale("RdBu_r", -bound, bound, "of the measured peak")
+
+    def row(rank: str, image: Image, flux: Array) -> Row:
+        measured, before, after = flux
+        shown = {"measured": (measured, flux_scale), "forecast before": (before, flux_scale)}
+        if study.found:
+            shown["forecast after"] = (after, flux_scale)
+        shown["residual before"] = (measured - before, residual_scale)
+        if study.found:
+            shown["residual after"] = (measured - after, residual_scale)
+        name = image.photograph.key
+        squares = {what: heat_map(f"{name}, {what}", v, (study.window,) * 2, s) for what, (v, s) in shown.items()}
+        return Row(rank, image, squares)
+
+    rows = [row(rank, image, flux) for (rank, image), flux in zip(chosen.items(), fluxes, strict=True)]
+    return Pictures(rows, study.window, flux_scale, residual_scale)
+
+
+def _fluxes(study: Study, photograph: Photograph) -> Array:
+    """Measured, before and after (3, 64, 64) of one image, in shares of its measured peak."""
+    place = list(study.photographs).index(photograph)
+    flux = np.stack([study.measured[place], study.before[place], study.after[place]])
+    return np.asarray(flux / flux[0].max())
+
+
+DRAWN = ("sun elevation", "slant range", "solar time", "recorded time")
+"""The covariates that the error is drawn against, as far as they are known."""
+
+
+@dataclass(frozen=True)
+class Dot:
+    """An image's error before and after: places 0 to 1 from left to right and from bottom to top."""
+
+    key: str
+    x: float
+    before: float
+    after: float
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """The error of all held-out images against one quantity, with the rank correlations of the two."""
+
+    label: str
+    dots: list[Dot]
+    x_ticks: tuple[Tick, ...]
+    y_ticks: tuple[Tick, ...]
+    correlation_before: float
+    correlation_after: float
+
+
+def scatters(study: Study) -> list[Scatter]:
+    """The error of all held-out images against each of `DRAWN`."""
+    known = covariates_of(study.photographs, study.latitude_deg)
+    return [_scatter(study, f"{c.name} [{c.unit}]", values) for c, values in known.items() if c.name in DRAWN]
+
+
+def _scatter(study: Study, label: str, x: Array) -> Scatter:
+    before, after = 1 - study.accuracy_before, 1 - study.accuracy_after
+    margin = 0.06 * float(np.ptp(x)) or 1.0
+    low, high = float(x.min()) - margin, float(x.max()) + margin
+    top = 1.08 * float(max(before.max(), after.max()))
+    dots = [
+        Dot(p.key, (float(at) - low) / (high - low), float(one) / top, float(other) / top)
+        for p, at, one, other in zip(study.photographs, x, before, after, strict=True)
+    ]
+    correlations = rank_correlation(before, x), rank_correlation(after, x)
+    return Scatter(label, dots, ticks(low, high), ticks(0.0, top), *correlations)

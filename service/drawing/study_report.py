@@ -1,0 +1,108 @@
+"""A study as one page that an operator reads: no request to anywhere, no script, its pictures within it."""
+
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from markupsafe import Markup
+
+from model.effects import CATALOGUE, Parameter
+from model.study import Study
+from model.study.advice import told_apart_by
+from model.study.report import Found
+from service.drawing.charts import difference_map
+from service.drawing.study_charts import accuracy_chart, pictures, scatters
+from service.drawing.templates import ASSETS, TEMPLATES
+
+VERDICTS = {"effect": "Effect found", "none": "Nothing missing", "unexplained": "Not explained"}
+
+FEW = 8
+"""Skipped items up to which they are listed at once."""
+
+
+@dataclass(frozen=True)
+class Value:
+    """A fitted number, its 95 % interval, and whether that excludes the value that changes nothing."""
+
+    value: float
+    low: float
+    high: float
+    telling: bool
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A parameter for all images or one heliostat: one value, or one a facet."""
+
+    name: str
+    unit: str
+    owner: str
+    values: list[Value]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """An effect that was found: what it is, its parameters, and which photographs tell it from its look-alikes."""
+
+    found: Found
+    about: str
+    parameters: list[Fitted]
+    lookalikes: dict[str, str]
+
+    @classmethod
+    def of(cls, found: Found) -> "Finding":
+        """An effect as the page shows it."""
+        kind = CATALOGUE[found.name]
+        about = (sys.modules[kind.__module__].__doc__ or "").partition("\n")[0]
+        parameters = [row for p in kind.parameters() for row in _rows(p, found.parameters[p.name])]
+        return cls(found, about, parameters, {name: told_apart_by(found.name, name) for name in found.lookalikes})
+
+
+def _rows(parameter: Parameter, fitted: Mapping[str, Any]) -> list[Fitted]:
+    """A line for each owner of a parameter's values."""
+    value, ci95 = fitted["value"], fitted["ci95"]
+    if parameter.scope in ("set", "camera"):
+        value, ci95 = {"all images": value}, {"all images": ci95}
+    if parameter.scope != "facet":
+        value, ci95 = ({owner: [one] for owner, one in given.items()} for given in (value, ci95))
+    values = {
+        owner: [_value(parameter, one, interval) for one, interval in zip(ones, ci95[owner], strict=True)]
+        for owner, ones in value.items()
+    }
+    return [Fitted(parameter.name, parameter.unit, owner, ones) for owner, ones in values.items()]
+
+
+def _value(parameter: Parameter, value: float, ci95: tuple[float, float]) -> Value:
+    low, high = ci95
+    return Value(value, low, high, not low <= parameter.neutral <= high)
+
+
+def study_page(study: Study, title: str, skipped: Mapping[str, str] | None = None) -> str:
+    """The report of a study as one self-contained HTML page.
+
+    Parameters
+    ----------
+    title : str
+        What was studied: a folder, a plant.
+    skipped : mapping
+        What was left out, with the reasons.
+    """
+    chart, sides = accuracy_chart(study), (study.window, study.window)
+    left = difference_map("Mean residual with what was found", study.residual_map(), sides, "× peak")
+    # The style is a file of our own, and `>` must stay what it is.
+    style = Markup(ASSETS.joinpath("app.css").read_text(encoding="utf-8"))
+    return TEMPLATES.get_template("study.html").render(
+        style=style,
+        study=study,
+        title=title,
+        verdict=VERDICTS[study.verdict],
+        findings=[Finding.of(found) for found in study.found],
+        chart=chart,
+        pictures=pictures(study, chart.images),
+        scatters=scatters(study),
+        residual_map=left,
+        chance=1.96 / max(len(study.photographs) - 1, 1) ** 0.5,
+        skipped=skipped or {},
+        few=FEW,
+    )

@@ -1,0 +1,71 @@
+"""The templates of pages and reports, and how both write numbers and moments."""
+
+from datetime import UTC, datetime
+from importlib.resources import files
+from urllib.parse import quote
+
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+ASSETS = files("service.drawing").joinpath("static")
+"""Styles and scripts."""
+
+# How print separates thousands and writes a minus.
+_SIGNS = {ord(","): "\N{NARROW NO-BREAK SPACE}", ord("-"): "\N{MINUS SIGN}"}
+
+
+def figure(value: float | None, digits: int = 2, unit: str = "") -> str:
+    """A number with its unit; a dash where there is none."""
+    if value is None:
+        return "–"
+    # Adding zero takes the sign from what rounds to it.
+    text = f"{round(value, digits) + 0.0:,.{digits}f}".translate(_SIGNS)
+    return f"{text}\N{NO-BREAK SPACE}{unit}" if unit else text
+
+
+def percent(value: float | None, digits: int = 1) -> str:
+    """A share in percent."""
+    return figure(None if value is None else value * 100, digits, "%")
+
+
+def moment(value: datetime | None) -> str | Markup:
+    """A moment in UTC; a dash where it is not known, which 1970 stands for."""
+    if value is None or value.year <= 1970:
+        return "–"
+    utc = value.astimezone(UTC)
+    return Markup('<time datetime="{}">{}</time>').format(utc.isoformat(), utc.strftime("%Y-%m-%d %H:%M UTC"))
+
+
+def power(watts: float) -> str:
+    """A power, in kW where that reads better."""
+    return figure(watts / 1e3, 2, "kW") if abs(watts) >= 1000 else figure(watts, 0, "W")
+
+
+def irradiance(watts_m2: float) -> str:
+    """An irradiance, in kW/m² where that reads better."""
+    return figure(watts_m2 / 1e3, 2, "kW/m²") if abs(watts_m2) >= 1000 else figure(watts_m2, 0, "W/m²")
+
+
+def environment(*packages: str) -> Environment:
+    """Templates of these packages, the first one's first, with the filters above."""
+    made = Environment(
+        loader=ChoiceLoader([PackageLoader(package) for package in packages]),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    made.filters.update(
+        figure=figure,
+        percent=percent,
+        moment=moment,
+        power=power,
+        irradiance=irradiance,
+        path=lambda value: quote(value, ""),
+        words=lambda name: name.replace("_", " "),
+    )
+    return made
+
+
+TEMPLATES = environment("service.drawing")
+"""The template of a study's report."""

@@ -1,0 +1,1 @@
+"""Work that outlives a request: one file a kind, and the worker."""

@@ -1,0 +1,29 @@
+"""Asking for a job and cancelling one, on somebody's behalf."""
+
+from typing import Any
+
+from service.store import audit
+from service.store.queue import add_job, cancel
+from service.store.tables import JobRow
+from service.twin.runtime import Runtime
+
+
+def ask_for(
+    runtime: Runtime, kind: str, payload: dict[str, Any], actor: str, idempotency_key: str | None = None
+) -> JobRow:
+    """Queue a job as `add_job` does, with its entry in the audit trail, and wake a worker of this process."""
+    with runtime.database.writing() as session:
+        most = runtime.settings.max_queued_jobs
+        row, is_new = add_job(session, kind, payload, actor, idempotency_key, most)
+        if is_new:
+            audit.record(session, actor, "job.created", f"job {row.id}", kind=kind)
+    runtime.job_came.release()
+    return row
+
+
+def cancel_for(runtime: Runtime, number: int, actor: str) -> JobRow:
+    """Cancel a job as `cancel` does, with its entry in the audit trail."""
+    with runtime.database.writing() as session:
+        row = cancel(session, number)
+        audit.record(session, actor, "job.cancelled", f"job {number}", kind=row.kind)
+        return row

@@ -1,0 +1,56 @@
+"""The job `imports`: a measurement folder into the store."""
+
+from pathlib import Path
+
+from pydantic import Field
+
+from model.errors import InvalidInputError
+from service.base.faults import ConflictError
+from service.base.fields import Model
+from service.base.progress import Steps
+from service.jobs.kind import Context, Result
+from service.sources.folder import read_folder
+from service.twin.importing import import_folder
+
+
+class ImportIn(Model):
+    """Load a measurement folder that lies on the service's machine, under the folder that its operator allowed."""
+
+    folder: str = Field(
+        min_length=1,
+        max_length=500,
+        pattern=r"^[^\x00-\x1f\x7f]+$",
+        description="Path relative to the allowed folder; `.` is that folder itself.",
+        examples=["stj"],
+    )
+
+
+def allowed_folder(root: Path | None, folder: str) -> Path:
+    """The folder of this name under ``root``; nothing that a link or a ``..`` leads to outside of it.
+
+    Raises
+    ------
+    ConflictError
+        Where the operator allowed no folder.
+    InvalidInputError
+        Where it is none, leads outside, or holds a link that does.
+    """
+    if root is None:
+        raise ConflictError("no folder may be imported: the operator sets HELIOTWIN_IMPORT_ROOT first")
+    top = root.resolve()
+    path = (top / folder).resolve()
+    # The answer is the same for what does not exist and what lies outside: it tells nothing of the rest of the disk.
+    if not path.is_relative_to(top) or not path.is_dir():
+        raise InvalidInputError(f"folder: there is no folder {folder!r} under the one that may be imported")
+    for entry in path.rglob("*"):
+        if entry.is_symlink() and not entry.resolve().is_relative_to(top):
+            raise InvalidInputError(f"folder: {entry.relative_to(top)} leads outside; copy what it links to")
+    return path
+
+
+def import_allowed(context: Context, payload: ImportIn) -> Result:
+    """The plant, heliostats, images and measured surfaces of a folder; what is there already stays as it is."""
+    folder = read_folder(allowed_folder(context.runtime.settings.import_root, payload.folder))
+    images = [len(item.images) for name in folder.plant.heliostats for item in folder.measurements(name, False)]
+    steps = Steps(len(folder.plant.heliostats) + sum(images), context.report)
+    return Result(import_folder(context.runtime, folder, steps))

@@ -1,0 +1,96 @@
+"""What a kind of job is: its payload, its function, and the function's view of its job."""
+
+import math
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel
+from sqlalchemy.orm import Session
+
+from service.store import queue
+from service.twin.runtime import Runtime
+
+# Seconds between two writes of a job's progress: what a person can follow, and little for the database.
+_REPORT_EVERY_S = 0.5
+Payload = TypeVar("Payload", bound=BaseModel)
+
+
+class CancelRequestedError(Exception):
+    """Somebody asked for the job's end."""
+
+
+class WorkerStoppingError(Exception):
+    """The worker was told to stop; another takes the job up."""
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """What a job gives: figures that are JSON, and named arrays where there are some."""
+
+    figures: dict[str, Any]
+    arrays: Mapping[str, NDArray[np.generic]] | None = None
+
+
+@dataclass(eq=False)
+class Context:
+    """A handler's view of its job.
+
+    A handler calls `report` every second or so: that is where it learns, by an exception that it lets pass, that the
+    job was cancelled, lost or put back. What must happen once although the job may be started again is written in one
+    transaction together with `keep`.
+    """
+
+    runtime: Runtime
+    lease: queue.Lease
+    created_by: str
+    stopping: threading.Event
+    cancelled: threading.Event = field(default_factory=threading.Event)
+    lost: threading.Event = field(default_factory=threading.Event)
+    reported_s: float = -math.inf
+
+    def check(self) -> None:
+        """Raise `LeaseLostError`, `CancelRequestedError` or `WorkerStoppingError` where the work shall end."""
+        if self.lost.is_set():
+            raise queue.LeaseLostError(f"job {self.lease.job_id}")
+        if self.cancelled.is_set():
+            raise CancelRequestedError
+        if self.stopping.is_set():
+            raise WorkerStoppingError
+
+    def report(self, progress: float, message: str = "") -> None:
+        """Say how far the job is, 0 to 1, and what is being done; raises what `check` raises."""
+        self.check()
+        if time.monotonic() - self.reported_s < _REPORT_EVERY_S:
+            return
+        self.reported_s = time.monotonic()
+        with self.runtime.database.writing() as session:
+            if queue.report(session, self.lease, progress, message):
+                self.cancelled.set()
+        self.check()
+
+    def steps(self) -> dict[str, dict[str, Any]]:
+        """The parts that this or an earlier attempt has done."""
+        with self.runtime.database.reading() as session:
+            return queue.steps(session, self.lease.job_id)
+
+    def keep(self, session: Session, name: str, result: dict[str, Any]) -> None:
+        """Note a part as done in the transaction that did it; LeaseLostError undoes both."""
+        queue.keep_step(session, self.lease, name, result)
+
+
+@dataclass(frozen=True)
+class Kind(Generic[Payload]):
+    """A kind of job: what it takes, and the function that does it."""
+
+    name: str
+    payload: type[Payload]
+    handler: Callable[[Context, Payload], Result]
+    summary: str
+
+
+Kinds = Mapping[str, Kind[Any]]

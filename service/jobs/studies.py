@@ -1,0 +1,57 @@
+"""The job `studies`: the effect that photographs demand and the model lacks."""
+
+from pydantic import Field, field_validator
+
+from model.effects import CATALOGUE
+from service import store
+from service.base.fields import Model, Moment, Name
+from service.jobs.kind import Context, Result
+from service.twin.study import StudyRequest, Surfaces, study_row, study_store
+
+
+class StudyIn(Model):
+    """Find the effect that stored photographs demand and the plant's current model lacks."""
+
+    heliostats: list[Name] | None = Field(
+        default=None, min_length=1, max_length=200, description="Names of heliostats; else some of all over the field."
+    )
+    most_heliostats: int = Field(
+        default=12, ge=1, le=200, description="How many heliostats to take where none is named, near ones and far ones."
+    )
+    surfaces: Surfaces = Field(
+        default="current",
+        description="measured: only heliostats with a measured surface; current: where there is none, the newest "
+        "prediction.",
+    )
+    images: int = Field(
+        default=12,
+        ge=2,
+        le=64,
+        description="Most photographs of each heliostat: the newest ones, spread over the sun's positions.",
+    )
+    since: Moment | None = Field(default=None, description="Only photographs from then on (time with zone).")
+    until: Moment | None = Field(default=None, description="Only photographs before then (time with zone).")
+    candidates: list[str] | None = Field(
+        default=None, min_length=1, max_length=100, description="Names of the effects to try; all without it."
+    )
+
+    @field_validator("candidates")
+    @classmethod
+    def _known(cls, names: list[str] | None) -> list[str] | None:
+
+        if names is not None and not set(names) <= set(CATALOGUE):
+            raise ValueError(f"the catalogue of effects has {', '.join(CATALOGUE)}")
+        return None if names is None else list(dict.fromkeys(names))
+
+
+def make_study(context: Context, payload: StudyIn) -> Result:
+    """A study, stored once however often the job is begun."""
+    if "study" not in context.steps():
+        studied = study_store(context.runtime, StudyRequest(**payload.model_dump()), context.report)
+        options = payload.model_dump(mode="json")
+        row = study_row(studied, f"Study of job {context.lease.job_id}", options, context.created_by)
+        with context.runtime.database.writing() as session:
+            store.add_study(session, row)
+            about = {"study": row.id, "verdict": row.verdict, "conclusion": row.conclusion, "skipped": row.skipped}
+            context.keep(session, "study", about)
+    return Result(context.steps()["study"])

@@ -1,0 +1,256 @@
+"""Workers: threads that take jobs, run their handlers, and see that each ends exactly once."""
+
+import logging
+import math
+import os
+import random
+import signal
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import timedelta
+from functools import partial
+
+from pydantic import ValidationError
+from sqlalchemy.exc import OperationalError, SQLAlchemyError, StatementError
+from sqlalchemy.orm import Session
+
+from model.errors import InvalidInputError, ModelError
+from service.base import logs, telemetry
+from service.base.arrays import pack
+from service.base.faults import ServiceError
+from service.base.meters import JOB_ATTEMPTS, JOB_SECONDS, PROCESS, listening, timed
+from service.base.settings import Settings
+from service.jobs.kind import CancelRequestedError, Context, Kinds, WorkerStoppingError
+from service.store import queue
+from service.store.tables import JobRow
+from service.twin.runtime import Operations, Runtime
+
+logger = logging.getLogger("heliotwin.jobs")
+
+# Seconds between two looks for jobs that are old enough to be deleted.
+_PURGE_EVERY_S = 3600.0
+
+# Seconds that jobs under way get to reach their next report when the workers are told to stop.
+_GRACE_S = 20.0
+
+
+def pause_s(attempt: int, base_s: float, generator: random.Random) -> float:
+    """Seconds before attempt ``attempt`` + 1: doubled each time, and spread so that not all come back at once."""
+    longest: float = min(queue.LONGEST_PAUSE_S, base_s * 2 ** (attempt - 1))
+    return longest * generator.uniform(0.5, 1.0)
+
+
+@dataclass(frozen=True)
+class _Ending:
+    """How an attempt ended, and what writes that."""
+
+    outcome: str
+    write: Callable[[Session], None]
+
+
+def _failed(lease: queue.Lease, reason: str) -> _Ending:
+    return _Ending("failed", lambda session: queue.fail(session, lease, reason))
+
+
+class Worker:
+    """Takes one job after the other until it is told to stop."""
+
+    def __init__(self, runtime: Runtime, kinds: Kinds, name: str, stopping: threading.Event) -> None:
+        self.runtime = runtime
+        self.kinds = kinds
+        self.name = name
+        self.stopping = stopping
+        self._random = random.Random(name)
+        self._purged_s = -math.inf
+
+    def run(self) -> None:
+        """Work; a database that is away is waited for."""
+        while not self.stopping.is_set():
+            try:
+                self._purge()
+                worked = self.work()
+            except SQLAlchemyError as error:
+                logger.error("%s: the database does not answer: %s", self.name, error)
+                worked = False
+            if not worked:
+                self.runtime.job_came.acquire(timeout=self.runtime.settings.job_poll_s)
+
+    def _purge(self) -> None:
+        """Delete old jobs, now and then, a few at a time."""
+        settings = self.runtime.settings
+        if not settings.job_retention_days or time.monotonic() - self._purged_s < _PURGE_EVERY_S:
+            return
+        with self.runtime.database.writing() as session:
+            count = queue.purge(session, timedelta(days=settings.job_retention_days))
+        if count:
+            logger.info("%s: %d jobs deleted that ended %g days ago", self.name, count, settings.job_retention_days)
+            return  # there may be more
+        self._purged_s = time.monotonic()
+
+    def work(self) -> bool:
+        """Take a job, if there is one, and bring it to an end; whether there was one."""
+        job = self._claim()
+        if job is None:
+            return False
+        context = Context(self.runtime, queue.lease_of(job), job.created_by, self.stopping)
+        with logs.bound(job=job.id, kind=job.kind), timed(JOB_SECONDS.labels(job.kind), f"job {job.kind}"):
+            logger.info("%s: job %d (%s), attempt %d", self.name, job.id, job.kind, job.attempts)
+            outcome = self._attempt(context, job)
+        JOB_ATTEMPTS.labels(job.kind, outcome).inc()
+        return True
+
+    def _attempt(self, context: Context, job: JobRow) -> str:
+        """Work at the job, store how that ended, and name it."""
+        try:
+            with self._heart(context):
+                ending = self._ending(context, job)
+                self._store(context, ending.write)
+                return ending.outcome
+        except queue.LeaseLostError:
+            logger.warning("%s: job %d went to another worker", self.name, job.id)
+            return "lost"
+
+    def _claim(self) -> JobRow | None:
+        settings, database = self.runtime.settings, self.runtime.database
+        with database.reading() as session:
+            if not queue.has_claimable(session, self.kinds, settings.job_lease_s):
+                return None
+        with database.writing() as session:
+            return queue.claim(session, self.kinds, self.name, settings.job_lease_s, settings.job_attempts)
+
+    @contextmanager
+    def _heart(self, context: Context) -> Iterator[None]:
+        """Renew the lease from a thread of its own, until the block ends."""
+        ended = threading.Event()
+        thread = threading.Thread(target=self._beat, args=(context, ended), name=f"{self.name}-heart", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            thread.join()
+
+    def _beat(self, context: Context, ended: threading.Event) -> None:
+        lease_s = self.runtime.settings.job_lease_s
+        while not ended.wait(lease_s / 3):
+            try:
+                with self.runtime.database.writing() as session:
+                    if queue.renew(session, context.lease, lease_s):
+                        context.cancelled.set()
+            except queue.LeaseLostError:
+                context.lost.set()
+                return
+            except SQLAlchemyError as error:  # the next beat may succeed before the lease runs out
+                logger.warning("%s: no heartbeat of job %d: %s", self.name, context.lease.job_id, error)
+
+    def _ending(self, context: Context, job: JobRow) -> _Ending:
+        """Run the handler; how that ended."""
+        lease, kind = context.lease, self.kinds[job.kind]
+        try:
+            result = kind.handler(context, kind.payload.model_validate(job.payload))
+            arrays = None if result.arrays is None else pack(result.arrays)
+            return _Ending("done", lambda session: queue.finish(session, lease, result.figures, arrays))
+        except queue.LeaseLostError:
+            raise
+        except CancelRequestedError:
+            return _Ending("cancelled", lambda session: queue.stop(session, lease))
+        except WorkerStoppingError:
+            return _Ending("released", lambda session: queue.release(session, lease))
+        except (ModelError, ServiceError) as error:  # trying again would find the same
+            return _failed(lease, str(error))
+        except ValidationError:
+            return _failed(lease, "its payload is not one that this version takes")
+        except Exception as error:  # a handler's fault must end with its job, not with the worker
+            logger.exception("%s: job %d failed in attempt %d", self.name, job.id, job.attempts)
+            return self._after_fault(lease, job.attempts, error)
+
+    def _after_fault(self, lease: queue.Lease, attempts: int, error: Exception) -> _Ending:
+        """Try again later, or give up; the reason names the fault's type only, the log has the rest."""
+        settings, fault = self.runtime.settings, type(error).__name__
+        if attempts >= settings.job_attempts:
+            return _failed(
+                lease,
+                f"failed {attempts} times, the last time by {fault}; the worker's log has more of job {lease.job_id}",
+            )
+        delay = pause_s(attempts, settings.job_retry_s, self._random)
+        reason = f"attempt {attempts} failed by {fault}; tried again in {delay:.0f} s"
+        return _Ending("retried", lambda session: queue.retry(session, lease, reason, delay))
+
+    def _store(self, context: Context, write: Callable[[Session], None]) -> None:
+        """Write how the job ended; while the database is away, again and again until the lease is lost."""
+        while True:
+            try:
+                with self.runtime.database.writing() as session:
+                    write(session)
+                return
+            except OperationalError as error:
+                logger.error("%s: the end of job %d is not stored yet: %s", self.name, context.lease.job_id, error)
+                if self.stopping.wait(self.runtime.settings.job_poll_s):
+                    return  # the lease runs out, and another worker does it again
+            except (StatementError, ValueError):  # a result that the database does not take
+                logger.exception("%s: the end of job %d cannot be stored", self.name, context.lease.job_id)
+                reason = "its result cannot be stored; the worker's log has more"
+                write = partial(queue.fail, lease=context.lease, reason=reason)
+
+
+class Workers:
+    """Some workers as threads of this process."""
+
+    def __init__(self, runtime: Runtime, kinds: Kinds, count: int) -> None:
+        self.stopping = threading.Event()
+        self._runtime = runtime
+        name = f"{socket.gethostname()[:48]}-{os.getpid()}"
+        self._threads = [
+            threading.Thread(
+                target=Worker(runtime, kinds, f"{name}-{number}", self.stopping).run, name=f"job-{number}", daemon=True
+            )
+            for number in range(count)
+        ]
+
+    def start(self) -> None:
+        """Begin to take jobs."""
+        for thread in self._threads:
+            thread.start()
+
+    def stop(self) -> None:
+        """Take no more jobs and wait a while for those under way to be put back.
+
+        One that does not report in time is left to its lease.
+        """
+        self.stopping.set()
+        self._runtime.job_came.release(max(1, len(self._threads)))  # wakes those that wait for work
+        until = time.monotonic() + _GRACE_S
+        for thread in self._threads:
+            thread.join(max(0.0, until - time.monotonic()))
+
+
+def work(settings: Settings, kinds: Kinds, operations: Operations | None = None) -> None:
+    """Work at the store's jobs, ``job_workers`` at a time, until SIGTERM or SIGINT; one under way is put back.
+
+    Raises
+    ------
+    InvalidInputError
+        Where ``job_workers`` is 0.
+    SchemaError
+        Where nobody migrated the store.
+    """
+    if not settings.job_workers:
+        raise InvalidInputError("job_workers: 0 works at nothing; give --count or HELIOTWIN_JOB_WORKERS")
+    logs.set_up(settings)
+    telemetry.set_up(settings, "heliotwin-worker")
+    runtime = Runtime.from_settings(settings, operations)
+    try:
+        runtime.database.require_current()
+        workers, stopping = Workers(runtime, kinds, settings.job_workers), threading.Event()
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, lambda *_: stopping.set())
+        with listening(settings, PROCESS):
+            workers.start()
+            stopping.wait()
+            workers.stop()
+    finally:
+        runtime.close()

@@ -1,1 +1,0 @@
-"""The web pages: rendered here from templates, with every style and script from `service/static`."""

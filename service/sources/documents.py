@@ -1,0 +1,290 @@
+"""The contents of PAINT's documents: plant, heliostats, measurements, declared model.
+
+Source: the PAINT database of the Solar Tower Juelich, https://paint-database.org.
+"""
+
+import json
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.effects import Effect, effects_from_json
+from model.errors import InvalidInputError
+from model.frames import sun_direction
+from model.mount import LinearActuator, Mount
+from model.plant import Cylinder, Facet, Heliostat, Plant, TargetPlane
+from model.sunshape import Buie, Gaussian, Pillbox, SunShape
+from model.tracing import Optics
+
+Array = NDArray[np.float64]
+IMAGE_KINDS = ("flux", "cropped", "raw", "flux-centered")
+"""Kinds of image that a measurement may hold, the most worked-out one with a known place on the target first."""
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """One calibration measurement.
+
+    Attributes
+    ----------
+    identifier : str
+    heliostat, target : str
+    azimuth_deg, elevation_deg : float [deg]
+        The sun, azimuth from south and positive to the east.
+    spot : (3,) [m] or None
+        Measured centre of mass in ENU.
+    motor_position : (2,) [steps] or None
+    images : dict
+        Files by kind.
+    taken_at : datetime or None
+        With time zone; from PAINT's STAC item ``ID-calibration-item-stac.json`` where there is one.
+    """
+
+    identifier: str
+    heliostat: str
+    target: str
+    azimuth_deg: float
+    elevation_deg: float
+    spot: Array | None = None
+    motor_position: Array | None = None
+    images: dict[str, Path] = field(default_factory=dict)
+    taken_at: datetime | None = None
+
+    @property
+    def sun(self) -> Array:
+        """Unit vector (3,) towards the sun."""
+        return sun_direction(self.azimuth_deg, self.elevation_deg)
+
+    @property
+    def key(self) -> str:
+        """``heliostat/identifier``."""
+        return f"{self.heliostat}/{self.identifier}"
+
+
+def get(data: Any, where: str, *keys: str | int) -> Any:
+    """Walk into parsed JSON; a missing key is named with its file."""
+    for key in keys:
+        try:
+            data = data[key]
+        except (KeyError, IndexError, TypeError):
+            raise InvalidInputError(f"{where}: '{key}' is missing") from None
+    return data
+
+
+def _numbers(data: Any, where: str, *keys: str | int, count: int) -> Array:
+    value = get(data, where, *keys)
+    try:
+        numbers = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        numbers = np.array([np.nan])
+    if numbers.shape != (count,) or not np.isfinite(numbers).all():
+        raise InvalidInputError(f"{where}: '{keys[-1]}' must be {count} finite numbers, got {str(value)[:80]}")
+    return numbers
+
+
+def _number(data: Any, where: str, *keys: str | int) -> float:
+    value = get(data, where, *keys)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+        raise InvalidInputError(f"{where}: '{keys[-1]}' must be a finite number, got {str(value)[:80]}")
+    return float(value)
+
+
+def read_json(path: Path) -> Any:
+    """Parsed JSON of a file; a file that is missing or not JSON is named."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InvalidInputError(f"{path}: no such file") from None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise InvalidInputError(f"{path}: not valid JSON ({error})") from None
+
+
+def _actuators(kinematics: Any, where: str) -> tuple[LinearActuator, LinearActuator] | None:
+    entries = get(kinematics, where, "actuators")
+    if not isinstance(entries, list) or len(entries) != 2 or any(e.get("type_axis") != "linear" for e in entries):
+        return None
+    first, second = (
+        LinearActuator(
+            increment=_number(entry, where, "increment"),
+            initial_stroke_length=_number(entry, where, "initial_stroke_length"),
+            offset=_number(entry, where, "offset"),
+            pivot_radius=_number(entry, where, "pivot_radius"),
+            initial_angle=_number(entry, where, "initial_angle"),
+            clockwise=bool(_number(entry, where, "clockwise_axis_movement")),
+            max_increment=_number(entry, where, "max_increment"),
+        )
+        for entry in entries
+    )
+    return first, second
+
+
+def _mount(kinematics: Any, where: str) -> Mount:
+    joint = [
+        sum(_number(kinematics, where, f"joint_translation_{axis}_{stage}") for stage in (1, 2))
+        for axis in ("e", "n", "u")
+    ]
+    # Older files count the offset from an upright mirror, newer ones from a lying one; along the normal it is the same.
+    along_normal = abs(_number(kinematics, where, "concentrator_translation_n"))
+    return Mount.juelich(_actuators(kinematics, where), joint=joint, mirror_offset=(0.0, 0.0, along_normal))
+
+
+def read_heliostat(name: str, properties: Any, origin: Array) -> Heliostat:
+    """A heliostat of the contents of PAINT's ``heliostat-properties.json``.
+
+    ``origin`` (3,) is the tower base in WGS84. Raises `InvalidInputError`, which names the field.
+    """
+    where = f"properties of {name}"
+    if not isinstance(properties, dict):
+        raise InvalidInputError(f"{where}: must be a JSON object")
+    kinematics = properties.get("kinematics_properties", properties.get("kinematic_properties"))
+    if kinematics is None:
+        raise InvalidInputError(f"{where}: 'kinematics_properties' is missing")
+    facets = get(properties, where, "facet_properties", "facets")
+    return Heliostat(
+        name=name,
+        position=Plant("", origin).to_enu(_numbers(properties, where, "heliostat_position", count=3)),
+        mount=_mount(kinematics, where),
+        facets=tuple(
+            Facet(
+                position=_numbers(facet, where, "translation_vector", count=3),
+                canting_x=_numbers(facet, where, "canting_e", count=3),
+                canting_y=_numbers(facet, where, "canting_n", count=3),
+            )
+            for facet in facets
+        ),
+        width=_number(properties, where, "width"),
+        height=_number(properties, where, "height"),
+    )
+
+
+def read_targets(tower: Any) -> tuple[Array, dict[str, TargetPlane]]:
+    """Tower base (3,) in WGS84 and the planar targets of PAINT's ``tower-measurements.json``.
+
+    Cylinders are no planes; `read_receivers` has them.
+    """
+    where = "tower measurements"
+    origin = _numbers(tower, where, "power_plant_properties", "coordinates", count=3)
+    plant = Plant("", origin)
+    targets = {}
+    for name, entry in tower.items():
+        if isinstance(entry, dict) and entry.get("type") == "planar":
+            corners = [
+                plant.to_enu(_numbers(entry, f"{where}, {name}", "coordinates", corner, count=3))
+                for corner in ("upper_left", "upper_right", "lower_left", "lower_right")
+            ]
+            targets[name] = TargetPlane.from_corners(name, *corners)
+    if not targets:
+        raise InvalidInputError(f"{where}: no target of type 'planar'")
+    return origin, targets
+
+
+def read_receivers(tower: Any) -> dict[str, Cylinder]:
+    """The cylindrical receivers of PAINT's ``tower-measurements.json``, convex ones that are surveyed.
+
+    Their inner corners are those of the lit surface: on its edge, a chord apart.
+    """
+    where = "tower measurements"
+    plant = Plant("", _numbers(tower, where, "power_plant_properties", "coordinates", count=3))
+    surveyed = {
+        name: entry
+        for name, entry in tower.items()
+        if isinstance(entry, dict) and entry.get("type") == "convex_cylinder" and "coordinates" in entry
+    }
+    return {name: _receiver(name, entry, f"{where}, {name}", plant) for name, entry in surveyed.items()}
+
+
+def _receiver(name: str, entry: Any, where: str, plant: Plant) -> Cylinder:
+    lower_left, lower_right, upper_left, upper_right = (
+        plant.to_enu(_numbers(entry, where, "coordinates", f"receiver_inner_{corner}", count=3))
+        for corner in ("lower_left", "lower_right", "upper_left", "upper_right")
+    )
+    radius, opening = _number(entry, where, "radius"), _number(entry, where, "opening_angle")
+    normal = _numbers(entry, where, "normal_vector", count=3)
+    up = (upper_left + upper_right - lower_left - lower_right) / 2
+    chord = (lower_left + lower_right + upper_left + upper_right) / 4
+    bulge = radius * (1 - np.cos(np.radians(opening) / 2)) * normal / np.linalg.norm(normal)
+    return Cylinder(name, chord + bulge, normal, up, radius, float(np.linalg.norm(up)), opening)
+
+
+def _spot(data: Any, where: str, plant: Plant) -> Array | None:
+    """Measured centre of mass in ENU: PAINT's UTIS, else HeliOS."""
+    spots = data.get("focal_spot") or {}
+    for source in ("UTIS", "HeliOS"):
+        if isinstance(spots, dict) and spots.get(source) is not None:
+            return plant.to_enu(_numbers(spots, where, source, count=3))
+    return None
+
+
+def _motors(data: Any, where: str) -> Array | None:
+    motors = data.get("motor_position")
+    if motors is None:
+        return None
+    return np.array([_number(motors, where, f"axis_{axis}_motor_position") for axis in (1, 2)])
+
+
+def read_measurement(identifier: str, heliostat: str, data: Any, plant: Plant) -> Measurement:
+    """A measurement, without its images, of the contents of PAINT's ``calibration-properties.json``."""
+    where = f"measurement {heliostat}/{identifier}"
+    if not isinstance(data, dict):
+        raise InvalidInputError(f"{where}: must be a JSON object")
+    target = get(data, where, "target_name")
+    if target not in plant.targets:
+        raise InvalidInputError(f"{where}: 'target_name' {target!r} is none of {', '.join(plant.targets)}")
+    elevation = _number(data, where, "sun_elevation")
+    if not 0 < elevation <= 90:
+        raise InvalidInputError(f"{where}: 'sun_elevation' must lie in (0, 90] degrees, got {elevation}")
+    return Measurement(
+        identifier=identifier,
+        heliostat=heliostat,
+        target=target,
+        azimuth_deg=_number(data, where, "sun_azimuth"),
+        elevation_deg=elevation,
+        spot=_spot(data, where, plant),
+        motor_position=_motors(data, where),
+    )
+
+
+def read_moment(item: Any, where: str) -> datetime:
+    """When a measurement was taken, of the contents of PAINT's STAC item; in UTC where it names no time zone."""
+    moment = get(item, where, "properties", "datetime")
+    try:
+        taken_at = datetime.fromisoformat(moment)
+    except (TypeError, ValueError):
+        raise InvalidInputError(f"{where}: 'datetime' must be an ISO 8601 time, got {str(moment)[:80]}") from None
+    return taken_at if taken_at.tzinfo is not None else taken_at.replace(tzinfo=UTC)
+
+
+def _sun_shape(declared: Any, where: str) -> SunShape:
+    shape = get(declared, where, "shape")
+    if shape == "buie":
+        return Buie(_number(declared, where, "circumsolar_ratio"))
+    if shape == "pillbox":
+        return Pillbox(_number(declared, where, "half_angle_mrad") * 1e-3)
+    if shape == "gaussian":
+        return Gaussian(_number(declared, where, "sigma_mrad") * 1e-3)
+    raise InvalidInputError(f"{where}: 'shape' must be buie, pillbox or gaussian, got {shape!r}")
+
+
+def parse_declared(declared: Any, where: str) -> tuple[Optics, tuple[Effect, ...]]:
+    """Optics and effects of a declared model, which ``where`` holds."""
+    if not isinstance(declared, dict):
+        raise InvalidInputError(f"{where}: 'declared' must be a JSON object")
+    sun = declared.get("sun")
+    optics = Optics() if sun is None else Optics(sun_shape=_sun_shape(sun, where))
+    return optics, _effects(declared.get("effects", []), where)
+
+
+def read_effects(path: Path) -> tuple[Effect, ...]:
+    """Effects of a JSON file: a list, or an object with ``effects``, such as a study's report."""
+    return _effects(read_json(path), str(path))
+
+
+def _effects(data: Any, where: str) -> tuple[Effect, ...]:
+    try:
+        return tuple(effects_from_json(data))
+    except InvalidInputError as error:
+        raise InvalidInputError(f"{where}: {error}") from None

@@ -1,0 +1,159 @@
+"""The database: connections to SQLite or PostgreSQL, transactions, and the schema's version."""
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from alembic import command
+from alembic.config import Config
+from alembic.runtime.migration import MigrationContext
+from alembic.script import ScriptDirectory
+from sqlalchemy import URL, Connection, Engine, create_engine, event, text
+from sqlalchemy.orm import Session
+
+import migrations
+from model.errors import InvalidInputError
+from service.base.faults import SchemaError
+from service.base.settings import Settings
+
+# Seconds that a writer waits for another on SQLite, and that a connection to PostgreSQL may take.
+_PATIENCE_S = 15
+
+# A PostgreSQL server that vanished without a word is given up after about a minute, not after the system's two hours.
+_ALIVE = {"keepalives_idle": 30, "keepalives_interval": 10, "keepalives_count": 3, "tcp_user_timeout": 60_000}
+
+# Beyond the five that are kept open; together they are enough for the 40 threads that Starlette runs routes in, those
+# that ask for keys, follow jobs and check readiness, and a few workers with their heartbeats.
+_MORE_CONNECTIONS = 64
+
+# Alembic keeps its context in module globals: one migration at a time in a process.
+_alembic = threading.Lock()
+
+
+def alembic_config() -> Config:
+    """The Alembic configuration whose scripts are the installed `migrations` package."""
+    config = Config()
+    config.set_main_option("script_location", str(Path(migrations.__file__).parent).replace("%", "%%"))
+    config.set_main_option("path_separator", "os")
+    return config
+
+
+def _prepare_sqlite(engine: Engine) -> None:
+    @event.listens_for(engine, "connect")
+    def _on_connect(connection: Any, _record: Any) -> None:
+        connection.isolation_level = None  # SQLAlchemy's "begin" below starts transactions, not the driver
+        for pragma in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON", f"busy_timeout={_PATIENCE_S * 1000}"):
+            connection.execute(f"PRAGMA {pragma}")
+
+    @event.listens_for(engine, "begin")
+    def _on_begin(connection: Connection) -> None:
+        # A deferred transaction that reads and then writes fails at once when another wrote in between; one that
+        # will write therefore takes the lock first and waits its turn.
+        writes = connection.get_execution_options().get("writes", False)
+        connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
+
+
+def make_engine(url: URL) -> Engine:
+    """A connection pool for ``url``; SQLite with write-ahead log, durable commits and foreign keys."""
+    if url.get_backend_name() != "sqlite":
+        connect = {"connect_timeout": _PATIENCE_S, **_ALIVE}
+        return create_engine(url, pool_pre_ping=True, connect_args=connect, max_overflow=_MORE_CONNECTIONS)
+    if url.database:
+        Path(url.database).parent.mkdir(parents=True, exist_ok=True)
+    engine = create_engine(url, max_overflow=_MORE_CONNECTIONS)
+    _prepare_sqlite(engine)
+    return engine
+
+
+class Database:
+    """A connection pool and its transactions.
+
+    Use ``with database.reading() as session`` to look and ``with database.writing() as session`` to change; the
+    latter commits at the end of its block, or rolls back when the block raises.
+    """
+
+    def __init__(self, url: URL) -> None:
+        self.url = url
+        self.engine = make_engine(url)
+        self._writer = self.engine.execution_options(writes=True)
+
+    @contextmanager
+    def reading(self) -> Iterator[Session]:
+        """A session that is rolled back at the end."""
+        with Session(self.engine, expire_on_commit=False) as session:
+            yield session
+
+    @contextmanager
+    def writing(self) -> Iterator[Session]:
+        """A session in one transaction; on SQLite it holds the only write lock, so compute before entering."""
+        with Session(self._writer, expire_on_commit=False) as session, session.begin():
+            yield session
+
+    def upgrade(self, revision: str = "head") -> None:
+        """Bring the schema up to ``revision``."""
+        with self._migrating() as config:
+            command.upgrade(config, revision)
+
+    def downgrade(self, revision: str) -> None:
+        """Take the schema down to ``revision`` ("base" for nothing)."""
+        with self._migrating() as config:
+            command.downgrade(config, revision)
+
+    @contextmanager
+    def _migrating(self) -> Iterator[Config]:
+        config = alembic_config()
+        with _alembic, self._writer.connect() as connection:
+            config.attributes["connection"] = connection
+            yield config
+
+    def ping(self) -> None:
+        """Ask the database for an answer; raises SQLAlchemy's error where there is none."""
+        with self.engine.connect() as connection:
+            connection.execute(text("SELECT 1"))
+
+    def revision(self) -> str | None:
+        """The schema's present version."""
+        with self.engine.connect() as connection:
+            return MigrationContext.configure(connection).get_current_revision()
+
+    def revisions(self) -> list[str]:
+        """All versions of the schema that this code knows, the oldest first."""
+        return [script.revision for script in ScriptDirectory.from_config(alembic_config()).walk_revisions()][::-1]
+
+    def is_current(self) -> bool:
+        """Whether the schema is at the newest version that this code knows."""
+        return self.revision() == ScriptDirectory.from_config(alembic_config()).get_current_head()
+
+    def require_current(self) -> None:
+        """Raise `SchemaError` unless the schema is at the newest version that this code knows."""
+        if not self.is_current():
+            raise SchemaError(
+                f"the store's schema is at {self.revision()}, this version works with {self.revisions()[-1]}: run "
+                "`heliotwin migrate`, or the version that fits"
+            )
+
+    def close(self) -> None:
+        """Close all pooled connections."""
+        self.engine.dispose()
+
+
+def migrate(settings: Settings, to: str = "head") -> str:
+    """Bring the store's schema to its newest version, or back to an older one, and return that version.
+
+    Raises
+    ------
+    InvalidInputError
+        Where this version knows no such revision.
+    """
+    database = Database(settings.database)
+    try:
+        known = database.revisions()
+        if to not in (*known, "head"):
+            raise InvalidInputError(f"--to {to}: must be head or one of {', '.join(known)}")
+        is_back = to != "head" and database.revision() in known[known.index(to) :]
+        (database.downgrade if is_back else database.upgrade)(to)
+        return database.revision() or "base"
+    finally:
+        database.close()

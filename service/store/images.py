@@ -1,0 +1,99 @@
+"""The image files: each kept once under the SHA-256 of its bytes, written whole or not at all."""
+
+import hashlib
+import os
+import tempfile
+from pathlib import Path
+
+from service.base.faults import StoreDamagedError, UnsupportedImageError
+
+# The formats that `model.imaging.decode` reads, by how their files begin.
+_SIGNATURES = {
+    b"\x89PNG\r\n\x1a\n": "image/png",
+    b"\xff\xd8\xff": "image/jpeg",
+    b"II*\x00": "image/tiff",
+    b"MM\x00*": "image/tiff",
+    b"BM": "image/bmp",
+}
+
+_REMEDY = "post it again, or restore it from a back-up (`heliotwin check` lists all such images)"
+
+
+def media_type(data: bytes) -> str:
+    """The image format by its first bytes, whatever its sender calls it.
+
+    Raises
+    ------
+    UnsupportedImageError
+        Where it is none of the accepted formats.
+    """
+    for signature, name in _SIGNATURES.items():
+        if data.startswith(signature):
+            return name
+    raise UnsupportedImageError("image: must be a PNG, JPEG, TIFF or BMP file")
+
+
+def digest(data: bytes) -> str:
+    """SHA-256 of ``data`` in hexadecimal."""
+    return hashlib.sha256(data).hexdigest()
+
+
+def _sync_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+class ImageStore:
+    """A folder of images, ``ab/cdef...`` for the digest ``abcdef...``."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+
+    def path(self, sha256: str) -> Path:
+        """Where the image of this digest lies."""
+        return self.root / sha256[:2] / sha256[2:]
+
+    def put(self, data: bytes) -> str:
+        """Keep ``data`` and return its digest; on return it is on the disk, also after a power cut."""
+        sha256 = digest(data)
+        path = self.path(sha256)
+        if not self._holds(sha256):  # also where a fault has altered it: writing it again repairs the store
+            self._write(path, data)
+        return sha256
+
+    def _holds(self, sha256: str) -> bool:
+        path = self.path(sha256)
+        return path.is_file() and digest(path.read_bytes()) == sha256
+
+    def _write(self, path: Path, data: bytes) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=".new-")
+        try:
+            with os.fdopen(descriptor, "wb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            Path(name).replace(path)
+        finally:
+            Path(name).unlink(missing_ok=True)
+        for folder in (path.parent, self.root):
+            _sync_folder(folder)
+
+    def read(self, sha256: str) -> bytes:
+        """The bytes of an image.
+
+        Raises
+        ------
+        StoreDamagedError
+            Where the file is gone or is not what was put there.
+        """
+        try:
+            data = self.path(sha256).read_bytes()
+        except FileNotFoundError as error:
+            raise StoreDamagedError(f"image {sha256} is missing from the store; {_REMEDY}") from error
+        if digest(data) != sha256:
+            raise StoreDamagedError(f"image {sha256} is damaged in the store; {_REMEDY}")
+        return data

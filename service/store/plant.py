@@ -1,0 +1,225 @@
+"""The plant, its heliostats, targets and receivers, as they are kept and found again."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from sqlalchemy import select
+from sqlalchemy.orm import Session, defer
+
+from model.plant import Cylinder, Receiver, TargetPlane
+from service.base import names
+from service.base.faults import ConflictError, NotFoundError
+from service.store.rows import Change, assign, floats, insert, insert_or_find
+from service.store.tables import HeliostatRow, PlantRow, ReceiverRow, StudyRow, TargetRow
+
+
+def get_plant(session: Session) -> PlantRow:
+    """The plant; ConflictError where none was set."""
+    plant = session.get(PlantRow, 1)
+    if plant is None:
+        raise ConflictError(
+            "the plant is not set yet: PUT its PAINT tower measurements to /v1/plant, or import a folder"
+        )
+    return plant
+
+
+def put_plant(session: Session, name: str, origin: ArrayLike) -> Change:
+    """Set the plant's name and origin (latitude [deg], longitude [deg], altitude [m]).
+
+    Raises
+    ------
+    ConflictError
+        Where heliostats or targets are already stored relative to another origin.
+    """
+    latitude, longitude, altitude = floats(origin)
+    values = {"name": name, "latitude_deg": latitude, "longitude_deg": longitude, "altitude_m": altitude}
+    plant = session.get(PlantRow, 1)
+    if plant is None:
+        if insert(session, PlantRow(id=1, **values)):
+            return Change.NEW
+        plant = get_plant(session)
+    if plant.origin != (latitude, longitude, altitude) and _has_positions(session):
+        raise ConflictError("the plant's origin is fixed: heliostats or targets are stored relative to it")
+    return assign(plant, values)
+
+
+def put_declared(session: Session, declared: dict[str, Any]) -> Change:
+    """Set what is declared of the plant's model, in the form of ``twin.json``.
+
+    Raises
+    ------
+    ConflictError
+        Where studies were made with another: what they found adds to that.
+    """
+    plant = get_plant(session)
+    studied = session.scalar(select(StudyRow.id).limit(1)) is not None
+    if studied and (plant.declared or {}) != declared:
+        raise ConflictError("the declared model is fixed: studies were made with it; adopt what they find instead")
+    return assign(plant, {"declared": declared})
+
+
+def _has_positions(session: Session) -> bool:
+    return any(session.scalar(select(table.id).limit(1)) is not None for table in (HeliostatRow, TargetRow))
+
+
+def find_heliostat(session: Session, name: str) -> HeliostatRow | None:
+    """The heliostat of this name, or None."""
+    return session.scalar(select(HeliostatRow).where(HeliostatRow.name == name))
+
+
+def get_heliostat(session: Session, name: str) -> HeliostatRow:
+    """The heliostat of this name; NotFoundError where there is none."""
+    row = find_heliostat(session, name)
+    if row is None:
+        raise NotFoundError(f"there is no heliostat {name}; POST it to /v1/heliostats first")
+    return row
+
+
+def get_heliostats(session: Session, wanted: Sequence[str]) -> dict[str, HeliostatRow]:
+    """Those of some heliostats that are stored, by name."""
+    rows = session.scalars(select(HeliostatRow).where(HeliostatRow.name.in_(wanted)))
+    return {row.name: row for row in rows}
+
+
+def list_heliostats(session: Session, limit: int, after: str | None = None) -> Sequence[HeliostatRow]:
+    """Up to ``limit`` heliostats in the order of their names, those after the name ``after``."""
+    query = select(HeliostatRow).options(defer(HeliostatRow.properties)).order_by(HeliostatRow.name).limit(limit)
+    return session.scalars(query.where(HeliostatRow.name > after) if after else query).all()
+
+
+def require_same_properties(row: HeliostatRow, properties: dict[str, Any]) -> None:
+    """ConflictError where ``properties`` are not those of the stored heliostat."""
+    if row.properties != properties:
+        raise ConflictError(f"name: heliostat {row.name} exists with other properties; PUT them to change it")
+
+
+def put_heliostat(
+    session: Session, name: str, properties: dict[str, Any], position: ArrayLike
+) -> tuple[HeliostatRow, Change]:
+    """Keep a heliostat's PAINT ``properties`` and its ENU ``position`` (3,) [m]; InvalidInputError for a bad name."""
+    names.require(names.NAME, name, "heliostat")
+    east, north, up = floats(position)
+    values = {"properties": properties, "east_m": east, "north_m": north, "up_m": up}
+    row, is_new = insert_or_find(session, HeliostatRow(name=name, **values))
+    return row, Change.NEW if is_new else assign(row, values)
+
+
+def find_target(session: Session, name: str) -> TargetRow | None:
+    """The target of this name, or None."""
+    return session.scalar(select(TargetRow).where(TargetRow.name == name))
+
+
+def get_target(session: Session, name: str) -> TargetRow:
+    """The target of this name; NotFoundError where there is none, naming those that exist."""
+    row = find_target(session, name)
+    if row is None:
+        known = ", ".join(target.name for target in list_targets(session)) or "none yet"
+        raise NotFoundError(f"there is no target {name}; known targets: {known}")
+    return row
+
+
+def list_targets(session: Session) -> Sequence[TargetRow]:
+    """All targets in the order of their names."""
+    return session.scalars(select(TargetRow).order_by(TargetRow.name)).all()
+
+
+def put_target(
+    session: Session, plane: TargetPlane, corners: dict[str, list[float]] | None = None
+) -> tuple[TargetRow, Change]:
+    """Keep a target plane under its name; ``corners`` are the WGS84 corners that it was made from, where known.
+
+    Raises `InvalidInputError` for a bad name, ConflictError where a receiver has it.
+    """
+    names.require(names.NAME, plane.name, "target")
+    if find_receiver(session, plane.name) is not None:
+        raise ConflictError(f"name: {plane.name} is a receiver; choose another name for the target plane")
+    values: dict[str, Any] = {
+        "center_m": floats(plane.center),
+        "normal": floats(plane.normal),
+        "up": floats(plane.up),
+        "width_m": float(plane.width),
+        "height_m": float(plane.height),
+    }
+    row, is_new = insert_or_find(session, TargetRow(name=plane.name, corners=corners, **values))
+    if is_new:
+        return row, Change.NEW
+    moved = any(getattr(row, name) != value for name, value in values.items())
+    # Corners that are known stay known while the plane is the same.
+    values["corners"] = corners if moved or corners is not None else row.corners
+    return row, assign(row, values)
+
+
+def target_plane(row: TargetRow) -> TargetPlane:
+    """The model's target plane of a stored one."""
+    return TargetPlane(
+        name=row.name,
+        center=np.array(row.center_m),
+        normal=np.array(row.normal),
+        up=np.array(row.up),
+        width=row.width_m,
+        height=row.height_m,
+    )
+
+
+def list_receivers(session: Session) -> Sequence[ReceiverRow]:
+    """All receivers in the order of their names."""
+    return session.scalars(select(ReceiverRow).order_by(ReceiverRow.name)).all()
+
+
+def find_receiver(session: Session, name: str) -> ReceiverRow | None:
+    """The receiver of this name, or None."""
+    return session.scalar(select(ReceiverRow).where(ReceiverRow.name == name))
+
+
+def get_receiver(session: Session, name: str) -> ReceiverRow:
+    """The receiver of this name; NotFoundError where there is none."""
+    row = find_receiver(session, name)
+    if row is None:
+        raise NotFoundError(f"there is no receiver {name}; PUT it to /v1/receivers/{name} first")
+    return row
+
+
+def put_receiver(session: Session, cylinder: Cylinder) -> tuple[ReceiverRow, Change]:
+    """Keep a receiver under its name.
+
+    Raises
+    ------
+    InvalidInputError
+        For a bad name.
+    ConflictError
+        Where a target has that name.
+    """
+    names.require(names.NAME, cylinder.name, "receiver")
+    if find_target(session, cylinder.name) is not None:
+        raise ConflictError(f"name: {cylinder.name} is a target plane; choose another name for the receiver")
+    values: dict[str, Any] = {
+        "center_m": floats(cylinder.center),
+        "normal": floats(cylinder.normal),
+        "up": floats(cylinder.up),
+        "radius_m": float(cylinder.radius),
+        "height_m": float(cylinder.height),
+        "opening_deg": float(cylinder.opening_deg),
+    }
+    row, is_new = insert_or_find(session, ReceiverRow(name=cylinder.name, **values))
+    return row, Change.NEW if is_new else assign(row, values)
+
+
+def receiver_cylinder(row: ReceiverRow) -> Cylinder:
+    """The model's receiver of a stored one."""
+    return Cylinder(
+        name=row.name,
+        center=np.array(row.center_m),
+        normal=np.array(row.normal),
+        up=np.array(row.up),
+        radius=row.radius_m,
+        height=row.height_m,
+        opening_deg=row.opening_deg,
+    )
+
+
+def get_target_or_receiver(session: Session, name: str) -> Receiver:
+    """The target plane or the cylinder of this name; NotFoundError where there is neither."""
+    row = find_receiver(session, name)
+    return target_plane(get_target(session, name)) if row is None else receiver_cylinder(row)

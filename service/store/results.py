@@ -1,0 +1,84 @@
+"""Forecasts and studies, as they are kept and found again, and how many of everything there are."""
+
+from collections.abc import Sequence
+from typing import cast
+
+from sqlalchemy import func, select
+from sqlalchemy.orm import Session, undefer
+
+from service.base.faults import NotFoundError
+from service.store.tables import (
+    Base,
+    ForecastRow,
+    HeliostatRow,
+    ImageRow,
+    MeasurementRow,
+    StudyRow,
+    SurfaceRow,
+    TargetRow,
+)
+
+
+def add_forecast(session: Session, row: ForecastRow) -> ForecastRow:
+    """Store a forecast."""
+    session.add(row)
+    session.flush()
+    session.refresh(row, ["heliostat", "surface"])
+    return row
+
+
+def get_forecast(session: Session, number: int) -> ForecastRow:
+    """A forecast with its flux; NotFoundError where there is none."""
+    row = session.scalar(select(ForecastRow).where(ForecastRow.id == number).options(undefer(ForecastRow.flux)))
+    if row is None:
+        raise NotFoundError(f"there is no forecast {number}")
+    return row
+
+
+def list_forecasts(
+    session: Session, limit: int, after: int | None = None, heliostat: HeliostatRow | None = None
+) -> Sequence[ForecastRow]:
+    """Up to ``limit`` forecasts in the order they were made, those after number ``after``."""
+    query = select(ForecastRow).order_by(ForecastRow.id).limit(limit)
+    if heliostat is not None:
+        query = query.where(ForecastRow.heliostat_id == heliostat.id)
+    return session.scalars(query.where(ForecastRow.id > after) if after else query).all()
+
+
+def add_study(session: Session, row: StudyRow) -> StudyRow:
+    """Store a study."""
+    session.add(row)
+    session.flush()
+    return row
+
+
+def get_study(session: Session, number: int, page: bool = False) -> StudyRow:
+    """A study with its report, and its ``page`` where wanted; NotFoundError where there is none."""
+    columns = [undefer(StudyRow.report), undefer(StudyRow.skipped), *([undefer(StudyRow.html)] if page else [])]
+    row = session.scalar(select(StudyRow).where(StudyRow.id == number).options(*columns))
+    if row is None:
+        raise NotFoundError(f"there is no study {number}")
+    return row
+
+
+def list_studies(session: Session, limit: int, after: int | None = None) -> Sequence[StudyRow]:
+    """Up to ``limit`` studies without their reports, newest first, those older than study ``after``."""
+    query = select(StudyRow).order_by(StudyRow.id.desc()).limit(limit)
+    return session.scalars(query.where(StudyRow.id < after) if after else query).all()
+
+
+_COUNTED: dict[str, type[Base]] = {
+    "heliostats": HeliostatRow,
+    "targets": TargetRow,
+    "images": ImageRow,
+    "measurements": MeasurementRow,
+    "surfaces": SurfaceRow,
+    "forecasts": ForecastRow,
+}
+
+
+def counts(session: Session) -> dict[str, int]:
+    """How many of each there are."""
+    return {
+        name: cast(int, session.scalar(select(func.count()).select_from(table))) for name, table in _COUNTED.items()
+    }

@@ -1,0 +1,153 @@
+"""Surfaces by version, as they are kept and found again."""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy import Select, func, select
+from sqlalchemy.orm import Session, undefer
+
+from service.base.arrays import pack
+from service.base.faults import ConflictError, NotFoundError
+from service.store.rows import ROUNDS, insert
+from service.store.tables import HeliostatRow, MeasurementRow, SurfaceRow, now
+
+
+@dataclass(frozen=True, eq=False)
+class NewSurface:
+    """A surface to be stored as the next version.
+
+    Attributes
+    ----------
+    source : one of measured, network, refined, imported
+    z, z_std : (4, 8, 8) [m]
+        Control heights and their standard deviation; zero where it is not known.
+    control_points : (4, 8, 8, 3) [m]
+        In heliostat coordinates, canting and facet position in them.
+    valid_from : datetime
+        From when it describes the mirror; without it, from now.
+    model : str
+        Name and hash of the weights that made it.
+    model_version : str
+        Version of the plant's model that it was made with.
+    measurements : the rows that it was made from
+    misfit : float
+    """
+
+    source: str
+    z: NDArray[Any]
+    z_std: NDArray[Any]
+    control_points: NDArray[Any]
+    valid_from: datetime | None = None
+    model: str | None = None
+    model_version: str | None = None
+    measurements: Sequence[MeasurementRow] = field(default=())
+    misfit: float | None = None
+
+    @property
+    def content(self) -> str:
+        """SHA-256 over its source and control points."""
+        points = np.ascontiguousarray(self.control_points, dtype=np.float64)
+        return hashlib.sha256(self.source.encode() + points.tobytes()).hexdigest()
+
+
+def _surfaces(heliostat: HeliostatRow) -> Select[SurfaceRow]:
+    return select(SurfaceRow).where(SurfaceRow.heliostat_id == heliostat.id)
+
+
+def _surface_row(heliostat: HeliostatRow, version: int, new: NewSurface, content: str | None) -> SurfaceRow:
+    created = now()
+    arrays = {"z": new.z, "z_std": new.z_std, "control_points": new.control_points}
+    return SurfaceRow(
+        heliostat_id=heliostat.id,
+        version=version,
+        created_at=created,
+        valid_from=new.valid_from or created,
+        source=new.source,
+        model=new.model,
+        model_version=new.model_version,
+        misfit=new.misfit,
+        content_sha256=content,
+        arrays=pack({name: np.asarray(array, np.float64) for name, array in arrays.items()}),
+        measurements=sorted(new.measurements, key=lambda measurement: measurement.id),
+    )
+
+
+def add_surface(
+    session: Session, heliostat: HeliostatRow, new: NewSurface, once: bool = False
+) -> tuple[SurfaceRow, bool]:
+    """Store a surface as the heliostat's next version.
+
+    With ``once`` (imports) the same control points from the same source are stored only the first time; the second
+    value is False where they were there already.
+    """
+    content = new.content if once else None
+    for _ in range(ROUNDS):
+        if content is not None:
+            existing = session.scalar(_surfaces(heliostat).where(SurfaceRow.content_sha256 == content))
+            if existing is not None:
+                return existing, False
+        last = session.scalar(select(func.max(SurfaceRow.version)).where(SurfaceRow.heliostat_id == heliostat.id))
+        row = _surface_row(heliostat, (last or 0) + 1, new, content)
+        if insert(session, row):
+            return row, True
+    raise ConflictError("too many writers on the same heliostat's surfaces; try again")
+
+
+def list_surfaces(
+    session: Session, heliostat: HeliostatRow, limit: int, after: int | None = None
+) -> Sequence[SurfaceRow]:
+    """Up to ``limit`` versions, oldest first, those after version ``after``."""
+    query = _surfaces(heliostat).order_by(SurfaceRow.version).limit(limit)
+    return session.scalars(query.where(SurfaceRow.version > after) if after else query).all()
+
+
+def get_surface(session: Session, heliostat: HeliostatRow, version: int) -> SurfaceRow:
+    """A version with its arrays; NotFoundError where there is none."""
+    row = session.scalar(_surfaces(heliostat).where(SurfaceRow.version == version).options(undefer(SurfaceRow.arrays)))
+    if row is None:
+        raise NotFoundError(f"heliostat {heliostat.name} has no surface version {version}")
+    return row
+
+
+def find_measured_surface(session: Session, heliostat: HeliostatRow) -> SurfaceRow | None:
+    """The newest version, with its arrays, that was measured and not predicted, or None."""
+    query = _surfaces(heliostat).where(SurfaceRow.source == "measured")
+    return session.scalar(query.order_by(SurfaceRow.version.desc()).limit(1).options(undefer(SurfaceRow.arrays)))
+
+
+def find_surface_at(session: Session, heliostat: HeliostatRow, moment: datetime | None = None) -> SurfaceRow | None:
+    """The version, with its arrays, that was valid at ``moment``: the last to begin before it, or None.
+
+    Without a moment the last of all: what begins a little ahead, because a camera's clock is ahead of ours or ours was
+    set back, is current too.
+    """
+    query = _surfaces(heliostat)
+    if moment is not None:
+        query = query.where(SurfaceRow.valid_from <= moment)
+    query = query.order_by(SurfaceRow.valid_from.desc(), SurfaceRow.version.desc()).limit(1)
+    return session.scalar(query.options(undefer(SurfaceRow.arrays)))
+
+
+def current_surfaces(session: Session, heliostats: Sequence[int]) -> dict[int, bytes]:
+    """The arrays of what `find_surface_at` has without a moment, by the heliostats' ids, of those that have one."""
+    newest = func.row_number().over(
+        partition_by=SurfaceRow.heliostat_id, order_by=(SurfaceRow.valid_from.desc(), SurfaceRow.version.desc())
+    )
+    ranked = select(SurfaceRow.id, newest.label("place")).where(SurfaceRow.heliostat_id.in_(heliostats)).subquery()
+    first = select(ranked.c.id).where(ranked.c.place == 1)
+    rows = session.execute(select(SurfaceRow.heliostat_id, SurfaceRow.arrays).where(SurfaceRow.id.in_(first)))
+    return {row.heliostat_id: row.arrays for row in rows}
+
+
+def get_surface_at(session: Session, heliostat: HeliostatRow, moment: datetime | None = None) -> SurfaceRow:
+    """The version valid at ``moment``, by default now; NotFoundError where there is none."""
+    row = find_surface_at(session, heliostat, moment)
+    if row is None:
+        when = f"at {moment.isoformat()}" if moment else "yet"
+        raise NotFoundError(f"heliostat {heliostat.name} has no surface {when}; POST to its surfaces to predict one")
+    return row

@@ -1,0 +1,414 @@
+"""The tables: one typed class each; a column says its unit in its name.
+
+Arrays live in compressed npz blobs that are loaded only when asked for; images live in files (`service.store.images`)
+and are referred to by their SHA-256.
+"""
+
+from datetime import UTC, datetime
+from typing import Any
+
+from sqlalchemy import (
+    JSON,
+    CheckConstraint,
+    Column,
+    DateTime,
+    Dialect,
+    ForeignKey,
+    Index,
+    LargeBinary,
+    MetaData,
+    String,
+    Table,
+    Text,
+    TypeDecorator,
+    UniqueConstraint,
+)
+from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column, relationship
+
+_NAMING = {
+    "ix": "ix_%(table_name)s_%(column_0_N_name)s",
+    "uq": "uq_%(table_name)s_%(column_0_N_name)s",
+    "ck": "ck_%(table_name)s_%(constraint_name)s",
+    "fk": "fk_%(table_name)s_%(column_0_name)s_%(referred_table_name)s",
+    "pk": "pk_%(table_name)s",
+}
+
+KINDS = ("raw", "cropped", "flux", "flux-centered")
+SOURCES = ("measured", "network", "refined", "imported")
+STATES = ("queued", "running", "done", "failed", "cancelled")
+ROLES = ("read", "ingest", "operate", "admin")
+VERDICTS = ("effect", "none", "unexplained")
+
+MODEL_VERSION = 256
+"""Characters that name a version of the plant's model: its number and all effects of the catalogue."""
+
+# A missing JSON value is SQL's NULL, not the JSON text "null".
+_Json = JSON(none_as_null=True)
+
+
+def _one_of(column: str, values: tuple[str, ...]) -> CheckConstraint:
+    return CheckConstraint(f"{column} IN ({', '.join(repr(value) for value in values)})", name=column)
+
+
+class UtcDateTime(TypeDecorator[datetime]):
+    """A moment in UTC; SQLite keeps no zone, so it is put back on the way out."""
+
+    impl = DateTime(timezone=True)
+    cache_ok = True
+
+    def process_bind_param(self, value: datetime | None, dialect: Dialect) -> datetime | None:
+        """In UTC; a moment without a zone is a programming error."""
+        if value is None:
+            return None
+        if value.tzinfo is None:
+            raise ValueError("a stored moment needs a time zone")
+        return value.astimezone(UTC)
+
+    def process_result_value(self, value: datetime | None, dialect: Dialect) -> datetime | None:
+        """With its zone."""
+        if value is None:
+            return None
+        return value.replace(tzinfo=UTC) if value.tzinfo is None else value.astimezone(UTC)
+
+
+def now() -> datetime:
+    """The present moment in UTC."""
+    return datetime.now(UTC)
+
+
+class Base(DeclarativeBase):
+    """What all tables share: constraint names that migrations can refer to."""
+
+    metadata = MetaData(naming_convention=_NAMING)
+    type_annotation_map = {  # noqa: RUF012
+        datetime: UtcDateTime,
+        dict[str, Any]: _Json,
+        list[dict[str, Any]]: _Json,
+        list[float]: _Json,
+        list[str]: _Json,
+    }
+
+
+class PlantRow(Base):
+    """The plant: one row, written before anything that needs its origin.
+
+    ``declared`` is what ``twin.json`` declares of its model (DESIGN.md, section 6); the defaults without it.
+    """
+
+    __tablename__ = "plant"
+    __table_args__ = (CheckConstraint("id = 1", name="single"),)
+
+    id: Mapped[int] = mapped_column(primary_key=True, autoincrement=False, default=1)
+    name: Mapped[str] = mapped_column(String(64))
+    latitude_deg: Mapped[float]
+    longitude_deg: Mapped[float]
+    altitude_m: Mapped[float]
+    declared: Mapped[dict[str, Any] | None]
+
+    @property
+    def origin(self) -> tuple[float, float, float]:
+        """The tower base in WGS84 [deg, deg, m]."""
+        return self.latitude_deg, self.longitude_deg, self.altitude_m
+
+
+class HeliostatRow(Base):
+    """A heliostat: its PAINT properties as they came, and its position in ENU [m] for queries."""
+
+    __tablename__ = "heliostats"
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    name: Mapped[str] = mapped_column(String(64), unique=True)
+    properties: Mapped[dict[str, Any]]
+    east_m: Mapped[float]
+    north_m: Mapped[float]
+    up_m: Mapped[float]
+    created_at: Mapped[datetime] = mapped_column(default=now)
+    updated_at: Mapped[datetime] = mapped_column(default=now, onupdate=now)
+
+
+class TargetRow(Base):
+    """A target plane in ENU [m]; ``corners`` are the WGS84 corners that it was made from, where it was."""
+
+    __tablename__ = "targets"
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    name: Mapped[str] = mapped_column(String(64), unique=True)
+    center_m: Mapped[list[float]]
+    normal: Mapped[list[float]]
+    up: Mapped[list[float]]
+    width_m: Mapped[float]
+    height_m: Mapped[float]
+    corners: Mapped[dict[str, Any] | None]
+    updated_at: Mapped[datetime] = mapped_column(default=now, onupdate=now)
+
+
+class ReceiverRow(Base):
+    """A cylindrical receiver in ENU [m]; see `model.plant.Cylinder`."""
+
+    __tablename__ = "receivers"
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    name: Mapped[str] = mapped_column(String(64), unique=True)
+    center_m: Mapped[list[float]]
+    normal: Mapped[list[float]]
+    up: Mapped[list[float]]
+    radius_m: Mapped[float]
+    height_m: Mapped[float]
+    opening_deg: Mapped[float]
+    updated_at: Mapped[datetime] = mapped_column(default=now, onupdate=now)
+
+
+class ImageRow(Base):
+    """An image file in the store, by its content."""
+
+    __tablename__ = "images"
+
+    sha256: Mapped[str] = mapped_column(String(64), primary_key=True)
+    media_type: Mapped[str] = mapped_column(String(32))
+    size_bytes: Mapped[int]
+    width_px: Mapped[int]
+    height_px: Mapped[int]
+    created_at: Mapped[datetime] = mapped_column(default=now)
+
+
+class MeasurementRow(Base):
+    """One photograph of one heliostat's spot and what was measured in it.
+
+    ``arrays`` holds npz ``flux`` and ``centered``; a refused image has neither and keeps its ``reason``.
+    ``center_right_m``, ``center_up_m``: centre of mass from the target's centre.
+    """
+
+    __tablename__ = "measurements"
+    __table_args__ = (
+        UniqueConstraint("heliostat_id", "image_sha256", "kind"),
+        UniqueConstraint("heliostat_id", "identifier"),
+        Index(None, "heliostat_id", "accepted"),
+        _one_of("kind", KINDS),
+    )
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    heliostat_id: Mapped[int] = mapped_column(ForeignKey("heliostats.id"))
+    identifier: Mapped[str] = mapped_column(String(96))
+    external_id: Mapped[str | None] = mapped_column(String(64))
+    image_sha256: Mapped[str] = mapped_column(ForeignKey("images.sha256"), index=True)
+    kind: Mapped[str] = mapped_column(String(16))
+    target_id: Mapped[int] = mapped_column(ForeignKey("targets.id"), index=True)
+    sun_azimuth_deg: Mapped[float]
+    sun_elevation_deg: Mapped[float]
+    motor_axis_1: Mapped[float | None]
+    motor_axis_2: Mapped[float | None]
+    taken_at: Mapped[datetime | None]
+    focal_spot_wgs84: Mapped[list[float] | None]
+    corners_px: Mapped[dict[str, Any] | None]
+    accepted: Mapped[bool]
+    reason: Mapped[str | None] = mapped_column(String(64))
+    quality: Mapped[dict[str, Any]]
+    center_right_m: Mapped[float | None]
+    center_up_m: Mapped[float | None]
+    arrays: Mapped[bytes | None] = mapped_column(LargeBinary, deferred=True)
+    created_at: Mapped[datetime] = mapped_column(default=now)
+
+    target: Mapped[TargetRow] = relationship(lazy="joined", innerjoin=True)
+    image: Mapped[ImageRow] = relationship(lazy="joined", innerjoin=True)
+
+
+surface_measurements = Table(
+    "surface_measurements",
+    Base.metadata,
+    Column("surface_id", ForeignKey("surfaces.id"), primary_key=True),
+    Column("measurement_id", ForeignKey("measurements.id"), primary_key=True, index=True),
+)
+
+
+class SurfaceRow(Base):
+    """One version of a heliostat's surface; npz ``z``, ``z_std`` (4, 8, 8) and ``control_points`` (4, 8, 8, 3) [m].
+
+    ``content_sha256`` is set where the same content must not be stored twice (imports); predictions leave it empty.
+    ``model`` names the weights, ``model_version`` the plant's model with its effects that a prediction was made by.
+    """
+
+    __tablename__ = "surfaces"
+    __table_args__ = (
+        UniqueConstraint("heliostat_id", "version"),
+        UniqueConstraint("heliostat_id", "content_sha256"),
+        Index(None, "heliostat_id", "valid_from"),
+        _one_of("source", SOURCES),
+    )
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    heliostat_id: Mapped[int] = mapped_column(ForeignKey("heliostats.id"))
+    version: Mapped[int]
+    created_at: Mapped[datetime] = mapped_column(default=now)
+    valid_from: Mapped[datetime]
+    source: Mapped[str] = mapped_column(String(16))
+    model: Mapped[str | None] = mapped_column(String(128))
+    model_version: Mapped[str | None] = mapped_column(String(MODEL_VERSION))
+    misfit: Mapped[float | None]
+    content_sha256: Mapped[str | None] = mapped_column(String(64))
+    arrays: Mapped[bytes] = mapped_column(LargeBinary, deferred=True)
+
+    measurements: Mapped[list[MeasurementRow]] = relationship(
+        secondary=surface_measurements, order_by=MeasurementRow.id, lazy="selectin"
+    )
+
+
+class DriftRow(Base):
+    """Flux accuracy [1] of a heliostat's surface on its newest photograph, when that came (`service.twin.accuracy`)."""
+
+    __tablename__ = "drift"
+
+    heliostat_id: Mapped[int] = mapped_column(ForeignKey("heliostats.id"), primary_key=True, autoincrement=False)
+    measurement_id: Mapped[int] = mapped_column(ForeignKey("measurements.id"))
+    surface_id: Mapped[int] = mapped_column(ForeignKey("surfaces.id"))
+    taken_at: Mapped[datetime]
+    accuracy: Mapped[float]
+
+
+class ForecastRow(Base):
+    """A computed flux map: its inputs, its npz ``flux`` (rows, columns) float32 [W/m2] and its figures."""
+
+    __tablename__ = "forecasts"
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    heliostat_id: Mapped[int] = mapped_column(ForeignKey("heliostats.id"), index=True)
+    surface_id: Mapped[int | None] = mapped_column(ForeignKey("surfaces.id"), index=True)
+    target_name: Mapped[str | None] = mapped_column(String(64))
+    plane: Mapped[dict[str, Any]]
+    sun_azimuth_deg: Mapped[float]
+    sun_elevation_deg: Mapped[float]
+    aim_point_m: Mapped[list[float] | None]
+    dni_w_m2: Mapped[float]
+    window_m: Mapped[float | None]
+    normalised: Mapped[bool]
+    rows: Mapped[int]
+    columns: Mapped[int]
+    peak_w_m2: Mapped[float]
+    power_w: Mapped[float]
+    center_right_m: Mapped[float | None]
+    center_up_m: Mapped[float | None]
+    model_version: Mapped[str] = mapped_column(String(MODEL_VERSION))
+    flux: Mapped[bytes] = mapped_column(LargeBinary, deferred=True)
+    created_at: Mapped[datetime] = mapped_column(default=now)
+
+    heliostat: Mapped[HeliostatRow] = relationship(lazy="joined", innerjoin=True)
+    surface: Mapped[SurfaceRow | None] = relationship(lazy="joined")
+
+
+class StudyRow(Base):
+    """A study of stored photographs: what was asked, what of it was looked at, and what it found.
+
+    ``model`` is the number of the plant's model that it was made with, ``report`` that of `model.study.Study.to_json`,
+    ``html`` the same as a page; a report from a file has no page. ``taken_from`` and ``taken_to`` are the first and the
+    last moment of its photographs.
+    """
+
+    __tablename__ = "studies"
+    __table_args__ = (_one_of("verdict", VERDICTS),)
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    created_at: Mapped[datetime] = mapped_column(default=now)
+    created_by: Mapped[str] = mapped_column(String(64))
+    options: Mapped[dict[str, Any]]
+    heliostats: Mapped[list[str]]
+    taken_from: Mapped[datetime | None]
+    taken_to: Mapped[datetime | None]
+    model: Mapped[int]
+    model_version: Mapped[str] = mapped_column(String(MODEL_VERSION))
+    verdict: Mapped[str] = mapped_column(String(16))
+    conclusion: Mapped[str] = mapped_column(Text)
+    report: Mapped[dict[str, Any]] = mapped_column(deferred=True)
+    skipped: Mapped[dict[str, Any]] = mapped_column(deferred=True)
+    html: Mapped[str | None] = mapped_column(Text, deferred=True)
+
+
+class ModelRow(Base):
+    """A version of the plant's model from the second on: the declared one, with all its ``effects``.
+
+    The first version is the declared model itself; it has no row, for nobody adopted it. Rows are never deleted.
+    """
+
+    __tablename__ = "models"
+
+    number: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
+    version: Mapped[str] = mapped_column(String(MODEL_VERSION))
+    effects: Mapped[list[dict[str, Any]]]
+    study_id: Mapped[int] = mapped_column(ForeignKey("studies.id"), index=True)
+    adopted_at: Mapped[datetime] = mapped_column(default=now)
+    adopted_by: Mapped[str] = mapped_column(String(64))
+    withdrawn_at: Mapped[datetime | None]
+    withdrawn_by: Mapped[str | None] = mapped_column(String(64))
+
+
+class JobRow(Base):
+    """A piece of work that outlives the request that asked for it; `service.store.queue` says how it changes.
+
+    ``lease_token`` names the one worker that may write to it until ``lease_until``; ``revision`` counts what a watcher
+    may see of it; npz ``arrays`` is the part of the result that is no JSON.
+    """
+
+    __tablename__ = "jobs"
+    __table_args__ = (
+        UniqueConstraint("created_by", "idempotency_key"),
+        Index(None, "state", "not_before"),
+        _one_of("state", STATES),
+    )
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    kind: Mapped[str] = mapped_column(String(32))
+    payload: Mapped[dict[str, Any]]
+    state: Mapped[str] = mapped_column(String(16), default="queued")
+    created_by: Mapped[str] = mapped_column(String(64))
+    idempotency_key: Mapped[str | None] = mapped_column(String(128))
+    created_at: Mapped[datetime] = mapped_column(default=now)
+    not_before: Mapped[datetime] = mapped_column(default=now)
+    started_at: Mapped[datetime | None]
+    finished_at: Mapped[datetime | None]
+    attempts: Mapped[int] = mapped_column(default=0)
+    cancel_requested: Mapped[bool] = mapped_column(default=False)
+    progress: Mapped[float] = mapped_column(default=0.0)
+    message: Mapped[str] = mapped_column(String(200), default="")
+    revision: Mapped[int] = mapped_column(default=1)
+    worker: Mapped[str | None] = mapped_column(String(96))
+    lease_token: Mapped[str | None] = mapped_column(String(32))
+    lease_until: Mapped[datetime | None]
+    reason: Mapped[str | None] = mapped_column(String(1000))
+    result: Mapped[dict[str, Any] | None]
+    arrays: Mapped[bytes | None] = mapped_column(LargeBinary, deferred=True)
+
+
+class JobStepRow(Base):
+    """A part of a job that is done for good: stored in one transaction with what it did, never done again."""
+
+    __tablename__ = "job_steps"
+
+    job_id: Mapped[int] = mapped_column(ForeignKey("jobs.id"), primary_key=True)
+    name: Mapped[str] = mapped_column(String(96), primary_key=True)
+    result: Mapped[dict[str, Any]]
+
+
+class KeyRow(Base):
+    """An API key by its hash; a withdrawn one stays, so that its name keeps its meaning in the audit trail."""
+
+    __tablename__ = "api_keys"
+    __table_args__ = (_one_of("role", ROLES),)
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    name: Mapped[str] = mapped_column(String(64), unique=True)
+    prefix: Mapped[str] = mapped_column(String(16), unique=True)
+    sha256: Mapped[str] = mapped_column(String(64))
+    role: Mapped[str] = mapped_column(String(16))
+    created_at: Mapped[datetime] = mapped_column(default=now)
+    withdrawn_at: Mapped[datetime | None]
+
+
+class AuditRow(Base):
+    """Who did what when; rows are only ever added."""
+
+    __tablename__ = "audit"
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    at: Mapped[datetime] = mapped_column(default=now)
+    actor: Mapped[str] = mapped_column(String(64))
+    action: Mapped[str] = mapped_column(String(64))
+    subject: Mapped[str] = mapped_column(String(128))
+    detail: Mapped[dict[str, Any]]

@@ -1,0 +1,224 @@
+"""How well the current surfaces forecast what was photographed: heliostat by heliostat, computed once and remembered.
+
+Forecast and photograph are compared in the photograph's own 4 m window about its centre of mass, as everywhere
+(DESIGN.md, section 7). A result holds until the heliostat gets another surface or
+another photograph, or the plant's model another version.
+"""
+
+import logging
+import threading
+from collections import OrderedDict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from statistics import fmean
+from typing import Any
+
+from numpy.typing import NDArray
+from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy.orm import Session
+
+from model.errors import ModelError
+from model.metrics import flux_accuracy
+from service import store
+from service.base.arrays import unpack
+from service.base.faults import ServiceError
+from service.base.meters import ACCURACY
+from service.store.tables import DriftRow, HeliostatRow, MeasurementRow, SurfaceRow
+from service.twin import versions
+from service.twin.evidence import load_heliostat, observation_of
+from service.twin.runtime import Runtime
+
+logger = logging.getLogger("heliotwin.service")
+RECENT = 8
+"""How many of a heliostat's newest photographs a forecast is held against."""
+
+
+# Results that are kept [1]: the field of the largest plant several times over.
+_MOST = 200_000
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """A photograph and its forecast.
+
+    Attributes
+    ----------
+    measurement : MeasurementRow
+    measured, forecast : (64, 64)
+        4 m x 4 m, each with sum 100.
+    accuracy : float [1]
+    was_used : bool
+        Whether the surface was made from this photograph, among others; then it proves less.
+    """
+
+    measurement: MeasurementRow
+    measured: NDArray[Any]
+    forecast: NDArray[Any]
+    accuracy: float
+    was_used: bool
+
+
+def _newest(session: Session, heliostat: HeliostatRow) -> list[MeasurementRow]:
+    recent = store.recent_measurements(session, heliostat, RECENT)
+    return [store.get_measurement(session, heliostat, row.identifier, arrays=True) for row in recent]
+
+
+def compare(runtime: Runtime, name: str, surface: SurfaceRow | None) -> list[Comparison]:
+    """The heliostat's newest photographs against forecasts with a stored surface, or the ideal one.
+
+    Raises
+    ------
+    NotFoundError
+        Where there is no such heliostat.
+    ModelError
+        Where a photograph or the surface cannot be traced.
+    """
+    with runtime.database.reading() as session:
+        rows = _newest(session, store.get_heliostat(session, name))
+    return compare_measurements(runtime, name, rows, surface)
+
+
+def compare_measurements(
+    runtime: Runtime, name: str, rows: Sequence[MeasurementRow], surface: SurfaceRow | None
+) -> list[Comparison]:
+    """The same for accepted measurements of the heliostat, loaded with their arrays."""
+    with runtime.database.reading() as session:
+        heliostat = load_heliostat(session, store.get_heliostat(session, name))
+        origin, model = store.get_plant(session).origin, versions.get_model(session)
+    if not rows:
+        return []
+    observations = [observation_of(measurement, origin) for measurement in rows]
+    z = None if surface is None else unpack(surface.arrays)["z"]
+    with runtime.computing("compare") as operations:
+        forecasts = operations.render(heliostat, observations, z, model.optics, model.effects)
+
+    used = set() if surface is None else {measurement.id for measurement in surface.measurements}
+    return [
+        Comparison(row, o.flux, forecast, flux_accuracy(o.flux, forecast), row.id in used)
+        for row, o, forecast in zip(rows, observations, forecasts, strict=True)
+    ]
+
+
+@dataclass(frozen=True)
+class State:
+    """What a heliostat's accuracy depends on.
+
+    Its surface and its newest photograph, by their rows' ids, and the version of the plant's model.
+    """
+
+    heliostat: str
+    surface: int
+    newest: int
+    model: int
+
+
+class AccuracyBook:
+    """Mean accuracies [1] by `State`; those that are missing are worked out by one thread, in the background."""
+
+    def __init__(self, runtime: Runtime) -> None:
+        self._runtime = runtime
+        self._lock = threading.Lock()
+        self._known: OrderedDict[State, float | None] = OrderedDict()
+        self._wanted: OrderedDict[State, None] = OrderedDict()
+        self._is_closed = False
+        self._thread: threading.Thread | None = None
+
+    def look_up(self, states: Iterable[State]) -> tuple[dict[str, float | None], int]:
+        """What is known, by heliostat (None: it could not be told), and how many are still being worked out."""
+        with self._lock:
+            asked = list(states)
+            missing = [state for state in asked if state not in self._known]
+            # What nobody asks for any more is not worth the work.
+            self._wanted = OrderedDict.fromkeys(missing)
+            if missing and not self._is_closed and self._thread is None:
+                self._thread = threading.Thread(target=self._work, name="accuracy", daemon=True)
+                self._thread.start()
+            known = {state.heliostat: self._known[state] for state in asked if state in self._known}
+            return known, len(missing)
+
+    def close(self) -> None:
+        """Stop working, and wait for what is under way."""
+        with self._lock:
+            self._is_closed = True
+            self._wanted.clear()
+            thread = self._thread
+        if thread is not None:
+            thread.join()
+
+    def _next(self) -> State | None:
+        with self._lock:
+            if not self._wanted:
+                self._thread = None
+                return None
+            return self._wanted.popitem(last=False)[0]
+
+    def _work(self) -> None:
+        while (state := self._next()) is not None:
+            try:
+                accuracy = self._accuracy(state)
+            except SQLAlchemyError as error:  # asked for again, it is tried again
+                logger.warning("the accuracy of heliostat %s waits for the database: %s", state.heliostat, error)
+                continue
+            with self._lock:
+                self._known[state] = accuracy
+                while len(self._known) > _MOST:
+                    self._known.popitem(last=False)
+
+    def _accuracy(self, state: State) -> float | None:
+        """Of the surface that is current by now; None where it cannot be told, which the log explains."""
+        try:
+            with self._runtime.database.reading() as session:
+                surface = store.get_surface_at(session, store.get_heliostat(session, state.heliostat))
+            compared = compare(self._runtime, state.heliostat, surface)
+            return fmean(comparison.accuracy for comparison in compared) if compared else None
+        except SQLAlchemyError:
+            raise
+        except (ModelError, ServiceError) as error:
+            logger.warning("the accuracy of heliostat %s cannot be told: %s", state.heliostat, error)
+        except Exception:  # whatever it is, the one thread that there is must live for the other heliostats
+            logger.exception("the accuracy of heliostat %s cannot be told", state.heliostat)
+        return None
+
+
+def judge(runtime: Runtime, heliostat: str, measurement: MeasurementRow) -> float | None:
+    """Hold an accepted photograph, loaded with its arrays, against the heliostat's current surface, and note it.
+
+    The accuracy [1]; None where the heliostat has no surface, or it cannot be told, which the log explains: the
+    photograph is stored already, and what watches over it must not refuse it.
+    """
+    try:
+        return _judge(runtime, heliostat, measurement)
+    except (ModelError, SQLAlchemyError) as error:
+        logger.warning("the drift of heliostat %s cannot be told: %s", heliostat, error)
+    except Exception:  # whatever it is, the photograph is stored, and its sender must be told so
+        logger.exception("the drift of heliostat %s cannot be told", heliostat)
+    return None
+
+
+def _judge(runtime: Runtime, name: str, measurement: MeasurementRow) -> float | None:
+    with runtime.database.reading() as session:
+        surface = store.find_surface_at(session, store.get_heliostat(session, name))
+    if surface is None:
+        return None
+    (compared,) = compare_measurements(runtime, name, [measurement], surface)
+    ACCURACY.observe(compared.accuracy)
+    with runtime.database.writing() as session:
+        _note(session, measurement, surface, compared.accuracy)
+    return compared.accuracy
+
+
+def _note(session: Session, measurement: MeasurementRow, surface: SurfaceRow, accuracy: float) -> None:
+    """Keep it as the heliostat's, unless that of a photograph that was taken later stands there."""
+    new = DriftRow(
+        heliostat_id=measurement.heliostat_id,
+        measurement_id=measurement.id,
+        surface_id=surface.id,
+        taken_at=measurement.taken_at or measurement.created_at,
+        accuracy=accuracy,
+    )
+    held = session.get(DriftRow, measurement.heliostat_id, with_for_update=True)
+    if held is None and store.insert(session, new):
+        return
+    held = held or session.get_one(DriftRow, measurement.heliostat_id, with_for_update=True)
+    if held.taken_at <= new.taken_at:
+        session.merge(new)

@@ -1,0 +1,204 @@
+"""What the command line, the demo and REST do, as plain functions: measure, predict, forecast, study."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from model.effects import JUELICH_LATITUDE, Effect, model_version
+from model.errors import InvalidInputError
+from model.fleet import Engine, FleetFlux, Superposition, Tile
+from model.fleet import superpose as superpose_tiles
+from model.forecast import Shot, View, align
+from model.imaging import ImageKind, MeasuredFlux
+from model.imaging import measure as measure_image
+from model.network.predictor import default_predictor
+from model.observation import Observation, SurfacePrediction, render_observations
+from model.plant import Heliostat, Receiver, TargetPlane
+from model.refinement import refine
+from model.study import Photograph, Study, StudyOptions
+from model.study import study as study_photographs
+from model.surface import COLUMNS, DEGREE, FACETS, ROWS, control_points
+from model.tracing import Optics
+from model.tracing.convolution import central_rays
+from service.base.progress import Progress, quiet
+
+Array = NDArray[np.float64]
+Method = Literal["network", "refined"]
+
+SAMPLES = 64
+"""Points along each side of a facet: measured surfaces of 20 x 20 control points converge to 0.2 % (L1)."""
+
+MODEL_VERSION = model_version(())
+"""Version of a plant's model that holds no effect."""
+
+
+def measure(
+    image: NDArray[np.uint8], kind: ImageKind, plane: TargetPlane, *, corners: Array | None = None
+) -> MeasuredFlux:
+    """Flux and quality of one photograph of a target; see `model.imaging.measure`."""
+    return measure_image(image, kind, plane, corners=corners)
+
+
+def predict(
+    heliostat: Heliostat,
+    observations: Sequence[Observation],
+    method: Method = "network",
+    optics: Optics | None = None,
+    effects: Sequence[Effect] = (),
+) -> SurfacePrediction:
+    """The mirror surface of a heliostat from its images, by the network alone or refined through the tracer.
+
+    ``optics`` and ``effects`` are those of the model that is believed.
+
+    Raises
+    ------
+    InvalidInputError
+        For no or too many images, or an unknown method.
+    """
+    if method not in ("network", "refined"):
+        raise InvalidInputError(f"method must be 'network' or 'refined', got {method!r}")
+    predictor = default_predictor()
+    if method == "network":
+        return predictor.predict(heliostat, observations, optics, effects)
+    start, _ = predictor.heights(heliostat, observations, optics, effects)
+    refined = refine(heliostat, observations, start, optics=optics, effects=effects)
+    return replace(refined, weights=f"{predictor.name}+{refined.weights}")
+
+
+def render(
+    heliostat: Heliostat,
+    observations: Sequence[Observation],
+    z: ArrayLike | None,
+    optics: Optics | None = None,
+    effects: Sequence[Effect] = (),
+) -> Array:
+    """What a surface (4, 8, 8) [m], None the ideal one, would have thrown where M fluxes were observed.
+
+    (M, 64, 64), each with sum 100, in the observations' own windows.
+    """
+    heights = np.zeros((FACETS, ROWS, COLUMNS)) if z is None else np.asarray(z, dtype=np.float64)
+    return render_observations(heliostat, observations, heights, optics, effects)
+
+
+@dataclass(frozen=True, eq=False)
+class Forecast:
+    """Flux of one heliostat on a plane.
+
+    Attributes
+    ----------
+    flux : (rows, columns) float32 [W/m2]
+    center_of_mass : (2,) [m]
+        Right and up of the plane's centre.
+    peak : float [W/m2]
+    power : float [W]
+        On the imaged part of the plane.
+    model_version : str
+        Version of the plant's model and the effects it holds.
+    """
+
+    flux: NDArray[np.float32]
+    center_of_mass: Array
+    peak: float
+    power: float
+    model_version: str = MODEL_VERSION
+
+
+def forecast(
+    heliostat: Heliostat,
+    z: ArrayLike | None,
+    sun: ArrayLike,
+    plane: TargetPlane,
+    *,
+    aim: ArrayLike | None = None,
+    spot: ArrayLike | None = None,
+    angles: ArrayLike | None = None,
+    resolution: tuple[int, int] = (256, 256),
+    window: float | None = None,
+    optics: Optics | None = None,
+    surface: tuple[ArrayLike, int] | None = None,
+    effects: Sequence[Effect] = (),
+    latitude_deg: float = JUELICH_LATITUDE,
+) -> Forecast:
+    """Trace the flux of a heliostat on a plane, as its model, with its effects, expects a camera to show it.
+
+    Parameters
+    ----------
+    z : array_like (4, 8, 8) [m], or None
+        Heights over the canted facets; None for the ideal surface.
+    sun : array_like (3,)
+        Unit vector towards the sun in ENU.
+    aim : array_like (3,) [m], optional
+        Where the ray from the mirror's centre goes; the plane's centre unless given.
+    spot : array_like (3,) [m], optional
+        Where the spot's centre of mass shall lie; the heliostat is turned until it does. Goes before ``angles``.
+    angles : array_like (2,) [rad], optional
+        The mount's axis angles, as its motors tell them. Goes before ``aim``.
+    resolution : (rows, columns)
+    window : float [m], optional
+        Side of a square about the spot; the whole plane unless given.
+    surface : (control points (F, I, J, 3) [m], degree), optional
+        A measured surface in place of ``z``.
+    effects : sequence of Effect
+    latitude_deg : float [deg]
+        Of the plant.
+
+    Raises
+    ------
+    UnreachableError
+        Where no attitude reflects the sun to the plane.
+    """
+    points, degree = (control_points(heliostat, z), DEGREE) if surface is None else surface
+    shot = Shot(
+        heliostat,
+        np.asarray(points, dtype=np.float64),
+        np.asarray(sun, dtype=np.float64),
+        plane,
+        spot=None if spot is None else np.asarray(spot, dtype=np.float64),
+        angles=None if angles is None else np.asarray(angles, dtype=np.float64),
+        aim=None if aim is None else np.asarray(aim, dtype=np.float64),
+        degree=degree,
+    )
+    view = View(*resolution, window=window, samples=SAMPLES, padding=0.5, cones="facet")
+    aligned = align([shot], effects, latitude_deg=latitude_deg, dtype=torch.float64)
+    with torch.no_grad():
+        traced = aligned.images(optics, effects, view)
+        center = central_rays(aligned.groups[0].scene, SAMPLES).spot
+    # Frequency space leaves ripples of some 1e-5 of the peak below zero.
+    flux = traced[0].clamp(min=0).float().numpy()
+    return Forecast(
+        flux=flux,
+        center_of_mass=center[0].numpy(),
+        peak=float(flux.max()),
+        power=float(flux.sum(dtype=np.float64) * np.prod(view.of(plane).pixel)),
+        model_version=model_version(effects),
+    )
+
+
+def superpose(
+    receiver: Receiver,
+    tiles: Iterable[Tile],
+    *,
+    resolution: tuple[int, int] = (256, 256),
+    optics: Optics | None = None,
+    effects: Sequence[Effect] = (),
+    latitude_deg: float = JUELICH_LATITUDE,
+    engine: Engine | None = None,
+) -> FleetFlux:
+    """The light [W/m2] of many heliostats on one receiver; see `model.fleet`."""
+    task = Superposition(receiver, resolution, optics or Optics(), tuple(effects), latitude_deg)
+    return superpose_tiles(task, tiles, engine)
+
+
+def study(
+    photographs: Sequence[Photograph],
+    optics: Optics,
+    effects: Sequence[Effect] = (),
+    options: StudyOptions | None = None,
+    progress: Progress = quiet,
+) -> Study:
+    """Which effects photographs demand that a model with these optics and effects lacks; see `model.study.study`."""
+    return study_photographs(photographs, optics, effects, options, progress)

@@ -1,0 +1,145 @@
+"""The field at a glance: every heliostat with what its twin is worth."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime
+
+import numpy as np
+from sqlalchemy import func, select
+from sqlalchemy.orm import Session
+
+from service.base.arrays import unpack
+from service.store.tables import HeliostatRow, MeasurementRow, SurfaceRow, now
+from service.twin import versions
+from service.twin.accuracy import AccuracyBook, State
+from service.twin.runtime import Runtime
+
+# Surfaces that are read at a time, to bound memory.
+_CHUNK = 200
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Of a surface [mm]: root mean square over the mirror of its deviation, and of its standard deviation if known."""
+
+    deviation_mm: float
+    uncertainty_mm: float | None
+
+
+def figures_of(arrays: bytes) -> Figures:
+    """The figures of a stored surface."""
+    unpacked = unpack(arrays)
+    z, z_std = unpacked["z"], unpacked["z_std"]
+    uncertainty = float(np.sqrt(np.mean(z_std**2)) * 1e3)
+    return Figures(float(np.sqrt(np.mean(z**2)) * 1e3), uncertainty or None)
+
+
+@dataclass(frozen=True)
+class Current:
+    """A heliostat's current surface, without its arrays."""
+
+    id: int
+    version: int
+    source: str
+    valid_from: datetime
+    misfit: float | None
+
+    @property
+    def age_days(self) -> float | None:
+        """Since it describes the mirror; a measured one may be of unknown age, for which 1970 stands."""
+        return None if self.valid_from.year <= 1970 else (now() - self.valid_from).total_seconds() / 86400
+
+
+@dataclass(frozen=True)
+class Line:
+    """A heliostat in the field; what is None is not known (yet)."""
+
+    name: str
+    east_m: float
+    north_m: float
+    photographs: int = 0
+    refused: int = 0
+    newest: int | None = None
+    surface: Current | None = None
+    figures: Figures | None = None
+    accuracy: float | None = None
+
+    def state(self, model: int) -> State | None:
+        """What its accuracy by this version of the model depends on; None where there is nothing to compare."""
+        if self.surface is None or self.newest is None:
+            return None
+        return State(self.name, self.surface.id, self.newest, model)
+
+
+def _current_surfaces(session: Session) -> dict[int, Current]:
+    query = select(
+        SurfaceRow.heliostat_id,
+        SurfaceRow.id,
+        SurfaceRow.version,
+        SurfaceRow.source,
+        SurfaceRow.valid_from,
+        SurfaceRow.misfit,
+    )
+    # In this order the current one of each heliostat comes last and stays.
+    query = query.order_by(SurfaceRow.valid_from, SurfaceRow.version)
+    return {row.heliostat_id: Current(*row[1:]) for row in session.execute(query)}
+
+
+def _photographs(session: Session) -> dict[tuple[int, bool], tuple[int, int]]:
+    """How many photographs each heliostat has, accepted or not, and the id of the newest."""
+    row = MeasurementRow
+    query = select(row.heliostat_id, row.accepted, func.count(), func.max(row.id)).group_by(
+        row.heliostat_id, row.accepted
+    )
+    return {(heliostat, accepted): (count, newest) for heliostat, accepted, count, newest in session.execute(query)}
+
+
+def read_lines(session: Session) -> list[Line]:
+    """All heliostats in the order of their names, without what arrays would tell."""
+    surfaces, photographs = _current_surfaces(session), _photographs(session)
+    columns = select(HeliostatRow.id, HeliostatRow.name, HeliostatRow.east_m, HeliostatRow.north_m)
+    lines = []
+    for number, name, east, north in session.execute(columns.order_by(HeliostatRow.name)):
+        accepted, newest = photographs.get((number, True), (0, None))
+        refused, _ = photographs.get((number, False), (0, None))
+        lines.append(Line(name, east, north, accepted + refused, refused, newest, surfaces.get(number)))
+    return lines
+
+
+class FieldBook:
+    """What takes arrays to tell of each heliostat: computed once, kept in memory."""
+
+    def __init__(self, runtime: Runtime) -> None:
+        self._runtime = runtime
+        self._accuracies = AccuracyBook(runtime)
+        self._figures: dict[int, Figures] = {}
+
+    def close(self) -> None:
+        """End what is under way."""
+        self._accuracies.close()
+
+    def _figures_of(self, session: Session, surfaces: Sequence[int]) -> dict[int, Figures]:
+        missing = [number for number in surfaces if number not in self._figures]
+        fresh: dict[int, Figures] = {}
+        for start in range(0, len(missing), _CHUNK):
+            chunk = select(SurfaceRow.id, SurfaceRow.arrays).where(SurfaceRow.id.in_(missing[start : start + _CHUNK]))
+            fresh.update((number, figures_of(arrays)) for number, arrays in session.execute(chunk))
+        # One assignment, so that two requests at a time do no harm; surfaces that are no longer current are let go.
+        self._figures = {**{number: self._figures[number] for number in surfaces if number not in missing}, **fresh}
+        return self._figures
+
+    def read(self, session: Session) -> tuple[list[Line], int]:
+        """All heliostats, and how many accuracies are still being worked out."""
+        lines = read_lines(session)
+        figures = self._figures_of(session, [line.surface.id for line in lines if line.surface is not None])
+        model = versions.current_number(session)
+        states = (line.state(model) for line in lines)
+        accuracies, pending = self._accuracies.look_up(state for state in states if state is not None)
+        return [
+            replace(
+                line,
+                figures=None if line.surface is None else figures.get(line.surface.id),
+                accuracy=accuracies.get(line.name),
+            )
+            for line in lines
+        ], pending

@@ -1,0 +1,177 @@
+"""Flux forecasts of one heliostat from stored surfaces."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy.orm import Session
+
+from model.effects import of_light
+from model.errors import InvalidInputError
+from model.frames import sun_direction
+from model.plant import Heliostat, Receiver, TargetPlane
+from service import store
+from service.base.arrays import pack, plain, unpack
+from service.base.faults import ConflictError, NotFoundError
+from service.store.tables import ForecastRow, HeliostatRow, SurfaceRow
+from service.twin import versions
+from service.twin.compute import Forecast
+from service.twin.evidence import load_heliostat
+from service.twin.runtime import Runtime
+from service.twin.versions import PlantModel
+
+
+@dataclass(frozen=True, eq=False)
+class ForecastRequest:
+    """What to forecast; ``target`` names a stored plane, else ``plane`` is one.
+
+    ``sun_azimuth_deg`` counts from south, positive to the east. ``aim`` (3,) [m] is by default the plane's centre.
+    ``surface``: "current", "ideal" or a version. ``window`` [m]: the side of a square about the centre of mass that is
+    mapped; the whole plane without it. ``model_version`` is the plant's model, by default the current one.
+    """
+
+    heliostat: str
+    sun_azimuth_deg: float
+    sun_elevation_deg: float
+    target: str | None = None
+    plane: TargetPlane | None = None
+    aim: tuple[float, float, float] | None = None
+    surface: str | int = "current"
+    dni: float = 1000.0
+    resolution: tuple[int, int] = (256, 256)
+    window: float | None = None
+    normalised: bool = False
+    model_version: int | None = None
+
+
+def _chosen_surface(session: Session, heliostat: HeliostatRow, choice: str | int) -> SurfaceRow | None:
+    if choice == "ideal":
+        return None
+    if isinstance(choice, int):
+        return store.get_surface(session, heliostat, choice)
+    try:
+        return store.get_surface_at(session, heliostat)
+    except NotFoundError as error:
+        raise ConflictError(f'surface: {error}, or ask for "ideal"') from error
+
+
+def _plane(session: Session, request: ForecastRequest) -> TargetPlane:
+    if request.plane is not None:
+        return request.plane
+    if request.target is None:
+        raise InvalidInputError("target: give a stored target or a plane")
+    if store.find_receiver(session, request.target) is not None:
+        raise ConflictError(
+            f"target: {request.target} is a cylinder; leave heliostat out and give heliostats: [{request.heliostat!r}]"
+        )
+    return store.target_plane(store.get_target(session, request.target))
+
+
+@dataclass(frozen=True, eq=False)
+class Traced:
+    """A flux map with the stored things that it was made from; ``surface`` is None for the ideal one."""
+
+    heliostat: HeliostatRow
+    surface: SurfaceRow | None
+    plane: TargetPlane
+    model: PlantModel
+    forecast: "Forecast"
+
+
+def trace_request(runtime: Runtime, request: ForecastRequest) -> Traced:
+    """Compute a flux map.
+
+    Raises
+    ------
+    NotFoundError, ConflictError
+        Where heliostat, target, model or surface version is not stored, or no surface is current.
+    UnreachableError
+        Where the heliostat cannot reflect the sun to the aim point, or light does not reach the plane's lit side.
+    """
+    with runtime.database.reading() as session:
+        row = store.get_heliostat(session, request.heliostat)
+        heliostat = load_heliostat(session, row)
+        plane = _plane(session, request)
+        surface = _chosen_surface(session, row, request.surface)
+        model, latitude_deg = versions.get_model(session, request.model_version), store.get_plant(session).latitude_deg
+    z = None if surface is None else unpack(surface.arrays)["z"]
+    forecast = _trace(runtime, heliostat, z, request, plane, model, latitude_deg)
+    return Traced(row, surface, plane, model, forecast)
+
+
+def receiver_as_json(receiver: Receiver) -> dict[str, Any]:
+    """A receiver's geometry, as forecasts keep it [m]; a cylinder's width is the length of its arc."""
+    plane = {name: plain(getattr(receiver, name)) for name in ("center", "normal", "up", "width", "height")}
+    if isinstance(receiver, TargetPlane):
+        return plane
+    return plane | {"radius": receiver.radius, "opening_deg": receiver.opening_deg}
+
+
+def _forecast_row(request: ForecastRequest, traced: Traced) -> ForecastRow:
+    forecast = traced.forecast
+    right, up = plain(forecast.center_of_mass)  # null where no light comes near the plane
+    return ForecastRow(
+        heliostat_id=traced.heliostat.id,
+        surface_id=None if traced.surface is None else traced.surface.id,
+        target_name=request.target,
+        plane=receiver_as_json(traced.plane),
+        sun_azimuth_deg=request.sun_azimuth_deg,
+        sun_elevation_deg=request.sun_elevation_deg,
+        aim_point_m=None if request.aim is None else list(request.aim),
+        dni_w_m2=request.dni,
+        window_m=request.window,
+        normalised=request.normalised,
+        rows=forecast.flux.shape[0],
+        columns=forecast.flux.shape[1],
+        peak_w_m2=float(forecast.peak),
+        power_w=float(forecast.power),
+        center_right_m=right,
+        center_up_m=up,
+        model_version=traced.model.version,
+        flux=pack({"flux": np.asarray(forecast.flux, np.float32)}),
+    )
+
+
+def make_forecast(runtime: Runtime, request: ForecastRequest) -> ForecastRow:
+    """Compute a flux map and keep it; raises what `trace_request` raises."""
+    row = _forecast_row(request, trace_request(runtime, request))
+    with runtime.database.writing() as session:
+        return store.add_forecast(session, row)
+
+
+def _trace(
+    runtime: Runtime,
+    heliostat: Heliostat,
+    z: NDArray[Any] | None,
+    request: ForecastRequest,
+    plane: TargetPlane,
+    model: PlantModel,
+    latitude_deg: float,
+) -> "Forecast":
+
+    with runtime.computing("forecast") as operations:
+        return operations.forecast(
+            heliostat,
+            z,
+            sun_direction(request.sun_azimuth_deg, request.sun_elevation_deg),
+            plane,
+            aim=None if request.aim is None else np.array(request.aim),
+            resolution=request.resolution,
+            window=request.window,
+            optics=replace(model.optics, dni=request.dni),
+            # A stored target is what the camera looks at; on any other plane there is only light.
+            effects=model.effects if request.plane is None else of_light(model.effects),
+            latitude_deg=latitude_deg,
+        )
+
+
+# A flux map's sum where it is normalised (the paper's rule).
+_NORMALISED_SUM = 100.0
+
+
+def flux_of(row: ForecastRow) -> NDArray[np.float32]:
+    """The map in the unit that was asked for."""
+    flux = unpack(row.flux)["flux"]
+    total = float(flux.sum(dtype=np.float64))
+    return flux * np.float32(_NORMALISED_SUM / total) if row.normalised and total > 0 else flux

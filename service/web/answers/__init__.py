@@ -1,0 +1,1 @@
+"""The form of answers: representations, pages of lists, problems, the OpenAPI document."""

@@ -1,0 +1,100 @@
+"""Representations: what is offered as JSON, npz or PNG, and which of them a client likes best."""
+
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import numpy as np
+from fastapi import Depends, Header, Response
+from fastapi.responses import JSONResponse
+from pydantic import BaseModel
+
+from service.base.faults import NotAcceptableError
+
+JSON = "application/json"
+NPZ = "application/x-npz"
+NPZ_VENDOR = "application/vnd.numpy.npz"
+PNG = "image/png"
+ARRAYS = (JSON, NPZ, NPZ_VENDOR, PNG)
+"""What flux maps and surfaces are offered as, the default first."""
+
+
+@dataclass(frozen=True)
+class _Range:
+    """One media range of an Accept header with its weight."""
+
+    main: str
+    sub: str
+    weight: float
+
+    def specificity(self, main: str, sub: str) -> int:
+        """How closely it names a media type: 0 not at all, 1 by ``*/*``, 2 by its main type, 3 fully."""
+        if (self.main, self.sub) == (main, sub):
+            return 3
+        if (self.main, self.sub) == (main, "*"):
+            return 2
+        return int((self.main, self.sub) == ("*", "*"))
+
+
+def _weight(parameters: list[str]) -> float:
+    """The q-value; what is no number between 0 and 1 counts as 0, so that nonsense never wins."""
+    for parameter in parameters:
+        name, _, value = parameter.partition("=")
+        if name.strip().lower() == "q":
+            text = value.strip()
+            is_number = text.replace(".", "", 1).isdecimal() and text.isascii()
+            return float(text) if is_number and float(text) <= 1 else 0.0
+    return 1.0
+
+
+def _ranges(accept: str) -> list[_Range]:
+    ranges = []
+    for entry in accept.split(","):
+        media, *parameters = entry.split(";")
+        main, slash, sub = media.strip().lower().partition("/")
+        if slash:
+            ranges.append(_Range(main, sub, _weight(parameters)))
+    return ranges
+
+
+def _quality(media_type: str, ranges: list[_Range]) -> float:
+    main, _, sub = media_type.partition("/")
+    matching = [(entry.specificity(main, sub), entry.weight) for entry in ranges if entry.specificity(main, sub)]
+    return max(matching)[1] if matching else 0.0
+
+
+def choose(accept: str | None, offered: tuple[str, ...] = ARRAYS) -> str:
+    """The offered media type that the client likes best; ties go to the one offered first.
+
+    Raises
+    ------
+    NotAcceptableError
+        Where the client accepts none of them.
+    """
+    if accept is None or not accept.strip():
+        return offered[0]
+    ranges = _ranges(accept)
+    best = max(offered, key=lambda media_type: _quality(media_type, ranges))
+    if _quality(best, ranges) <= 0:
+        raise NotAcceptableError(offered)
+    return best
+
+
+async def _media_type(
+    accept: Annotated[str | None, Header(description=f"One of {', '.join(ARRAYS)}; JSON by default.")] = None,
+) -> str:
+    return choose(accept)
+
+
+MediaType = Annotated[str, Depends(_media_type)]
+
+
+def json_answer(model: BaseModel, **arrays: Any) -> Response:
+    """A model with arrays beside it that are not worth checking number by number."""
+    plain = {name: None if array is None else np.asarray(array).tolist() for name, array in arrays.items()}
+    return JSONResponse({**model.model_dump(mode="json"), **plain}, headers={"Vary": "Accept"})
+
+
+def file_answer(content: bytes, media_type: str, name: str) -> Response:
+    """A file that a browser shows, under a name to keep it by."""
+    headers = {"Vary": "Accept", "Content-Disposition": f'inline; filename="{name}"'}
+    return Response(content, media_type=media_type, headers=headers)

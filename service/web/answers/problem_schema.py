@@ -1,0 +1,25 @@
+"""Errors by RFC 9457, as they are documented."""
+
+from pydantic import BaseModel, Field
+
+
+class FieldProblem(BaseModel):
+    """What is wrong with one field of the request."""
+
+    field: str = Field(examples=["sun.elevation_deg"])
+    message: str = Field(examples=["Input should be less than or equal to 90"])
+
+
+class Problem(BaseModel):
+    """An error, by RFC 9457."""
+
+    type: str = Field(examples=["about:blank"])
+    title: str = Field(examples=["Unprocessable Content"])
+    status: int = Field(examples=[422])
+    detail: str = Field(examples=["sun.elevation_deg: Input should be less than or equal to 90"])
+    instance: str = Field(examples=["/v1/forecasts"])
+    request_id: str = Field(description="Quote it when reporting a fault; it stands in the service's log.")
+    errors: list[FieldProblem] | None = Field(
+        default=None, description="Every field at fault, where there are several."
+    )
+    offered: list[str] | None = Field(default=None, description="Acceptable media types, where none was acceptable.")

@@ -1,0 +1,183 @@
+"""Every error as a problem document (RFC 9457), by one table from exception to HTTP status."""
+
+import errno
+import json
+import logging
+import sqlite3
+from collections.abc import Mapping, Sequence
+from http import HTTPStatus
+from typing import Any
+
+from fastapi import FastAPI, Request, Response
+from fastapi.exceptions import RequestValidationError
+from sqlalchemy.exc import OperationalError
+from starlette.exceptions import HTTPException
+from starlette.types import Scope
+
+from model.errors import ImageRefusedError, InvalidInputError, ModelError, UnreachableError
+from service.base import faults
+from service.web.answers import pages
+
+logger = logging.getLogger("heliotwin.service")
+
+PROBLEM_MEDIA_TYPE = "application/problem+json"
+
+# Pages load what this service serves and nothing else, and no page of others can frame them; pictures may also stand
+# in the page itself, as those of Swagger UI do.
+SECURITY_HEADERS = {
+    "Content-Security-Policy": (
+        "default-src 'self'; img-src 'self' data:; object-src 'none'; base-uri 'none'; form-action 'self'; "
+        "frame-ancestors 'none'"
+    ),
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cache-Control": "no-store",
+}
+
+STATUS: dict[type[Exception], HTTPStatus] = {
+    InvalidInputError: HTTPStatus.UNPROCESSABLE_ENTITY,
+    UnreachableError: HTTPStatus.UNPROCESSABLE_ENTITY,
+    ImageRefusedError: HTTPStatus.UNPROCESSABLE_ENTITY,
+    ModelError: HTTPStatus.UNPROCESSABLE_ENTITY,
+    faults.NotFoundError: HTTPStatus.NOT_FOUND,
+    faults.ConflictError: HTTPStatus.CONFLICT,
+    faults.NotAcceptableError: HTTPStatus.NOT_ACCEPTABLE,
+    faults.TooLargeError: HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
+    faults.TooManyError: HTTPStatus.TOO_MANY_REQUESTS,
+    faults.UnsupportedImageError: HTTPStatus.UNSUPPORTED_MEDIA_TYPE,
+    faults.UnsupportedContentError: HTTPStatus.UNSUPPORTED_MEDIA_TYPE,
+    faults.StoreDamagedError: HTTPStatus.INTERNAL_SERVER_ERROR,
+}
+
+# PostgreSQL's code for a disk without room.
+_DISK_FULL = "53100"
+
+# What the caller may do about an error that comes without a sentence of its own.
+_REMEDIES = {
+    400: "the request could not be read; check its body",
+    404: "there is nothing at this path; see /docs for the paths",
+    405: "this path does not take this method; see the Allow header",
+}
+
+
+def request_id(scope: Scope) -> str:
+    """The request's id, as `service.web.middleware` gave it."""
+    return str(scope.get("state", {}).get("request_id", ""))
+
+
+def problem(
+    scope: Scope, status: int, detail: str, headers: Mapping[str, str] | None = None, **extension: Any
+) -> Response:
+    """A problem document as a response, ASCII, so that any text in it can be sent; as a page where a person asks."""
+    document = {
+        "type": "about:blank",
+        "title": HTTPStatus(status).phrase,
+        "status": status,
+        "detail": detail,
+        "instance": scope.get("path", ""),
+        "request_id": request_id(scope),
+        **extension,
+    }
+    if pages.wants_page(scope):
+        answer = pages.error_page(scope, document)
+        answer.headers.update(headers or {})
+        return answer
+    return Response(
+        json.dumps(document), status_code=status, headers=dict(headers or {}), media_type=PROBLEM_MEDIA_TYPE
+    )
+
+
+def _field(location: Sequence[int | str]) -> str:
+    """A field's name without the part of the request that it stands in."""
+    inner = location[1:] if location and location[0] in ("body", "path", "query", "header") else location
+    # Where a body may be one of several, the alternative that was taken stands in brackets.
+    inner = [part for part in inner if not str(part).startswith("(")]
+    return ".".join(str(part) for part in inner) or "body"
+
+
+def _on_known(request: Request, error: Exception) -> Response:
+    status = next(STATUS[kind] for kind in type(error).__mro__ if kind in STATUS)
+    if isinstance(error, faults.StoreDamagedError):
+        logger.error("%s, request %s", error, request_id(request.scope))
+    if isinstance(error, faults.TooManyError):
+        return problem(request.scope, status, str(error), {"Retry-After": "30"})
+    if isinstance(error, faults.NotAcceptableError):
+        return problem(request.scope, status, str(error), offered=list(error.offered))
+    return problem(request.scope, status, str(error))
+
+
+def _on_validation(request: Request, error: Exception) -> Response:
+    assert isinstance(error, RequestValidationError)
+    errors = [
+        {"field": _field(entry["loc"]), "message": entry["msg"].removeprefix("Value error, ")}
+        for entry in error.errors()
+    ]
+    detail = "; ".join(f"{entry['field']}: {entry['message']}" for entry in errors[:5])
+    return problem(request.scope, HTTPStatus.UNPROCESSABLE_ENTITY, detail, errors=errors[:100])
+
+
+def _on_http(request: Request, error: Exception) -> Response:
+    assert isinstance(error, HTTPException)
+    phrase = HTTPStatus(error.status_code).phrase
+    plain = str(error.detail) in ("", phrase)
+    detail = _REMEDIES.get(error.status_code, phrase) if plain else str(error.detail)
+    return problem(request.scope, error.status_code, detail, error.headers)
+
+
+def _is_full(error: BaseException) -> bool:
+    """Whether a disk, or the database's, has no room left."""
+    if isinstance(error, OSError):
+        return error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+    if isinstance(error, OperationalError):
+        origin: Any = error.orig
+        codes = (getattr(origin, "sqlite_errorcode", None), getattr(origin, "sqlstate", None))
+        return codes[0] == sqlite3.SQLITE_FULL or codes[1] == _DISK_FULL
+    return False
+
+
+def _no_room(scope: Scope, error: Exception) -> Response:
+    logger.error("no room left, request %s: %s", request_id(scope), error)
+    detail = "the store's disk is full and nothing was kept; try again when its operator has made room"
+    return problem(scope, HTTPStatus.INSUFFICIENT_STORAGE, detail, {"Retry-After": "60"})
+
+
+def database_away(scope: Scope, error: Exception) -> Response:
+    """The answer while the database does not give one, or can store no more."""
+    if _is_full(error):
+        return _no_room(scope, error)
+    logger.error("database unavailable, request %s: %s", request_id(scope), error)
+    detail = "the database does not answer; try again later"
+    return problem(scope, HTTPStatus.SERVICE_UNAVAILABLE, detail, {"Retry-After": "5"})
+
+
+def _on_database_away(request: Request, error: Exception) -> Response:
+    return database_away(request.scope, error)
+
+
+def _on_os(request: Request, error: Exception) -> Response:
+    if _is_full(error):
+        return _no_room(request.scope, error)
+    raise error
+
+
+def _on_unexpected(request: Request, error: Exception) -> Response:
+    identity = request_id(request.scope)
+    logger.error("unexpected error, request %s", identity, exc_info=error, extra={"request_id": identity})
+    detail = "the service failed; report the request_id to its operator"
+    # This handler stands outside the middleware that adds these.
+    headers = {"X-Request-ID": request_id(request.scope), **SECURITY_HEADERS}
+    return problem(request.scope, HTTPStatus.INTERNAL_SERVER_ERROR, detail, headers)
+
+
+def install(app: FastAPI) -> None:
+    """Make ``app`` answer every error with a problem document."""
+    for kind in STATUS:
+        app.add_exception_handler(kind, _on_known)
+    app.add_exception_handler(RequestValidationError, _on_validation)
+    app.add_exception_handler(HTTPException, _on_http)
+    app.add_exception_handler(OperationalError, _on_database_away)
+    app.add_exception_handler(OSError, _on_os)
+    app.add_exception_handler(Exception, _on_unexpected)

@@ -1,0 +1,46 @@
+"""The audit trail."""
+
+from datetime import datetime
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query
+from pydantic import BaseModel, Field
+
+from service.base.fields import Version
+from service.store import audit
+from service.store.tables import AuditRow
+from service.web.answers.openapi import problems
+from service.web.answers.paging import Page, page
+from service.web.door.dependencies import ADMIN, Limit, RuntimeDep
+
+
+class AuditOut(BaseModel):
+    """An entry of the audit trail."""
+
+    id: int
+    at: datetime
+    actor: str = Field(description="Name of the key; `local` where none is demanded, `cli` and the user elsewhere.")
+    action: str = Field(examples=["key.withdrawn"])
+    subject: str = Field(examples=["key calibration"])
+    detail: dict[str, Any]
+
+
+def audit_out(row: AuditRow) -> AuditOut:
+    """An entry of the audit trail as JSON."""
+    return AuditOut.model_validate(row, from_attributes=True)
+
+
+router = APIRouter(tags=["audit"])
+
+
+@router.get("/audit", responses=problems(), dependencies=[ADMIN])
+def list_audit(
+    runtime: RuntimeDep,
+    limit: Limit = 100,
+    after: Annotated[Version | None, Query(description="The last id of the page before.")] = None,
+) -> Page[AuditOut]:
+    """Who did what, newest first."""
+    with runtime.database.reading() as session:
+        rows = audit.entries(session, limit + 1, after)
+    items = [audit_out(row) for row in rows]
+    return page(items, limit)

@@ -1,0 +1,127 @@
+"""Heliostats."""
+
+from datetime import datetime
+from typing import Annotated, Any
+
+import numpy as np
+from fastapi import APIRouter, Depends, Query, Response, status
+from pydantic import BaseModel, Field
+from sqlalchemy.orm import Session
+
+from service import store
+from service.base.fields import Model, Name
+from service.sources.documents import read_heliostat
+from service.sources.schema import HeliostatProperties
+from service.store import audit
+from service.store.tables import HeliostatRow
+from service.web.answers.openapi import problems
+from service.web.answers.paging import Page, page
+from service.web.door.dependencies import OPERATE, READ, IdentityDep, Limit, NamePath, RuntimeDep, require_json
+from service.web.door.security import Identity
+
+
+class HeliostatIn(Model):
+    """A heliostat to be stored."""
+
+    name: Name
+    properties: HeliostatProperties
+
+
+class HeliostatSummary(BaseModel):
+    """A heliostat in a list."""
+
+    name: str
+    position_m: tuple[float, float, float] = Field(description="East, north, up of the tower base [m].")
+
+
+class HeliostatOut(HeliostatSummary):
+    """A heliostat with its properties."""
+
+    properties: dict[str, Any] = Field(description="PAINT properties as they were sent.")
+    updated_at: datetime
+
+
+def heliostat_summary(row: HeliostatRow) -> HeliostatSummary:
+    """A heliostat without its properties."""
+    return HeliostatSummary(name=row.name, position_m=(row.east_m, row.north_m, row.up_m))
+
+
+def heliostat_out(row: HeliostatRow) -> HeliostatOut:
+    """A heliostat as JSON."""
+    position = (row.east_m, row.north_m, row.up_m)
+    return HeliostatOut(name=row.name, position_m=position, properties=row.properties, updated_at=row.updated_at)
+
+
+router = APIRouter(tags=["heliostats"])
+
+
+def _put(
+    session: Session, name: str, properties: HeliostatProperties, identity: Identity
+) -> tuple[HeliostatOut, store.Change]:
+
+    # Reading them as the model does is the check: what is stored can be traced.
+    heliostat = read_heliostat(name, properties.raw, np.array(store.get_plant(session).origin))
+    row, change = store.put_heliostat(session, name, properties.raw, heliostat.position)
+    audit.record(session, identity.name, "heliostat.set", f"heliostat {name}", change=change)
+    return heliostat_out(row), change
+
+
+@router.get("/heliostats", responses=problems(), dependencies=[READ])
+def list_heliostats(
+    runtime: RuntimeDep,
+    limit: Limit = 100,
+    after: Annotated[Name | None, Query(description="The last name of the page before.")] = None,
+) -> Page[HeliostatSummary]:
+    """Heliostats in the order of their names."""
+    with runtime.database.reading() as session:
+        rows = store.list_heliostats(session, limit + 1, after)
+    items = [heliostat_summary(row) for row in rows]
+    return page(items, limit, "name")
+
+
+@router.post(
+    "/heliostats",
+    status_code=status.HTTP_201_CREATED,
+    responses={**problems(409, 413, 415), 200: {"model": HeliostatOut, "description": "It was there already."}},
+    dependencies=[OPERATE, Depends(require_json)],
+)
+def post_heliostat(
+    request: HeliostatIn, runtime: RuntimeDep, identity: IdentityDep, response: Response
+) -> HeliostatOut:
+    """Add a heliostat; the same one again is no error, the same name with other properties is (use PUT)."""
+    with runtime.database.writing() as session:
+        known = store.find_heliostat(session, request.name)
+        if known is not None:
+            store.require_same_properties(known, request.properties.raw)
+            response.status_code = status.HTTP_200_OK
+            return heliostat_out(known)
+        heliostat, _ = _put(session, request.name, request.properties, identity)
+    response.headers["Location"] = f"/v1/heliostats/{request.name}"
+    return heliostat
+
+
+@router.get("/heliostats/{name}", responses=problems(404), dependencies=[READ])
+def get_heliostat(name: NamePath, runtime: RuntimeDep) -> HeliostatOut:
+    """A heliostat with its properties."""
+    with runtime.database.reading() as session:
+        return heliostat_out(store.get_heliostat(session, name))
+
+
+@router.put(
+    "/heliostats/{name}",
+    responses={**problems(409, 413, 415), 201: {"model": HeliostatOut, "description": "It is new."}},
+    dependencies=[OPERATE, Depends(require_json)],
+)
+def put_heliostat(
+    name: NamePath,
+    properties: HeliostatProperties,
+    runtime: RuntimeDep,
+    identity: IdentityDep,
+    response: Response,
+) -> HeliostatOut:
+    """Set a heliostat's PAINT properties."""
+    with runtime.database.writing() as session:
+        heliostat, change = _put(session, name, properties, identity)
+    if change is store.Change.NEW:
+        response.status_code = status.HTTP_201_CREATED
+    return heliostat

@@ -1,0 +1,225 @@
+"""Photographs and what was measured in them."""
+
+from datetime import datetime
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, File, Form, Query, Response, UploadFile, status
+from pydantic import BaseModel, BeforeValidator, Field, Json
+
+from service import store
+from service.base.arrays import pair, unpack
+from service.base.faults import NotFoundError, TooLargeError
+from service.base.fields import Azimuth, Elevation, Identifier, Kind, MeasurementName, Model, Moment, Name, Wgs84
+from service.drawing.pictures import flux_picture
+from service.sources.schema import paint_motors, paint_spot
+from service.store.tables import MeasurementRow
+from service.twin.ingest import Photograph, ingest
+from service.web.answers import formats
+from service.web.answers.formats import MediaType, file_answer, json_answer
+from service.web.answers.openapi import arrays, problems
+from service.web.answers.paging import Page, page
+from service.web.door.dependencies import INGEST, READ, Limit, MeasurementPath, NamePath, RuntimeDep, require_multipart
+
+Motors = Annotated[
+    tuple[Annotated[float, Field(ge=-1e9, le=1e9)], Annotated[float, Field(ge=-1e9, le=1e9)]],
+    BeforeValidator(paint_motors),
+]
+
+Pixel = tuple[Annotated[float, Field(ge=-1e5, le=1e5)], Annotated[float, Field(ge=-1e5, le=1e5)]]
+
+
+class MeasurementIn(Model):
+    """What is known of a photograph; PAINT's ``calibration-properties.json`` with ``kind`` (and ``id``) added fits."""
+
+    target_name: Name = Field(description="The target that the heliostat was aimed at.")
+    sun_azimuth: Azimuth
+    sun_elevation: Elevation
+    kind: Kind = Field(
+        description="raw: a camera frame; cropped: the rectified target; flux: the separated spot on the whole "
+        "target; flux-centered: the spot about its centre of mass, already separated."
+    )
+    id: Identifier | None = Field(default=None, description="The caller's own number of the measurement.")
+    taken_at: Moment | None = Field(default=None, description="When it was taken, with time zone.")
+    motor_position: Motors | None = Field(
+        default=None, description="Motor positions of both axes [steps], as a pair or as PAINT's object."
+    )
+    focal_spot: Annotated[Wgs84, BeforeValidator(paint_spot)] | None = Field(
+        default=None,
+        description="Known centre of mass: latitude [deg], longitude [deg], altitude [m], or PAINT's object (UTIS is "
+        "preferred).",
+    )
+    corners: tuple[Pixel, Pixel, Pixel, Pixel] | None = Field(
+        default=None,
+        description="Positions (x, y) [px] of the target's upper left, upper right, lower left and lower right "
+        "corners in a raw frame; without them they are searched.",
+    )
+
+
+class MeasurementOut(BaseModel):
+    """A stored measurement."""
+
+    id: str = Field(description="Names it in this service's paths.")
+    heliostat: str
+    external_id: str | None = Field(description="The caller's own number.")
+    kind: Kind
+    target_name: str
+    sun_azimuth: float = Field(description="From south, positive to the east [deg].")
+    sun_elevation: float = Field(description="[deg]")
+    motor_position: tuple[float, float] | None = Field(description="[steps]")
+    taken_at: datetime | None
+    focal_spot: tuple[float, float, float] | None = Field(
+        description="As given: latitude [deg], longitude [deg], altitude [m]."
+    )
+    accepted: bool = Field(description="Whether the image can be used; a refused one is kept with its reason.")
+    reason: str | None = Field(description="Why it was refused.")
+    quality: dict[str, Any] = Field(description="The quality record of the image.")
+    center_of_mass: tuple[float, float] | None = Field(description="Right and up of the target's centre [m].")
+    image_sha256: str
+    image_media_type: str
+    created_at: datetime
+
+
+def measurement_out(heliostat_name: str, row: MeasurementRow) -> MeasurementOut:
+    """A measurement as JSON."""
+    return MeasurementOut.model_validate(
+        {
+            "id": row.identifier,
+            "heliostat": heliostat_name,
+            "external_id": row.external_id,
+            "kind": row.kind,
+            "target_name": row.target.name,
+            "sun_azimuth": row.sun_azimuth_deg,
+            "sun_elevation": row.sun_elevation_deg,
+            "motor_position": pair(row.motor_axis_1, row.motor_axis_2),
+            "taken_at": row.taken_at,
+            "focal_spot": row.focal_spot_wgs84,
+            "accepted": row.accepted,
+            "reason": row.reason,
+            "quality": row.quality,
+            "center_of_mass": pair(row.center_right_m, row.center_up_m),
+            "image_sha256": row.image_sha256,
+            "image_media_type": row.image.media_type,
+            "created_at": row.created_at,
+        }
+    )
+
+
+def flux_answer(heliostat_name: str, row: MeasurementRow, media_type: str) -> Response:
+    """The flux of a measurement; NotFoundError for a refused image, which has none."""
+    if row.arrays is None:
+        raise NotFoundError(f"measurement {row.identifier} was refused ({row.reason}), so it has no flux")
+    arrays = unpack(row.arrays)
+    name = f"{heliostat_name}-{row.identifier}-flux"
+    if media_type == formats.PNG:
+        whole = "flux" in arrays
+        size = (row.target.width_m, row.target.height_m) if whole else None
+        shown = arrays["flux" if whole else "centered"]
+        title = f"{heliostat_name} {row.identifier}, measured"
+        return file_answer(flux_picture(shown, size, "flux [% per pixel]", title), media_type, f"{name}.png")
+    if media_type != formats.JSON:
+        return file_answer(row.arrays, media_type, f"{name}.npz")
+    return json_answer(measurement_out(heliostat_name, row), flux=arrays.get("flux"), centered=arrays.get("centered"))
+
+
+router = APIRouter(prefix="/heliostats/{name}/measurements", tags=["measurements"])
+
+_METADATA_EXAMPLE = (
+    '{"id": "205363", "kind": "flux", "target_name": "multi_focus_tower", "sun_azimuth": -41.2, "sun_elevation": 33.5}'
+)
+
+
+def _photograph(metadata: MeasurementIn) -> Photograph:
+    return Photograph(
+        target_name=metadata.target_name,
+        kind=metadata.kind,
+        sun_azimuth_deg=metadata.sun_azimuth,
+        sun_elevation_deg=metadata.sun_elevation,
+        external_id=metadata.id,
+        taken_at=metadata.taken_at,
+        motor_position=metadata.motor_position,
+        focal_spot_wgs84=metadata.focal_spot,
+        corners=metadata.corners,
+    )
+
+
+def _bytes(upload: UploadFile, limit: int) -> bytes:
+    data = upload.file.read(limit + 1)
+    if len(data) > limit:
+        raise TooLargeError(f"image: larger than the {limit} bytes allowed; crop or compress it")
+    return data
+
+
+@router.post(
+    "",
+    status_code=status.HTTP_201_CREATED,
+    responses={
+        **problems(400, 404, 409, 413, 415),
+        200: {"model": MeasurementOut, "description": "This image was there already; nothing changed."},
+    },
+    dependencies=[INGEST, Depends(require_multipart)],
+)
+def post_measurement(
+    name: NamePath,
+    image: Annotated[UploadFile, File(description="A PNG, JPEG, TIFF or BMP file.")],
+    metadata: Annotated[Json[MeasurementIn], Form(description="JSON", examples=[_METADATA_EXAMPLE])],
+    runtime: RuntimeDep,
+    response: Response,
+) -> MeasurementOut:
+    """Measure and keep a photograph of a heliostat's spot.
+
+    The same image posted again is the same measurement (200 instead of 201). An image that cannot be used is kept
+    with `accepted: false` and its `reason`.
+    """
+    data = _bytes(image, runtime.settings.max_image_bytes)
+    row, is_new = ingest(runtime, name, _photograph(metadata), data)
+    response.headers["Location"] = f"/v1/heliostats/{name}/measurements/{row.identifier}"
+    if not is_new:
+        response.status_code = status.HTTP_200_OK
+    return measurement_out(name, row)
+
+
+@router.get("", responses=problems(404), dependencies=[READ])
+def list_measurements(
+    name: NamePath,
+    runtime: RuntimeDep,
+    limit: Limit = 100,
+    after: Annotated[MeasurementName | None, Query(description="The last id of the page before.")] = None,
+    accepted: Annotated[bool | None, Query(description="Only accepted, or only refused ones.")] = None,
+) -> Page[MeasurementOut]:
+    """A heliostat's measurements in the order they came."""
+    with runtime.database.reading() as session:
+        rows = store.list_measurements(session, store.get_heliostat(session, name), limit + 1, after, accepted)
+    items = [measurement_out(name, row) for row in rows]
+    return page(items, limit)
+
+
+@router.get("/{measurement}", responses=problems(404), dependencies=[READ])
+def get_measurement(name: NamePath, measurement: MeasurementPath, runtime: RuntimeDep) -> MeasurementOut:
+    """A measurement with its quality record."""
+    with runtime.database.reading() as session:
+        row = store.get_measurement(session, store.get_heliostat(session, name), measurement)
+    return measurement_out(name, row)
+
+
+@router.get(
+    "/{measurement}/image",
+    response_class=Response,
+    responses={**problems(404), 200: {"description": "The file as it was sent.", "content": {"image/*": {}}}},
+    dependencies=[READ],
+)
+def get_image(name: NamePath, measurement: MeasurementPath, runtime: RuntimeDep) -> Response:
+    """The image as it was sent."""
+    with runtime.database.reading() as session:
+        row = store.get_measurement(session, store.get_heliostat(session, name), measurement)
+    headers = {"ETag": f'"{row.image_sha256}"', "X-Content-Type-Options": "nosniff"}
+    return Response(runtime.images.read(row.image_sha256), media_type=row.image.media_type, headers=headers)
+
+
+@router.get(
+    "/{measurement}/flux", responses={**problems(404, 406), **arrays("`flux` and `centered`.")}, dependencies=[READ]
+)
+def get_flux(name: NamePath, measurement: MeasurementPath, runtime: RuntimeDep, media_type: MediaType) -> Response:
+    """The measured flux: over the whole target (256 x 256), and 64 x 64 about the centre of mass with sum 100."""
+    with runtime.database.reading() as session:
+        row = store.get_measurement(session, store.get_heliostat(session, name), measurement, arrays=True)
+    return flux_answer(name, row, media_type)

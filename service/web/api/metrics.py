@@ -1,0 +1,20 @@
+"""The figures that Prometheus reads."""
+
+from fastapi import APIRouter, Response
+from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
+
+from service.web.door.dependencies import READ, RuntimeDep
+from service.web.metrics import registry
+
+router = APIRouter(tags=["health"])
+
+
+@router.get(
+    "/metrics",
+    response_class=Response,
+    responses={200: {"description": "Prometheus' text format.", "content": {"text/plain": {}}}},
+    dependencies=[READ],
+)
+def get_metrics(runtime: RuntimeDep) -> Response:
+    """Counts and times of this process, the queue, and the drift of heliostats."""
+    return Response(generate_latest(registry(runtime)), media_type=CONTENT_TYPE_LATEST)

@@ -1,0 +1,71 @@
+"""Versions of the plant's model."""
+
+from datetime import datetime
+from typing import Any
+
+from fastapi import APIRouter
+from pydantic import BaseModel, Field
+from sqlalchemy.orm import Session
+
+from service.store.tables import ModelRow
+from service.twin import versions
+from service.web.answers.openapi import problems
+from service.web.answers.paging import Page
+from service.web.door.dependencies import READ, RuntimeDep
+
+router = APIRouter(tags=["studies"])
+
+
+class ModelOut(BaseModel):
+    """A version of the plant's model."""
+
+    number: int = Field(description="Ask for it as `model_version`.")
+    version: str = Field(description="Number and names of its effects.", examples=["2:camera_response"])
+    is_current: bool = Field(description="Whether forecasts and predictions are made by it.")
+    effects: list[dict[str, Any]] = Field(description="Its effects with their parameters.")
+    study: int | None = Field(description="The study that it was adopted from; null: the declared model.")
+    adopted_at: datetime | None
+    adopted_by: str | None
+    withdrawn_at: datetime | None
+    withdrawn_by: str | None
+
+
+def declared_model(is_current: bool) -> ModelOut:
+    """The model that nobody had to adopt."""
+    unknown = dict.fromkeys(("study", "adopted_at", "adopted_by", "withdrawn_at", "withdrawn_by"))
+    about = {"number": versions.DECLARED, "version": versions.version_name(versions.DECLARED, ()), "effects": []}
+    return ModelOut.model_validate({**about, "is_current": is_current, **unknown})
+
+
+def model_out(row: ModelRow, is_current: bool) -> ModelOut:
+    """An adopted version of the plant's model."""
+    names = ModelOut.model_fields.keys() - {"is_current", "study"}
+    fields = {name: getattr(row, name) for name in names}
+    return ModelOut.model_validate({**fields, "is_current": is_current, "study": row.study_id})
+
+
+def all_models(session: Session) -> list[ModelOut]:
+    """All versions of the plant's model, oldest first, withdrawn ones too."""
+    current = versions.current_number(session)
+    adopted = [model_out(row, row.number == current) for row in versions.list_models(session)]
+    return [declared_model(current == versions.DECLARED), *adopted]
+
+
+def current_out(session: Session) -> ModelOut:
+    """The current version, adopted or declared."""
+    row = versions.find_current(session)
+    return declared_model(True) if row is None else model_out(row, is_current=True)
+
+
+@router.get("/models", responses=problems(), dependencies=[READ])
+def list_models(runtime: RuntimeDep) -> Page[ModelOut]:
+    """All versions of the plant's model, oldest first, withdrawn ones too."""
+    with runtime.database.reading() as session:
+        return Page(items=all_models(session), next=None)
+
+
+@router.get("/models/current", responses=problems(), dependencies=[READ])
+def get_current_model(runtime: RuntimeDep) -> ModelOut:
+    """The version that forecasts and predictions are made by."""
+    with runtime.database.reading() as session:
+        return current_out(session)

@@ -1,0 +1,228 @@
+"""The plant and its target planes."""
+
+from typing import Any, Self
+
+from fastapi import APIRouter, Body, Depends, Response, status
+from pydantic import BaseModel, Field, model_validator
+from sqlalchemy.orm import Session
+
+from model.frames import wgs84_to_enu
+from model.plant import TargetPlane
+from service import store
+from service.base.fields import Model, Plane, ReceiverIn, Wgs84
+from service.sources.documents import read_receivers, read_targets
+from service.sources.schema import TowerMeasurements
+from service.store import audit
+from service.store.tables import PlantRow, ReceiverRow, TargetRow
+from service.web.answers.openapi import problems
+from service.web.answers.paging import Page
+from service.web.door.dependencies import OPERATE, READ, IdentityDep, NamePath, RuntimeDep, require_json
+
+
+class PlantOut(BaseModel):
+    """The plant."""
+
+    name: str
+    origin_wgs84: tuple[float, float, float] = Field(
+        description="Tower base: latitude [deg], longitude [deg], altitude [m]."
+    )
+    declared: dict[str, Any] | None = Field(
+        description="What is declared of its model, as in twin.json; null: Buie's sun with a ratio of 0.02, no effects."
+    )
+
+
+class ReceiverOut(BaseModel):
+    """A cylindrical receiver."""
+
+    name: str
+    center: tuple[float, float, float] = Field(description="The middle of the lit surface [m].")
+    normal: tuple[float, float, float] = Field(description="Unit normal there, away from the axis.")
+    up: tuple[float, float, float] = Field(description="Unit vector along the axis.")
+    radius: float = Field(description="[m]")
+    height: float = Field(description="[m]")
+    opening_deg: float = Field(description="Angle of the lit surface [deg].")
+
+
+class Corners(Model):
+    """A target by its corners as seen from the field, in WGS84 (latitude [deg], longitude [deg], altitude [m])."""
+
+    upper_left: Wgs84 = Field(description="[deg, deg, m]")
+    upper_right: Wgs84 = Field(description="[deg, deg, m]")
+    lower_left: Wgs84 = Field(description="[deg, deg, m]")
+    lower_right: Wgs84 = Field(description="[deg, deg, m]")
+
+
+class TargetIn(Model):
+    """A target plane, either by its rectangle in east-north-up metres or by its four corners in WGS84."""
+
+    plane: Plane | None = None
+    corners: Corners | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> Self:
+        if (self.plane is None) == (self.corners is None):
+            raise ValueError("give either plane or corners")
+        return self
+
+
+class TargetOut(BaseModel):
+    """A target plane."""
+
+    name: str
+    center: tuple[float, float, float] = Field(description="East, north, up of the tower base [m].")
+    normal: tuple[float, float, float] = Field(description="Unit normal of the lit side.")
+    up: tuple[float, float, float] = Field(description="Unit vector up the image.")
+    width: float = Field(description="[m]")
+    height: float = Field(description="[m]")
+    corners: dict[str, Any] | None = Field(description="The WGS84 corners that it was made from, if it was.")
+
+
+def plant_out(row: PlantRow) -> PlantOut:
+    """A plant as JSON."""
+    return PlantOut(name=row.name, origin_wgs84=row.origin, declared=row.declared)
+
+
+def target_out(row: TargetRow) -> TargetOut:
+    """A target plane as JSON."""
+    return TargetOut.model_validate(
+        {
+            "name": row.name,
+            "center": row.center_m,
+            "normal": row.normal,
+            "up": row.up,
+            "width": row.width_m,
+            "height": row.height_m,
+            "corners": row.corners,
+        }
+    )
+
+
+def receiver_out(row: ReceiverRow) -> ReceiverOut:
+    """A cylindrical receiver as JSON."""
+    return ReceiverOut.model_validate(
+        {
+            "name": row.name,
+            "center": row.center_m,
+            "normal": row.normal,
+            "up": row.up,
+            "radius": row.radius_m,
+            "height": row.height_m,
+            "opening_deg": row.opening_deg,
+        }
+    )
+
+
+router = APIRouter(tags=["plant"])
+_CORNERS = ("upper_left", "upper_right", "lower_left", "lower_right")
+_RECEIVER_EXAMPLE = {"center": [0, 0, 55.2], "normal": [0, 1, 0], "radius": 4.1, "height": 5.2, "opening_deg": 60}
+_PLANE_EXAMPLE = {"plane": {"center": [0, -3.2, 35.9], "normal": [0, 1, 0], "width": 8.6, "height": 7.2}}
+
+
+def _from_corners(session: Session, name: str, corners: Corners) -> TargetPlane:
+    origin = store.get_plant(session).origin
+    return TargetPlane.from_corners(name, *(wgs84_to_enu(getattr(corners, corner), origin) for corner in _CORNERS))
+
+
+def _paint_corners(document: dict[str, Any], name: str) -> dict[str, list[float]]:
+    coordinates = document[name]["coordinates"]
+    return {corner: [float(value) for value in coordinates[corner]] for corner in _CORNERS}
+
+
+@router.get("/plant", responses=problems(409), dependencies=[READ])
+def get_plant(runtime: RuntimeDep) -> PlantOut:
+    """The plant's name and the tower base."""
+    with runtime.database.reading() as session:
+        return plant_out(store.get_plant(session))
+
+
+@router.put("/plant", responses=problems(409, 413, 415), dependencies=[OPERATE, Depends(require_json)])
+def put_plant(document: TowerMeasurements, runtime: RuntimeDep, identity: IdentityDep) -> PlantOut:
+    """Set the tower base, all planar targets and receivers from PAINT's tower measurements; again changes nothing."""
+    origin, targets = read_targets(document.raw)
+    receivers = read_receivers(document.raw)
+    with runtime.database.writing() as session:
+        change = store.put_plant(session, document.power_plant_properties.ID, origin)
+        audit.record(session, identity.name, "plant.set", f"plant {document.power_plant_properties.ID}", change=change)
+        for name, plane in targets.items():
+            store.put_target(session, plane, _paint_corners(document.raw, name))
+        for cylinder in receivers.values():
+            store.put_receiver(session, cylinder)
+        return plant_out(store.get_plant(session))
+
+
+@router.get("/targets", responses=problems(), dependencies=[READ])
+def list_targets(runtime: RuntimeDep) -> Page[TargetOut]:
+    """All target planes."""
+    with runtime.database.reading() as session:
+        return Page(items=[target_out(row) for row in store.list_targets(session)], next=None)
+
+
+@router.get("/targets/{name}", responses=problems(404), dependencies=[READ])
+def get_target(name: NamePath, runtime: RuntimeDep) -> TargetOut:
+    """A target plane."""
+    with runtime.database.reading() as session:
+        return target_out(store.get_target(session, name))
+
+
+@router.put(
+    "/targets/{name}",
+    responses={**problems(409, 413, 415), 201: {"model": TargetOut, "description": "It is new."}},
+    dependencies=[OPERATE, Depends(require_json)],
+)
+def put_target(
+    name: NamePath,
+    request: TargetIn = Body(examples=[_PLANE_EXAMPLE]),
+    *,
+    runtime: RuntimeDep,
+    identity: IdentityDep,
+    response: Response,
+) -> TargetOut:
+    """Set a target plane, by its rectangle [m] or by its four corners in WGS84."""
+    with runtime.database.writing() as session:
+        if request.corners is not None:
+            plane = _from_corners(session, name, request.corners)
+            corners = {corner: list(getattr(request.corners, corner)) for corner in _CORNERS}
+        else:
+            assert request.plane is not None  # the schema wants one of both
+            plane, corners = request.plane.named(name), None
+        row, change = store.put_target(session, plane, corners)
+        audit.record(session, identity.name, "target.set", f"target {name}", change=change)
+        if change is store.Change.NEW:
+            response.status_code = status.HTTP_201_CREATED
+        return target_out(row)
+
+
+@router.get("/receivers", responses=problems(), dependencies=[READ])
+def list_receivers(runtime: RuntimeDep) -> Page[ReceiverOut]:
+    """All cylindrical receivers."""
+    with runtime.database.reading() as session:
+        return Page(items=[receiver_out(row) for row in store.list_receivers(session)], next=None)
+
+
+@router.get("/receivers/{name}", responses=problems(404), dependencies=[READ])
+def get_receiver(name: NamePath, runtime: RuntimeDep) -> ReceiverOut:
+    """A cylindrical receiver."""
+    with runtime.database.reading() as session:
+        return receiver_out(store.get_receiver(session, name))
+
+
+@router.put(
+    "/receivers/{name}",
+    responses={**problems(409, 413, 415), 201: {"model": ReceiverOut, "description": "It is new."}},
+    dependencies=[OPERATE, Depends(require_json)],
+)
+def put_receiver(
+    name: NamePath,
+    request: ReceiverIn = Body(examples=[_RECEIVER_EXAMPLE]),
+    *,
+    runtime: RuntimeDep,
+    identity: IdentityDep,
+    response: Response,
+) -> ReceiverOut:
+    """Set a cylindrical receiver."""
+    with runtime.database.writing() as session:
+        row, change = store.put_receiver(session, request.named(name))
+        audit.record(session, identity.name, "receiver.set", f"receiver {name}", change=change)
+        if change is store.Change.NEW:
+            response.status_code = status.HTTP_201_CREATED
+        return receiver_out(row)

@@ -1,0 +1,180 @@
+"""Surfaces by version."""
+
+from datetime import datetime
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Body, Depends, Path, Query, Response, status
+from pydantic import BaseModel, Field
+
+from service import store
+from service.base.arrays import unpack
+from service.base.fields import MeasurementName, Method, Model, ModelVersion, Moment, Source, Version
+from service.drawing.pictures import surface_picture
+from service.store.tables import SurfaceRow
+from service.twin.prediction import predict_surface
+from service.twin.runtime import Runtime
+from service.web.answers import formats
+from service.web.answers.formats import MediaType, file_answer, json_answer
+from service.web.answers.openapi import arrays, problems
+from service.web.answers.paging import Page, page
+from service.web.door.dependencies import OPERATE, READ, IdentityDep, Limit, NamePath, RuntimeDep, require_json
+
+
+class SurfaceIn(Model):
+    """How to predict a surface; without ``measurements`` the newest accepted ones are chosen."""
+
+    method: Method = Field(default="network", description="network: at once; refined: fitted through the ray tracer.")
+    measurements: list[MeasurementName] | None = Field(
+        default=None, min_length=1, max_length=8, description="Ids of 1 to 8 accepted measurements."
+    )
+    images: int = Field(
+        default=8,
+        ge=1,
+        le=8,
+        description="How many of the newest accepted ones to take, spread over the sun's positions.",
+    )
+    model_version: ModelVersion = None
+
+
+class SurfaceSummary(BaseModel):
+    """A version of a surface."""
+
+    heliostat: str
+    version: int
+    source: Source
+    model: str | None = Field(description="Name and hash of the network's weights.")
+    model_version: str | None = Field(
+        description="Version of the plant's model that it was predicted by; null: it was measured."
+    )
+    created_at: datetime
+    valid_from: datetime = Field(description="The mirror is taken to have this surface from then on.")
+    measurements: list[str] = Field(description="Ids of the measurements that it was made from.")
+    misfit: float | None = Field(description="What the refinement left unexplained of the flux.")
+
+
+class SurfaceOut(SurfaceSummary):
+    """A surface with its arrays."""
+
+    z: list[Any] = Field(
+        description="Control heights (4, 8, 8) [m]: facet, along x, along y; deviation from the ideally canted facet."
+    )
+    z_std: list[Any] = Field(description="Their standard deviations (4, 8, 8) [m].")
+    control_points: list[Any] = Field(description="(4, 8, 8, 3) [m] in heliostat coordinates.")
+
+
+def surface_summary(heliostat_name: str, row: SurfaceRow) -> SurfaceSummary:
+    """A surface without its arrays."""
+    return SurfaceSummary.model_validate(
+        {
+            "heliostat": heliostat_name,
+            "version": row.version,
+            "source": row.source,
+            "model": row.model,
+            "model_version": row.model_version,
+            "created_at": row.created_at,
+            "valid_from": row.valid_from,
+            "measurements": [measurement_out.identifier for measurement_out in row.measurements],
+            "misfit": row.misfit,
+        }
+    )
+
+
+def surface_out(heliostat_name: str, row: SurfaceRow) -> SurfaceOut:
+    """A surface with its arrays as JSON."""
+    arrays = {name: array.tolist() for name, array in unpack(row.arrays).items()}
+    return SurfaceOut.model_validate({**surface_summary(heliostat_name, row).model_dump(), **arrays})
+
+
+def surface_answer(heliostat_name: str, row: SurfaceRow, media_type: str) -> Response:
+    """A surface as the client wants it."""
+    name = f"{heliostat_name}-surface-{row.version}"
+    if media_type == formats.PNG:
+        title = f"{heliostat_name}, surface {row.version} ({row.source})"
+        return file_answer(surface_picture(unpack(row.arrays)["z"], title), media_type, f"{name}.png")
+    if media_type != formats.JSON:
+        return file_answer(row.arrays, media_type, f"{name}.npz")
+    return json_answer(surface_summary(heliostat_name, row), **unpack(row.arrays))
+
+
+router = APIRouter(prefix="/heliostats/{name}/surfaces", tags=["surfaces"])
+
+
+@router.post(
+    "",
+    status_code=status.HTTP_201_CREATED,
+    responses=problems(404, 409, 413, 415),
+    dependencies=[OPERATE, Depends(require_json)],
+)
+def post_surface(
+    name: NamePath,
+    runtime: RuntimeDep,
+    identity: IdentityDep,
+    response: Response,
+    request: Annotated[SurfaceIn, Body(examples=[{"method": "network", "images": 4}])],
+) -> SurfaceOut:
+    """Predict the surface from stored measurements and keep it as the next version."""
+    row = predict_surface(
+        runtime,
+        name,
+        request.method,
+        request.measurements,
+        request.images,
+        identity.name,
+        model_version=request.model_version,
+    )
+    response.headers["Location"] = f"/v1/heliostats/{name}/surfaces/{row.version}"
+    return surface_out(name, row)
+
+
+@router.get(
+    "",
+    responses={**problems(404, 406), **arrays("With `at`: the surface itself.")},
+    response_model=None,
+    dependencies=[READ],
+)
+def list_surfaces(
+    name: NamePath,
+    runtime: RuntimeDep,
+    media_type: MediaType,
+    limit: Limit = 100,
+    after: Annotated[Version | None, Query(description="The last version of the page before.")] = None,
+    at: Annotated[
+        Moment | None, Query(description="Answer with the surface that was valid then (time with zone).")
+    ] = None,
+) -> Page[SurfaceSummary] | Response:
+    """The history of the surface, oldest version first; with `at` the one that was valid at that time."""
+    if at is not None:
+        return _at(runtime, name, at, media_type)
+    with runtime.database.reading() as session:
+        rows = store.list_surfaces(session, store.get_heliostat(session, name), limit + 1, after)
+    items = [surface_summary(name, row) for row in rows]
+    return page(items, limit, "version")
+
+
+def _at(runtime: Runtime, name: str, moment: datetime | None, media_type: str) -> Response:
+    with runtime.database.reading() as session:
+        row = store.get_surface_at(session, store.get_heliostat(session, name), moment)
+    return surface_answer(name, row, media_type)
+
+
+@router.get(
+    "/current", responses={**problems(404, 406), **arrays("`control_points`, `z`, `z_std` [m].")}, dependencies=[READ]
+)
+def get_current_surface(name: NamePath, runtime: RuntimeDep, media_type: MediaType) -> Response:
+    """The surface that is valid now."""
+    return _at(runtime, name, None, media_type)
+
+
+@router.get(
+    "/{version}", responses={**problems(404, 406), **arrays("`control_points`, `z`, `z_std` [m].")}, dependencies=[READ]
+)
+def get_surface(
+    name: NamePath,
+    version: Annotated[Version, Path(description="Number of the version, from 1.")],
+    runtime: RuntimeDep,
+    media_type: MediaType,
+) -> Response:
+    """A version of the surface."""
+    with runtime.database.reading() as session:
+        row = store.get_surface(session, store.get_heliostat(session, name), version)
+    return surface_answer(name, row, media_type)

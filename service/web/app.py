@@ -1,0 +1,115 @@
+"""The application: settings in, FastAPI out."""
+
+import threading
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from importlib.metadata import PackageNotFoundError, version
+
+from anyio import to_thread
+from fastapi import APIRouter, FastAPI
+from fastapi.routing import APIRoute
+
+from service.base.meters import listening
+from service.base.settings import Settings
+from service.jobs.kind import Kinds
+from service.jobs.kinds import KINDS
+from service.jobs.worker import Workers
+from service.twin.field import FieldBook
+from service.twin.runtime import Operations, Runtime
+from service.web.answers import openapi, problems
+from service.web.api import (
+    audit,
+    forecasts,
+    health,
+    heliostats,
+    jobs,
+    measurements,
+    metrics,
+    models,
+    plant,
+    session,
+    studies,
+    surfaces,
+)
+from service.web.door import security
+from service.web.metrics import registry
+from service.web.middleware import BodyLimitMiddleware, DoorMiddleware, RequestIdMiddleware, SecurityHeadersMiddleware
+from service.web.pages import assets, documentation, field, forecast, heliostat, login
+from service.web.pages import jobs as job_pages
+from service.web.pages import studies as study_pages
+
+_DESCRIPTION = (
+    "Post the target photographs of a solar tower, read back each heliostat's flux and surface, and forecast the "
+    "flux that it throws on any plane. Metres, degrees where a name says so, east-north-up from the tower base."
+)
+
+
+def _version() -> str:
+    try:
+        return version("heliotwin")
+    except PackageNotFoundError:  # run from a checkout that is not installed
+        return "0"
+
+
+def _operation_id(route: APIRoute) -> str:
+    return route.name
+
+
+def create_app(settings: Settings, operations: Operations | None = None, kinds: Kinds = KINDS) -> FastAPI:
+    """The service for these settings.
+
+    ``operations`` stands in for the model (`service.twin.compute`) in tests. The store is opened, and an embedded
+    SQLite one migrated, when the application starts; a store that nobody migrated keeps it from starting, and so does
+    a door that would stand open to other machines. Jobs of ``kinds`` can be asked for, and are worked at where the
+    settings say so.
+    """
+
+    @asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        runtime = await to_thread.run_sync(Runtime.from_settings, settings, operations)
+        try:
+            if settings.migrates_on_start:
+                await to_thread.run_sync(runtime.database.upgrade)
+            await to_thread.run_sync(runtime.database.require_current)
+            await to_thread.run_sync(security.require_closed_door, settings, runtime.database)
+            app.state.runtime = runtime
+            app.state.field = FieldBook(runtime)
+            workers = Workers(runtime, kinds, settings.job_workers)
+            workers.start()
+            try:
+                with listening(settings, registry(runtime)):
+                    yield
+            finally:
+                await to_thread.run_sync(workers.stop)
+                await to_thread.run_sync(app.state.field.close)
+        finally:
+            runtime.close()
+
+    app = FastAPI(
+        title="heliotwin",
+        version=_version(),
+        description=_DESCRIPTION,
+        lifespan=lifespan,
+        generate_unique_id_function=_operation_id,
+        redirect_slashes=False,
+        docs_url=None,  # service.web.pages.documentation has its own page
+        redoc_url=None,
+    )
+    app.state.stopping = threading.Event()
+    v1 = APIRouter(prefix="/v1")
+    for module in (plant, heliostats, measurements, surfaces, forecasts, studies, models, audit):
+        v1.include_router(module.router)
+    v1.include_router(jobs.make_router(kinds))
+    app.include_router(v1)
+    for router in (health.router, metrics.router, session.router, documentation.router):
+        app.include_router(router)
+    for page in (assets, login, field, heliostat, forecast, job_pages, study_pages):
+        app.include_router(page.router)
+    security.require_declared_roles(app)
+    problems.install(app)
+    openapi.install(app)
+    app.add_middleware(BodyLimitMiddleware, settings=settings)
+    app.add_middleware(DoorMiddleware, settings=settings)
+    app.add_middleware(SecurityHeadersMiddleware)
+    app.add_middleware(RequestIdMiddleware)  # added last, it comes first
+    return app

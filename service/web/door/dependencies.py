@@ -1,0 +1,67 @@
+"""What routes ask for in their signatures.
+
+None of it holds a database connection: a route opens its session itself and closes it before it returns. A session
+from a dependency would keep its connection while the request waits for a thread, and threads would wait for it.
+"""
+
+import threading
+from typing import Annotated
+
+from fastapi import Depends, Path, Query, Request
+
+from service.base.faults import UnsupportedContentError
+from service.base.fields import MeasurementName, Name
+from service.twin.runtime import Runtime
+from service.web.door.security import Identity, Requires, Role
+
+
+async def get_runtime(request: Request) -> Runtime:
+    """The parts of the running service."""
+    runtime: Runtime = request.app.state.runtime
+    return runtime
+
+
+RuntimeDep = Annotated[Runtime, Depends(get_runtime)]
+
+# For a route's ``dependencies``: whoever has at least this role is let in.
+READ, INGEST, OPERATE, ADMIN = (Depends(Requires(role)) for role in Role)
+
+
+async def _identity(request: Request) -> Identity:
+    identity: Identity = request.state.identity
+    return identity
+
+
+IdentityDep = Annotated[Identity, Depends(_identity)]
+"""Who asks; for routes that `requires` a role."""
+
+
+async def _stopping(request: Request) -> threading.Event:
+    event: threading.Event = request.app.state.stopping
+    return event
+
+
+StoppingDep = Annotated[threading.Event, Depends(_stopping)]
+"""Set when the service is told to stop, so that answers without an end end."""
+
+
+NamePath = Annotated[Name, Path(description="Name of the heliostat or target.")]
+MeasurementPath = Annotated[MeasurementName, Path()]
+Limit = Annotated[int, Query(ge=1, le=500, description="Most items on a page.")]
+
+
+def _content_type(request: Request) -> str:
+    return request.headers.get("content-type", "").partition(";")[0].strip().lower()
+
+
+async def require_json(request: Request) -> None:
+    """Refuse a body that is not JSON."""
+    given = _content_type(request)
+    if given != "application/json" and not (given.startswith("application/") and given.endswith("+json")):
+        raise UnsupportedContentError("Content-Type: send the body as application/json")
+
+
+async def require_multipart(request: Request) -> None:
+    """Refuse a body that is not a form with files."""
+    if _content_type(request) != "multipart/form-data":
+        raise UnsupportedContentError("Content-Type: send the image and its metadata as multipart/form-data")

@@ -1,0 +1,81 @@
+"""All that Prometheus reads: the meters of the process, and what the store says when it is asked.
+
+Each `serve` and each `worker` counts what it did itself and is a target of its own. What stands in the database, such
+as the queue, is told by `serve` alone, lest it be counted twice.
+"""
+
+import logging
+from collections.abc import Iterator
+
+from prometheus_client import CollectorRegistry
+from prometheus_client.core import GaugeMetricFamily, Metric
+from prometheus_client.registry import Collector
+from sqlalchemy import func, select
+from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy.orm import Session
+
+from service.base.meters import PROCESS
+from service.store import queue
+from service.store.tables import DriftRow, HeliostatRow, JobRow
+from service.twin.runtime import Runtime
+
+logger = logging.getLogger("heliotwin.service")
+
+
+class StoreCollector(Collector):
+    """What the store holds at the moment of asking; a database that is away is told, and harms no other figure."""
+
+    def __init__(self, runtime: Runtime) -> None:
+        self._runtime = runtime
+
+    def describe(self) -> list[Metric]:
+        """Nothing, so that registering asks no database."""
+        return []
+
+    def collect(self) -> Iterator[Metric]:
+        """The figures, read in one transaction."""
+        try:
+            with self._runtime.database.reading() as session:
+                found = [*_queue(session), _drift(session, self._runtime.settings.metrics_heliostats)]
+        except SQLAlchemyError as error:
+            logger.warning("metrics of the store are missing: %s", error)
+            found = []
+        yield GaugeMetricFamily("heliotwin_database_up", "Whether the database answers.", value=float(bool(found)))
+        yield from found
+
+
+def _queue(session: Session) -> Iterator[Metric]:
+    counted = select(JobRow.kind, JobRow.state, func.count()).where(JobRow.state.not_in(queue.ENDED))
+    depth = GaugeMetricFamily("heliotwin_jobs", "Jobs that wait or run.", labels=["kind", "state"])
+    for kind, state, count in session.execute(counted.group_by(JobRow.kind, JobRow.state)):
+        depth.add_metric([kind, state], count)
+    yield depth
+    oldest = session.scalar(select(func.min(JobRow.created_at)).where(JobRow.state == "queued"))
+    waited_s = 0.0 if oldest is None else max(0.0, (queue.clock(session) - oldest).total_seconds())
+    yield GaugeMetricFamily("heliotwin_jobs_oldest_seconds", "How long the oldest waiting job waits [s].", waited_s)
+
+
+def _drift(session: Session, most: int) -> Metric:
+    """The worst heliostats' accuracies: a field of any size gives a bounded number of series."""
+    worst = (
+        select(HeliostatRow.name, DriftRow.accuracy)
+        .join(DriftRow, DriftRow.heliostat_id == HeliostatRow.id)
+        .order_by(DriftRow.accuracy, HeliostatRow.name)
+        .limit(most)
+    )
+    family = GaugeMetricFamily(
+        "heliotwin_heliostat_forecast_accuracy",
+        "Flux accuracy of the twin on the heliostat's newest photograph when it came [1]; the worst heliostats only.",
+        labels=["heliostat"],
+    )
+    for name, accuracy in session.execute(worst):
+        family.add_metric([name], accuracy)
+    return family
+
+
+def registry(runtime: Runtime) -> CollectorRegistry:
+    """The meters of this process together with the store's figures."""
+    both = CollectorRegistry()
+    both.register(PROCESS)  # it collects like any collector
+    both.register(StoreCollector(runtime))
+    return both

@@ -1,0 +1,224 @@
+"""What stands before every route: a request id, a log line, headers for browsers, the door, a bound on the body."""
+
+import logging
+import math
+import re
+import time
+import uuid
+from http import HTTPStatus
+from urllib.parse import urlsplit
+
+from anyio import CapacityLimiter, to_thread
+from fastapi import HTTPException, Response
+from sqlalchemy.exc import OperationalError
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from service.base import logs
+from service.base.meters import REQUEST_SECONDS, REQUESTS
+from service.base.settings import Settings, is_loopback
+from service.web.answers import pages, problems
+from service.web.answers.problems import SECURITY_HEADERS, problem
+from service.web.door import security
+from service.web.door.limits import Buckets
+
+logger = logging.getLogger("heliotwin.access")
+
+_REQUEST_ID = re.compile(r"[A-Za-z0-9_-]{8,64}")
+# Methods that are told apart in metrics, and paths that are asked for too often to log each time.
+_METHODS = ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS")
+_PROBES = ("/livez", "/readyz", "/metrics")
+# What multipart boundaries, part headers and the metadata may add to an image [bytes].
+_MULTIPART_OVERHEAD = 64 * 1024
+
+
+class RequestIdMiddleware:
+    """Gives every request an id, the caller's where it is well-formed, sends it back and logs the request with it."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """One ASGI call."""
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
+        given = Headers(scope=scope).get("x-request-id", "")
+        identity = given if _REQUEST_ID.fullmatch(given) else uuid.uuid4().hex
+        scope.setdefault("state", {})["request_id"] = identity
+        started = time.perf_counter()
+
+        async def send_with_id(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                MutableHeaders(scope=message)["X-Request-ID"] = identity
+                _note(scope, message["status"], time.perf_counter() - started)
+            await send(message)
+
+        with logs.bound(request_id=identity):
+            await self.app(scope, receive, send_with_id)
+
+
+def _note(scope: Scope, status: int, took_s: float) -> None:
+    """Log a request and count it."""
+    path, identity = scope["path"], scope["state"].get("identity")
+    level = logging.DEBUG if path in _PROBES else logging.INFO
+    extra = {"method": scope["method"], "path": path, "status": status, "ms": round(took_s * 1e3, 1)}
+    extra["key"] = None if identity is None else identity.name
+    logger.log(level, "%s %s %d %.1f ms", scope["method"], path, status, took_s * 1e3, extra=extra)
+    method = scope["method"] if scope["method"] in _METHODS else "other"
+    route = _template(scope)
+    REQUESTS.labels(method, route, status).inc()
+    REQUEST_SECONDS.labels(method, route).observe(took_s)
+
+
+def _template(scope: Scope) -> str:
+    """The path as its route declares it, ``/v1/heliostats/{name}``; "none" where there is no route."""
+    path: str | None = getattr(scope.get("route"), "path", None)
+    if path is None:
+        return "none"
+    # A router that was included tells its own path only.
+    return path if not scope["path"].startswith("/v1/") or path.startswith("/v1/") else f"/v1{path}"
+
+
+class SecurityHeadersMiddleware:
+    """Tells browsers to load nothing from elsewhere, to guess no types and to show nothing in foreign frames."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """One ASGI call."""
+
+        async def send_with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                for name, value in SECURITY_HEADERS.items():
+                    headers.setdefault(name, value)
+            await send(message)
+
+        await self.app(scope, receive, send_with_headers)
+
+
+class DoorMiddleware:
+    """Finds out who asks, before anything of the body is read, and turns away who may not come in.
+
+    The request's `service.web.door.security.Identity` is left in its state for the routes. Whoever may come in is
+    let in as often as the settings allow; failed attempts count for the client's address.
+    """
+
+    def __init__(self, app: ASGIApp, settings: Settings) -> None:
+        self.app = app
+        self.settings = settings
+        self.buckets = Buckets(settings.requests_per_s, settings.requests_burst)
+        # Its own threads: a service that is busy with predictions still knows its keys.
+        self.threads = CapacityLimiter(8)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """One ASGI call."""
+        if scope["type"] == "http":
+            refusal = await self._refusal(scope)
+            if refusal is not None:
+                await refusal(scope, receive, send)
+                return
+        await self.app(scope, receive, send)
+
+    async def _refusal(self, scope: Scope) -> Response | None:
+        headers = Headers(scope=scope)
+        if scope["method"] not in ("GET", "HEAD", "OPTIONS") and _is_cross_site(headers):
+            return problem(scope, HTTPStatus.FORBIDDEN, "another site's page may not change anything here")
+        identity = None
+        if not security.is_public(scope["path"]):
+            try:
+                identity = await self._identify(scope, headers)
+            except OperationalError as error:
+                return problems.database_away(scope, error)
+        if identity == security.LOCAL and self._is_rebound(headers):
+            return problem(scope, HTTPStatus.FORBIDDEN, "Host: without a key use one of this machine's own names")
+        return self._too_often(scope, identity) or self._unknown(scope, identity)
+
+    def _is_rebound(self, headers: Headers) -> bool:
+        """Whether a page may have reached this machine by a name that its owner lets point here (DNS rebinding)."""
+        return is_loopback(self.settings.host) and not _is_loopback_name(headers.get("host", ""))
+
+    async def _identify(self, scope: Scope, headers: Headers) -> security.Identity | None:
+        database, presented = scope["app"].state.runtime.database, security.presented_key(headers)
+        identity = await to_thread.run_sync(security.identify, database, self.settings, presented, limiter=self.threads)
+        scope.setdefault("state", {})["identity"] = identity
+        return identity
+
+    def _too_often(self, scope: Scope, identity: security.Identity | None) -> Response | None:
+        client = scope.get("client")
+        address = client[0] if client else ""
+        wait_s = self.buckets.wait_s(f"address {address}" if identity is None else f"key {identity.name}")
+        if not wait_s:
+            return None
+        headers = {"Retry-After": str(math.ceil(wait_s))}
+        return problem(scope, HTTPStatus.TOO_MANY_REQUESTS, "too many requests; wait as Retry-After says", headers)
+
+    def _unknown(self, scope: Scope, identity: security.Identity | None) -> Response | None:
+        if identity is not None or security.is_public(scope["path"]):
+            return None
+        if pages.wants_page(scope) and scope["method"] == "GET":
+            return self._login(scope)
+        detail = "present a valid key: Authorization: Bearer KEY; `heliotwin keys create` makes one"
+        return problem(scope, HTTPStatus.UNAUTHORIZED, detail, {"WWW-Authenticate": "Bearer"})
+
+    def _login(self, scope: Scope) -> Response:
+        """A browser is sent to the page for keys; htmx, which would show that page inside of another, goes there."""
+        path = pages.login_path(scope)
+        if "hx-request" in Headers(scope=scope):
+            return Response(status_code=HTTPStatus.UNAUTHORIZED, headers={"HX-Redirect": path})
+        return pages.go_to(path)
+
+
+def _is_loopback_name(host: str) -> bool:
+    try:
+        return is_loopback(urlsplit(f"//{host}").hostname or "")
+    except ValueError:
+        return False
+
+
+def _is_cross_site(headers: Headers) -> bool:
+    """Whether a browser says that the request comes from a page of another origin; other clients say nothing."""
+    fetched = headers.get("sec-fetch-site")
+    if fetched is not None:
+        return fetched not in ("same-origin", "none")
+    origin = headers.get("origin")
+    return origin is not None and origin.partition("://")[2] != headers.get("host")
+
+
+class BodyLimitMiddleware:
+    """Stops reading a body at its bound: at once where its length is announced, else when the bound is passed."""
+
+    def __init__(self, app: ASGIApp, settings: Settings) -> None:
+        self.app = app
+        self.settings = settings
+
+    def _limit(self, headers: Headers) -> int:
+        if headers.get("content-type", "").lower().startswith("multipart/form-data"):
+            return self.settings.max_image_bytes + _MULTIPART_OVERHEAD
+        return self.settings.max_json_bytes
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """One ASGI call."""
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
+        headers = Headers(scope=scope)
+        limit = self._limit(headers)
+        detail = f"body: larger than the {limit} bytes allowed; send less"
+        announced = headers.get("content-length", "0")
+        if announced.isdecimal() and int(announced[:20]) > limit:
+            await problem(scope, HTTPStatus.REQUEST_ENTITY_TOO_LARGE, detail)(scope, receive, send)
+            return
+        received = 0
+
+        async def bounded() -> Message:
+            nonlocal received
+            message = await receive()
+            received += len(message.get("body", b""))
+            if received > limit:
+                raise HTTPException(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, detail)
+            return message
+
+        await self.app(scope, bounded, send)

@@ -1,0 +1,218 @@
+"""The field: every heliostat on a map, coloured by what its twin is worth, and the same as a table."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from fastapi import APIRouter, Depends, Query, Request
+from fastapi.responses import HTMLResponse
+from sqlalchemy import func, select
+from sqlalchemy.orm import Session
+
+from service.drawing.charts import Scale, scale_of
+from service.store.tables import JobRow, PlantRow, TargetRow
+from service.twin.accuracy import RECENT
+from service.twin.field import FieldBook, Line
+from service.web.answers.pages import render
+from service.web.door.dependencies import READ, RuntimeDep
+
+router = APIRouter(include_in_schema=False, dependencies=[READ])
+
+# Heliostats in the table, unless somebody asks for the whole of it.
+_LISTED = 100
+
+
+@dataclass(frozen=True)
+class Metric:
+    """What the map can be coloured by; dark is always the end that deserves a look."""
+
+    name: str
+    label: str
+    unit: str
+    digits: int
+    colours: str
+    about: str
+    value: Callable[[Line], float | None]
+
+
+def _deviation(line: Line) -> float | None:
+    return None if line.figures is None else line.figures.deviation_mm
+
+
+def _uncertainty(line: Line) -> float | None:
+    return None if line.figures is None else line.figures.uncertainty_mm
+
+
+def _misfit(line: Line) -> float | None:
+    return None if line.surface is None or line.surface.misfit is None else line.surface.misfit * 100
+
+
+def _age(line: Line) -> float | None:
+    return None if line.surface is None else line.surface.age_days
+
+
+def _accuracy(line: Line) -> float | None:
+    return None if line.accuracy is None else line.accuracy * 100
+
+
+MetricName = Literal["deviation", "uncertainty", "misfit", "age", "accuracy"]
+
+METRICS: dict[str, Metric] = {
+    metric.name: metric
+    for metric in (
+        Metric(
+            "accuracy",
+            "Forecast accuracy",
+            "%",
+            1,
+            "viridis",
+            f"Mean agreement of forecast and measured flux on up to {RECENT} newest photographs, with today's surface.",
+            _accuracy,
+        ),
+        Metric(
+            "deviation",
+            "Surface error",
+            "mm",
+            3,
+            "viridis_r",
+            "How far the mirror is from its ideal shape: root mean square of the heights.",
+            _deviation,
+        ),
+        Metric(
+            "uncertainty",
+            "Surface uncertainty",
+            "mm",
+            3,
+            "viridis_r",
+            "How well the surface is known: root mean square of the heights' standard deviations.",
+            _uncertainty,
+        ),
+        Metric(
+            "misfit",
+            "Surface misfit",
+            "%",
+            1,
+            "viridis_r",
+            "What the surface leaves unexplained of the photographs that it was made from.",
+            _misfit,
+        ),
+        Metric("age", "Age of the surface", "days", 0, "viridis_r", "Since the surface describes the mirror.", _age),
+    )
+}
+
+
+async def _book(request: Request) -> FieldBook:
+    book: FieldBook = request.app.state.field
+    return book
+
+
+FieldBookDep = Annotated[FieldBook, Depends(_book)]
+
+
+@dataclass(frozen=True)
+class Dot:
+    """A heliostat on the drawn map, in the drawing's units; without a colour where its value is not known."""
+
+    line: Line
+    x: float
+    y: float
+    value: float | None
+    colour: str | None
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """The field from above, north up: size, dots with their radius, the tower, and a bar for its length."""
+
+    width: float
+    height: float
+    radius: float
+    dots: list[Dot]
+    tower: tuple[float, float]
+    bar_m: float
+    bar: float
+    has_names: bool
+
+
+_WIDTH = 720.0
+_MARGIN = 34.0
+
+
+def _round_length(metres: float) -> float:
+    """The largest of 1, 2 or 5 times a power of ten that is not longer."""
+    power: float = 10.0 ** math.floor(math.log10(metres))
+    return max(factor * power for factor in (1, 2, 5) if factor * power <= metres)
+
+
+def draw(lines: Sequence[Line], metric: Metric, scale: Scale) -> Drawing:
+    """The map of ``lines``; the tower stands at the origin and is always on it."""
+    east = np.array([line.east_m for line in lines] + [0.0])
+    north = np.array([line.north_m for line in lines] + [0.0])
+    spans = max(float(np.ptp(east)), 1.0), max(float(np.ptp(north)), 1.0)
+    per_metre = min((_WIDTH - 2 * _MARGIN) / spans[0], (_WIDTH - 2 * _MARGIN) / spans[1])
+    width, height = (max(span * per_metre, 200.0) + 2 * _MARGIN for span in spans)
+    x = width / 2 + (east - (east.max() + east.min()) / 2) * per_metre
+    y = height / 2 - (north - (north.max() + north.min()) / 2) * per_metre
+    values = [metric.value(line) for line in lines]
+    colours = scale.names([math.nan if value is None else value for value in values])
+    dots = [
+        Dot(line, float(x[i]), float(y[i]), value, None if value is None else colour)
+        for i, (line, value, colour) in enumerate(zip(lines, values, colours, strict=True))
+    ]
+    bar_m = _round_length(width / 4 / per_metre)
+    radius = min(max(0.35 * math.sqrt(width * height / max(len(lines), 1)), 3.0), 12.0)
+    tower = float(x[-1]), float(y[-1])
+    return Drawing(width, height, radius, dots, tower, bar_m, bar_m * per_metre, len(lines) <= 60)
+
+
+def _worst_first(lines: Sequence[Line], metric: Metric) -> list[Line]:
+    """Those without a value last, each group by name."""
+    sign = 1.0 if metric.name == "accuracy" else -1.0
+    valued = [(sign * value, line.name, line) for line in lines if (value := metric.value(line)) is not None]
+    return [line for *_, line in sorted(valued)] + [line for line in lines if metric.value(line) is None]
+
+
+def _totals(session: Session) -> dict[str, Any]:
+    plant = session.get(PlantRow, 1)
+    running = select(func.count()).select_from(JobRow).where(JobRow.state.in_(("queued", "running")))
+    return {
+        "plant": None if plant is None else plant.name,
+        "targets": session.scalars(select(func.count()).select_from(TargetRow)).one(),
+        "live_jobs": session.scalars(running).one(),
+    }
+
+
+@router.get("/")
+def get_field(
+    request: Request,
+    runtime: RuntimeDep,
+    book: FieldBookDep,
+    metric: Annotated[MetricName, Query()] = "accuracy",
+    whole: Annotated[bool, Query()] = False,
+) -> HTMLResponse:
+    """The field map and its table, or the ``whole`` table of a large field."""
+    chosen = METRICS[metric]
+    with runtime.database.reading() as session:
+        lines, pending = book.read(session)
+        totals = _totals(session)
+    values = [value for line in lines if (value := chosen.value(line)) is not None]
+    # A large field takes its time and its page is long: it is asked for again the less often the more is left.
+    again_ms = min(max(1500, 30 * pending), 15_000)
+    scale = scale_of(values, chosen.colours, f"{chosen.label} [{chosen.unit}]", 5 * 10.0**-chosen.digits)
+    return render(
+        request,
+        "field.html",
+        **totals,
+        lines=lines,
+        listed=_worst_first(lines, chosen)[: None if whole else _LISTED],
+        whole=whole,
+        metrics=METRICS,
+        metric=chosen,
+        values=values,
+        scale=scale,
+        drawing=draw(lines, chosen, scale) if lines else None,
+        pending=pending,
+        again_ms=again_ms,
+    )

@@ -1,0 +1,149 @@
+"""Forecasts: a form, and the flux map that comes of it."""
+
+from datetime import UTC, datetime
+from typing import Annotated, Any, Literal, Self
+
+from fastapi import APIRouter, Form, Path, Query, Request, Response
+from fastapi.responses import HTMLResponse
+from pydantic import AfterValidator, Field, model_validator
+from sqlalchemy import select
+from sqlalchemy.orm import Session, defer
+
+from model.ephemeris import sun_angles_at
+from model.errors import InvalidInputError
+from service import store
+from service.base.fields import Azimuth, Elevation, Model, Name, Sun, Version
+from service.drawing import charts
+from service.jobs.asking import ask_for
+from service.jobs.field_forecasts import FleetForecastIn
+from service.store.tables import ForecastRow, HeliostatRow, PlantRow, ReceiverRow, TargetRow, now
+from service.twin.forecast import ForecastRequest, flux_of, make_forecast
+from service.twin.runtime import Runtime
+from service.web.answers.pages import go_to, leave_for, render
+from service.web.door.dependencies import OPERATE, READ, IdentityDep, RuntimeDep
+from service.web.door.security import Identity
+
+router = APIRouter(include_in_schema=False)
+
+_RECENT = 10
+
+
+def _in_utc(moment: datetime) -> datetime:
+    """What a browser's field for a moment gives bears no zone; the page says that it means UTC."""
+    return moment.replace(tzinfo=UTC) if moment.tzinfo is None else moment.astimezone(UTC)
+
+
+class ForecastForm(Model):
+    """The form; without a heliostat it means all of them."""
+
+    heliostat: Name | None = None
+    target: Name
+    sun_by: Literal["position", "time"] = "position"
+    azimuth_deg: Azimuth | None = None
+    elevation_deg: Elevation | None = None
+    moment: Annotated[datetime | None, AfterValidator(lambda moment: None if moment is None else _in_utc(moment))] = (
+        None
+    )
+    surface: Literal["current", "ideal"] = "current"
+    dni_w_m2: float = Field(default=1000.0, gt=0, le=2000)
+
+    @model_validator(mode="after")
+    def _sun(self) -> Self:
+        if self.sun_by == "time" and self.moment is None:
+            raise ValueError("moment: say when")
+        if self.sun_by == "position" and (self.azimuth_deg is None or self.elevation_deg is None):
+            raise ValueError("azimuth_deg, elevation_deg: say where the sun stands")
+        return self
+
+
+def _sun(runtime: Runtime, form: ForecastForm) -> Sun:
+    """Where the sun stands; InvalidInputError where it is night at that time."""
+    if form.sun_by == "position":
+        assert form.azimuth_deg is not None
+        assert form.elevation_deg is not None
+        return Sun(azimuth_deg=form.azimuth_deg, elevation_deg=form.elevation_deg)
+    assert form.moment is not None
+    with runtime.database.reading() as session:
+        latitude, longitude, _ = store.get_plant(session).origin
+    azimuth, elevation = sun_angles_at(form.moment, latitude, longitude)
+    if elevation <= 0:
+        raise InvalidInputError(f"moment: the sun is {-elevation:.1f}° below the horizon then; choose another time")
+    return Sun(azimuth_deg=azimuth, elevation_deg=elevation)
+
+
+def _sun_now(plant: PlantRow | None) -> tuple[float, float]:
+    """Where the sun stands now, [deg]; at night, or without a plant, a high sun in the south."""
+    if plant is None:
+        return 0.0, 45.0
+    azimuth, elevation = sun_angles_at(now(), plant.latitude_deg, plant.longitude_deg)
+    return (round(azimuth, 2), round(elevation, 2)) if elevation > 5 else (0.0, 45.0)
+
+
+def _choices(session: Session) -> dict[str, Any]:
+    newest = select(ForecastRow).options(defer(ForecastRow.plane)).order_by(ForecastRow.id.desc()).limit(_RECENT)
+    return {
+        "heliostats": session.scalars(select(HeliostatRow.name).order_by(HeliostatRow.name)).all(),
+        "targets": session.scalars(select(TargetRow.name).order_by(TargetRow.name)).all(),
+        "receivers": session.scalars(select(ReceiverRow.name).order_by(ReceiverRow.name)).all(),
+        "recent": session.scalars(newest).all(),
+        "moment": now().strftime("%Y-%m-%dT%H:%M"),
+    }
+
+
+@router.get("/forecast", dependencies=[READ])
+def get_forecast_form(
+    request: Request, runtime: RuntimeDep, heliostat: Annotated[Name | None, Query()] = None
+) -> HTMLResponse:
+    """The form, empty but for what is likely."""
+    with runtime.database.reading() as session:
+        choices = _choices(session)
+        azimuth, elevation = _sun_now(session.get(PlantRow, 1))
+    filled = {"heliostat": heliostat, "target": None, "azimuth_deg": azimuth, "elevation_deg": elevation}
+    return render(request, "forecast.html", **choices, filled=filled, forecast=None)
+
+
+def _ask_for_all(runtime: Runtime, form: ForecastForm, sun: Sun, identity: Identity) -> str:
+    """All heliostats take longer than a request may: the path of the job."""
+    payload = FleetForecastIn(target=form.target, sun=sun, surface=form.surface, dni_w_m2=form.dni_w_m2)
+    row = ask_for(runtime, "forecasts", payload.model_dump(mode="json"), identity.name)
+    return f"/jobs/{row.id}"
+
+
+@router.post("/forecast", dependencies=[OPERATE])
+def post_forecast_form(
+    form: Annotated[ForecastForm, Form()], request: Request, runtime: RuntimeDep, identity: IdentityDep
+) -> Response:
+    """Compute and keep a forecast, and go to its page."""
+    sun = _sun(runtime, form)
+    if form.heliostat is None:
+        return leave_for(request, _ask_for_all(runtime, form, sun, identity))
+    asked = ForecastRequest(
+        heliostat=form.heliostat,
+        target=form.target,
+        sun_azimuth_deg=sun.azimuth_deg,
+        sun_elevation_deg=sun.elevation_deg,
+        surface=form.surface,
+        dni=form.dni_w_m2,
+    )
+    return go_to(f"/forecasts/{make_forecast(runtime, asked).id}")
+
+
+@router.get("/forecasts/{number}", dependencies=[READ])
+def get_forecast_page(
+    number: Annotated[Version, Path(description="Id of the forecast.")], request: Request, runtime: RuntimeDep
+) -> HTMLResponse:
+    """A forecast's flux map and figures, with the form for the next one."""
+    with runtime.database.reading() as session:
+        row = store.get_forecast(session, number)
+        choices = _choices(session)
+    size = (row.window_m or row.plane["width"], row.window_m or row.plane["height"])
+    unit = "% per pixel" if row.normalised else "W/m²"
+    title = f"Flux of {row.heliostat.name} on {row.target_name or 'a plane'}, peak {row.peak_w_m2:.0f} W/m²"
+    filled = {
+        "heliostat": row.heliostat.name,
+        "target": row.target_name,
+        "azimuth_deg": round(row.sun_azimuth_deg, 3),
+        "elevation_deg": round(row.sun_elevation_deg, 3),
+    }
+    flux = charts.flux_map(title, flux_of(row), size, unit)
+    return render(request, "forecast.html", **choices, filled=filled, forecast=row, flux=flux)

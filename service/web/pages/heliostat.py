@@ -1,0 +1,174 @@
+"""A heliostat: its surface as a map and in space, how it changed, what it forecasts, and its photographs."""
+
+import itertools
+import json
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from statistics import fmean
+from typing import Annotated, Any
+
+import numpy as np
+from fastapi import APIRouter, Query, Request
+from fastapi.responses import HTMLResponse
+from numpy.typing import NDArray
+from sqlalchemy import select
+from sqlalchemy.orm import Session, undefer
+
+from model.errors import ModelError
+from service import store
+from service.base.arrays import unpack
+from service.base.fields import Version
+from service.drawing import charts
+from service.drawing.charts import HeatMap, History, Scale
+from service.drawing.pictures import mirror_heights
+from service.store.tables import HeliostatRow, MeasurementRow, SurfaceRow
+from service.twin.accuracy import RECENT, Comparison, compare
+from service.twin.field import Figures, figures_of
+from service.twin.runtime import Runtime
+from service.web.answers.pages import render
+from service.web.door.dependencies import READ, NamePath, RuntimeDep
+
+router = APIRouter(include_in_schema=False, dependencies=[READ])
+logger = logging.getLogger("heliotwin.service")
+
+# Newest surfaces and photographs that the page lists.
+_MOST_SURFACES = 40
+_MOST_PHOTOGRAPHS = 60
+# Points along each side of a facet in the view in space.
+_SPACE_SAMPLES = 14
+# Side of the window of measured fluxes [m].
+_WINDOW = (4.0, 4.0)
+
+
+@dataclass(frozen=True)
+class Revision:
+    """A line of the history."""
+
+    row: SurfaceRow
+    figures: Figures
+    change_mm: float | None
+
+
+@dataclass(frozen=True)
+class ComparisonFigure:
+    """A comparison and its three pictures."""
+
+    comparison: Comparison
+    measured: HeatMap
+    forecast: HeatMap
+    difference: HeatMap
+
+
+def _newest_surfaces(session: Session, heliostat: HeliostatRow) -> list[SurfaceRow]:
+    query = select(SurfaceRow).where(SurfaceRow.heliostat_id == heliostat.id).options(undefer(SurfaceRow.arrays))
+    return list(session.scalars(query.order_by(SurfaceRow.version.desc()).limit(_MOST_SURFACES)))
+
+
+def _newest_photographs(session: Session, heliostat: HeliostatRow) -> Sequence[MeasurementRow]:
+    query = select(MeasurementRow).where(MeasurementRow.heliostat_id == heliostat.id)
+    return session.scalars(query.order_by(MeasurementRow.id.desc()).limit(_MOST_PHOTOGRAPHS)).all()
+
+
+def _rms_mm(heights: NDArray[Any]) -> float:
+    return float(np.sqrt(np.mean(heights**2)) * 1e3)
+
+
+def versions(rows: Sequence[SurfaceRow]) -> list[Revision]:
+    """Surfaces, newest first, each with its change from the one before it in the list [mm, root mean square]."""
+    heights = [unpack(row.arrays)["z"] for row in rows]
+    changes = [_rms_mm(new - old) for new, old in itertools.pairwise(heights)]
+    return [Revision(row, figures_of(row.arrays), change) for row, change in zip(rows, [*changes, None], strict=False)]
+
+
+def _histories(listed: Sequence[Revision]) -> list[History]:
+    oldest_first = list(reversed(listed))
+    deviation = [(f"version {v.row.version}", v.figures.deviation_mm) for v in oldest_first]
+    changes = [(f"version {v.row.version}", v.change_mm) for v in oldest_first if v.change_mm is not None]
+    drawn = [charts.history("Surface error by version", "mm", deviation, 3)]
+    return [*drawn, charts.history("Change from the version before", "mm", changes, 3)] if changes else drawn
+
+
+def space_view(z: NDArray[Any], size: tuple[float, float]) -> str:
+    """What `surface3d.js` draws: heights [mm] of each facet on an even grid, the mirror's size [m], and colours."""
+    heights = mirror_heights(z, _SPACE_SAMPLES)
+    colours = Scale("RdBu_r", 0, 1, "").names(np.linspace(0, 1, 33).tolist())
+    return json.dumps({"size": size, "facets": np.round(heights, 4).tolist(), "colours": colours})
+
+
+def _comparison_figure(comparison: Comparison) -> ComparisonFigure:
+    # Both have the sum 100 on the same pixels: shares of the mean are a scale that all pictures have in common.
+    measured, forecast = (image * (image.size / 100) for image in (comparison.measured, comparison.forecast))
+    top = float(max(measured.max(), forecast.max()))
+    name = comparison.measurement.identifier
+    return ComparisonFigure(
+        comparison,
+        charts.flux_map(f"measured flux of {name}", measured, _WINDOW, "of the mean", top),
+        charts.flux_map(f"forecast flux of {name}", forecast, _WINDOW, "of the mean", top),
+        charts.difference_map(f"forecast minus measured flux of {name}", forecast - measured, _WINDOW, "of the mean"),
+    )
+
+
+def _compare(runtime: Runtime, name: str, surface: SurfaceRow | None) -> tuple[list[Comparison], str | None]:
+    """Comparisons, or why there are none; the rest of the page does not depend on them."""
+    try:
+        return compare(runtime, name, surface), None
+    except ModelError as error:
+        logger.warning("heliostat %s cannot be compared with its photographs: %s", name, error)
+        return [], str(error)
+
+
+def _means(comparisons: Sequence[Comparison]) -> dict[str, float | None]:
+    groups = {
+        "accuracy": [c.accuracy for c in comparisons],
+        "accuracy_new": [c.accuracy for c in comparisons if not c.was_used],
+    }
+    return {name: fmean(group) if group else None for name, group in groups.items()}
+
+
+def _surface_context(surface: SurfaceRow, size: tuple[float, float]) -> dict[str, Any]:
+    arrays = unpack(surface.arrays)
+    shown = figures_of(surface.arrays)
+    title = f"Surface {surface.version}: deviation from the ideal mirror, seen from the front"
+    deviation = charts.surface_map(title, arrays["z"], size)
+    uncertainty = charts.uncertainty_map("Standard deviation of the surface", arrays["z_std"], size)
+    return {
+        "figures": shown,
+        "surface_map": deviation,
+        "uncertainty_map": uncertainty if shown.uncertainty_mm else None,
+        "space": space_view(arrays["z"], size),
+    }
+
+
+def _size(row: HeliostatRow) -> tuple[float, float]:
+    return float(row.properties["width"]), float(row.properties["height"])
+
+
+@router.get("/heliostats/{name}")
+def get_heliostat_page(
+    name: NamePath, request: Request, runtime: RuntimeDep, version: Annotated[Version | None, Query()] = None
+) -> HTMLResponse:
+    """A heliostat with its current surface, or an earlier ``version``."""
+    with runtime.database.reading() as session:
+        row = store.get_heliostat(session, name)
+        today = store.find_surface_at(session, row)
+        surface = today if version is None else store.get_surface(session, row, version)
+        listed = versions(_newest_surfaces(session, row))
+        photographs = _newest_photographs(session, row)
+    comparisons, trouble = _compare(runtime, name, surface)
+    return render(
+        request,
+        "heliostat.html",
+        heliostat=row,
+        size=_size(row),
+        surface=surface,
+        today=today,
+        versions=listed,
+        histories=_histories(listed) if listed else [],
+        comparisons=[_comparison_figure(comparison) for comparison in comparisons],
+        trouble=trouble,
+        recent=RECENT,
+        photographs=photographs,
+        **_means(comparisons),
+        **(_surface_context(surface, _size(row)) if surface is not None else {}),
+    )

@@ -1,0 +1,92 @@
+"""Jobs: what is under way, what became of the rest, and the buttons that start and stop them."""
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Form, Path, Query, Request, Response
+from fastapi.responses import HTMLResponse
+
+from service.base.arrays import unpack
+from service.base.fields import Method, Model, Name, Version
+from service.drawing import charts
+from service.drawing.charts import HeatMap
+from service.jobs.asking import ask_for, cancel_for
+from service.jobs.predictions import PredictionsIn
+from service.store import queue
+from service.store.tables import JobRow
+from service.web.answers.pages import go_to, render
+from service.web.door.dependencies import OPERATE, READ, IdentityDep, RuntimeDep
+
+router = APIRouter(include_in_schema=False)
+
+Number = Annotated[Version, Path(description="Id of the job.")]
+
+_PAGE = 50
+
+
+class PredictionForm(Model):
+    """The form that asks for surfaces; without a heliostat of all of them."""
+
+    heliostat: Name | None = None
+    method: Method = "network"
+
+
+@router.get("/jobs", dependencies=[READ])
+def get_jobs_page(
+    request: Request, runtime: RuntimeDep, after: Annotated[Version | None, Query()] = None
+) -> HTMLResponse:
+    """Jobs, newest first."""
+    with runtime.database.reading() as session:
+        rows = queue.list_jobs(session, _PAGE + 1, after)
+    is_live = any(row.state not in queue.ENDED for row in rows)
+    more = rows[_PAGE - 1].id if len(rows) > _PAGE else None
+    return render(request, "jobs.html", jobs=rows[:_PAGE], more=more, after=after, is_live=is_live, ended=queue.ENDED)
+
+
+def _flux(row: JobRow) -> HeatMap | None:
+    """The map of a job that gave one."""
+    if row.arrays is None or row.result is None or "plane" not in row.result:
+        return None
+    plane = row.result["plane"]
+    flux = unpack(row.arrays)["flux"]
+    return charts.flux_map("Flux of all heliostats together", flux, (plane["width"], plane["height"]), "W/m²")
+
+
+def _plain(value: Any) -> bool:
+    return isinstance(value, str | int | float | bool)
+
+
+@router.get("/jobs/{number}", dependencies=[READ])
+def get_job_page(number: Number, request: Request, runtime: RuntimeDep) -> HTMLResponse:
+    """A job; the page follows it until it ends."""
+    with runtime.database.reading() as session:
+        row = queue.get_job(session, number, arrays=True)
+    result = row.result or {}
+    return render(
+        request,
+        "job.html",
+        job=row,
+        is_live=row.state not in queue.ENDED,
+        asked={name: value for name, value in row.payload.items() if value is not None},
+        flux=_flux(row),
+        facts={name: value for name, value in result.items() if _plain(value)},
+        counts=result.get("counts", {}),
+        surfaces=result.get("surfaces", {}),
+        skipped=result.get("skipped", {}),
+    )
+
+
+@router.post("/jobs/predictions", dependencies=[OPERATE])
+def post_predictions_form(
+    form: Annotated[PredictionForm, Form()], runtime: RuntimeDep, identity: IdentityDep
+) -> Response:
+    """Ask for surfaces, and go to the job's page."""
+    heliostats = None if form.heliostat is None else [form.heliostat]
+    payload = PredictionsIn(heliostats=heliostats, method=form.method).model_dump(mode="json")
+    return go_to(f"/jobs/{ask_for(runtime, 'predictions', payload, identity.name).id}")
+
+
+@router.post("/jobs/{number}/cancel", dependencies=[OPERATE])
+def post_cancel_form(number: Number, runtime: RuntimeDep, identity: IdentityDep) -> Response:
+    """Cancel a job, and go to its page."""
+    cancel_for(runtime, number, identity.name)
+    return go_to(f"/jobs/{number}")

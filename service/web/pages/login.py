@@ -1,0 +1,49 @@
+"""The door's own page, and what it is made of; nothing here needs a key, and nothing shows the plant."""
+
+import re
+from typing import Annotated
+
+from fastapi import APIRouter, Form, Query, Request, Response
+from fastapi.responses import HTMLResponse
+
+from service.web.answers.pages import go_to, render
+from service.web.api.session import forget_key, keep_key, require_valid
+from service.web.door.dependencies import RuntimeDep
+
+router = APIRouter(include_in_schema=False)
+
+# A path of this service and nothing that a browser could take for another host.
+_OWN_PATH = re.compile(r"/(?:[A-Za-z0-9_-][A-Za-z0-9_/-]*)?(?:\?[A-Za-z0-9_=&.%-]*)?")
+
+
+def own_path(wanted: str) -> str:
+    """The path to go on to, or the field where somebody wrote another into the link."""
+    return wanted if _OWN_PATH.fullmatch(wanted) else "/"
+
+
+@router.get("/login")
+def get_login(request: Request, next_: Annotated[str, Query(alias="next", max_length=500)] = "/") -> HTMLResponse:
+    """The form for a key."""
+    return render(request, "login.html", next=own_path(next_))
+
+
+@router.post("/login")
+def post_login(
+    key: Annotated[str, Form(max_length=200)],
+    request: Request,
+    runtime: RuntimeDep,
+    next_: Annotated[str, Form(alias="next", max_length=500)] = "/",
+) -> Response:
+    """Keep a valid key in a cookie, and go on."""
+    require_valid(runtime, key.strip())
+    answer = go_to(own_path(next_))
+    keep_key(answer, request, key.strip())
+    return answer
+
+
+@router.post("/logout")
+def post_logout() -> Response:
+    """Forget the key."""
+    answer = go_to("/login")
+    forget_key(answer)
+    return answer

@@ -1,0 +1,58 @@
+"""Running the service: what the command line's ``serve`` and ``migrate`` call."""
+
+import threading
+from types import FrameType
+
+import uvicorn
+
+from service.base import logs, telemetry
+from service.base.faults import NotStartedError
+from service.base.settings import Settings
+from service.web.app import create_app
+
+# Seconds that requests under way get to finish when the service is told to stop.
+_GRACE_S = 30
+
+# Seconds that an idle connection stays open: longer than clients and proxies usually keep one for their next request.
+_KEEP_ALIVE_S = 75
+
+
+class _Server(uvicorn.Server):
+    """Ends streams without an end when it is told to stop, instead of waiting for their readers."""
+
+    def __init__(self, config: uvicorn.Config, stopping: threading.Event) -> None:
+        super().__init__(config)
+        self._stopping = stopping
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """On SIGTERM or SIGINT."""
+        self._stopping.set()
+        super().handle_exit(sig, frame)
+
+
+def serve(settings: Settings) -> None:
+    """Run the service until it is told to stop; an embedded SQLite store is migrated first.
+
+    Raises
+    ------
+    NotStartedError
+        Where the store or the door keeps it from starting.
+    """
+    logs.set_up(settings)
+    telemetry.set_up(settings, "heliotwin")
+    app = create_app(settings)
+    config = uvicorn.Config(
+        app,
+        host=settings.host,
+        port=settings.port,
+        log_config=None,  # ours above
+        access_log=False,  # service.web.middleware writes one with request ids
+        server_header=False,
+        timeout_graceful_shutdown=_GRACE_S,
+        timeout_keep_alive=_KEEP_ALIVE_S,
+    )
+    server = _Server(config, app.state.stopping)
+    try:
+        server.run()
+    except SystemExit as refusal:  # uvicorn's way to say that the application or the port failed
+        raise NotStartedError("the service could not start; the log above says why") from refusal

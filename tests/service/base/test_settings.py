@@ -1,0 +1,55 @@
+"""Settings: safe by default, unsafe ones refused, passwords in files."""
+
+from pathlib import Path
+
+import pytest
+from pydantic import ValidationError
+
+from service.base.settings import Settings, is_loopback
+
+
+@pytest.fixture(autouse=True)
+def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)  # where no .env lies
+
+
+def test_defaults_need_nothing():
+    settings = Settings()
+    assert settings.database.drivername == "sqlite"
+    assert settings.database.database == "heliotwin-data/heliotwin.sqlite"
+    assert settings.migrates_on_start
+    assert settings.host == "127.0.0.1"
+
+
+def test_environment_is_read(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("HELIOTWIN_DATABASE_URL", "postgresql://helio@db/twin")
+    monkeypatch.setenv("HELIOTWIN_PORT", "9000")
+    settings = Settings()
+    assert settings.database.drivername == "postgresql+psycopg"
+    assert settings.port == 9000
+    assert not settings.migrates_on_start
+
+
+def test_password_comes_from_its_file(tmp_path: Path):
+    secret = tmp_path / "password"
+    secret.write_text("s3:cr/et@\n")
+    settings = Settings(database_url="postgresql://helio@db/twin", database_password_file=secret)
+    assert settings.database.password == "s3:cr/et@"
+    assert "s3" not in repr(settings)
+    assert "s3" not in str(settings.database)
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.9.9.9", "::1", "localhost"])
+def test_loopback_is_known(host: str):
+    assert is_loopback(host)
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.1.5", "plant.example", "127.0.0.1.example", ""])
+def test_anything_else_may_be_reached_by_others(host: str):
+    assert not is_loopback(host)
+
+
+@pytest.mark.parametrize("url", ["mysql://a/b", "nonsense", "", "postgresql"])
+def test_other_databases_are_refused(url: str):
+    with pytest.raises(ValidationError, match="database_url"):
+        Settings(database_url=url)

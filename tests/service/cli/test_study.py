@@ -1,0 +1,263 @@
+"""``heliotwin study``: the report of DESIGN.md, section 7, its page, and what it says to bad input."""
+
+import json
+import re
+import shutil
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from model.effects import CATALOGUE
+from model.effects.facet_canting import FacetCanting
+from model.errors import InvalidInputError
+from model.study import StudyOptions
+from model.study.judging import Gain
+from model.study.report import Found
+from model.study.unknowns import Unknowns
+from service.cli.folder_study import FolderStudy, study_folder
+from service.cli.main import main
+from service.drawing.study_report import study_page
+from service.sources.folder import read_folder
+
+HELIOSTATS = ("AD34", "AR18")
+
+
+@pytest.fixture(scope="module")
+def few(undeclared, tmp_path_factory) -> Path:
+    """Three images of two heliostats each, of a set under a hazy sky."""
+    return copy(undeclared / "set-5", tmp_path_factory.mktemp("few"), 3)
+
+
+def copy(source: Path, root: Path, images: int) -> Path:
+    """A folder of few heliostats and images."""
+    for path in source.glob("*.json"):
+        shutil.copy(path, root)
+    for name in HELIOSTATS:
+        for part in ("Properties", "Deflectometry"):
+            shutil.copytree(source / name / part, root / name / part)
+        (root / name / "Calibration").mkdir()
+        kept = sorted((source / name / "Calibration").glob("*-calibration-properties.json"))[:images]
+        for about in kept:
+            for path in about.parent.glob(about.name.split("-")[0] + "-*"):
+                shutil.copy(path, root / name / "Calibration")
+    return root
+
+
+@pytest.fixture(scope="module")
+def hazy(few) -> FolderStudy:
+    return study_folder(read_folder(few), options=StudyOptions(candidates=("sun_shape", "camera_blur")))
+
+
+@pytest.fixture(scope="module")
+def clean(undeclared, tmp_path_factory) -> FolderStudy:
+    """Of a folder that declares the sun that it has."""
+    root = copy(undeclared / "set-5", tmp_path_factory.mktemp("clean"), 3)
+    found = study_folder(read_folder(root), options=StudyOptions(candidates=("sun_shape",))).study.effects[0]
+    options = StudyOptions(candidates=("sun_shape", "axis_tilt"))
+    return study_folder(read_folder(root), options=options, effects=[found])
+
+
+# --- the command ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def heliotwin(monkeypatch, capsys) -> Callable[..., tuple[int, str, str]]:
+    """Run the command in this process: exit code, standard output and standard error."""
+
+    def run(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["heliotwin", *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        said = capsys.readouterr()
+        return ended.value.code, said.out, said.err
+
+    return run
+
+
+def test_the_report_keeps_the_contract_and_serves_forecasts(few, tmp_path, heliotwin):
+    def report_of(*arguments: object) -> dict:
+        code, said, trouble = heliotwin(*arguments, "--json")
+        assert code == 0, trouble
+        return json.loads(said)
+
+    files = ("--out", tmp_path / "new" / "r.json", "--html", tmp_path / "new" / "r.html")
+    report = report_of("study", few, *files)
+    assert json.loads((tmp_path / "new" / "r.json").read_text()) == report
+    assert report["verdict"] == "effect"
+    assert report["images"] == {"fit": 4, "held_out": 2}
+    for part in ("before", "after"):
+        accuracies = report[part]["per_image"]
+        assert {key.split("/")[0] for key in accuracies} == set(HELIOSTATS)
+        assert report[part]["accuracy_mean"] == pytest.approx(np.mean(list(accuracies.values())), abs=2e-5)
+        assert report[part]["accuracy_median"] == pytest.approx(np.median(list(accuracies.values())), abs=2e-5)
+    assert 0 < report["noise_floor"] < 0.05
+    assert 0 <= report["unexplained_share"] <= 1
+    for effect in report["effects"]:
+        assert set(effect["parameters"]) == {p.name for p in CATALOGUE[effect["name"]].parameters()}
+        for parameter in effect["parameters"].values():
+            assert set(parameter) == {"value", "ci95", "unit"}
+        assert effect["accuracy_gain"]["ci95"][0] > 0
+        assert set(effect["told_apart_by"]) == set(effect["lookalikes"])
+    accuracies = [candidate["accuracy_after"] for candidate in report["candidates"]]
+    assert accuracies == sorted(accuracies, reverse=True)
+    assert {candidate["name"] for candidate in report["candidates"]} == set(CATALOGUE)
+    assert "skipped" not in report
+    assert report["conclusion"] in text((tmp_path / "new" / "r.html").read_text(encoding="utf-8"))
+
+    plain = report_of("forecast", few, "--out", tmp_path / "plain")
+    better = report_of("forecast", few, "--out", tmp_path / "better", "--effects", tmp_path / "new" / "r.json")
+    assert better["accuracy_mean"] > plain["accuracy_mean"] + 0.5 * report["effects"][0]["accuracy_gain"]["mean"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("nowhere", "--out", "x"), "no such folder"),
+        (("FOLDER", "--out", "."), "is a folder; name a file"),
+        (("FOLDER", "--out", "x", "--surfaces", "nowhere"), "--surfaces must be"),
+        (("FOLDER", "--out", "x", "--surfaces", "."), "got 0 (AD34: no surface in AD34/Deflectometry; AR18"),
+        (("FOLDER", "--out", "x", "--effects", "nowhere.json"), "nowhere.json: no such file"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(few, heliotwin, arguments, says):
+    code, _, trouble = heliotwin("study", *(few if a == "FOLDER" else a for a in arguments))
+    assert code == 2
+    assert says in trouble
+    assert len(trouble.strip().splitlines()) == 1
+    assert not Path("x").exists()
+
+
+# --- what is left out -------------------------------------------------------------------------------------------------
+
+
+def changed(few: Path, root: Path, change: Callable[[dict], None]) -> str:
+    """Copy the folder with the properties of one measurement changed; gives back its key."""
+    shutil.copytree(few, root, dirs_exist_ok=True)
+    path = min((root / "AD34" / "Calibration").glob("*-calibration-properties.json"))
+    about = json.loads(path.read_text())
+    change(about)
+    path.write_text(json.dumps(about))
+    return f"AD34/{path.name.split('-')[0]}"
+
+
+def test_a_heliostat_without_a_prediction_is_skipped_by_name(few, tmp_path):
+    """The other one is not enough for a study, and the error says why there is no more."""
+    shutil.copytree(few / "AD34" / "Deflectometry", tmp_path / "AD34" / "Deflectometry")
+    with pytest.raises(InvalidInputError, match=r"at least 4 photographs, got 3 \(AR18: no surface in"):
+        study_folder(read_folder(few), str(tmp_path))
+
+
+def test_a_spot_off_its_target_is_skipped_by_name(few, tmp_path):
+    def raise_spot(about: dict) -> None:
+        for place in about["focal_spot"].values():
+            place[2] += 30
+
+    key = changed(few, tmp_path, raise_spot)
+    done = study_folder(read_folder(tmp_path), options=StudyOptions(candidates=("sun_shape",)))
+    assert list(done.skipped) == [key]
+    assert f"{key}: 'focal_spot' lies off its target" in done.skipped[key]
+    assert done.to_json()["skipped"] == done.skipped
+    assert key in text(study_page(done.study, "few", done.skipped))
+
+
+# --- the page ---------------------------------------------------------------------------------------------------------
+
+
+class _Reader(HTMLParser):
+    """The words of a page, its tags, and every address it names."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.words: list[str] = []
+        self.tags: list[str] = []
+        self.addresses: list[str] = []
+        self.labels: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        given = dict(attrs)
+        self.addresses += [given[name] or "" for name in ("src", "href", "action", "data") if name in given]
+        if tag == "svg" and given.get("role") == "img":
+            self.labels.append(given.get("aria-label") or given.get("aria-labelledby") or "")
+
+    def handle_data(self, data: str) -> None:
+        self.words.append(data)
+
+
+def read(page: str) -> _Reader:
+    reader = _Reader()
+    reader.feed(page)
+    return reader
+
+
+def text(page: str) -> str:
+    """The words of a page, blanks made one."""
+    return re.sub(r"\s+", " ", "".join(read(page).words))
+
+
+def test_the_page_stands_alone(hazy):
+    page = study_page(hazy.study, "few")
+    reader = read(page)
+    assert not {"script", "link", "iframe", "object", "form"} & set(reader.tags)
+    assert all(address.startswith("data:image/png;base64,") for address in reader.addresses)
+    assert len(reader.addresses) == 3 * 5 + 1
+    rest = re.sub(r"data:image/png;base64,[^\"]*", "", page)
+    assert not re.search(r"https?:|//[a-z]|url\((?!#)|@import|style=", rest)
+    assert all(reader.labels)
+
+
+def test_the_page_says_what_was_found(hazy):
+    page = study_page(hazy.study, "few")
+    words = text(page)
+    assert hazy.study.conclusion() in words
+    assert words.index(hazy.study.conclusion()) < words.index("Mean accuracy")
+    assert "Effect found" in words
+    ratio = hazy.study.to_json()["effects"][0]["parameters"]["circumsolar_ratio"]
+    assert f"{ratio['value']:.3f}{ratio['ci95'][0]:.3f} to {ratio['ci95'][1]:.3f}" in words
+    assert "camera blur" in words
+    for photograph in hazy.study.photographs:
+        assert photograph.key in words
+
+
+def test_the_page_of_a_complete_model_shows_no_after(clean):
+    words = text(study_page(clean.study, "few"))
+    assert clean.study.verdict == "none"
+    assert "Nothing missing" in words
+    assert "forecast after" not in words
+    assert "There is nothing to adopt" in words
+
+
+def test_look_alikes_come_with_the_photographs_that_decide(hazy):
+    (found,) = hazy.study.found
+    doubtful = replace(hazy.study, found=[replace(found, lookalikes=["slope_error"])])
+    words = text(study_page(doubtful, "few"))
+    assert "Slope error would do as well. To decide, photograph several heliostats within the same hour" in words
+    assert "Before the effect is adopted" in words
+
+
+def test_parameters_of_facets_stand_in_columns(hazy):
+    unknowns = Unknowns((FacetCanting,), (("AD34", 4), ("AR18", 4)))
+    values = np.linspace(-1, 1, 16)
+    found = Found("facet_canting", Gain(0.02, 0.01, 0.03, 4.0), []).fitted(unknowns, values, np.full(16, 0.1))
+    page = study_page(replace(hazy.study, found=[found]), "few")
+    assert "Facet 4" in text(page)
+    assert page.count("<code>x_mrad</code>") == page.count("<code>y_mrad</code>") == 2
+    telling = [abs(v) > 0.196 for v in values]
+    assert len(re.findall(r"<strong>[−0-9.]+</strong><small>", page)) == sum(telling)
+
+
+def test_names_are_text_wherever_they_come_from(hazy):
+    evil = '"><script>alert(1)</script>'
+    photographs = [
+        replace(p, shot=replace(p.shot, identifier=f"{evil}/{n}", heliostat=replace(p.shot.heliostat, name=evil)))
+        for n, p in enumerate(hazy.study.photographs)
+    ]
+    page = study_page(replace(hazy.study, photographs=photographs), evil, {evil: evil})
+    assert "<script" not in page
+    assert "script" not in read(page).tags
+    assert evil in "".join(read(page).words)

@@ -1,0 +1,421 @@
+"""The queue: each job ends exactly once, whoever dies, races, fails or is told to stop."""
+
+import itertools
+import os
+import random
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy import URL, select, update
+from sqlalchemy.exc import OperationalError
+
+from model.errors import InvalidInputError
+from service.base.faults import ConflictError, TooManyError
+from service.base.settings import Settings
+from service.jobs.worker import Worker, Workers, pause_s
+from service.store import queue
+from service.store.database import Database
+from service.store.tables import AuditRow, JobRow
+from service.twin.runtime import Runtime
+from tests.service.conftest import FakeOperations, until
+from tests.service.job_kinds import TEST_KINDS
+
+ROOT = Path(__file__).parents[3]
+KINDS = ("squares",)
+
+
+@pytest.fixture
+def runtime(store_url: URL, tmp_path: Path, operations: FakeOperations) -> Iterator[Runtime]:
+    settings = Settings(
+        data_dir=tmp_path / "data",
+        database_url=store_url.render_as_string(hide_password=False).replace("+psycopg", ""),
+        job_lease_s=5.0,  # a writer may wait for its turn on SQLite longer than a second
+        job_poll_s=0.05,
+        job_retry_s=0.05,
+    )
+    opened = Runtime.from_settings(settings, operations)
+    yield opened
+    opened.close()
+
+
+def ask(runtime: Runtime, **payload: Any) -> int:
+    with runtime.database.writing() as session:
+        return queue.add_job(session, "squares", payload, "tester")[0].id
+
+
+def look(runtime: Runtime, number: int) -> JobRow:
+    with runtime.database.reading() as session:
+        return queue.get_job(session, number, arrays=True)
+
+
+def marks(runtime: Runtime) -> list[str]:
+    """The marks that parts of jobs left in the store."""
+    with runtime.database.reading() as session:
+        return sorted(session.scalars(select(AuditRow.subject).where(AuditRow.action == "part")))
+
+
+def ended(runtime: Runtime, number: int) -> JobRow:
+    until(lambda: look(runtime, number).state in queue.ENDED)
+    return look(runtime, number)
+
+
+@contextmanager
+def working(runtime: Runtime, count: int = 1) -> Iterator[Workers]:
+    workers = Workers(runtime, TEST_KINDS, count)
+    workers.start()
+    try:
+        yield workers
+    finally:
+        workers.stop()
+
+
+def claim(database: Database, worker: str = "w", lease_s: float = 60.0, attempts: int = 3) -> JobRow | None:
+    with database.writing() as session:
+        return queue.claim(session, KINDS, worker, lease_s, attempts)
+
+
+def expire(database: Database) -> None:
+    """Let all leases run out, as after a long silence."""
+    with database.writing() as session:
+        session.execute(update(JobRow).values(lease_until=queue.clock(session) - timedelta(seconds=1)))
+
+
+# --- the queue --------------------------------------------------------------------------------------------------------
+
+
+def test_oldest_job_is_taken_first_and_only_once(runtime: Runtime):
+    first, second = ask(runtime), ask(runtime)
+    taken = [claim(runtime.database) for _ in range(3)]
+    assert [None if row is None else row.id for row in taken] == [first, second, None]
+
+
+def test_other_kinds_are_left_alone(runtime: Runtime):
+    with runtime.database.writing() as session:
+        queue.add_job(session, "triangles", {}, "tester")
+    assert claim(runtime.database) is None
+
+
+def test_job_that_another_holds_is_skipped_without_waiting(runtime: Runtime):
+    """On PostgreSQL two claims at a time take different jobs; on SQLite the second waits for the first."""
+    numbers = {ask(runtime) for _ in range(20)}
+    found: list[int] = []
+
+    def take() -> None:
+        while (row := claim(runtime.database)) is not None:
+            found.append(row.id)
+
+    threads = [threading.Thread(target=take) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(found) == sorted(numbers)
+
+
+def test_late_worker_writes_nothing(runtime: Runtime):
+    """Its lease ran out and another has the job: neither result, progress, part nor heartbeat is taken from it."""
+    number = ask(runtime)
+    late = claim(runtime.database, "late")
+    assert late is not None
+    old = queue.lease_of(late)
+    expire(runtime.database)
+    fresh = claim(runtime.database, "fresh")
+    assert fresh is not None
+    writes: list[Callable[[Any], Any]] = [
+        lambda session: queue.finish(session, old, {"of": "late"}),
+        lambda session: queue.report(session, old, 0.5, "late"),
+        lambda session: queue.renew(session, old, 60),
+        lambda session: queue.keep_step(session, old, "part", {}),
+        lambda session: queue.fail(session, old, "late"),
+        lambda session: queue.stop(session, old),
+        lambda session: queue.retry(session, old, "late", 0),
+        lambda session: queue.release(session, old),
+    ]
+    for write in writes:
+        with pytest.raises(queue.LeaseLostError), runtime.database.writing() as session:
+            write(session)
+    with runtime.database.writing() as session:
+        queue.finish(session, queue.lease_of(fresh), {"of": "fresh"})
+    row = look(runtime, number)
+    assert (row.state, row.result, row.attempts, row.worker) == ("done", {"of": "fresh"}, 2, "fresh")
+
+
+def test_renewed_lease_is_kept(runtime: Runtime):
+    ask(runtime)
+    row = claim(runtime.database)
+    assert row is not None
+    expire(runtime.database)
+    with runtime.database.writing() as session:
+        assert queue.renew(session, queue.lease_of(row), 60) is False
+    assert claim(runtime.database) is None
+
+
+def test_job_that_loses_its_workers_ends_failed(runtime: Runtime):
+    number = ask(runtime)
+    for attempt in range(3):
+        assert claim(runtime.database, f"w{attempt}") is not None
+        expire(runtime.database)
+    assert claim(runtime.database) is None
+    row = look(runtime, number)
+    assert (row.state, row.reason) == ("failed", "its worker was lost 3 times, the last one w2")
+    assert row.finished_at is not None
+
+
+def test_same_idempotency_key_is_the_same_job(runtime: Runtime):
+    def add(payload: dict[str, Any], sender: str = "a") -> tuple[int, bool]:
+        with runtime.database.writing() as session:
+            row, is_new = queue.add_job(session, "squares", payload, sender, "key-1")
+            return row.id, is_new
+
+    first, is_new = add({"value": 1})
+    assert is_new
+    assert add({"value": 1}) == (first, False)
+    assert add({"value": 1}, "b") != (first, False)
+    with pytest.raises(InvalidInputError, match=f"job {first}"):
+        add({"value": 2})
+
+
+def test_racing_requests_with_one_key_make_one_job(runtime: Runtime):
+    numbers: list[int] = []
+
+    def add() -> None:
+        with runtime.database.writing() as session:
+            numbers.append(queue.add_job(session, "squares", {}, "a", "key-1")[0].id)
+
+    threads = [threading.Thread(target=add) for _ in range(6)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(numbers) == 6
+    assert len(set(numbers)) == 1
+
+
+def test_queue_has_a_bound(runtime: Runtime):
+    with runtime.database.writing() as session:
+        queue.add_job(session, "squares", {}, "a", most_queued=1)
+        with pytest.raises(TooManyError, match="1 jobs are waiting"):
+            queue.add_job(session, "squares", {}, "a", most_queued=1)
+
+
+def test_pause_doubles_is_spread_and_bounded():
+    generator = random.Random(0)
+    for attempt, longest in ((1, 5), (2, 10), (3, 20), (20, 600)):
+        pauses = [pause_s(attempt, 5.0, generator) for _ in range(100)]
+        assert longest / 2 <= min(pauses) < max(pauses) <= longest
+        assert len(set(pauses)) > 90
+
+
+# --- cancelling -------------------------------------------------------------------------------------------------------
+
+
+def cancel(runtime: Runtime, number: int) -> str:
+    with runtime.database.writing() as session:
+        return queue.cancel(session, number).state
+
+
+def test_waiting_job_is_cancelled_at_once(runtime: Runtime):
+    number = ask(runtime)
+    assert cancel(runtime, number) == "cancelled"
+    assert cancel(runtime, number) == "cancelled"
+    assert claim(runtime.database) is None
+
+
+def test_running_job_ends_at_its_next_report(runtime: Runtime):
+    number = ask(runtime, steps=1000, pause_s=0.05)
+    with working(runtime):
+        until(lambda: len(marks(runtime)) >= 2)
+        assert cancel(runtime, number) == "running"
+        row = ended(runtime, number)
+    assert (row.state, row.result) == ("cancelled", None)
+    assert len(marks(runtime)) < 1000
+
+
+def test_job_whose_worker_died_can_be_cancelled(runtime: Runtime):
+    number = ask(runtime)
+    claim(runtime.database)
+    assert cancel(runtime, number) == "running"
+    expire(runtime.database)
+    assert claim(runtime.database) is None
+    assert look(runtime, number).state == "cancelled"
+
+
+def test_job_that_has_ended_cannot_be_cancelled(runtime: Runtime):
+    number = ask(runtime, value=3)
+    with working(runtime):
+        assert ended(runtime, number).result == {"square": 9}
+    with pytest.raises(ConflictError, match="done"):
+        cancel(runtime, number)
+
+
+# --- workers ----------------------------------------------------------------------------------------------------------
+
+
+def test_racing_workers_do_every_job_once(runtime: Runtime):
+    numbers = [ask(runtime, value=value, steps=1) for value in range(40)]
+    with working(runtime, 2), working(runtime, 2):
+        for number in numbers:
+            ended(runtime, number)
+    rows = [look(runtime, number) for number in numbers]
+    assert [row.result for row in rows] == [{"square": value**2} for value in range(40)]
+    assert {row.attempts for row in rows} == {1}
+    assert len(marks(runtime)) == 40
+
+
+def test_fault_is_tried_again_and_its_reason_forgotten(runtime: Runtime):
+    number = ask(runtime, value=4, fails=2)
+    with working(runtime):
+        row = ended(runtime, number)
+    assert (row.state, row.result, row.attempts, row.reason) == ("done", {"square": 16}, 3, None)
+
+
+def test_fault_that_stays_fails_the_job_and_shows_nothing_of_the_inside(runtime: Runtime):
+    poison, healthy = ask(runtime, fails=99), ask(runtime, value=2)
+    with working(runtime):
+        row = ended(runtime, poison)
+        assert ended(runtime, healthy).state == "done"
+    assert (row.state, row.attempts) == ("failed", 3)
+    assert row.reason is not None
+    assert row.reason.startswith("failed 3 times, the last time by OperationalError;")
+    assert "secret" not in row.reason
+
+
+def test_wrong_input_fails_at_once(runtime: Runtime):
+    number = ask(runtime, refuses=True)
+    with working(runtime):
+        row = ended(runtime, number)
+    assert (row.state, row.attempts, row.reason) == ("failed", 1, "value: it is refused")
+
+
+def test_payload_of_another_version_fails(runtime: Runtime):
+    number = ask(runtime, unknown=1)
+    with working(runtime):
+        row = ended(runtime, number)
+    assert (row.state, row.attempts) == ("failed", 1)
+    assert "payload" in (row.reason or "")
+
+
+def test_result_that_cannot_be_stored_fails_the_job(runtime: Runtime):
+    """NaN is no JSON: PostgreSQL refuses it, and the worker lives on. SQLite keeps text, so it takes it."""
+    number, healthy = ask(runtime, result="nan"), ask(runtime, value=2)
+    with working(runtime):
+        row = ended(runtime, number)
+        assert ended(runtime, healthy).state == "done"
+    if runtime.database.url.get_backend_name() == "postgresql":
+        assert (row.state, row.reason) == ("failed", "its result cannot be stored; the worker's log has more")
+
+
+def test_heartbeat_keeps_a_job_that_outlasts_its_lease(runtime: Runtime):
+    number = ask(runtime, steps=1, pause_s=2.5)
+    short = replace(runtime, settings=runtime.settings.model_copy(update={"job_lease_s": 1.0}))
+    with working(short, 2):
+        row = ended(runtime, number)
+    assert (row.state, row.attempts) == ("done", 1)
+
+
+def test_stopped_worker_puts_its_job_back(runtime: Runtime):
+    number = ask(runtime, value=5, steps=4, pause_s=0.3)
+    with working(runtime):
+        until(lambda: len(marks(runtime)) >= 1)
+    row = look(runtime, number)
+    assert (row.state, row.attempts, row.lease_token) == ("queued", 0, None)
+    with working(runtime):
+        assert ended(runtime, number).result == {"square": 25}
+    assert marks(runtime) == ["0", "1", "2", "3"]
+
+
+def away_twice(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    """The database does not answer the first two calls of this function of `service.store.queue`."""
+    real, calls = getattr(queue, name), itertools.count(1)
+
+    def fails_twice(*arguments: Any) -> Any:
+        if next(calls) <= 2:
+            raise OperationalError("SELECT 1", {}, Exception("away"))
+        return real(*arguments)
+
+    monkeypatch.setattr(queue, name, fails_twice)
+
+
+def test_worker_outlives_a_database_that_is_away(runtime: Runtime, monkeypatch: pytest.MonkeyPatch):
+    number = ask(runtime, value=6)
+    away_twice(monkeypatch, "has_claimable")
+    with working(runtime):
+        assert ended(runtime, number).state == "done"
+
+
+def test_end_is_stored_when_the_database_is_back(runtime: Runtime, monkeypatch: pytest.MonkeyPatch):
+    number = ask(runtime, value=7)
+    away_twice(monkeypatch, "finish")
+    worker = Worker(runtime, TEST_KINDS, "w", threading.Event())
+    assert worker.work()
+    row = look(runtime, number)
+    assert (row.state, row.attempts, row.result) == ("done", 1, {"square": 49})
+
+
+# --- processes --------------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def process(runtime: Runtime) -> Iterator[subprocess.Popen[bytes]]:
+    """A worker as a process of its own."""
+    settings = runtime.settings
+    environment = os.environ | {
+        "HELIOTWIN_DATA_DIR": str(settings.data_dir),
+        "HELIOTWIN_DATABASE_URL": str(settings.database_url),
+        "HELIOTWIN_JOB_LEASE_S": "1",
+        "HELIOTWIN_JOB_POLL_S": "0.05",
+    }
+    command = [sys.executable, "-m", "tests.service.job_kinds"]
+    running = subprocess.Popen(command, cwd=ROOT, env=environment, stderr=subprocess.DEVNULL)
+    try:
+        yield running
+    finally:
+        running.kill()
+        running.wait()
+
+
+def test_job_of_a_killed_process_is_finished_by_another(runtime: Runtime):
+    number = ask(runtime, value=9, steps=8, pause_s=0.2)
+    with process(runtime) as first:
+        until(lambda: len(marks(runtime)) >= 2)
+        first.send_signal(signal.SIGKILL)
+        first.wait()
+    assert look(runtime, number).state == "running"
+    with working(runtime):
+        row = ended(runtime, number)
+    assert (row.state, row.result, row.attempts) == ("done", {"square": 81}, 2)
+    # Each part left its mark once: those of the killed process were not done again.
+    assert marks(runtime) == [str(part) for part in range(8)]
+    with runtime.database.reading() as session:
+        workers = {step["by"] for step in queue.steps(session, number).values()}
+    assert workers == {first.pid, os.getpid()}
+
+
+def test_poison_that_kills_its_process_ends_failed(runtime: Runtime):
+    number = ask(runtime, dies=99)
+    for _ in range(3):
+        with process(runtime) as victim:
+            assert victim.wait(60) == -signal.SIGKILL
+    with working(runtime):
+        row = ended(runtime, number)
+    assert row.state == "failed"
+    assert (row.reason or "").startswith("its worker was lost 3 times")
+
+
+def test_process_that_is_told_to_stop_puts_its_job_back(runtime: Runtime):
+    number = ask(runtime, steps=1000, pause_s=0.1)
+    with process(runtime) as running:
+        until(lambda: len(marks(runtime)) >= 1)
+        running.send_signal(signal.SIGTERM)
+        assert running.wait(30) == 0
+    row = look(runtime, number)
+    assert (row.state, row.attempts) == ("queued", 0)

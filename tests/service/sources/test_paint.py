@@ -1,0 +1,144 @@
+import json
+from datetime import UTC, datetime
+
+import h5py
+import numpy as np
+import pytest
+
+from model.effects import effect_to_json
+from model.errors import InvalidInputError
+from model.metrics import surface_error
+from model.sunshape import Buie, Gaussian, Pillbox
+from model.surface import control_points, evaluate
+from service.sources.documents import read_heliostat, read_measurement, read_moment, read_targets
+from service.sources.folder import measured_heights, read_declared, read_deflectometry, read_folder
+from tests.conftest import flat_heliostat
+
+
+def test_the_real_plant(stj):
+    folder = read_folder(stj)
+    assert set(folder.plant.targets) == {
+        "multi_focus_tower",
+        "solar_tower_juelich_upper",
+        "solar_tower_juelich_lower",
+    }
+    upper = folder.plant.targets["solar_tower_juelich_upper"]
+    assert (upper.width, upper.height) == pytest.approx((8.6, 7.2), abs=0.1)
+    assert upper.normal @ [0, 1, 0] > 0.999
+    # Older and newer spellings of the properties, positions as in the field's own list.
+    np.testing.assert_allclose(folder.plant.heliostats["AA39"].position, [13.2, 25.0, 1.7], atol=0.3)
+    np.testing.assert_allclose(folder.plant.heliostats["AD37"].position, [4.4, 38.8, 1.7], atol=1.5)
+    assert len(folder.measurements("AA39")) == 9
+    assert len(folder.measurements("AA39", with_images=False)) == 12
+
+
+def test_motor_positions_agree_with_the_spot_to_about_a_degree(stj):
+    """README of the data: uncorrected kinematics land within about 1 degree of what the focal spot demands."""
+    folder = read_folder(stj)
+    heliostat = folder.plant.heliostats["AA39"]
+    measurement = next(m for m in folder.measurements("AA39") if m.identifier == "205363")
+    by_motor = heliostat.mount.attitude(heliostat.mount.angles_from_motors(measurement.motor_position))
+    by_spot = heliostat.mount.attitude(heliostat.mount.align(heliostat.position, measurement.sun, measurement.spot))
+    assert np.degrees(np.arccos(by_motor[:, 2] @ by_spot[:, 2])) < 1.2
+
+
+def test_a_surface_measured_twice(stj):
+    """AA28's measured surface is in its own file and, anonymous, in surfaces.npz: the same order, axes and sign."""
+    folder = read_folder(stj)
+    z = measured_heights(folder.plant.heliostats["AA28"], folder.measured_surface("AA28"))
+    with np.load(stj / "surfaces.npz") as data:
+        others = data["z"].reshape(len(data["z"]), -1)
+    correlation = [np.corrcoef(z.ravel(), other)[0, 1] for other in others]
+    assert max(correlation) > 0.9
+
+
+def test_deflectometry_h5_is_fitted(tmp_path):
+    heliostat = flat_heliostat(focal_length=60.0)
+    z = np.random.default_rng(0).normal(0, 3e-4, (4, 8, 8))
+    rng = np.random.default_rng(1)
+    with h5py.File(tmp_path / "X-deflectometry.h5", "w") as file:
+        for facet, points in enumerate(control_points(heliostat, z), start=1):
+            u, v = np.sort(rng.random(50)), np.sort(rng.random(40))
+            place, normals = evaluate(points, u, v)
+            file[f"facet{facet}/surface_points"] = place.reshape(-1, 3)
+            file[f"facet{facet}/surface_normals"] = normals.reshape(-1, 3)
+    assert surface_error(read_deflectometry(tmp_path / "X-deflectometry.h5", heliostat), z) < 2e-6
+
+
+@pytest.mark.parametrize(
+    ("sun", "shape"),
+    [
+        ({"shape": "buie", "circumsolar_ratio": 0.1}, Buie(0.1)),
+        ({"shape": "pillbox", "half_angle_mrad": 4.7}, Pillbox(4.7e-3)),
+        ({"shape": "gaussian", "sigma_mrad": 2.5}, Gaussian(2.5e-3)),
+    ],
+)
+def test_declared_sun(tmp_path, sun, shape):
+    (tmp_path / "twin.json").write_text(json.dumps({"declared": {"sun": sun, "effects": []}}))
+    optics, effects = read_declared(tmp_path / "twin.json")
+    assert optics.sun_shape == shape
+    assert effects == ()
+
+
+def test_undeclared_sun_is_buies(tmp_path):
+    assert read_declared(tmp_path / "twin.json")[0].sun_shape == Buie(0.02)
+
+
+def test_declared_effects(tmp_path):
+    effects = [{"name": "soiling", "parameters": {"reflectivity_ratio": {"AA39": [1.0, 0.8, 1.0, 0.9]}}}]
+    (tmp_path / "twin.json").write_text(json.dumps({"declared": {"effects": effects}}))
+    _, declared = read_declared(tmp_path / "twin.json")
+    assert [effect_to_json(effect) for effect in declared] == effects
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        ("{", "not valid JSON"),
+        ("{}", "'declared' is missing"),
+        ('{"declared": {"sun": {"shape": "square"}}}', "'shape' must be"),
+        ('{"declared": {"sun": {"shape": "buie", "circumsolar_ratio": NaN}}}', "finite number"),
+        ('{"declared": {"effects": [{"name": "dust"}]}}', "twin.json: effect 'dust' is unknown"),
+        ('{"declared": {"effects": [{"name": "slope_error", "parameters": {"sigma_mrad": 9}}]}}', "sigma_mrad"),
+        ('{"declared": []}', "'declared' must be a JSON object"),
+    ],
+)
+def test_bad_declarations_name_the_field(tmp_path, content, says):
+    (tmp_path / "twin.json").write_text(content)
+    with pytest.raises(InvalidInputError, match=says):
+        read_declared(tmp_path / "twin.json")
+
+
+def test_bad_measurements_name_the_field(stj):
+    plant = read_folder(stj).plant
+    good = {"target_name": "multi_focus_tower", "sun_elevation": 30.0, "sun_azimuth": 1.0}
+    assert read_measurement("1", "AA39", good, plant).spot is None
+    for change, says in [
+        ({"target_name": "moon"}, "target_name"),
+        ({"sun_elevation": -3}, "sun_elevation"),
+        ({"sun_azimuth": "east"}, "sun_azimuth"),
+        ({"focal_spot": {"UTIS": [1, 2]}}, "UTIS"),
+        ({"motor_position": {"axis_1_motor_position": 1}}, "axis_2_motor_position"),
+    ]:
+        with pytest.raises(InvalidInputError, match=says):
+            read_measurement("1", "AA39", {**good, **change}, plant)
+
+
+def test_bad_properties_name_the_field():
+    origin = np.array([50.9, 6.4, 87.0])
+    for properties, says in [([], "JSON object"), ({}, "kinematics_properties")]:
+        with pytest.raises(InvalidInputError, match=says):
+            read_heliostat("AA39", properties, origin)
+    with pytest.raises(InvalidInputError, match="coordinates"):
+        read_targets({"power_plant_properties": {}})
+
+
+@pytest.mark.parametrize("moment", ["2021-07-14T11:05:27Z", "2021-07-14T13:05:27+02:00", "2021-07-14T11:05:27"])
+def test_a_stac_item_tells_when_a_measurement_was_taken(moment):
+    assert read_moment({"properties": {"datetime": moment}}, "item") == datetime(2021, 7, 14, 11, 5, 27, tzinfo=UTC)
+
+
+@pytest.mark.parametrize("moment", [None, 5, "yesterday"])
+def test_a_stac_item_without_a_time_is_named(moment):
+    with pytest.raises(InvalidInputError, match="item: 'datetime' must be an ISO 8601 time"):
+        read_moment({"properties": {"datetime": moment}}, "item")

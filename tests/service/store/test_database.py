@@ -1,0 +1,114 @@
+"""Migrations up, down and up again without drift, and transactions that wait their turn."""
+
+import os
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, datetime, timedelta, timezone
+from pathlib import Path
+
+import pytest
+from alembic.autogenerate import compare_metadata
+from alembic.runtime.migration import MigrationContext
+from sqlalchemy import URL, inspect, text
+from sqlalchemy.exc import IntegrityError, StatementError
+
+from service import store
+from service.store.database import Database
+from service.store.tables import Base, HeliostatRow
+
+ROOT = Path(__file__).parents[3]
+
+
+def tables(database: Database) -> set[str]:
+    return set(inspect(database.engine).get_table_names()) - {"alembic_version"}
+
+
+def test_migrations_go_up_down_and_up_again(empty_url: URL):
+    database = Database(empty_url)
+    assert database.revision() is None
+    assert not database.is_current()
+    for _ in range(2):
+        database.upgrade()
+        assert database.is_current()
+        assert tables(database) == set(Base.metadata.tables)
+        database.downgrade("base")
+        assert tables(database) == set()
+    database.close()
+
+
+def test_migrated_schema_is_the_mapped_one(database: Database):
+    with database.engine.connect() as connection:
+        context = MigrationContext.configure(connection, opts={"compare_server_default": True})
+        assert compare_metadata(context, Base.metadata) == []
+
+
+def test_two_processes_migrate_at_once(empty_url: URL):
+    environment = os.environ | {"HELIOTWIN_DATABASE_URL": empty_url.render_as_string(hide_password=False)}
+    command = [sys.executable, "-m", "alembic", "upgrade", "head"]
+    running = [subprocess.Popen(command, env=environment, cwd=ROOT) for _ in range(2)]
+    assert [process.wait(60) for process in running] == [0, 0]
+    database = Database(empty_url)
+    assert database.is_current()
+    database.close()
+
+
+def test_foreign_keys_hold(database: Database):
+    with pytest.raises(IntegrityError), database.writing() as session:
+        session.execute(text("INSERT INTO surface_measurements (surface_id, measurement_id) VALUES (1, 1)"))
+
+
+def test_values_are_checked_by_the_database(database: Database):
+    found = {
+        check["name"]
+        for table in Base.metadata.tables
+        for check in inspect(database.engine).get_check_constraints(table)
+    }
+    columns = {"plant_single", "measurements_kind", "surfaces_source", "studies_verdict", "jobs_state", "api_keys_role"}
+    assert found == {f"ck_{column}" for column in columns}
+
+
+def test_moments_come_back_in_utc(database: Database):
+    moment = datetime(2024, 6, 1, 14, tzinfo=timezone(timedelta(hours=2)))
+    with database.writing() as session:
+        session.add(HeliostatRow(name="A", properties={}, east_m=0, north_m=0, up_m=0, created_at=moment))
+    with database.reading() as session:
+        found = store.get_heliostat(session, "A").created_at
+    assert found == moment
+    assert found.tzinfo is UTC
+
+
+def test_moment_without_zone_is_refused(database: Database):
+    row = HeliostatRow(name="A", properties={}, east_m=0, north_m=0, up_m=0, created_at=datetime(2024, 6, 1))
+    with pytest.raises(StatementError, match="time zone"), database.writing() as session:
+        session.add(row)
+
+
+def test_writers_wait_for_each_other(database: Database):
+    """Read, then write, from several threads: no update is lost and none fails."""
+    with database.writing() as session:
+        session.add(HeliostatRow(name="A", properties={}, east_m=0, north_m=0, up_m=0))
+
+    def count_up() -> None:
+        for _ in range(5):
+            with database.writing() as session:
+                row = session.query(HeliostatRow).with_for_update().one()
+                row.east_m += 1
+
+    with ThreadPoolExecutor(6) as pool:
+        for done in [pool.submit(count_up) for _ in range(6)]:
+            done.result()
+    with database.reading() as session:
+        assert store.get_heliostat(session, "A").east_m == 30
+
+
+def test_failed_write_leaves_nothing(database: Database):
+    def fail() -> None:
+        with database.writing() as session:
+            store.put_heliostat(session, "A", {}, (0, 0, 0))
+            raise RuntimeError("on purpose")
+
+    with pytest.raises(RuntimeError):
+        fail()
+    with database.reading() as session:
+        assert store.find_heliostat(session, "A") is None

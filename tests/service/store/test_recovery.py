@@ -1,0 +1,301 @@
+"""Back-up, restore and check, on both databases: what comes back is what was there, and nothing is overwritten."""
+
+import json
+import shutil
+import threading
+import uuid
+from collections.abc import Iterator
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import psycopg
+import pytest
+from sqlalchemy import URL, select, update
+from typer.testing import CliRunner
+
+from model.errors import InvalidInputError
+from service import store
+from service.base.faults import ConflictError
+from service.base.settings import Settings
+from service.cli.main import app as cli
+from service.store import queue
+from service.store.backup import back_up, images_of, restore
+from service.store.check import inspect_store, is_sound
+from service.store.database import Database, migrate
+from service.store.tables import Base, JobRow, JobStepRow, MeasurementRow
+from service.twin.ingest import Photograph, ingest
+from service.twin.prediction import predict_surface
+from service.twin.runtime import Runtime
+from tests.service.conftest import ORIGIN, POSTGRES, FakeOperations, png, properties_document, tower_document
+
+PHOTOGRAPH = Photograph("lower", "flux", 20.0, 45.0)
+
+
+def plain(url: URL) -> str:
+    return url.render_as_string(hide_password=False).replace("+psycopg", "")
+
+
+@pytest.fixture
+def runtime(store_url: URL, tmp_path: Path, operations: FakeOperations) -> Iterator[Runtime]:
+    """A store with a plant, a heliostat, four photographs, a surface and a job."""
+    from service.sources.documents import read_targets
+
+    opened = Runtime.from_settings(Settings(data_dir=tmp_path / "data", database_url=plain(store_url)), operations)
+    with opened.database.writing() as session:
+        store.put_plant(session, "plant", ORIGIN)
+        for plane in read_targets(tower_document())[1].values():
+            store.put_target(session, plane)
+        store.put_heliostat(session, "AA39", properties_document(), (0.0, 30.0, 1.0))
+        queue.add_job(session, "predictions", {"heliostats": ["AA39"]}, "tester\n\\N\t'")
+    for seed in range(4):
+        ingest(opened, "AA39", PHOTOGRAPH, png(seed))
+    predict_surface(opened, "AA39")
+    ingest(opened, "AA39", PHOTOGRAPH, png(9))  # with its drift
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def elsewhere(store_url: URL, tmp_path: Path) -> Iterator[Settings]:
+    """Settings of an empty store on the same engine."""
+    data_dir = tmp_path / "elsewhere"
+    if store_url.get_backend_name() == "sqlite":
+        yield Settings(data_dir=data_dir)
+        return
+    name = f"heliotwin_test_{uuid.uuid4().hex[:12]}"
+    with psycopg.connect(POSTGRES, autocommit=True) as connection:
+        connection.execute(f'CREATE DATABASE "{name}"')
+    yield Settings(data_dir=data_dir, database_url=plain(store_url.set(database=name)))
+    with psycopg.connect(POSTGRES, autocommit=True) as connection:
+        connection.execute(f'DROP DATABASE "{name}" WITH (FORCE)')
+
+
+def contents(database: Database) -> dict[str, list[Any]]:
+    """Every row of every table."""
+    with database.engine.connect() as connection:
+        return {
+            name: [tuple(row) for row in connection.execute(select(table).order_by(*table.primary_key))]
+            for name, table in Base.metadata.tables.items()
+        }
+
+
+def test_what_comes_back_is_what_was_there(runtime: Runtime, elsewhere: Settings, tmp_path: Path):
+    manifest = back_up(runtime.settings, tmp_path / "one")
+    assert (manifest["images"], manifest["damaged"]) == (5, [])
+    before = contents(runtime.database)
+    assert all(before[name] for name in ("measurements", "surfaces", "surface_measurements", "drift", "jobs", "audit"))
+    restore(elsewhere, tmp_path / "one")
+    database = Database(elsewhere.database)
+    assert contents(database) == before
+    assert is_sound(inspect_store(database, images_of(elsewhere), lambda _: None))
+    restored = Runtime.from_settings(elsewhere, runtime.operations)
+    row, is_new = ingest(restored, "AA39", PHOTOGRAPH, png(20))  # numbers go on after the last
+    assert is_new
+    assert row.id == 6
+    restored.close()
+    database.close()
+
+
+def test_back_up_while_photographs_come_is_of_one_moment(runtime: Runtime, elsewhere: Settings, tmp_path: Path):
+    stop, sent = threading.Event(), []
+
+    def send() -> None:
+        while not stop.is_set():
+            sent.append(ingest(runtime, "AA39", PHOTOGRAPH, png(100 + len(sent)))[0].identifier)
+
+    thread = threading.Thread(target=send)
+    thread.start()
+    try:
+        while len(sent) < 5:
+            stop.wait(0.01)
+        acknowledged = list(sent)
+        back_up(runtime.settings, tmp_path / "one")
+    finally:
+        stop.set()
+        thread.join()
+    restore(elsewhere, tmp_path / "one")
+    database = Database(elsewhere.database)
+    assert is_sound(inspect_store(database, images_of(elsewhere), lambda _: None))
+    with database.reading() as session:
+        assert set(acknowledged) <= set(session.scalars(select(MeasurementRow.identifier)))
+    database.close()
+
+
+def test_nothing_is_overwritten(runtime: Runtime, elsewhere: Settings, tmp_path: Path):
+    back_up(runtime.settings, tmp_path / "one")
+    with pytest.raises(InvalidInputError, match="exists"):
+        back_up(runtime.settings, tmp_path / "one")
+    before = contents(runtime.database)
+    with pytest.raises(ConflictError, match="overwrites nothing"):
+        restore(runtime.settings, tmp_path / "one")
+    assert contents(runtime.database) == before
+    stranger = images_of(elsewhere)
+    stranger.put(b"of another store")
+    with pytest.raises(ConflictError, match="not of this back-up"):
+        restore(elsewhere, tmp_path / "one")
+
+
+def _flip(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize("what", ["database", "image", "lost image", "list", "manifest"])
+def test_damaged_back_up_is_not_restored(runtime: Runtime, elsewhere: Settings, tmp_path: Path, what: str):
+    folder = tmp_path / "one"
+    back_up(runtime.settings, folder)
+    image = next(path for path in (folder / "images").rglob("*") if path.is_file())
+    database = next(path for path in folder.iterdir() if path.name in ("database.sqlite", "measurements.copy.gz"))
+    file = {"database": database, "list": folder / "images.txt", "manifest": folder / "manifest.json"}.get(what, image)
+    if what == "manifest":
+        file.write_text(file.read_text()[:-20])
+    elif what == "lost image":
+        file.unlink()
+    else:
+        _flip(file)
+    with pytest.raises(InvalidInputError, match=r"damaged|cannot be read"):
+        restore(elsewhere, folder)
+    restored = Database(elsewhere.database)
+    assert restored.revision() is None
+    restored.close()
+    assert not elsewhere.data_dir.exists() or not any(images_of(elsewhere).root.rglob("*"))
+
+
+def test_restore_that_is_interrupted_can_be_tried_again(
+    runtime: Runtime, elsewhere: Settings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def interrupt(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    back_up(runtime.settings, tmp_path / "one")
+    on_sqlite = elsewhere.database.get_backend_name() == "sqlite"
+    with monkeypatch.context() as broken:
+        broken.setattr("shutil.copyfile" if on_sqlite else "service.store.backup._copy_in", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            restore(elsewhere, tmp_path / "one")
+    restore(elsewhere, tmp_path / "one")
+    database = Database(elsewhere.database)
+    assert contents(database) == contents(runtime.database)
+    database.close()
+
+
+def test_damaged_image_in_the_store_ends_no_back_up(runtime: Runtime, elsewhere: Settings, tmp_path: Path):
+    image = next(path for path in runtime.images.root.rglob("*") if path.is_file())
+    _flip(image)
+    manifest = back_up(runtime.settings, tmp_path / "one")
+    assert len(manifest["damaged"]) == 1
+    assert manifest["images"] == 4
+    restore(elsewhere, tmp_path / "one")
+    database = Database(elsewhere.database)
+    report = inspect_store(database, images_of(elsewhere), lambda _: None)
+    assert [found["reason"] for found in report["bad"].values()] == ["missing"]
+    database.close()
+
+
+def test_back_up_of_another_engine_or_a_newer_schema_is_refused(runtime: Runtime, elsewhere: Settings, tmp_path: Path):
+    folder = tmp_path / "one"
+    back_up(runtime.settings, folder)
+    document = json.loads((folder / "manifest.json").read_text())
+    for change in ({"revision": "9999"}, {"engine": "oracle"}, {"format": 2}):
+        (folder / "manifest.json").write_text(json.dumps(document | change))
+        with pytest.raises(InvalidInputError):
+            restore(elsewhere, folder)
+
+
+def test_back_up_of_an_older_schema_comes_back_and_is_upgraded(runtime: Runtime, elsewhere: Settings, tmp_path: Path):
+    runtime.database.downgrade("0003")
+    try:
+        assert back_up(runtime.settings, tmp_path / "one")["revision"] == "0003"
+    finally:
+        runtime.database.upgrade()
+    elsewhere.data_dir.mkdir()
+    restore(elsewhere, tmp_path / "one")
+    assert migrate(elsewhere) == runtime.database.revisions()[-1]
+    database = Database(elsewhere.database)
+    with database.reading() as session:
+        assert len(session.scalars(select(MeasurementRow.id)).all()) == 5
+    database.close()
+
+
+# --- check ------------------------------------------------------------------------------------------------------------
+
+
+def test_check_names_what_is_lost(runtime: Runtime, monkeypatch: pytest.MonkeyPatch):
+    first, second, third, *_ = sorted(path for path in runtime.images.root.rglob("*") if path.is_file())
+    _flip(first)
+    second.write_bytes(second.read_bytes()[:10])
+    third.unlink()
+    (runtime.images.root / ".new-x").write_bytes(b"cut")
+    runtime.images.put(b"of no row")
+    monkeypatch.setenv("HELIOTWIN_DATA_DIR", str(runtime.settings.data_dir))
+    monkeypatch.setenv("HELIOTWIN_DATABASE_URL", str(runtime.settings.database_url))
+    done = CliRunner().invoke(cli, ["check", "--json"])
+    assert done.exit_code == 1
+    report = json.loads(done.stdout)
+    assert [report["bad"][path.parent.name + path.name]["reason"] for path in (first, second, third)] == [
+        "damaged",
+        "damaged",
+        "missing",
+    ]
+    assert all(found["measurements"][0].startswith("AA39/") for found in report["bad"].values())
+    assert (report["unused"], report["leftovers"]) == (1, 1)
+    for seed in (0, 1, 2, 3, 9):  # posted again, they are whole again
+        assert not ingest(runtime, "AA39", PHOTOGRAPH, png(seed))[1]
+    assert CliRunner().invoke(cli, ["check"]).exit_code == 0
+
+
+def test_verbs_of_the_command_line(runtime: Runtime, elsewhere: Settings, tmp_path: Path, monkeypatch: Any):
+    folder = str(tmp_path / "one")
+    monkeypatch.setenv("HELIOTWIN_DATA_DIR", str(runtime.settings.data_dir))
+    monkeypatch.setenv("HELIOTWIN_DATABASE_URL", str(runtime.settings.database_url))
+    assert CliRunner().invoke(cli, ["backup", folder]).exit_code == 0
+    monkeypatch.setenv("HELIOTWIN_DATA_DIR", str(elsewhere.data_dir))
+    monkeypatch.setenv("HELIOTWIN_DATABASE_URL", elsewhere.database_url or "")
+    done = CliRunner().invoke(cli, ["restore", folder, "--json"])
+    assert done.exit_code == 0
+    assert json.loads(done.stdout)["images"] == 5
+    assert CliRunner().invoke(cli, ["check"]).exit_code == 0
+    assert CliRunner().invoke(cli, ["migrate", "--to", "0003", "--json"]).exit_code == 0
+    with pytest.raises(InvalidInputError, match="0001, 0002"):
+        CliRunner().invoke(cli, ["migrate", "--to", "nine"], catch_exceptions=False)
+    shutil.rmtree(folder)
+
+
+# --- jobs that are old ------------------------------------------------------------------------------------------------
+
+
+def test_old_jobs_are_deleted_and_numbers_are_not_given_twice(runtime: Runtime):
+    with runtime.database.writing() as session:
+        for _ in range(5):
+            queue.add_job(session, "squares", {}, "tester")
+        at = queue.clock(session)
+        session.execute(update(JobRow).values(state="done", finished_at=at - timedelta(days=10)))
+        numbers = sorted(session.scalars(select(JobRow.id)))
+        for number, state in ((numbers[1], "running"), (numbers[2], "failed")):
+            session.execute(update(JobRow).where(JobRow.id == number).values(state=state))
+        session.execute(update(JobRow).where(JobRow.id == numbers[3]).values(finished_at=at))
+        session.add(JobStepRow(job_id=numbers[0], name="part", result={}))
+    with runtime.database.writing() as session:
+        assert queue.purge(session, timedelta(days=5), most=2) == 2
+        assert queue.purge(session, timedelta(days=5)) == 1
+        assert queue.purge(session, timedelta(days=5)) == 0
+        assert sorted(session.scalars(select(JobRow.id))) == [numbers[1], numbers[3], numbers[5]]
+
+
+def test_clock_that_was_set_back_stalls_no_queue(runtime: Runtime):
+    """Moments that lie further ahead than any pause or lease are those of a clock that was wrong."""
+    with runtime.database.writing() as session:
+        session.execute(update(JobRow).values(not_before=queue.clock(session) + timedelta(hours=5)))
+        row = queue.claim(session, ["predictions"], "one", 30.0, 3)
+        assert row is not None
+        assert not queue.has_claimable(session, ["predictions"], 30.0)
+        row.lease_until = queue.clock(session) + timedelta(hours=5)
+        session.flush()
+        taken = queue.claim(session, ["predictions"], "two", 30.0, 3)
+        assert taken is not None
+        assert taken.worker == "two"
+        queue.retry(session, queue.lease_of(taken), "later", 300.0)
+        session.flush()
+        assert not queue.has_claimable(session, ["predictions"], 30.0)

@@ -1,0 +1,92 @@
+"""Tiles of a fleet forecast on a Ray cluster of two worker processes: the same light, whatever happens to a worker."""
+
+import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from model.fleet import FleetFlux, Superposition, Threads, Tile, standing, superpose, tiles
+from model.forecast import Shot
+from model.frames import sun_direction
+from model.plant import Heliostat
+from model.surface import control_points
+from service.base.faults import ConflictError
+from service.jobs.kinds import KINDS
+from service.jobs.worker import Worker
+from service.twin.engines import Ray, engine_of
+from tests.conftest import target
+from tests.service.twin.test_field_light import FLEET, field, runtime_of  # noqa: F401  # a fixture
+
+SUN = sun_direction(20.0, 30.0)
+
+
+def some_tiles() -> list[Tile]:
+    positions = [np.array([-20.0 + 5 * (i % 8), 60.0 + 5 * (i // 8), 1.8]) for i in range(32)]
+    heliostats = [Heliostat.juelich(f"H{i}", position, 80.0) for i, position in enumerate(positions)]
+    plane = target(10.0)
+    shots = [Shot(one, control_points(one), SUN, plane) for one in heliostats]
+    return list(tiles(shots, standing([(one, plane.center) for one in heliostats], SUN), size=8))
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Any]:
+    ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'heliotwin[ray]'")
+    ray.init(address="local", num_cpus=2, include_dashboard=False, log_to_driver=False)
+    yield ray
+    ray.shutdown()
+
+
+pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning:ray", "ignore::ResourceWarning")
+
+
+@pytest.mark.slow
+def test_cluster_gives_the_same_light_also_where_a_worker_is_killed(cluster: Any, tmp_path: Path):
+    task, parts = Superposition(target(10.0), (32, 32)), some_tiles()
+    expected = superpose(task, parts, Threads(1))
+    died = tmp_path / "died"
+
+    class Killing:
+        """The task; the first worker to meet the second tile is killed over it."""
+
+        receiver, resolution = task.receiver, task.resolution
+
+        def __call__(self, tile: Tile) -> tuple[int, FleetFlux]:
+            if tile.shots[0].heliostat.name == "H8" and not died.exists():
+                died.touch()
+                os.kill(os.getpid(), signal.SIGKILL)
+            return os.getpid(), task(tile)
+
+    made = list(Ray("local").map(Killing(), parts))
+    assert died.exists()
+    assert len({process for process, _ in made}) >= 2
+    total = sum((flux for _, flux in made), FleetFlux(np.zeros(task.resolution)))
+    assert (total.heliostats, total.skipped) == (32, {})
+    np.testing.assert_allclose(total.irradiance.clip(min=0), expected.irradiance, atol=1e-6 * expected.irradiance.max())
+    assert total.power == pytest.approx(expected.power, rel=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("store_url", ["sqlite"], indirect=True)
+def test_service_forecasts_on_the_cluster(cluster: Any, field: Any):  # noqa: F811
+    runtime = runtime_of(field)
+    fluxes = []
+    for address in (None, "local"):
+        object.__setattr__(runtime, "settings", runtime.settings.model_copy(update={"ray_address": address}))
+        assert isinstance(engine_of(runtime), Threads if address is None else Ray)
+        job = field.post("/v1/forecasts", json=FLEET).headers["Location"]
+        assert Worker(runtime, KINDS, "tester", threading.Event()).work()
+        assert field.get(job).json()["state"] == "done", field.get(job).json()["reason"]
+        fluxes.append(np.array(field.get(f"{job}/flux").json()["flux"]))
+    np.testing.assert_allclose(fluxes[1], fluxes[0], atol=1e-6 * fluxes[0].max())
+
+
+def test_without_ray_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(ConflictError, match=r"pip install 'heliotwin\[ray\]'"):
+        next(Ray("local").map(len, ["a"]))

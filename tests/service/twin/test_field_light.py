@@ -1,0 +1,179 @@
+"""Forecasts of a whole field over HTTP, with the real tracer, on both databases."""
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from fastapi import FastAPI
+from fastapi.testclient import TestClient
+from sqlalchemy import URL
+
+from model.frames import sun_direction
+from model.plant import Heliostat, Plant
+from model.surface import control_points
+from service import store
+from service.base.settings import Settings
+from service.cli.demo_plant import ORIGIN, TARGET, properties
+from service.jobs.kinds import KINDS
+from service.jobs.worker import Worker
+from service.sources.documents import read_receivers
+from service.sources.folder import read_folder
+from service.store.database import Database
+from service.store.surfaces import NewSurface
+from service.twin import versions
+from service.twin.runtime import Runtime
+from service.web.app import create_app
+from tests.service.conftest import QUIET, FakeOperations, Post, client_of, png
+from tests.service.twin.test_study import heights
+from tests.service.twin.test_versions import add, adopt
+
+SUN = {"azimuth_deg": -20.0, "elevation_deg": 20.0}
+FLEET = {"target": TARGET.name, "sun": SUN, "resolution": 32}
+FIELD = {f"B{row}{column}": (column * 4.2 - 4.2, 60 + row * 3.6, 1.8) for row in range(3) for column in range(3)}
+
+
+def fill(database: Database) -> None:
+    """A dense field of nine; all but the last have a surface."""
+    rng, plant = np.random.default_rng(3), Plant("demo", ORIGIN)
+    with database.writing() as session:
+        store.put_plant(session, "demo", ORIGIN)
+        store.put_target(session, TARGET)
+        for name, position in FIELD.items():
+            mirror = Heliostat.juelich(name, position, 70.0)
+            row, _ = store.put_heliostat(session, name, properties(mirror, plant), np.array(position))
+            if name != "B22":
+                for _ in range(2):  # the second is the current one
+                    z = heights(rng)
+                    store.add_surface(session, row, NewSurface("measured", z, 0 * z, control_points(mirror, z)))
+
+
+@pytest.fixture
+def field(store_url: URL, tmp_path: Path) -> Iterator[TestClient]:
+    url = store_url.render_as_string(hide_password=False).replace("+psycopg", "")
+    app = create_app(Settings(data_dir=tmp_path / "data", database_url=url, **QUIET))
+    with client_of(app) as client:
+        fill(app.state.runtime.database)
+        yield client
+
+
+def runtime_of(client: TestClient) -> Runtime:
+    return cast(Runtime, cast(FastAPI, client.app).state.runtime)
+
+
+def fleet(client: TestClient, **changes: Any) -> tuple[dict[str, Any], np.ndarray]:
+    """Result and map of a fleet forecast that is worked at here."""
+    answer = client.post("/v1/forecasts", json=FLEET | changes)
+    assert answer.status_code == 202, answer.text
+    assert Worker(runtime_of(client), KINDS, "tester", threading.Event()).work()
+    job = client.get(answer.headers["Location"]).json()
+    assert job["state"] == "done", job["reason"]
+    return job["result"], np.array(client.get(answer.headers["Location"] + "/flux").json()["flux"])
+
+
+def alone(client: TestClient, name: str, **changes: Any) -> np.ndarray:
+    answer = client.post("/v1/forecasts", json={"heliostat": name} | FLEET | changes)
+    assert answer.status_code == 201, answer.text
+    return np.array(client.get(answer.headers["Location"]).json()["flux"])
+
+
+def test_field_is_the_sum_of_its_heliostats(field: TestClient):
+    result, flux = fleet(field, neighbours=False)
+    assert result["heliostats"] == 8
+    assert "no surface" in result["skipped"]["B22"]
+    assert result["power_w"] < result["reflected_w"] < 8 * 8.3e3
+    single = sum(alone(field, name) for name in FIELD if name != "B22")
+    assert np.abs(flux - single).sum() < 0.01 * single.sum()
+    assert result["peak_w_m2"] == pytest.approx(flux.max())
+
+
+def test_neighbours_take_light_and_can_be_left_out(field: TestClient):
+    names = ["B02", "B01", "B00", "B12"]
+    free, _ = fleet(field, heliostats=names, neighbours=False)
+    hidden, _ = fleet(field, heliostats=[*names, "nobody"], neighbours=True)
+    assert hidden["reflected_w"] < 0.95 * free["reflected_w"]
+    assert "no heliostat nobody" in hidden["skipped"]["nobody"]
+
+
+def test_heliostats_aim_where_they_are_told(field: TestClient):
+    aside = list(TARGET.to_enu((1.5, 0.0)))
+    _, flux = fleet(field, heliostats=["B00", "B01"], aim_points={"B01": aside}, neighbours=False)
+    expected = alone(field, "B00") + alone(field, "B01", aim_point=aside)
+    assert np.abs(flux - expected).sum() < 0.01 * expected.sum()
+
+
+def test_receiver_is_stored_and_forecast_on(field: TestClient):
+    cylinder = {"center": [0, 0, 40], "normal": [0, 2, 0], "radius": 2.5, "height": 8, "opening_deg": 180}
+    created = field.put("/v1/receivers/ring", json=cylinder)
+    assert created.status_code == 201, created.text
+    assert created.json()["normal"] == [0, 1, 0]
+    assert field.put("/v1/receivers/ring", json=cylinder).status_code == 200
+    assert field.get("/v1/receivers").json()["items"] == [field.get("/v1/receivers/ring").json()]
+    stored, flux = fleet(field, target="ring", surface="ideal")
+    assert flux.shape == (32, 32)
+    assert stored["plane"]["width"] == pytest.approx(2.5 * np.pi)
+    assert 0.9 * stored["reflected_w"] < stored["power_w"] < stored["reflected_w"]
+    given, same = fleet(field, target=None, receiver=cylinder, surface="ideal")
+    np.testing.assert_array_equal(same, flux)
+    assert given["plane"]["radius"] == 2.5
+    answer = field.post("/v1/forecasts", json={"heliostat": "B00", **FLEET, "target": "ring"})
+    assert answer.status_code == 409
+    assert "heliostats" in answer.json()["detail"]
+    assert field.put(f"/v1/receivers/{TARGET.name}", json=cylinder).status_code == 409
+    plane = {"center": [0, 0, 40], "normal": [0, 1, 0], "width": 3, "height": 3}
+    assert field.put("/v1/targets/ring", json={"plane": plane}).status_code == 409
+
+
+def test_camera_changes_no_light_on_a_receiver(field: TestClient):
+    database = runtime_of(field).database
+    _, light = fleet(field)
+    blur = {"name": "slope_error", "parameters": {"sigma_mrad": {"value": 2.0}}}
+    gamma = {"name": "camera_response", "parameters": {"gamma": {"value": 0.5}}}
+    for effect, is_same in ((gamma, True), (blur, False)):
+        with database.reading() as session:
+            current = versions.current_number(session)
+        adopt(database, add(database, effect, model=current))
+        result, seen = fleet(field)
+        assert effect["name"] in result["model_version"]
+        assert np.allclose(seen, light) == is_same
+        plane = {"center": list(TARGET.center), "normal": list(TARGET.normal), "width": 4, "height": 4}
+        bare = alone(field, "B00", target=None, plane=plane, model_version=1)
+        assert np.allclose(alone(field, "B00", target=None, plane=plane), bare) == is_same
+
+
+def test_one_forecast_or_those_of_the_field(client: TestClient, operations: FakeOperations, post: Post):
+    post(png(1))
+    body = {"target": "lower", "sun": SUN, "surface": "ideal"}
+    assert client.post("/v1/forecasts", json=body | {"heliostat": "AA39"}).status_code == 201
+    headers = {"Idempotency-Key": "noon"}
+    asked = [client.post("/v1/forecasts", json=body, headers=headers).headers["Location"] for _ in range(2)]
+    assert asked[0] == asked[1]
+    for wrong, named in (
+        (body | {"heliostat": "AA39", "resolution": 4096}, "resolution.0: "),
+        (body | {"resolution": 4096}, "resolution.0: "),
+        (body | {"heliostat": "AA39", "receiver": {}}, "receiver: "),
+        ({"sun": SUN}, "give either target or plane, or receiver"),
+        ([], "field"),
+    ):
+        answer = client.post("/v1/forecasts", json=wrong)
+        assert answer.status_code == 422
+        assert named in answer.json()["detail"]
+
+
+def test_receiver_of_the_tower_file(stj: Path):
+    """Its edges lie where the inner corners were surveyed."""
+    folder = read_folder(stj)
+    cylinder = folder.plant.receivers["receiver"]
+    assert (cylinder.radius, cylinder.opening_deg) == (4.14, 60)
+    assert cylinder.height == pytest.approx(5.22, abs=0.01)
+    edges = [cylinder.tangent(side * np.radians(30), 0.1, 0.1) for side in (-1, 1)]
+    for plane, east in zip(edges, (2.06, -2.07), strict=True):
+        np.testing.assert_allclose(plane.to_enu((0.0, cylinder.height / 2)), [east, 0.61, 57.59], atol=0.03)
+        np.testing.assert_allclose(plane.to_enu((0.0, -cylinder.height / 2)), [east, -1.62, 52.86], atol=0.03)
+    assert cylinder.normal @ sun_direction(180.0, -25.0) == pytest.approx(1, abs=1e-6)
+
+
+def test_receiver_without_a_survey_is_left_out(tower: dict[str, Any]):
+    assert read_receivers(tower) == {}

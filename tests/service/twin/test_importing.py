@@ -1,0 +1,51 @@
+import json
+from pathlib import Path
+
+from model.sunshape import Pillbox
+from service import store
+from service.base.settings import Settings
+from service.sources.folder import read_folder
+from service.twin import versions
+from service.twin.importing import import_folder
+from service.twin.runtime import Runtime
+from tests.service.conftest import properties_document, tower_document
+
+
+def test_a_second_import_changes_nothing(stj: Path, tmp_path: Path):
+    """Every heliostat, image and measured surface of the real folder, once; what has no image is named."""
+    folder = read_folder(stj)
+    runtime = Runtime.from_settings(Settings(data_dir=tmp_path))
+    try:
+        runtime.database.upgrade()
+        first, second = import_folder(runtime, folder), import_folder(runtime, folder)
+        with runtime.database.reading() as session:
+            stored = store.counts(session)
+    finally:
+        runtime.close()
+    assert first["counts"]["heliostats new"] == 7
+    assert first["counts"]["surfaces new"] == 3
+    assert sum(n for what, n in first["counts"].items() if what.startswith("images")) == 54
+    assert all("unchanged" in what for what in second["counts"])
+    assert stored["heliostats"] == 7
+    assert stored["measurements"] == 54
+    assert first["skipped"] == second["skipped"]
+    assert first["skipped"]["AA39/156500"] == "no image"
+
+
+def test_declared_model_of_a_folder_is_the_store_s(tmp_path: Path):
+    declared = {"sun": {"shape": "pillbox", "half_angle_mrad": 4.65}, "effects": []}
+    properties = tmp_path / "folder" / "AA39" / "Properties" / "AA39-heliostat-properties.json"
+    properties.parent.mkdir(parents=True)
+    properties.write_text(json.dumps(properties_document()))
+    (tmp_path / "folder" / "plant-tower-measurements.json").write_text(json.dumps(tower_document()))
+    (tmp_path / "folder" / "twin.json").write_text(json.dumps({"declared": declared}))
+    runtime = Runtime.from_settings(Settings(data_dir=tmp_path / "data"))
+    try:
+        runtime.database.upgrade()
+        folder = read_folder(tmp_path / "folder")
+        for outcome in ("changed", "unchanged"):
+            assert import_folder(runtime, folder)["counts"][f"declared models {outcome}"] == 1
+        with runtime.database.reading() as session:
+            assert versions.get_model(session).optics.sun_shape == folder.optics.sun_shape == Pillbox(4.65 * 1e-3)
+    finally:
+        runtime.close()

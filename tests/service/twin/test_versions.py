@@ -1,0 +1,403 @@
+"""Versions of the plant's model: which is current, who may change it, and what is made by it."""
+
+import json
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, cast
+
+import pytest
+from fastapi import FastAPI
+from fastapi.testclient import TestClient
+from sqlalchemy import URL, select, text
+
+from model.effects import CATALOGUE, model_version
+from model.sunshape import Gaussian
+from service import store
+from service.base.faults import ConflictError, NotFoundError
+from service.jobs.kinds import KINDS
+from service.jobs.worker import Worker
+from service.store import keys
+from service.store.database import Database
+from service.store.tables import MODEL_VERSION, AuditRow, StudyRow
+from service.twin import versions
+from tests.service.conftest import ORIGIN, FakeOperations, Post, png
+from tests.service.web.test_keys import heliotwin
+
+GAMMA = {"name": "camera_response", "parameters": {"gamma": {"value": 0.8, "ci95": [0.78, 0.82], "unit": "1"}}}
+SLOPE = {"name": "slope_error", "parameters": {"sigma_mrad": {"value": 1.5, "ci95": [1.4, 1.6], "unit": "mrad"}}}
+FORECAST = {
+    "heliostat": "AA39",
+    "target": "lower",
+    "sun": {"azimuth_deg": 0, "elevation_deg": 45},
+    "surface": "ideal",
+    "resolution": 16,
+}
+
+
+def report_of(*effects: dict[str, Any], verdict: str = "effect") -> dict[str, Any]:
+    """The report of a study that found these effects."""
+    accuracy = {"accuracy_mean": 0.9, "accuracy_median": 0.9, "per_image": {"AA39/1": 0.9}}
+    return {
+        "verdict": verdict,
+        "conclusion": "It is so.",
+        "images": {"fit": 4, "held_out": 4},
+        "before": accuracy,
+        "after": accuracy,
+        "noise_floor": 0.01,
+        "unexplained_share": 0.1,
+        "effects": list(effects),
+        "candidates": [],
+    }
+
+
+def study_row(*effects: dict[str, Any], model: int = 1, verdict: str | None = None) -> StudyRow:
+    """A study of AA39 that found these effects."""
+    verdict = verdict or ("effect" if effects else "none")
+    return StudyRow(
+        created_by="tester",
+        options={},
+        heliostats=["AA39"],
+        model=model,
+        model_version=f"{model}:",
+        verdict=verdict,
+        conclusion="It is so.",
+        report=report_of(*effects, verdict=verdict),
+        skipped={},
+    )
+
+
+def add(database: Database, *effects: dict[str, Any], **about: Any) -> int:
+    with database.writing() as session:
+        return store.add_study(session, study_row(*effects, **about)).id
+
+
+def adopt(database: Database, study: int, force: bool = False) -> str:
+    with database.writing() as session:
+        return versions.adopt(session, study, "tester", force).version
+
+
+def current(database: Database) -> str:
+    with database.reading() as session:
+        return versions.get_model(session).version
+
+
+# --- versions ---------------------------------------------------------------------------------------------------------
+
+
+def test_declared_model_is_the_first_version(database: Database):
+    with database.reading() as session:
+        model = versions.get_model(session)
+        assert (model.number, model.version, model.effects) == (1, "1:none", ())
+        with pytest.raises(NotFoundError, match="no version 2"):
+            versions.get_model(session, 2)
+
+
+DECLARED = {"sun": {"shape": "gaussian", "sigma_mrad": 2.0}, "effects": [GAMMA]}
+
+
+def test_declared_sun_and_effects_are_part_of_every_version(database: Database):
+    with database.writing() as session:
+        store.put_plant(session, "plant", ORIGIN)
+        assert store.put_declared(session, DECLARED) is store.Change.CHANGED
+        assert store.put_declared(session, DECLARED) is store.Change.UNCHANGED
+    assert adopt(database, add(database, SLOPE)) == "2:slope_error"
+    with database.reading() as session:
+        first, second = versions.get_model(session, 1), versions.get_model(session, 2)
+    assert (first.optics.sun_shape, second.optics.sun_shape) == (Gaussian(0.002), Gaussian(0.002))
+    assert [effect.name for effect in first.effects] == ["camera_response"]
+    assert [effect.name for effect in second.effects] == ["camera_response", "slope_error"]
+    with database.writing() as session, pytest.raises(ConflictError, match="studies were made with it"):
+        store.put_declared(session, {})
+
+
+def test_versions_build_upon_each_other_and_are_withdrawn_from_the_top(database: Database):
+    first = add(database, GAMMA)
+    assert adopt(database, first) == "2:camera_response"
+    second = add(database, SLOPE, model=2)
+    assert adopt(database, second) == "3:slope_error+camera_response"
+    with database.reading() as session:
+        found = {effect.name: effect for effect in versions.get_model(session).effects}
+        assert (found["camera_response"].gamma, found["slope_error"].sigma_mrad) == (0.8, 1.5)
+    with database.writing() as session, pytest.raises(ConflictError, match="withdraw version 3"):
+        versions.withdraw(session, first, "tester")
+    for study, before in ((second, "2:camera_response"), (first, "1:none")):
+        with database.writing() as session:
+            versions.withdraw(session, study, "other")
+        assert current(database) == before
+    with database.writing() as session, pytest.raises(ConflictError, match="is not adopted"):
+        versions.withdraw(session, first, "tester")
+    with database.reading() as session:
+        kept = versions.list_models(session)
+        assert [(row.number, row.adopted_by, row.withdrawn_by) for row in kept] == [
+            (2, "tester", "other"),
+            (3, "tester", "other"),
+        ]
+        assert versions.get_model(session, 3).version == "3:slope_error+camera_response"
+    # Numbers are not given twice: forecasts name them.
+    assert adopt(database, first) == "4:camera_response"
+
+
+def test_study_of_another_version_takes_its_place_only_by_force(database: Database):
+    first, second = add(database, GAMMA), add(database, SLOPE)
+    adopt(database, first)
+    with pytest.raises(ConflictError, match="made with version 1"):
+        adopt(database, second)
+    assert current(database) == "2:camera_response"
+    assert adopt(database, second, force=True) == "3:slope_error"
+
+
+def test_study_that_found_nothing_is_not_adopted(database: Database):
+    nothing, doubtful = add(database), add(database, GAMMA, verdict="unexplained")
+    for force in (False, True):
+        with pytest.raises(ConflictError, match="found no effect"):
+            adopt(database, nothing, force)
+    with pytest.raises(ConflictError, match="verdict is 'unexplained'"):
+        adopt(database, doubtful)
+    assert adopt(database, doubtful, force=True) == "2:camera_response"
+
+
+def test_of_those_who_adopt_at_once_one_is_first(database: Database):
+    with database.writing() as session:
+        store.put_plant(session, "plant", ORIGIN)
+    studies = [add(database, GAMMA) for _ in range(4)]
+
+    def attempt(study: int) -> str | None:
+        try:
+            return adopt(database, study)
+        except ConflictError:
+            return None
+
+    with ThreadPoolExecutor(4) as pool:
+        outcomes = sorted(pool.map(attempt, studies), key=str)
+    assert outcomes == ["2:camera_response", None, None, None]
+
+
+def test_name_of_a_model_with_every_effect_fits_its_column():
+    assert len(model_version(kind() for kind in CATALOGUE.values())) + 10 <= MODEL_VERSION
+
+
+# --- the migration ----------------------------------------------------------------------------------------------------
+
+
+def test_what_was_stored_before_goes_up_and_down(empty_url: URL):
+    database = Database(empty_url)
+    database.upgrade("0002")
+    add_old = (
+        "INSERT INTO heliostats (id, name, properties, east_m, north_m, up_m, created_at, updated_at) "
+        "VALUES (1, 'A', '{}', 0, 0, 0, '2024-06-01', '2024-06-01')",
+        "INSERT INTO surfaces (id, heliostat_id, version, created_at, valid_from, source, arrays) "
+        "VALUES (1, 1, 1, '2024-06-01', '2024-06-01', 'measured', 'a')",
+        "INSERT INTO surfaces (id, heliostat_id, version, created_at, valid_from, source, arrays) "
+        "VALUES (2, 1, 2, '2024-06-01', '2024-06-01', 'network', 'b')",
+        "INSERT INTO forecasts (id, heliostat_id, surface_id, plane, sun_azimuth_deg, sun_elevation_deg, dni_w_m2, "
+        "normalised, rows, columns, peak_w_m2, power_w, model_version, flux, created_at) "
+        "VALUES (1, 1, 2, '{}', 0, 45, 1000, FALSE, 8, 8, 1, 1, '1:none', 'f', '2024-06-01')",
+    )
+    with database.writing() as session:
+        for statement in add_old:
+            session.execute(text(statement))
+    database.upgrade()
+    with database.writing() as session:
+        surfaces = session.execute(text("SELECT version, model_version FROM surfaces ORDER BY version")).all()
+        assert surfaces == [(1, None), (2, "1:none")]
+        session.execute(text(f"UPDATE forecasts SET model_version = '{'2:' + 'x' * 200}'"))
+    database.downgrade("0002")
+    with database.reading() as session:
+        assert session.execute(text("SELECT count(*) FROM surfaces")).scalar() == 2
+        kept = session.execute(text("SELECT surface_id, model_version FROM forecasts")).one()
+        assert kept[0] == 2
+        assert kept[1].startswith("2:x")
+    database.upgrade()
+    database.close()
+
+
+# --- over HTTP --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def stored(client: TestClient) -> Database:
+    """The service's database."""
+    return cast(Database, cast(FastAPI, client.app).state.runtime.database)
+
+
+def work(client: TestClient) -> None:
+    runtime = cast(FastAPI, client.app).state.runtime
+    assert Worker(runtime, KINDS, "tester", threading.Event()).work()
+
+
+def test_models_are_listed_with_what_became_of_them(client: TestClient, stored: Database):
+    declared = client.get("/v1/models/current").json()
+    assert (declared["number"], declared["version"], declared["study"]) == (1, "1:none", None)
+    path = f"/v1/studies/{add(stored, GAMMA)}"
+    assert client.get(path).json()["adopted"] is None
+    client.post(f"{path}/adopt")
+    adopted = client.get("/v1/models/current").json()
+    assert (adopted["version"], adopted["adopted_by"]) == ("2:camera_response", "local")
+    assert adopted["effects"] == [{"name": "camera_response", "parameters": {"gamma": 0.8, "saturation": 1.0}}]
+    assert [entry["is_current"] for entry in client.get("/v1/models").json()["items"]] == [False, True]
+    client.post(f"{path}/withdraw")
+    first, second = client.get("/v1/models").json()["items"]
+    assert (first["is_current"], second["is_current"], second["withdrawn_by"]) == (True, False, "local")
+
+
+def test_studies_are_listed_newest_first(client: TestClient, stored: Database):
+    first, second = add(stored, GAMMA), add(stored)
+    client.post(f"/v1/studies/{first}/adopt")
+    page = client.get("/v1/studies", params={"limit": 1}).json()
+    assert [(item["id"], item["verdict"]) for item in page["items"]] == [(second, "none")]
+    rest = client.get("/v1/studies", params={"after": page["next"]}).json()
+    assert [(item["id"], item["adopted"]) for item in rest["items"]] == [(first, "2:camera_response")]
+
+
+def test_conflicts_say_what_to_do(client: TestClient, stored: Database):
+    first, second = add(stored, GAMMA), add(stored, SLOPE)
+    assert client.post(f"/v1/studies/{first}/withdraw").status_code == 409
+    assert client.post(f"/v1/studies/{first}/adopt").status_code == 201
+    again = client.post(f"/v1/studies/{second}/adopt", json={"force": False})
+    assert (again.status_code, "make another study" in again.json()["detail"]) == (409, True)
+    assert client.post(f"/v1/studies/{second}/adopt", json={"force": True}).status_code == 201
+    for action in ("adopt", "withdraw", "report"):
+        answer = client.request("GET" if action == "report" else "POST", f"/v1/studies/99/{action}")
+        assert answer.status_code == 404
+    assert client.get(f"/v1/studies/{first}/report").status_code == 404  # this one has no page
+
+
+def test_audit_trail_names_who_adopted_and_withdrew(client: TestClient, stored: Database):
+    path = f"/v1/studies/{add(stored, GAMMA)}"
+    client.post(f"{path}/adopt")
+    client.post(f"{path}/withdraw")
+    with stored.reading() as session:
+        entries = session.scalars(select(AuditRow).where(AuditRow.action.startswith("effect."))).all()
+    about = {"model": "2:camera_response"}
+    assert [(e.actor, e.action, e.subject, e.detail) for e in entries] == [
+        ("local", "effect.adopted", "study 1", about | {"effects": ["camera_response"]}),
+        ("local", "effect.withdrawn", "study 1", about),
+    ]
+
+
+@pytest.fixture
+def roles(client: TestClient, stored: Database) -> dict[str, dict[str, str]]:
+    """Headers by role."""
+    with stored.writing() as session:
+        made = {role: keys.create(session, role, role, "tester") for role in ("read", "ingest", "operate", "admin")}
+    return {role: {"Authorization": f"Bearer {key}"} for role, key in made.items()}
+
+
+def test_only_operators_change_the_model(client: TestClient, stored: Database, roles: dict[str, dict[str, str]]):
+    path = f"/v1/studies/{add(stored, GAMMA)}"
+    for role in ("read", "ingest"):
+        for action in ("adopt", "withdraw"):
+            assert client.post(f"{path}/{action}", headers=roles[role]).status_code == 403
+        assert client.post("/v1/studies", json={}, headers=roles[role]).status_code == 403
+        assert client.get(path, headers=roles[role]).status_code == 200
+        assert client.get("/v1/models/current", headers=roles[role]).json()["version"] == "1:none"
+    assert client.post(f"{path}/adopt", headers=roles["operate"]).json()["adopted_by"] == "operate"
+    assert client.post(f"{path}/withdraw", headers=roles["admin"]).status_code == 200
+
+
+def test_everything_that_is_made_uses_the_model_that_is_asked_for(
+    client: TestClient, stored: Database, post: Post, operations: FakeOperations
+):
+    post(png(1))
+    client.post(f"/v1/studies/{add(stored, GAMMA)}/adopt")
+    plane = {key: FORECAST[key] for key in ("target", "sun", "surface", "resolution")}
+    for wanted, version, names in (
+        ({}, "2:camera_response", ["camera_response"]),
+        ({"model_version": 1}, "1:none", []),
+    ):
+        forecast = client.post("/v1/forecasts", json=FORECAST | wanted).json()
+        surface = client.post("/v1/heliostats/AA39/surfaces", json=wanted).json()
+        assert (forecast["model_version"], surface["model_version"]) == (version, version)
+        assert [effect.name for effect in operations.forecasts[-1]["effects"]] == names
+        assert [effect.name for effect in operations.believed[-1]] == names
+        fleet = client.post("/v1/jobs/forecasts", json=plane | wanted)
+        work(client)
+        assert client.get(fleet.headers["Location"]).json()["result"]["model_version"] == version
+        client.post("/v1/jobs/predictions", json=wanted)
+        work(client)
+        assert client.get("/v1/heliostats/AA39/surfaces/current").json()["model_version"] == version
+    assert operations.forecasts[-1]["latitude_deg"] == pytest.approx(ORIGIN[0])
+
+
+def test_forecast_is_made_under_the_declared_sun(client: TestClient, stored: Database, operations: FakeOperations):
+    with stored.writing() as session:
+        store.put_declared(session, {"sun": {"shape": "gaussian", "sigma_mrad": 2.0}})
+    assert client.get("/v1/plant").json()["declared"]["sun"]["shape"] == "gaussian"
+    client.post("/v1/forecasts", json=FORECAST | {"dni_w_m2": 800})
+    optics = operations.forecasts[-1]["optics"]
+    assert (optics.sun_shape, optics.dni) == (Gaussian(0.002), 800)
+
+
+def test_version_that_is_not_there_is_not_found(client: TestClient, post: Post):
+    post(png(1))
+    for path, body in (("forecasts", FORECAST), ("heliostats/AA39/surfaces", {})):
+        answer = client.post(f"/v1/{path}", json=body | {"model_version": 7})
+        assert (answer.status_code, "/v1/models" in answer.json()["detail"]) == (404, True)
+    job = client.post("/v1/jobs/predictions", json={"model_version": 7}).headers["Location"]
+    work(client)
+    assert "no version 7" in client.get(job).json()["reason"]
+
+
+# --- the command line -------------------------------------------------------------------------------------------------
+
+
+def test_report_of_a_folder_is_adopted_and_withdrawn_by_the_command_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setenv("HELIOTWIN_DATA_DIR", str(tmp_path / "data"))
+    file = tmp_path / "report.json"
+    file.write_text(json.dumps(report_of(GAMMA)))
+    assert heliotwin("models", "adopt", str(file), "--json") == 0
+    assert json.loads(capsys.readouterr().out) == {"study": 1, "version": "2:camera_response"}
+    assert heliotwin("models", "list", "--json") == 0
+    listed = json.loads(capsys.readouterr().out)
+    assert [(entry["number"], entry["is_current"]) for entry in listed] == [(1, False), (2, True)]
+    assert listed[1]["adopted_by"].startswith("cli")
+    assert heliotwin("models", "withdraw", "1") == 0
+    assert capsys.readouterr().out.strip() == "1:none is current"
+    assert heliotwin("models", "withdraw", "1") == 1
+    assert heliotwin("models", "list") == 0
+    assert "2:camera_response" in capsys.readouterr().out
+
+
+def test_report_is_adopted_into_the_version_that_it_was_made_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setenv("HELIOTWIN_DATA_DIR", str(tmp_path / "data"))
+    file = tmp_path / "report.json"
+
+    def adopt(found: dict[str, Any], known: list[dict[str, Any]]) -> int:
+        file.write_text(json.dumps(report_of(found) | {"model": {"effects": known}}))
+        return heliotwin("models", "adopt", str(file))
+
+    slope = {"name": "slope_error", "parameters": {"sigma_mrad": 0.5}}
+    assert adopt(slope, [GAMMA]) == 1
+    assert "camera_response" in capsys.readouterr().err
+    assert adopt(GAMMA, []) == 0
+    assert adopt(slope, [GAMMA]) == 0
+    capsys.readouterr()
+    assert adopt(slope, []) == 1  # made with version 1, and version 3 is current
+    assert "version 1" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("document", "word"),
+    [
+        ([], "report"),
+        (report_of(GAMMA) | {"verdict": "perhaps"}, "verdict"),
+        (report_of(GAMMA) | {"before": 3}, "before"),
+        (report_of({"name": "magic"}), "magic"),
+        (report_of({"name": "slope_error", "parameters": {"sigma_mrad": 99}}), "sigma_mrad"),
+    ],
+)
+def test_file_that_is_no_report_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], document: Any, word: str
+):
+    monkeypatch.setenv("HELIOTWIN_DATA_DIR", str(tmp_path / "data"))
+    file = tmp_path / "report.json"
+    file.write_text(json.dumps(document))
+    assert heliotwin("models", "adopt", str(file)) == 2
+    assert word in capsys.readouterr().err
+    assert heliotwin("models", "list", "--json") == 0
+    assert len(json.loads(capsys.readouterr().out)) == 1

@@ -1,0 +1,332 @@
+"""Jobs over HTTP: asked for, followed, cancelled; their progress as a stream that a real client reads."""
+
+import io
+import json
+import math
+import shutil
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from fastapi import FastAPI
+from fastapi.testclient import TestClient
+
+from service.base.settings import Settings
+from service.jobs.kind import Context
+from service.jobs.kinds import KINDS
+from service.jobs.predictions import PredictionsIn, predict_many
+from service.store import queue
+from service.store.tables import JobRow
+from service.web.app import create_app
+from tests.service.conftest import QUIET, FakeOperations, Post, client_of, png, serving, until
+from tests.service.job_kinds import TEST_KINDS
+
+JSON = {"Content-Type": "application/json"}
+
+
+@pytest.fixture
+def settings(tmp_path: Path) -> Settings:
+    root = tmp_path / "imports"
+    root.mkdir()
+    working = QUIET | {"job_workers": 1, "job_poll_s": 0.05, "job_retry_s": 0.05}
+    return Settings(data_dir=tmp_path / "data", import_root=root, max_queued_jobs=50, **working)
+
+
+@pytest.fixture
+def app(settings: Settings, operations: FakeOperations) -> FastAPI:
+    return create_app(settings, operations, {**KINDS, **TEST_KINDS})
+
+
+def finish(client: TestClient, answer: Any) -> dict[str, Any]:
+    """The job that was asked for, when it has ended."""
+    assert answer.status_code == 202, answer.text
+    path = answer.headers["Location"]
+    until(lambda: client.get(path).json()["state"] in ("done", "failed", "cancelled"))
+    job: dict[str, Any] = client.get(path).json()
+    return job
+
+
+# --- the kinds --------------------------------------------------------------------------------------------------------
+
+
+def test_predictions_make_one_version_each_and_name_what_they_skip(client: TestClient, post: Post, properties: Any):
+    client.put("/v1/heliostats/AB01", json=properties)
+    client.put("/v1/heliostats/AB02", json=properties)
+    post(png(1))
+    post(png(2), heliostat="AB01")
+    job = finish(client, client.post("/v1/jobs/predictions", json={}))
+    assert job["state"] == "done"
+    assert job["result"]["surfaces"] == {"AA39": 1, "AB01": 1}
+    assert "no accepted measurement" in job["result"]["skipped"]["AB02"]
+    assert job["progress"] == 1
+    assert client.get("/v1/heliostats/AA39/surfaces/1").status_code == 200
+    again = finish(client, client.post("/v1/jobs/predictions", json={"heliostats": ["AA39", "AA39"]}))
+    assert again["result"] == {"surfaces": {"AA39": 2}, "skipped": {}}
+
+
+def test_surfaces_of_a_job_that_is_begun_again_are_not_made_again(
+    client: TestClient, post: Post, properties: Any, operations: FakeOperations, monkeypatch: pytest.MonkeyPatch
+):
+    client.put("/v1/heliostats/AB01", json=properties)
+    post(png(1))
+    post(png(2), heliostat="AB01")
+    predict, calls = operations.predict, []
+
+    def fails_the_second_time(*arguments: Any, **options: Any) -> Any:
+        calls.append(1)
+        if len(calls) == 2:
+            raise ZeroDivisionError
+        return predict(*arguments, **options)
+
+    monkeypatch.setattr(operations, "predict", fails_the_second_time)
+    job = finish(client, client.post("/v1/jobs/predictions", json={}))
+    assert (job["state"], job["attempts"]) == ("done", 2)
+    assert job["result"]["surfaces"] == {"AA39": 1, "AB01": 1}
+    assert len(calls) == 3
+    for name in ("AA39", "AB01"):
+        assert len(client.get(f"/v1/heliostats/{name}/surfaces").json()["items"]) == 1
+
+
+def test_surface_of_a_late_worker_is_not_stored(
+    app: FastAPI, client: TestClient, post: Post, operations: FakeOperations
+):
+    """While it computed, its lease ran out and another took the job: its surface is undone with its step."""
+    post()
+    runtime = app.state.runtime
+    with runtime.database.writing() as session:
+        session.add(JobRow(kind="later", payload={}, created_by="a"))
+    with runtime.database.writing() as session:
+        row = queue.claim(session, ["later"], "late", 60, 3)
+        assert row is not None
+        lease = queue.lease_of(row)
+        queue.release(session, lease)
+    with runtime.database.writing() as session:
+        queue.claim(session, ["later"], "fresh", 60, 3)
+    context = Context(runtime, lease, "a", threading.Event(), reported_s=math.inf)  # it learns nothing by reporting
+    with pytest.raises(queue.LeaseLostError):
+        predict_many(context, PredictionsIn())
+    assert len(operations.predictions) == 1
+    assert client.get("/v1/heliostats/AA39/surfaces").json()["items"] == []
+
+
+def test_predictions_without_any_image_fail_with_the_reason(client: TestClient):
+    job = finish(client, client.post("/v1/jobs/predictions", json={"heliostats": ["AA39", "ZZ99"]}))
+    assert job["state"] == "failed"
+    assert "AA39: heliostat AA39 has no accepted measurement" in job["reason"]
+
+
+def test_fleet_forecast_is_the_sum_of_its_heliostats(client: TestClient, properties: Any):
+    client.put("/v1/heliostats/AB01", json=properties)
+    body = {"target": "lower", "sun": {"azimuth_deg": 0, "elevation_deg": 45}, "surface": "ideal", "resolution": 16}
+    job = finish(client, client.post("/v1/jobs/forecasts", json=body))
+    assert job["state"] == "done"
+    assert job["result"]["heliostats"] == 2
+    assert job["result"]["peak_w_m2"] == 4.0
+    area = job["result"]["plane"]["width"] * job["result"]["plane"]["height"]
+    assert job["result"]["power_w"] == pytest.approx(4.0 * area)
+    assert job["result"]["reflected_w"] == 120.0
+    path = f"/v1/jobs/{job['id']}/flux"
+    npz = np.load(io.BytesIO(client.get(path, headers={"Accept": "application/x-npz"}).content), allow_pickle=False)
+    np.testing.assert_array_equal(npz["flux"], np.full((16, 16), 4.0, np.float32))
+    assert np.shape(client.get(path).json()["flux"]) == (16, 16)
+    assert client.get(path, headers={"Accept": "image/png"}).content.startswith(b"\x89PNG")
+    skipping = finish(client, client.post("/v1/jobs/forecasts", json={**body, "surface": "current"}))
+    assert skipping["state"] == "failed"
+
+
+def test_job_without_a_map_has_none(client: TestClient):
+    job = finish(client, client.post("/v1/jobs/squares", json={}))
+    assert client.get(f"/v1/jobs/{job['id']}/flux").status_code == 404
+
+
+def test_import_of_an_allowed_folder(bare: TestClient, settings: Settings, tower: Any, properties: Any):
+    assert settings.import_root is not None
+    folder = settings.import_root / "plant"
+    (folder / "AA39" / "Properties").mkdir(parents=True)
+    (folder / "WRI1030197-tower-measurements.json").write_text(json.dumps(tower))
+    (folder / "AA39" / "Properties" / "AA39-heliostat-properties.json").write_text(json.dumps(properties))
+    job = finish(bare, bare.post("/v1/jobs/imports", json={"folder": "plant"}))
+    assert job["state"] == "done", job["reason"]
+    assert job["result"]["counts"]["heliostats new"] == 1
+    assert bare.get("/v1/heliostats/AA39").status_code == 200
+    again = finish(bare, bare.post("/v1/jobs/imports", json={"folder": "./plant"}))
+    assert "heliostats unchanged" in again["result"]["counts"]
+
+
+@pytest.mark.parametrize("folder", ["..", "../data", "/etc", "plant/../../data", "nothing", "link", "~", "file"])
+def test_import_never_leaves_its_root(bare: TestClient, settings: Settings, folder: str):
+    """Whether the other place exists makes no difference to the answer."""
+    root = settings.import_root
+    assert root is not None
+    (root / "plant").mkdir()
+    (root / "file").write_text("x")
+    (root / "link").symlink_to(settings.data_dir)
+    job = finish(bare, bare.post("/v1/jobs/imports", json={"folder": folder}))
+    assert job["state"] == "failed"
+    assert job["reason"] == f"folder: there is no folder {folder!r} under the one that may be imported"
+
+
+def test_import_refuses_links_that_lead_outside(bare: TestClient, settings: Settings):
+    root = settings.import_root
+    assert root is not None
+    (root / "plant" / "AA39").mkdir(parents=True)
+    (root / "plant" / "AA39" / "secret.png").symlink_to("/etc/hostname")
+    job = finish(bare, bare.post("/v1/jobs/imports", json={"folder": "plant"}))
+    assert job["reason"] == "folder: plant/AA39/secret.png leads outside; copy what it links to"
+
+
+def test_import_needs_the_operators_leave(settings: Settings, operations: FakeOperations):
+    shutil.rmtree(settings.data_dir, ignore_errors=True)
+    closed = settings.model_copy(update={"import_root": None})
+    with client_of(create_app(closed, operations)) as client:
+        job = finish(client, client.post("/v1/jobs/imports", json={"folder": "."}))
+    assert "HELIOTWIN_IMPORT_ROOT" in job["reason"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "body"),
+    [
+        ("predictions", {"heliostats": []}),
+        ("predictions", {"heliostats": ["../x"]}),
+        ("predictions", {"images": 9}),
+        ("forecasts", {"sun": {"azimuth_deg": 0, "elevation_deg": 45}}),
+        ("forecasts", {"target": "lower", "sun": {"azimuth_deg": 0, "elevation_deg": -1}}),
+        ("imports", {"folder": ""}),
+        ("imports", {"folder": "a\x00b"}),
+        ("imports", {"folder": "a\nb"}),
+        ("imports", {}),
+    ],
+)
+def test_wrong_request(refusing: TestClient, kind: str, body: Any):
+    assert refusing.post(f"/v1/jobs/{kind}", json=body).status_code == 422
+
+
+# --- asking, listing, cancelling --------------------------------------------------------------------------------------
+
+
+def test_idempotency_key_is_kept_over_http(client: TestClient):
+    headers = {"Idempotency-Key": "order-1"}
+    first = client.post("/v1/jobs/squares", json={"value": 2}, headers=headers)
+    again = client.post("/v1/jobs/squares", json={"value": 2}, headers=headers)
+    assert first.headers["Location"] == again.headers["Location"]
+    assert client.post("/v1/jobs/squares", json={"value": 3}, headers=headers).status_code == 422
+    assert client.post("/v1/jobs/squares", json={}, headers={"Idempotency-Key": "a b"}).status_code == 422
+
+
+def test_jobs_are_listed_newest_first_in_pages(client: TestClient):
+    numbers = [finish(client, client.post("/v1/jobs/squares", json={"value": value}))["id"] for value in range(3)]
+    failed = finish(client, client.post("/v1/jobs/squares", json={"refuses": True}))["id"]
+    page = client.get("/v1/jobs", params={"limit": 2}).json()
+    assert [job["id"] for job in page["items"]] == [failed, numbers[2]]
+    rest = client.get("/v1/jobs", params={"limit": 2, "after": page["next"]}).json()
+    assert [job["id"] for job in rest["items"]] == [numbers[1], numbers[0]]
+    assert rest["next"] is None
+    assert [job["id"] for job in client.get("/v1/jobs", params={"state": "failed"}).json()["items"]] == [failed]
+    assert client.get("/v1/jobs", params={"kind": "imports"}).json()["items"] == []
+
+
+def test_cancel_over_http(client: TestClient):
+    running = client.post("/v1/jobs/squares", json={"steps": 1000, "pause_s": 0.05})
+    waiting = client.post("/v1/jobs/squares", json={})
+    path = running.headers["Location"]
+    until(lambda: client.get(path).json()["state"] == "running")
+    assert client.post(f"{waiting.headers['Location']}/cancel").json()["state"] == "cancelled"
+    assert client.post(f"{path}/cancel").json()["cancel_requested"] is True
+    assert finish(client, running)["state"] == "cancelled"
+    done = client.post("/v1/jobs/squares", json={})
+    assert finish(client, done)["state"] == "done"
+    assert client.post(f"{done.headers['Location']}/cancel").status_code == 409
+    assert client.post("/v1/jobs/99/cancel").status_code == 404
+    assert client.get("/v1/jobs/99").status_code == 404
+
+
+def test_too_many_waiting_jobs_are_refused(app: FastAPI, client: TestClient):
+    with app.state.runtime.database.writing() as session:
+        session.add_all(JobRow(kind="unknown", payload={}, created_by="a") for _ in range(50))
+    answer = client.post("/v1/jobs/squares", json={})
+    assert answer.status_code == 429
+    assert answer.headers["Retry-After"]
+
+
+# --- the stream -------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def server(app: FastAPI) -> Iterator[str]:
+    """The service behind a real socket; yields its address."""
+    with serving(app) as address:
+        yield address
+
+
+def read_events(url: str, last: str | None = None, most: int = 10**6) -> list[dict[str, str]]:
+    """Events of a stream until its end, or the first ``most`` of them."""
+    events: list[dict[str, str]] = [{}]
+    headers = {} if last is None else {"Last-Event-ID": last}
+    with httpx.stream("GET", url, headers=headers, timeout=30) as answer:
+        assert answer.status_code == 200
+        assert answer.headers["Content-Type"].startswith("text/event-stream")
+        for line in answer.iter_lines():
+            name, _, value = line.partition(": ")
+            if line:
+                events[-1][name] = value
+            elif "data" not in events[-1]:
+                events[-1] = {}
+            elif len(events) == most:
+                return events
+            else:
+                events.append({})
+    return events[:-1]
+
+
+def test_stream_follows_a_job_to_its_end(server: str):
+    job = httpx.post(f"{server}/v1/jobs/squares", json={"value": 3, "steps": 6, "pause_s": 0.4}).json()
+    events = read_events(f"{server}/v1/jobs/{job['id']}/events")
+    assert [event["event"] for event in events[:-1]] == ["progress"] * (len(events) - 1)
+    documents = [json.loads(event["data"]) for event in events]
+    shares = [document["progress"] for document in documents]
+    assert shares == sorted(shares)
+    assert len(set(shares)) >= 4
+    assert events[-1]["event"] == "end"
+    assert documents[-1]["result"] == {"square": 9}
+    numbers = [int(event["id"]) for event in events]
+    assert numbers == sorted(set(numbers))
+
+
+def test_stream_goes_on_where_it_was_left(server: str):
+    job = httpx.post(f"{server}/v1/jobs/squares", json={"steps": 6, "pause_s": 0.4}).json()
+    url = f"{server}/v1/jobs/{job['id']}/events"
+    begun = read_events(url, most=2)
+    rest = read_events(url, last=begun[-1]["id"])
+    assert int(rest[0]["id"]) > int(begun[-1]["id"])
+    assert rest[-1]["event"] == "end"
+    over = httpx.get(url, headers={"Last-Event-ID": rest[-1]["id"]})
+    assert over.status_code == 204
+    assert httpx.get(url, headers={"Last-Event-ID": "nonsense"}).text.count("event: end") == 1
+    assert httpx.get(f"{server}/v1/jobs/99/events").status_code == 404
+
+
+def test_silent_stream_is_kept_open_by_comments(server: str, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("service.web.api.jobs._COMMENT_EVERY_S", 0.2)
+    job = httpx.post(f"{server}/v1/jobs/squares", json={"steps": 1, "pause_s": 2.0}).json()
+    text = httpx.get(f"{server}/v1/jobs/{job['id']}/events", timeout=30).text
+    assert "\n: still here\n\n" in text
+
+
+def test_open_stream_does_not_keep_the_service_from_stopping(app: FastAPI, server: str):
+    """The fixture's end waits for the server; the stream of a job that nobody works at would not end by itself."""
+    with app.state.runtime.database.writing() as session:
+        row = JobRow(kind="unknown", payload={}, created_by="a")
+        session.add(row)
+        session.flush()
+        number = row.id
+    reader = threading.Thread(target=read_events, args=(f"{server}/v1/jobs/{number}/events",))
+    reader.start()
+    time.sleep(0.5)
+    app.state.stopping.set()
+    reader.join(10)
+    assert not reader.is_alive()

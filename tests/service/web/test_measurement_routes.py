@@ -1,0 +1,274 @@
+"""Photographs over HTTP: once each, kept when refused, bounded, read back in every representation."""
+
+import io
+import json
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from fastapi.testclient import TestClient
+from sqlalchemy import URL
+
+from service.base.settings import Settings
+from service.web.app import create_app
+from tests.service.conftest import FakeOperations, Post, client_of, metadata, png
+
+BASE = "/v1/heliostats/AA39/measurements"
+
+
+def test_measurement_is_stored_and_read_back(client: TestClient, post: Post):
+    sent = {
+        "id": "205363",
+        "taken_at": "2024-05-01T10:00:00+02:00",
+        "motor_position": {"axis_1_motor_position": 30076, "axis_2_motor_position": 37935},
+        "focal_spot": {"HeliOS": [50.9, 6.38, 122.1], "UTIS": [50.9, 6.38, 122.0]},
+    }
+    created = post(**sent)
+    assert created.status_code == 201
+    body = created.json()
+    assert created.headers["Location"] == f"{BASE}/205363"
+    assert body["id"] == body["external_id"] == "205363"
+    assert (body["accepted"], body["reason"], body["center_of_mass"]) == (True, None, [0.5, -0.25])
+    assert body["motor_position"] == [30076, 37935]
+    assert body["focal_spot"] == [50.9, 6.38, 122.0]
+    assert body["taken_at"] == "2024-05-01T08:00:00Z"
+    assert body["quality"]["accepted"] is True
+    assert client.get(f"{BASE}/205363").json() == body
+
+
+def test_plain_pairs_are_taken_too(post: Post):
+    body = post(motor_position=[1, 2], focal_spot=[50.9, 6.38, 122.0]).json()
+    assert (body["motor_position"], body["focal_spot"]) == ([1, 2], [50.9, 6.38, 122.0])
+
+
+def test_same_image_is_one_measurement(client: TestClient, post: Post, operations: FakeOperations):
+    first, second = post(id="1"), post(id="2")
+    assert (first.status_code, second.status_code) == (201, 200)
+    assert first.json() == second.json()
+    assert second.headers["Location"] == first.headers["Location"]
+    assert operations.measured == 1
+    assert len(client.get(BASE).json()["items"]) == 1
+
+
+def test_another_image_of_the_same_id_is_a_conflict(post: Post):
+    assert post(png(1), id="1").status_code == 201
+    answer = post(png(2), id="1")
+    assert answer.status_code == 409
+    assert answer.json()["detail"].startswith("id: ")
+    assert post(png(3), id="1", kind="raw").json()["id"] == "1-raw"
+
+
+def test_refused_image_is_kept_with_its_reason(client: TestClient, post: Post):
+    image = png(refused=True)
+    created = post(image)
+    assert created.status_code == 201
+    body = created.json()
+    assert (body["accepted"], body["reason"]) == (False, "no_spot")
+    assert body["quality"]["detail"] == "no spot stands out"
+    assert client.get(f"{BASE}/{body['id']}/image").content == image
+    flux = client.get(f"{BASE}/{body['id']}/flux")
+    assert flux.status_code == 404
+    assert "no_spot" in flux.json()["detail"]
+    assert post(image).status_code == 200
+
+
+def test_list_filters_and_pages(client: TestClient, post: Post):
+    for seed in range(4):
+        post(png(seed, refused=seed == 2), id=str(seed))
+    assert [item["id"] for item in client.get(f"{BASE}?accepted=false").json()["items"]] == ["2"]
+    page = client.get(f"{BASE}?accepted=true&limit=2").json()
+    assert ([item["id"] for item in page["items"]], page["next"]) == (["0", "1"], "1")
+    page = client.get(f"{BASE}?accepted=true&limit=2&after=1").json()
+    assert ([item["id"] for item in page["items"]], page["next"]) == (["3"], None)
+    assert client.get(f"{BASE}?after=nothing").status_code == 404
+
+
+def test_image_comes_back_byte_for_byte(client: TestClient, post: Post):
+    image = png(5)
+    body = post(image).json()
+    answer = client.get(f"{BASE}/{body['id']}/image")
+    assert answer.content == image
+    assert answer.headers["Content-Type"] == "image/png"
+    assert answer.headers["ETag"] == f'"{body["image_sha256"]}"'
+    assert answer.headers["X-Content-Type-Options"] == "nosniff"
+
+
+def test_damaged_image_file_is_no_answer(client: TestClient, post: Post, settings: Settings):
+    body = post(png(5)).json()
+    sha256 = body["image_sha256"]
+    (settings.data_dir / "images" / sha256[:2] / sha256[2:]).write_bytes(b"rotten")
+    answer = client.get(f"{BASE}/{body['id']}/image")
+    assert answer.status_code == 500
+    assert str(settings.data_dir) not in answer.text
+    assert post(png(5)).status_code == 200  # the caller's copy mends it
+    assert client.get(f"{BASE}/{body['id']}/image").content == png(5)
+
+
+def test_flux_in_every_representation(client: TestClient, post: Post):
+    post(id="7")
+    as_json = client.get(f"{BASE}/7/flux")
+    assert as_json.headers["Content-Type"] == "application/json"
+    assert as_json.headers["Vary"] == "Accept"
+    assert np.shape(as_json.json()["flux"]) == (256, 256)
+    assert np.sum(as_json.json()["centered"]) == pytest.approx(100)
+    for media_type in ("application/x-npz", "application/vnd.numpy.npz"):
+        answer = client.get(f"{BASE}/7/flux", headers={"Accept": media_type})
+        assert answer.headers["Content-Type"] == media_type
+        arrays = np.load(io.BytesIO(answer.content), allow_pickle=False)
+        assert {name: arrays[name].shape for name in arrays} == {"flux": (256, 256), "centered": (64, 64)}
+    picture = client.get(f"{BASE}/7/flux", headers={"Accept": "image/png"})
+    assert picture.headers["Content-Type"] == "image/png"
+    assert cv2.imdecode(np.frombuffer(picture.content, np.uint8), cv2.IMREAD_COLOR).ndim == 3
+    refused = client.get(f"{BASE}/7/flux", headers={"Accept": "text/csv"})
+    assert refused.status_code == 406
+    assert refused.json()["offered"] == as_json.json().get("x", refused.json()["offered"])
+    assert "image/png" in refused.json()["offered"]
+
+
+def test_centered_image_has_no_place_on_the_target(client: TestClient, post: Post):
+    body = post(id="7", kind="flux-centered").json()
+    assert body["center_of_mass"] is None
+    flux = client.get(f"{BASE}/7/flux").json()
+    assert flux["flux"] is None
+    assert np.shape(flux["centered"]) == (64, 64)
+    assert client.get(f"{BASE}/7/flux", headers={"Accept": "image/png"}).status_code == 200
+
+
+# --- what is refused --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"sun_elevation": 91}, "metadata.sun_elevation"),
+        ({"sun_elevation": 0}, "metadata.sun_elevation"),
+        ({"sun_azimuth": "x"}, "metadata.sun_azimuth"),
+        ({"kind": "photo"}, "metadata.kind"),
+        ({"target_name": "../x"}, "metadata.target_name"),
+        ({"id": "a/b"}, "metadata.id"),
+        ({"taken_at": "2024-05-01T10:00:00"}, "metadata.taken_at"),
+        ({"motor_position": [1]}, "metadata.motor_position"),
+        ({"motor_position": {"axis_1_motor_position": 1}}, "metadata.motor_position"),
+        ({"focal_spot": {"UTIS": [1, 2]}}, "metadata.focal_spot"),
+        ({"focal_spot": {}}, "metadata.focal_spot"),
+        ({"corners": [[0, 0]] * 3}, "metadata.corners"),
+        ({"typo": 1}, "metadata.typo"),
+    ],
+)
+def test_wrong_metadata_is_named(refused_post: Post, changes: dict[str, Any], named: str):
+    answer = refused_post(**changes)
+    assert answer.status_code == 422
+    assert any(error["field"].startswith(named) for error in answer.json()["errors"]), answer.json()
+
+
+@pytest.mark.parametrize("number", ["NaN", "Infinity", "-Infinity", "1e999"])
+def test_numbers_that_are_none(refused_post: Post, number: str):
+    for key in ("sun_azimuth", "sun_elevation"):
+        assert refused_post(raw=json.dumps(metadata(**{key: "@"})).replace('"@"', number)).status_code == 422
+    assert refused_post(raw=json.dumps(metadata(motor_position=["@", 1])).replace('"@"', number)).status_code == 422
+
+
+@pytest.mark.parametrize("text", ["", "{", "null", "[]", "x" * 10_000, '{"kind": "flux"}'])
+def test_metadata_that_is_none(refused_post: Post, text: str):
+    assert refused_post(raw=text).status_code == 422
+
+
+def test_unknown_heliostat_or_target(refused_post: Post):
+    assert "heliostat AB01" in refused_post(heliostat="AB01").json()["detail"]
+    answer = refused_post(target_name="middle")
+    assert answer.status_code == 404
+    assert "lower, upper" in answer.json()["detail"]
+
+
+@pytest.mark.parametrize("data", [b"", b"GIF89a", b"<svg xmlns='http://www.w3.org/2000/svg'/>", b"\x00" * 100])
+def test_file_of_another_format(refused_post: Post, data: bytes):
+    answer = refused_post(data)
+    assert answer.status_code == 415
+    assert "PNG" in answer.json()["detail"]
+
+
+@pytest.mark.parametrize("data", [png()[:60], png()[:-20], png() + b"PK\x03\x04", b"\xff\xd8\xff\xe0 no more"])
+def test_broken_file_is_refused(refused_post: Post, data: bytes):
+    assert refused_post(data).status_code == 422
+
+
+def test_too_many_pixels(refused_post: Post):
+    flat = cv2.imencode(".png", np.full((1000, 1000), 7, np.uint8))[1].tobytes()
+    answer = refused_post(flat)
+    assert answer.status_code == 422
+    assert "pixels" in answer.json()["detail"]
+
+
+def test_too_many_bytes(post: Post, settings: Settings):
+    for size in (settings.max_image_bytes + 1, settings.max_image_bytes + 200_000):
+        answer = post(png() + bytes(size - len(png())))
+        assert answer.status_code == 413
+        assert "bytes allowed" in answer.json()["detail"]
+
+
+def test_body_without_announced_length_is_stopped(client: TestClient, settings: Settings):
+    sent = 0
+
+    def endless() -> Any:
+        nonlocal sent
+        yield b'--b\r\nContent-Disposition: form-data; name="image"; filename="a.png"\r\n\r\n'
+        while sent < 100 * settings.max_image_bytes:
+            sent += 50_000
+            yield bytes(50_000)
+
+    answer = client.post(BASE, content=endless(), headers={"Content-Type": "multipart/form-data; boundary=b"})
+    assert answer.status_code == 413
+
+
+@pytest.mark.parametrize("content_type", ["application/json", "image/png", "text/plain", ""])
+def test_body_that_is_no_form(refusing: TestClient, content_type: str):
+    headers = {"Content-Type": content_type} if content_type else {}
+    answer = refusing.post(BASE, content=png(), headers=headers)
+    assert answer.status_code == 415
+    assert "multipart/form-data" in answer.json()["detail"]
+
+
+def test_form_without_its_parts(refusing: TestClient):
+    answer = refusing.post(BASE, files={"other": ("x", b"y")})
+    assert answer.status_code == 422
+    assert {error["field"] for error in answer.json()["errors"]} == {"image", "metadata"}
+    broken = refusing.post(BASE, content=b"nothing", headers={"Content-Type": "multipart/form-data; boundary=b"})
+    assert broken.status_code in (400, 422)
+    no_boundary = refusing.post(BASE, content=b"nothing", headers={"Content-Type": "multipart/form-data"})
+    assert no_boundary.status_code in (400, 422)
+
+
+# --- at the same time -------------------------------------------------------------------------------------------------
+
+
+def test_same_image_from_many_clients_is_one_measurement(
+    store_url: URL, tmp_path: Path, tower: dict[str, Any], properties: dict[str, Any]
+):
+    """All requests pass the first look-up before any of them writes, and still one measurement comes of them."""
+    clients = 6
+    together = threading.Barrier(clients)
+
+    class Waiting(FakeOperations):
+        def measure(self, *arguments: Any, **options: Any) -> Any:
+            together.wait(timeout=20)
+            return super().measure(*arguments, **options)
+
+    url = store_url.render_as_string(hide_password=False)
+    settings = Settings(data_dir=tmp_path / "data", database_url=url, parallel_computations=clients)
+    files = {"image": ("spot.png", png(), "image/png")}
+    with client_of(create_app(settings, Waiting())) as client:
+        client.put("/v1/plant", json=tower)
+        client.put("/v1/heliostats/AA39", json=properties)
+        with ThreadPoolExecutor(clients) as pool:
+            sending = [
+                pool.submit(client.post, BASE, files=files, data={"metadata": json.dumps(metadata(id="7"))})
+                for _ in range(clients)
+            ]
+            answers = [future.result() for future in sending]
+        assert sorted(answer.status_code for answer in answers) == [200] * (clients - 1) + [201]
+        assert len({answer.text for answer in answers}) == 1
+        assert len(client.get(BASE).json()["items"]) == 1

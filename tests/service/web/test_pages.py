@@ -1,0 +1,434 @@
+"""The pages as a client without a browser sees them: each answers, escapes what it shows, and asks nobody else."""
+
+import re
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from fastapi import FastAPI
+from fastapi.testclient import TestClient
+
+from service import store
+from service.base.settings import Settings
+from service.store import keys
+from service.web.answers.pages import ASSETS
+from service.web.app import create_app
+from service.web.door import security
+from service.web.pages.field import METRICS
+from service.web.pages.login import own_path
+from tests.service.conftest import QUIET, FakeOperations, client_of, png, poster, properties_document, tower_document
+from tests.service.twin.test_versions import SLOPE, study_row
+
+HTML = {"Accept": "text/html,application/xhtml+xml"}
+HTMX = {"HX-Request": "true"}
+
+# What a browser would load or follow: nothing of it may name another host.
+_LINK = re.compile(r"""(?:href|src|action|hx-get|hx-post|sse-connect|data|poster|srcset)\s*=\s*["']([^"']*)["']""")
+
+
+def fill(client: TestClient) -> None:
+    """Photographs, one of them refused, two surfaces, a forecast, and a job that waits."""
+    post = poster(client)
+    assert post(png(1), id="101").status_code == 201
+    assert post(png(2), id="102", sun_azimuth=-30.0).status_code == 201
+    assert post(png(3, refused=True), id="103").status_code == 201
+    for _ in range(2):
+        assert client.post("/v1/heliostats/AA39/surfaces", json={}).status_code == 201
+    sun = {"azimuth_deg": -20, "elevation_deg": 45}
+    assert client.post("/v1/forecasts", json={"heliostat": "AA39", "target": "lower", "sun": sun}).status_code == 201
+    assert client.post("/v1/jobs/imports", json={"folder": "<script>alert(1)</script>"}).status_code == 202
+    client.headers.update(HTML)
+
+
+def keep_study(app: FastAPI, *effects: dict[str, Any], **about: Any) -> int:
+    """A study that somebody made, with what no report of ours would hold."""
+    row = study_row(*effects, **about)
+    row.conclusion, row.html = "<img src=x onerror=alert(1)>", "<style>p{}</style><p>found</p><script>alert(1)</script>"
+    with app.state.runtime.database.writing() as session:
+        return store.add_study(session, row).id
+
+
+@pytest.fixture
+def pages(client: TestClient) -> TestClient:
+    """A filled store."""
+    fill(client)
+    return client
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
+    """The same for tests that only look."""
+    settings = Settings(data_dir=tmp_path_factory.mktemp("shown"), **QUIET)
+    with client_of(create_app(settings, FakeOperations())) as client:
+        client.put("/v1/plant", json=tower_document())
+        client.put("/v1/heliostats/AA39", json=properties_document())
+        fill(client)
+        keep_study(client.app, SLOPE)  # type: ignore[arg-type]
+        yield client
+
+
+PATHS = (
+    "/",
+    "/?metric=age",
+    "/heliostats/AA39",
+    "/heliostats/AA39?version=1",
+    "/forecast",
+    "/forecast?heliostat=AA39",
+    "/forecasts/1",
+    "/jobs",
+    "/jobs/1",
+    "/studies",
+    "/studies/1",
+    "/login",
+    "/nothing",
+    "/heliostats/none",
+)
+
+
+def text_of(client: TestClient, path: str, status: int = 200) -> str:
+    answer = client.get(path)
+    assert answer.status_code == status, answer.text
+    assert answer.headers["Content-Type"].startswith("text/html")
+    return str(answer.text)
+
+
+def settled(client: TestClient, path: str = "/") -> str:
+    """The field's page when nothing is being worked out any more."""
+    for _ in range(100):
+        page = text_of(client, path)
+        if "being worked out" not in page:
+            return page
+        time.sleep(0.05)
+    raise AssertionError("accuracies are never done")
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_page_loads_nothing_from_elsewhere_and_runs_nothing_of_its_own(shown: TestClient, path: str):
+    answer = shown.get(path)
+    assert answer.headers["Content-Type"].startswith("text/html")
+    policy = answer.headers["Content-Security-Policy"]
+    assert "default-src 'self'" in policy
+    assert "unsafe" not in policy
+    for link in _LINK.findall(answer.text):
+        assert re.match(r"/(?!/)|data:image/|#|\?", link) or ":" not in link, link
+    # What the policy would refuse must not be there.
+    assert not re.search(r"<script(?![^>]* src=)|<[^>]*\s(?:on[a-z]+|style)=|<style|javascript:", answer.text)
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_page_has_landmarks_one_heading_and_labels(shown: TestClient, path: str):
+    page = shown.get(path).text
+    assert '<html lang="en">' in page
+    assert page.count("<main") == page.count("<h1") == 1
+    assert 'class="skip" href="#main"' in page
+    for control in re.findall(r"<(?:input|select)\b[^>]*>", page):
+        if 'type="hidden"' not in control:
+            name = re.search(r'id="([^"]+)"', control)
+            is_inside = re.search(r"<label[^>]*>[^<]*(?:<(?!/label)[^>]*>)*[^<]*" + re.escape(control), page)
+            assert is_inside or (name and f'for="{name[1]}"' in page), control
+    for drawing in re.findall(r"<(?:svg|canvas|img|progress)\b[^>]*>", page):
+        assert re.search(r"aria-label|alt=", drawing), drawing
+    numbers = re.findall(r'\bid="([^"]+)"', page)
+    assert len(numbers) == len(set(numbers))
+
+
+def test_what_senders_wrote_is_escaped(shown: TestClient):
+    page = text_of(shown, "/jobs/1")
+    assert "&lt;script&gt;alert(1)&lt;/script&gt;" in page
+    assert "<script>alert" not in page
+    for path in ("/studies", "/studies/1"):
+        page = text_of(shown, path)
+        assert "&lt;img src=x" in page
+        assert "<img src=x" not in page
+    for path in ("/?metric=<script>alert(1)</script>", "/heliostats/<script>alert(1)<script>", "/<script>alert(1)"):
+        assert "<script>alert" not in shown.get(path).text
+
+
+def test_assets_come_from_the_package_and_stay_in_the_browser(shown: TestClient):
+    found = set(re.findall(r'"(/static/[^"]+)"', "".join(text_of(shown, p) for p in ("/", "/heliostats/AA39"))))
+    assert {path.partition("?")[0] for path in found} == {
+        f"/static/{name}"
+        for name in ("app.css", "icon.svg", "htmx.min.js", "htmx-sse.min.js", "map.js", "surface3d.js")
+    }
+    for path in found:
+        answer = shown.get(path)
+        assert answer.status_code == 200
+        assert "immutable" in answer.headers["Cache-Control"]
+        assert re.match(r"text/(css|javascript)|image/svg\+xml", answer.headers["Content-Type"])
+    for path in ("/static/LICENSES.md", "/static/none.js", "/static/..%2fapp.py", "/static/%2e%2e/app.py"):
+        assert shown.get(path).status_code == 404
+
+
+def test_no_asset_names_another_host():
+    for entry in ASSETS.iterdir():
+        if entry.name.endswith((".js", ".css", ".svg")):
+            text = entry.read_text("utf-8")
+            # The one name is that of SVG's vocabulary, which nothing is fetched from.
+            hosts = set(re.findall(r"https?://[A-Za-z0-9.-]+", text)) - {"http://www.w3.org"}
+            assert not hosts, entry.name
+            assert not re.search(r"@import|url\(|\beval\b(?!.*allowEval)", text) or entry.name == "htmx.min.js"
+
+
+def test_empty_store_says_what_to_do(bare: TestClient):
+    bare.headers.update(HTML)
+    assert "heliotwin import" in text_of(bare, "/")
+    assert "import a folder first" in text_of(bare, "/forecast")
+    assert "None yet" in text_of(bare, "/jobs")
+
+
+@pytest.mark.parametrize("metric", METRICS)
+def test_field_shows_every_figure_as_colour_and_as_number(shown: TestClient, metric: str):
+    page = settled(shown, f"/?metric={metric}")
+    assert f'<h2 id="map-title">{METRICS[metric].label}</h2>' in page
+    label = re.search(r'aria-label="AA39: ([^"]+)"', page)
+    assert label is not None
+    number = label[1].split("\N{NO-BREAK SPACE}")[0]
+    assert f'<td class="number">{number}</td>' in page
+    assert re.search(r'<circle [^>]*fill="#[0-9a-f]{6}"', page)
+
+
+def test_accuracy_is_worked_out_once_for_each_surface(pages: TestClient, operations: FakeOperations):
+    # The stand-in forecasts what was measured.
+    assert "AA39: 100.0" in settled(pages)
+    rendered = operations.rendered
+    assert rendered > 0
+    settled(pages)
+    assert operations.rendered == rendered
+    assert pages.post("/v1/heliostats/AA39/surfaces", json={}).status_code == 201
+    settled(pages)
+    assert operations.rendered == rendered + 1
+
+
+def test_heliostat_without_anything_is_drawn_hollow(pages: TestClient, properties: dict[str, Any]):
+    assert pages.put("/v1/heliostats/AB01", json=properties).status_code == 201
+    page = settled(pages)
+    assert 'aria-label="AB01: not known"' in page
+    assert 'class="unknown"' in page
+    assert "No surface yet" in text_of(pages, "/heliostats/AB01")
+
+
+def test_heliostat_page_tells_all_of_it(shown: TestClient):
+    page = text_of(shown, "/heliostats/AA39")
+    for heading in ("Surface 2", "Measured against forecast", "History", "Photographs"):
+        assert heading in page
+    assert page.count('alt="measured flux of') == 2
+    assert "refused</span> no spot" in page
+    assert "100.0\N{NO-BREAK SPACE}%" in page
+    assert 'data-surface="{' in page
+    assert "not today&#39;s" in text_of(shown, "/heliostats/AA39?version=1")
+    assert shown.get("/heliostats/AA39?version=9").status_code == 404
+
+
+def form(**changes: Any) -> dict[str, Any]:
+    return {
+        "heliostat": "AA39",
+        "target": "lower",
+        "azimuth_deg": "-20",
+        "elevation_deg": "45",
+        "moment": "",
+        **changes,
+    }
+
+
+def test_forecast_form_leads_to_its_flux_map(pages: TestClient, operations: FakeOperations):
+    answer = pages.post("/forecast", data=form(), follow_redirects=False)
+    assert (answer.status_code, answer.headers["Location"]) == (303, "/forecasts/2")
+    page = text_of(pages, "/forecasts/2")
+    assert "AA39 on lower" in page
+    assert "2\N{NO-BREAK SPACE}W/m²" in page
+    assert operations.forecasts[-1]["heliostat"] == "AA39"
+
+
+def test_forecast_form_takes_a_time(pages: TestClient, operations: FakeOperations):
+    """At noon of a June day the sun stands high in the south of Jülich."""
+    answer = pages.post("/forecast", data=form(sun_by="time", moment="2026-06-21T11:36"), follow_redirects=False)
+    assert answer.status_code == 303
+    east, north, up = operations.forecasts[-1]["sun"]
+    assert abs(east) < 0.02
+    assert north < 0
+    assert up == pytest.approx(0.887, abs=0.002)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"sun_by": "time", "moment": "2026-06-21T00:00"}, "below the horizon"),
+        ({"sun_by": "time"}, "say when"),
+        ({"azimuth_deg": "", "elevation_deg": ""}, "say where the sun stands"),
+        ({"elevation_deg": "91"}, "elevation_deg"),
+        ({"target": "<b>"}, "target"),
+        ({"dni_w_m2": "nan"}, "dni_w_m2"),
+    ],
+)
+def test_forecast_form_says_what_is_wrong(shown: TestClient, changes: dict[str, str], said: str):
+    answer = shown.post("/forecast", data=form(**changes))
+    assert answer.status_code == 422
+    assert said in answer.text
+    assert "<h1" in answer.text
+    part = shown.post("/forecast", data=form(**changes), headers=HTMX)
+    assert part.text.startswith('<p class="alert" role="alert">')
+    assert part.headers["HX-Retarget"] == "#notice"
+
+
+def test_forecast_of_all_heliostats_is_a_job(pages: TestClient):
+    answer = pages.post("/forecast", data=form(heliostat=""), follow_redirects=False)
+    assert (answer.status_code, answer.headers["Location"]) == (303, "/jobs/2")
+    assert pages.post("/forecast", data=form(heliostat=""), headers=HTMX).headers["HX-Redirect"] == "/jobs/3"
+
+
+def test_jobs_are_asked_for_followed_and_cancelled(pages: TestClient):
+    asked = pages.post("/jobs/predictions", data={"heliostat": "AA39", "method": "refined"}, follow_redirects=False)
+    assert asked.headers["Location"] == "/jobs/2"
+    page = text_of(pages, "/jobs/2")
+    assert 'sse-connect="/v1/jobs/2/events"' in page
+    assert 'hx-trigger="every 2s"' in text_of(pages, "/jobs")
+    assert pages.get("/v1/jobs/2").json()["payload"]["heliostats"] == ["AA39"]
+    cancelled = pages.post("/jobs/2/cancel", follow_redirects=False)
+    assert cancelled.headers["Location"] == "/jobs/2"
+    page = text_of(pages, "/jobs/2")
+    assert "cancelled" in page
+    assert "sse-connect" not in page
+    actions = [entry["action"] for entry in pages.get("/v1/audit").json()["items"]]
+    assert actions[:2] == ["job.cancelled", "job.created"]
+
+
+def test_report_of_a_study_stands_in_a_frame_that_runs_nothing(shown: TestClient):
+    page = text_of(shown, "/studies/1")
+    assert re.search(r'<iframe[^>]* sandbox src="/studies/1/report" title="Report of study 1">', page)
+    report = shown.get("/studies/1/report")
+    assert "<p>found</p>" in report.text
+    policy = report.headers["Content-Security-Policy"]
+    assert "default-src 'none'" in policy
+    assert "script-src" not in policy
+    assert policy.endswith("frame-ancestors 'self'; sandbox")
+    assert report.headers["X-Frame-Options"] == "SAMEORIGIN"
+
+
+def test_study_is_adopted_and_withdrawn(app: FastAPI, pages: TestClient):
+    number = keep_study(app, SLOPE)
+    assert "Adopt slope error" in text_of(pages, f"/studies/{number}")
+    assert pages.post(f"/studies/{number}/adopt", follow_redirects=False).status_code == 303
+    page = text_of(pages, f"/studies/{number}")
+    assert "Adopted as version 2" in page
+    assert "Withdraw it" in page
+    assert "version <strong>2</strong>: slope error" in text_of(pages, "/studies")
+    assert pages.post(f"/studies/{number}/withdraw", follow_redirects=False).status_code == 303
+    assert "version <strong>1</strong>: the declared model" in text_of(pages, "/studies")
+    assert pages.post(f"/studies/{number}/withdraw").status_code == 409
+    actions = [entry["action"] for entry in pages.get("/v1/audit").json()["items"]]
+    assert actions[:2] == ["effect.withdrawn", "effect.adopted"]
+
+
+def test_doubtful_study_is_adopted_by_who_says_so(app: FastAPI, pages: TestClient):
+    number, empty = keep_study(app, SLOPE, verdict="unexplained"), keep_study(app)
+    assert 'name="force" value="true" required' in text_of(pages, f"/studies/{number}")
+    refused = pages.post(f"/studies/{number}/adopt")
+    assert refused.status_code == 409
+    assert "unexplained" in refused.text
+    assert pages.post(f"/studies/{number}/adopt", data={"force": "true"}, follow_redirects=False).status_code == 303
+    assert "nothing to adopt" in text_of(pages, f"/studies/{empty}")
+
+
+def test_accuracy_is_told_anew_for_another_model(app: FastAPI, pages: TestClient, operations: FakeOperations):
+    number = keep_study(app, SLOPE)
+    settled(pages)
+    rendered = operations.rendered
+    assert pages.post(f"/studies/{number}/adopt", follow_redirects=False).status_code == 303
+    settled(pages)
+    assert operations.rendered == rendered + 1
+
+
+def test_study_is_asked_for(pages: TestClient):
+    assert pages.post("/studies", follow_redirects=False).headers["Location"] == "/jobs/2"
+    assert pages.get("/v1/jobs/2").json()["kind"] == "studies"
+
+
+def test_large_field_lists_the_worst_and_on_demand_all(bare: TestClient, properties: dict[str, Any]):
+    assert bare.put("/v1/plant", json=tower_document()).status_code == 200
+    for number in range(102):
+        assert bare.put(f"/v1/heliostats/H{number:03}", json=properties).status_code == 201
+    bare.headers.update(HTML)
+    page, whole = text_of(bare, "/"), text_of(bare, "/?whole=true")
+    assert (page.count('<th scope="row">'), whole.count('<th scope="row">')) == (100, 102)
+    assert page.count("<circle") == whole.count("<circle") == 102
+    assert "All 102 heliostats" in page
+
+
+def test_rest_answers_browsers_in_json_as_ever(shown: TestClient):
+    answer = shown.get("/v1/heliostats/none")
+    assert answer.headers["Content-Type"] == "application/problem+json"
+
+
+# --- the door ---------------------------------------------------------------------------------------------------------
+
+
+def make_key(app: FastAPI, role: str) -> str:
+    with app.state.runtime.database.writing() as session:
+        return keys.create(session, role, role, "tester")
+
+
+def test_browser_without_a_key_is_sent_to_the_login(app: FastAPI, pages: TestClient):
+    make_key(app, "read")
+    answer = pages.get("/heliostats/AA39?version=1", follow_redirects=False)
+    assert (answer.status_code, answer.headers["Location"]) == (303, "/login?next=%2Fheliostats%2FAA39%3Fversion%3D1")
+    assert 'value="/heliostats/AA39?version=1"' in pages.get(answer.headers["Location"]).text
+    part = pages.get("/jobs", headers=HTMX)
+    assert (part.status_code, part.headers["HX-Redirect"]) == (401, "/login?next=%2Fjobs")
+    assert pages.get("/", headers={"Accept": "*/*"}).status_code == 401
+    assert pages.post("/forecast", data=form(), follow_redirects=False).status_code == 401
+    assert pages.get("/v1/heliostats", follow_redirects=False).status_code == 401
+
+
+def test_login_keeps_the_key_and_logout_forgets_it(app: FastAPI, pages: TestClient):
+    key = make_key(app, "read")
+    assert pages.post("/login", data={"key": "htw_wrong"}).status_code == 401
+    answer = pages.post("/login", data={"key": f" {key} ", "next": "/jobs"}, follow_redirects=False)
+    assert (answer.status_code, answer.headers["Location"]) == (303, "/jobs")
+    assert "HttpOnly" in answer.headers["Set-Cookie"]
+    assert "SameSite=strict" in answer.headers["Set-Cookie"]
+    page = text_of(pages, "/jobs")
+    assert 'read <span class="role">read</span>' in page
+    assert pages.post("/logout", follow_redirects=False).headers["Location"] == "/login"
+    assert pages.cookies.get(security.COOKIE) is None
+    assert pages.get("/jobs", follow_redirects=False).status_code == 303
+
+
+def test_reader_sees_no_buttons_and_may_not_press_them(app: FastAPI, pages: TestClient):
+    pages.headers["Authorization"] = f"Bearer {make_key(app, 'read')}"
+    assert "Predict" not in settled(pages)
+    assert "Cancel" not in text_of(pages, "/jobs/1")
+    assert "forecasts need the role operate" in text_of(pages, "/forecast")
+    assert "Study the photographs" not in text_of(pages, "/studies")
+    for path in ("/forecast", "/jobs/predictions", "/jobs/1/cancel", "/studies", "/studies/1/adopt"):
+        answer = pages.post(path, data=form() if path == "/forecast" else {})
+        assert answer.status_code == 403
+        assert "needs operate" in answer.text
+
+
+def test_form_of_another_site_changes_nothing(shown: TestClient):
+    answer = shown.post("/jobs/1/cancel", headers={"Sec-Fetch-Site": "cross-site"})
+    assert answer.status_code == 403
+    assert shown.get("/v1/jobs/1").json()["state"] == "queued"
+
+
+@pytest.mark.parametrize(
+    "wanted",
+    [
+        "//evil.example",
+        "/\\evil.example",
+        "https://evil.example",
+        "evil",
+        "/a\r\nSet-Cookie: b=c",
+        "/%2f/evil",
+        "",
+        "/\t/x",
+    ],
+)
+def test_login_leads_nowhere_else(wanted: str):
+    assert own_path(wanted) == "/"
+
+
+@pytest.mark.parametrize("wanted", ["/", "/?metric=age", "/heliostats/AA39?version=2", "/jobs/7"])
+def test_login_leads_back(wanted: str):
+    assert own_path(wanted) == wanted

@@ -1,0 +1,240 @@
+"""The pages in a real browser: what an operator does in a shift, by mouse and by keyboard, on a desk and on a phone.
+
+Needs Chromium, `HELIOTWIN_TEST_CHROMIUM` or one on the path, and its driver from the package playwright.
+"""
+
+import os
+import shutil
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fastapi import FastAPI
+from sqlalchemy import delete
+
+from service.base.settings import Settings
+from service.store import keys
+from service.store.tables import KeyRow
+from service.web.app import create_app
+from tests.service.conftest import (
+    QUIET,
+    FakeOperations,
+    client_of,
+    free_port,
+    png,
+    poster,
+    properties_document,
+    serving,
+    tower_document,
+)
+
+playwright = pytest.importorskip("playwright.sync_api", reason="no browser driver: pip install playwright")
+expect = playwright.expect
+expect.set_options(timeout=40_000)
+
+CHROMIUM = os.environ.get("HELIOTWIN_TEST_CHROMIUM") or shutil.which("chromium") or shutil.which("google-chrome")
+FLAGS = [
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
+DESK, PHONE = {"width": 1280, "height": 900}, {"width": 390, "height": 844}
+PATHS = ("/", "/heliostats/AA39", "/heliostats/AB01", "/forecast", "/forecasts/1", "/studies", "/jobs", "/jobs/1")
+
+
+class GatedOperations(FakeOperations):
+    """Predicts while its gate is open."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.gate = threading.Event()
+        self.gate.set()
+
+    def predict(self, *arguments: Any, **options: Any) -> Any:
+        assert self.gate.wait(60)
+        return super().predict(*arguments, **options)
+
+
+@dataclass
+class Served:
+    """A service that listens."""
+
+    app: FastAPI
+    address: str
+    operations: GatedOperations
+
+
+def fill(app: FastAPI) -> None:
+    with client_of(app) as client:
+        assert client.put("/v1/plant", json=tower_document()).status_code == 200
+        for name, north in (("AA39", 0.0), ("AB01", 3e-4)):
+            properties = properties_document()
+            properties["heliostat_position"][0] += north
+            assert client.put(f"/v1/heliostats/{name}", json=properties).status_code == 201
+        send = poster(client)
+        for seed, azimuth in enumerate((20.0, -30.0)):
+            assert send(png(seed), id=f"10{seed}", sun_azimuth=azimuth).status_code == 201
+        assert client.post("/v1/heliostats/AA39/surfaces", json={}).status_code == 201
+        sun = {"azimuth_deg": -20, "elevation_deg": 45}
+        body = {"heliostat": "AA39", "target": "lower", "sun": sun}
+        assert client.post("/v1/forecasts", json=body).status_code == 201
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    """A service on a port of this machine, with one worker."""
+    folder = tmp_path_factory.mktemp("served")
+    settings = Settings(data_dir=folder, port=free_port(), job_poll_s=0.05, **QUIET | {"job_workers": 1})
+    fill(create_app(settings, FakeOperations()))
+    operations = GatedOperations()
+    app = create_app(settings, operations)
+    with serving(app, settings.port, ws="none") as address:
+        try:
+            yield Served(app, address, operations)
+        finally:
+            operations.gate.set()
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    if CHROMIUM is None:
+        pytest.skip("no Chromium: apt-get install chromium, or set HELIOTWIN_TEST_CHROMIUM")
+    with playwright.sync_playwright() as driver:
+        opened = driver.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        yield opened
+        opened.close()
+
+
+@pytest.fixture
+def page(browser: Any, served: Served) -> Iterator[Any]:
+    """A fresh browser window; at the end nothing went elsewhere, and no policy was broken."""
+    context = browser.new_context(base_url=served.address, viewport=DESK)
+    context.set_default_timeout(40_000)
+    opened, elsewhere, complaints = context.new_page(), [], []
+    context.on("request", lambda r: None if r.url.startswith((served.address, "data:")) else elsewhere.append(r.url))
+    opened.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
+    opened.on("pageerror", lambda error: complaints.append(str(error)))
+    yield opened
+    context.close()
+    assert not elsewhere
+    # Refusals that a test provokes are answers with a status; anything else is a fault of the page.
+    assert not [text for text in complaints if "status of 4" not in text and "Status Error Code 4" not in text]
+
+
+def follow(page: Any, selector: str) -> None:
+    """Press a link or button and wait for where it leads."""
+    with page.expect_navigation():
+        page.click(selector)
+
+
+def test_operator_looks_at_the_field_and_at_a_heliostat(page: Any):
+    page.goto("/")
+    expect(page.locator("#map-title")).to_have_text("Forecast accuracy")
+    expect(page.locator('[data-map] a[aria-label^="AA39: 100.0"]')).to_be_attached()
+    page.select_option("#metric", "deviation")
+    expect(page.locator("#map-title")).to_have_text("Surface error")
+    assert page.url.endswith("/?metric=deviation")
+    # By keyboard: one tab stop for the map, arrows to the neighbour, Enter to its page.
+    expect(page.locator('[data-map] a[tabindex="0"]')).to_have_count(1)
+    page.locator('[data-map] a[aria-label^="AA39"]').focus()
+    page.keyboard.press("ArrowUp")
+    assert page.evaluate("document.activeElement.getAttribute('aria-label')") == "AB01: not known"
+    page.keyboard.press("ArrowDown")
+    with page.expect_navigation():
+        page.keyboard.press("Enter")
+    expect(page.locator("h1")).to_have_text("Heliostat AA39")
+    before = page.locator("canvas").screenshot()
+    page.locator("canvas").focus()
+    page.keyboard.press("ArrowRight")
+    assert page.locator("canvas").screenshot() != before
+    assert float(page.locator("[data-exaggeration]").inner_text()) > 1
+
+
+def test_operator_asks_for_a_forecast(page: Any):
+    page.goto("/forecast")
+    page.fill("[name=azimuth_deg]", "-20")
+    page.fill("[name=elevation_deg]", "45")
+    page.check("[value=time]")
+    page.fill("[name=moment]", "2026-06-21T00:00")
+    page.click("form.stack button")
+    expect(page.locator("#notice [role=alert]")).to_contain_text("below the horizon")
+    page.check("[value=position]")
+    page.click("form.stack button")
+    expect(page.locator("#result h2").first).to_have_text("AA39 on lower")
+    expect(page.locator("#result svg image")).to_be_visible()
+    expect(page.locator("#notice")).to_be_empty()
+    assert "/forecasts/" in page.url
+
+
+def test_operator_follows_and_cancels_a_job(page: Any, served: Served):
+    served.operations.gate.clear()
+    page.goto("/heliostats/AA39")
+    follow(page, "text=Predict its surface")
+    first = page.url
+    expect(page.locator("#progress-title")).to_have_text("running")
+    # The one worker is held up, so another job waits, and ends as soon as it is cancelled.
+    page.goto("/heliostats/AA39")
+    follow(page, "text=Predict its surface")
+    follow(page, "text=Cancel")
+    expect(page.locator("#progress-title")).to_have_text("cancelled")
+    page.goto(first)
+    expect(page.locator("#progress-title")).to_have_text("running")
+    served.operations.gate.set()
+    expect(page.locator("#progress-title")).to_have_text("done")  # without a reload: by server-sent events
+    expect(page.locator("#job-state")).to_have_text("done")
+    expect(page.locator("text=AA39, version 2")).to_be_visible()
+    page.goto("/jobs")
+    expect(page.locator("tbody .state")).to_have_text(["cancelled", "done"])
+
+
+def test_pages_fit_desk_and_phone(page: Any):
+    for size in (DESK, PHONE):
+        page.set_viewport_size(size)
+        for path in PATHS:
+            page.goto(path)
+            too_wide = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
+            assert page.evaluate(too_wide) <= 0, (path, size)
+            page.keyboard.press("Tab")
+            assert page.evaluate("document.activeElement.className") == "skip"
+            assert page.evaluate("getComputedStyle(document.activeElement).outlineStyle") == "solid"
+
+
+def test_text_has_contrast(page: Any):
+    """WCAG 2.2 AA: 4.5 for text; measured on what the browser computed."""
+    script = (Path(__file__).parent / "contrast.js").read_text("utf-8")
+    for path in PATHS:
+        page.goto(path)
+        assert page.evaluate(script) == [], path
+
+
+@pytest.fixture
+def key(served: Served) -> Iterator[str]:
+    """A reader's key; while there is one, everybody needs one."""
+    database = served.app.state.runtime.database
+    with database.writing() as session:
+        made = keys.create(session, "visitor", "read", "tester")
+    yield made
+    with database.writing() as session:
+        session.execute(delete(KeyRow))
+
+
+def test_who_has_no_key_logs_in_and_out(page: Any, key: str):
+    page.goto("/heliostats/AA39")
+    assert "/login" in page.url
+    page.fill("[name=key]", "htw_nonsense")
+    follow(page, "text=Log in >> nth=-1")
+    expect(page.locator("[role=alert]")).to_contain_text("not valid")
+    page.goto("/login?next=/heliostats/AA39")
+    page.fill("[name=key]", key)
+    page.keyboard.press("Enter")
+    expect(page.locator("h1")).to_have_text("Heliostat AA39")
+    assert page.locator("text=Predict its surface").count() == 0
+    follow(page, "text=Log out")
+    assert page.url.endswith("/login")
