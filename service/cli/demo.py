@@ -22,11 +22,12 @@ from model.tracing import Optics
 from service.base.arrays import unpack
 from service.base.settings import Settings
 from service.cli.demo_plant import write_plant
-from service.cli.folder import choose, observe, surface_errors, write_json
+from service.cli.folder import observations_of, surface_errors, write_json
 from service.drawing.pictures import comparison_picture, surface_picture
 from service.sources.folder import MeasurementFolder, measured_heights, read_folder
 from service.twin import compute
 from service.twin.compute import Method
+from service.twin.evidence import choose
 from service.twin.forecast import ForecastRequest, make_forecast
 from service.twin.importing import import_folder
 from service.twin.prediction import predict_surface
@@ -112,12 +113,11 @@ def _predict_all(
     task = bars.add_task("predict and forecast", total=len(folder.plant.heliostats))
     for name in folder.plant.heliostats:
         bars.update(task, description=f"predict and forecast {name}")
-        observed = [observe(folder, measurement) for measurement in folder.measurements(name)]
-        usable = [o for o in observed if isinstance(o, Observation)]
+        usable, refused = observations_of(folder, name)
         if usable:
             results.append(_predict(runtime, folder, name, usable, out))
         else:
-            skipped[name] = next((o for o in observed if isinstance(o, str)), "no image")
+            skipped[name] = next(iter(refused.values()), "no image")
         bars.update(task, advance=1)
     return results, skipped
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from model.errors import InvalidInputError, ModelError
 from model.imaging import ImageKind, MeasuredFlux, decode_image
 from model.metrics import compare_on_target, surface_error
 from model.network.architecture import MAX_IMAGES
-from model.observation import Observation, SurfacePrediction, spread_suns
+from model.observation import Observation, SurfacePrediction
 from model.plant import Heliostat, TargetPlane
 from model.surface import split_canting
 from service.base.progress import Progress, quiet
@@ -27,6 +27,7 @@ from service.sources.documents import IMAGE_KINDS, Measurement
 from service.sources.folder import MeasurementFolder, measured_heights, read_surface
 from service.twin import compute
 from service.twin.compute import Method
+from service.twin.evidence import Evidence, choose
 
 Array = NDArray[np.float64]
 
@@ -34,6 +35,9 @@ WINDOWS = (4.0, 6.0, 8.0)
 """Sides [m] of the accuracy's window: the paper's, unless more than `SPILL` of the measured energy lies outside."""
 
 SPILL = 0.01
+
+ROUGHEST_FIRST: tuple[ImageKind, ...] = ("raw", "cropped", "flux", "flux-centered")
+"""Kinds of image by how much is left to do to them."""
 
 
 def write_json(path: Path, content: Any) -> None:
@@ -55,11 +59,11 @@ def _measure(path: Path, kind: ImageKind, plane: TargetPlane) -> MeasuredFlux:
     return compute.measure(read_image(path), kind, plane)
 
 
-def measure(folder: MeasurementFolder, measurement: Measurement, kind: str | None = None) -> MeasuredFlux:
+def measure(folder: MeasurementFolder, measurement: Measurement, kind: ImageKind | None = None) -> MeasuredFlux:
     """Flux of a measurement's most worked-out image, or of its image of one kind."""
-    chosen = kind or next(k for k in IMAGE_KINDS if k in measurement.images)
+    chosen: ImageKind = kind or next(k for k in IMAGE_KINDS if k in measurement.images)
     plane = folder.plant.targets[measurement.target]
-    return _measure(measurement.images[chosen], cast(ImageKind, chosen), plane)
+    return _measure(measurement.images[chosen], chosen, plane)
 
 
 def _finish(folder: MeasurementFolder, report: dict[str, Any], path: Path, done: str) -> dict[str, Any]:
@@ -84,7 +88,7 @@ def flux_folder(folder: MeasurementFolder, out: Path, progress: Progress = quiet
             report["skipped"][name] = "no image"
         for measurement in measurements:
             progress(measurement.key)
-            kind = next((k for k in ("raw", "cropped", *IMAGE_KINDS) if k in measurement.images), "")
+            kind = next(k for k in ROUGHEST_FIRST if k in measurement.images)
             try:
                 measured = measure(folder, measurement, kind)
             except ModelError as error:
@@ -124,40 +128,46 @@ def write_gray(path: Path, image: NDArray[Any]) -> None:
 # --- predict ----------------------------------------------------------------------------------------------------------
 
 
-def observe(folder: MeasurementFolder, measurement: Measurement) -> Observation | str:
-    """What a measurement shows, or why it was refused."""
-    try:
-        measured = measure(folder, measurement)
-    except InvalidInputError as error:
-        return str(error)
+def evidence_of(folder: MeasurementFolder, measurement: Measurement) -> Evidence:
+    """What a measurement tells the model, of its most worked-out image.
+
+    Raises
+    ------
+    InvalidInputError
+        Where the image cannot be read, or is refused; the message says why.
+    """
+    measured, target = measure(folder, measurement), folder.plant.targets[measurement.target]
     if measured.centered is None:
-        return f"{measured.quality.reason}: {measured.quality.detail}"
-    target = folder.plant.targets[measurement.target]
-    spot = measurement.spot
-    if measured.center_of_mass is not None:
-        spot = target.to_enu(measured.center_of_mass)
-    return Observation(
-        flux=measured.centered,
+        raise InvalidInputError(f"{measured.quality.reason}: {measured.quality.detail}")
+    center = measured.center_of_mass
+    return Evidence(
+        identifier=measurement.identifier,
         sun=measurement.sun,
         target=target,
-        center_of_mass=target.center if spot is None else spot,
-        identifier=measurement.identifier,
+        flux=measured.flux,
+        centered=measured.centered,
+        spot=measurement.spot if center is None else target.to_enu(center),
         motor_position=measurement.motor_position,
+        taken_at=measurement.taken_at,
     )
 
 
-def choose(observations: list[Observation], count: int) -> list[Observation]:
-    """Up to ``count`` observations whose suns stand far apart."""
-    return [observations[i] for i in spread_suns(np.array([o.sun for o in observations]), count)]
+def observations_of(folder: MeasurementFolder, heliostat: str) -> tuple[list[Observation], dict[str, str]]:
+    """What a heliostat's images show, and why others were refused, by identifier."""
+    usable, refused = [], {}
+    for measurement in folder.measurements(heliostat):
+        try:
+            usable.append(evidence_of(folder, measurement).observation())
+        except InvalidInputError as error:
+            refused[measurement.identifier] = str(error)
+    return usable, refused
 
 
 def predict_heliostat(
     folder: MeasurementFolder, heliostat: Heliostat, method: Method, images: int
 ) -> tuple[SurfacePrediction, dict[str, Any]]:
     """Predict one heliostat's surface; the second value is its entry in ``predictions.json``."""
-    observed = {m.identifier: observe(folder, m) for m in folder.measurements(heliostat.name)}
-    usable = [o for o in observed.values() if isinstance(o, Observation)]
-    refused = {identifier: o for identifier, o in observed.items() if isinstance(o, str)}
+    usable, refused = observations_of(folder, heliostat.name)
     if not usable:
         reason = f"every image was refused: {next(iter(refused.values()))}" if refused else "no image"
         raise InvalidInputError(reason)

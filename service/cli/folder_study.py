@@ -5,22 +5,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from model.effects import Effect, effect_to_json
 from model.errors import InvalidInputError, ModelError
-from model.forecast import Shot
-from model.imaging.window import center_of_mass
-from model.plant import Heliostat, TargetPlane
 from model.study import Photograph, Study, StudyOptions, study
 from model.surface import DEGREE, control_points
 from service.base.progress import Progress, quiet
-from service.cli.folder import check_surfaces, measure, read_image, surface_of
-from service.sources.documents import Measurement, read_json
+from service.cli.folder import check_surfaces, evidence_of, surface_of
+from service.sources.documents import read_json
 from service.sources.folder import MeasurementFolder
-
-CENTERED_SIDE = 6.1
-"""Side [m] of PAINT's ``flux-centered.png``."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,8 +45,8 @@ def photographs_of(folder: MeasurementFolder, surfaces: str = "measured") -> tup
         points, degree = (control_points(heliostat), DEGREE) if surface is None else surface
         for measurement in folder.measurements(name):
             try:
-                photograph = _photograph(folder, measurement, heliostat, points, degree)
-                photographs.append(replace(photograph, seen=measurement.identifier in seen.get(name, ())))
+                evidence, was_used = evidence_of(folder, measurement), measurement.identifier in seen.get(name, ())
+                photographs.append(evidence.photograph(heliostat, points, degree, was_used))
             except ModelError as error:
                 skipped[measurement.key] = str(error)
     return photographs, skipped
@@ -69,41 +61,6 @@ def predicted_from(surfaces: str) -> dict[str, list[str]]:
         return {name: list(entry["images"]) for name, entry in read_json(path)["heliostats"].items()}
     except (KeyError, TypeError, AttributeError):
         raise InvalidInputError(f"{path} is not as `heliotwin predict` writes it") from None
-
-
-def _photograph(
-    folder: MeasurementFolder, measurement: Measurement, heliostat: Heliostat, points: np.ndarray, degree: int
-) -> Photograph:
-    """The flux of a measurement over its target, or over the crop that is all there is, and its shot."""
-    image, plane = _flux(folder, measurement)
-    spot = measurement.spot
-    if spot is None:
-        spot = plane.to_enu(center_of_mass(image, (plane.width, plane.height)))
-    across, up = plane.to_plane(spot)
-    if abs(across) > plane.width / 2 or abs(up) > plane.height / 2:
-        raise InvalidInputError(f"{measurement.key}: 'focal_spot' lies off its target {measurement.target}")
-    shot = Shot(heliostat, points, measurement.sun, plane, spot=spot, degree=degree, identifier=measurement.key)
-    return Photograph(shot, image, taken_at=measurement.taken_at)
-
-
-def _flux(folder: MeasurementFolder, measurement: Measurement) -> tuple[np.ndarray, TargetPlane]:
-    plane = folder.plant.targets[measurement.target]
-    if "flux" in measurement.images:
-        return _gray(measurement.images["flux"]), plane
-    if {"cropped", "raw"} & set(measurement.images):
-        measured = measure(folder, measurement)
-        if measured.flux is None:
-            raise InvalidInputError(f"{measurement.key}: {measured.quality.reason}: {measured.quality.detail}")
-        return np.asarray(measured.flux, dtype=np.float64), plane
-    if measurement.spot is None:
-        raise InvalidInputError(f"{measurement.key}: a centred flux without 'focal_spot' has no place on the target")
-    crop = replace(plane, center=measurement.spot, width=CENTERED_SIDE, height=CENTERED_SIDE)
-    return _gray(measurement.images["flux-centered"]), crop
-
-
-def _gray(path: Path) -> np.ndarray:
-    image = read_image(path).astype(np.float64)
-    return image.mean(axis=2) if image.ndim == 3 else image
 
 
 def study_folder(

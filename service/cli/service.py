@@ -8,6 +8,7 @@ import typer
 
 from service.cli.output import AsJson, console, make_table, progress, show
 from service.cli.photographs import Folder
+from service.cli.store import actor
 from service.store import database
 
 app = typer.Typer()
@@ -27,7 +28,7 @@ def import_(folder: Folder, as_json: AsJson = False) -> None:
         if runtime.settings.migrates_on_start:
             runtime.database.upgrade()
         with progress(None, "import") as step:
-            report = import_folder(runtime, source, step)
+            report = import_folder(runtime, source, step, actor())
     finally:
         runtime.close()
     table = make_table("Imported", "what", "count")

@@ -53,4 +53,4 @@ def import_allowed(context: Context, payload: ImportIn) -> Result:
     folder = read_folder(allowed_folder(context.runtime.settings.import_root, payload.folder))
     images = [len(item.images) for name in folder.plant.heliostats for item in folder.measurements(name, False)]
     steps = Steps(len(folder.plant.heliostats) + sum(images), context.report)
-    return Result(import_folder(context.runtime, folder, steps))
+    return Result(import_folder(context.runtime, folder, steps, context.created_by))

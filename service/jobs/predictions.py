@@ -7,7 +7,7 @@ from service.base.fields import Method, Model, ModelVersion
 from service.jobs.common import Heliostats, chosen_names, require_some
 from service.jobs.kind import Context, Result
 from service.twin import versions
-from service.twin.prediction import predict_surface
+from service.twin.prediction import compute_surface, keep_surface
 from service.twin.runtime import Runtime
 
 
@@ -43,15 +43,12 @@ def _model_number(runtime: Runtime, wanted: int | None) -> int:
 
 def _predict_step(context: Context, payload: PredictionsIn, name: str, model_version: int) -> None:
     try:
-        predict_surface(
-            context.runtime,
-            name,
-            payload.method,
-            images=payload.images,
-            actor=context.created_by,
-            also=lambda session, row: context.keep(session, name, {"version": row.version}),
-            model_version=model_version,
+        predicted = compute_surface(
+            context.runtime, name, payload.method, images=payload.images, model_version=model_version
         )
+        with context.runtime.database.writing() as session:
+            row = keep_surface(session, predicted, context.created_by)
+            context.keep(session, name, {"version": row.version})
     except SKIPPED as error:
         with context.runtime.database.writing() as session:
             context.keep(session, name, {"skipped": str(error)})

@@ -15,13 +15,15 @@ from numpy.typing import NDArray
 from model.effects import Effect, effects_from_json
 from model.errors import InvalidInputError
 from model.frames import sun_direction
+from model.imaging import ImageKind
 from model.mount import LinearActuator, Mount
 from model.plant import Cylinder, Facet, Heliostat, Plant, TargetPlane
 from model.sunshape import Buie, Gaussian, Pillbox, SunShape
 from model.tracing import Optics
+from service.sources.photograph import Photograph
 
 Array = NDArray[np.float64]
-IMAGE_KINDS = ("flux", "cropped", "raw", "flux-centered")
+IMAGE_KINDS: tuple[ImageKind, ...] = ("flux", "cropped", "raw", "flux-centered")
 """Kinds of image that a measurement may hold, the most worked-out one with a known place on the target first."""
 
 
@@ -51,7 +53,7 @@ class Measurement:
     elevation_deg: float
     spot: Array | None = None
     motor_position: Array | None = None
-    images: dict[str, Path] = field(default_factory=dict)
+    images: dict[ImageKind, Path] = field(default_factory=dict)
     taken_at: datetime | None = None
 
     @property
@@ -63,6 +65,21 @@ class Measurement:
     def key(self) -> str:
         """``heliostat/identifier``."""
         return f"{self.heliostat}/{self.identifier}"
+
+    def photograph(self, kind: ImageKind, plant: Plant) -> Photograph:
+        """What it says of its image of one kind."""
+        motors = None if self.motor_position is None else self.motor_position.tolist()
+        spot = None if self.spot is None else plant.to_wgs84(self.spot).tolist()
+        return Photograph(
+            target_name=self.target,
+            kind=kind,
+            sun_azimuth_deg=self.azimuth_deg,
+            sun_elevation_deg=self.elevation_deg,
+            external_id=self.identifier,
+            taken_at=self.taken_at,
+            motor_position=None if motors is None else (motors[0], motors[1]),
+            focal_spot_wgs84=None if spot is None else (spot[0], spot[1], spot[2]),
+        )
 
 
 def get(data: Any, where: str, *keys: str | int) -> Any:

@@ -4,7 +4,7 @@ Source: the PAINT database of the Solar Tower Juelich, https://paint-database.or
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +46,8 @@ class MeasurementFolder:
         Those of the declared model.
     skipped : dict
         Heliostats and measurements that are there but could not be read, with the reason.
+    properties : dict
+        The heliostats' property documents, by name, as their files have them.
     """
 
     root: Path
@@ -53,6 +55,7 @@ class MeasurementFolder:
     optics: Optics
     effects: tuple[Effect, ...]
     skipped: dict[str, str]
+    properties: dict[str, Any] = field(default_factory=dict)
 
     def measurements(self, heliostat: str, with_images: bool = True) -> list[Measurement]:
         """All measurements of a heliostat by identifier, or only those that have an image.
@@ -145,11 +148,13 @@ def read_folder(root: Path, heliostats: list[str] | None = None) -> MeasurementF
     origin, targets = read_targets(tower)
     found: dict[str, Heliostat] = {}
     skipped: dict[str, str] = {}
+    properties: dict[str, Any] = {}
     for path in sorted(root.glob("*/Properties/*heliostat-properties.json")):
         name = path.parent.parent.name
         if heliostats is None or name in heliostats:
             try:
-                found[name] = read_heliostat(name, read_json(path), origin)
+                document = read_json(path)
+                found[name], properties[name] = read_heliostat(name, document, origin), document
             except InvalidInputError as error:
                 skipped[name] = str(error)
     if not found:
@@ -157,7 +162,7 @@ def read_folder(root: Path, heliostats: list[str] | None = None) -> MeasurementF
     plant = Plant(
         towers[0].name.removesuffix("-tower-measurements.json"), origin, targets, found, read_receivers(tower)
     )
-    return MeasurementFolder(root, plant, *read_declared(root / "twin.json"), skipped)
+    return MeasurementFolder(root, plant, *read_declared(root / "twin.json"), skipped, properties)
 
 
 def read_declared(path: Path) -> tuple[Optics, tuple[Effect, ...]]:

@@ -1,59 +1,18 @@
 """Images and measurements, as they are kept and found again."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
 from datetime import datetime
-from typing import Any
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
 from sqlalchemy import Select, func, select
 from sqlalchemy.orm import Session, undefer
 
 from service.base import names
-from service.base.arrays import pack
 from service.base.faults import ConflictError, NotFoundError
-from service.store.rows import ROUNDS, floats, insert
-from service.store.tables import HeliostatRow, ImageRow, MeasurementRow, TargetRow
+from service.store.rows import ROUNDS, insert
+from service.store.tables import HeliostatRow, ImageRow, MeasurementRow
 
 # Which image of a measurement to use where there are several: separated ones first, for they need no guess.
 PREFERENCE = ("flux", "cropped", "raw", "flux-centered")
-
-
-@dataclass(frozen=True)
-class NewImage:
-    """An image file that lies in the image store; size in bytes and pixels."""
-
-    sha256: str
-    media_type: str
-    size_bytes: int
-    width_px: int
-    height_px: int
-
-
-@dataclass(frozen=True, eq=False)
-class NewMeasurement:
-    """A measured photograph to be stored; units as in `service.store.tables.MeasurementRow`.
-
-    ``flux`` (256, 256) over the whole target and ``centered`` (64, 64) are None where the image was refused.
-    """
-
-    image: NewImage
-    kind: str
-    target: TargetRow
-    sun_azimuth_deg: float
-    sun_elevation_deg: float
-    accepted: bool
-    quality: dict[str, Any]
-    reason: str | None = None
-    external_id: str | None = None
-    motor_position: tuple[float, float] | None = None
-    taken_at: datetime | None = None
-    focal_spot_wgs84: tuple[float, float, float] | None = None
-    corners_px: dict[str, Any] | None = None
-    center_of_mass: ArrayLike | None = None
-    flux: NDArray[Any] | None = None
-    centered: NDArray[Any] | None = None
 
 
 def _measurements(heliostat: HeliostatRow) -> Select[MeasurementRow]:
@@ -118,57 +77,24 @@ def recent_measurements(
     return list(best.values())[:limit]
 
 
-def _put_image(session: Session, image: NewImage) -> None:
-    if session.get(ImageRow, image.sha256) is None:
-        insert(session, ImageRow(**asdict(image)))
-
-
-def _free_identifier(session: Session, heliostat: HeliostatRow, new: NewMeasurement) -> str:
+def _free_identifier(session: Session, heliostat: HeliostatRow, row: MeasurementRow) -> str:
     """Its own identifier; with the kind appended where another kind of image of the same measurement has it."""
-    wanted = new.external_id or new.image.sha256[:16]
-    for identifier in (wanted, f"{wanted}-{new.kind}"):
+    wanted = row.external_id or row.image_sha256[:16]
+    for identifier in (wanted, f"{wanted}-{row.kind}"):
         holder = find_measurement(session, heliostat, identifier)
         if holder is None:
             return identifier
-        if holder.kind == new.kind:
+        if holder.kind == row.kind:
             break
-    raise ConflictError(f"id: measurement {wanted} of heliostat {heliostat.name} has another {new.kind} image already")
+    raise ConflictError(f"id: measurement {wanted} of heliostat {heliostat.name} has another {row.kind} image already")
 
 
-def _center_columns(center: ArrayLike | None) -> dict[str, float]:
-    if center is None:
-        return {}
-    right, up = floats(center)
-    return {"center_right_m": right, "center_up_m": up}
+def add_measurement(
+    session: Session, heliostat: HeliostatRow, image: ImageRow, row: MeasurementRow
+) -> tuple[MeasurementRow, bool]:
+    """Store a measurement of ``image`` once, under an identifier that is free.
 
-
-def _measurement_row(heliostat: HeliostatRow, identifier: str, new: NewMeasurement) -> MeasurementRow:
-    arrays = {name: array for name, array in (("flux", new.flux), ("centered", new.centered)) if array is not None}
-    motors = new.motor_position or (None, None)
-    return MeasurementRow(
-        heliostat_id=heliostat.id,
-        identifier=identifier,
-        external_id=new.external_id,
-        image_sha256=new.image.sha256,
-        kind=new.kind,
-        target_id=new.target.id,
-        sun_azimuth_deg=new.sun_azimuth_deg,
-        sun_elevation_deg=new.sun_elevation_deg,
-        motor_axis_1=motors[0],
-        motor_axis_2=motors[1],
-        taken_at=new.taken_at,
-        focal_spot_wgs84=None if new.focal_spot_wgs84 is None else list(new.focal_spot_wgs84),
-        corners_px=new.corners_px,
-        accepted=new.accepted,
-        reason=new.reason,
-        quality=new.quality,
-        arrays=pack({name: np.asarray(array, np.float32) for name, array in arrays.items()}) if arrays else None,
-        **_center_columns(new.center_of_mass),
-    )
-
-
-def add_measurement(session: Session, heliostat: HeliostatRow, new: NewMeasurement) -> tuple[MeasurementRow, bool]:
-    """Store a measurement once; the second value is False where this image of this kind was there already.
+    The second value is False where this image of this kind was there already; the first is then the row that was.
 
     Raises
     ------
@@ -177,14 +103,16 @@ def add_measurement(session: Session, heliostat: HeliostatRow, new: NewMeasureme
     InvalidInputError
         Where the given id is no good name.
     """
-    if new.external_id is not None:
-        names.require(names.IDENTIFIER, new.external_id, "id")
-    _put_image(session, new.image)
+    if row.external_id is not None:
+        names.require(names.IDENTIFIER, row.external_id, "id")
+    if session.get(ImageRow, image.sha256) is None:
+        insert(session, image)
+    row.heliostat_id, row.image_sha256 = heliostat.id, image.sha256
     for _ in range(ROUNDS):
-        existing = find_measurement_of_image(session, heliostat, new.image.sha256, new.kind)
+        existing = find_measurement_of_image(session, heliostat, image.sha256, row.kind)
         if existing is not None:
             return existing, False
-        row = _measurement_row(heliostat, _free_identifier(session, heliostat, new), new)
+        row.identifier = _free_identifier(session, heliostat, row)
         if insert(session, row):
             session.refresh(row, ["target", "image"])
             return row, True

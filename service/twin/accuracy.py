@@ -20,12 +20,9 @@ from sqlalchemy.orm import Session
 from model.errors import ModelError
 from model.metrics import flux_accuracy
 from service import store
-from service.base.arrays import unpack
 from service.base.faults import ServiceError
-from service.base.meters import ACCURACY
 from service.store.tables import DriftRow, HeliostatRow, MeasurementRow, SurfaceRow
-from service.twin import versions
-from service.twin.evidence import load_heliostat, observation_of
+from service.twin.evidence import Evidence, Twin, evidence_of, heights_of, load_twin
 from service.twin.runtime import Runtime
 
 logger = logging.getLogger("heliotwin.service")
@@ -74,29 +71,23 @@ def compare(runtime: Runtime, name: str, surface: SurfaceRow | None) -> list[Com
         Where a photograph or the surface cannot be traced.
     """
     with runtime.database.reading() as session:
-        rows = _newest(session, store.get_heliostat(session, name))
-    return compare_measurements(runtime, name, rows, surface)
-
-
-def compare_measurements(
-    runtime: Runtime, name: str, rows: Sequence[MeasurementRow], surface: SurfaceRow | None
-) -> list[Comparison]:
-    """The same for accepted measurements of the heliostat, loaded with their arrays."""
-    with runtime.database.reading() as session:
-        heliostat = load_heliostat(session, store.get_heliostat(session, name))
-        origin, model = store.get_plant(session).origin, versions.get_model(session)
+        twin = load_twin(session, name)
+        rows = _newest(session, twin.row)
     if not rows:
         return []
-    observations = [observation_of(measurement, origin) for measurement in rows]
-    z = None if surface is None else unpack(surface.arrays)["z"]
-    with runtime.computing("compare") as operations:
-        forecasts = operations.render(heliostat, observations, z, model.optics, model.effects)
-
+    shown = [evidence_of(row, twin.origin) for row in rows]
     used = set() if surface is None else {measurement.id for measurement in surface.measurements}
     return [
-        Comparison(row, o.flux, forecast, flux_accuracy(o.flux, forecast), row.id in used)
-        for row, o, forecast in zip(rows, observations, forecasts, strict=True)
+        Comparison(row, evidence.centered, forecast, flux_accuracy(evidence.centered, forecast), row.id in used)
+        for row, evidence, forecast in zip(rows, shown, forecasts_of(runtime, twin, shown, surface), strict=True)
     ]
+
+
+def forecasts_of(runtime: Runtime, twin: Twin, shown: Sequence[Evidence], surface: SurfaceRow | None) -> NDArray[Any]:
+    """What a stored surface, or the ideal one, throws where each photograph shows its spot: (n, 64, 64), sum 100."""
+    observations, model = [evidence.observation() for evidence in shown], twin.model
+    with runtime.computing("compare") as operations:
+        return operations.render(twin.heliostat, observations, heights_of(surface), model.optics, model.effects)
 
 
 @dataclass(frozen=True)
@@ -180,34 +171,28 @@ class AccuracyBook:
         return None
 
 
-def judge(runtime: Runtime, heliostat: str, measurement: MeasurementRow) -> float | None:
-    """Hold an accepted photograph, loaded with its arrays, against the heliostat's current surface, and note it.
+# --- drift ------------------------------------------------------------------------------------------------------------
 
-    The accuracy [1]; None where the heliostat has no surface, or it cannot be told, which the log explains: the
-    photograph is stored already, and what watches over it must not refuse it.
+
+def judge(runtime: Runtime, twin: Twin, surface: SurfaceRow | None, shown: Evidence) -> float | None:
+    """Accuracy [1] with which the current surface, loaded with its arrays, forecasts a photograph that just came.
+
+    None where there is no surface, or it cannot be told, which the log explains: the photograph will be stored, and
+    what watches over it must not refuse it.
     """
+    if surface is None:
+        return None
     try:
-        return _judge(runtime, heliostat, measurement)
-    except (ModelError, SQLAlchemyError) as error:
-        logger.warning("the drift of heliostat %s cannot be told: %s", heliostat, error)
-    except Exception:  # whatever it is, the photograph is stored, and its sender must be told so
-        logger.exception("the drift of heliostat %s cannot be told", heliostat)
+        (forecast,) = forecasts_of(runtime, twin, [shown], surface)
+        return float(flux_accuracy(shown.centered, forecast))
+    except ModelError as error:
+        logger.warning("the drift of heliostat %s cannot be told: %s", twin.row.name, error)
+    except Exception:  # whatever it is, the photograph can be stored, and its sender must be told so
+        logger.exception("the drift of heliostat %s cannot be told", twin.row.name)
     return None
 
 
-def _judge(runtime: Runtime, name: str, measurement: MeasurementRow) -> float | None:
-    with runtime.database.reading() as session:
-        surface = store.find_surface_at(session, store.get_heliostat(session, name))
-    if surface is None:
-        return None
-    (compared,) = compare_measurements(runtime, name, [measurement], surface)
-    ACCURACY.observe(compared.accuracy)
-    with runtime.database.writing() as session:
-        _note(session, measurement, surface, compared.accuracy)
-    return compared.accuracy
-
-
-def _note(session: Session, measurement: MeasurementRow, surface: SurfaceRow, accuracy: float) -> None:
+def note(session: Session, measurement: MeasurementRow, surface: SurfaceRow, accuracy: float) -> None:
     """Keep it as the heliostat's, unless that of a photograph that was taken later stands there."""
     new = DriftRow(
         heliostat_id=measurement.heliostat_id,

@@ -1,9 +1,14 @@
-"""What the store knows of a heliostat, as the model takes it: mirrors, observations, photographs."""
+"""What measurements tell the model, wherever they come from: a photograph's way from a row, or a folder, to the model.
 
-from collections.abc import Sequence
-from dataclasses import replace
+The store and the command line's folders both make `Evidence` of a measurement; from there on there is one road to
+surfaces (`Evidence.observation`) and to studies (`Evidence.photograph`).
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from datetime import datetime
-from typing import Any
+from operator import attrgetter
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,57 +17,146 @@ from sqlalchemy.orm import Session
 from model.errors import InvalidInputError
 from model.forecast import Shot
 from model.frames import sun_direction, wgs84_to_enu
-from model.observation import Observation, spread_suns
+from model.observation import FLUX_WINDOW, Observation, spread_suns
 from model.plant import Heliostat, TargetPlane
 from model.study import Photograph
+from model.surface import DEGREE
 from service import store
 from service.base.arrays import unpack
 from service.base.faults import ConflictError
 from service.sources.documents import read_heliostat
-from service.store.tables import HeliostatRow, MeasurementRow
+from service.store.tables import HeliostatRow, MeasurementRow, SurfaceRow
+from service.twin import versions
+from service.twin.versions import PlantModel
 
-CENTERED_SIDE = 4.0
-"""Side [m] of a measurement's ``centered`` flux, all that there is of a photograph that shows no more."""
-
-
-def photograph_of(
-    row: MeasurementRow, heliostat: Heliostat, points: np.ndarray[Any, Any], origin: tuple[float, float, float]
-) -> Photograph:
-    """An accepted measurement, loaded with its arrays, as a study compares it; ``points`` (F, I, J, 3) [m]."""
-    image, plane = _flux(row, origin)
-    shot = Shot(
-        heliostat,
-        points,
-        sun_direction(row.sun_azimuth_deg, row.sun_elevation_deg),
-        plane,
-        spot=spot_of(row, store.target_plane(row.target), origin),
-        identifier=f"{heliostat.name}/{row.identifier}",
-    )
-    return Photograph(shot, image, taken_at=row.taken_at)
-
-
-def _flux(row: MeasurementRow, origin: tuple[float, float, float]) -> tuple[np.ndarray[Any, Any], TargetPlane]:
-    """The flux over the whole target, or over the crop that is all there is."""
-    plane, arrays = store.target_plane(row.target), unpack(row.arrays or b"")
-    if "flux" in arrays:
-        return arrays["flux"].astype(np.float64), plane
-    if row.focal_spot_wgs84 is None:
-        raise InvalidInputError("a centred flux without 'focal_spot' has no place on the target")
-    spot = spot_of(row, plane, origin)
-    if (np.abs(plane.to_plane(spot)) > np.array([plane.width, plane.height]) / 2).any():
-        raise InvalidInputError(f"'focal_spot' lies off its target {plane.name}")
-    crop = replace(plane, center=spot, width=CENTERED_SIDE, height=CENTERED_SIDE)
-    return arrays["centered"].astype(np.float64), crop
-
+Array = NDArray[np.float64]
+Item = TypeVar("Item")
 
 # The newest measurements, this many times as many as are wanted, stand for the mirror's present state; those that
 # are used are chosen among them for variety of the sun's position.
 _RECENT = 4
 
 
-def load_heliostat(session: Session, row: HeliostatRow) -> Heliostat:
-    """The model's heliostat of a stored one."""
-    return read_heliostat(row.name, row.properties, np.array(store.get_plant(session).origin))
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """An accepted measurement as the model takes it.
+
+    Attributes
+    ----------
+    identifier : str
+    sun : (3,)
+        Unit vector towards the sun.
+    target : TargetPlane
+    flux : (rows, columns) or None
+        Over the whole target; None where only the part about its centre of mass is known.
+    centered : (64, 64)
+        In a window of `FLUX_WINDOW` about the centre of mass, sum 100.
+    spot : (3,) [m] or None
+        Where the centre of mass lies, in ENU: as measured, else as the sender knew it.
+    motor_position : (2,) [steps] or None
+    taken_at : datetime or None
+    """
+
+    identifier: str
+    sun: Array
+    target: TargetPlane
+    flux: NDArray[Any] | None
+    centered: NDArray[np.float32]
+    spot: Array | None
+    motor_position: Array | None = None
+    taken_at: datetime | None = None
+
+    def observation(self) -> Observation:
+        """What it shows of the mirror."""
+        return Observation(
+            flux=self.centered,
+            sun=self.sun,
+            center_of_mass=np.array(self.target.center) if self.spot is None else self.spot,
+            target=self.target,
+            motor_position=self.motor_position,
+            identifier=self.identifier,
+        )
+
+    def photograph(self, heliostat: Heliostat, points: Array, degree: int = DEGREE, seen: bool = False) -> Photograph:
+        """It as a study compares it with the mirror of control points (F, I, J, 3) [m].
+
+        ``seen``: the mirror was found from this very photograph.
+
+        Raises
+        ------
+        InvalidInputError
+            Where it has no place on its target.
+        """
+        key = f"{heliostat.name}/{self.identifier}"
+        if self.spot is None:
+            raise InvalidInputError(f"{key}: a centred flux without 'focal_spot' has no place on the target")
+        if (np.abs(self.target.to_plane(self.spot)) > np.array([self.target.width, self.target.height]) / 2).any():
+            raise InvalidInputError(f"{key}: 'focal_spot' lies off its target {self.target.name}")
+        image, plane = self.flux, self.target
+        if image is None:  # the part about the spot is all there is
+            image, plane = self.centered, replace(plane, center=self.spot, width=FLUX_WINDOW, height=FLUX_WINDOW)
+        shot = Shot(heliostat, points, self.sun, plane, spot=self.spot, degree=degree, identifier=key)
+        return Photograph(shot, np.asarray(image, dtype=np.float64), taken_at=self.taken_at, seen=seen)
+
+
+def choose(items: Sequence[Item], count: int, sun_of: Callable[[Item], Array] = attrgetter("sun")) -> list[Item]:
+    """Up to ``count`` of what was seen under some sun, the suns far apart."""
+    return [items[index] for index in spread_suns(np.array([sun_of(item) for item in items]), count)]
+
+
+# --- out of the store -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Twin:
+    """A stored heliostat with the plant's model: all that tracing it takes but a surface and a sun."""
+
+    row: HeliostatRow
+    heliostat: Heliostat
+    origin: tuple[float, float, float]
+    model: PlantModel
+
+
+def load_twin(session: Session, name: str, model_version: int | None = None) -> Twin:
+    """A heliostat by its name, under a version of the plant's model, by default the current one.
+
+    Raises
+    ------
+    NotFoundError
+        Where the heliostat or the version is not stored.
+    ConflictError
+        Where the plant is not set.
+    """
+    row, origin = store.get_heliostat(session, name), store.get_plant(session).origin
+    heliostat = read_heliostat(row.name, row.properties, np.array(origin))
+    return Twin(row, heliostat, origin, versions.get_model(session, model_version))
+
+
+def heights_of(surface: SurfaceRow | None) -> Array | None:
+    """Control heights (4, 8, 8) [m] of a stored surface, loaded with its arrays; None for the ideal one."""
+    return None if surface is None else unpack(surface.arrays)["z"].astype(np.float64)
+
+
+def evidence_of(row: MeasurementRow, origin: tuple[float, float, float], target: TargetPlane | None = None) -> Evidence:
+    """An accepted measurement, loaded with its arrays; ``target`` where the row is not in the store yet."""
+    plane, arrays = target or store.target_plane(row.target), unpack(row.arrays or b"")
+    motors = (row.motor_axis_1, row.motor_axis_2)
+    return Evidence(
+        identifier=row.identifier,
+        sun=sun_direction(row.sun_azimuth_deg, row.sun_elevation_deg),
+        target=plane,
+        flux=arrays.get("flux"),
+        centered=arrays["centered"],
+        spot=_spot_of(row, plane, origin),
+        motor_position=None if None in motors else np.array(motors),
+        taken_at=row.taken_at,
+    )
+
+
+def _spot_of(row: MeasurementRow, plane: TargetPlane, origin: tuple[float, float, float]) -> Array | None:
+    if row.center_right_m is not None and row.center_up_m is not None:
+        return plane.to_enu((row.center_right_m, row.center_up_m))
+    return None if row.focal_spot_wgs84 is None else wgs84_to_enu(row.focal_spot_wgs84, origin)
 
 
 def choose_measurements(
@@ -84,9 +178,7 @@ def choose_measurements(
         raise ConflictError(f"heliostat {heliostat.name} has no accepted measurement of this time")
     if not recent:
         raise ConflictError(f"heliostat {heliostat.name} has no accepted measurement; post target images of it first")
-
-    suns = sun_direction([row.sun_azimuth_deg for row in recent], [row.sun_elevation_deg for row in recent])
-    return [recent[index] for index in spread_suns(suns, count)]
+    return choose(recent, count, lambda row: sun_direction(row.sun_azimuth_deg, row.sun_elevation_deg))
 
 
 def named_measurements(session: Session, heliostat: HeliostatRow, names: Sequence[str]) -> list[MeasurementRow]:
@@ -96,26 +188,3 @@ def named_measurements(session: Session, heliostat: HeliostatRow, names: Sequenc
         if not row.accepted or row.arrays is None:
             raise ConflictError(f"measurements: {row.identifier} was refused ({row.reason}); choose accepted ones")
     return rows
-
-
-def spot_of(row: MeasurementRow, plane: TargetPlane, origin: tuple[float, float, float]) -> NDArray[np.float64]:
-    """Centre of mass in ENU: as measured, else as it was given, else the target's centre."""
-    if row.center_right_m is not None and row.center_up_m is not None:
-        return plane.to_enu((row.center_right_m, row.center_up_m))
-    if row.focal_spot_wgs84 is not None:
-        return wgs84_to_enu(row.focal_spot_wgs84, origin)
-    return np.array(plane.center)
-
-
-def observation_of(row: MeasurementRow, origin: tuple[float, float, float]) -> Observation:
-    """What an accepted measurement, loaded with its arrays, shows the model."""
-    plane = store.target_plane(row.target)
-    motors = (row.motor_axis_1, row.motor_axis_2)
-    return Observation(
-        flux=unpack(row.arrays or b"")["centered"],
-        sun=sun_direction(row.sun_azimuth_deg, row.sun_elevation_deg),
-        center_of_mass=spot_of(row, plane, origin),
-        target=plane,
-        motor_position=None if None in motors else np.array(motors),
-        identifier=row.identifier,
-    )

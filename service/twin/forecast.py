@@ -10,14 +10,13 @@ from sqlalchemy.orm import Session
 from model.effects import of_light
 from model.errors import InvalidInputError
 from model.frames import sun_direction
-from model.plant import Heliostat, Receiver, TargetPlane
+from model.plant import Receiver, TargetPlane
 from service import store
 from service.base.arrays import pack, plain, unpack
 from service.base.faults import ConflictError, NotFoundError
 from service.store.tables import ForecastRow, HeliostatRow, SurfaceRow
-from service.twin import versions
 from service.twin.compute import Forecast
-from service.twin.evidence import load_heliostat
+from service.twin.evidence import Twin, heights_of, load_twin
 from service.twin.runtime import Runtime
 from service.twin.versions import PlantModel
 
@@ -90,14 +89,9 @@ def trace_request(runtime: Runtime, request: ForecastRequest) -> Traced:
         Where the heliostat cannot reflect the sun to the aim point, or light does not reach the plane's lit side.
     """
     with runtime.database.reading() as session:
-        row = store.get_heliostat(session, request.heliostat)
-        heliostat = load_heliostat(session, row)
-        plane = _plane(session, request)
-        surface = _chosen_surface(session, row, request.surface)
-        model, latitude_deg = versions.get_model(session, request.model_version), store.get_plant(session).latitude_deg
-    z = None if surface is None else unpack(surface.arrays)["z"]
-    forecast = _trace(runtime, heliostat, z, request, plane, model, latitude_deg)
-    return Traced(row, surface, plane, model, forecast)
+        twin = load_twin(session, request.heliostat, request.model_version)
+        plane, surface = _plane(session, request), _chosen_surface(session, twin.row, request.surface)
+    return Traced(twin.row, surface, plane, twin.model, _trace(runtime, twin, heights_of(surface), request, plane))
 
 
 def receiver_as_json(receiver: Receiver) -> dict[str, Any]:
@@ -141,18 +135,12 @@ def make_forecast(runtime: Runtime, request: ForecastRequest) -> ForecastRow:
 
 
 def _trace(
-    runtime: Runtime,
-    heliostat: Heliostat,
-    z: NDArray[Any] | None,
-    request: ForecastRequest,
-    plane: TargetPlane,
-    model: PlantModel,
-    latitude_deg: float,
-) -> "Forecast":
-
+    runtime: Runtime, twin: Twin, z: NDArray[Any] | None, request: ForecastRequest, plane: TargetPlane
+) -> Forecast:
+    model = twin.model
     with runtime.computing("forecast") as operations:
         return operations.forecast(
-            heliostat,
+            twin.heliostat,
             z,
             sun_direction(request.sun_azimuth_deg, request.sun_elevation_deg),
             plane,
@@ -162,7 +150,7 @@ def _trace(
             optics=replace(model.optics, dni=request.dni),
             # A stored target is what the camera looks at; on any other plane there is only light.
             effects=model.effects if request.plane is None else of_light(model.effects),
-            latitude_deg=latitude_deg,
+            latitude_deg=twin.origin[0],
         )
 
 

@@ -7,41 +7,36 @@ from typing import Any
 import numpy as np
 
 from model.errors import ImageRefusedError, InvalidInputError
+from model.imaging import ImageKind
+from model.plant import Heliostat
 from model.surface import control_points
 from service import store
 from service.base.faults import ConflictError, TooLargeError, UnsupportedImageError
 from service.base.progress import Progress, quiet
-from service.sources.documents import IMAGE_KINDS, Measurement, read_json
+from service.sources.documents import IMAGE_KINDS, Measurement
 from service.sources.folder import MeasurementFolder, declared_json, measured_heights
-from service.twin.ingest import Photograph, ingest
+from service.store import audit
+from service.store.keys import RESERVED
+from service.twin import geometry
+from service.twin.ingest import ingest
 from service.twin.runtime import Runtime
 
 UNREADABLE = (InvalidInputError, ImageRefusedError, ConflictError, TooLargeError, UnsupportedImageError)
 """What one image may be refused for without ending the import."""
 
 
-def import_folder(runtime: Runtime, folder: MeasurementFolder, progress: Progress = quiet) -> dict[str, Any]:
-    """Store the plant, its targets, and every heliostat with its images and measured surface.
+def import_folder(
+    runtime: Runtime, folder: MeasurementFolder, progress: Progress = quiet, actor: str = RESERVED
+) -> dict[str, Any]:
+    """Store the plant, its targets, and every heliostat with its images and measured surface, on behalf of ``actor``.
 
     Returns how many of each were new, changed or there already; measurements without an image, and images that cannot
     be read, are listed with the reason.
     """
-    counts: Counter[str] = Counter()
-    skipped: dict[str, str] = {}
-    with runtime.database.writing() as session:
-        counts[f"plants {store.put_plant(session, folder.plant.name, folder.plant.origin)}"] += 1
-        declared = declared_json(folder.root / "twin.json")
-        if declared:
-            counts[f"declared models {store.put_declared(session, declared)}"] += 1
-        for plane in folder.plant.targets.values():
-            counts[f"targets {store.put_target(session, plane)[1]}"] += 1
-        for cylinder in folder.plant.receivers.values():
-            counts[f"receivers {store.put_receiver(session, cylinder)[1]}"] += 1
+    counts, skipped = _put_plant(runtime, folder, actor), dict[str, str]()
     for name in folder.plant.heliostats:
         progress(name)
-        counts[f"heliostats {_put_heliostat(runtime, folder, name)}"] += 1
-        for outcome in _put_surface(runtime, folder, name):
-            counts[outcome] += 1
+        counts.update(_put_heliostat(runtime, folder, name, actor))
         for measurement in folder.measurements(name, with_images=False):
             if not measurement.images:
                 skipped[measurement.key] = "no image"
@@ -54,40 +49,43 @@ def import_folder(runtime: Runtime, folder: MeasurementFolder, progress: Progres
     return {"counts": dict(sorted(counts.items())), "skipped": {**folder.skipped, **skipped}}
 
 
-def _put_heliostat(runtime: Runtime, folder: MeasurementFolder, name: str) -> store.Change:
-    path = next((folder.root / name / "Properties").glob("*heliostat-properties.json"))
+def _put_plant(runtime: Runtime, folder: MeasurementFolder, actor: str) -> Counter[str]:
+    """The plant with its targets, receivers and declared model: one deed."""
+    plant, declared = folder.plant, declared_json(folder.root / "twin.json")
     with runtime.database.writing() as session:
-        position = folder.plant.heliostats[name].position
-        return store.put_heliostat(session, name, read_json(path), position)[1]
+        done = geometry.set_plant(
+            session, actor, plant.name, plant.origin, plant.targets.values(), plant.receivers.values(), declared
+        )
+    counts = Counter([f"plants {done.plant}"])
+    counts.update(f"targets {change}" for change in done.targets.values())
+    counts.update(f"receivers {change}" for change in done.receivers.values())
+    if done.declared is not None:
+        counts[f"declared models {done.declared}"] += 1
+    return counts
 
 
-def _put_surface(runtime: Runtime, folder: MeasurementFolder, name: str) -> list[str]:
+def _put_heliostat(runtime: Runtime, folder: MeasurementFolder, name: str, actor: str) -> list[str]:
+    """A heliostat with its measured surface, where it has one: one deed."""
     measured = folder.measured_surface(name)
-    if measured is None:
-        return []
-    heliostat = folder.plant.heliostats[name]
-    z = measured_heights(heliostat, measured)
-    # A measured surface describes the mirror from before anything else is known of it.
-    surface = store.NewSurface(
-        "measured", z, np.zeros_like(z), control_points(heliostat, z), valid_from=datetime(1970, 1, 1, tzinfo=UTC)
-    )
     with runtime.database.writing() as session:
-        _, new = store.add_surface(session, store.get_heliostat(session, name), surface, once=True)
-    return [f"surfaces {store.Change.NEW if new else store.Change.UNCHANGED}"]
+        row, change = geometry.set_heliostat(session, actor, name, folder.properties[name])
+        outcomes = [f"heliostats {change}"]
+        if measured is not None:
+            _, is_new = store.add_surface(session, row, _measured(folder.plant.heliostats[name], measured), once=True)
+            outcomes.append(f"surfaces {store.Change.NEW if is_new else store.Change.UNCHANGED}")
+            if is_new:
+                audit.record(session, actor, "surface.imported", f"heliostat {name}")
+    return outcomes
 
 
-def _put_image(runtime: Runtime, folder: MeasurementFolder, measurement: Measurement, kind: str) -> str:
-    motors, spot = measurement.motor_position, measurement.spot
-    photograph = Photograph(
-        target_name=measurement.target,
-        kind=kind,  # type: ignore[arg-type]
-        sun_azimuth_deg=measurement.azimuth_deg,
-        sun_elevation_deg=measurement.elevation_deg,
-        external_id=measurement.identifier,
-        taken_at=measurement.taken_at,
-        motor_position=None if motors is None else (float(motors[0]), float(motors[1])),
-        focal_spot_wgs84=None if spot is None else tuple(float(v) for v in folder.plant.to_wgs84(spot)),  # type: ignore[arg-type]
-    )
-    row, new = ingest(runtime, measurement.heliostat, photograph, measurement.images[kind].read_bytes())
-    state = "new" if new else "unchanged"
+def _measured(heliostat: Heliostat, measured: tuple[Any, int]) -> store.NewSurface:
+    """A measured surface describes the mirror from before anything else is known of it."""
+    z, since = measured_heights(heliostat, measured), datetime(1970, 1, 1, tzinfo=UTC)
+    return store.NewSurface("measured", z, np.zeros_like(z), control_points(heliostat, z), valid_from=since)
+
+
+def _put_image(runtime: Runtime, folder: MeasurementFolder, measurement: Measurement, kind: ImageKind) -> str:
+    photograph = measurement.photograph(kind, folder.plant)
+    row, is_new = ingest(runtime, measurement.heliostat, photograph, measurement.images[kind].read_bytes())
+    state = "new" if is_new else "unchanged"
     return f"images {state}" if row.accepted else f"images {state}, refused"

@@ -1,37 +1,40 @@
-"""Surfaces from stored measurements."""
+"""Surfaces from stored measurements: computed outside any transaction, kept in the caller's."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 from sqlalchemy.orm import Session
 
 from model.observation import SurfacePrediction
 from service import store
-from service.store import audit
+from service.store import NewSurface, audit
 from service.store.keys import RESERVED
-from service.store.surfaces import NewSurface
-from service.store.tables import MeasurementRow, SurfaceRow
-from service.twin import versions
+from service.store.tables import SurfaceRow
 from service.twin.compute import Method
-from service.twin.evidence import choose_measurements, load_heliostat, named_measurements, observation_of
+from service.twin.evidence import Twin, choose_measurements, evidence_of, load_twin, named_measurements
 from service.twin.runtime import Runtime
-from service.twin.versions import PlantModel
 
 
-def predict_surface(
+@dataclass(frozen=True, eq=False)
+class Predicted:
+    """A surface that is not kept yet."""
+
+    twin: Twin
+    method: Method
+    surface: SurfacePrediction
+
+
+def compute_surface(
     runtime: Runtime,
-    heliostat_name: str,
-    method: "Method" = "network",
+    heliostat: str,
+    method: Method = "network",
     measurements: Sequence[str] | None = None,
     images: int = 8,
-    actor: str = RESERVED,
-    also: Callable[[Session, SurfaceRow], None] | None = None,
     model_version: int | None = None,
-) -> SurfaceRow:
-    """Predict a heliostat's surface from stored measurements and keep it as its next version.
+) -> Predicted:
+    """A heliostat's surface from named measurements, else from up to ``images`` chosen ones.
 
-    It is valid from when the newest of its images was taken, where that is known, else from now. ``actor`` is who
-    asked for it. ``also`` writes in the same transaction; what it raises undoes the surface too. ``model_version`` is
-    the plant's model that explains the images, by default the current one.
+    ``model_version`` is the plant's model that explains the images, by default the current one.
 
     Raises
     ------
@@ -39,38 +42,50 @@ def predict_surface(
         Where the heliostat, a measurement or the model is not stored, or no measurement is accepted.
     """
     with runtime.database.reading() as session:
-        row = store.get_heliostat(session, heliostat_name)
-        origin = store.get_plant(session).origin
-        heliostat = load_heliostat(session, row)
+        twin = load_twin(session, heliostat, model_version)
         if measurements is None:
-            measurements = [measurement.identifier for measurement in choose_measurements(session, row, images)]
-        chosen = named_measurements(session, row, measurements)
-        model = versions.get_model(session, model_version)
-    observations = [observation_of(measurement, origin) for measurement in chosen]
+            measurements = [row.identifier for row in choose_measurements(session, twin.row, images)]
+        chosen = named_measurements(session, twin.row, measurements)
+    observations = [evidence_of(row, twin.origin).observation() for row in chosen]
     with runtime.computing(f"predict_{method}") as operations:
-        predicted = operations.predict(heliostat, observations, method, model.optics, model.effects)
-    with runtime.database.writing() as session:
-        row = store.get_heliostat(session, heliostat_name)
-        used = [store.get_measurement(session, row, name) for name in predicted.used]
-        surface, _ = store.add_surface(session, row, _new_surface(method, model, predicted, used))
-        about = {"version": surface.version, "model": model.version}
-        audit.record(session, actor, "surface.predicted", f"heliostat {heliostat_name}", **about)
-        if also is not None:
-            also(session, surface)
-        return surface
+        surface = operations.predict(twin.heliostat, observations, method, twin.model.optics, twin.model.effects)
+    return Predicted(twin, method, surface)
 
 
-def _new_surface(
-    method: str, model: PlantModel, predicted: "SurfacePrediction", used: list[MeasurementRow]
-) -> NewSurface:
-    return NewSurface(
-        source=method,
-        z=predicted.z,
-        z_std=predicted.z_std,
-        control_points=predicted.control_points,
+def keep_surface(session: Session, predicted: Predicted, actor: str) -> SurfaceRow:
+    """Keep a predicted surface as its heliostat's next version; ``actor`` is who asked for it.
+
+    It is valid from when the newest of its images was taken, where that is known, else from now.
+    """
+    heliostat, surface = predicted.twin.row, predicted.surface
+    used = [store.get_measurement(session, heliostat, name) for name in surface.used]
+    new = NewSurface(
+        source=predicted.method,
+        z=surface.z,
+        z_std=surface.z_std,
+        control_points=surface.control_points,
         valid_from=max((row.taken_at for row in used if row.taken_at is not None), default=None),
-        model=predicted.weights,
-        model_version=model.version,
+        model=surface.weights,
+        model_version=predicted.twin.model.version,
         measurements=used,
-        misfit=predicted.misfit,
+        misfit=surface.misfit,
     )
+    row, _ = store.add_surface(session, heliostat, new)
+    about = {"version": row.version, "model": new.model_version}
+    audit.record(session, actor, "surface.predicted", f"heliostat {heliostat.name}", **about)
+    return row
+
+
+def predict_surface(
+    runtime: Runtime,
+    heliostat: str,
+    method: Method = "network",
+    measurements: Sequence[str] | None = None,
+    images: int = 8,
+    actor: str = RESERVED,
+    model_version: int | None = None,
+) -> SurfaceRow:
+    """`compute_surface`, then `keep_surface` in a transaction of its own."""
+    predicted = compute_surface(runtime, heliostat, method, measurements, images, model_version)
+    with runtime.database.writing() as session:
+        return keep_surface(session, predicted, actor)

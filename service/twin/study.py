@@ -17,14 +17,14 @@ from model.study import Photograph, Study, StudyOptions
 from model.study.loop import LEAST_IMAGES
 from model.surface import control_points
 from service import store
-from service.base.arrays import plain, unpack
+from service.base.arrays import plain
 from service.base.faults import SKIPPED, ConflictError, NotFoundError
 from service.base.fields import StudyReport
 from service.base.progress import Report, Steps
 from service.drawing.study_report import study_page
 from service.store.tables import HeliostatRow, MeasurementRow, StudyRow, SurfaceRow
 from service.twin import versions
-from service.twin.evidence import choose_measurements, load_heliostat, photograph_of
+from service.twin.evidence import choose_measurements, evidence_of, heights_of, load_twin
 from service.twin.runtime import Runtime
 from service.twin.versions import PlantModel
 
@@ -122,15 +122,13 @@ def _surface(session: Session, heliostat: HeliostatRow, surfaces: Surfaces) -> S
 
 
 def _gather_heliostat(session: Session, row: HeliostatRow, request: StudyRequest, material: Material) -> None:
-
-    heliostat, origin = load_heliostat(session, row), store.get_plant(session).origin
-    surface = _surface(session, row, request.surfaces)
-    points, seen = control_points(heliostat, unpack(surface.arrays)["z"]), {m.identifier for m in surface.measurements}
+    twin, surface = load_twin(session, row.name), _surface(session, row, request.surfaces)
+    points, seen = control_points(twin.heliostat, heights_of(surface)), {m.identifier for m in surface.measurements}
     for chosen in choose_measurements(session, row, request.images, request.since, request.until):
         measurement = store.get_measurement(session, row, chosen.identifier, arrays=True)
         try:
-            photograph = photograph_of(measurement, heliostat, points, origin)
-            photograph = replace(photograph, seen=chosen.identifier in seen)
+            evidence = evidence_of(measurement, twin.origin)
+            photograph = evidence.photograph(twin.heliostat, points, seen=chosen.identifier in seen)
         except SKIPPED as error:
             material.skipped[f"{row.name}/{chosen.identifier}"] = str(error)
             continue

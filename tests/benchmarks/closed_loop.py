@@ -26,7 +26,7 @@ from model.study.fitting import Fitter
 from model.study.judging import accuracies
 from model.study.photographs import Forecaster
 from model.study.unknowns import Unknowns
-from service.cli.folder import observe, predict_folder, surface_errors
+from service.cli.folder import observations_of, predict_folder, surface_errors
 from service.cli.folder_study import photographs_of, study_folder
 from service.sources.folder import measured_heights, read_folder
 from tests.benchmarks import data_folder
@@ -166,8 +166,7 @@ def real_surfaces(root: Path, effects: Sequence[Effect]) -> None:
     """Surfaces of AA39 and AC43 from their photographs, with and without effects, against deflectometry."""
     folder = read_folder(root, HELIOSTATS)
     for name, heliostat in folder.plant.heliostats.items():
-        observed = [observe(folder, measurement) for measurement in folder.measurements(name)]
-        images = [o for o in observed if isinstance(o, Observation)]
+        images, _ = observations_of(folder, name)
         measured = folder.measured_surface(name)
         assert measured is not None
         truth = measured_heights(heliostat, measured)

@@ -16,9 +16,9 @@ from model.images import normalized
 from model.metrics import surface_error
 from model.network.predictor import WEIGHTS
 from model.observation import SurfacePrediction, render_observations
-from service.cli.folder import choose
 from service.sources.folder import read_folder
 from service.twin.compute import predict
+from service.twin.evidence import choose
 from tests.benchmarks import data_folder
 from tests.benchmarks.surfaces import IMAGES, mirrors
 from training.cases import Case, make_cases

@@ -12,8 +12,9 @@ from model.observation import Observation
 from model.plant import Heliostat
 from model.refinement import misfits, refine
 from service.cli import folder as verbs
-from service.cli.folder import choose, surface_errors
+from service.cli.folder import surface_errors
 from service.sources.folder import MeasurementFolder, measured_heights, read_folder
+from service.twin.evidence import choose
 from tests.benchmarks import data_folder
 
 IMAGES = 8

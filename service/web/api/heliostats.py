@@ -3,21 +3,17 @@
 from datetime import datetime
 from typing import Annotated, Any
 
-import numpy as np
 from fastapi import APIRouter, Depends, Query, Response, status
 from pydantic import BaseModel, Field
-from sqlalchemy.orm import Session
 
 from service import store
 from service.base.fields import Model, Name
-from service.sources.documents import read_heliostat
 from service.sources.schema import HeliostatProperties
-from service.store import audit
 from service.store.tables import HeliostatRow
+from service.twin import geometry
 from service.web.answers.openapi import problems
 from service.web.answers.paging import Page, page
 from service.web.door.dependencies import OPERATE, READ, IdentityDep, Limit, NamePath, RuntimeDep, require_json
-from service.web.door.security import Identity
 
 
 class HeliostatIn(Model):
@@ -55,17 +51,6 @@ def heliostat_out(row: HeliostatRow) -> HeliostatOut:
 router = APIRouter(tags=["heliostats"])
 
 
-def _put(
-    session: Session, name: str, properties: HeliostatProperties, identity: Identity
-) -> tuple[HeliostatOut, store.Change]:
-
-    # Reading them as the model does is the check: what is stored can be traced.
-    heliostat = read_heliostat(name, properties.raw, np.array(store.get_plant(session).origin))
-    row, change = store.put_heliostat(session, name, properties.raw, heliostat.position)
-    audit.record(session, identity.name, "heliostat.set", f"heliostat {name}", change=change)
-    return heliostat_out(row), change
-
-
 @router.get("/heliostats", responses=problems(), dependencies=[READ])
 def list_heliostats(
     runtime: RuntimeDep,
@@ -95,9 +80,9 @@ def post_heliostat(
             store.require_same_properties(known, request.properties.raw)
             response.status_code = status.HTTP_200_OK
             return heliostat_out(known)
-        heliostat, _ = _put(session, request.name, request.properties, identity)
+        row, _ = geometry.set_heliostat(session, identity.name, request.name, request.properties.raw)
     response.headers["Location"] = f"/v1/heliostats/{request.name}"
-    return heliostat
+    return heliostat_out(row)
 
 
 @router.get("/heliostats/{name}", responses=problems(404), dependencies=[READ])
@@ -121,7 +106,7 @@ def put_heliostat(
 ) -> HeliostatOut:
     """Set a heliostat's PAINT properties."""
     with runtime.database.writing() as session:
-        heliostat, change = _put(session, name, properties, identity)
+        row, change = geometry.set_heliostat(session, identity.name, name, properties.raw)
     if change is store.Change.NEW:
         response.status_code = status.HTTP_201_CREATED
-    return heliostat
+    return heliostat_out(row)

@@ -11,9 +11,10 @@ from service.base.arrays import pair, unpack
 from service.base.faults import NotFoundError, TooLargeError
 from service.base.fields import Azimuth, Elevation, Identifier, Kind, MeasurementName, Model, Moment, Name, Wgs84
 from service.drawing.pictures import flux_picture
+from service.sources.photograph import Photograph
 from service.sources.schema import paint_motors, paint_spot
 from service.store.tables import MeasurementRow
-from service.twin.ingest import Photograph, ingest
+from service.twin.ingest import ingest
 from service.web.answers import formats
 from service.web.answers.formats import MediaType, file_answer, json_answer
 from service.web.answers.openapi import arrays, problems

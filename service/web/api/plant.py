@@ -12,8 +12,8 @@ from service import store
 from service.base.fields import Model, Plane, ReceiverIn, Wgs84
 from service.sources.documents import read_receivers, read_targets
 from service.sources.schema import TowerMeasurements
-from service.store import audit
 from service.store.tables import PlantRow, ReceiverRow, TargetRow
+from service.twin import geometry
 from service.web.answers.openapi import problems
 from service.web.answers.paging import Page
 from service.web.door.dependencies import OPERATE, READ, IdentityDep, NamePath, RuntimeDep, require_json
@@ -141,12 +141,15 @@ def put_plant(document: TowerMeasurements, runtime: RuntimeDep, identity: Identi
     origin, targets = read_targets(document.raw)
     receivers = read_receivers(document.raw)
     with runtime.database.writing() as session:
-        change = store.put_plant(session, document.power_plant_properties.ID, origin)
-        audit.record(session, identity.name, "plant.set", f"plant {document.power_plant_properties.ID}", change=change)
-        for name, plane in targets.items():
-            store.put_target(session, plane, _paint_corners(document.raw, name))
-        for cylinder in receivers.values():
-            store.put_receiver(session, cylinder)
+        geometry.set_plant(
+            session,
+            identity.name,
+            document.power_plant_properties.ID,
+            origin,
+            targets.values(),
+            receivers.values(),
+            corners={name: _paint_corners(document.raw, name) for name in targets},
+        )
         return plant_out(store.get_plant(session))
 
 
@@ -185,8 +188,7 @@ def put_target(
         else:
             assert request.plane is not None  # the schema wants one of both
             plane, corners = request.plane.named(name), None
-        row, change = store.put_target(session, plane, corners)
-        audit.record(session, identity.name, "target.set", f"target {name}", change=change)
+        row, change = geometry.set_target(session, identity.name, plane, corners)
         if change is store.Change.NEW:
             response.status_code = status.HTTP_201_CREATED
         return target_out(row)
@@ -221,8 +223,7 @@ def put_receiver(
 ) -> ReceiverOut:
     """Set a cylindrical receiver."""
     with runtime.database.writing() as session:
-        row, change = store.put_receiver(session, request.named(name))
-        audit.record(session, identity.name, "receiver.set", f"receiver {name}", change=change)
+        row, change = geometry.set_receiver(session, identity.name, request.named(name))
         if change is store.Change.NEW:
             response.status_code = status.HTTP_201_CREATED
         return receiver_out(row)

@@ -12,13 +12,12 @@ from sqlalchemy.orm import Session
 from model.errors import InvalidInputError
 from model.plant import TargetPlane
 from service import store
-from service.base.arrays import unpack
+from service.base.arrays import pack, unpack
 from service.base.faults import ConflictError, NotFoundError
 from service.store.database import Database
-from service.store.measurements import NewImage, NewMeasurement
 from service.store.rows import Change
 from service.store.surfaces import NewSurface
-from service.store.tables import HeliostatRow, TargetRow
+from service.store.tables import HeliostatRow, ImageRow, MeasurementRow, TargetRow
 from tests.service.conftest import ORIGIN
 
 PLANE = TargetPlane("lower", np.zeros(3), np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), 8.6, 7.2)
@@ -29,18 +28,18 @@ def setup(session: Session) -> tuple[HeliostatRow, TargetRow]:
     return store.put_heliostat(session, "AA39", {"a": 1}, (1, 2, 3))[0], store.put_target(session, PLANE)[0]
 
 
-def new(target: TargetRow, image: str = "a", kind: str = "flux", **changes: Any) -> NewMeasurement:
+def new(target: TargetRow, image: str = "a", kind: str = "flux", **changes: Any) -> tuple[ImageRow, MeasurementRow]:
     values: dict[str, Any] = {
-        "image": NewImage(image * 64, "image/png", 10, 4, 5),
         "kind": kind,
-        "target": target,
+        "target_id": target.id,
         "sun_azimuth_deg": 10.0,
         "sun_elevation_deg": 40.0,
         "accepted": True,
         "quality": {"accepted": True},
-        "centered": np.ones((64, 64)),
+        "arrays": pack({"centered": np.ones((64, 64), np.float32)}),
     }
-    return NewMeasurement(**(values | changes))
+    stored = ImageRow(sha256=image * 64, media_type="image/png", size_bytes=10, width_px=4, height_px=5)
+    return stored, MeasurementRow(**(values | changes))
 
 
 def test_plant_target_and_heliostat_are_written_once(database: Database):
@@ -77,7 +76,7 @@ def test_names_that_no_path_could_hold_are_refused(database: Database, name: str
         with pytest.raises(InvalidInputError, match="target"):
             store.put_target(session, replace(PLANE, name=name))
         with pytest.raises(InvalidInputError, match="id"):
-            store.add_measurement(session, heliostat, new(target, external_id=name * 2))
+            store.add_measurement(session, heliostat, *new(target, external_id=name * 2))
 
 
 def test_origin_is_fixed_once_something_stands_on_it(database: Database):
@@ -123,8 +122,8 @@ def test_properties_come_back_as_they_were(database: Database):
 def test_same_image_is_one_measurement(database: Database):
     with database.writing() as session:
         heliostat, target = setup(session)
-        first, is_new = store.add_measurement(session, heliostat, new(target, external_id="7"))
-        again, is_new_again = store.add_measurement(session, heliostat, new(target, external_id="8"))
+        first, is_new = store.add_measurement(session, heliostat, *new(target, external_id="7"))
+        again, is_new_again = store.add_measurement(session, heliostat, *new(target, external_id="8"))
         assert (is_new, is_new_again) == (True, False)
         assert first.id == again.id
         assert store.counts(session)["measurements"] == 1
@@ -134,14 +133,14 @@ def test_images_of_one_measurement_in_several_kinds(database: Database):
     with database.writing() as session:
         heliostat, target = setup(session)
         rows = [
-            store.add_measurement(session, heliostat, new(target, image, kind, external_id="7"))[0]
+            store.add_measurement(session, heliostat, *new(target, image, kind, external_id="7"))[0]
             for image, kind in (("a", "flux"), ("b", "raw"), ("c", "flux-centered"))
         ]
         assert [row.identifier for row in rows] == ["7", "7-raw", "7-flux-centered"]
         with pytest.raises(ConflictError, match="another flux image"):
-            store.add_measurement(session, heliostat, new(target, "d", "flux", external_id="7"))
+            store.add_measurement(session, heliostat, *new(target, "d", "flux", external_id="7"))
         with pytest.raises(ConflictError, match="another raw image"):
-            store.add_measurement(session, heliostat, new(target, "d", "raw", external_id="7"))
+            store.add_measurement(session, heliostat, *new(target, "d", "raw", external_id="7"))
         assert [row.identifier for row in store.recent_measurements(session, heliostat, 8)] == ["7"]
 
 
@@ -149,8 +148,8 @@ def test_same_image_of_two_heliostats_is_kept_once(database: Database):
     with database.writing() as session:
         heliostat, target = setup(session)
         other, _ = store.put_heliostat(session, "AB12", {}, (0, 0, 0))
-        store.add_measurement(session, heliostat, new(target))
-        assert store.add_measurement(session, other, new(target))[1]
+        store.add_measurement(session, heliostat, *new(target))
+        assert store.add_measurement(session, other, *new(target))[1]
         assert store.counts(session) == {
             "heliostats": 2,
             "targets": 1,
@@ -162,10 +161,10 @@ def test_same_image_of_two_heliostats_is_kept_once(database: Database):
 
 
 def test_refused_image_keeps_its_reason_and_is_not_used(database: Database):
-    refused = {"accepted": False, "reason": "no_spot", "centered": None, "quality": {"detail": "dark"}}
+    refused = {"accepted": False, "reason": "no_spot", "arrays": None, "quality": {"detail": "dark"}}
     with database.writing() as session:
         heliostat, target = setup(session)
-        row, _ = store.add_measurement(session, heliostat, new(target, **refused))
+        row, _ = store.add_measurement(session, heliostat, *new(target, **refused))
     with database.reading() as session:
         found = store.get_measurement(session, heliostat, row.identifier, arrays=True)
         assert (found.accepted, found.reason, found.quality, found.arrays) == (
@@ -182,12 +181,15 @@ def test_measurement_comes_back_as_it_was(database: Database):
     with database.writing() as session:
         heliostat, target = setup(session)
         given = {
-            "motor_position": (1.0, 2.0),
+            "motor_axis_1": 1.0,
+            "motor_axis_2": 2.0,
             "taken_at": taken,
-            "focal_spot_wgs84": ORIGIN,
-            "center_of_mass": [0.5, -1],
+            "focal_spot_wgs84": list(ORIGIN),
+            "center_right_m": 0.5,
+            "center_up_m": -1,
+            "arrays": pack({"flux": np.eye(256, dtype=np.float32), "centered": np.ones((64, 64), np.float32)}),
         }
-        row, _ = store.add_measurement(session, heliostat, new(target, flux=np.eye(256), **given))
+        row, _ = store.add_measurement(session, heliostat, *new(target, **given))
     with database.reading() as session:
         found = store.get_measurement(session, heliostat, row.identifier, arrays=True)
     assert (found.motor_axis_1, found.motor_axis_2, found.taken_at) == (1.0, 2.0, taken)
@@ -204,7 +206,7 @@ def test_pages_follow_each_other(database: Database):
         for name in ("C", "A", "B"):
             store.put_heliostat(session, name, {}, (0, 0, 0))
         for image in "abc":
-            store.add_measurement(session, heliostat, new(target, image, accepted=image != "b", external_id=image))
+            store.add_measurement(session, heliostat, *new(target, image, accepted=image != "b", external_id=image))
     with database.reading() as session:
         assert [row.name for row in store.list_heliostats(session, 2)] == ["A", "AA39"]
         assert [row.name for row in store.list_heliostats(session, 9, "AA39")] == ["B", "C"]
@@ -222,7 +224,7 @@ def test_surfaces_are_versions_in_time(database: Database):
     start = datetime(2024, 1, 1, tzinfo=UTC)
     with database.writing() as session:
         heliostat, target = setup(session)
-        used, _ = store.add_measurement(session, heliostat, new(target))
+        used, _ = store.add_measurement(session, heliostat, *new(target))
         for days in (0, 20, 10):
             moment = start + timedelta(days=days)
             store.add_surface(session, heliostat, surface(days, valid_from=moment, measurements=[used]))
@@ -267,7 +269,7 @@ def test_many_writers_of_one_image_make_one_measurement(database: Database):
         with database.writing() as session:
             heliostat = store.get_heliostat(session, "AA39")
             measurement = new(store.get_target(session, "lower"), external_id="7")
-            row, is_new = store.add_measurement(session, heliostat, measurement)
+            row, is_new = store.add_measurement(session, heliostat, *measurement)
             return row.id, is_new
 
     with ThreadPoolExecutor(8) as pool:
@@ -284,7 +286,7 @@ def test_many_writers_of_one_measurement_in_other_kinds(database: Database):
         with database.writing() as session:
             heliostat = store.get_heliostat(session, "AA39")
             measurement = new(store.get_target(session, "lower"), str(len(kind) % 10), kind, external_id="7")
-            return store.add_measurement(session, heliostat, measurement)[0].identifier
+            return store.add_measurement(session, heliostat, *measurement)[0].identifier
 
     kinds = ["raw", "cropped", "flux", "flux-centered"]
     with ThreadPoolExecutor(4) as pool:

@@ -20,15 +20,14 @@ from model.imaging.window import center_of_mass
 from model.plant import Heliostat, Plant
 from model.surface import control_points
 from service import store
-from service.base.arrays import unpack
+from service.base.arrays import pack, unpack
 from service.base.settings import Settings
 from service.cli.demo_plant import ORIGIN, TARGET, properties
 from service.jobs.kinds import KINDS
 from service.jobs.worker import Worker
 from service.store.database import Database
-from service.store.measurements import NewImage, NewMeasurement
 from service.store.surfaces import NewSurface
-from service.store.tables import SurfaceRow
+from service.store.tables import ImageRow, MeasurementRow, SurfaceRow
 from service.twin.runtime import Runtime
 from service.twin.study import StudyRequest, gather
 from service.web.app import create_app
@@ -79,26 +78,28 @@ def fill(database: Database) -> None:
             surface = NewSurface("measured", z, np.zeros_like(z), control_points(mirror, z), valid_from=BEGIN)
             store.add_surface(session, row, surface)
             for index, (sun, image) in enumerate(zip(*photographs(mirror, z, rng), strict=True)):
-                store.add_measurement(session, row, measurement(target, f"{name}{index}", sun, image, index))
+                store.add_measurement(session, row, *measurement(target, f"{name}{index}", sun, image, index))
 
 
-def measurement(target: Any, number: str, sun: np.ndarray, image: np.ndarray, day: int) -> NewMeasurement:
+def measurement(
+    target: Any, number: str, sun: np.ndarray, image: np.ndarray, day: int
+) -> tuple[ImageRow, MeasurementRow]:
     azimuth, elevation = sun_angles(sun)
-    center = center_of_mass(image, (TARGET.width, TARGET.height))
+    right, up = center_of_mass(image, (TARGET.width, TARGET.height)).tolist()
+    arrays = {"flux": image.astype(np.float32), "centered": np.ones((64, 64), np.float32)}
     sha = f"{int.from_bytes(number.encode(), 'big'):064x}"
-    return NewMeasurement(
-        image=NewImage(sha, "image/png", 10, 128, 128),
+    return ImageRow(sha256=sha, media_type="image/png", size_bytes=10, width_px=128, height_px=128), MeasurementRow(
         kind="flux",
-        target=target,
+        target_id=target.id,
         sun_azimuth_deg=float(azimuth),
         sun_elevation_deg=float(elevation),
         accepted=True,
         quality={"accepted": True},
         external_id=number,
         taken_at=BEGIN + timedelta(days=day),
-        center_of_mass=center,
-        flux=image,
-        centered=np.ones((64, 64)),
+        center_right_m=right,
+        center_up_m=up,
+        arrays=pack(arrays),
     )
 
 
