@@ -61,7 +61,7 @@ def _measure(path: Path, kind: ImageKind, plane: TargetPlane) -> MeasuredFlux:
 
 def measure(folder: MeasurementFolder, measurement: Measurement, kind: ImageKind | None = None) -> MeasuredFlux:
     """Flux of a measurement's most worked-out image, or of its image of one kind."""
-    chosen: ImageKind = kind or next(k for k in IMAGE_KINDS if k in measurement.images)
+    chosen = next(k for k in IMAGE_KINDS if k in measurement.images) if kind is None else kind
     plane = folder.plant.targets[measurement.target]
     return _measure(measurement.images[chosen], chosen, plane)
 

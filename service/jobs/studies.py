@@ -38,7 +38,6 @@ class StudyIn(Model):
     @field_validator("candidates")
     @classmethod
     def _known(cls, names: list[str] | None) -> list[str] | None:
-
         if names is not None and not set(names) <= set(CATALOGUE):
             raise ValueError(f"the catalogue of effects has {', '.join(CATALOGUE)}")
         return None if names is None else list(dict.fromkeys(names))

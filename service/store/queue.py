@@ -20,8 +20,9 @@ from sqlalchemy.orm import Session, undefer
 
 from model.errors import InvalidInputError
 from service.base.faults import ConflictError, NotFoundError, TooManyError
+from service.store.columns import now
 from service.store.rows import insert
-from service.store.tables import JobRow, JobStepRow, now
+from service.store.tables import JobRow, JobStepRow
 
 ENDED = ("done", "failed", "cancelled")
 """States that a job does not leave."""

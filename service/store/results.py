@@ -7,16 +7,8 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import Session, undefer
 
 from service.base.faults import NotFoundError
-from service.store.tables import (
-    Base,
-    ForecastRow,
-    HeliostatRow,
-    ImageRow,
-    MeasurementRow,
-    StudyRow,
-    SurfaceRow,
-    TargetRow,
-)
+from service.store.columns import Base
+from service.store.tables import ForecastRow, HeliostatRow, ImageRow, MeasurementRow, StudyRow, SurfaceRow, TargetRow
 
 
 def add_forecast(session: Session, row: ForecastRow) -> ForecastRow:

@@ -9,7 +9,8 @@ from sqlalchemy import select
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
-from service.store.tables import Base, HeliostatRow, ReceiverRow, TargetRow
+from service.store.columns import Base
+from service.store.tables import HeliostatRow, ReceiverRow, TargetRow
 
 # Rounds that a writer takes against others who write the same thing before it gives up.
 ROUNDS = 8

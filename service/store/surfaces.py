@@ -13,8 +13,9 @@ from sqlalchemy.orm import Session, undefer
 
 from service.base.arrays import pack
 from service.base.faults import ConflictError, NotFoundError
+from service.store.columns import now
 from service.store.rows import ROUNDS, insert
-from service.store.tables import HeliostatRow, MeasurementRow, SurfaceRow, now
+from service.store.tables import HeliostatRow, MeasurementRow, SurfaceRow
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,8 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from service.base.arrays import unpack
-from service.store.tables import HeliostatRow, MeasurementRow, SurfaceRow, now
+from service.store.columns import now
+from service.store.tables import HeliostatRow, MeasurementRow, SurfaceRow
 from service.twin import versions
 from service.twin.accuracy import AccuracyBook, State
 from service.twin.runtime import Runtime

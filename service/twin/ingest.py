@@ -19,8 +19,9 @@ from service.base.arrays import pack, plain
 from service.base.faults import TooLargeError
 from service.base.meters import ACCURACY, PHOTOGRAPHS, REFUSALS
 from service.sources.photograph import Photograph
+from service.store.columns import now
 from service.store.images import digest, media_type
-from service.store.tables import ImageRow, MeasurementRow, SurfaceRow, now
+from service.store.tables import ImageRow, MeasurementRow, SurfaceRow
 from service.twin import accuracy
 from service.twin.evidence import Twin, evidence_of, load_twin
 from service.twin.runtime import Runtime

@@ -172,7 +172,6 @@ def study_store(runtime: Runtime, request: StudyRequest, report: Report = lambda
 
 
 def _require_enough(material: Material) -> None:
-
     count = len(material.photographs)
     if count < LEAST_IMAGES:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in list(material.skipped.items())[:5])

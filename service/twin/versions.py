@@ -17,7 +17,8 @@ from service import store
 from service.base.faults import ConflictError, NotFoundError
 from service.sources.documents import parse_declared
 from service.store import audit
-from service.store.tables import ModelRow, PlantRow, StudyRow, now
+from service.store.columns import now
+from service.store.tables import ModelRow, PlantRow, StudyRow
 
 DECLARED = 1
 """Number of the declared model, which has no effect but the declared ones."""
@@ -94,7 +95,6 @@ def _adopted_effects(session: Session, number: int) -> tuple[Effect, ...]:
 
 
 def _effects(data: Any) -> tuple[Effect, ...]:
-
     return tuple(effects_from_json(data))
 
 
@@ -135,7 +135,6 @@ def adopt(session: Session, number: int, actor: str, force: bool = False) -> Mod
 
 
 def _next_version(session: Session, study: StudyRow, effects: Sequence[Effect], actor: str) -> ModelRow:
-
     number = (session.scalar(select(func.max(ModelRow.number))) or DECLARED) + 1
     row = ModelRow(
         number=number,

@@ -14,7 +14,7 @@ from typing import Any
 from service.base.settings import Settings
 from service.jobs.kinds import KINDS
 from service.jobs.worker import work
-from service.store import tables
+from service.store import columns
 from service.twin import runtime
 from service.web import server
 from tests.service.conftest import FakeOperations
@@ -29,7 +29,7 @@ class SlowOperations(FakeOperations):
 
 
 class ShiftedClock(datetime):
-    """What `service.store.tables.now`, from which all of the service has the time, asks."""
+    """What `service.store.columns.now`, from which all of the service has the time, asks."""
 
     @classmethod
     def now(cls, tz: tzinfo | None = None) -> datetime:  # type: ignore[override]
@@ -39,7 +39,7 @@ class ShiftedClock(datetime):
 
 
 if __name__ == "__main__":
-    tables.datetime = ShiftedClock  # type: ignore[misc]
+    columns.datetime = ShiftedClock  # type: ignore[misc]
     runtime.load_operations = SlowOperations  # type: ignore[assignment]
     if sys.argv[1] == "worker":
         work(Settings(), KINDS)

@@ -28,8 +28,8 @@ from model.imaging import MeasuredFlux, Quality
 from model.observation import Observation, SurfacePrediction
 from model.plant import Heliostat, TargetPlane
 from service.base.settings import Settings
+from service.store.columns import Base
 from service.store.database import Database
-from service.store.tables import Base
 from service.twin.compute import Forecast
 from service.web.app import create_app
 

@@ -45,7 +45,6 @@ def _migrations(runtime: Runtime) -> str:
 
 
 def _weights(_runtime: Runtime) -> str:
-
     default_predictor()
     return "ok"
 

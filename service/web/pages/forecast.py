@@ -16,7 +16,8 @@ from service.base.fields import Azimuth, Elevation, Model, Name, Sun, Version
 from service.drawing import charts
 from service.jobs.asking import ask_for
 from service.jobs.field_forecasts import FleetForecastIn
-from service.store.tables import ForecastRow, HeliostatRow, PlantRow, ReceiverRow, TargetRow, now
+from service.store.columns import now
+from service.store.tables import ForecastRow, HeliostatRow, PlantRow, ReceiverRow, TargetRow
 from service.twin.forecast import ForecastRequest, flux_of, make_forecast
 from service.twin.runtime import Runtime
 from service.web.answers.pages import go_to, leave_for, render

@@ -14,8 +14,9 @@ from sqlalchemy import URL, inspect, text
 from sqlalchemy.exc import IntegrityError, StatementError
 
 from service import store
+from service.store.columns import Base
 from service.store.database import Database
-from service.store.tables import Base, HeliostatRow
+from service.store.tables import HeliostatRow
 
 ROOT = Path(__file__).parents[3]
 

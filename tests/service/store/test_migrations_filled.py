@@ -8,8 +8,8 @@ from alembic.script import ScriptDirectory
 from sqlalchemy import URL, Column, MetaData, Table, insert, inspect, select
 from sqlalchemy.types import JSON, Boolean, DateTime, Float, Integer, LargeBinary
 
+from service.store.columns import Base
 from service.store.database import Database, alembic_config
-from service.store.tables import Base
 
 REVISIONS = [script.revision for script in ScriptDirectory.from_config(alembic_config()).walk_revisions()][::-1]
 

@@ -22,8 +22,9 @@ from service.cli.main import app as cli
 from service.store import queue
 from service.store.backup import back_up, images_of, restore
 from service.store.check import inspect_store, is_sound
+from service.store.columns import Base
 from service.store.database import Database, migrate
-from service.store.tables import Base, JobRow, JobStepRow, MeasurementRow
+from service.store.tables import JobRow, JobStepRow, MeasurementRow
 from service.twin.ingest import Photograph, ingest
 from service.twin.prediction import predict_surface
 from service.twin.runtime import Runtime
