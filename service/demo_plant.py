@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.frames import sun_angles, sun_direction_at
-from model.imaging.camera import CameraOptions, photograph
 from model.plant import Heliostat, Plant, TargetPlane
 from model.refinement import default_prior
 from model.surface import control_points
 from model.tracing import Scene, Window
 from model.tracing.alignment import align_to_spots
 from model.tracing.montecarlo import trace_montecarlo
+from service.demo_camera import CameraOptions, photograph
 from service.folder import write_json
 from service.progress import Progress, quiet
 

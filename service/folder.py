@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from model.effects import Effect, effect_to_json, model_version
 from model.errors import InvalidInputError, ModelError
-from model.imaging import ImageKind, MeasuredFlux, decode_image
+from model.imaging import ImageKind, MeasuredFlux
 from model.metrics import compare_on_target, surface_error
 from model.network.architecture import MAX_IMAGES
 from model.observation import Observation, SurfacePrediction, spread_suns
@@ -26,6 +26,7 @@ from service import operations
 from service.operations import Method
 from service.paint import IMAGE_KINDS, Measurement, MeasurementFolder, measured_heights, read_surface
 from service.progress import Progress, quiet
+from service.sources.decode import decode_image
 
 Array = NDArray[np.float64]
 

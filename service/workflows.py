@@ -111,7 +111,7 @@ def _read(operations: Operations, pixels: NDArray[Any], photograph: Photograph, 
 
 
 def _decode(runtime: Runtime, data: bytes) -> NDArray[np.uint8]:
-    from model.imaging import decode_image
+    from service.sources.decode import decode_image
 
     limit = runtime.settings.max_image_bytes
     if len(data) > limit:

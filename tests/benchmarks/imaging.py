@@ -17,9 +17,10 @@ import matplotlib as mpl
 import numpy as np
 from numpy.typing import NDArray
 
-from model.imaging import MeasuredFlux, center_of_mass, decode_image, measure
+from model.imaging import MeasuredFlux, center_of_mass, measure
 from model.plant import Plant, TargetPlane
 from service.paint import read_json, read_targets
+from service.sources.decode import decode_image
 from tests.benchmarks import data_folder
 
 TOWER = "WRI1030197-tower-measurements.json"

@@ -7,8 +7,8 @@ import pytest
 
 from model.errors import InvalidInputError
 from model.imaging import MeasuredFlux, center_of_mass, measure
-from model.imaging.camera import CameraOptions, photograph, target_corners
 from model.imaging.rectify import rectify
+from service.demo_camera import CameraOptions, photograph, target_corners
 from tests.imaging import accuracy, gaussian
 
 SIZE = (5.4, 6.4)

@@ -3,10 +3,10 @@ import numpy as np
 import pytest
 
 from model.errors import ImageRefusedError, InvalidInputError
-from model.imaging.camera import CameraOptions, photograph, target_corners
 from model.imaging.marks import find_marks
 from model.imaging.rectify import check_corners, find_corners, rectify
 from model.plant import TargetPlane
+from service.demo_camera import CameraOptions, photograph, target_corners
 
 ARM, STROKE = 0.74, 0.16  # [m]
 
