@@ -1,10 +1,10 @@
 """The light of a whole field on one receiver.
 
-Heliostats come in tiles, which an `Engine` works at in any number of threads or machines; what a tile gives is one map,
-so that memory does not grow with the field::
+Heliostats come in tiles, which an `Engine` may work at in any number of threads or machines; what a tile gives is one
+map, so that memory does not grow with the field::
 
     task = Superposition(receiver, resolution=(128, 128), optics=optics, effects=effects)
-    total = superpose(task, tiles(shots), Threads(2))
+    total = superpose(task, tiles(shots), engine)
 
 Forecasts for a receiver are light in W/m2: effects of the camera, of stage "image", say how a photograph differs from
 the light and do not act here. Where neighbours are given (`model.neighbours`), their shadows are traced, and the
@@ -15,10 +15,7 @@ that touch it.
 """
 
 import math
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from typing import Protocol, Self, TypeVar
@@ -41,7 +38,6 @@ from model.tracing.convolution import superpose as superpose_scene
 Array = NDArray[np.float64]
 Item = TypeVar("Item")
 Made = TypeVar("Made")
-Pending = TypeVar("Pending")
 
 
 class _Items(Protocol):
@@ -272,44 +268,6 @@ class Engine(Protocol):
         """What ``work`` makes of the items, in their order; no more than a few of them are drawn ahead."""
 
 
-def in_order(
-    submit: Callable[[Item], Pending], items: Iterable[Item], ahead: int, result: Callable[[Pending], Made]
-) -> Iterator[Made]:
-    """Results in the items' order, while up to ``ahead`` of them are under way."""
-    pending: deque[Pending] = deque()
-    for item in items:
-        pending.append(submit(item))
-        if len(pending) >= ahead:
-            yield result(pending.popleft())
-    while pending:
-        yield result(pending.popleft())
-
-
-@dataclass(frozen=True, eq=False)
-class Threads:
-    """The engine of one machine; PyTorch leaves Python's lock while it computes.
-
-    Attributes
-    ----------
-    count : int
-    turn : callable
-        Gives what each piece of work is done within: a place in a queue for the processor, say.
-    """
-
-    count: int = 2
-    turn: Callable[[], AbstractContextManager[object]] = nullcontext
-
-    def map(self, work: Callable[[Item], Made], items: Iterable[Item]) -> Iterator[Made]:
-        """As `Engine.map`."""
-
-        def one(item: Item) -> Made:
-            with self.turn():
-                return work(item)
-
-        with ThreadPoolExecutor(self.count) as pool:
-            yield from in_order(lambda item: pool.submit(one, item), items, 2 * self.count, Future.result)
-
-
 def tiles(shots: Iterable[Shot], neighbours: Neighbours | None = None, size: int = TILE) -> Iterator[Tile]:
     """Tiles of ``size`` heliostats, with what of the neighbours stands in their way."""
     remaining = iter(shots)
@@ -350,9 +308,12 @@ def standing(
 
 
 def superpose(task: Superposition, parts: Iterable[Tile], engine: Engine | None = None) -> FleetFlux:
-    """The light of all tiles on the task's receiver; the same to the last bit whatever the engine."""
+    """The light of all tiles on the task's receiver, one after another without an engine.
+
+    The same to the last bit whatever the engine.
+    """
     total = FleetFlux(np.zeros(task.resolution))
-    for part in (engine or Threads()).map(task, parts):
+    for part in map(task, parts) if engine is None else engine.map(task, parts):
         total = total + part
     # Frequency space leaves ripples below zero: 1e-5 of the peak, more where pixels are coarser than the spots.
     return replace(total, irradiance=total.irradiance.clip(min=0))

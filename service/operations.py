@@ -25,6 +25,7 @@ from model.surface import COLUMNS, DEGREE, FACETS, ROWS, control_points
 from model.tracing import Optics
 from model.tracing.convolution import central_rays
 from service.progress import Progress, quiet
+from service.sources.juelich import CENTERED_WINDOW, mark_layouts
 
 Array = NDArray[np.float64]
 Method = Literal["network", "refined"]
@@ -40,7 +41,7 @@ def measure(
     image: NDArray[np.uint8], kind: ImageKind, plane: TargetPlane, *, corners: Array | None = None
 ) -> MeasuredFlux:
     """Flux and quality of one photograph of a target; see `model.imaging.measure`."""
-    return measure_image(image, kind, plane, corners=corners)
+    return measure_image(image, kind, plane, layouts=mark_layouts(plane.name), side=CENTERED_WINDOW, corners=corners)
 
 
 def predict(

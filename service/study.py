@@ -17,9 +17,7 @@ from model.surface import DEGREE, control_points
 from service.folder import check_surfaces, measure, read_image, surface_of
 from service.paint import Measurement, MeasurementFolder, read_json
 from service.progress import Progress, quiet
-
-CENTERED_SIDE = 6.1
-"""Side [m] of PAINT's ``flux-centered.png``."""
+from service.sources.juelich import CENTERED_WINDOW
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +94,7 @@ def _flux(folder: MeasurementFolder, measurement: Measurement) -> tuple[np.ndarr
         return np.asarray(measured.flux, dtype=np.float64), plane
     if measurement.spot is None:
         raise InvalidInputError(f"{measurement.key}: a centred flux without 'focal_spot' has no place on the target")
-    crop = replace(plane, center=measurement.spot, width=CENTERED_SIDE, height=CENTERED_SIDE)
+    crop = replace(plane, center=measurement.spot, width=CENTERED_WINDOW, height=CENTERED_WINDOW)
     return _gray(measurement.images["flux-centered"]), crop
 
 

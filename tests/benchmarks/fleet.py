@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from model.fleet import Superposition, Threads, standing, superpose, tiles
+from model.fleet import Superposition, standing, superpose, tiles
 from model.forecast import Shot
 from model.frames import sun_direction
 from model.plant import Cylinder, Heliostat, Plant, Receiver, TargetPlane
@@ -25,6 +25,7 @@ from model.surface import control_points
 from model.tracing import Optics
 from service import jobs, store
 from service.demo_plant import ORIGIN, properties
+from service.engines import Threads
 from service.handlers import KINDS
 from service.runtime import Runtime
 from service.settings import Settings

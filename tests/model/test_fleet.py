@@ -10,7 +10,7 @@ from model.effects.blocking import Blocking
 from model.effects.camera_blur import CameraBlur
 from model.effects.camera_response import CameraResponse
 from model.effects.slope_error import SlopeError
-from model.fleet import Superposition, Threads, standing, superpose, tile_of, tiles
+from model.fleet import Superposition, standing, superpose, tile_of, tiles
 from model.forecast import Shot
 from model.frames import sun_direction
 from model.neighbours import clear
@@ -57,8 +57,8 @@ def test_fleet_is_the_sum_of_its_mirrors_however_it_is_tiled():
     each = trace(scene, Window.of(plane, 48, 64), replace(OPTICS, slope_error=1e-3), samples=16, padding=0.25)
     np.testing.assert_allclose(whole.irradiance, each.irradiance.sum(0), atol=1e-5 * whole.irradiance.max())
     assert whole.power == pytest.approx(float(each.power.sum()), rel=1e-5)
-    for engine, size in ((Threads(1), 1), (Threads(3), 2)):
-        again = superpose(task, tiles(some, size=size), engine)
+    for size in (1, 2):
+        again = superpose(task, tiles(some, size=size))
         np.testing.assert_allclose(again.irradiance, whole.irradiance, atol=1e-6 * whole.irradiance.max())
 
 

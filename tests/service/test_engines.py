@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from model.fleet import FleetFlux, Superposition, Threads, Tile, standing, superpose, tiles
+from model.fleet import FleetFlux, Superposition, Tile, standing, superpose, tiles
 from model.forecast import Shot
 from model.frames import sun_direction
 from model.plant import Heliostat
 from model.surface import control_points
-from service.engines import Ray, engine_of
+from service.engines import Ray, Threads, engine_of
 from service.faults import ConflictError
 from service.handlers import KINDS
 from service.workers import Worker
@@ -44,6 +44,14 @@ def cluster() -> Iterator[Any]:
 
 
 pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning:ray", "ignore::ResourceWarning")
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_threads_give_the_same_light_whatever_their_number(count: int):
+    task, parts = Superposition(target(10.0), (32, 32)), some_tiles()
+    expected, made = superpose(task, parts), superpose(task, parts, Threads(count))
+    assert (made.heliostats, made.power) == (expected.heliostats, expected.power)
+    np.testing.assert_array_equal(made.irradiance, expected.irradiance)
 
 
 @pytest.mark.slow
