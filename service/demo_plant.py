@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from model.frames import sun_angles, sun_direction_at
 from model.plant import Heliostat, Plant, TargetPlane
-from model.refinement import default_prior
+from model.prior import default_prior
 from model.surface import control_points
 from model.tracing import Scene, Window
 from model.tracing.alignment import align_to_spots

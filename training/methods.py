@@ -9,7 +9,8 @@ import torch
 from numpy.typing import NDArray
 
 from model.network.predictor import LOOKS, SurfacePredictor
-from model.refinement import SurfacePrior, refine
+from model.prior import SurfacePrior
+from model.refinement import refine
 from training.cases import Case
 from training.render import Shots
 from training.train import Run

@@ -34,7 +34,8 @@ from model.observation import (
     align_observations,
 )
 from model.plant import Heliostat
-from model.refinement import default_prior, misfits
+from model.prior import default_prior
+from model.refinement import misfits
 from model.surface import FACETS, control_points, mirrored
 from model.tracing import Optics
 

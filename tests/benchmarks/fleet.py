@@ -19,7 +19,7 @@ from model.fleet import Superposition, standing, superpose, tiles
 from model.forecast import Shot
 from model.frames import sun_direction
 from model.plant import Cylinder, Heliostat, Plant, Receiver, TargetPlane
-from model.refinement import default_prior
+from model.prior import default_prior
 from model.sunshape import Pillbox
 from model.surface import control_points
 from model.tracing import Optics

@@ -10,7 +10,8 @@ from model.frames import sun_direction
 from model.network.architecture import MAX_IMAGES
 from model.network.predictor import INPUTS, LOOKS, SurfacePredictor
 from model.plant import Heliostat, TargetPlane
-from model.refinement import default_prior, refine
+from model.prior import default_prior
+from model.refinement import refine
 from model.surface import control_points
 from model.tracing import Scene, Window, trace
 from model.tracing.montecarlo import trace_montecarlo

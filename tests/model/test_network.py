@@ -9,7 +9,7 @@ from model.network.paper import PaperConfig, PaperNetwork
 from model.network.predictor import INPUTS, SurfacePredictor, default_predictor, mirrored_inputs, model_card
 from model.observation import Observation, spread_suns
 from model.plant import TargetPlane
-from model.refinement import default_prior
+from model.prior import default_prior
 from model.surface import control_points, mirrored
 from model.tracing import Scene
 from model.tracing.convolution import central_rays

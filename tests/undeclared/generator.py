@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from model.effects import Effect, effects_from_json
 from model.forecast import Shot
 from model.plant import Heliostat, TargetPlane
-from model.refinement import default_prior
+from model.prior import default_prior
 from model.surface import control_points
 from tests.undeclared.camera import photograph
 from tests.undeclared.rays import Exposure, Sun, throw
