@@ -10,15 +10,11 @@ from numpy.typing import NDArray
 from model.effects import Effect
 from model.errors import InvalidInputError
 from model.forecast import Aligned, Shot, View, align
-from model.images import normalized
+from model.images import FLUX_SHAPE, FLUX_WINDOW, normalized
 from model.plant import Heliostat, TargetPlane
 from model.surface import control_points
 from model.tracing import Optics, Scene
 from model.tracing.alignment import align_to_spots
-
-FLUX_SHAPE = (64, 64)
-FLUX_WINDOW = 4.0
-"""Side [m] of the square that flux images show about their centre of mass (the paper's)."""
 
 TRUSTED_MISFIT = 0.2
 """Misfit of an image up to which a surface explains it: twice what clean images leave, more than real ones do."""

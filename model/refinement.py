@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 from model.effects import Effect
 from model.errors import InvalidInputError
 from model.forecast import Aligned, View
-from model.images import binned, normalized
+from model.images import COARSE_SIZE, FLUX_WINDOW, binned, normalized
 from model.metrics import flux_accuracy
 from model.network.inputs import STEP_HEIGHT
-from model.observation import FLUX_WINDOW, Observation, SurfacePrediction, align_observations, render_observations
+from model.observation import Observation, SurfacePrediction, align_observations, render_observations
 from model.plant import Heliostat
 from model.prior import SurfacePrior, default_prior
 from model.surface import control_points
@@ -54,7 +54,7 @@ class RefinementOptions:
     so that 90 % intervals hold nine of ten heights of mirrors left out, in five folds.
     ``shift_m``, ``exposure``, ``background`` [of the peak], ``blur_m`` and ``gamma`` are the standard deviations of the
     nuisance parameters; pixels up to ``dark`` [of the peak] are lifted by noise that cannot go below black. Images are
-    compared at ``resolution`` pixels a side: the sun has blurred all that is finer. Their changes may be traced more
+    compared at ``resolution`` pixels a side. Their changes may be traced more
     coarsely than they themselves, which are few.
     """
 
@@ -72,7 +72,7 @@ class RefinementOptions:
     blur_m: float = 0.05
     gamma: float = 0.1
     dark: float = 0.01
-    resolution: int = 32
+    resolution: int = COARSE_SIZE
     samples: int = 32
     jacobian_samples: int = 12
 

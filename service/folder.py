@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from model.effects import Effect, effect_to_json, model_version
 from model.errors import InvalidInputError, ModelError
 from model.imaging import ImageKind, MeasuredFlux
-from model.metrics import compare_on_target, surface_error
+from model.metrics import accuracy_window, compare_on_target, surface_error
 from model.network.architecture import MAX_IMAGES
 from model.observation import Observation, SurfacePrediction, spread_suns
 from model.plant import Heliostat, TargetPlane
@@ -30,10 +30,10 @@ from service.sources.decode import decode_image
 
 Array = NDArray[np.float64]
 
-WINDOWS = (4.0, 6.0, 8.0)
-"""Sides [m] of the accuracy's window: the paper's, unless more than `SPILL` of the measured energy lies outside."""
-
 SPILL = 0.01
+"""Share of the measured energy that may lie outside the accuracy's window, up to one of `WIDEST` [m]."""
+
+WIDEST = 8.0
 
 
 def write_json(path: Path, content: Any) -> None:
@@ -274,14 +274,6 @@ def forecast_measurement(
     )
 
 
-def accuracy_window(measured: NDArray[Any], size: tuple[float, float]) -> float:
-    """Side [m] of the smallest of `WINDOWS` that leaves out no more than `SPILL` of the measured energy."""
-    for window in WINDOWS:
-        if compare_on_target(measured, measured, size, window).measured_outside <= SPILL:
-            return window
-    return WINDOWS[-1]
-
-
 def compare(
     folder: MeasurementFolder, measurement: Measurement, traced: operations.Forecast, window: float | None
 ) -> dict[str, Any] | None:
@@ -292,7 +284,8 @@ def compare(
     gray = measured.mean(axis=2) if measured.ndim == 3 else measured
     plane = folder.plant.targets[measurement.target]
     size = (plane.width, plane.height)
-    return asdict(compare_on_target(gray, traced.flux, size, window or accuracy_window(gray, size)))
+    window = window or accuracy_window([gray], [size], spill=SPILL, widest=WIDEST)
+    return asdict(compare_on_target(gray, traced.flux, size, window))
 
 
 def forecast_folder(

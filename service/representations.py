@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 from sqlalchemy.orm import Session
 
+from model.images import FLUX_SUM
 from service import models, negotiation
 from service.arrays import pack, unpack
 from service.faults import NotFoundError
@@ -45,9 +46,6 @@ from service.tables import (
     SurfaceRow,
     TargetRow,
 )
-
-# A flux map's sum where it is normalised (the paper's rule).
-_NORMALISED_SUM = 100.0
 
 
 def page(items: Sequence[Item], limit: int, mark: str = "id") -> Page[Item]:
@@ -282,7 +280,7 @@ def flux_of(row: ForecastRow) -> NDArray[np.float32]:
     """The map in the unit that was asked for."""
     flux = unpack(row.flux)["flux"]
     total = float(flux.sum(dtype=np.float64))
-    return flux * np.float32(_NORMALISED_SUM / total) if row.normalised and total > 0 else flux
+    return flux * np.float32(FLUX_SUM / total) if row.normalised and total > 0 else flux
 
 
 def forecast(row: ForecastRow, media_type: str) -> Response:

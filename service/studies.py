@@ -12,6 +12,7 @@ from sqlalchemy.orm import Session
 
 from model.errors import InvalidInputError, UnreachableError
 from model.frames import sun_direction
+from model.images import FLUX_WINDOW
 from model.plant import Heliostat, TargetPlane
 from service import models, store
 from service.arrays import unpack
@@ -27,9 +28,6 @@ if TYPE_CHECKING:  # see `service.runtime`
     from model.study import Photograph, Study
 
 Surfaces = Literal["measured", "current"]
-
-CENTERED_SIDE = 4.0
-"""Side [m] of a measurement's ``centered`` flux, all that there is of a photograph that shows no more."""
 
 
 @dataclass(frozen=True)
@@ -173,7 +171,7 @@ def _flux(row: MeasurementRow, origin: tuple[float, float, float]) -> tuple[np.n
     spot = spot_of(row, plane, origin)
     if (np.abs(plane.to_plane(spot)) > np.array([plane.width, plane.height]) / 2).any():
         raise InvalidInputError(f"'focal_spot' lies off its target {plane.name}")
-    crop = replace(plane, center=spot, width=CENTERED_SIDE, height=CENTERED_SIDE)
+    crop = replace(plane, center=spot, width=FLUX_WINDOW, height=FLUX_WINDOW)
     return arrays["centered"].astype(np.float64), crop
 
 

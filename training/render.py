@@ -20,10 +20,10 @@ from model.effects.sun_shape import SunShapeEffect
 from model.effects.target_registration import TargetRegistration
 from model.forecast import images_under, optics_under
 from model.frames import sun_direction_at
-from model.images import normalized
-from model.network.architecture import CONDITIONS, IMAGE_SIZE
-from model.network.inputs import DESCENT_SAMPLES, DESCENT_SIZE, GUESS_SAMPLES, conditions, descents
-from model.observation import FLUX_SHAPE, Observation, scene_of
+from model.images import COARSE_SIZE, FLUX_SHAPE, FLUX_SIZE, normalized
+from model.network.architecture import CONDITIONS
+from model.network.inputs import DESCENT_SAMPLES, GUESS_SAMPLES, conditions, descents
+from model.observation import Observation, scene_of
 from model.plant import Heliostat, TargetPlane
 from model.surface import control_points
 from model.tracing import Optics, Scene, Window, trace
@@ -138,7 +138,7 @@ class Shots:
         raised = torch.einsum("bmfij,bfk->bmfkij", z, self.lift).flatten(0, 1)
         return self.ideal.with_(control_points=self.ideal.control_points + raised)
 
-    def trace(self, z: Tensor, samples: int = GUESS_SAMPLES, size: int = IMAGE_SIZE) -> Tensor:
+    def trace(self, z: Tensor, samples: int = GUESS_SAMPLES, size: int = FLUX_SIZE) -> Tensor:
         """Flux (B, images, size, size), sum 100, of surfaces as `scene` takes them, as no camera sees it."""
         window = Window(rows=size, columns=size, on_spot=True)
         flux = trace(self.scene(z), window, samples=samples, padding=0.25).irradiance
@@ -146,7 +146,7 @@ class Shots:
 
     def descents(self, z: Tensor, flux: Tensor, basis: Tensor) -> Tensor:
         """`model.network.inputs.descents` (B, images, 4, 8, 8) [m] from surfaces ``z`` (B, 4, 8, 8) [m]."""
-        return descents(lambda dz: self.trace(z[:, None] + dz, DESCENT_SAMPLES, DESCENT_SIZE), flux, basis)
+        return descents(lambda dz: self.trace(z[:, None] + dz, DESCENT_SAMPLES, COARSE_SIZE), flux, basis)
 
     def conditions(self) -> Tensor:
         """What the network is told of each image (B, images, 12)."""
@@ -183,7 +183,7 @@ class Camera:
 
     def photograph(self, scene: Scene, device: torch.device, rng: np.random.Generator) -> Tensor:
         """Flux images (B, 64, 64), sum 100, 4 m about the spot's centre."""
-        images = torch.empty(scene.batch, IMAGE_SIZE, IMAGE_SIZE, device=device)
+        images = torch.empty(scene.batch, FLUX_SIZE, FLUX_SIZE, device=device)
         for rows in np.array_split(rng.permutation(scene.batch), min(self.worlds, scene.batch)):
             share = rng.uniform() ** self.ease
             seen = self._seen(scene.subset(rows.tolist()), self.effects(share, rng))

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model.errors import ImageRefusedError, InvalidInputError
+from model.images import FLUX_WINDOW, normalized
 from model.imaging.quality import SATURATED_GRAY, Quality, judge, judge_flux, refused
 from model.imaging.rectify import BRACKETS, CROP_SIZE, Layout, check_corners, find_corners, rectify
 from model.imaging.separate import find_spots, separate
@@ -16,10 +17,6 @@ from model.imaging.window import center_of_mass, flux_window
 from model.plant import TargetPlane
 
 ImageKind = Literal["raw", "cropped", "flux", "flux-centered"]
-
-WINDOW = 4.0  # [m], the paper's
-WINDOW_SIZE = 64  # [px]
-TOTAL = 100.0  # the paper's sum of a normalised flux
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +48,7 @@ class MeasuredFlux:
     flux: NDArray[np.float32] | None = None
     centered: NDArray[np.float32] | None = None
     center_of_mass: NDArray[np.float64] | None = None
-    window: float = WINDOW
+    window: float = FLUX_WINDOW
     crop: NDArray[np.uint8] | None = None
     corners: NDArray[np.float64] | None = None
 
@@ -185,9 +182,9 @@ def _centered(
 ) -> tuple[NDArray[np.float64], NDArray[np.float32], float]:
     """Centre of mass (2,) [m], the normalised window about it, and the share of the energy that it leaves out."""
     center = center_of_mass(flux, size)
-    cut = flux_window(flux, size, center, WINDOW, WINDOW_SIZE)
+    cut = flux_window(flux, size, center)
     return center, _normalised(cut), max(0.0, 1.0 - float(cut.sum() / flux.sum(dtype=np.float64)))
 
 
 def _normalised(flux: NDArray[np.floating]) -> NDArray[np.float32]:
-    return np.asarray(flux * (TOTAL / flux.sum(dtype=np.float64)), dtype=np.float32)
+    return np.asarray(normalized(flux.astype(np.float64)), dtype=np.float32)

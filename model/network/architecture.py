@@ -31,9 +31,6 @@ MAX_IMAGES = 8
 CONDITIONS = 12
 """Numbers that describe the geometry of one image (`model.network.inputs.conditions`)."""
 
-IMAGE_SIZE = 64
-"""Rows and columns of a flux image."""
-
 
 @dataclass(frozen=True)
 class NetworkConfig:

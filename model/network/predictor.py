@@ -16,23 +16,16 @@ from torch import Tensor
 from model.effects import Effect
 from model.errors import InvalidInputError
 from model.forecast import Aligned, View
-from model.images import normalized
+from model.images import COARSE_SIZE, FLUX_SIZE, FLUX_WINDOW, normalized
 from model.network.architecture import MAX_IMAGES
 from model.network.inputs import (
     DESCENT_SAMPLES,
-    DESCENT_SIZE,
     GUESS_SAMPLES,
     MIRRORED_CONDITIONS,
     conditions,
     descents,
 )
-from model.observation import (
-    FLUX_SHAPE,
-    FLUX_WINDOW,
-    Observation,
-    SurfacePrediction,
-    align_observations,
-)
+from model.observation import Observation, SurfacePrediction, align_observations
 from model.plant import Heliostat
 from model.prior import default_prior
 from model.refinement import misfits
@@ -154,7 +147,7 @@ class _Sight:
         aligned = align_observations(self.heliostat, self.observations, z, self.effects, start=self.aligned)
         self.aligned = aligned
         with torch.no_grad():
-            guess_flux = self._images(aligned, FLUX_SHAPE[0], GUESS_SAMPLES)
+            guess_flux = self._images(aligned, FLUX_SIZE, GUESS_SAMPLES)
         descent = descents(partial(self._changed, aligned), self.flux[None], self.basis)[0]
         return {
             "flux": _filled(self.flux.numpy()),
@@ -173,7 +166,7 @@ class _Sight:
     def _changed(self, aligned: Aligned, changes: Tensor) -> Tensor:
         """Images (1, M, R, R), sum 100, of mirrors that stand, changed by heights (1, M, 4, 8, 8) [m]."""
         raised = aligned.raised(torch.einsum("mfij,fk->mfkij", changes[0], self.normals))
-        return self._images(raised, DESCENT_SIZE, DESCENT_SAMPLES)[None]
+        return self._images(raised, COARSE_SIZE, DESCENT_SAMPLES)[None]
 
     def _conditions(self, aligned: Aligned) -> Tensor:
         """`conditions` (M, 12) of the ideal mirror where the guess stands, as in training."""

@@ -14,6 +14,7 @@ from scipy.optimize import lsq_linear
 
 from model.effects import Effect
 from model.errors import InvalidInputError, UnreachableError
+from model.images import COARSE_SIZE
 from model.study.photographs import Forecaster
 from model.study.unknowns import Unknowns, copied
 
@@ -33,9 +34,6 @@ AT_ONCE = 16
 
 STEP = 5e-3
 """Step of the differences, in shares of an unknown's range."""
-
-RESOLUTION = 32
-"""Pixels a side in which fits compare; the sun has blurred all that is finer."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,18 +61,18 @@ class Fitter:
     ) -> None:
         self.forecaster, self.fine, self.fixed, self.iterations = forecaster, fine, fixed, iterations
         self.heliostats = np.array([p.heliostat for p in forecaster.photographs])
-        self.measured = forecaster.measured(RESOLUTION)
+        self.measured = forecaster.measured(COARSE_SIZE)
         self.peaks = self.measured.max(axis=(1, 2))
 
     def residuals(self, unknowns: Unknowns, values: Array) -> Array:
-        """Measured minus forecast (N, RESOLUTION**2) in units of `TRUST`; infinite where the model fails."""
+        """Measured minus forecast (N, COARSE_SIZE**2) in units of `TRUST`; infinite where the model fails."""
         return np.asarray(self.residuals_of(unknowns, values[None])[0])
 
     def residuals_of(self, unknowns: Unknowns, trials: Array) -> Array:
-        """Residuals (M, N, RESOLUTION**2) of many trials (M, P), traced at once where only mirrors differ in them."""
+        """Residuals (M, N, COARSE_SIZE**2) of many trials (M, P), traced at once where only mirrors differ in them."""
         shared = np.array([unknown.shared for unknown in unknowns.all])
         _, group = np.unique(trials[:, shared], axis=0, return_inverse=True)
-        residuals = np.empty((len(trials), len(self.measured), RESOLUTION**2))
+        residuals = np.empty((len(trials), len(self.measured), COARSE_SIZE**2))
         for one in np.unique(group):
             rows = np.flatnonzero(group == one)
             for part in np.array_split(rows, -(-len(rows) // AT_ONCE)):
@@ -82,17 +80,17 @@ class Fitter:
         return residuals
 
     def _residuals_alike(self, unknowns: Unknowns, trials: Array) -> Array:
-        """Residuals (M, N, RESOLUTION**2) of trials (M, P) with the same shared unknowns."""
+        """Residuals (M, N, COARSE_SIZE**2) of trials (M, P) with the same shared unknowns."""
         count = len(trials)
         copies, values = unknowns.copies(trials)
         fixed = [copied(effect, count) for effect in self.fixed]
         try:
-            forecast = self.forecaster.copies(count).cuts([*fixed, *copies.effects(values)], RESOLUTION)
+            forecast = self.forecaster.copies(count).cuts([*fixed, *copies.effects(values)], COARSE_SIZE)
         except (UnreachableError, InvalidInputError):
             if count > 1:
                 return np.concatenate([self._residuals_alike(unknowns, trial[None]) for trial in trials])
             # A clock an hour off puts low suns below the horizon, and all light may be blocked: as wrong as can be.
-            return np.full((1, len(self.measured), RESOLUTION**2), np.inf)
+            return np.full((1, len(self.measured), COARSE_SIZE**2), np.inf)
         difference = self.measured - forecast.reshape(count, *self.measured.shape)
         shares = difference / self.peaks[:, None, None] / TRUST
         return np.asarray(shares.reshape(count, len(self.measured), -1))
@@ -101,8 +99,8 @@ class Fitter:
         """Add to the measured images what the coarse forecast of ``begin`` differs by from the fine one."""
         if self.fine is not None:
             model = [*self.fixed, *unknowns.effects(begin)]
-            grid = self.forecaster.cuts(model, RESOLUTION) - self.fine.cuts(model, RESOLUTION)
-            self.measured = self.forecaster.measured(RESOLUTION) + grid
+            grid = self.forecaster.cuts(model, COARSE_SIZE) - self.fine.cuts(model, COARSE_SIZE)
+            self.measured = self.forecaster.measured(COARSE_SIZE) + grid
 
     def _pull(self, unknowns: Unknowns, values: Array) -> Array:
         """Distances (P,) from neutral: holds what images cannot tell."""
@@ -113,7 +111,7 @@ class Fitter:
         return float((residuals**2).sum() + (self._pull(unknowns, values) ** 2).sum()) / 2
 
     def jacobian(self, unknowns: Unknowns, values: Array, residuals: Array) -> Array:
-        """Derivatives of the residuals (P, N, RESOLUTION**2); unknowns of different heliostats are changed at once."""
+        """Derivatives of the residuals (P, N, COARSE_SIZE**2); unknowns of different heliostats are changed at once."""
         low, high = unknowns.bounds
         steps = STEP * (high - low)
         steps = np.where(values + steps > high, -steps, steps)

@@ -64,11 +64,6 @@ def split(photographs: Sequence[Photograph]) -> Split:
     return Split(*(np.array(sorted(parts[part]), dtype=np.int64) for part in ("fit", "own", "held_out")))
 
 
-def accuracies(measured: Array, forecast: Array) -> Array:
-    """Flux accuracy (N,) of cuts (N, n, n) of sum one (`model.metrics.flux_accuracy`)."""
-    return np.asarray(1 - np.abs(measured - forecast).sum(axis=(1, 2)))
-
-
 @dataclass(frozen=True)
 class Gain:
     """Mean of paired differences, its 95 % interval and how many standard errors it is worth."""

@@ -9,9 +9,11 @@ from numpy.typing import NDArray
 from model.effects import CATALOGUE, JUELICH_LATITUDE, Effect
 from model.errors import InvalidInputError
 from model.forecast import View
+from model.images import FLUX_SIZE
+from model.metrics import flux_accuracies
 from model.study.fitting import Fitter
-from model.study.judging import Gain, Split, accuracies, paired_gain, split
-from model.study.photographs import RESOLUTION, Forecaster, Photograph, spot_window
+from model.study.judging import Gain, Split, paired_gain, split
+from model.study.photographs import Forecaster, Photograph, spot_window
 from model.study.report import Candidate, Found, Study
 from model.study.unknowns import Unknowns
 from model.tracing import Optics
@@ -80,7 +82,7 @@ class _Loop:
             for rows in (self.split.fit, self.split.own)
         )
         self.judge = forecaster(self.split.held_out, options.view)
-        self.measured = self.judge.measured(RESOLUTION)
+        self.measured = self.judge.measured(FLUX_SIZE)
         self.heliostats = np.array([photographs[row].heliostat for row in self.split.held_out])
         self.noise = float(np.mean([photographs[row].noise_share(self.window) for row in self.split.held_out]))
 
@@ -131,7 +133,7 @@ class _Loop:
 
     def accuracy(self, effects: Sequence[Effect]) -> Array:
         """Accuracy (H,) of the held-out images under effects."""
-        return accuracies(self.measured, self.judge.cuts(effects))
+        return flux_accuracies(self.measured, self.judge.cuts(effects))
 
     def gain(self, after: Trial, before: Trial) -> Gain:
         """What ``after`` is better by on held-out images."""

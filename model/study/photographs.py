@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from model.effects import JUELICH_LATITUDE, Effect, effect_to_json
 from model.errors import InvalidInputError
 from model.forecast import Aligned, Shot, View, align
+from model.images import FLUX_SIZE
 from model.imaging.window import overlap_matrix
-from model.metrics import compare_on_target
+from model.metrics import accuracy_window
 from model.plant import TargetPlane
 from model.study.noise import black_lift, grain_variance
 from model.study.unknowns import copied, copy_name
@@ -23,14 +24,6 @@ from model.sunshape import transfer_table
 from model.tracing import Optics, Scene, Window, trace
 
 Array = NDArray[np.float64]
-
-WINDOWS = (4.0, 6.0, 8.0, 12.0)
-"""Sides [m] of the comparison's window: the paper's, unless more than `SPILL` of the energy lies outside."""
-
-SPILL = 0.02
-
-RESOLUTION = 64
-"""Pixels a side of the window in which accuracy is counted (DESIGN.md, section 7)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +79,7 @@ class Photograph:
     def noise_share(self, window: float) -> float:
         """The error (one minus accuracy) that this image's noise alone makes, in a cut of side ``window`` [m]."""
         images, planes = np.stack([self.image, black_lift(self.image)]), [self.shot.plane] * 2
-        seen, lift = windows(images, planes, centers(images[:1], planes[:1]).repeat(2, axis=0), window, RESOLUTION)
+        seen, lift = windows(images, planes, centers(images[:1], planes[:1]).repeat(2, axis=0), window, FLUX_SIZE)
         # A lift of the dark takes from the light's share of the sum.
         lifted = lift - seen * lift.sum() / seen.sum()
         grain = np.sqrt(2 / np.pi * grain_variance(seen))
@@ -95,14 +88,8 @@ class Photograph:
 
 def spot_window(photographs: Sequence[Photograph]) -> float:
     """Side [m] of the window that holds nearly all of every spot's energy."""
-    for window in WINDOWS:
-        outside = [
-            compare_on_target(p.image, p.image, (p.shot.plane.width, p.shot.plane.height), window).measured_outside
-            for p in photographs
-        ]
-        if np.median(outside) <= SPILL:
-            return window
-    return WINDOWS[-1]
+    sizes = [(p.shot.plane.width, p.shot.plane.height) for p in photographs]
+    return accuracy_window([p.image for p in photographs], sizes)
 
 
 def centers(images: NDArray[np.floating], planes: Sequence[TargetPlane]) -> Array:
@@ -204,12 +191,12 @@ class Forecaster:
             )
         return self._copies[count]
 
-    def measured(self, resolution: int = RESOLUTION) -> Array:
+    def measured(self, resolution: int = FLUX_SIZE) -> Array:
         """The photographs' cuts (N, resolution, resolution)."""
         cuts = [cut(p.image[None], [p.shot.plane], self.window, resolution) for p in self.photographs]
         return np.concatenate(cuts)
 
-    def cuts(self, effects: Sequence[Effect], resolution: int = RESOLUTION) -> Array:
+    def cuts(self, effects: Sequence[Effect], resolution: int = FLUX_SIZE) -> Array:
         """The forecasts' cuts (N, resolution, resolution) under the declared effects and these.
 
         Raises

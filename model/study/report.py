@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.effects import CATALOGUE, JUELICH_LATITUDE, Effect
+from model.metrics import flux_accuracies
 from model.study.advice import told_apart_by
 from model.study.covariates import covariates_of
-from model.study.judging import Gain, accuracies, rank_correlation
+from model.study.judging import Gain, rank_correlation
 from model.study.photographs import Photograph
 from model.study.unknowns import Unknowns
 
@@ -104,12 +105,12 @@ class Study:
     @cached_property
     def accuracy_before(self) -> Array:
         """Accuracy (H,) of the declared model."""
-        return accuracies(self.measured, self.before)
+        return flux_accuracies(self.measured, self.before)
 
     @cached_property
     def accuracy_after(self) -> Array:
         """Accuracy (H,) with the effects found."""
-        return accuracies(self.measured, self.after)
+        return flux_accuracies(self.measured, self.after)
 
     @cached_property
     def noise_floor(self) -> float:

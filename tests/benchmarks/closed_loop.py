@@ -16,14 +16,13 @@ from matplotlib.figure import Figure
 
 from model.effects import CATALOGUE, Effect, effect_from_json
 from model.forecast import View
-from model.metrics import flux_accuracy
+from model.metrics import flux_accuracies, flux_accuracy
 from model.network.predictor import default_predictor
 from model.observation import Observation, align_observations, render_observations
 from model.plant import Heliostat, TargetPlane
 from model.refinement import refine
 from model.study import Photograph, Study, StudyOptions
 from model.study.fitting import Fitter
-from model.study.judging import accuracies
 from model.study.photographs import Forecaster
 from model.study.unknowns import Unknowns
 from service.folder import observe, predict_folder, surface_errors
@@ -130,7 +129,7 @@ def left_out(photographs: Sequence[Photograph], kinds: tuple[str, ...], window: 
             fitter = Fitter(*(Forecaster(rest, optics, [], window, view) for view in views))
             effects = unknowns.effects(fitter.fit(unknowns, unknowns.neutral).values)
         judge = Forecaster([photograph], optics, [], window, StudyOptions().view)
-        accuracy[index] = accuracies(judge.measured(), judge.cuts(effects))[0]
+        accuracy[index] = flux_accuracies(judge.measured(), judge.cuts(effects))[0]
     return accuracy
 
 

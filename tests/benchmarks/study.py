@@ -25,8 +25,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from model.effects import CATALOGUE as KINDS
+from model.metrics import flux_accuracies
 from model.study import Photograph, Study, StudyOptions, study
-from model.study.judging import accuracies
 from model.study.photographs import Forecaster
 from model.tracing import Optics
 from service.paint import read_folder
@@ -97,7 +97,7 @@ def upper_bound(made: MeasurementSet, found: Study) -> tuple[float, float]:
     """Accuracy on the held-out images with the true effects, and by how much those change the forecast."""
     forecaster = Forecaster(found.photographs, Optics(), [], found.window, StudyOptions().view)
     with_truth = forecaster.cuts(made.effects)
-    true, same = accuracies(found.measured, with_truth).mean(), accuracies(found.before, with_truth).mean()
+    true, same = flux_accuracies(found.measured, with_truth).mean(), flux_accuracies(found.before, with_truth).mean()
     return round(float(true), 5), round(float(1 - same), 5)
 
 

@@ -18,12 +18,13 @@ from model.effects.sun_shape import SunShapeEffect
 from model.errors import InvalidInputError
 from model.forecast import Shot, View, forecast_shots
 from model.frames import sun_direction
+from model.metrics import flux_accuracies
 from model.plant import Heliostat
 from model.study import Photograph, StudyOptions, study
 from model.study.advice import PHOTOGRAPHS, SAME_SCALING, SCALES_WITH, told_apart_by
 from model.study.covariates import RECORDED_TIME, covariates_of
 from model.study.fitting import Fitter
-from model.study.judging import accuracies, paired_gain, rank_correlation, split
+from model.study.judging import paired_gain, rank_correlation, split
 from model.study.noise import grain_variance
 from model.study.photographs import Forecaster, cut, in_pixels, spot_window
 from model.study.unknowns import Unknowns
@@ -142,7 +143,7 @@ def test_accuracy_is_one_less_the_summed_difference():
     a = np.zeros((2, 4, 4))
     b = a.copy()
     a[:, 0, 0] = b[0, 0, 0] = b[1, 3, 3] = 1.0
-    np.testing.assert_allclose(accuracies(a, b), [1.0, -1.0])
+    np.testing.assert_allclose(flux_accuracies(a, b), [1.0, -1.0])
 
 
 def test_the_interval_of_a_gain_covers_the_truth_about_as_often_as_it_says():
@@ -204,7 +205,7 @@ def test_the_share_of_noise_is_the_error_it_makes(camera):
         light = exact.image / exact.image.max()
         taken = Photograph(exact.shot, CAMERAS[camera](light, rng))
         true = cut(in_pixels(light[None], *taken.image.shape), [exact.shot.plane], 4.0, 64)
-        errors.append(1 - accuracies(cut(taken.image[None], [exact.shot.plane], 4.0, 64), true)[0])
+        errors.append(1 - flux_accuracies(cut(taken.image[None], [exact.shot.plane], 4.0, 64), true)[0])
         shares.append(taken.noise_share(4.0))
     assert 0.5 < np.mean(shares) / np.mean(errors) < 1.35
 
@@ -218,7 +219,7 @@ def test_a_coarse_camera_is_forecast_in_its_own_pixels():
     taken = photographs()
     coarse = [Photograph(p.shot, in_pixels(p.image[None], 32, 32)[0]) for p in taken]
     forecaster = Forecaster(coarse, Optics(), [], 4.0, View(128, 128, samples=12))
-    assert accuracies(forecaster.measured(), forecaster.cuts([])).min() > 0.99
+    assert flux_accuracies(forecaster.measured(), forecaster.cuts([])).min() > 0.99
 
 
 def test_the_window_holds_the_spots(clean, hazy):
