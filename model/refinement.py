@@ -23,6 +23,7 @@ from model.effects import Effect
 from model.errors import InvalidInputError
 from model.forecast import Aligned, View
 from model.images import COARSE_SIZE, FLUX_WINDOW, binned, normalized
+from model.least_squares import Descent, minimize
 from model.metrics import flux_accuracy
 from model.network.inputs import STEP_HEIGHT
 from model.observation import Observation, SurfacePrediction, align_observations, render_observations
@@ -36,8 +37,17 @@ Array = NDArray[np.float64]
 BLOCK = 4
 """Pixels along the side of the patches in which residuals of images err together."""
 
-LEAST_GAIN = 0.5
-"""Gain of log posterior below which a climb ends."""
+DESCENT = Descent(
+    steps=16,
+    jacobians=1,
+    corrected=True,
+    damping=0.1,
+    raising=4.0,
+    least_damping=1e-4,
+    most_damping=100.0,
+    least_gain=0.5,
+)
+"""How the minimum of the negative log posterior is sought; a gain of half a unit is none."""
 
 
 @dataclass(frozen=True)
@@ -186,12 +196,6 @@ class _Posterior:
             curvature = curvature + j.T @ j - (directions.T @ j).T @ projected
         return gradient, curvature
 
-    def step(self, state: _State, jacobian: Array, noise: float, damping: float) -> Array:
-        """The change (k,) of the first coefficients that Levenberg and Marquardt would try next."""
-        gradient, curvature = self.quadratic(state, jacobian, noise)
-        change = np.linalg.solve(curvature + damping * np.diag(np.diag(curvature)), gradient)
-        return np.asarray(change, dtype=np.float64)
-
     def moved(self, state: _State, change: Array) -> _State:
         """The mirror after a change (k,) of its first coefficients."""
         return self.state(state.c + np.pad(change, (0, len(state.c) - len(change))))
@@ -199,26 +203,11 @@ class _Posterior:
     def climb(self, state: _State, noise: float, jacobian: Array, retraced: int = 1) -> tuple[_State, Array]:
         """The state of the highest density near another, in a Jacobian's (k, M, R, R) coefficients, and its Jacobian.
 
-        Levenberg-Marquardt; the Jacobian is traced anew up to ``retraced`` times, where corrections no longer help.
+        The Jacobian is traced anew up to ``retraced`` times, where corrections no longer help.
         """
-        cost, damping, fresh = self.cost(state, noise), 0.1, False
-        for _ in range(self.options.steps):
-            change = self.step(state, jacobian, noise, damping)
-            trial = self.moved(state, change)
-            trial_cost = self.cost(trial, noise)
-            gain = cost - trial_cost
-            if gain > 0:
-                missed = trial.images - state.images - np.tensordot(change, jacobian, axes=1)
-                jacobian = jacobian + change[:, None, None, None] / (change @ change) * missed
-                state, cost = trial, trial_cost
-            damping = max(damping / 5, 1e-4) if gain > 0 else damping * 4
-            if gain >= LEAST_GAIN:
-                fresh = False
-            elif not fresh and retraced:
-                jacobian, fresh, retraced = self.jacobian(state, len(jacobian)), True, retraced - 1
-            elif gain > 0 or damping > 100:
-                break
-        return state, jacobian
+        descent = replace(DESCENT, steps=self.options.steps, jacobians=retraced)
+        found = minimize(_Problem(self, noise, len(jacobian)), state, descent, jacobian)
+        return found.state, found.jacobian
 
     def summit(self, c: Array) -> tuple[_State, Array]:
         """The summit above coefficients (K,) and the Jacobian there: large features first, then all."""
@@ -247,6 +236,33 @@ class _Posterior:
             patch += binned(residual.reshape(1, *image.shape), image.shape[0] // BLOCK).var() / BLOCK**2
         variance = (grain + self.options.patches * max(0.0, patch - grain)) / len(self.measured)
         return max(self.options.noise, share * float(np.sqrt(variance)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """A posterior as a least-squares problem: in its first ``count`` coefficients, with one ``noise`` of images."""
+
+    posterior: _Posterior
+    noise: float
+    count: int
+
+    def cost(self, state: _State) -> float:
+        return self.posterior.cost(state, self.noise)
+
+    def response(self, state: _State) -> Array:
+        return state.images
+
+    def jacobian(self, state: _State) -> Array:
+        return self.posterior.jacobian(state, self.count)
+
+    def quadratic(self, state: _State, jacobian: Array) -> tuple[Array, Array]:
+        return self.posterior.quadratic(state, jacobian, self.noise)
+
+    def bounds(self, state: _State) -> None:
+        return None
+
+    def moved(self, state: _State, change: Array) -> _State:
+        return self.posterior.moved(state, change)
 
 
 def _untilted(z: Array, ideal: Array) -> Array:

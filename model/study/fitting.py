@@ -5,16 +5,15 @@ something, so that all pixels count alike (`TRUST`); intervals come from how the
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
-from scipy.optimize import lsq_linear
 
 from model.effects import Effect
 from model.errors import InvalidInputError, UnreachableError
 from model.images import COARSE_SIZE
+from model.least_squares import Descent, minimize
 from model.study.photographs import Forecaster
 from model.study.unknowns import Unknowns, copied
 
@@ -34,6 +33,13 @@ AT_ONCE = 16
 
 STEP = 5e-3
 """Step of the differences, in shares of an unknown's range."""
+
+
+TRIES = 3
+"""Steps from one Jacobian, each shorter than the last, after which a fit has come to its end."""
+
+DESCENT = Descent(steps=24, jacobians=8, patience=TRIES, least_share=1e-3)
+"""How the least cost is sought; a Jacobian is few forecasts, and is taken after every step."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,30 +187,15 @@ class Fitter:
 
     def descend(self, unknowns: Unknowns, values: Array) -> Fit:
         """The least cost near ``values`` (P,)."""
-        low, high = unknowns.bounds
-        scale = 1 / unknowns.held**2
-        damping, residuals = 1e-2, self.residuals(unknowns, values)
-        cost = self.cost(unknowns, values, residuals)
+        begin = _Point(values, self.residuals(unknowns, values))
+        problem = _Problem(self, unknowns)
+        cost = problem.cost(begin)
         if not np.isfinite(cost):
             return Fit(values, cost, np.full(len(values), np.nan))
-        for _ in range(self.iterations):
-            jacobian = self.jacobian(unknowns, values, residuals)
-            flat = jacobian.reshape(len(values), -1)
-            curvature = flat @ flat.T + np.diag(scale)
-            gradient = flat @ residuals.ravel() + self._pull(unknowns, values) * np.sqrt(scale)
-            before = cost
-            for _ in range(3):
-                damped = curvature + damping * np.diag(np.diag(curvature))
-                trial = values + _bounded_step(damped, gradient, low - values, high - values)
-                trial_residuals = self.residuals(unknowns, trial)
-                trial_cost = self.cost(unknowns, trial, trial_residuals)
-                if trial_cost < cost:
-                    values, residuals, cost, damping = trial, trial_residuals, trial_cost, damping / 5
-                    break
-                damping *= 8
-            if before - cost < 1e-3 * before:
-                break
-        return Fit(values, cost, self._spread(jacobian, residuals, scale))
+        descent = replace(DESCENT, jacobians=self.iterations, steps=self.iterations * TRIES)
+        found = minimize(problem, begin, descent)
+        end = found.state
+        return Fit(end.values, found.cost, self._spread(found.jacobian, end.residuals, 1 / unknowns.held**2))
 
     def _spread(self, jacobian: Array, residuals: Array, scale: Array) -> Array:
         """Standard deviations (P,) by the sandwich of White (1980), with images, not pixels, as independent.
@@ -219,11 +210,39 @@ class Fitter:
         return np.sqrt(np.diag(bread @ filling @ bread))
 
 
-def _bounded_step(curvature: Array, gradient: Array, low: Array, high: Array) -> Array:
-    """The step (P,) between ``low`` and ``high`` (P,) to the least of a quadratic form.
+@dataclass(frozen=True, eq=False)
+class _Point:
+    """Values (P,) of unknowns and the residuals (N, COARSE_SIZE**2) there."""
 
-    A full step that was only cut at the bounds would go astray where unknowns make up for each other.
-    """
-    root = np.linalg.cholesky(curvature)
-    solution = lsq_linear(root.T, -solve_triangular(root, gradient, lower=True), (low, high), method="bvls")
-    return np.asarray(np.clip(solution.x, low, high))
+    values: Array
+    residuals: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """The fit of unknowns as a least-squares problem."""
+
+    fitter: Fitter
+    unknowns: Unknowns
+
+    def cost(self, point: _Point) -> float:
+        return self.fitter.cost(self.unknowns, point.values, point.residuals)
+
+    def response(self, point: _Point) -> Array:
+        return point.residuals
+
+    def jacobian(self, point: _Point) -> Array:
+        return self.fitter.jacobian(self.unknowns, point.values, point.residuals)
+
+    def quadratic(self, point: _Point, jacobian: Array) -> tuple[Array, Array]:
+        flat, held = jacobian.reshape(len(jacobian), -1), self.unknowns.held
+        pull = (point.values - self.unknowns.neutral) / held**2
+        return -(flat @ point.residuals.ravel() + pull), flat @ flat.T + np.diag(1 / held**2)
+
+    def bounds(self, point: _Point) -> tuple[Array, Array]:
+        low, high = self.unknowns.bounds
+        return low - point.values, high - point.values
+
+    def moved(self, point: _Point, change: Array) -> _Point:
+        values = point.values + change
+        return _Point(values, self.fitter.residuals(self.unknowns, values))
