@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 LEADING = 8
-"""Directions of the prior that tell a strange surface: the longest, which every image shows."""
+"""Directions of the prior in which Mahalanobis distances are taken: the longest, which every image shows."""
 
 PRIOR = Path(__file__).parent / "weights" / "surface-prior.npz"
 
@@ -59,10 +59,11 @@ class SurfacePrior:
         """Heights (4, 8, 8) [m] of coefficients (K,)."""
         return np.asarray(self.mean + np.tensordot(coefficients, self.basis, axes=1))
 
-    def strangeness(self, z: Array) -> float:
-        """How far ``z`` (4, 8, 8) [m] lies from the mean: root mean square of its leading coefficients.
+    def mahalanobis(self, z: Array) -> float:
+        """Mahalanobis distance of ``z`` (4, 8, 8) [m] from the mean, over the root of its `LEADING` degrees of freedom.
 
-        About one for a mirror of the kind that the prior was estimated from.
+        The root mean square of its leading coefficients; about one for a mirror of the kind that the prior was
+        estimated from.
         """
         return float(np.sqrt((self.coefficients(z)[:LEADING] ** 2).mean()))
 

@@ -8,8 +8,8 @@ is marginalised exactly. The curvature at the end gives the uncertainty.
 The Jacobian is taken by differences, one batched trace of all coefficients and images. That is most of the work, so a
 Jacobian serves many steps, and every step corrects it by what the images really did (Broyden 1965).
 
-Light from four facets lies in one spot, and facets can take each other's part: the posterior has side maxima. The climb
-starts from every guess there is, and the highest summit is taken.
+Light from four facets lies in one spot, and facets can take each other's part: the posterior has several local
+optima. The optimisation starts from every guess there is, and the best local optimum is taken.
 """
 
 from collections.abc import Sequence
@@ -55,13 +55,13 @@ class RefinementOptions:
     """How images are trusted.
 
     ``noise`` is the least standard deviation of a pixel as a share of the image's peak; what the images then turn out
-    to err by, times ``hope``, is taken instead where it is more, in several ``rounds``. Errors of a model that lacks
-    something come in patches, in which pixels err together and must not be counted one by one: variance that blocks
-    of `BLOCK` pixels a side have beyond that of grain counts ``patches`` times. ``annealing`` are the noises to
+    to err by, times ``noise_share``, is taken instead where it is more, in several ``rounds``. Errors of a model that
+    lacks something come in patches, in which pixels err together and must not be counted one by one: variance that
+    blocks of `BLOCK` pixels a side have beyond that of grain counts ``patches`` times. ``annealing`` are the noises to
     begin with, stage by stage, with the ``leading`` directions of the prior: images that are trusted little at first
     let the large features settle before the small ones are looked at. ``calibration`` is how many times the images'
-    variance is counted in the uncertainty: the curvature at one summit knows nothing of others nearby. It was chosen
-    so that 90 % intervals hold nine of ten heights of mirrors left out, in five folds.
+    variance is counted in the uncertainty: the curvature at one local optimum knows nothing of others nearby. It was
+    chosen so that 90 % intervals hold nine of ten heights of mirrors left out, in five folds.
     ``shift_m``, ``exposure``, ``background`` [of the peak], ``blur_m`` and ``gamma`` are the standard deviations of the
     nuisance parameters; pixels up to ``dark`` [of the peak] are lifted by noise that cannot go below black. Images are
     compared at ``resolution`` pixels a side. Their changes may be traced more
@@ -69,7 +69,7 @@ class RefinementOptions:
     """
 
     noise: float = 0.005
-    hope: float = 0.7
+    noise_share: float = 0.7
     patches: float = 32.0
     rounds: int = 4
     annealing: tuple[float, ...] = (0.5, 0.1, 0.03)
@@ -109,7 +109,7 @@ def _nuisance(image: Array, options: RefinementOptions) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """Coefficients (K,), where the mirror they make stands before each sun, and its images (M, R, R) of sum 100."""
+    """Coefficients (K,), the mirror they make as aligned under each sun, and its images (M, R, R) of sum 100."""
 
     c: Array
     aligned: Aligned
@@ -140,16 +140,16 @@ class _Posterior:
         changes = np.einsum("k,kfij,fc->kfcij", self.steps, untilted, heliostat.facet_normals)
         self.changes = torch.as_tensor(changes, dtype=torch.float32)
 
-    def _photographs(self, aligned: Aligned, samples: int) -> Array:
-        """Images (B, R, R), sum 100, of mirrors that stand."""
+    def _rendered(self, aligned: Aligned, samples: int) -> Array:
+        """Images (B, R, R), sum 100, of aligned mirrors."""
         with torch.no_grad():
             images = aligned.images(self.optics, self.effects, replace(self.view, samples=samples)).double().numpy()
         return normalized(images)
 
     def state(self, c: Array) -> _State:
-        """The mirror of coefficients (K,) before its suns."""
+        """The mirror of coefficients (K,), aligned under each sun."""
         aligned = align_observations(self.heliostat, self.observations, self.prior.surface(c), self.effects)
-        return _State(c, aligned, self._photographs(aligned, self.options.samples))
+        return _State(c, aligned, self._rendered(aligned, self.options.samples))
 
     def jacobian(self, state: _State, count: int) -> Array:
         """Change of the images per coefficient (count, M, R, R), of the first so many.
@@ -160,8 +160,8 @@ class _Posterior:
         points = (group.scene.control_points + changes[:, None]).flatten(0, 1)
         scene = group.scene.repeated(count).with_(control_points=points)
         stacked = replace(group, rows=list(range(scene.batch)), planes=group.planes * count, scene=scene)
-        changed = self._photographs(Aligned((stacked,)), samples).reshape(count, *state.images.shape)
-        return np.asarray((changed - self._photographs(state.aligned, samples)) / self.steps[:count, None, None, None])
+        changed = self._rendered(Aligned((stacked,)), samples).reshape(count, *state.images.shape)
+        return np.asarray((changed - self._rendered(state.aligned, samples)) / self.steps[:count, None, None, None])
 
     def _whitened(self, image: Array, noise: float) -> tuple[float, Array, Array]:
         """Noise of an image's pixels, its nuisance directions over that noise (n, 7), and Woodbury's inner inverse.
@@ -200,7 +200,7 @@ class _Posterior:
         """The mirror after a change (k,) of its first coefficients."""
         return self.state(state.c + np.pad(change, (0, len(state.c) - len(change))))
 
-    def climb(self, state: _State, noise: float, jacobian: Array, retraced: int = 1) -> tuple[_State, Array]:
+    def optimize(self, state: _State, noise: float, jacobian: Array, retraced: int = 1) -> tuple[_State, Array]:
         """The state of the highest density near another, in a Jacobian's (k, M, R, R) coefficients, and its Jacobian.
 
         The Jacobian is traced anew up to ``retraced`` times, where corrections no longer help.
@@ -209,15 +209,17 @@ class _Posterior:
         found = minimize(_Problem(self, noise, len(jacobian)), state, descent, jacobian)
         return found.state, found.jacobian
 
-    def summit(self, c: Array) -> tuple[_State, Array]:
-        """The summit above coefficients (K,) and the Jacobian there: large features first, then all."""
+    def optimum(self, c: Array) -> tuple[_State, Array]:
+        """The local optimum near coefficients (K,) and the Jacobian there: large features first, then all."""
         state, options = self.state(c), self.options
         jacobian = self.jacobian(state, min(options.leading, len(c)))
         for noise in options.annealing:
-            state, jacobian = self.climb(state, noise, jacobian)
+            state, jacobian = self.optimize(state, noise, jacobian)
         jacobian = self.jacobian(state, len(c))
         for left in reversed(range(options.rounds)):
-            state, jacobian = self.climb(state, self.noise(state, options.hope), jacobian, retraced=int(left == 0))
+            state, jacobian = self.optimize(
+                state, self.noise(state, options.noise_share), jacobian, retraced=int(left == 0)
+            )
         return state, jacobian
 
     def covariance(self, state: _State, jacobian: Array) -> Array:
@@ -303,8 +305,8 @@ def refine(
     options = options or RefinementOptions()
     posterior = _Posterior(heliostat, observations, prior, (optics, effects), options)
     starts = [np.zeros(len(prior.basis))] + ([] if start is None else [prior.coefficients(start)])
-    summits = [posterior.summit(c) for c in starts]
-    state, jacobian = min(summits, key=lambda summit: posterior.cost(summit[0], options.noise))
+    optima = [posterior.optimum(c) for c in starts]
+    state, jacobian = min(optima, key=lambda optimum: posterior.cost(optimum[0], options.noise))
     z = prior.surface(state.c)
     return SurfacePrediction(
         z=z,
@@ -314,7 +316,7 @@ def refine(
         weights=prior.name,
         misfits=misfits(heliostat, observations, z, optics, effects),
         used=tuple(o.identifier for o in observations),
-        strangeness=prior.strangeness(z),
+        mahalanobis=prior.mahalanobis(z),
     )
 
 

@@ -169,7 +169,7 @@ def predict_heliostat(
         "refused": refused,
         "misfit": round(predicted.misfit, 4),
         "trusted": predicted.trusted,
-        "strangeness": round(predicted.strangeness, 3),
+        "strangeness": round(predicted.mahalanobis, 3),
         "suspicious": list(predicted.suspicious),
         "z_rms_mm": round(float(np.sqrt((predicted.z**2).mean()) * 1e3), 4),
         "z_std_mean_mm": round(float(predicted.z_std.mean() * 1e3), 4),

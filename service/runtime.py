@@ -21,7 +21,7 @@ if TYPE_CHECKING:  # these bring the tracer's libraries with them, which take se
     from model.imaging import ImageKind, MeasuredFlux
     from model.observation import Observation, SurfacePrediction
     from model.plant import Heliostat, Receiver, TargetPlane
-    from model.study import Photograph, Study, StudyOptions
+    from model.study import FluxImage, Study, StudyOptions
     from model.tracing import Optics
     from service.operations import Forecast, Method
 
@@ -85,7 +85,7 @@ class Operations(Protocol):
 
     def study(
         self,
-        photographs: Sequence["Photograph"],
+        photographs: Sequence["FluxImage"],
         optics: "Optics",
         effects: Sequence["Effect"] = (),
         options: "StudyOptions | None" = None,

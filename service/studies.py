@@ -25,7 +25,7 @@ from service.tables import HeliostatRow, MeasurementRow, StudyRow, SurfaceRow
 from service.workflows import choose_measurements, load_heliostat, plain, spot_of
 
 if TYPE_CHECKING:  # see `service.runtime`
-    from model.study import Photograph, Study
+    from model.study import FluxImage, Study
 
 Surfaces = Literal["measured", "current"]
 
@@ -52,7 +52,7 @@ class StudyRequest:
 class Material:
     """What the store gives a study: photographs, what was left out, and when photographs were taken, by their keys."""
 
-    photographs: list["Photograph"] = field(default_factory=list)
+    photographs: list["FluxImage"] = field(default_factory=list)
     skipped: dict[str, str] = field(default_factory=dict)
 
     @property
@@ -73,7 +73,7 @@ class Material:
         kept, skipped = [], dict(self.skipped)
         for photograph in self.photographs:
             try:
-                align([photograph.shot])
+                align([photograph.setup])
             except UnreachableError as error:
                 skipped[photograph.key] = str(error)
             else:
@@ -144,13 +144,13 @@ def _gather_heliostat(session: Session, row: HeliostatRow, request: StudyRequest
 
 def photograph_of(
     row: MeasurementRow, heliostat: Heliostat, points: np.ndarray[Any, Any], origin: tuple[float, float, float]
-) -> "Photograph":
+) -> "FluxImage":
     """An accepted measurement, loaded with its arrays, as a study compares it; ``points`` (F, I, J, 3) [m]."""
-    from model.forecast import Shot
-    from model.study import Photograph
+    from model.forecast import Setup
+    from model.study import FluxImage
 
     image, plane = _flux(row, origin)
-    shot = Shot(
+    shot = Setup(
         heliostat,
         points,
         sun_direction(row.sun_azimuth_deg, row.sun_elevation_deg),
@@ -158,7 +158,7 @@ def photograph_of(
         spot=spot_of(row, store.target_plane(row.target), origin),
         identifier=f"{heliostat.name}/{row.identifier}",
     )
-    return Photograph(shot, image, taken_at=row.taken_at)
+    return FluxImage(shot, image, taken_at=row.taken_at)
 
 
 def _flux(row: MeasurementRow, origin: tuple[float, float, float]) -> tuple[np.ndarray[Any, Any], TargetPlane]:

@@ -9,10 +9,10 @@ import numpy as np
 
 from model.effects import Effect, effect_to_json
 from model.errors import InvalidInputError, ModelError
-from model.forecast import Shot
+from model.forecast import Setup
 from model.imaging.window import center_of_mass
 from model.plant import Heliostat, TargetPlane
-from model.study import Photograph, Study, StudyOptions, study
+from model.study import FluxImage, Study, StudyOptions, study
 from model.surface import DEGREE, control_points
 from service.folder import check_surfaces, measure, read_image, surface_of
 from service.paint import Measurement, MeasurementFolder, read_json
@@ -37,9 +37,9 @@ class FolderStudy:
         }
 
 
-def photographs_of(folder: MeasurementFolder, surfaces: str = "measured") -> tuple[list[Photograph], dict[str, str]]:
+def photographs_of(folder: MeasurementFolder, surfaces: str = "measured") -> tuple[list[FluxImage], dict[str, str]]:
     """What a folder gives a study, and what it does not: heliostats and measurements with the reasons."""
-    photographs: list[Photograph] = []
+    photographs: list[FluxImage] = []
     skipped, seen = dict(folder.skipped), predicted_from(surfaces)
     for name, heliostat in folder.plant.heliostats.items():
         try:
@@ -70,7 +70,7 @@ def predicted_from(surfaces: str) -> dict[str, list[str]]:
 
 def _photograph(
     folder: MeasurementFolder, measurement: Measurement, heliostat: Heliostat, points: np.ndarray, degree: int
-) -> Photograph:
+) -> FluxImage:
     """The flux of a measurement over its target, or over the crop that is all there is, and its shot."""
     image, plane = _flux(folder, measurement)
     spot = measurement.spot
@@ -79,8 +79,8 @@ def _photograph(
     across, up = plane.to_plane(spot)
     if abs(across) > plane.width / 2 or abs(up) > plane.height / 2:
         raise InvalidInputError(f"{measurement.key}: 'focal_spot' lies off its target {measurement.target}")
-    shot = Shot(heliostat, points, measurement.sun, plane, spot=spot, degree=degree, identifier=measurement.key)
-    return Photograph(shot, image, taken_at=measurement.taken_at)
+    shot = Setup(heliostat, points, measurement.sun, plane, spot=spot, degree=degree, identifier=measurement.key)
+    return FluxImage(shot, image, taken_at=measurement.taken_at)
 
 
 def _flux(folder: MeasurementFolder, measurement: Measurement) -> tuple[np.ndarray, TargetPlane]:

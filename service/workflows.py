@@ -447,7 +447,7 @@ def _trace(
     model: PlantModel,
     latitude_deg: float,
 ) -> "Forecast":
-    from model.effects import of_light
+    from model.effects import light_effects
 
     with runtime.computing("forecast") as operations:
         return operations.forecast(
@@ -460,6 +460,6 @@ def _trace(
             window=request.window,
             optics=replace(model.optics, dni=request.dni),
             # A stored target is what the camera looks at; on any other plane there is only light.
-            effects=model.effects if request.plane is None else of_light(model.effects),
+            effects=model.effects if request.plane is None else light_effects(model.effects),
             latitude_deg=latitude_deg,
         )

@@ -19,7 +19,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from model.forecast import Shot, View, forecast_shots
+from model.forecast import Setup, View, forecast_setups
 from model.frames import wgs84_to_enu
 from model.images import FLUX_SHAPE, FLUX_WINDOW
 from model.metrics import flux_accuracies
@@ -143,7 +143,7 @@ def fit_accuracies(heliostat: Heliostat, fine: Array, coarse: Array, seed: int =
     suns = Situations().suns(SUNS, np.random.default_rng(seed))
     view = View(*FLUX_SHAPE, window=FLUX_WINDOW, samples=64, cones="facet")
     truth, fitted = (
-        forecast_shots([Shot(heliostat, points, sun, SOURCE, spot=SOURCE.center) for sun in suns], view=view)
+        forecast_setups([Setup(heliostat, points, sun, SOURCE, spot=SOURCE.center) for sun in suns], view=view)
         .clamp(min=0)
         .numpy()
         for points in (fine, coarse)

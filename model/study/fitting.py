@@ -1,7 +1,8 @@
 """Fitting effects to photographs: Levenberg and Marquardt within bounds, from several starts.
 
 Images are compared in shares of their peak. Their residuals are far larger than their grain as long as the model lacks
-something, so that all pixels count alike (`TRUST`); intervals come from how the images disagree, not from the pixels.
+something, so that all pixels count alike (`PIXEL_NOISE`); intervals come from how the images disagree, not from the
+pixels.
 """
 
 from collections.abc import Sequence
@@ -14,18 +15,18 @@ from model.effects import Effect
 from model.errors import InvalidInputError, UnreachableError
 from model.images import COARSE_SIZE
 from model.least_squares import Descent, minimize
-from model.study.photographs import Forecaster
+from model.study.flux_images import Forecaster
 from model.study.unknowns import Unknowns, copied
 
 Array = NDArray[np.float64]
 
-TRUST = 0.03
-"""Residual of a pixel [of the peak] that weighs as much as an unknown that is ``held`` away from neutral."""
+PIXEL_NOISE = 0.03
+"""Standard deviation of a pixel [of the peak] that fits count with, beside the unknowns' ``prior_std``."""
 
 STARTS = (-0.4, -0.15, -0.05, 0.05, 0.15, 0.4)
 """Where fits of an unknown begin, in shares of its range away from neutral."""
 
-HOPELESS = 3
+WORST_START = 3
 """Cost of a start, in costs of the best one, above which none is made from it."""
 
 AT_ONCE = 16
@@ -66,12 +67,12 @@ class Fitter:
         iterations: int = 8,
     ) -> None:
         self.forecaster, self.fine, self.fixed, self.iterations = forecaster, fine, fixed, iterations
-        self.heliostats = np.array([p.heliostat for p in forecaster.photographs])
+        self.heliostats = np.array([p.heliostat for p in forecaster.flux_images])
         self.measured = forecaster.measured(COARSE_SIZE)
         self.peaks = self.measured.max(axis=(1, 2))
 
     def residuals(self, unknowns: Unknowns, values: Array) -> Array:
-        """Measured minus forecast (N, COARSE_SIZE**2) in units of `TRUST`; infinite where the model fails."""
+        """Measured minus forecast (N, COARSE_SIZE**2) in units of `PIXEL_NOISE`; infinite where the model fails."""
         return np.asarray(self.residuals_of(unknowns, values[None])[0])
 
     def residuals_of(self, unknowns: Unknowns, trials: Array) -> Array:
@@ -98,7 +99,7 @@ class Fitter:
             # A clock an hour off puts low suns below the horizon, and all light may be blocked: as wrong as can be.
             return np.full((1, len(self.measured), COARSE_SIZE**2), np.inf)
         difference = self.measured - forecast.reshape(count, *self.measured.shape)
-        shares = difference / self.peaks[:, None, None] / TRUST
+        shares = difference / self.peaks[:, None, None] / PIXEL_NOISE
         return np.asarray(shares.reshape(count, len(self.measured), -1))
 
     def _take_off_grid(self, unknowns: Unknowns, begin: Array) -> None:
@@ -108,31 +109,31 @@ class Fitter:
             grid = self.forecaster.cuts(model, COARSE_SIZE) - self.fine.cuts(model, COARSE_SIZE)
             self.measured = self.forecaster.measured(COARSE_SIZE) + grid
 
-    def _pull(self, unknowns: Unknowns, values: Array) -> Array:
-        """Distances (P,) from neutral: holds what images cannot tell."""
-        return np.asarray((values - unknowns.neutral) / unknowns.held)
+    def _prior_residuals(self, unknowns: Unknowns, values: Array) -> Array:
+        """Distances (P,) from neutral in prior standard deviations: they fix what images cannot tell."""
+        return np.asarray((values - unknowns.neutral) / unknowns.prior_std)
 
     def cost(self, unknowns: Unknowns, values: Array, residuals: Array) -> float:
         """Half the sum of squares."""
-        return float((residuals**2).sum() + (self._pull(unknowns, values) ** 2).sum()) / 2
+        return float((residuals**2).sum() + (self._prior_residuals(unknowns, values) ** 2).sum()) / 2
 
     def jacobian(self, unknowns: Unknowns, values: Array, residuals: Array) -> Array:
-        """Derivatives of the residuals (P, N, COARSE_SIZE**2); unknowns of different heliostats are changed at once."""
+        """Derivatives of the residuals (P, N, COARSE_SIZE**2); a group is changed at once."""
         low, high = unknowns.bounds
         steps = STEP * (high - low)
         steps = np.where(values + steps > high, -steps, steps)
-        colours = list(unknowns.colours.values())
-        trials = np.tile(values, (len(colours), 1))
-        for trial, places in zip(trials, colours, strict=True):
+        groups = list(unknowns.groups.values())
+        trials = np.tile(values, (len(groups), 1))
+        for trial, places in zip(trials, groups, strict=True):
             trial[places] += steps[places]
         derivatives = np.zeros((len(values), *residuals.shape))
-        for places, response in zip(colours, self.residuals_of(unknowns, trials) - residuals, strict=True):
+        for places, response in zip(groups, self.residuals_of(unknowns, trials) - residuals, strict=True):
             for place in places:
-                feels = self._feels(unknowns, place)
-                derivatives[place, feels] = response[feels] / steps[place]
+                affected = self._affected(unknowns, place)
+                derivatives[place, affected] = response[affected] / steps[place]
         return derivatives
 
-    def _feels(self, unknowns: Unknowns, place: int) -> NDArray[np.bool_]:
+    def _affected(self, unknowns: Unknowns, place: int) -> NDArray[np.bool_]:
         """Which images (N,) an unknown changes."""
         heliostat = unknowns.all[place].heliostat
         return np.full(len(self.heliostats), True) if heliostat is None else self.heliostats == heliostat
@@ -140,23 +141,23 @@ class Fitter:
     def starts(self, unknowns: Unknowns, begin: Array, free: NDArray[np.bool_]) -> tuple[list[Array], list[float]]:
         """Values to begin with and their costs, the best first: ``begin``, and its ``free`` unknowns elsewhere.
 
-        Many effects are even in their parameter, and a fit from neutral would not move; some have several valleys.
+        Many effects are even in their parameter, and a fit from neutral would not move; some have several local optima.
         Each unknown is moved by itself; heliostats choose apart where they have unknowns of their own.
         """
         low, high = unknowns.bounds
-        colours = [places for places in unknowns.colours.values() if free[places].all()]
-        if not colours:
+        groups = [places for places in unknowns.groups.values() if free[places].all()]
+        if not groups:
             return [begin], [0.0]
-        trials = np.tile(begin, (len(colours), 1 + len(STARTS), 1))
-        for moved, places in zip(trials, colours, strict=True):
+        trials = np.tile(begin, (len(groups), 1 + len(STARTS), 1))
+        for moved, places in zip(trials, groups, strict=True):
             moved[:, places] += np.array([0.0, *STARTS])[:, None] * (high - low)[places]
         trials = np.clip(trials, low, high)
         residuals = self.residuals_of(unknowns, trials.reshape(-1, len(begin)))
         energies = (residuals**2).sum(axis=-1).reshape(*trials.shape[:2], -1)
         chosen, found = begin.copy(), []
-        for moved, energy, places in zip(trials, energies, colours, strict=True):
+        for moved, energy, places in zip(trials, energies, groups, strict=True):
             for place in places:
-                best = energy[:, self._feels(unknowns, place)].sum(axis=1).argmin()
+                best = energy[:, self._affected(unknowns, place)].sum(axis=1).argmin()
                 chosen[place] = moved[best, place]
             if unknowns.all[places[0]].shared:
                 found.append(np.where(np.isin(np.arange(len(begin)), places), chosen, begin))
@@ -182,8 +183,10 @@ class Fitter:
         free = np.full(len(begin), True) if free is None else free
         self._take_off_grid(unknowns, begin)
         starts, costs = self.starts(unknowns, begin, free)
-        hopeful = [start for start, cost in zip(starts, costs, strict=True) if not cost > HOPELESS * costs[0]][:tries]
-        return min((self.descend(unknowns, start) for start in hopeful), key=lambda fit: fit.cost)
+        promising = [start for start, cost in zip(starts, costs, strict=True) if not cost > WORST_START * costs[0]][
+            :tries
+        ]
+        return min((self.descend(unknowns, start) for start in promising), key=lambda fit: fit.cost)
 
     def descend(self, unknowns: Unknowns, values: Array) -> Fit:
         """The least cost near ``values`` (P,)."""
@@ -195,7 +198,7 @@ class Fitter:
         descent = replace(DESCENT, jacobians=self.iterations, steps=self.iterations * TRIES)
         found = minimize(problem, begin, descent)
         end = found.state
-        return Fit(end.values, found.cost, self._spread(found.jacobian, end.residuals, 1 / unknowns.held**2))
+        return Fit(end.values, found.cost, self._spread(found.jacobian, end.residuals, 1 / unknowns.prior_std**2))
 
     def _spread(self, jacobian: Array, residuals: Array, scale: Array) -> Array:
         """Standard deviations (P,) by the sandwich of White (1980), with images, not pixels, as independent.
@@ -235,9 +238,9 @@ class _Problem:
         return self.fitter.jacobian(self.unknowns, point.values, point.residuals)
 
     def quadratic(self, point: _Point, jacobian: Array) -> tuple[Array, Array]:
-        flat, held = jacobian.reshape(len(jacobian), -1), self.unknowns.held
-        pull = (point.values - self.unknowns.neutral) / held**2
-        return -(flat @ point.residuals.ravel() + pull), flat @ flat.T + np.diag(1 / held**2)
+        flat, prior_std = jacobian.reshape(len(jacobian), -1), self.unknowns.prior_std
+        prior_gradient = (point.values - self.unknowns.neutral) / prior_std**2
+        return -(flat @ point.residuals.ravel() + prior_gradient), flat @ flat.T + np.diag(1 / prior_std**2)
 
     def bounds(self, point: _Point) -> tuple[Array, Array]:
         low, high = self.unknowns.bounds

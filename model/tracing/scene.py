@@ -26,7 +26,7 @@ class Optics:
     slope_error : float or Tensor (B,) [rad]
         Standard deviation of the mirror's normals per axis, below what the surface resolves.
     tracking_jitter : float or Tensor (B,) [rad]
-        Standard deviation with which the mirror swings about the first mount axis while it is imaged.
+        Standard deviation with which the mirror turns about the first mount axis while it is imaged.
     dni : float [W/m2]
     reflectivity : float
     attenuation : tuple of float

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from model.observation import TRUSTED_STRANGENESS
+from model.observation import TRUSTED_MAHALANOBIS
 from model.prior import default_prior
 from training.surfaces import tilt_modes
 
@@ -10,10 +10,10 @@ def test_a_mirror_unlike_those_known_is_strange():
     """Half of the facets turned by three milliradians, five times what the prior expects of canting."""
     prior = default_prior()
     truth = prior.surface(np.random.default_rng(2).normal(0, 0.5, len(prior.basis)))
-    assert prior.strangeness(prior.mean) == pytest.approx(0, abs=1e-6)
-    assert prior.strangeness(truth) < TRUSTED_STRANGENESS
+    assert prior.mahalanobis(prior.mean) == pytest.approx(0, abs=1e-6)
+    assert prior.mahalanobis(truth) < TRUSTED_MAHALANOBIS
     tilt = np.einsum("f,kij->fij", [3e-3, -3e-3, 0, 0], tilt_modes())
-    assert prior.strangeness(truth + tilt) > TRUSTED_STRANGENESS
+    assert prior.mahalanobis(truth + tilt) > TRUSTED_MAHALANOBIS
 
 
 def test_prior_inverts_its_own_coefficients():

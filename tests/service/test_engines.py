@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from model.fleet import FleetFlux, Superposition, Tile, standing, superpose, tiles
-from model.forecast import Shot
+from model.fleet import FleetFlux, Superposition, Tile, aligned_field, superpose, tiles
+from model.forecast import Setup
 from model.frames import sun_direction
 from model.plant import Heliostat
 from model.surface import control_points
@@ -31,8 +31,8 @@ def some_tiles() -> list[Tile]:
     positions = [np.array([-20.0 + 5 * (i % 8), 60.0 + 5 * (i // 8), 1.8]) for i in range(32)]
     heliostats = [Heliostat.juelich(f"H{i}", position, 80.0) for i, position in enumerate(positions)]
     plane = target(10.0)
-    shots = [Shot(one, control_points(one), SUN, plane) for one in heliostats]
-    return list(tiles(shots, standing([(one, plane.center) for one in heliostats], SUN), size=8))
+    shots = [Setup(one, control_points(one), SUN, plane) for one in heliostats]
+    return list(tiles(shots, aligned_field([(one, plane.center) for one in heliostats], SUN), size=8))
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +66,7 @@ def test_cluster_gives_the_same_light_also_where_a_worker_is_killed(cluster: Any
         receiver, resolution = task.receiver, task.resolution
 
         def __call__(self, tile: Tile) -> tuple[int, FleetFlux]:
-            if tile.shots[0].heliostat.name == "H8" and not died.exists():
+            if tile.setups[0].heliostat.name == "H8" and not died.exists():
                 died.touch()
                 os.kill(os.getpid(), signal.SIGKILL)
             return os.getpid(), task(tile)
