@@ -1,10 +1,10 @@
 """The light of a whole field on one receiver.
 
-Heliostats come in tiles, which an `Engine` works at in any number of threads or machines; what a tile gives is one map,
-so that memory does not grow with the field::
+Heliostats come in tiles, which an `Engine` may work at in any number of threads or machines; what a tile gives is one
+map, so that memory does not grow with the field::
 
     task = Superposition(receiver, resolution=(128, 128), optics=optics, effects=effects)
-    total = superpose(task, tiles(shots), Threads(2))
+    total = superpose(task, tiles(setups), engine)
 
 Forecasts for a receiver are light in W/m2: effects of the camera, of stage "image", say how a photograph differs from
 the light and do not act here. Where neighbours are given (`model.neighbours`), their shadows are traced, and the
@@ -15,10 +15,7 @@ that touch it.
 """
 
 import math
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from typing import Protocol, Self, TypeVar
@@ -28,10 +25,10 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from model.effects import JUELICH_LATITUDE, Effect, of_light
+from model.effects import JUELICH_LATITUDE, Effect, light_effects
 from model.effects.blocking import Blocking
 from model.errors import ModelError, UnreachableError
-from model.forecast import Shot, align, altered, optics_under
+from model.forecast import Setup, align, altered, optics_under
 from model.neighbours import Neighbours, outlines
 from model.plant import Cylinder, Heliostat, Receiver, TargetPlane
 from model.sunshape import transfer_table
@@ -41,7 +38,6 @@ from model.tracing.convolution import superpose as superpose_scene
 Array = NDArray[np.float64]
 Item = TypeVar("Item")
 Made = TypeVar("Made")
-Pending = TypeVar("Pending")
 
 
 class _Items(Protocol):
@@ -77,20 +73,20 @@ class Tile:
 
     Attributes
     ----------
-    shots : sequence of Shot
+    setups : sequence of Setup
         Before one sun; their planes are of no account, their aims are.
     obstacles : (B, K, 3, 3) [m] or None
         The neighbours in the way of each, as `Neighbours.obstacles` gives them; None: nothing is.
     """
 
-    shots: Sequence[Shot]
+    setups: Sequence[Setup]
     obstacles: Array | None = None
 
     def __getitem__(self, part: slice) -> "Tile":
-        return Tile(self.shots[part], None if self.obstacles is None else self.obstacles[part])
+        return Tile(self.setups[part], None if self.obstacles is None else self.obstacles[part])
 
     def __len__(self) -> int:
-        return len(self.shots)
+        return len(self.setups)
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,19 +147,19 @@ class Superposition:
         total = FleetFlux(np.zeros(self.resolution))
         for part, made in in_parts(self._trace, tile):
             if isinstance(made, ModelError):
-                made = FleetFlux(np.zeros(self.resolution), skipped={part.shots[0].heliostat.name: str(made)})
+                made = FleetFlux(np.zeros(self.resolution), skipped={part.setups[0].heliostat.name: str(made)})
             total = total + made
         return total
 
     def _trace(self, tile: Tile) -> FleetFlux:
-        acting = of_light(self.effects)
+        acting = light_effects(self.effects)
         if tile.obstacles is not None:
             acting = [effect for effect in acting if not isinstance(effect, Blocking)]
         optics = optics_under(acting, self.optics)
         table = transfer_table(optics.sun_shape, torch.float32, torch.device("cpu"))
         flux, power = torch.zeros(self.resolution, dtype=torch.float64), 0.0
         with torch.no_grad():
-            for group in align(tile.shots, acting, latitude_deg=self.latitude_deg).groups:
+            for group in align(tile.setups, acting, latitude_deg=self.latitude_deg).groups:
                 scene = group.scene
                 if tile.obstacles is not None:
                     scene = scene.with_(obstacles=torch.as_tensor(tile.obstacles[group.rows]).to(scene.sun))
@@ -272,65 +268,27 @@ class Engine(Protocol):
         """What ``work`` makes of the items, in their order; no more than a few of them are drawn ahead."""
 
 
-def in_order(
-    submit: Callable[[Item], Pending], items: Iterable[Item], ahead: int, result: Callable[[Pending], Made]
-) -> Iterator[Made]:
-    """Results in the items' order, while up to ``ahead`` of them are under way."""
-    pending: deque[Pending] = deque()
-    for item in items:
-        pending.append(submit(item))
-        if len(pending) >= ahead:
-            yield result(pending.popleft())
-    while pending:
-        yield result(pending.popleft())
-
-
-@dataclass(frozen=True, eq=False)
-class Threads:
-    """The engine of one machine; PyTorch leaves Python's lock while it computes.
-
-    Attributes
-    ----------
-    count : int
-    turn : callable
-        Gives what each piece of work is done within: a place in a queue for the processor, say.
-    """
-
-    count: int = 2
-    turn: Callable[[], AbstractContextManager[object]] = nullcontext
-
-    def map(self, work: Callable[[Item], Made], items: Iterable[Item]) -> Iterator[Made]:
-        """As `Engine.map`."""
-
-        def one(item: Item) -> Made:
-            with self.turn():
-                return work(item)
-
-        with ThreadPoolExecutor(self.count) as pool:
-            yield from in_order(lambda item: pool.submit(one, item), items, 2 * self.count, Future.result)
-
-
-def tiles(shots: Iterable[Shot], neighbours: Neighbours | None = None, size: int = TILE) -> Iterator[Tile]:
+def tiles(setups: Iterable[Setup], neighbours: Neighbours | None = None, size: int = TILE) -> Iterator[Tile]:
     """Tiles of ``size`` heliostats, with what of the neighbours stands in their way."""
-    remaining = iter(shots)
+    remaining = iter(setups)
     while some := list(islice(remaining, size)):
         yield tile_of(some, neighbours)
 
 
-def tile_of(shots: Sequence[Shot], neighbours: Neighbours | None = None) -> Tile:
+def tile_of(setups: Sequence[Setup], neighbours: Neighbours | None = None) -> Tile:
     """One tile; what is none of the neighbours, because it cannot be aimed, is skipped when it is traced."""
     if neighbours is None:
-        return Tile(shots)
-    return Tile(shots, neighbours.obstacles([shot.heliostat.name for shot in shots]))
+        return Tile(setups)
+    return Tile(setups, neighbours.obstacles([setup.heliostat.name for setup in setups]))
 
 
-def standing(
+def aligned_field(
     field: Iterable[tuple[Heliostat, ArrayLike]],
     sun: ArrayLike,
     effects: Iterable[Effect] = (),
     latitude_deg: float = JUELICH_LATITUDE,
 ) -> Neighbours:
-    """The mirrors of heliostats with their aims (3,) [m] under the recorded ``sun`` (3,).
+    """The aligned mirrors of heliostats with their aim points (3,) [m] under the recorded ``sun`` (3,).
 
     Those whose mounts cannot turn there are left out.
     """
@@ -339,20 +297,23 @@ def standing(
     for effect in acting:
         true_sun = effect.on_sun(true_sun, latitude_deg)
 
-    def stand(part: Sequence[tuple[Heliostat, ArrayLike]]) -> tuple[list[str], Array, Array]:
+    def outlined(part: Sequence[tuple[Heliostat, ArrayLike]]) -> tuple[list[str], Array, Array]:
         heliostats, aims = [one for one, _ in part], np.array([aim for _, aim in part], dtype=np.float64)
         return [one.name for one in heliostats], outlines(altered(heliostats, acting), true_sun[0], aims), aims
 
     remaining, found = iter(field), []
     while some := list(islice(remaining, TILE)):
-        found += [made for _, made in in_parts(stand, some) if not isinstance(made, ModelError)]
-    return Neighbours.standing(found, true_sun[0])
+        found += [made for _, made in in_parts(outlined, some) if not isinstance(made, ModelError)]
+    return Neighbours.from_outlines(found, true_sun[0])
 
 
 def superpose(task: Superposition, parts: Iterable[Tile], engine: Engine | None = None) -> FleetFlux:
-    """The light of all tiles on the task's receiver; the same to the last bit whatever the engine."""
+    """The light of all tiles on the task's receiver, one after another without an engine.
+
+    The same to the last bit whatever the engine.
+    """
     total = FleetFlux(np.zeros(task.resolution))
-    for part in (engine or Threads()).map(task, parts):
+    for part in map(task, parts) if engine is None else engine.map(task, parts):
         total = total + part
     # Frequency space leaves ripples below zero: 1e-5 of the peak, more where pixels are coarser than the spots.
     return replace(total, irradiance=total.irradiance.clip(min=0))

@@ -1,12 +1,13 @@
-"""From shots to images: what photographs a model of the plant expects.
+"""From measurement setups to flux images: what a model of the plant expects a camera to see.
 
-A shot is one heliostat before one sun and one target. `align` turns the heliostats, with every effect on sun, mount and
-mirror already in place; what it gives back traces itself under any optics and any camera, as often as needed::
+A `Setup` is the geometry of one measurement: one heliostat before one sun and one target. `align` turns the heliostats,
+with every effect on sun, mount and mirror already in place; what it gives back traces itself under any optics and any
+camera, as often as needed::
 
-    aligned = align(shots, effects)
+    aligned = align(setups, effects)
     images = aligned.images(optics, effects, View(96, 96))
 
-or, in one step, `forecast_shots`. Gradients with respect to an effect's parameters hold the alignment fixed.
+or, in one step, `forecast_setups`. Gradients with respect to an effect's parameters hold the alignment fixed.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -23,7 +24,7 @@ from model.mount import Mount
 from model.plant import Heliostat, TargetPlane
 from model.surface import DEGREE
 from model.tracing import Optics, Scene, Window, trace
-from model.tracing.alignment import settle
+from model.tracing.alignment import align_scene
 
 Array = NDArray[np.float64]
 Tracer = Callable[[Scene, Window, Optics], Tensor]
@@ -31,8 +32,8 @@ Tracer = Callable[[Scene, Window, Optics], Tensor]
 
 
 @dataclass(frozen=True, eq=False)
-class Shot:
-    """One heliostat before one sun and one target.
+class Setup:
+    """The geometry of one measurement: one heliostat before one sun and one target.
 
     Attributes
     ----------
@@ -71,7 +72,7 @@ class Shot:
 
     @property
     def kind(self) -> tuple[object, ...]:
-        """What shots must have in common to be aligned at once."""
+        """What setups must have in common to be aligned at once."""
         return (self.degree, *self.control_points.shape, self.spot is None)
 
 
@@ -123,12 +124,12 @@ def images_under(effects: Iterable[Effect], flux: Tensor, window: Window) -> Ten
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Aligned shots whose mirrors are alike in their splines.
+    """Aligned setups whose mirrors are alike in their splines.
 
     Attributes
     ----------
     rows : list of int
-        Their places among all shots.
+        Their places among all setups.
     planes : list of TargetPlane
     scene : Scene
     angles : (B, 2) [rad]
@@ -143,7 +144,7 @@ class Group:
     aims: Array
 
     def windows(self, view: View) -> Iterator[tuple[Window, list[int]]]:
-        """Each window that the view has on their targets, with the places in this group of the shots that share it."""
+        """Each window that the view has on their targets, with the places in this group of the setups that share it."""
         places: dict[Window, list[int]] = {}
         for place, plane in enumerate(self.planes):
             places.setdefault(view.of(plane), []).append(place)
@@ -152,7 +153,7 @@ class Group:
 
 @dataclass(frozen=True, eq=False)
 class Aligned:
-    """Shots whose heliostats stand, under the geometry's effects, where their spots demand.
+    """Setups whose heliostats are aligned, under the geometry's effects, by their spots.
 
     Attributes
     ----------
@@ -163,16 +164,16 @@ class Aligned:
 
     @property
     def aims(self) -> Array:
-        """Aim points (B, 3) [m] in ENU, in the shots' order."""
+        """Aim points (B, 3) [m] in ENU, in the setups' order."""
         return _in_order([group.aims for group in self.groups], self.groups)
 
     @property
     def angles(self) -> Array:
-        """Axis angles (B, 2) [rad], in the shots' order."""
+        """Axis angles (B, 2) [rad], in the setups' order."""
         return _in_order([group.angles for group in self.groups], self.groups)
 
-    def raised(self, changes: Tensor) -> "Aligned":
-        """The same shots, all alike in their splines, with control points changed by (B, F, 3, I, J) [m].
+    def deformed(self, changes: Tensor) -> "Aligned":
+        """The same setups, all alike in their splines, deformed: control points changed by (B, F, 3, I, J) [m].
 
         The mounts stay where they are.
         """
@@ -187,22 +188,24 @@ class Aligned:
         view: View | None = None,
         tracer: Tracer | None = None,
     ) -> Tensor:
-        """Irradiance (B, rows, columns) [W/m2] under optics, the same for all shots, to which the effects' are added.
+        """Irradiance (B, rows, columns) [W/m2] under optics, the same for all setups, to which the effects' are added.
 
         ``tracer`` takes the place of the convolution tracer.
         """
-        view, met = view or View(), optics_under(effects, optics or Optics())
+        view, effective = view or View(), optics_under(effects, optics or Optics())
         by_tracer = tracer or view.trace
-        return self._each_window(view, lambda group, window, rows: by_tracer(group.scene.subset(rows), window, met))
+        return self._each_window(
+            view, lambda group, window, rows: by_tracer(group.scene.subset(rows), window, effective)
+        )
 
-    def photographs(self, flux: Tensor, effects: Iterable[Effect], view: View | None = None) -> Tensor:
+    def camera_images(self, flux: Tensor, effects: Iterable[Effect], view: View | None = None) -> Tensor:
         """What the effects of the camera make of ``flux`` (B, rows, columns), which was traced in the same view."""
         acting = list(effects)
 
-        def photograph(group: Group, window: Window, rows: list[int]) -> Tensor:
+        def imaged(group: Group, window: Window, rows: list[int]) -> Tensor:
             return images_under(acting, flux[[group.rows[row] for row in rows]], window)
 
-        return self._each_window(view or View(), photograph)
+        return self._each_window(view or View(), imaged)
 
     def images(
         self,
@@ -211,11 +214,11 @@ class Aligned:
         view: View | None = None,
         tracer: Tracer | None = None,
     ) -> Tensor:
-        """`flux`, then `photographs`: images (B, rows, columns)."""
-        return self.photographs(self.flux(optics, effects, view, tracer), effects, view)
+        """`flux`, then `camera_images`: images (B, rows, columns)."""
+        return self.camera_images(self.flux(optics, effects, view, tracer), effects, view)
 
     def _each_window(self, view: View, act: Callable[[Group, Window, list[int]], Tensor]) -> Tensor:
-        """What ``act`` makes (b, ...) of the shots in each window of each group, in the shots' order (B, ...)."""
+        """What ``act`` makes (b, ...) of the setups in each window of each group, in the setups' order (B, ...)."""
         parts, places = [], []
         for group in self.groups:
             for window, rows in group.windows(view):
@@ -225,24 +228,24 @@ class Aligned:
 
 
 def _in_order(parts: Sequence[Array], groups: Sequence[Group]) -> Array:
-    """Parts of each group (b, ...) in the shots' order (B, ...)."""
+    """Parts of each group (b, ...) in the setups' order (B, ...)."""
     places = [row for group in groups for row in group.rows]
     return np.concatenate(parts)[np.argsort(places)]
 
 
 def align(
-    shots: Sequence[Shot],
+    setups: Sequence[Setup],
     effects: Iterable[Effect] = (),
     *,
     latitude_deg: float = JUELICH_LATITUDE,
     dtype: torch.dtype = torch.float32,
     start: Aligned | None = None,
 ) -> Aligned:
-    """Turn the heliostats of shots under the effects on sun, mount and mirror.
+    """Turn the heliostats of setups under the effects on sun, mount and mirror.
 
     Parameters
     ----------
-    shots : sequence of Shot
+    setups : sequence of Setup
     effects : iterable of Effect
         Those on optics and camera are of no account here.
     latitude_deg : float [deg]
@@ -250,7 +253,7 @@ def align(
     dtype : torch.dtype
         In which it will be traced; the alignment itself is in double precision.
     start : Aligned, optional
-        The same shots under effects that differ little: saves rounds.
+        The same setups under effects that differ little: saves rounds.
 
     Raises
     ------
@@ -259,29 +262,33 @@ def align(
     """
     ordered = in_light_order(effects)
     kinds: dict[tuple[object, ...], list[int]] = {}
-    for row, shot in enumerate(shots):
-        kinds.setdefault(shot.kind, []).append(row)
-    aims = np.array([shot.goal for shot in shots]) if start is None else start.aims
+    for row, setup in enumerate(setups):
+        kinds.setdefault(setup.kind, []).append(row)
+    aims = np.array([setup.goal for setup in setups]) if start is None else start.aims
     return Aligned(
-        tuple(_align_group(shots, rows, ordered, latitude_deg, dtype, aims[rows]) for rows in kinds.values())
+        tuple(_align_group(setups, rows, ordered, latitude_deg, dtype, aims[rows]) for rows in kinds.values())
     )
 
 
 def _align_group(
-    shots: Sequence[Shot],
+    setups: Sequence[Setup],
     rows: list[int],
     effects: Sequence[Effect],
     latitude_deg: float,
     dtype: torch.dtype,
     aims: Array,
 ) -> Group:
-    """Align the shots of one kind."""
-    group = [shots[row] for row in rows]
-    heliostats = altered([shot.heliostat for shot in group], effects)
-    suns = np.array([shot.sun for shot in group], dtype=np.float64)
+    """Align the setups of one kind."""
+    group = [setups[row] for row in rows]
+    heliostats = altered([setup.heliostat for setup in group], effects)
+    suns = np.array([setup.sun for setup in group], dtype=np.float64)
     for effect in effects:
         suns = effect.on_sun(suns, latitude_deg)
-    points, planes, degree = [shot.control_points for shot in group], [shot.plane for shot in group], group[0].degree
+    points, planes, degree = (
+        [setup.control_points for setup in group],
+        [setup.plane for setup in group],
+        group[0].degree,
+    )
 
     def alter(scene: Scene) -> Scene:
         for effect in effects:
@@ -292,8 +299,10 @@ def _align_group(
         angles = _given_angles(group, heliostats, suns)
         scene = Scene.build(heliostats, points, angles, suns, planes, degree=degree, dtype=torch.float64)
     else:
-        goals = [shot.goal for shot in group]
-        angles, aims, scene = settle(heliostats, points, suns, planes, goals, degree=degree, start=aims, alter=alter)
+        goals = [setup.goal for setup in group]
+        angles, aims, scene = align_scene(
+            heliostats, points, suns, planes, goals, degree=degree, start=aims, alter=alter
+        )
     return Group(rows, planes, alter(scene.to(dtype)), angles, aims)
 
 
@@ -309,19 +318,21 @@ def altered(heliostats: Sequence[Heliostat], effects: Sequence[Effect]) -> list[
     return [altered[id(heliostat)] for heliostat in heliostats]
 
 
-def _given_angles(shots: Sequence[Shot], heliostats: Sequence[Heliostat], suns: Array) -> Array:
-    """Axis angles (B, 2) [rad] of shots without a spot: as given, or by the aim of the mirror's centre."""
-    angles = np.array([(np.nan, np.nan) if shot.angles is None else shot.angles for shot in shots], dtype=np.float64)
-    aimed = [row for row, shot in enumerate(shots) if shot.angles is None]
+def _given_angles(setups: Sequence[Setup], heliostats: Sequence[Heliostat], suns: Array) -> Array:
+    """Axis angles (B, 2) [rad] of setups without a spot: as given, or by the aim of the mirror's centre."""
+    angles = np.array(
+        [(np.nan, np.nan) if setup.angles is None else setup.angles for setup in setups], dtype=np.float64
+    )
+    aimed = [row for row, setup in enumerate(setups) if setup.angles is None]
     if aimed:
         mount = Mount.stack([heliostats[row].mount for row in aimed])
-        positions, goals = ([heliostats[row].position for row in aimed], [shots[row].goal for row in aimed])
+        positions, goals = ([heliostats[row].position for row in aimed], [setups[row].goal for row in aimed])
         angles[aimed] = mount.align(positions, suns[aimed], goals)
     return angles
 
 
-def forecast_shots(
-    shots: Sequence[Shot],
+def forecast_setups(
+    setups: Sequence[Setup],
     optics: Optics | None = None,
     effects: Sequence[Effect] = (),
     view: View | None = None,
@@ -329,11 +340,11 @@ def forecast_shots(
     latitude_deg: float = JUELICH_LATITUDE,
     dtype: torch.dtype = torch.float32,
 ) -> Tensor:
-    """Images (B, rows, columns) that the model, with its effects, expects of shots, in W/m2 but for the camera.
+    """Images (B, rows, columns) that the model, with its effects, expects of setups, in W/m2 but for the camera.
 
     Raises
     ------
     UnreachableError
         Where no attitude reflects the sun to the spot.
     """
-    return align(shots, effects, latitude_deg=latitude_deg, dtype=dtype).images(optics, effects, view)
+    return align(setups, effects, latitude_deg=latitude_deg, dtype=dtype).images(optics, effects, view)

@@ -1,15 +1,32 @@
-"""Flux images as numbers, alike for numpy and torch."""
+"""Flux images as numbers, alike for numpy and torch.
 
-from typing import TypeVar
+The flux image that everything compares, predicts from and reports is a square about the spot's centre of mass, of the
+side, the pixels and the sum that Lewen et al. 2024 (iDLR) chose.
+"""
+
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
-Images = TypeVar("Images", NDArray[np.float64], Tensor)
+if TYPE_CHECKING:  # its sizes are read where nothing is traced
+    from torch import Tensor
+
+Images = TypeVar("Images", NDArray[np.float64], "Tensor")
+
+FLUX_WINDOW = 4.0
+"""Side [m] of a flux image about its centre of mass."""
+
+FLUX_SIZE = 64
+"""Pixels along a side of a flux image."""
+
+FLUX_SHAPE = (FLUX_SIZE, FLUX_SIZE)
 
 FLUX_SUM = 100.0
-"""What the pixels of a normalised flux image add up to (the paper's rule)."""
+"""What the pixels of a normalised flux image add up to."""
+
+COARSE_SIZE = 32
+"""Pixels along a side of images that are fitted: the sun has blurred all that is finer."""
 
 
 def normalized(images: Images) -> Images:

@@ -5,28 +5,49 @@ neither aiming nor exposure counts. Surface error is the mean absolute differenc
 facet's mean is taken out, which no image can see.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model.errors import InvalidInputError
+from model.images import FLUX_SIZE, FLUX_WINDOW
 from model.imaging.window import center_of_mass, flux_window
 
 Array = NDArray[np.float64]
 
 
-def flux_accuracy(measured: ArrayLike, forecast: ArrayLike) -> float:
-    """1 - sum|measured - forecast| / sum(measured), both scaled to the same sum; one for equal shapes.
+WINDOWS = (FLUX_WINDOW, 6.0, 8.0, 12.0)
+"""Sides [m] of windows to compare in: that of a flux image, unless a spot is larger (`accuracy_window`)."""
 
-    Source: Lewen et al. 2024 (iDLR), flux accuracy.
+SPILL = 0.02
+"""Share of a spot's energy that may lie outside its window."""
+
+
+def flux_accuracies(measured: Array, forecast: Array) -> Array:
+    """1 - sum|measured - forecast| / sum(measured) of fluxes (..., R, C), both scaled to the same sum.
+
+    One for equal shapes. Source: Lewen et al. 2024 (iDLR), flux accuracy.
+    """
+    a, b = (flux / flux.sum(axis=(-2, -1), keepdims=True) for flux in (measured, forecast))
+    return np.asarray(1 - np.abs(a - b).sum(axis=(-2, -1)))
+
+
+def flux_accuracy(measured: ArrayLike, forecast: ArrayLike) -> float:
+    """As `flux_accuracies`, of one flux (R, C).
+
+    Raises
+    ------
+    InvalidInputError
+        If the fluxes differ in shape, are not finite or hold no energy.
     """
     a, b = np.asarray(measured, dtype=np.float64), np.asarray(forecast, dtype=np.float64)
     if a.shape != b.shape:
         raise InvalidInputError(f"fluxes must have one shape, got {a.shape} and {b.shape}")
     if not (np.isfinite(a).all() and np.isfinite(b).all() and a.sum() > 0 and b.sum() > 0):
         raise InvalidInputError("fluxes must be finite and hold energy")
-    return float(1 - np.abs(a / a.sum() - b / b.sum()).sum())
+    return float(flux_accuracies(a, b))
 
 
 @dataclass(frozen=True)
@@ -40,18 +61,45 @@ class FluxComparison:
 
 
 def compare_on_target(
-    measured: ArrayLike, forecast: ArrayLike, size: tuple[float, float], window: float = 4.0, resolution: int = 64
+    measured: ArrayLike,
+    forecast: ArrayLike,
+    size: tuple[float, float],
+    window: float = FLUX_WINDOW,
+    resolution: int = FLUX_SIZE,
 ) -> FluxComparison:
     """Compare two fluxes (rows, columns) over one target of ``size`` (width, height) [m].
 
     Each is cut to a square ``window`` [m] about its own centre of mass, (resolution, resolution) pixels.
     """
-    cuts, outside = [], []
-    for flux in (np.asarray(measured, dtype=np.float64), np.asarray(forecast, dtype=np.float64)):
-        cut = flux_window(flux, size, center_of_mass(flux, size), window, resolution)
-        cuts.append(cut)
-        outside.append(1 - cut.sum() / flux.sum())
+    cuts, outside = zip(*(_cut(flux, size, window, resolution) for flux in (measured, forecast)), strict=True)
     return FluxComparison(flux_accuracy(*cuts), window, *outside)
+
+
+def accuracy_window(
+    images: Sequence[ArrayLike],
+    sizes: Sequence[tuple[float, float]],
+    *,
+    spill: float = SPILL,
+    widest: float = WINDOWS[-1],
+) -> float:
+    """Side [m] of the smallest of `WINDOWS`, up to ``widest``, that holds all of the spots but ``spill``.
+
+    ``images`` are N fluxes (rows, columns) over whole targets of ``sizes`` (width, height) [m]; of many, half of them
+    must fit.
+    """
+    windows = [window for window in WINDOWS if window <= widest]
+    for window in windows:
+        outside = [_cut(i, size, window, FLUX_SIZE)[1] for i, size in zip(images, sizes, strict=True)]
+        if np.median(outside) <= spill:
+            return window
+    return windows[-1]
+
+
+def _cut(image: ArrayLike, size: tuple[float, float], window: float, resolution: int) -> tuple[Array, float]:
+    """A flux in the window about its centre of mass, and the share of its energy outside."""
+    flux = np.asarray(image, dtype=np.float64)
+    cut = flux_window(flux, size, center_of_mass(flux, size), window, resolution)
+    return cut, float(1 - cut.sum() / flux.sum())
 
 
 def surface_error(z: ArrayLike, truth: ArrayLike) -> float:

@@ -226,8 +226,8 @@ class Mount:
         ratio = (_dot(goal, first) - constant) / amplitude
         if (np.abs(ratio) > 1 + 1e-9).any():
             raise UnreachableError("the mount cannot turn its mirror to this normal")
-        phase, swing = np.arctan2(sine, cosine), np.arccos(np.clip(ratio, -1, 1))
-        both = np.stack([phase + swing, phase - swing], axis=-1)
+        phase, half_angle = np.arctan2(sine, cosine), np.arccos(np.clip(ratio, -1, 1))
+        both = np.stack([phase + half_angle, phase - half_angle], axis=-1)
         both = np.arctan2(np.sin(both), np.cos(both))
         t2 = np.where(np.abs(both[..., 0]) <= np.abs(both[..., 1]), both[..., 0], both[..., 1])
         turned = _apply(rotation(second, t2), zero)

@@ -49,7 +49,7 @@ def outlines(heliostats: Sequence[Heliostat], sun: ArrayLike, aims: ArrayLike) -
 
 @dataclass(frozen=True, eq=False)
 class Neighbours:
-    """The mirrors of a field as they stand under one sun.
+    """The mirrors of a field as they are aligned under one sun.
 
     Attributes
     ----------
@@ -68,7 +68,7 @@ class Neighbours:
     sun: Array
 
     @classmethod
-    def standing(cls, parts: Iterable[tuple[Sequence[str], Array, Array]], sun: ArrayLike) -> "Neighbours":
+    def from_outlines(cls, parts: Iterable[tuple[Sequence[str], Array, Array]], sun: ArrayLike) -> "Neighbours":
         """Of parts of a field: names, `outlines` (n, 3, 3) [m] and aims (n, 3) [m] of each."""
         listed = list(parts)
         names = [name for part in listed for name in part[0]]
@@ -113,8 +113,8 @@ class Neighbours:
             along = apart @ direction
             aside = (apart**2).sum(axis=1) - along**2
             near = radii[first:last] + radii[row]
-            met = (along > -near) & (along < end) & (aside < near**2)
-            yield from (other for other in first + np.flatnonzero(met) if other != row)
+            in_the_way = (along > -near) & (along < end) & (aside < near**2)
+            yield from (other for other in first + np.flatnonzero(in_the_way) if other != row)
 
 
 def clear(obstacles: Tensor, points: Tensor, direction: Tensor, cell: Tensor) -> Tensor:

@@ -9,23 +9,22 @@ from numpy.typing import NDArray
 
 from model.effects import Effect
 from model.errors import InvalidInputError
-from model.forecast import Aligned, Shot, View, align
-from model.images import normalized
+from model.forecast import Aligned, Setup, View, align
+from model.images import FLUX_SHAPE, FLUX_WINDOW, normalized
 from model.plant import Heliostat, TargetPlane
 from model.surface import control_points
 from model.tracing import Optics, Scene
 from model.tracing.alignment import align_to_spots
 
-FLUX_SHAPE = (64, 64)
-FLUX_WINDOW = 4.0
-"""Side [m] of the square that flux images show about their centre of mass (the paper's)."""
-
 TRUSTED_MISFIT = 0.2
 """Misfit of an image up to which a surface explains it: twice what clean images leave, more than real ones do."""
 
 
-TRUSTED_STRANGENESS = 1.8
-"""Strangeness up to which a surface may be a mirror of this kind: one in a thousand is stranger (chi-squared, 8)."""
+TRUSTED_MAHALANOBIS = 1.8
+"""Mahalanobis distance per root degree of freedom up to which a surface may be a mirror of this kind.
+
+One in a thousand lies farther (chi-squared, 8).
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,8 +76,8 @@ class SurfacePrediction:
         How badly the surface explains each of its own images: one minus the flux accuracy of re-rendering it.
     used : tuple of str
         Identifiers of the images.
-    strangeness : float
-        How far the surface lies from those measured before; one is usual (`SurfacePrior.strangeness`).
+    mahalanobis : float
+        Mahalanobis distance of the surface from the prior; about one is usual (`SurfacePrior.mahalanobis`).
     """
 
     z: NDArray[np.float64]
@@ -88,7 +87,7 @@ class SurfacePrediction:
     weights: str
     misfits: tuple[float, ...]
     used: tuple[str, ...]
-    strangeness: float = 1.0
+    mahalanobis: float = 1.0
 
     @property
     def misfit(self) -> float:
@@ -107,7 +106,7 @@ class SurfacePrediction:
         Not so for a foreign spot, a mirror of another kind, or images of another heliostat: a surface can often be bent
         to explain those, but not a likely one.
         """
-        return not self.suspicious and self.strangeness <= TRUSTED_STRANGENESS
+        return not self.suspicious and self.mahalanobis <= TRUSTED_MAHALANOBIS
 
 
 def scene_of(
@@ -145,8 +144,8 @@ def align_observations(
     that differs little, and saves rounds.
     """
     points = control_points(heliostat, z)
-    shots = [Shot(heliostat, points, o.sun, o.target, spot=o.center_of_mass) for o in observations]
-    return align(shots, effects, start=start)
+    setups = [Setup(heliostat, points, o.sun, o.target, spot=o.center_of_mass) for o in observations]
+    return align(setups, effects, start=start)
 
 
 def render_observations(

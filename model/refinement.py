@@ -8,16 +8,12 @@ is marginalised exactly. The curvature at the end gives the uncertainty.
 The Jacobian is taken by differences, one batched trace of all coefficients and images. That is most of the work, so a
 Jacobian serves many steps, and every step corrects it by what the images really did (Broyden 1965).
 
-Light from four facets lies in one spot, and facets can take each other's part: the posterior has side maxima. The climb
-starts from every guess there is, and the highest summit is taken.
+Light from four facets lies in one spot, and facets can take each other's part: the posterior has several local
+optima. The optimisation starts from every guess there is, and the best local optimum is taken.
 """
 
-import hashlib
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -26,11 +22,13 @@ from numpy.typing import NDArray
 from model.effects import Effect
 from model.errors import InvalidInputError
 from model.forecast import Aligned, View
-from model.images import binned, normalized
+from model.images import COARSE_SIZE, FLUX_WINDOW, binned, normalized
+from model.least_squares import Descent, minimize
 from model.metrics import flux_accuracy
 from model.network.inputs import STEP_HEIGHT
-from model.observation import FLUX_WINDOW, Observation, SurfacePrediction, align_observations, render_observations
+from model.observation import Observation, SurfacePrediction, align_observations, render_observations
 from model.plant import Heliostat
+from model.prior import SurfacePrior, default_prior
 from model.surface import control_points
 from model.tracing import Optics
 
@@ -39,70 +37,17 @@ Array = NDArray[np.float64]
 BLOCK = 4
 """Pixels along the side of the patches in which residuals of images err together."""
 
-LEAST_GAIN = 0.5
-"""Gain of log posterior below which a climb ends."""
-
-LEADING = 8
-"""Directions of the prior that tell a strange surface: the longest, which every image shows."""
-
-PRIOR = Path(__file__).parent / "weights" / "surface-prior.npz"
-
-
-@dataclass(frozen=True, eq=False)
-class SurfacePrior:
-    """A Gaussian over surfaces.
-
-    Attributes
-    ----------
-    mean : (4, 8, 8) [m]
-    basis : (K, 4, 8, 8) [m]
-        Orthogonal directions, each as long as its standard deviation; the longest first.
-    hidden : (H, 4, 8, 8) [m]
-        Directions that no image shows, as long as their standard deviations: the tilts of the whole mirror.
-    name : str
-        Which file, with its content hash.
-    """
-
-    mean: Array
-    basis: Array
-    hidden: Array
-    name: str = "unnamed"
-
-    @classmethod
-    def load(cls, path: Path = PRIOR) -> "SurfacePrior":
-        """Read a prior that `training.prior` wrote."""
-        content = path.read_bytes()
-        with np.load(io.BytesIO(content)) as data:
-            name = f"{path.stem}-{hashlib.sha256(content).hexdigest()[:12]}"
-            mean, basis, hidden = (data[key].astype(np.float64) for key in ("mean", "basis", "hidden"))
-            return cls(mean, basis, hidden, name)
-
-    def coefficients(self, z: Array) -> Array:
-        """Coefficients (K,) of the surface of the prior's span nearest to ``z`` (4, 8, 8) [m]."""
-        flat = self.basis.reshape(len(self.basis), -1)
-        return np.asarray(flat @ (z - self.mean).ravel() / (flat**2).sum(axis=1))
-
-    def surface(self, coefficients: Array) -> Array:
-        """Heights (4, 8, 8) [m] of coefficients (K,)."""
-        return np.asarray(self.mean + np.tensordot(coefficients, self.basis, axes=1))
-
-    def strangeness(self, z: Array) -> float:
-        """How far ``z`` (4, 8, 8) [m] lies from the mean: root mean square of its leading coefficients.
-
-        About one for a mirror of the kind that the prior was estimated from.
-        """
-        return float(np.sqrt((self.coefficients(z)[:LEADING] ** 2).mean()))
-
-    def deviation(self, covariance: Array) -> Array:
-        """Standard deviation (4, 8, 8) [m] of heights whose coefficients have a covariance (K, K)."""
-        shown = np.einsum("kfij,kl,lfij->fij", self.basis, covariance, self.basis, optimize=True)
-        return np.asarray(np.sqrt(shown + (self.hidden**2).sum(axis=0)))
-
-
-@lru_cache(maxsize=1)
-def default_prior() -> SurfacePrior:
-    """The shipped prior, loaded once."""
-    return SurfacePrior.load()
+DESCENT = Descent(
+    steps=16,
+    jacobians=1,
+    corrected=True,
+    damping=0.1,
+    raising=4.0,
+    least_damping=1e-4,
+    most_damping=100.0,
+    least_gain=0.5,
+)
+"""How the minimum of the negative log posterior is sought; a gain of half a unit is none."""
 
 
 @dataclass(frozen=True)
@@ -110,21 +55,21 @@ class RefinementOptions:
     """How images are trusted.
 
     ``noise`` is the least standard deviation of a pixel as a share of the image's peak; what the images then turn out
-    to err by, times ``hope``, is taken instead where it is more, in several ``rounds``. Errors of a model that lacks
-    something come in patches, in which pixels err together and must not be counted one by one: variance that blocks
-    of `BLOCK` pixels a side have beyond that of grain counts ``patches`` times. ``annealing`` are the noises to
+    to err by, times ``noise_share``, is taken instead where it is more, in several ``rounds``. Errors of a model that
+    lacks something come in patches, in which pixels err together and must not be counted one by one: variance that
+    blocks of `BLOCK` pixels a side have beyond that of grain counts ``patches`` times. ``annealing`` are the noises to
     begin with, stage by stage, with the ``leading`` directions of the prior: images that are trusted little at first
     let the large features settle before the small ones are looked at. ``calibration`` is how many times the images'
-    variance is counted in the uncertainty: the curvature at one summit knows nothing of others nearby. It was chosen
-    so that 90 % intervals hold nine of ten heights of mirrors left out, in five folds.
+    variance is counted in the uncertainty: the curvature at one local optimum knows nothing of others nearby. It was
+    chosen so that 90 % intervals hold nine of ten heights of mirrors left out, in five folds.
     ``shift_m``, ``exposure``, ``background`` [of the peak], ``blur_m`` and ``gamma`` are the standard deviations of the
     nuisance parameters; pixels up to ``dark`` [of the peak] are lifted by noise that cannot go below black. Images are
-    compared at ``resolution`` pixels a side: the sun has blurred all that is finer. Their changes may be traced more
+    compared at ``resolution`` pixels a side. Their changes may be traced more
     coarsely than they themselves, which are few.
     """
 
     noise: float = 0.005
-    hope: float = 0.7
+    noise_share: float = 0.7
     patches: float = 32.0
     rounds: int = 4
     annealing: tuple[float, ...] = (0.5, 0.1, 0.03)
@@ -137,7 +82,7 @@ class RefinementOptions:
     blur_m: float = 0.05
     gamma: float = 0.1
     dark: float = 0.01
-    resolution: int = 32
+    resolution: int = COARSE_SIZE
     samples: int = 32
     jacobian_samples: int = 12
 
@@ -164,7 +109,7 @@ def _nuisance(image: Array, options: RefinementOptions) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """Coefficients (K,), where the mirror they make stands before each sun, and its images (M, R, R) of sum 100."""
+    """Coefficients (K,), the mirror they make as aligned under each sun, and its images (M, R, R) of sum 100."""
 
     c: Array
     aligned: Aligned
@@ -195,16 +140,16 @@ class _Posterior:
         changes = np.einsum("k,kfij,fc->kfcij", self.steps, untilted, heliostat.facet_normals)
         self.changes = torch.as_tensor(changes, dtype=torch.float32)
 
-    def _photographs(self, aligned: Aligned, samples: int) -> Array:
-        """Images (B, R, R), sum 100, of mirrors that stand."""
+    def _rendered(self, aligned: Aligned, samples: int) -> Array:
+        """Images (B, R, R), sum 100, of aligned mirrors."""
         with torch.no_grad():
             images = aligned.images(self.optics, self.effects, replace(self.view, samples=samples)).double().numpy()
         return normalized(images)
 
     def state(self, c: Array) -> _State:
-        """The mirror of coefficients (K,) before its suns."""
+        """The mirror of coefficients (K,), aligned under each sun."""
         aligned = align_observations(self.heliostat, self.observations, self.prior.surface(c), self.effects)
-        return _State(c, aligned, self._photographs(aligned, self.options.samples))
+        return _State(c, aligned, self._rendered(aligned, self.options.samples))
 
     def jacobian(self, state: _State, count: int) -> Array:
         """Change of the images per coefficient (count, M, R, R), of the first so many.
@@ -215,8 +160,8 @@ class _Posterior:
         points = (group.scene.control_points + changes[:, None]).flatten(0, 1)
         scene = group.scene.repeated(count).with_(control_points=points)
         stacked = replace(group, rows=list(range(scene.batch)), planes=group.planes * count, scene=scene)
-        changed = self._photographs(Aligned((stacked,)), samples).reshape(count, *state.images.shape)
-        return np.asarray((changed - self._photographs(state.aligned, samples)) / self.steps[:count, None, None, None])
+        changed = self._rendered(Aligned((stacked,)), samples).reshape(count, *state.images.shape)
+        return np.asarray((changed - self._rendered(state.aligned, samples)) / self.steps[:count, None, None, None])
 
     def _whitened(self, image: Array, noise: float) -> tuple[float, Array, Array]:
         """Noise of an image's pixels, its nuisance directions over that noise (n, 7), and Woodbury's inner inverse.
@@ -251,49 +196,30 @@ class _Posterior:
             curvature = curvature + j.T @ j - (directions.T @ j).T @ projected
         return gradient, curvature
 
-    def step(self, state: _State, jacobian: Array, noise: float, damping: float) -> Array:
-        """The change (k,) of the first coefficients that Levenberg and Marquardt would try next."""
-        gradient, curvature = self.quadratic(state, jacobian, noise)
-        change = np.linalg.solve(curvature + damping * np.diag(np.diag(curvature)), gradient)
-        return np.asarray(change, dtype=np.float64)
-
     def moved(self, state: _State, change: Array) -> _State:
         """The mirror after a change (k,) of its first coefficients."""
         return self.state(state.c + np.pad(change, (0, len(state.c) - len(change))))
 
-    def climb(self, state: _State, noise: float, jacobian: Array, retraced: int = 1) -> tuple[_State, Array]:
+    def optimize(self, state: _State, noise: float, jacobian: Array, retraced: int = 1) -> tuple[_State, Array]:
         """The state of the highest density near another, in a Jacobian's (k, M, R, R) coefficients, and its Jacobian.
 
-        Levenberg-Marquardt; the Jacobian is traced anew up to ``retraced`` times, where corrections no longer help.
+        The Jacobian is traced anew up to ``retraced`` times, where corrections no longer help.
         """
-        cost, damping, fresh = self.cost(state, noise), 0.1, False
-        for _ in range(self.options.steps):
-            change = self.step(state, jacobian, noise, damping)
-            trial = self.moved(state, change)
-            trial_cost = self.cost(trial, noise)
-            gain = cost - trial_cost
-            if gain > 0:
-                missed = trial.images - state.images - np.tensordot(change, jacobian, axes=1)
-                jacobian = jacobian + change[:, None, None, None] / (change @ change) * missed
-                state, cost = trial, trial_cost
-            damping = max(damping / 5, 1e-4) if gain > 0 else damping * 4
-            if gain >= LEAST_GAIN:
-                fresh = False
-            elif not fresh and retraced:
-                jacobian, fresh, retraced = self.jacobian(state, len(jacobian)), True, retraced - 1
-            elif gain > 0 or damping > 100:
-                break
-        return state, jacobian
+        descent = replace(DESCENT, steps=self.options.steps, jacobians=retraced)
+        found = minimize(_Problem(self, noise, len(jacobian)), state, descent, jacobian)
+        return found.state, found.jacobian
 
-    def summit(self, c: Array) -> tuple[_State, Array]:
-        """The summit above coefficients (K,) and the Jacobian there: large features first, then all."""
+    def optimum(self, c: Array) -> tuple[_State, Array]:
+        """The local optimum near coefficients (K,) and the Jacobian there: large features first, then all."""
         state, options = self.state(c), self.options
         jacobian = self.jacobian(state, min(options.leading, len(c)))
         for noise in options.annealing:
-            state, jacobian = self.climb(state, noise, jacobian)
+            state, jacobian = self.optimize(state, noise, jacobian)
         jacobian = self.jacobian(state, len(c))
         for left in reversed(range(options.rounds)):
-            state, jacobian = self.climb(state, self.noise(state, options.hope), jacobian, retraced=int(left == 0))
+            state, jacobian = self.optimize(
+                state, self.noise(state, options.noise_share), jacobian, retraced=int(left == 0)
+            )
         return state, jacobian
 
     def covariance(self, state: _State, jacobian: Array) -> Array:
@@ -312,6 +238,33 @@ class _Posterior:
             patch += binned(residual.reshape(1, *image.shape), image.shape[0] // BLOCK).var() / BLOCK**2
         variance = (grain + self.options.patches * max(0.0, patch - grain)) / len(self.measured)
         return max(self.options.noise, share * float(np.sqrt(variance)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """A posterior as a least-squares problem: in its first ``count`` coefficients, with one ``noise`` of images."""
+
+    posterior: _Posterior
+    noise: float
+    count: int
+
+    def cost(self, state: _State) -> float:
+        return self.posterior.cost(state, self.noise)
+
+    def response(self, state: _State) -> Array:
+        return state.images
+
+    def jacobian(self, state: _State) -> Array:
+        return self.posterior.jacobian(state, self.count)
+
+    def quadratic(self, state: _State, jacobian: Array) -> tuple[Array, Array]:
+        return self.posterior.quadratic(state, jacobian, self.noise)
+
+    def bounds(self, state: _State) -> None:
+        return None
+
+    def moved(self, state: _State, change: Array) -> _State:
+        return self.posterior.moved(state, change)
 
 
 def _untilted(z: Array, ideal: Array) -> Array:
@@ -352,8 +305,8 @@ def refine(
     options = options or RefinementOptions()
     posterior = _Posterior(heliostat, observations, prior, (optics, effects), options)
     starts = [np.zeros(len(prior.basis))] + ([] if start is None else [prior.coefficients(start)])
-    summits = [posterior.summit(c) for c in starts]
-    state, jacobian = min(summits, key=lambda summit: posterior.cost(summit[0], options.noise))
+    optima = [posterior.optimum(c) for c in starts]
+    state, jacobian = min(optima, key=lambda optimum: posterior.cost(optimum[0], options.noise))
     z = prior.surface(state.c)
     return SurfacePrediction(
         z=z,
@@ -363,7 +316,7 @@ def refine(
         weights=prior.name,
         misfits=misfits(heliostat, observations, z, optics, effects),
         used=tuple(o.identifier for o in observations),
-        strangeness=prior.strangeness(z),
+        mahalanobis=prior.mahalanobis(z),
     )
 
 

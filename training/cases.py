@@ -84,9 +84,9 @@ def _case(name: str, truth: Array, field: Array, camera: Camera | CleanCamera, r
     situations = Situations()
     (heliostat,) = situations.heliostats(field[rng.integers(len(field), size=1)], rng)
     suns = situations.suns(MAX_IMAGES + NEW_SUNS, rng)
-    shots = places(suns[:MAX_IMAGES], [SOURCE] * MAX_IMAGES)
+    setups = places(suns[:MAX_IMAGES], [SOURCE] * MAX_IMAGES)
     new = places(np.tile(suns[MAX_IMAGES:], (2, 1)), [SOURCE] * NEW_SUNS + [ELSEWHERE] * NEW_SUNS)
-    return Case(name, heliostat, truth, observe(heliostat, truth, shots, camera, rng), new)
+    return Case(name, heliostat, truth, observe(heliostat, truth, setups, camera, rng), new)
 
 
 def within_reach(field: Array) -> NDArray[np.bool_]:

@@ -15,8 +15,8 @@ import onnx
 import torch
 from torch import nn
 
-from model.images import normalized
-from model.network.architecture import CONDITIONS, IMAGE_SIZE, MAX_IMAGES
+from model.images import FLUX_SIZE, normalized
+from model.network.architecture import CONDITIONS, MAX_IMAGES
 from model.network.predictor import INPUTS, WEIGHTS, SurfacePredictor
 from model.surface import COLUMNS, FACETS, ROWS
 from training.cases import make_cases
@@ -32,7 +32,7 @@ PARITY_MM = 1e-4
 def example(batch: int, images: int) -> tuple[torch.Tensor, ...]:
     """Inputs of the network's form in the order of `INPUTS`, the first ``images`` of eight present."""
     generator = torch.Generator().manual_seed(batch * 10 + images)
-    fluxes = torch.rand(2, batch, MAX_IMAGES, IMAGE_SIZE, IMAGE_SIZE, generator=generator) ** 4
+    fluxes = torch.rand(2, batch, MAX_IMAGES, FLUX_SIZE, FLUX_SIZE, generator=generator) ** 4
     flux, guess_flux = normalized(fluxes)
     conditions = torch.randn(batch, MAX_IMAGES, CONDITIONS, generator=generator)
     mask = torch.zeros(batch, MAX_IMAGES)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from model.metrics import flux_accuracy, surface_error
+from model.metrics import flux_accuracies, surface_error
 from model.network.architecture import MAX_IMAGES
 from model.observation import render_observations
 from training.cases import NEW_SUNS, Case
@@ -37,7 +37,7 @@ class Outcome:
 def judge(case: Case, z: Array, z_std: Array | None) -> Outcome:
     """Compare a predicted surface (4, 8, 8) [m], and its standard deviation, with the true one."""
     truth, forecast = (render_observations(case.heliostat, case.forecasts, s).clip(min=0) for s in (case.truth, z))
-    accuracies = [flux_accuracy(a, b) for a, b in zip(truth, forecast, strict=True)]
+    accuracies = flux_accuracies(truth, forecast)
     return Outcome(
         surface=case.surface,
         distance_m=case.distance,

@@ -19,11 +19,11 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from model.forecast import Shot, View, forecast_shots
+from model.forecast import Setup, View, forecast_setups
 from model.frames import wgs84_to_enu
-from model.metrics import flux_accuracy
+from model.images import FLUX_SHAPE, FLUX_WINDOW
+from model.metrics import flux_accuracies
 from model.mount import Mount
-from model.observation import FLUX_SHAPE, FLUX_WINDOW
 from model.plant import Facet, Heliostat
 from model.surface import COLUMNS, DEGREE, ROWS, basis, control_points, fit_heights
 from training.cases import SOURCE
@@ -138,17 +138,17 @@ def normals_of(z: Array, u: Array, v: Array, half_size: Array) -> Array:
     return np.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True))
 
 
-def flux_accuracies(heliostat: Heliostat, fine: Array, coarse: Array, seed: int = 0) -> Array:
+def fit_accuracies(heliostat: Heliostat, fine: Array, coarse: Array, seed: int = 0) -> Array:
     """Flux accuracy (`SUNS`,) of a coarse surface's control points (F, I, J, 3) [m] against those of a fine one."""
     suns = Situations().suns(SUNS, np.random.default_rng(seed))
     view = View(*FLUX_SHAPE, window=FLUX_WINDOW, samples=64, cones="facet")
     truth, fitted = (
-        forecast_shots([Shot(heliostat, points, sun, SOURCE, spot=SOURCE.center) for sun in suns], view=view)
+        forecast_setups([Setup(heliostat, points, sun, SOURCE, spot=SOURCE.center) for sun in suns], view=view)
         .clamp(min=0)
         .numpy()
         for points in (fine, coarse)
     )
-    return np.array([flux_accuracy(a, b) for a, b in zip(truth, fitted, strict=True)])
+    return flux_accuracies(truth, fitted)
 
 
 HEAD = (
@@ -167,7 +167,7 @@ def row(measured: Deflectometry, fitted: Fit) -> list[str]:
     residuals, loss = fitted.residuals_mrad, None
     if measured.fine is not None:
         coarse = control_points(measured.heliostat, fitted.z)
-        loss = 1 - float(flux_accuracies(measured.heliostat, measured.fine, coarse).mean())
+        loss = 1 - float(fit_accuracies(measured.heliostat, measured.fine, coarse).mean())
     figures = (np.sqrt((residuals**2).mean()), np.quantile(residuals, 0.99), residuals.max(), loss)
     return [
         measured.heliostat.name,

@@ -9,9 +9,10 @@ import torch
 from numpy.typing import NDArray
 
 from model.network.predictor import LOOKS, SurfacePredictor
-from model.refinement import SurfacePrior, refine
+from model.prior import SurfacePrior
+from model.refinement import refine
 from training.cases import Case
-from training.render import Shots
+from training.render import Setups
 from training.train import Run
 
 Array = NDArray[np.float64]
@@ -42,7 +43,7 @@ def by_run(run: Run, looks: int | None = None) -> Method:
         used = case.observations[:images]
         suns, aims = np.array([o.sun for o in used]), np.array([o.center_of_mass for o in used])
         flux = torch.as_tensor(np.array([o.flux for o in used]))
-        return run.predict(flux[None], Shots.of([case.heliostat], suns, aims, run.device), looks)[
+        return run.predict(flux[None], Setups.of([case.heliostat], suns, aims, run.device), looks)[
             0
         ].double().numpy(), None
 

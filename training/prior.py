@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from model.refinement import PRIOR, SurfacePrior
+from model.prior import PRIOR, SurfacePrior
 from training.config import TrainConfig
 from training.surfaces import load_surfaces, split_by_heliostat, tilt_modes, untilted, with_symmetries
 

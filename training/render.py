@@ -20,10 +20,10 @@ from model.effects.sun_shape import SunShapeEffect
 from model.effects.target_registration import TargetRegistration
 from model.forecast import images_under, optics_under
 from model.frames import sun_direction_at
-from model.images import normalized
-from model.network.architecture import CONDITIONS, IMAGE_SIZE
-from model.network.inputs import DESCENT_SAMPLES, DESCENT_SIZE, GUESS_SAMPLES, conditions, descents
-from model.observation import FLUX_SHAPE, Observation, scene_of
+from model.images import COARSE_SIZE, FLUX_SHAPE, FLUX_SIZE, normalized
+from model.network.architecture import CONDITIONS
+from model.network.inputs import DESCENT_SAMPLES, GUESS_SAMPLES, conditions, descents
+from model.observation import Observation, scene_of
 from model.plant import Heliostat, TargetPlane
 from model.surface import control_points
 from model.tracing import Optics, Scene, Window, trace
@@ -76,7 +76,7 @@ class Situations:
         focal = np.linalg.norm(positions - TOWER_TOP, axis=-1) * rng.uniform(*self.focus, len(positions))
         return [Heliostat.juelich("synthetic", p, f) for p, f in zip(positions, focal, strict=True)]
 
-    def shots(self, field: Array, count: int, images: int, rng: np.random.Generator, device: torch.device) -> "Shots":
+    def setups(self, field: Array, count: int, images: int, rng: np.random.Generator, device: torch.device) -> "Setups":
         """``count`` heliostats at random places (N, 3) [m] of the field, each before ``images`` suns and aims."""
         heliostats = self.heliostats(field[rng.integers(len(field), size=count)], rng)
         total = count * images
@@ -88,11 +88,11 @@ class Situations:
             ],
             axis=-1,
         )
-        return Shots.of(heliostats, self.suns(total, rng), aims, device)
+        return Setups.of(heliostats, self.suns(total, rng), aims, device)
 
 
 @dataclass(frozen=True, eq=False)
-class Shots:
+class Setups:
     """Photographs to be taken of heliostats, whatever their surfaces.
 
     Attributes
@@ -109,8 +109,8 @@ class Shots:
     images: int
 
     @classmethod
-    def of(cls, heliostats: Sequence[Heliostat], suns: Array, aims: Array, device: torch.device) -> "Shots":
-        """Shots of heliostats of one mount with suns and aims (B * images, 3) on targets that face north."""
+    def of(cls, heliostats: Sequence[Heliostat], suns: Array, aims: Array, device: torch.device) -> "Setups":
+        """Setups of heliostats of one mount with suns and aims (B * images, 3) on targets that face north."""
         images, mount = len(suns) // len(heliostats), heliostats[0].mount
         points = np.array([control_points(h) for h in heliostats])
         normals = np.array([h.facet_normals for h in heliostats])
@@ -135,10 +135,10 @@ class Shots:
         """The scene of surfaces ``z`` (B, 4, 8, 8) [m], or of other ones before each sun (B, images, 4, 8, 8)."""
         if z.ndim == 4:
             z = z[:, None].expand(-1, self.images, -1, -1, -1)
-        raised = torch.einsum("bmfij,bfk->bmfkij", z, self.lift).flatten(0, 1)
-        return self.ideal.with_(control_points=self.ideal.control_points + raised)
+        deformed = torch.einsum("bmfij,bfk->bmfkij", z, self.lift).flatten(0, 1)
+        return self.ideal.with_(control_points=self.ideal.control_points + deformed)
 
-    def trace(self, z: Tensor, samples: int = GUESS_SAMPLES, size: int = IMAGE_SIZE) -> Tensor:
+    def trace(self, z: Tensor, samples: int = GUESS_SAMPLES, size: int = FLUX_SIZE) -> Tensor:
         """Flux (B, images, size, size), sum 100, of surfaces as `scene` takes them, as no camera sees it."""
         window = Window(rows=size, columns=size, on_spot=True)
         flux = trace(self.scene(z), window, samples=samples, padding=0.25).irradiance
@@ -146,18 +146,18 @@ class Shots:
 
     def descents(self, z: Tensor, flux: Tensor, basis: Tensor) -> Tensor:
         """`model.network.inputs.descents` (B, images, 4, 8, 8) [m] from surfaces ``z`` (B, 4, 8, 8) [m]."""
-        return descents(lambda dz: self.trace(z[:, None] + dz, DESCENT_SAMPLES, DESCENT_SIZE), flux, basis)
+        return descents(lambda dz: self.trace(z[:, None] + dz, DESCENT_SAMPLES, COARSE_SIZE), flux, basis)
 
     def conditions(self) -> Tensor:
         """What the network is told of each image (B, images, 12)."""
         return conditions(self.ideal).view(-1, self.images, CONDITIONS)
 
-    def __getitem__(self, rows: slice) -> "Shots":
-        """The shots of some of the heliostats."""
+    def __getitem__(self, rows: slice) -> "Setups":
+        """The setups of some of the heliostats."""
         start, stop, _ = rows.indices(len(self.lift))
-        shots = slice(start * self.images, stop * self.images)
-        parts = {name: getattr(self.ideal, name)[shots] for name in TENSORS}
-        return Shots(self.ideal.with_(**parts), self.lift[rows], self.images)
+        setups = slice(start * self.images, stop * self.images)
+        parts = {name: getattr(self.ideal, name)[setups] for name in TENSORS}
+        return Setups(self.ideal.with_(**parts), self.lift[rows], self.images)
 
 
 @dataclass(frozen=True)
@@ -183,7 +183,7 @@ class Camera:
 
     def photograph(self, scene: Scene, device: torch.device, rng: np.random.Generator) -> Tensor:
         """Flux images (B, 64, 64), sum 100, 4 m about the spot's centre."""
-        images = torch.empty(scene.batch, IMAGE_SIZE, IMAGE_SIZE, device=device)
+        images = torch.empty(scene.batch, FLUX_SIZE, FLUX_SIZE, device=device)
         for rows in np.array_split(rng.permutation(scene.batch), min(self.worlds, scene.batch)):
             share = rng.uniform() ** self.ease
             seen = self._seen(scene.subset(rows.tolist()), self.effects(share, rng))
@@ -254,27 +254,27 @@ def places(suns: Array, planes: Sequence[TargetPlane]) -> list[Observation]:
 def observe(
     heliostat: Heliostat,
     z: Array,
-    shots: Sequence[Observation],
+    setups: Sequence[Observation],
     camera: Camera | CleanCamera,
     rng: np.random.Generator,
 ) -> list[Observation]:
     """What a camera sees of a heliostat with heights ``z`` (4, 8, 8) [m] at `places`."""
     with torch.no_grad():
-        images = camera.photograph(scene_of(heliostat, shots, [z]), torch.device("cpu"), rng).numpy()
-    return [replace(shot, flux=image) for shot, image in zip(shots, images, strict=True)]
+        images = camera.photograph(scene_of(heliostat, setups, [z]), torch.device("cpu"), rng).numpy()
+    return [replace(setup, flux=image) for setup, image in zip(setups, images, strict=True)]
 
 
 def render(
     z: Array, images: int, field: Array, situations: Situations, camera: Camera | None, device: torch.device, seed: int
-) -> tuple[Tensor, Shots]:
-    """Flux (B, images, 64, 64) of surfaces ``z`` (B, 4, 8, 8) [m] in random situations, and the shots.
+) -> tuple[Tensor, Setups]:
+    """Flux (B, images, 64, 64) of surfaces ``z`` (B, 4, 8, 8) [m] in random situations, and the setups.
 
     Without a camera the flux is traced for the default sun and nothing else.
     """
     rng = np.random.default_rng(seed)
-    shots = situations.shots(field, len(z), images, rng, device)
+    setups = situations.setups(field, len(z), images, rng, device)
     surfaces = torch.as_tensor(z, dtype=torch.float32, device=device)
     if camera is None:
-        return shots.trace(surfaces, samples=24), shots
-    flux = camera.photograph(shots.scene(surfaces), device, rng)
-    return flux.view(len(z), images, *flux.shape[1:]), shots
+        return setups.trace(surfaces, samples=24), setups
+    flux = camera.photograph(setups.scene(surfaces), device, rng)
+    return flux.view(len(z), images, *flux.shape[1:]), setups

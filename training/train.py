@@ -25,7 +25,7 @@ from model.network.paper import PaperNetwork
 from training import parallel
 from training.config import TrainConfig
 from training.prior import estimate
-from training.render import Shots, load_field, render
+from training.render import Setups, load_field, render
 from training.surfaces import load_surfaces, split_by_heliostat
 
 
@@ -109,32 +109,32 @@ class Run:
         progress = min(1.0, (self.step - c.warmup) / max(1, c.steps - c.warmup))
         return c.learning_rate * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * progress)))
 
-    def look(self, network: nn.Module, flux: Tensor, shots: Shots, guess: Tensor) -> tuple[Tensor, Tensor]:
+    def look(self, network: nn.Module, flux: Tensor, setups: Setups, guess: Tensor) -> tuple[Tensor, Tensor]:
         """Heights and spread (B, 4, 8, 8) [mm] after one look at flux (B, M, 64, 64), from guesses (B, 4, 8, 8) [m]."""
         # Geometry does not bear sixteen bits: all of it stays outside of autocast.
         with torch.no_grad():
-            guess_flux, conditions = shots.trace(guess), shots.conditions()
-            descent = shots.descents(guess, flux, self.basis)
+            guess_flux, conditions = setups.trace(guess), setups.conditions()
+            descent = setups.descents(guess, flux, self.basis)
         mask = torch.ones(flux.shape[:2], device=self.device)
         with torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=self.config.bfloat16 and network.training):
             heights, spread = network(flux, conditions, mask, guess_flux, guess * 1e3, descent * 1e3)
         return heights.float(), spread.float()
 
     @torch.no_grad()
-    def predict(self, flux: Tensor, shots: Shots, looks: int | None = None) -> Tensor:
+    def predict(self, flux: Tensor, setups: Setups, looks: int | None = None) -> Tensor:
         """Surfaces (B, 4, 8, 8) [m] that the averaged network sees in flux (B, M, 64, 64) after all its looks."""
         guess = self.mean.expand(len(flux), -1, -1, -1)
         for _ in range(self.config.looks if looks is None else looks):
-            guess = self.look(self.average.eval(), flux, shots, guess)[0] * 1e-3
+            guess = self.look(self.average.eval(), flux, setups, guess)[0] * 1e-3
         return guess
 
-    def _guesses(self, flux: Tensor, shots: Shots) -> Tensor:
+    def _guesses(self, flux: Tensor, setups: Setups) -> Tensor:
         """Guesses (B, 4, 8, 8) [m]: the mean surface, and for an equal share of the batch the later looks' guesses."""
         guess = self.mean.expand(len(flux), -1, -1, -1).clone()
         for look in range(1, self.config.looks):
             rows = slice(0, len(flux) * (self.config.looks - look) // self.config.looks)
             with torch.no_grad():
-                guess[rows] = self.look(self.network, flux[rows], shots[rows], guess[rows])[0] * 1e-3
+                guess[rows] = self.look(self.network, flux[rows], setups[rows], guess[rows])[0] * 1e-3
         return guess
 
     def train_step(self) -> float:
@@ -144,10 +144,10 @@ class Run:
         z = c.augmentation.sample(self.surfaces, c.batch // parallel.size(), rng)
         images = int(rng.integers(1, MAX_IMAGES + 1))
         with torch.no_grad():
-            flux, shots = render(z, images, self.field, c.situations, c.camera, self.device, int(rng.integers(2**31)))
+            flux, setups = render(z, images, self.field, c.situations, c.camera, self.device, int(rng.integers(2**31)))
         truth = torch.as_tensor(z * 1e3, dtype=torch.float32, device=self.device)
         truth = truth - truth.mean(dim=(2, 3), keepdim=True)
-        heights, spread = self.look(self.network.train(), flux, shots, self._guesses(flux, shots))
+        heights, spread = self.look(self.network.train(), flux, setups, self._guesses(flux, setups))
         error, slopes, likelihood = loss_terms(heights, spread, truth)
         self.optimizer.param_groups[0]["lr"] = self._learning_rate()
         self.optimizer.zero_grad()
@@ -171,10 +171,10 @@ class Run:
     def validate(self, repeats: int = 8) -> list[float]:
         """Mean absolute height error [mm] on held-out heliostats, eight clean images each, after each look."""
         z = self.held_out.repeat(repeats, axis=0)
-        flux, shots = render(z, MAX_IMAGES, self.field, self.config.situations, None, self.device, seed=0)
+        flux, setups = render(z, MAX_IMAGES, self.field, self.config.situations, None, self.device, seed=0)
         truth = torch.as_tensor(z, dtype=torch.float32, device=self.device)
         truth = truth - truth.mean(dim=(2, 3), keepdim=True)
-        guesses = [self.predict(flux, shots, looks) for looks in range(1, self.config.looks + 1)]
+        guesses = [self.predict(flux, setups, looks) for looks in range(1, self.config.looks + 1)]
         return [round(float((guess - truth).abs().mean()) * 1e3, 4) for guess in guesses]
 
     def train(self, minutes: float, every: int = 250) -> None:

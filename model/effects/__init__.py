@@ -7,8 +7,8 @@ from model.effects.catalogue import (
     effect_to_json,
     effects_from_json,
     in_light_order,
+    light_effects,
     model_version,
-    of_light,
 )
 
 __all__ = [
@@ -22,7 +22,7 @@ __all__ = [
     "effect_to_json",
     "effects_from_json",
     "in_light_order",
+    "light_effects",
     "model_version",
-    "of_light",
     "parameter",
 ]

@@ -91,15 +91,15 @@ class Effect:
         What must be done anew when a parameter changes: the alignment of the mirrors, the tracing, or only the image.
     guesses : tuple of dict
         Parameters to begin a fit from, where those near neutral lead nowhere one by one.
-    held : float
-        Standard deviation of a parameter about neutral, in shares of its range, before any image is seen. It should
-        matter only for what images cannot tell.
+    prior_std : float
+        Prior standard deviation of a parameter about neutral, in shares of its range. It should matter only for what
+        images cannot tell.
     """
 
     name: ClassVar[str]
     stage: ClassVar[Stage]
     guesses: ClassVar[tuple[dict[str, float], ...]] = ()
-    held: ClassVar[float] = 1.0
+    prior_std: ClassVar[float] = 1.0
 
     def __post_init__(self) -> None:
         for p in self.parameters():

@@ -53,7 +53,7 @@ def in_light_order(effects: Iterable[Effect]) -> list[Effect]:
     return sorted(effects, key=lambda effect: order.get(effect.name, len(order)))
 
 
-def of_light(effects: Iterable[Effect]) -> list[Effect]:
+def light_effects(effects: Iterable[Effect]) -> list[Effect]:
     """Those that act on light itself; the others say how the camera's photograph of it differs."""
     return [effect for effect in effects if effect.stage != "image"]
 

@@ -44,7 +44,7 @@ class FacetCanting(Effect):
 
     name: ClassVar[str] = "facet_canting"
     stage: ClassVar[Stage] = "geometry"
-    held: ClassVar[float] = 0.1  # the mount takes back what a mirror's facets share, and no image shows it
+    prior_std: ClassVar[float] = 0.1  # the mount takes back what a mirror's facets share, and no image shows it
 
     x_mrad: ByHeliostat = parameter(0.0, -5.0, 5.0, "mrad", "facet")
     y_mrad: ByHeliostat = parameter(0.0, -5.0, 5.0, "mrad", "facet")

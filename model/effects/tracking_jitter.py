@@ -1,8 +1,8 @@
-"""Tracking jitter: the mount swings about its first axis while the camera's shutter is open.
+"""Tracking jitter: the mount oscillates about its first axis while the camera's shutter is open.
 
 What it is
-    Wind, backlash and the steps of the drive let a mirror swing about the axis that is least stiff; at the Solar
-    Tower Juelich that is the first, which points east. In an image that is exposed for longer than a swing, or
+    Wind, backlash and the steps of the drive let a mirror oscillate about the axis that is least stiff; at the Solar
+    Tower Juelich that is the first, which points east. In an image that is exposed for longer than an oscillation, or
     averaged of several, the spot is smeared. The angle is Gaussian with ``sigma_mrad``.
 
 Source

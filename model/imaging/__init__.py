@@ -1,8 +1,7 @@
 """Camera frame -> rectified target -> separated flux -> centred, cropped, normalised flux, with a quality record."""
 
-from model.imaging.decode import decode_image
 from model.imaging.measure import ImageKind, MeasuredFlux, measure
 from model.imaging.quality import Quality
 from model.imaging.window import center_of_mass, flux_window
 
-__all__ = ["ImageKind", "MeasuredFlux", "Quality", "center_of_mass", "decode_image", "flux_window", "measure"]
+__all__ = ["ImageKind", "MeasuredFlux", "Quality", "center_of_mass", "flux_window", "measure"]

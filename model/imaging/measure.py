@@ -1,5 +1,6 @@
 """From a photograph to a measured flux: find, rectify, separate, centre, crop, normalise, judge."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -8,18 +9,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model.errors import ImageRefusedError, InvalidInputError
+from model.images import FLUX_WINDOW, normalized
 from model.imaging.quality import SATURATED_GRAY, Quality, judge, judge_flux, refused
-from model.imaging.rectify import CROP_SIZE, check_corners, find_corners, rectify
+from model.imaging.rectify import BRACKETS, CROP_SIZE, Layout, check_corners, find_corners, rectify
 from model.imaging.separate import find_spots, separate
 from model.imaging.window import center_of_mass, flux_window
 from model.plant import TargetPlane
 
 ImageKind = Literal["raw", "cropped", "flux", "flux-centered"]
-
-WINDOW = 4.0  # [m], the paper's
-WINDOW_SIZE = 64  # [px]
-TOTAL = 100.0  # the paper's sum of a normalised flux
-PAINT_CENTERED_WINDOW = 6.1  # [m], side of PAINT's flux-centered images
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +48,7 @@ class MeasuredFlux:
     flux: NDArray[np.float32] | None = None
     centered: NDArray[np.float32] | None = None
     center_of_mass: NDArray[np.float64] | None = None
-    window: float = WINDOW
+    window: float = FLUX_WINDOW
     crop: NDArray[np.uint8] | None = None
     corners: NDArray[np.float64] | None = None
 
@@ -61,7 +58,8 @@ def measure(
     kind: ImageKind,
     plane: TargetPlane,
     *,
-    target_name: str | None = None,
+    layouts: Sequence[Layout] = (BRACKETS,),
+    side: float | None = None,
     corners: ArrayLike | None = None,
     empty: NDArray[np.uint8] | None = None,
 ) -> MeasuredFlux:
@@ -71,12 +69,14 @@ def measure(
     ----------
     image : uint8 (rows, columns) or (rows, columns, 3) in RGB
     kind : {"raw", "cropped", "flux", "flux-centered"}
-        A camera frame; the target seen straight on; that with its background removed; 6.1 m of that about the centre
-        of mass (PAINT's kinds).
+        A camera frame; the target seen straight on; that with its background removed; a square of that about the
+        centre of mass.
     plane : TargetPlane
         The target on which the image shows the spot.
-    target_name : str, optional
-        Default: the plane's name. See `model.imaging.rectify.mark_layouts`.
+    layouts : sequence of Layout
+        Where a raw image may show the target's marks; those to try, in order.
+    side : float [m], optional
+        Side of the square that a ``flux-centered`` image shows, which does not say so itself.
     corners : array_like (4, 2) [px], optional
         The target's corners in a raw image, used instead of its marks: upper left, upper right, lower left, lower
         right.
@@ -95,13 +95,15 @@ def measure(
     """
     _check(image, kind)
     if kind == "flux-centered":
-        return _measure_centered(_gray(image))
+        if side is None or not side > 0:
+            raise InvalidInputError(f"side of a centred flux must be positive metres, got {side}")
+        return _measure_centered(_gray(image), side)
     if kind == "flux":
         return _measure_flux(_gray(image), plane)
     if kind == "cropped":
         return _measure_crop(_square(_gray(image)), _square(_brightest(image)), plane, empty)
     try:
-        found = find_corners(_gray(image), plane, target_name) if corners is None else check_corners(corners)
+        found = find_corners(_gray(image), plane, layouts) if corners is None else check_corners(corners)
     except ImageRefusedError as refusal:
         return MeasuredFlux(refused(refusal.reason, refusal.detail))
     return _measure_crop(rectify(_gray(image), found), rectify(_brightest(image), found), plane, empty, found)
@@ -165,11 +167,11 @@ def _measure_flux(image: NDArray[np.uint8], plane: TargetPlane) -> MeasuredFlux:
     return MeasuredFlux(quality, _normalised(flux), centered, center)
 
 
-def _measure_centered(image: NDArray[np.uint8]) -> MeasuredFlux:
+def _measure_centered(image: NDArray[np.uint8], side: float) -> MeasuredFlux:
     flux = image.astype(np.float64)
     if not flux.any():
         return MeasuredFlux(refused("no_spot"))
-    _, centered, outside = _centered(flux, (PAINT_CENTERED_WINDOW, PAINT_CENTERED_WINDOW))
+    _, centered, outside = _centered(flux, (side, side))
     main, foreign = find_spots(flux.astype(np.float32), noise=float(flux.max()) / 255)
     quality = judge_flux(flux, main, outside, float(flux[foreign].sum() / flux.sum()))
     return MeasuredFlux(quality, centered=centered) if quality.accepted else MeasuredFlux(quality)
@@ -180,9 +182,9 @@ def _centered(
 ) -> tuple[NDArray[np.float64], NDArray[np.float32], float]:
     """Centre of mass (2,) [m], the normalised window about it, and the share of the energy that it leaves out."""
     center = center_of_mass(flux, size)
-    cut = flux_window(flux, size, center, WINDOW, WINDOW_SIZE)
+    cut = flux_window(flux, size, center)
     return center, _normalised(cut), max(0.0, 1.0 - float(cut.sum() / flux.sum(dtype=np.float64)))
 
 
 def _normalised(flux: NDArray[np.floating]) -> NDArray[np.float32]:
-    return np.asarray(flux * (TOTAL / flux.sum(dtype=np.float64)), dtype=np.float32)
+    return np.asarray(normalized(flux.astype(np.float64)), dtype=np.float32)

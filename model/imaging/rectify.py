@@ -1,11 +1,11 @@
 """From a camera frame to the target seen straight on: which marks are the target's, and the homography through them.
 
-A target has an L bracket at each free corner. Where two targets share an edge (the Juelich tower's upper and lower), T
-bars stand at the ends of that edge and L brackets only at the corners of the pair, so the pair's marks together serve
-either target. A target that is alone is searched by its four brackets. Four marks give a homography as a hypothesis; it
-must be plausible (convex, the right aspect, arms along the edges) and is scored by all marks that agree with it.
+Where a target's marks stand is data, a `Layout`: a bracket at each corner unless the plant says otherwise, as it must
+where marks serve several targets that share an edge. Four marks give a homography as a hypothesis; it must be plausible
+(convex, the right aspect, arms along the edges) and is scored by all marks of the layout that agree with it.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations, product
 
@@ -36,36 +36,16 @@ class MarkPlace:
     y: float
 
 
-_ALONE = (MarkPlace("L", 0, 0, 0), MarkPlace("L", 1, 1, 0), MarkPlace("L", 3, 0, 1), MarkPlace("L", 2, 1, 1))
-_SQUARE = np.array([[place.x, place.y] for place in _ALONE], dtype=np.float64)
-# The upper of two targets; the lower one has the same marks, one side further up. A layout starts with the target's own
-# corners: upper left, upper right, lower left, lower right.
-_UPPER = (
-    MarkPlace("L", 0, 0, 0),
-    MarkPlace("L", 1, 1, 0),
-    MarkPlace("T", 3, 0, 1),
-    MarkPlace("T", 1, 1, 1),
-    MarkPlace("T", 0, 0.5, 0),
-    MarkPlace("L", 3, 0, 2),
-    MarkPlace("L", 2, 1, 2),
-    MarkPlace("T", 2, 0.5, 2),
-)
-_LOWER = tuple(
-    MarkPlace(place.kind, place.quarter, place.x, place.y - 1) for place in (*_UPPER[2:4], *_UPPER[5:7], *_UPPER[:2])
-) + tuple(MarkPlace(place.kind, place.quarter, place.x, place.y - 1) for place in (_UPPER[4], _UPPER[7]))
+Layout = tuple[MarkPlace, ...]
+"""The marks of a target; the first four are those of its corners: upper left, upper right, lower left, lower right."""
+
+BRACKETS: Layout = (MarkPlace("L", 0, 0, 0), MarkPlace("L", 1, 1, 0), MarkPlace("L", 3, 0, 1), MarkPlace("L", 2, 1, 1))
+"""A target by itself: an L bracket at each corner."""
+
+_SQUARE = np.array([[place.x, place.y] for place in BRACKETS], dtype=np.float64)
 
 
-def mark_layouts(target_name: str) -> tuple[tuple[MarkPlace, ...], ...]:
-    """The layouts of marks to try for a target, in order; one of a pair is named ``..._upper`` or ``..._lower``."""
-    name = target_name.lower()
-    if name.endswith("upper"):
-        return _UPPER, _ALONE
-    if name.endswith("lower"):
-        return _LOWER, _ALONE
-    return (_ALONE,)
-
-
-def find_corners(gray: NDArray[np.uint8], plane: TargetPlane, target_name: str | None = None) -> Points:
+def find_corners(gray: NDArray[np.uint8], plane: TargetPlane, layouts: Sequence[Layout] = (BRACKETS,)) -> Points:
     """The target's corners in a camera frame, by its marks.
 
     Parameters
@@ -73,8 +53,8 @@ def find_corners(gray: NDArray[np.uint8], plane: TargetPlane, target_name: str |
     gray : uint8 (rows, columns)
     plane : TargetPlane
         Its aspect tells it from other targets in the frame.
-    target_name : str, optional
-        Default: the plane's name. See `mark_layouts`.
+    layouts : sequence of Layout
+        Those to try, in order.
 
     Returns
     -------
@@ -87,13 +67,13 @@ def find_corners(gray: NDArray[np.uint8], plane: TargetPlane, target_name: str |
         With reason ``target_not_found``.
     """
     marks = find_marks(gray)
-    for layout in mark_layouts(target_name or plane.name):
+    for layout in layouts:
         corners = _fit_layout(marks, layout, plane)
         if corners is not None:
             return corners
     raise ImageRefusedError(
         "target_not_found",
-        f"the corner marks of {target_name or plane.name} were not found; give the four corners in pixels",
+        f"the corner marks of {plane.name} were not found; give the four corners in pixels",
     )
 
 
@@ -139,7 +119,7 @@ def rectify(image: NDArray[np.uint8], corners: Points, size: int = CROP_SIZE) ->
     return np.asarray(cv2.resize(warped, (size, size), interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
-def _fit_layout(marks: list[Mark], layout: tuple[MarkPlace, ...], plane: TargetPlane) -> Points | None:
+def _fit_layout(marks: list[Mark], layout: Layout, plane: TargetPlane) -> Points | None:
     """The corners by the best agreeing set of marks, or None."""
     candidates = [
         [mark for mark in marks if (mark.kind, mark.quarter) == (place.kind, place.quarter)][:_CANDIDATES]
@@ -156,7 +136,7 @@ def _fit_layout(marks: list[Mark], layout: tuple[MarkPlace, ...], plane: TargetP
 
 def _best_of(
     sets: tuple[tuple[int, ...], ...],
-    layout: tuple[MarkPlace, ...],
+    layout: Layout,
     candidates: list[list[Mark]],
     plane: TargetPlane,
 ) -> Points | None:
@@ -173,7 +153,7 @@ def _best_of(
     return None if best is None else best[1]
 
 
-def _best_completed(layout: tuple[MarkPlace, ...], candidates: list[list[Mark]], plane: TargetPlane) -> Points | None:
+def _best_completed(layout: Layout, candidates: list[list[Mark]], plane: TargetPlane) -> Points | None:
     """The corners by the best agreeing three corner marks, the fourth put where its neighbours' arms meet."""
     best: tuple[float, Points] | None = None
     for hidden in range(4):
@@ -206,7 +186,7 @@ def _spread(points: Points) -> float:
 
 
 def _fit_four(
-    source: Points, chosen: list[Mark], layout: tuple[MarkPlace, ...], candidates: list[list[Mark]], plane: TargetPlane
+    source: Points, chosen: list[Mark], layout: Layout, candidates: list[list[Mark]], plane: TargetPlane
 ) -> tuple[float, Points] | None:
     """Score and corners of the homography through four marks, or None if it is implausible."""
     sizes = np.array([mark.size for mark in chosen])
@@ -225,9 +205,7 @@ def _fit_four(
     return sum(mark.score for mark in agreeing.values()), _settled(corners, agreeing, layout)
 
 
-def _agreeing(
-    transform: Points, layout: tuple[MarkPlace, ...], candidates: list[list[Mark]], size: float
-) -> dict[int, Mark]:
+def _agreeing(transform: Points, layout: Layout, candidates: list[list[Mark]], size: float) -> dict[int, Mark]:
     """The best mark near where the homography puts it, by place."""
     found = {}
     for index, (place, marks) in enumerate(zip(layout, candidates, strict=True)):
@@ -238,7 +216,7 @@ def _agreeing(
     return found
 
 
-def _settled(corners: Points, agreeing: dict[int, Mark], layout: tuple[MarkPlace, ...]) -> Points:
+def _settled(corners: Points, agreeing: dict[int, Mark], layout: Layout) -> Points:
     """The corners: measured where their mark is seen, else by the homography through all agreeing marks."""
     if len(agreeing) > 4:
         source = np.array([[layout[i].x, layout[i].y] for i in agreeing], dtype=np.float64)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model.errors import InvalidInputError
+from model.images import FLUX_SIZE, FLUX_WINDOW
 
 
 def overlap_matrix(source_edges: NDArray[np.float64], target_edges: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -31,8 +32,8 @@ def flux_window(
     flux: NDArray[np.floating],
     plane_size: tuple[float, float],
     center: ArrayLike = (0.0, 0.0),
-    window: float | tuple[float, float] = 4.0,
-    resolution: int | tuple[int, int] = 64,
+    window: float | tuple[float, float] = FLUX_WINDOW,
+    resolution: int | tuple[int, int] = FLUX_SIZE,
 ) -> NDArray[np.float64]:
     """The energy of a flux image in a window, resampled by area.
 

@@ -31,9 +31,6 @@ MAX_IMAGES = 8
 CONDITIONS = 12
 """Numbers that describe the geometry of one image (`model.network.inputs.conditions`)."""
 
-IMAGE_SIZE = 64
-"""Rows and columns of a flux image."""
-
 
 @dataclass(frozen=True)
 class NetworkConfig:
@@ -70,10 +67,10 @@ class ModulatedConv(nn.Module):
 
     def forward(self, x: Tensor, style: Tensor) -> Tensor:
         """(N, inputs, H, W) and (N, style) to (N, outputs, H / stride, W / stride)."""
-        scale = self.to_scale(style)
+        scale = self.to_scale(style)  # (N, inputs)
         x = functional.conv2d(x * scale[:, :, None, None], self.weight, stride=self.stride, padding=1)
         if self.demodulate:
-            energy = scale.square() @ self.weight.square().sum(dim=(2, 3)).T
+            energy = scale.square() @ self.weight.square().sum(dim=(2, 3)).T  # (N, outputs)
             x = x * torch.rsqrt(energy + 1e-8)[:, :, None, None]
         return x + self.bias[:, None, None]
 
@@ -89,7 +86,7 @@ class EncoderBlock(nn.Module):
 
     def forward(self, x: Tensor, style: Tensor) -> Tensor:
         """(N, inputs, H, W) to (N, outputs, H / stride, W / stride)."""
-        y = activate(self.first(x, style))
+        y = activate(self.first(x, style))  # (N, outputs, H / stride, W / stride)
         return activate((self.second(y, style) + self.skip(x)) * 0.5**0.5)
 
 
@@ -114,11 +111,12 @@ class Encoder(nn.Module):
 
     def forward(self, flux: Tensor, guess_flux: Tensor, conditions: Tensor) -> Tensor:
         """Fluxes (N, 64, 64) of sum 100 and conditions (N, 12) to features (N, features)."""
-        style = self.style(conditions)
-        x = self.fold(torch.cat([_channels(flux), _channels(guess_flux)], dim=1))
+        style = self.style(conditions)  # (N, 128)
+        x = torch.cat([_channels(flux), _channels(guess_flux)], dim=1)  # (N, 4, 64, 64)
+        x = self.fold(x)  # (N, 64, 16, 16)
         for block in self.blocks:
-            x = block(x, style)
-        features: Tensor = self.to_features(torch.cat([x.flatten(1), style], dim=1))
+            x = block(x, style)  # (N, fine, 16, 16), (N, middle, 8, 8), (N, coarse, 4, 4)
+        features: Tensor = self.to_features(torch.cat([x.flatten(1), style], dim=1))  # (N, features)
         return features
 
 
@@ -144,11 +142,12 @@ class Attention(nn.Module):
         """(B, M, width) to the same; ``hidden`` (B, M) is zero, very negative where there is no image."""
         batch, images, width = features.shape
         qkv = self.to_qkv(self.norm(features)).view(batch, images, 3, self.heads, width // self.heads)
-        q, k, v = qkv.permute(2, 0, 3, 1, 4)
-        scores = q @ k.transpose(-1, -2) * (width // self.heads) ** -0.5 + hidden[:, None, None, :]
-        mixed = (scores.softmax(dim=-1) @ v).transpose(1, 2).reshape(batch, images, width)
+        q, k, v = qkv.permute(2, 0, 3, 1, 4)  # (B, heads, M, width / heads) each
+        scores = q @ k.transpose(-1, -2) * (width // self.heads) ** -0.5  # (B, heads, M, M)
+        scores = scores + hidden[:, None, None, :]
+        mixed = (scores.softmax(dim=-1) @ v).transpose(1, 2).reshape(batch, images, width)  # (B, M, width)
         features = features + self.mix(mixed)
-        features = features + self.mlp(features)
+        features = features + self.mlp(features)  # (B, M, width)
         return features
 
 
@@ -165,11 +164,11 @@ class Pooling(nn.Module):
 
     def forward(self, features: Tensor, mask: Tensor) -> Tensor:
         """(B, M, features) and mask (B, M), one where there is an image, to (B, features)."""
-        hidden = (mask - 1) * 1e4
+        hidden = (mask - 1) * 1e4  # (B, M)
         for block in self.blocks:
-            features = block(features, hidden)
-        weights = (self.to_weights(features) + hidden[..., None]).softmax(dim=1)
-        pooled: Tensor = (features * weights).sum(dim=1)
+            features = block(features, hidden)  # (B, M, features)
+        weights = (self.to_weights(features) + hidden[..., None]).softmax(dim=1)  # (B, M, features)
+        pooled: Tensor = (features * weights).sum(dim=1)  # (B, features)
         return pooled
 
 
@@ -185,12 +184,12 @@ class Decoder(nn.Module):
 
     def forward(self, styles: Tensor) -> tuple[Tensor, Tensor]:
         """(B, layers, style) to heights and log spreads, each (B, 4, 8, 8)."""
-        x = self.seed.expand(styles.shape[0], -1, -1, -1)
+        x = self.seed.expand(styles.shape[0], -1, -1, -1)  # (B, channels, 4, 4)
         for layer, conv in enumerate(self.convs):
             if layer == 1:
                 x = functional.interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=False)
-            x = activate(conv(x, styles[:, layer]))
-        heights, log_spread = self.to_heights(x, styles[:, -1]).chunk(2, dim=1)
+            x = activate(conv(x, styles[:, layer]))  # (B, channels, 4, 4), then (B, channels, 8, 8)
+        heights, log_spread = self.to_heights(x, styles[:, -1]).chunk(2, dim=1)  # (B, 4, 8, 8) each
         return heights, log_spread
 
 
@@ -245,14 +244,16 @@ class SurfaceNetwork(nn.Module):
         heights, spread : Tensor (B, 4, 8, 8) [mm]
             Facet mean zero; the spread is the scale of a Laplace distribution of the error.
         """
-        shares = descent.flatten(2) / self.scale
-        step = shares.sum(dim=1)
-        features = self.encoder(flux.flatten(0, 1), guess_flux.flatten(0, 1), conditions.flatten(0, 1))
-        alone = shares * mask.sum(dim=1)[:, None, None]
-        pooled = self.pooling(features.view(*mask.shape, -1) + self.from_descent(alone), mask)
-        pooled = pooled + self.from_guess(guess.flatten(1) / self.scale) + self.from_step(step)
-        styles = self.to_styles(pooled).view(-1, self.config.style_layers, self.config.style_features)
-        heights, log_spread = self.decoder(styles)
-        heights = heights + self.bypass(torch.cat([pooled, step], dim=1)).view_as(heights)
+        shares = descent.flatten(2) / self.scale  # (B, M, points)
+        step = shares.sum(dim=1)  # (B, points)
+        each = (images.flatten(0, 1) for images in (flux, guess_flux, conditions))  # (B M, ...)
+        features = self.encoder(*each).view(*mask.shape, -1)  # (B, M, features)
+        alone = shares * mask.sum(dim=1)[:, None, None]  # (B, M, points)
+        pooled = self.pooling(features + self.from_descent(alone), mask)  # (B, features)
+        pooled = pooled + self.from_guess(guess.flatten(1) / self.scale) + self.from_step(step)  # (B, features)
+        styles = self.to_styles(pooled)  # (B, layers * style)
+        styles = styles.view(-1, self.config.style_layers, self.config.style_features)  # (B, layers, style)
+        heights, log_spread = self.decoder(styles)  # (B, 4, 8, 8) each
+        heights = heights + self.bypass(torch.cat([pooled, step], dim=1)).view_as(heights)  # (B, 4, 8, 8)
         heights = heights - heights.mean(dim=(2, 3), keepdim=True)
         return guess + self.scale * heights, self.scale * torch.exp(log_spread.clamp(-6, 2))

@@ -19,11 +19,8 @@ GUESS_SAMPLES = 16
 MIRRORED_CONDITIONS = (1, -1, -1, 1) * 2 + (1,) * 4
 """Signs by which `conditions` change where the world is mirrored, left and right exchanged."""
 
-DESCENT_SIZE = 32
-"""Rows and columns of the images that are differentiated: the sun has blurred all that is finer."""
-
 DESCENT_SAMPLES = 12
-"""Points along each side of a facet for the same."""
+"""Points along each side of a facet for images, of `model.images.COARSE_SIZE`, that are differentiated."""
 
 DESCENT_NOISE = 0.03
 """Standard deviation of a pixel [of the peak] that a descent counts with."""

@@ -16,25 +16,19 @@ from torch import Tensor
 from model.effects import Effect
 from model.errors import InvalidInputError
 from model.forecast import Aligned, View
-from model.images import normalized
+from model.images import COARSE_SIZE, FLUX_SIZE, FLUX_WINDOW, normalized
 from model.network.architecture import MAX_IMAGES
 from model.network.inputs import (
     DESCENT_SAMPLES,
-    DESCENT_SIZE,
     GUESS_SAMPLES,
     MIRRORED_CONDITIONS,
     conditions,
     descents,
 )
-from model.observation import (
-    FLUX_SHAPE,
-    FLUX_WINDOW,
-    Observation,
-    SurfacePrediction,
-    align_observations,
-)
+from model.observation import Observation, SurfacePrediction, align_observations
 from model.plant import Heliostat
-from model.refinement import default_prior, misfits
+from model.prior import default_prior
+from model.refinement import misfits
 from model.surface import FACETS, control_points, mirrored
 from model.tracing import Optics
 
@@ -90,12 +84,12 @@ class SurfacePredictor:
             raise InvalidInputError(f"a prediction takes 1 to {MAX_IMAGES} images, got {len(observations)}")
         if len(heliostat.facets) != FACETS:
             raise InvalidInputError(f"the network knows mirrors of {FACETS} facets, {heliostat.name} has other")
-        sight = _Sight(heliostat, observations, optics, effects)
+        network_inputs = _NetworkInputs(heliostat, observations, optics, effects)
         z = default_prior().mean
-        inputs = sight.inputs(z)
+        inputs = network_inputs.inputs(z)
         for _ in range(looks - 1):
             z = self.look(inputs)[0][0]
-            inputs = sight.inputs(z)
+            inputs = network_inputs.inputs(z)
         swapped = mirrored_inputs(inputs)
         both = self.look({name: np.concatenate([inputs[name], swapped[name]]) for name in INPUTS})
         z, z_std = ((values[0] + mirrored(values[1])) / 2 for values in both)
@@ -126,11 +120,11 @@ class SurfacePredictor:
             weights=self.name,
             misfits=misfits(heliostat, observations, z, optics, effects),
             used=tuple(o.identifier for o in observations),
-            strangeness=default_prior().strangeness(z),
+            mahalanobis=default_prior().mahalanobis(z),
         )
 
 
-class _Sight:
+class _NetworkInputs:
     """What the network is shown of a heliostat's M observations under optics and effects, guess after guess."""
 
     def __init__(
@@ -153,7 +147,7 @@ class _Sight:
         aligned = align_observations(self.heliostat, self.observations, z, self.effects, start=self.aligned)
         self.aligned = aligned
         with torch.no_grad():
-            guess_flux = self._images(aligned, FLUX_SHAPE[0], GUESS_SAMPLES)
+            guess_flux = self._images(aligned, FLUX_SIZE, GUESS_SAMPLES)
         descent = descents(partial(self._changed, aligned), self.flux[None], self.basis)[0]
         return {
             "flux": _filled(self.flux.numpy()),
@@ -165,17 +159,17 @@ class _Sight:
         }
 
     def _images(self, aligned: Aligned, size: int, samples: int) -> Tensor:
-        """Images (M, size, size), sum 100, of mirrors that stand."""
+        """Images (M, size, size), sum 100, of aligned mirrors."""
         view = View(size, size, window=FLUX_WINDOW, samples=samples)
         return normalized(aligned.images(self.optics, self.effects, view))
 
     def _changed(self, aligned: Aligned, changes: Tensor) -> Tensor:
-        """Images (1, M, R, R), sum 100, of mirrors that stand, changed by heights (1, M, 4, 8, 8) [m]."""
-        raised = aligned.raised(torch.einsum("mfij,fk->mfkij", changes[0], self.normals))
-        return self._images(raised, DESCENT_SIZE, DESCENT_SAMPLES)[None]
+        """Images (1, M, R, R), sum 100, of aligned mirrors, deformed by heights (1, M, 4, 8, 8) [m]."""
+        deformed = aligned.deformed(torch.einsum("mfij,fk->mfkij", changes[0], self.normals))
+        return self._images(deformed, COARSE_SIZE, DESCENT_SAMPLES)[None]
 
     def _conditions(self, aligned: Aligned) -> Tensor:
-        """`conditions` (M, 12) of the ideal mirror where the guess stands, as in training."""
+        """`conditions` (M, 12) of the ideal mirror as the guess is aligned, as in training."""
         scene = aligned.groups[0].scene
         return conditions(scene.with_(control_points=self.ideal.expand_as(scene.control_points)))
 

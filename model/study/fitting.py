@@ -1,31 +1,32 @@
 """Fitting effects to photographs: Levenberg and Marquardt within bounds, from several starts.
 
 Images are compared in shares of their peak. Their residuals are far larger than their grain as long as the model lacks
-something, so that all pixels count alike (`TRUST`); intervals come from how the images disagree, not from the pixels.
+something, so that all pixels count alike (`PIXEL_NOISE`); intervals come from how the images disagree, not from the
+pixels.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
-from scipy.optimize import lsq_linear
 
 from model.effects import Effect
 from model.errors import InvalidInputError, UnreachableError
-from model.study.photographs import Forecaster
+from model.images import COARSE_SIZE
+from model.least_squares import Descent, minimize
+from model.study.flux_images import Forecaster
 from model.study.unknowns import Unknowns, copied
 
 Array = NDArray[np.float64]
 
-TRUST = 0.03
-"""Residual of a pixel [of the peak] that weighs as much as an unknown that is ``held`` away from neutral."""
+PIXEL_NOISE = 0.03
+"""Standard deviation of a pixel [of the peak] that fits count with, beside the unknowns' ``prior_std``."""
 
 STARTS = (-0.4, -0.15, -0.05, 0.05, 0.15, 0.4)
 """Where fits of an unknown begin, in shares of its range away from neutral."""
 
-HOPELESS = 3
+WORST_START = 3
 """Cost of a start, in costs of the best one, above which none is made from it."""
 
 AT_ONCE = 16
@@ -34,8 +35,12 @@ AT_ONCE = 16
 STEP = 5e-3
 """Step of the differences, in shares of an unknown's range."""
 
-RESOLUTION = 32
-"""Pixels a side in which fits compare; the sun has blurred all that is finer."""
+
+TRIES = 3
+"""Steps from one Jacobian, each shorter than the last, after which a fit has come to its end."""
+
+DESCENT = Descent(steps=24, jacobians=8, patience=TRIES, least_share=1e-3)
+"""How the least cost is sought; a Jacobian is few forecasts, and is taken after every step."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,19 +67,19 @@ class Fitter:
         iterations: int = 8,
     ) -> None:
         self.forecaster, self.fine, self.fixed, self.iterations = forecaster, fine, fixed, iterations
-        self.heliostats = np.array([p.heliostat for p in forecaster.photographs])
-        self.measured = forecaster.measured(RESOLUTION)
+        self.heliostats = np.array([p.heliostat for p in forecaster.flux_images])
+        self.measured = forecaster.measured(COARSE_SIZE)
         self.peaks = self.measured.max(axis=(1, 2))
 
     def residuals(self, unknowns: Unknowns, values: Array) -> Array:
-        """Measured minus forecast (N, RESOLUTION**2) in units of `TRUST`; infinite where the model fails."""
+        """Measured minus forecast (N, COARSE_SIZE**2) in units of `PIXEL_NOISE`; infinite where the model fails."""
         return np.asarray(self.residuals_of(unknowns, values[None])[0])
 
     def residuals_of(self, unknowns: Unknowns, trials: Array) -> Array:
-        """Residuals (M, N, RESOLUTION**2) of many trials (M, P), traced at once where only mirrors differ in them."""
+        """Residuals (M, N, COARSE_SIZE**2) of many trials (M, P), traced at once where only mirrors differ in them."""
         shared = np.array([unknown.shared for unknown in unknowns.all])
         _, group = np.unique(trials[:, shared], axis=0, return_inverse=True)
-        residuals = np.empty((len(trials), len(self.measured), RESOLUTION**2))
+        residuals = np.empty((len(trials), len(self.measured), COARSE_SIZE**2))
         for one in np.unique(group):
             rows = np.flatnonzero(group == one)
             for part in np.array_split(rows, -(-len(rows) // AT_ONCE)):
@@ -82,53 +87,53 @@ class Fitter:
         return residuals
 
     def _residuals_alike(self, unknowns: Unknowns, trials: Array) -> Array:
-        """Residuals (M, N, RESOLUTION**2) of trials (M, P) with the same shared unknowns."""
+        """Residuals (M, N, COARSE_SIZE**2) of trials (M, P) with the same shared unknowns."""
         count = len(trials)
         copies, values = unknowns.copies(trials)
         fixed = [copied(effect, count) for effect in self.fixed]
         try:
-            forecast = self.forecaster.copies(count).cuts([*fixed, *copies.effects(values)], RESOLUTION)
+            forecast = self.forecaster.copies(count).cuts([*fixed, *copies.effects(values)], COARSE_SIZE)
         except (UnreachableError, InvalidInputError):
             if count > 1:
                 return np.concatenate([self._residuals_alike(unknowns, trial[None]) for trial in trials])
             # A clock an hour off puts low suns below the horizon, and all light may be blocked: as wrong as can be.
-            return np.full((1, len(self.measured), RESOLUTION**2), np.inf)
+            return np.full((1, len(self.measured), COARSE_SIZE**2), np.inf)
         difference = self.measured - forecast.reshape(count, *self.measured.shape)
-        shares = difference / self.peaks[:, None, None] / TRUST
+        shares = difference / self.peaks[:, None, None] / PIXEL_NOISE
         return np.asarray(shares.reshape(count, len(self.measured), -1))
 
     def _take_off_grid(self, unknowns: Unknowns, begin: Array) -> None:
         """Add to the measured images what the coarse forecast of ``begin`` differs by from the fine one."""
         if self.fine is not None:
             model = [*self.fixed, *unknowns.effects(begin)]
-            grid = self.forecaster.cuts(model, RESOLUTION) - self.fine.cuts(model, RESOLUTION)
-            self.measured = self.forecaster.measured(RESOLUTION) + grid
+            grid = self.forecaster.cuts(model, COARSE_SIZE) - self.fine.cuts(model, COARSE_SIZE)
+            self.measured = self.forecaster.measured(COARSE_SIZE) + grid
 
-    def _pull(self, unknowns: Unknowns, values: Array) -> Array:
-        """Distances (P,) from neutral: holds what images cannot tell."""
-        return np.asarray((values - unknowns.neutral) / unknowns.held)
+    def _prior_residuals(self, unknowns: Unknowns, values: Array) -> Array:
+        """Distances (P,) from neutral in prior standard deviations: they fix what images cannot tell."""
+        return np.asarray((values - unknowns.neutral) / unknowns.prior_std)
 
     def cost(self, unknowns: Unknowns, values: Array, residuals: Array) -> float:
         """Half the sum of squares."""
-        return float((residuals**2).sum() + (self._pull(unknowns, values) ** 2).sum()) / 2
+        return float((residuals**2).sum() + (self._prior_residuals(unknowns, values) ** 2).sum()) / 2
 
     def jacobian(self, unknowns: Unknowns, values: Array, residuals: Array) -> Array:
-        """Derivatives of the residuals (P, N, RESOLUTION**2); unknowns of different heliostats are changed at once."""
+        """Derivatives of the residuals (P, N, COARSE_SIZE**2); a group is changed at once."""
         low, high = unknowns.bounds
         steps = STEP * (high - low)
         steps = np.where(values + steps > high, -steps, steps)
-        colours = list(unknowns.colours.values())
-        trials = np.tile(values, (len(colours), 1))
-        for trial, places in zip(trials, colours, strict=True):
+        groups = list(unknowns.groups.values())
+        trials = np.tile(values, (len(groups), 1))
+        for trial, places in zip(trials, groups, strict=True):
             trial[places] += steps[places]
         derivatives = np.zeros((len(values), *residuals.shape))
-        for places, response in zip(colours, self.residuals_of(unknowns, trials) - residuals, strict=True):
+        for places, response in zip(groups, self.residuals_of(unknowns, trials) - residuals, strict=True):
             for place in places:
-                feels = self._feels(unknowns, place)
-                derivatives[place, feels] = response[feels] / steps[place]
+                affected = self._affected(unknowns, place)
+                derivatives[place, affected] = response[affected] / steps[place]
         return derivatives
 
-    def _feels(self, unknowns: Unknowns, place: int) -> NDArray[np.bool_]:
+    def _affected(self, unknowns: Unknowns, place: int) -> NDArray[np.bool_]:
         """Which images (N,) an unknown changes."""
         heliostat = unknowns.all[place].heliostat
         return np.full(len(self.heliostats), True) if heliostat is None else self.heliostats == heliostat
@@ -136,23 +141,23 @@ class Fitter:
     def starts(self, unknowns: Unknowns, begin: Array, free: NDArray[np.bool_]) -> tuple[list[Array], list[float]]:
         """Values to begin with and their costs, the best first: ``begin``, and its ``free`` unknowns elsewhere.
 
-        Many effects are even in their parameter, and a fit from neutral would not move; some have several valleys.
+        Many effects are even in their parameter, and a fit from neutral would not move; some have several local optima.
         Each unknown is moved by itself; heliostats choose apart where they have unknowns of their own.
         """
         low, high = unknowns.bounds
-        colours = [places for places in unknowns.colours.values() if free[places].all()]
-        if not colours:
+        groups = [places for places in unknowns.groups.values() if free[places].all()]
+        if not groups:
             return [begin], [0.0]
-        trials = np.tile(begin, (len(colours), 1 + len(STARTS), 1))
-        for moved, places in zip(trials, colours, strict=True):
+        trials = np.tile(begin, (len(groups), 1 + len(STARTS), 1))
+        for moved, places in zip(trials, groups, strict=True):
             moved[:, places] += np.array([0.0, *STARTS])[:, None] * (high - low)[places]
         trials = np.clip(trials, low, high)
         residuals = self.residuals_of(unknowns, trials.reshape(-1, len(begin)))
         energies = (residuals**2).sum(axis=-1).reshape(*trials.shape[:2], -1)
         chosen, found = begin.copy(), []
-        for moved, energy, places in zip(trials, energies, colours, strict=True):
+        for moved, energy, places in zip(trials, energies, groups, strict=True):
             for place in places:
-                best = energy[:, self._feels(unknowns, place)].sum(axis=1).argmin()
+                best = energy[:, self._affected(unknowns, place)].sum(axis=1).argmin()
                 chosen[place] = moved[best, place]
             if unknowns.all[places[0]].shared:
                 found.append(np.where(np.isin(np.arange(len(begin)), places), chosen, begin))
@@ -178,35 +183,22 @@ class Fitter:
         free = np.full(len(begin), True) if free is None else free
         self._take_off_grid(unknowns, begin)
         starts, costs = self.starts(unknowns, begin, free)
-        hopeful = [start for start, cost in zip(starts, costs, strict=True) if not cost > HOPELESS * costs[0]][:tries]
-        return min((self.descend(unknowns, start) for start in hopeful), key=lambda fit: fit.cost)
+        promising = [start for start, cost in zip(starts, costs, strict=True) if not cost > WORST_START * costs[0]][
+            :tries
+        ]
+        return min((self.descend(unknowns, start) for start in promising), key=lambda fit: fit.cost)
 
     def descend(self, unknowns: Unknowns, values: Array) -> Fit:
         """The least cost near ``values`` (P,)."""
-        low, high = unknowns.bounds
-        scale = 1 / unknowns.held**2
-        damping, residuals = 1e-2, self.residuals(unknowns, values)
-        cost = self.cost(unknowns, values, residuals)
+        begin = _Point(values, self.residuals(unknowns, values))
+        problem = _Problem(self, unknowns)
+        cost = problem.cost(begin)
         if not np.isfinite(cost):
             return Fit(values, cost, np.full(len(values), np.nan))
-        for _ in range(self.iterations):
-            jacobian = self.jacobian(unknowns, values, residuals)
-            flat = jacobian.reshape(len(values), -1)
-            curvature = flat @ flat.T + np.diag(scale)
-            gradient = flat @ residuals.ravel() + self._pull(unknowns, values) * np.sqrt(scale)
-            before = cost
-            for _ in range(3):
-                damped = curvature + damping * np.diag(np.diag(curvature))
-                trial = values + _bounded_step(damped, gradient, low - values, high - values)
-                trial_residuals = self.residuals(unknowns, trial)
-                trial_cost = self.cost(unknowns, trial, trial_residuals)
-                if trial_cost < cost:
-                    values, residuals, cost, damping = trial, trial_residuals, trial_cost, damping / 5
-                    break
-                damping *= 8
-            if before - cost < 1e-3 * before:
-                break
-        return Fit(values, cost, self._spread(jacobian, residuals, scale))
+        descent = replace(DESCENT, jacobians=self.iterations, steps=self.iterations * TRIES)
+        found = minimize(problem, begin, descent)
+        end = found.state
+        return Fit(end.values, found.cost, self._spread(found.jacobian, end.residuals, 1 / unknowns.prior_std**2))
 
     def _spread(self, jacobian: Array, residuals: Array, scale: Array) -> Array:
         """Standard deviations (P,) by the sandwich of White (1980), with images, not pixels, as independent.
@@ -221,11 +213,39 @@ class Fitter:
         return np.sqrt(np.diag(bread @ filling @ bread))
 
 
-def _bounded_step(curvature: Array, gradient: Array, low: Array, high: Array) -> Array:
-    """The step (P,) between ``low`` and ``high`` (P,) to the least of a quadratic form.
+@dataclass(frozen=True, eq=False)
+class _Point:
+    """Values (P,) of unknowns and the residuals (N, COARSE_SIZE**2) there."""
 
-    A full step that was only cut at the bounds would go astray where unknowns make up for each other.
-    """
-    root = np.linalg.cholesky(curvature)
-    solution = lsq_linear(root.T, -solve_triangular(root, gradient, lower=True), (low, high), method="bvls")
-    return np.asarray(np.clip(solution.x, low, high))
+    values: Array
+    residuals: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """The fit of unknowns as a least-squares problem."""
+
+    fitter: Fitter
+    unknowns: Unknowns
+
+    def cost(self, point: _Point) -> float:
+        return self.fitter.cost(self.unknowns, point.values, point.residuals)
+
+    def response(self, point: _Point) -> Array:
+        return point.residuals
+
+    def jacobian(self, point: _Point) -> Array:
+        return self.fitter.jacobian(self.unknowns, point.values, point.residuals)
+
+    def quadratic(self, point: _Point, jacobian: Array) -> tuple[Array, Array]:
+        flat, prior_std = jacobian.reshape(len(jacobian), -1), self.unknowns.prior_std
+        prior_gradient = (point.values - self.unknowns.neutral) / prior_std**2
+        return -(flat @ point.residuals.ravel() + prior_gradient), flat @ flat.T + np.diag(1 / prior_std**2)
+
+    def bounds(self, point: _Point) -> tuple[Array, Array]:
+        low, high = self.unknowns.bounds
+        return low - point.values, high - point.values
+
+    def moved(self, point: _Point, change: Array) -> _Point:
+        values = point.values + change
+        return _Point(values, self.fitter.residuals(self.unknowns, values))

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from model.study.photographs import Photograph
+from model.study.flux_images import FluxImage
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
@@ -41,32 +41,27 @@ FRESH = 2
 """Images that no surface was predicted from, from which on they alone judge."""
 
 
-def split(photographs: Sequence[Photograph]) -> Split:
+def split(flux_images: Sequence[FluxImage]) -> Split:
     """Every second image of each heliostat, by the sun's elevation, judges; and one heliostat of several is kept apart.
 
     The one that is kept apart is at the median distance: the others span it. Images that surfaces were predicted from
     do not judge; where fewer than `FRESH` others are left they have to, which the report says.
     """
-    seen = [p.seen for p in photographs]
+    seen = [p.seen for p in flux_images]
     judged_apart = any(seen) and seen.count(False) >= FRESH
-    names = sorted({p.heliostat for p in photographs})
-    distance = {name: np.mean([p.slant_range for p in photographs if p.heliostat == name]) for name in names}
+    names = sorted({p.heliostat for p in flux_images})
+    distance = {name: np.mean([p.slant_range for p in flux_images if p.heliostat == name]) for name in names}
     kept = sorted(names, key=lambda name: distance[name])[len(names) // 2] if len(names) >= SEVERAL else None
     parts: dict[str, list[int]] = {"fit": [], "own": [], "held_out": []}
     for name in names:
-        rows = [row for row, p in enumerate(photographs) if p.heliostat == name]
-        rows.sort(key=lambda row: (photographs[row].elevation_deg, photographs[row].key))
+        rows = [row for row, p in enumerate(flux_images) if p.heliostat == name]
+        rows.sort(key=lambda row: (flux_images[row].elevation_deg, flux_images[row].key))
         fitted = [row for row in rows if seen[row]] if judged_apart else rows[::2]
         if not fitted:  # a heliostat none of whose images is seen, beside others
             fitted = rows[::2]
         parts["own" if name == kept else "fit"] += fitted
         parts["held_out"] += [row for row in rows if row not in fitted]
     return Split(*(np.array(sorted(parts[part]), dtype=np.int64) for part in ("fit", "own", "held_out")))
-
-
-def accuracies(measured: Array, forecast: Array) -> Array:
-    """Flux accuracy (N,) of cuts (N, n, n) of sum one (`model.metrics.flux_accuracy`)."""
-    return np.asarray(1 - np.abs(measured - forecast).sum(axis=(1, 2)))
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,11 @@ from numpy.typing import NDArray
 from model.effects import CATALOGUE, JUELICH_LATITUDE, Effect
 from model.errors import InvalidInputError
 from model.forecast import View
+from model.images import FLUX_SIZE
+from model.metrics import flux_accuracies
 from model.study.fitting import Fitter
-from model.study.judging import Gain, Split, accuracies, paired_gain, split
-from model.study.photographs import RESOLUTION, Forecaster, Photograph, spot_window
+from model.study.flux_images import FluxImage, Forecaster, spot_window
+from model.study.judging import Gain, Split, paired_gain, split
 from model.study.report import Candidate, Found, Study
 from model.study.unknowns import Unknowns
 from model.tracing import Optics
@@ -24,7 +26,7 @@ REFITTED = 3
 """How many of the best candidates are fitted once more, jointly with the effects found before."""
 
 
-TELLING = 0.001
+LEAST_DIFFERENCE = 0.001
 """Accuracy that one effect must gain more than another on the same images to be told from it."""
 
 
@@ -64,15 +66,15 @@ class _Loop:
     """One study while it goes on."""
 
     def __init__(
-        self, photographs: Sequence[Photograph], optics: Optics, declared: Sequence[Effect], options: StudyOptions
+        self, flux_images: Sequence[FluxImage], optics: Optics, declared: Sequence[Effect], options: StudyOptions
     ) -> None:
-        self.photographs, self.options = photographs, options
-        self.window = options.window or spot_window(photographs)
-        self.split: Split = split(photographs)
-        self.facets = tuple(sorted({(p.heliostat, len(p.shot.control_points)) for p in photographs}))
+        self.flux_images, self.options = flux_images, options
+        self.window = options.window or spot_window(flux_images)
+        self.split: Split = split(flux_images)
+        self.facets = tuple(sorted({(p.heliostat, len(p.setup.control_points)) for p in flux_images}))
 
         def forecaster(rows: NDArray[np.int64], view: View) -> Forecaster:
-            chosen = [photographs[row] for row in rows]
+            chosen = [flux_images[row] for row in rows]
             return Forecaster(chosen, optics, declared, self.window, view, options.latitude_deg)
 
         self.fit, self.own = (
@@ -80,9 +82,9 @@ class _Loop:
             for rows in (self.split.fit, self.split.own)
         )
         self.judge = forecaster(self.split.held_out, options.view)
-        self.measured = self.judge.measured(RESOLUTION)
-        self.heliostats = np.array([photographs[row].heliostat for row in self.split.held_out])
-        self.noise = float(np.mean([photographs[row].noise_share(self.window) for row in self.split.held_out]))
+        self.measured = self.judge.measured(FLUX_SIZE)
+        self.heliostats = np.array([flux_images[row].heliostat for row in self.split.held_out])
+        self.noise = float(np.mean([flux_images[row].noise_share(self.window) for row in self.split.held_out]))
 
     def trial(self, kinds: Sequence[type[Effect]], start: Trial | None = None, joint: bool = True) -> Trial:
         """Fit kinds of effect, from where ``start`` has fitted some of them, and judge them.
@@ -131,7 +133,7 @@ class _Loop:
 
     def accuracy(self, effects: Sequence[Effect]) -> Array:
         """Accuracy (H,) of the held-out images under effects."""
-        return accuracies(self.measured, self.judge.cuts(effects))
+        return flux_accuracies(self.measured, self.judge.cuts(effects))
 
     def gain(self, after: Trial, before: Trial) -> Gain:
         """What ``after`` is better by on held-out images."""
@@ -142,21 +144,21 @@ class _Loop:
         return gain.low > 0 and gain.mean >= self.options.least_gain
 
     @staticmethod
-    def tells(gain: Gain) -> bool:
+    def distinguishes(gain: Gain) -> bool:
         """Whether a gain of one effect over another is significant, and more than what fits may differ by."""
-        return gain.low > 0 and gain.mean >= TELLING
+        return gain.low > 0 and gain.mean >= LEAST_DIFFERENCE
 
     def choose(self, trials: dict[str, Trial], current: Trial) -> tuple[str, list[str]] | None:
         """The candidate to add and its look-alikes, or None.
 
         Of those that no held-out image tells from the best one the simplest is taken.
         """
-        worthy = {name: t for name, t in trials.items() if self.counts(self.gain(t, current))}
-        if not worthy:
+        significant = {name: t for name, t in trials.items() if self.counts(self.gain(t, current))}
+        if not significant:
             return None
-        best = max(worthy.values(), key=lambda t: t.accuracy.mean())
-        alike = [name for name, t in worthy.items() if t is best or not self.tells(self.gain(best, t))]
-        alike.sort(key=lambda name: (len(worthy[name].values), -worthy[name].accuracy.mean()))
+        best = max(significant.values(), key=lambda t: t.accuracy.mean())
+        alike = [name for name, t in significant.items() if t is best or not self.distinguishes(self.gain(best, t))]
+        alike.sort(key=lambda name: (len(significant[name].values), -significant[name].accuracy.mean()))
         return alike[0], alike[1:]
 
     def without_idle(self, current: Trial) -> Trial:
@@ -170,7 +172,7 @@ class _Loop:
 
 
 def study(
-    photographs: Sequence[Photograph],
+    flux_images: Sequence[FluxImage],
     optics: Optics,
     effects: Sequence[Effect] = (),
     options: StudyOptions | None = None,
@@ -180,7 +182,7 @@ def study(
 
     Parameters
     ----------
-    photographs : sequence of Photograph
+    flux_images : sequence of FluxImage
         With surfaces that are believed; at least four, better several heliostats under many suns.
     optics, effects
         The declared model.
@@ -195,11 +197,11 @@ def study(
         Where no attitude reflects the sun to a measured spot.
     """
     options = options or StudyOptions()
-    if len(photographs) < LEAST_IMAGES:
-        raise InvalidInputError(f"a study takes at least {LEAST_IMAGES} photographs, got {len(photographs)}")
-    if len({p.key for p in photographs}) < len(photographs):
+    if len(flux_images) < LEAST_IMAGES:
+        raise InvalidInputError(f"a study takes at least {LEAST_IMAGES} photographs, got {len(flux_images)}")
+    if len({p.key for p in flux_images}) < len(flux_images):
         raise InvalidInputError("photographs of a study must have identifiers of their own")
-    loop = _Loop(photographs, optics, effects, options)
+    loop = _Loop(flux_images, optics, effects, options)
     declared = {effect.name for effect in effects}
     before = current = loop.trial([])
     found: list[Found] = []
@@ -224,10 +226,10 @@ def study(
         current = loop.without_idle(trials[name])
         found = [f for f in found if CATALOGUE[f.name] in current.unknowns.kinds]
         left.remove(name)
-    held_out = [photographs[row] for row in loop.split.held_out]
+    held_out = [flux_images[row] for row in loop.split.held_out]
     return Study(
-        photographs=held_out,
-        fitted=len(photographs) - len(held_out),
+        images=held_out,
+        fitted=len(flux_images) - len(held_out),
         window=loop.window,
         measured=loop.measured,
         before=loop.judge.cuts([]),

@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.effects import CATALOGUE, JUELICH_LATITUDE, Effect
+from model.metrics import flux_accuracies
 from model.study.advice import told_apart_by
 from model.study.covariates import covariates_of
-from model.study.judging import Gain, accuracies, rank_correlation
-from model.study.photographs import Photograph
+from model.study.flux_images import FluxImage
+from model.study.judging import Gain, rank_correlation
 from model.study.unknowns import Unknowns
 
 Array = NDArray[np.float64]
@@ -73,7 +74,7 @@ class Study:
 
     Attributes
     ----------
-    photographs : sequence of Photograph
+    images : sequence of FluxImage
         The H held-out ones, by which it was judged.
     fitted : int
         How many others were fitted.
@@ -90,7 +91,7 @@ class Study:
         Of the plant.
     """
 
-    photographs: Sequence[Photograph]
+    images: Sequence[FluxImage]
     fitted: int
     window: float
     measured: Array
@@ -104,17 +105,17 @@ class Study:
     @cached_property
     def accuracy_before(self) -> Array:
         """Accuracy (H,) of the declared model."""
-        return accuracies(self.measured, self.before)
+        return flux_accuracies(self.measured, self.before)
 
     @cached_property
     def accuracy_after(self) -> Array:
         """Accuracy (H,) with the effects found."""
-        return accuracies(self.measured, self.after)
+        return flux_accuracies(self.measured, self.after)
 
     @cached_property
     def noise_floor(self) -> float:
         """Mean error that the images' noise alone makes."""
-        return float(np.mean([p.noise_share(self.window) for p in self.photographs]))
+        return float(np.mean([p.noise_share(self.window) for p in self.images]))
 
     @property
     def unexplained_share(self) -> float:
@@ -136,7 +137,7 @@ class Study:
     @property
     def flattered(self) -> int:
         """How many of the judging images a surface was predicted from, for want of others."""
-        return sum(p.seen for p in self.photographs)
+        return sum(p.seen for p in self.images)
 
     @property
     def incomplete(self) -> bool:
@@ -146,7 +147,7 @@ class Study:
     def covariates(self) -> dict[str, float]:
         """Rank correlation of the error that is left with what may drive it, the strongest first."""
         error = 1 - self.accuracy_after
-        known = covariates_of(self.photographs, self.latitude_deg)
+        known = covariates_of(self.images, self.latitude_deg)
         found = {covariate.name: round(rank_correlation(error, v), 3) for covariate, v in known.items()}
         return dict(sorted(found.items(), key=lambda item: -abs(item[1])))
 
@@ -160,7 +161,7 @@ class Study:
         if not self.flattered:
             return self._conclusion()
         return (
-            f"{self._conclusion()} {self.flattered} of the {len(self.photographs)} images that judge are among those "
+            f"{self._conclusion()} {self.flattered} of the {len(self.images)} images that judge are among those "
             "that the surfaces were predicted from, which flatters both accuracies: predict from fewer, or take more."
         )
 
@@ -193,7 +194,7 @@ class Study:
             "conclusion": self.conclusion(),
             "images": {
                 "fit": self.fitted,
-                "held_out": len(self.photographs),
+                "held_out": len(self.images),
                 **({"held_out_but_predicted_from": self.flattered} if self.flattered else {}),
             },
             "window_m": self.window,
@@ -221,7 +222,7 @@ class Study:
         return {
             "accuracy_mean": round(float(accuracy.mean()), 5),
             "accuracy_median": round(float(np.median(accuracy)), 5),
-            "per_image": {p.key: round(float(a), 5) for p, a in zip(self.photographs, accuracy, strict=True)},
+            "per_image": {p.key: round(float(a), 5) for p, a in zip(self.images, accuracy, strict=True)},
         }
 
 

@@ -27,8 +27,11 @@ class Unknown:
         return self.heliostat is None
 
     @property
-    def colour(self) -> tuple[str, str, int | None]:
-        """Unknowns of one colour belong to different heliostats: no image feels two of them."""
+    def group(self) -> tuple[str, str, int | None]:
+        """Unknowns of one group belong to different heliostats: no image depends on two of them.
+
+        Their columns of a Jacobian are estimated at once (Curtis, Powell and Reid 1974, doi:10.1093/imamat/13.1.117).
+        """
         return self.effect.name, self.parameter.name, self.facet
 
 
@@ -69,17 +72,17 @@ class Unknowns:
         return np.array([u.parameter.low for u in self.all]), np.array([u.parameter.high for u in self.all])
 
     @property
-    def held(self) -> Array:
-        """Standard deviations (P,) about neutral before any image is seen."""
+    def prior_std(self) -> Array:
+        """Prior standard deviations (P,) about neutral."""
         low, high = self.bounds
-        return np.array([u.effect.held for u in self.all]) * (high - low)
+        return np.array([u.effect.prior_std for u in self.all]) * (high - low)
 
     @property
-    def colours(self) -> dict[tuple[str, str, int | None], list[int]]:
-        """Places of the unknowns that may be changed at once, by colour."""
+    def groups(self) -> dict[tuple[str, str, int | None], list[int]]:
+        """Places of the unknowns that may be changed at once, by group."""
         places: dict[tuple[str, str, int | None], list[int]] = {}
         for place, unknown in enumerate(self.all):
-            places.setdefault(unknown.colour, []).append(place)
+            places.setdefault(unknown.group, []).append(place)
         return places
 
     def nested(self, kind: type[Effect], values: Sequence[object]) -> dict[str, object]:

@@ -62,10 +62,10 @@ def align_to_spots(
     UnreachableError
         Where no attitude reflects the sun there.
     """
-    return settle(heliostats, control_points, suns, planes, spots, degree=degree, samples=samples).angles
+    return align_scene(heliostats, control_points, suns, planes, spots, degree=degree, samples=samples).angles
 
 
-def settle(
+def align_scene(
     heliostats: Sequence[Heliostat],
     control_points: Sequence[ArrayLike],
     suns: ArrayLike,
@@ -77,7 +77,7 @@ def settle(
     start: ArrayLike | None = None,
     alter: Callable[[Scene], Scene] | None = None,
 ) -> Alignment:
-    """As `align_to_spots`, of mirrors that ``alter`` changes once they stand in a scene (by gravity, say).
+    """As `align_to_spots`, of mirrors that ``alter`` changes once they are aligned (by gravity, say).
 
     ``start`` (B, 3) [m] are aims to begin with in place of the spots: those of an alignment that differs little save
     rounds.

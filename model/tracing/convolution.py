@@ -72,7 +72,7 @@ class Rays:
         Mean mirror normal in the plane's frame.
     footprint : Tensor (B, 2, 2) [m]
         How far apart, right and up, the rays of neighbouring samples land, along the facet's x and y; mirror means.
-    swing : Tensor (B, 2) or None [m/rad]
+    spot_per_angle : Tensor (B, 2) or None [m/rad]
         How far, right and up, the spot moves as the mirror turns about the mount's first axis, where that is known.
     """
 
@@ -82,7 +82,7 @@ class Rays:
     slant_range: Tensor
     normal: Tensor
     footprint: Tensor
-    swing: Tensor | None
+    spot_per_angle: Tensor | None
 
     @property
     def spot(self) -> Tensor:
@@ -130,8 +130,12 @@ def central_rays(scene: Scene, samples: int) -> Rays:
         ways = (sun[..., None], direction)
         power = power * torch.minimum(*(clear(obstacles, points, way, cell) for way in ways))
     slant_range = mean_point[:, 2] / -beam[:, 2]
-    swing = None if scene.first_axis is None else _swing(scene, scene.first_axis, mean_normal, sun, beam, slant_range)
-    return Rays(hits, power, beam, slant_range, mean_normal, _footprint(hits, samples), swing)
+    spot_per_angle = (
+        None
+        if scene.first_axis is None
+        else _spot_per_angle(scene, scene.first_axis, mean_normal, sun, beam, slant_range)
+    )
+    return Rays(hits, power, beam, slant_range, mean_normal, _footprint(hits, samples), spot_per_angle)
 
 
 def _unblocked(scene: Scene, line: Tensor, samples: int) -> Tensor:
@@ -147,7 +151,9 @@ def _unblocked(scene: Scene, line: Tensor, samples: int) -> Tensor:
     return share.flatten(1)
 
 
-def _swing(scene: Scene, axis: Tensor, normal: Tensor, sun: Tensor, beam: Tensor, slant_range: Tensor) -> Tensor:
+def _spot_per_angle(
+    scene: Scene, axis: Tensor, normal: Tensor, sun: Tensor, beam: Tensor, slant_range: Tensor
+) -> Tensor:
     """Movement (B, 2) [m/rad] of the spot as mirrors turn about ``axis`` (B, 3), all others in the plane's frame.
 
     The normal moves by axis x normal, the beam 2 (n.s) n - s by the derivative of that, and the spot by the slant range
@@ -210,7 +216,7 @@ def _interpolate(table: Tensor, frequency: Tensor) -> Tensor:
 
 
 def _cone_transfer(rays: Rays, optics: Optics, right: Tensor, up: Tensor, table: Tensor) -> Tensor:
-    """Transfer function (B, R, C/2+1) of the reflected cone, and of its swing with the mount, on the target plane.
+    """Transfer function (B, R, C/2+1) of the reflected cone, and of the mount's jitter, on the target plane.
 
     A ray tilted by a small angle e (a vector across the beam d) meets the plane, whose normal is z, shifted by
     R (e - d e_z / d_z). The frequency f on the plane therefore sees the angular frequency g = R (f - z (d.f) / d_z),
@@ -233,10 +239,10 @@ def _cone_transfer(rays: Rays, optics: Optics, right: Tensor, up: Tensor, table:
         variance = 4 * sigma**2 * (total - perpendicular * (1 - cosine**2)) * angular**2
         transfer = transfer * torch.exp(-2 * math.pi**2 * variance)
     if isinstance(optics.tracking_jitter, Tensor) or optics.tracking_jitter > 0:
-        if rays.swing is None:
+        if rays.spot_per_angle is None:
             raise InvalidInputError("tracking jitter needs a scene with 'first_axis'")
         sigma = torch.as_tensor(optics.tracking_jitter, dtype=right.dtype, device=right.device).reshape(-1, 1, 1)
-        moved = rays.swing[:, 0, None, None] * right + rays.swing[:, 1, None, None] * up
+        moved = rays.spot_per_angle[:, 0, None, None] * right + rays.spot_per_angle[:, 1, None, None] * up
         transfer = transfer * torch.exp(-2 * math.pi**2 * (sigma * moved) ** 2)
     return transfer
 

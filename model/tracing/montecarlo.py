@@ -1,8 +1,8 @@
 """The Monte Carlo tracer: the slow, plain reference.
 
 Every ray is thrown for itself: a random place on a random facet, a random direction from the sun's disc and aureole, a
-random slope error, a random swing of the mount, exact reflection, exact intersection with the plane. It shares the
-scene with the convolution tracer and nothing of its method, so that each can be tested against the other.
+random slope error, random tracking jitter of the mount, exact reflection, exact intersection with the plane. It shares
+the scene with the convolution tracer and nothing of its method, so that each can be tested against the other.
 """
 
 from collections.abc import Iterator
@@ -127,8 +127,8 @@ def _swung(scene: Scene, index: int, place: Array, area: Array, angle: Array) ->
     if scene.first_axis is None:
         raise InvalidInputError("tracking jitter needs a scene with 'first_axis'")
     center, turn = _center_and_turn(scene, index)
-    swing = rotation(turn @ scene.first_axis[index].double().numpy(), angle)
-    return center + np.einsum("nij,nj->ni", swing, place - center), np.einsum("nij,nj->ni", swing, area)
+    jitter = rotation(turn @ scene.first_axis[index].double().numpy(), angle)
+    return center + np.einsum("nij,nj->ni", jitter, place - center), np.einsum("nij,nj->ni", jitter, area)
 
 
 def trace_montecarlo(

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from model.errors import InvalidInputError
+from model.images import FLUX_SIZE, FLUX_WINDOW
 from model.mount import Mount
 from model.plant import Heliostat, TargetPlane
 from model.sunshape import Buie, SunShape
@@ -25,7 +26,7 @@ class Optics:
     slope_error : float or Tensor (B,) [rad]
         Standard deviation of the mirror's normals per axis, below what the surface resolves.
     tracking_jitter : float or Tensor (B,) [rad]
-        Standard deviation with which the mirror swings about the first mount axis while it is imaged.
+        Standard deviation with which the mirror turns about the first mount axis while it is imaged.
     dni : float [W/m2]
     reflectivity : float
     attenuation : tuple of float
@@ -70,10 +71,10 @@ class Window:
         Centred on the spot's centre of mass instead of the plane's centre.
     """
 
-    width: float = 4.0
-    height: float = 4.0
-    rows: int = 64
-    columns: int = 64
+    width: float = FLUX_WINDOW
+    height: float = FLUX_WINDOW
+    rows: int = FLUX_SIZE
+    columns: int = FLUX_SIZE
     on_spot: bool = False
 
     def __post_init__(self) -> None:

@@ -13,10 +13,11 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from model.errors import ModelError
 from model.frames import sun_angles
+from model.images import FLUX_SIZE, FLUX_WINDOW
 from model.imaging.window import center_of_mass, flux_window
 from model.metrics import flux_accuracy
 from model.network.architecture import MAX_IMAGES
-from model.observation import FLUX_WINDOW, Observation
+from model.observation import Observation
 from model.plant import Heliostat
 from model.tracing import Optics
 from service.base.arrays import unpack
@@ -206,7 +207,7 @@ def _forecast(
         surface=measured,
     )
     center = center_of_mass(traced.flux, (wide, wide))
-    return flux_window(traced.flux, (wide, wide), center, FLUX_WINDOW, 64)
+    return flux_window(traced.flux, (wide, wide), center, FLUX_WINDOW, FLUX_SIZE)
 
 
 def _draw(

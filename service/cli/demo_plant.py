@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.frames import sun_angles, sun_direction_at
-from model.imaging.camera import CameraOptions, photograph
 from model.plant import Heliostat, Plant, TargetPlane
-from model.refinement import default_prior
+from model.prior import default_prior
 from model.surface import control_points
 from model.tracing import Scene, Window
 from model.tracing.alignment import align_to_spots
 from model.tracing.montecarlo import trace_montecarlo
 from service.base.progress import Progress, quiet
+from service.cli.demo_camera import CameraOptions, photograph
 from service.cli.folder import write_json
 
 Array = NDArray[np.float64]

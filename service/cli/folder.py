@@ -16,13 +16,14 @@ from numpy.typing import NDArray
 
 from model.effects import Effect, effect_to_json, model_version
 from model.errors import InvalidInputError, ModelError
-from model.imaging import ImageKind, MeasuredFlux, decode_image
-from model.metrics import compare_on_target, surface_error
+from model.imaging import ImageKind, MeasuredFlux
+from model.metrics import accuracy_window, compare_on_target, surface_error
 from model.network.architecture import MAX_IMAGES
 from model.observation import Observation, SurfacePrediction
 from model.plant import Heliostat, TargetPlane
 from model.surface import split_canting
 from service.base.progress import Progress, quiet
+from service.sources.decode import decode_image
 from service.sources.documents import IMAGE_KINDS, Measurement
 from service.sources.folder import MeasurementFolder, measured_heights, read_surface
 from service.twin import compute
@@ -31,10 +32,10 @@ from service.twin.evidence import Evidence, choose
 
 Array = NDArray[np.float64]
 
-WINDOWS = (4.0, 6.0, 8.0)
-"""Sides [m] of the accuracy's window: the paper's, unless more than `SPILL` of the measured energy lies outside."""
-
 SPILL = 0.01
+"""Share of the measured energy that may lie outside the accuracy's window, up to one of `WIDEST` [m]."""
+
+WIDEST = 8.0
 
 ROUGHEST_FIRST: tuple[ImageKind, ...] = ("raw", "cropped", "flux", "flux-centered")
 """Kinds of image by how much is left to do to them."""
@@ -179,7 +180,7 @@ def predict_heliostat(
         "refused": refused,
         "misfit": round(predicted.misfit, 4),
         "trusted": predicted.trusted,
-        "strangeness": round(predicted.strangeness, 3),
+        "strangeness": round(predicted.mahalanobis, 3),
         "suspicious": list(predicted.suspicious),
         "z_rms_mm": round(float(np.sqrt((predicted.z**2).mean()) * 1e3), 4),
         "z_std_mean_mm": round(float(predicted.z_std.mean() * 1e3), 4),
@@ -284,14 +285,6 @@ def forecast_measurement(
     )
 
 
-def accuracy_window(measured: NDArray[Any], size: tuple[float, float]) -> float:
-    """Side [m] of the smallest of `WINDOWS` that leaves out no more than `SPILL` of the measured energy."""
-    for window in WINDOWS:
-        if compare_on_target(measured, measured, size, window).measured_outside <= SPILL:
-            return window
-    return WINDOWS[-1]
-
-
 def compare(
     folder: MeasurementFolder, measurement: Measurement, traced: compute.Forecast, window: float | None
 ) -> dict[str, Any] | None:
@@ -302,7 +295,8 @@ def compare(
     gray = measured.mean(axis=2) if measured.ndim == 3 else measured
     plane = folder.plant.targets[measurement.target]
     size = (plane.width, plane.height)
-    return asdict(compare_on_target(gray, traced.flux, size, window or accuracy_window(gray, size)))
+    window = window or accuracy_window([gray], [size], spill=SPILL, widest=WIDEST)
+    return asdict(compare_on_target(gray, traced.flux, size, window))
 
 
 def forecast_folder(

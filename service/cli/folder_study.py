@@ -7,7 +7,7 @@ from typing import Any
 
 from model.effects import Effect, effect_to_json
 from model.errors import InvalidInputError, ModelError
-from model.study import Photograph, Study, StudyOptions, study
+from model.study import FluxImage, Study, StudyOptions, study
 from model.surface import DEGREE, control_points
 from service.base.progress import Progress, quiet
 from service.cli.folder import check_surfaces, evidence_of, surface_of
@@ -32,9 +32,9 @@ class FolderStudy:
         }
 
 
-def photographs_of(folder: MeasurementFolder, surfaces: str = "measured") -> tuple[list[Photograph], dict[str, str]]:
+def photographs_of(folder: MeasurementFolder, surfaces: str = "measured") -> tuple[list[FluxImage], dict[str, str]]:
     """What a folder gives a study, and what it does not: heliostats and measurements with the reasons."""
-    photographs: list[Photograph] = []
+    photographs: list[FluxImage] = []
     skipped, seen = dict(folder.skipped), predicted_from(surfaces)
     for name, heliostat in folder.plant.heliostats.items():
         try:

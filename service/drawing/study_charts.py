@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from model.study import Photograph, Study
+from model.study import FluxImage, Study
 from model.study.covariates import covariates_of
 from model.study.judging import rank_correlation
 from service.drawing.charts import HeatMap, Scale, Tick, heat_map, ticks
@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 class Image:
     """A held-out image: accuracy before and after, and where those lie on the chart, 0 to 1 from left to right."""
 
-    photograph: Photograph
+    photograph: FluxImage
     before: float
     after: float
     at_before: float
@@ -48,7 +48,7 @@ def accuracy_chart(study: Study) -> Chart:
         return (accuracy - low) / (1 - low)
 
     groups: dict[str, list[Image]] = {}
-    found = zip(study.photographs, before.tolist(), after.tolist(), strict=True)
+    found = zip(study.images, before.tolist(), after.tolist(), strict=True)
     for photograph, one, other in sorted(found, key=lambda f: (f[0].heliostat, f[0].elevation_deg)):
         image = Image(photograph, one, other, place(one), place(other))
         groups.setdefault(photograph.heliostat, []).append(image)
@@ -103,9 +103,9 @@ def pictures(study: Study, images: Sequence[Image]) -> Pictures:
     return Pictures(rows, study.window, flux_scale, residual_scale)
 
 
-def _fluxes(study: Study, photograph: Photograph) -> Array:
+def _fluxes(study: Study, photograph: FluxImage) -> Array:
     """Measured, before and after (3, 64, 64) of one image, in shares of its measured peak."""
-    place = list(study.photographs).index(photograph)
+    place = list(study.images).index(photograph)
     flux = np.stack([study.measured[place], study.before[place], study.after[place]])
     return np.asarray(flux / flux[0].max())
 
@@ -138,7 +138,7 @@ class Scatter:
 
 def scatters(study: Study) -> list[Scatter]:
     """The error of all held-out images against each of `DRAWN`."""
-    known = covariates_of(study.photographs, study.latitude_deg)
+    known = covariates_of(study.images, study.latitude_deg)
     return [_scatter(study, f"{c.name} [{c.unit}]", values) for c, values in known.items() if c.name in DRAWN]
 
 
@@ -149,7 +149,7 @@ def _scatter(study: Study, label: str, x: Array) -> Scatter:
     top = 1.08 * float(max(before.max(), after.max()))
     dots = [
         Dot(p.key, (float(at) - low) / (high - low), float(one) / top, float(other) / top)
-        for p, at, one, other in zip(study.photographs, x, before, after, strict=True)
+        for p, at, one, other in zip(study.images, x, before, after, strict=True)
     ]
     correlations = rank_correlation(before, x), rank_correlation(after, x)
     return Scatter(label, dots, ticks(low, high), ticks(0.0, top), *correlations)

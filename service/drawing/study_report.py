@@ -102,7 +102,7 @@ def study_page(study: Study, title: str, skipped: Mapping[str, str] | None = Non
         pictures=pictures(study, chart.images),
         scatters=scatters(study),
         residual_map=left,
-        chance=1.96 / max(len(study.photographs) - 1, 1) ** 0.5,
+        chance=1.96 / max(len(study.images) - 1, 1) ** 0.5,
         skipped=skipped or {},
         few=FEW,
     )

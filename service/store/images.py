@@ -7,7 +7,7 @@ from pathlib import Path
 
 from service.base.faults import StoreDamagedError, UnsupportedImageError
 
-# The formats that `model.imaging.decode` reads, by how their files begin.
+# The formats that `service.sources.decode` reads, by how their files begin.
 _SIGNATURES = {
     b"\x89PNG\r\n\x1a\n": "image/png",
     b"\xff\xd8\xff": "image/jpeg",

@@ -12,19 +12,20 @@ from model.effects import JUELICH_LATITUDE, Effect, model_version
 from model.errors import InvalidInputError
 from model.fleet import Engine, FleetFlux, Superposition, Tile
 from model.fleet import superpose as superpose_tiles
-from model.forecast import Shot, View, align
+from model.forecast import Setup, View, align
 from model.imaging import ImageKind, MeasuredFlux
 from model.imaging import measure as measure_image
 from model.network.predictor import default_predictor
 from model.observation import Observation, SurfacePrediction, render_observations
 from model.plant import Heliostat, Receiver, TargetPlane
 from model.refinement import refine
-from model.study import Photograph, Study, StudyOptions
+from model.study import FluxImage, Study, StudyOptions
 from model.study import study as study_photographs
 from model.surface import COLUMNS, DEGREE, FACETS, ROWS, control_points
 from model.tracing import Optics
 from model.tracing.convolution import central_rays
 from service.base.progress import Progress, quiet
+from service.sources.juelich import CENTERED_WINDOW, mark_layouts
 
 Array = NDArray[np.float64]
 Method = Literal["network", "refined"]
@@ -40,7 +41,7 @@ def measure(
     image: NDArray[np.uint8], kind: ImageKind, plane: TargetPlane, *, corners: Array | None = None
 ) -> MeasuredFlux:
     """Flux and quality of one photograph of a target; see `model.imaging.measure`."""
-    return measure_image(image, kind, plane, corners=corners)
+    return measure_image(image, kind, plane, layouts=mark_layouts(plane.name), side=CENTERED_WINDOW, corners=corners)
 
 
 def predict(
@@ -152,7 +153,7 @@ def forecast(
         Where no attitude reflects the sun to the plane.
     """
     points, degree = (control_points(heliostat, z), DEGREE) if surface is None else surface
-    shot = Shot(
+    shot = Setup(
         heliostat,
         np.asarray(points, dtype=np.float64),
         np.asarray(sun, dtype=np.float64),
@@ -194,7 +195,7 @@ def superpose(
 
 
 def study(
-    photographs: Sequence[Photograph],
+    photographs: Sequence[FluxImage],
     optics: Optics,
     effects: Sequence[Effect] = (),
     options: StudyOptions | None = None,

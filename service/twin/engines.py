@@ -2,17 +2,21 @@
 
 import os
 import threading
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeVar
 
-from model.fleet import Engine, Threads, in_order
+from model.fleet import Engine
 from service.base.faults import ConflictError
 from service.twin.runtime import Runtime
 
 Item = TypeVar("Item")
 Made = TypeVar("Made")
+Pending = TypeVar("Pending")
 
 # How often a tile is worked at again whose worker died. One that kills every worker fails the job, and the job's own
 # attempts and reason take over.
@@ -27,6 +31,44 @@ def engine_of(runtime: Runtime) -> Engine:
     if settings.ray_address is not None:
         return Ray(settings.ray_address)
     return Threads(settings.parallel_computations, partial(runtime.computing, "superpose"))
+
+
+def in_order(
+    submit: Callable[[Item], Pending], items: Iterable[Item], ahead: int, result: Callable[[Pending], Made]
+) -> Iterator[Made]:
+    """Results in the items' order, while up to ``ahead`` of them are under way."""
+    pending: deque[Pending] = deque()
+    for item in items:
+        pending.append(submit(item))
+        if len(pending) >= ahead:
+            yield result(pending.popleft())
+    while pending:
+        yield result(pending.popleft())
+
+
+@dataclass(frozen=True, eq=False)
+class Threads:
+    """The engine of one machine; PyTorch leaves Python's lock while it computes.
+
+    Attributes
+    ----------
+    count : int
+    turn : callable
+        Gives what each piece of work is done within: a place in a queue for the processor, say.
+    """
+
+    count: int = 2
+    turn: Callable[[], AbstractContextManager[object]] = nullcontext
+
+    def map(self, work: Callable[[Item], Made], items: Iterable[Item]) -> Iterator[Made]:
+        """As `model.fleet.Engine.map`."""
+
+        def one(item: Item) -> Made:
+            with self.turn():
+                return work(item)
+
+        with ThreadPoolExecutor(self.count) as pool:
+            yield from in_order(lambda item: pool.submit(one, item), items, 2 * self.count, Future.result)
 
 
 @dataclass(frozen=True)

@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 from sqlalchemy.orm import Session
 
 from model.errors import InvalidInputError
-from model.forecast import Shot
+from model.forecast import Setup
 from model.frames import sun_direction, wgs84_to_enu
-from model.observation import FLUX_WINDOW, Observation, spread_suns
+from model.images import FLUX_WINDOW
+from model.observation import Observation, spread_suns
 from model.plant import Heliostat, TargetPlane
-from model.study import Photograph
+from model.study import FluxImage
 from model.surface import DEGREE
 from service import store
 from service.base.arrays import unpack
@@ -77,7 +78,7 @@ class Evidence:
             identifier=self.identifier,
         )
 
-    def photograph(self, heliostat: Heliostat, points: Array, degree: int = DEGREE, seen: bool = False) -> Photograph:
+    def photograph(self, heliostat: Heliostat, points: Array, degree: int = DEGREE, seen: bool = False) -> FluxImage:
         """It as a study compares it with the mirror of control points (F, I, J, 3) [m].
 
         ``seen``: the mirror was found from this very photograph.
@@ -95,8 +96,8 @@ class Evidence:
         image, plane = self.flux, self.target
         if image is None:  # the part about the spot is all there is
             image, plane = self.centered, replace(plane, center=self.spot, width=FLUX_WINDOW, height=FLUX_WINDOW)
-        shot = Shot(heliostat, points, self.sun, plane, spot=self.spot, degree=degree, identifier=key)
-        return Photograph(shot, np.asarray(image, dtype=np.float64), taken_at=self.taken_at, seen=seen)
+        shot = Setup(heliostat, points, self.sun, plane, spot=self.spot, degree=degree, identifier=key)
+        return FluxImage(shot, np.asarray(image, dtype=np.float64), taken_at=self.taken_at, seen=seen)
 
 
 def choose(items: Sequence[Item], count: int, sun_of: Callable[[Item], Array] = attrgetter("sun")) -> list[Item]:

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from sqlalchemy.orm import Session
 
 from model.errors import ModelError
-from model.fleet import TILE, Engine, FleetFlux, Tile, standing, tile_of
-from model.forecast import Shot
+from model.fleet import TILE, Engine, FleetFlux, Tile, aligned_field, tile_of
+from model.forecast import Setup
 from model.neighbours import Neighbours
 from model.plant import Cylinder, Heliostat, Receiver, TargetPlane
 from model.surface import control_points
@@ -124,7 +124,7 @@ def _standing(runtime: Runtime, fleet: Fleet, report: Callable[[float], None]) -
             for heliostat in _heliostats(fleet, rows, names):
                 yield heliostat, fleet.aim_of(heliostat.name)
 
-    return standing(all_of_them(), fleet.sun, fleet.model.effects, fleet.origin[0])
+    return aligned_field(all_of_them(), fleet.sun, fleet.model.effects, fleet.origin[0])
 
 
 def _tiles(
@@ -147,11 +147,11 @@ def _heights(session: Session, rows: Mapping[str, HeliostatRow]) -> dict[str, Ar
 
 def _shots(
     fleet: Fleet, rows: Mapping[str, HeliostatRow], names: Sequence[str], heights: Mapping[str, Array]
-) -> Iterator[Shot]:
+) -> Iterator[Setup]:
     for heliostat in _heliostats(fleet, rows, names):
         name = heliostat.name
         if not fleet.ideal and name not in heights:
             fleet.skipped[name] = f'surface: heliostat {name} has no surface yet; predict one, or ask for "ideal"'
             continue
         points = control_points(heliostat, heights.get(name))
-        yield Shot(heliostat, points, fleet.sun, fleet.plane, aim=fleet.aim_of(name), identifier=name)
+        yield Setup(heliostat, points, fleet.sun, fleet.plane, aim=fleet.aim_of(name), identifier=name)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy.orm import Session
 
-from model.effects import of_light
+from model.effects import light_effects
 from model.errors import InvalidInputError
 from model.frames import sun_direction
 from model.plant import Receiver, TargetPlane
@@ -149,7 +149,7 @@ def _trace(
             window=request.window,
             optics=replace(model.optics, dni=request.dni),
             # A stored target is what the camera looks at; on any other plane there is only light.
-            effects=model.effects if request.plane is None else of_light(model.effects),
+            effects=model.effects if request.plane is None else light_effects(model.effects),
             latitude_deg=twin.origin[0],
         )
 

@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.errors import ImageRefusedError, InvalidInputError
-from model.imaging import MeasuredFlux, decode_image
+from model.imaging import MeasuredFlux
 from model.imaging.quality import refused
 from model.plant import TargetPlane
 from service import store
 from service.base.arrays import pack, plain
 from service.base.faults import TooLargeError
 from service.base.meters import ACCURACY, PHOTOGRAPHS, REFUSALS
+from service.sources.decode import decode_image
 from service.sources.photograph import Photograph
 from service.store.columns import now
 from service.store.images import digest, media_type

@@ -14,7 +14,7 @@ from model.fleet import Engine, FleetFlux, Tile
 from model.imaging import ImageKind, MeasuredFlux
 from model.observation import Observation, SurfacePrediction
 from model.plant import Heliostat, Receiver, TargetPlane
-from model.study import Photograph, Study, StudyOptions
+from model.study import FluxImage, Study, StudyOptions
 from model.tracing import Optics
 from service.base import meters
 from service.base.progress import Progress
@@ -83,7 +83,7 @@ class Operations(Protocol):
 
     def study(
         self,
-        photographs: Sequence[Photograph],
+        photographs: Sequence[FluxImage],
         optics: Optics,
         effects: Sequence[Effect] = (),
         options: StudyOptions | None = None,

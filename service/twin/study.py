@@ -13,7 +13,7 @@ from sqlalchemy.orm import Session
 from model.effects import effects_from_json
 from model.errors import InvalidInputError, UnreachableError
 from model.forecast import align
-from model.study import Photograph, Study, StudyOptions
+from model.study import FluxImage, Study, StudyOptions
 from model.study.loop import LEAST_IMAGES
 from model.surface import control_points
 from service import store
@@ -53,7 +53,7 @@ class StudyRequest:
 class Material:
     """What the store gives a study: photographs, what was left out, and when photographs were taken, by their keys."""
 
-    photographs: list["Photograph"] = field(default_factory=list)
+    photographs: list["FluxImage"] = field(default_factory=list)
     skipped: dict[str, str] = field(default_factory=dict)
 
     @property
@@ -72,7 +72,7 @@ class Material:
         kept, skipped = [], dict(self.skipped)
         for photograph in self.photographs:
             try:
-                align([photograph.shot])
+                align([photograph.setup])
             except UnreachableError as error:
                 skipped[photograph.key] = str(error)
             else:

@@ -16,15 +16,14 @@ from matplotlib.figure import Figure
 
 from model.effects import CATALOGUE, Effect, effect_from_json
 from model.forecast import View
-from model.metrics import flux_accuracy
+from model.metrics import flux_accuracies, flux_accuracy
 from model.network.predictor import default_predictor
 from model.observation import Observation, align_observations, render_observations
 from model.plant import Heliostat, TargetPlane
 from model.refinement import refine
-from model.study import Photograph, Study, StudyOptions
+from model.study import FluxImage, Study, StudyOptions
 from model.study.fitting import Fitter
-from model.study.judging import accuracies
-from model.study.photographs import Forecaster
+from model.study.flux_images import Forecaster
 from model.study.unknowns import Unknowns
 from service.cli.folder import observations_of, predict_folder, surface_errors
 from service.cli.folder_study import photographs_of, study_folder
@@ -101,7 +100,7 @@ def picture(study: Study) -> Figure:
         peak = study.measured[index].max()
         measured, before, after = (cuts[index] / peak for cuts in (study.measured, study.before, study.after))
         shown = {
-            study.photographs[index].key: measured,
+            study.images[index].key: measured,
             f"before: {study.accuracy_before[index]:.3f}": before,
             f"after: {study.accuracy_after[index]:.3f}": after,
             "residual before": measured - before,
@@ -116,9 +115,9 @@ def picture(study: Study) -> Figure:
     return figure
 
 
-def left_out(photographs: Sequence[Photograph], kinds: tuple[str, ...], window: float) -> np.ndarray:
+def left_out(photographs: Sequence[FluxImage], kinds: tuple[str, ...], window: float) -> np.ndarray:
     """Accuracy (N,) of each photograph under effects that were fitted to all others."""
-    folder_facets = tuple(sorted({(p.heliostat, len(p.shot.control_points)) for p in photographs}))
+    folder_facets = tuple(sorted({(p.heliostat, len(p.setup.control_points)) for p in photographs}))
     unknowns = Unknowns(tuple(CATALOGUE[kind] for kind in kinds), folder_facets)
     optics = read_folder(data_folder(), HELIOSTATS).optics
     accuracy = np.empty(len(photographs))
@@ -130,7 +129,7 @@ def left_out(photographs: Sequence[Photograph], kinds: tuple[str, ...], window: 
             fitter = Fitter(*(Forecaster(rest, optics, [], window, view) for view in views))
             effects = unknowns.effects(fitter.fit(unknowns, unknowns.neutral).values)
         judge = Forecaster([photograph], optics, [], window, StudyOptions().view)
-        accuracy[index] = accuracies(judge.measured(), judge.cuts(effects))[0]
+        accuracy[index] = flux_accuracies(judge.measured(), judge.cuts(effects))[0]
     return accuracy
 
 
@@ -223,16 +222,16 @@ def photograph(
     suns = Situations().suns(8, rng)
     centers = np.stack([rng.uniform(-10, 10, 8), np.zeros(8), rng.uniform(30, 55, 8)], axis=-1)
     planes = [TargetPlane("t", c, np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), 8, 8) for c in centers]
-    shots = places(suns, planes)
+    setups = places(suns, planes)
     view = View(64, 64, window=4.0, samples=48)
     with torch.no_grad():
-        flux = align_observations(heliostat, shots, z, effects).images(None, effects, view).numpy()
+        flux = align_observations(heliostat, setups, z, effects).images(None, effects, view).numpy()
     images = []
-    for shot, image in zip(shots, flux, strict=True):
+    for setup, image in zip(setups, flux, strict=True):
         noisy = image / image.max() + rng.normal(0, CleanCamera().noise, image.shape)
         digital = np.round(noisy.clip(0, 1) * 255).astype(np.float32)
         images.append(
-            Observation(digital / digital.sum() * 100, shot.sun, shot.target, shot.center_of_mass, shot.identifier)
+            Observation(digital / digital.sum() * 100, setup.sun, setup.target, setup.center_of_mass, setup.identifier)
         )
     return images
 

@@ -15,11 +15,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from model.fleet import Superposition, Threads, standing, superpose, tiles
-from model.forecast import Shot
+from model.fleet import Superposition, aligned_field, superpose, tiles
+from model.forecast import Setup
 from model.frames import sun_direction
 from model.plant import Cylinder, Heliostat, Plant, Receiver, TargetPlane
-from model.refinement import default_prior
+from model.prior import default_prior
 from model.sunshape import Pillbox
 from model.surface import control_points
 from model.tracing import Optics
@@ -31,6 +31,7 @@ from service.jobs.kinds import KINDS
 from service.jobs.worker import Worker
 from service.store import queue
 from service.store.surfaces import NewSurface
+from service.twin.engines import Threads
 from service.twin.runtime import Runtime
 from tests.field_rays import Land, onto_cylinder, onto_plane, trace_field
 
@@ -89,12 +90,12 @@ def peak_mib() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
-def shots(field: Field, aim: TargetPlane, every: int = 1) -> Iterator[Shot]:
+def setups(field: Field, aim: TargetPlane, every: int = 1) -> Iterator[Setup]:
     """Each ``every``-th heliostat of a field with a mirror of its own."""
     rng, prior, sun = np.random.default_rng(0), default_prior(), sun_direction(*SUN)
     for heliostat in field.every(every):
         z = prior.surface(rng.normal(size=len(prior.basis)))
-        yield Shot(heliostat, control_points(heliostat, z), sun, aim)
+        yield Setup(heliostat, control_points(heliostat, z), sun, aim)
 
 
 def against_monte_carlo() -> None:
@@ -120,8 +121,8 @@ def against_monte_carlo() -> None:
         }
         expected, powers = traced[True]
         task = Superposition(receiver, (72, 72), Optics(Pillbox(half_angle)))
-        some = [Shot(one, control_points(one), sun, square, aim=aim) for one in heliostats]
-        neighbours = standing([(one, aim) for one in heliostats], sun)
+        some = [Setup(one, control_points(one), sun, square, aim=aim) for one in heliostats]
+        neighbours = aligned_field([(one, aim) for one in heliostats], sun)
         found = superpose(task, tiles(some, neighbours))
         coarse = found.irradiance.reshape(18, 4, 18, 4).mean(axis=(1, 3))
         print(
@@ -135,7 +136,7 @@ def field_of_2000() -> None:
     """Planes, a cylinder, with neighbours and without."""
     field, square = Field(2000, 60.0), plane(50.0, 10.0)
     drum = Cylinder("drum", square.center + [0, 3, 0], square.normal, square.up, 3.0, 8.0, 180.0)
-    some = list(shots(field, square))
+    some = list(setups(field, square))
     cases: list[tuple[str, Receiver, int, bool]] = [
         ("plane, 256 x 256, no neighbours", square, 256, False),
         ("plane, 256 x 256, neighbours shade and block", square, 256, True),
@@ -146,7 +147,7 @@ def field_of_2000() -> None:
         with Meter() as meter:
             neighbours = None
             if has_neighbours:
-                neighbours = standing([(shot.heliostat, square.center) for shot in some], some[0].sun)
+                neighbours = aligned_field([(setup.heliostat, square.center) for setup in some], some[0].sun)
             total = superpose(Superposition(receiver, (side, side)), tiles(some, neighbours))
         landed = total.irradiance.mean() * receiver.width * receiver.height
         print(f"  2,000 heliostats, {name}: {meter}; {total.power / 1e6:.2f} MW thrown, {landed / 1e6:.2f} MW land")
@@ -181,11 +182,11 @@ def field_of_200000(part: int) -> None:
     field, square = Field(200_000, 100.0), plane(200.0, 25.0)
     print(f"  200,000 heliostats: memory before {peak_mib():.0f} MiB")
     with Meter() as meter:
-        neighbours = standing(((one, square.center) for one in field.every()), sun_direction(*SUN))
+        neighbours = aligned_field(((one, square.center) for one in field.every()), sun_direction(*SUN))
     print(f"  where all 200,000 mirrors stand: {meter}; memory {peak_mib():.0f} MiB")
     rates = []
     for count in (part // 16, part // 4, part):
-        some = shots(field, square, every=200_000 // count)
+        some = setups(field, square, every=200_000 // count)
         with Meter() as meter:
             total = superpose(Superposition(square, (128, 128)), tiles(some, neighbours), Threads(2))
         rates.append((total.heliostats, meter.cpu))

@@ -17,9 +17,11 @@ import matplotlib as mpl
 import numpy as np
 from numpy.typing import NDArray
 
-from model.imaging import MeasuredFlux, center_of_mass, decode_image, measure
+from model.imaging import MeasuredFlux, center_of_mass, measure
 from model.plant import Plant, TargetPlane
+from service.sources.decode import decode_image
 from service.sources.documents import read_json, read_targets
+from service.sources.juelich import mark_layouts
 from tests.benchmarks import data_folder
 
 TOWER = "WRI1030197-tower-measurements.json"
@@ -62,7 +64,7 @@ def read_case(properties: Path, plant: Plant) -> Case:
 
     raw = image("raw") if (properties.parent / f"{stem}-raw.png").exists() else None
     start = perf_counter()
-    from_raw = None if raw is None else measure(raw, "raw", plane)
+    from_raw = None if raw is None else measure(raw, "raw", plane, layouts=mark_layouts(plane.name))
     return Case(
         name=stem,
         target=plane.name,

@@ -101,13 +101,13 @@ def line(label: str, cases: list[Case], predictions: list[SurfacePrediction]) ->
     mean, worst = (np.array([f(p.misfits) for p in predictions]) for f in (np.mean, np.max))
     doubted = sum(not p.trusted for p in predictions)
     errors = [surface_error(p.z, case.truth) * 1e3 for p, case in zip(predictions, cases, strict=True)]
-    strange = [p.strangeness for p in predictions]
+    distances = [p.mahalanobis for p in predictions]
     third = sum(p.suspicious == p.used[2:3] for p in predictions)
     return (
         f"  {label:<32} doubted {doubted:>2} of {len(mean):<3} third image alone {third:>2}   "
         f"misfit median {np.median(mean):.3f}   "
         f"worst image min {worst.min():.3f} median {np.median(worst):.3f} max {worst.max():.3f}   "
-        f"strangeness min {min(strange):.2f} median {np.median(strange):.2f} max {max(strange):.2f}   "
+        f"mahalanobis min {min(distances):.2f} median {np.median(distances):.2f} max {max(distances):.2f}   "
         f"error [mm] median {np.median(errors):.3f}"
     )
 
@@ -135,7 +135,7 @@ def photographed() -> None:
                 " ".join(f"{m:.3f}" for m in predicted.misfits),
             )
             print(f"  {heliostat.name} from photographs of {owner.name}: {verdict}", end="   ")
-            print(f"strangeness {predicted.strangeness:.2f}   misfits {shown}")
+            print(f"mahalanobis {predicted.mahalanobis:.2f}   misfits {shown}")
 
 
 def main() -> None:

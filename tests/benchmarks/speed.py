@@ -10,7 +10,8 @@ from model.frames import sun_direction
 from model.network.architecture import MAX_IMAGES
 from model.network.predictor import INPUTS, LOOKS, SurfacePredictor
 from model.plant import Heliostat, TargetPlane
-from model.refinement import default_prior, refine
+from model.prior import default_prior
+from model.refinement import refine
 from model.surface import control_points
 from model.tracing import Scene, Window, trace
 from model.tracing.montecarlo import trace_montecarlo
@@ -69,8 +70,8 @@ def main() -> None:
             print(f"  convolution on {torch.cuda.get_device_name()}: {seconds(on_gpu, 10) / 4096 * 1e3:.4f} ms a flux")
     predictor, mirror = SurfacePredictor(threads=1), Heliostat.juelich("synthetic", np.array([20.0, 95.0, 1.8]), 100.0)
     rng = np.random.default_rng(0)
-    shots = places(Situations().suns(MAX_IMAGES, rng), [TARGET] * MAX_IMAGES)
-    images = observe(mirror, default_prior().mean, shots, CleanCamera(), rng)
+    setups = places(Situations().suns(MAX_IMAGES, rng), [TARGET] * MAX_IMAGES)
+    images = observe(mirror, default_prior().mean, setups, CleanCamera(), rng)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     one, two = ({n: v.numpy() for n, v in zip(INPUTS, example(batch, MAX_IMAGES), strict=True)} for batch in (1, 2))

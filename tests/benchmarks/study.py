@@ -25,9 +25,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from model.effects import CATALOGUE as KINDS
-from model.study import Photograph, Study, StudyOptions, study
-from model.study.judging import accuracies
-from model.study.photographs import Forecaster
+from model.metrics import flux_accuracies
+from model.study import FluxImage, Study, StudyOptions, study
+from model.study.flux_images import Forecaster
 from model.tracing import Optics
 from service.cli.folder_study import study_folder
 from service.sources.folder import read_folder
@@ -68,7 +68,7 @@ def answer(case: Case) -> Record:
     torch.set_num_threads(1)
     made = generate(case.name, case.level, case.seed, mirrors(data_folder()))
     start = process_time()
-    found = study([Photograph(shot, image) for shot, image in zip(made.shots, made.images, strict=True)], Optics())
+    found = study([FluxImage(setup, image) for setup, image in zip(made.setups, made.images, strict=True)], Optics())
     seconds = process_time() - start
     report = found.to_json()
     true, change = upper_bound(made, found)
@@ -95,9 +95,9 @@ def answer(case: Case) -> Record:
 
 def upper_bound(made: MeasurementSet, found: Study) -> tuple[float, float]:
     """Accuracy on the held-out images with the true effects, and by how much those change the forecast."""
-    forecaster = Forecaster(found.photographs, Optics(), [], found.window, StudyOptions().view)
+    forecaster = Forecaster(found.images, Optics(), [], found.window, StudyOptions().view)
     with_truth = forecaster.cuts(made.effects)
-    true, same = accuracies(found.measured, with_truth).mean(), accuracies(found.before, with_truth).mean()
+    true, same = flux_accuracies(found.measured, with_truth).mean(), flux_accuracies(found.before, with_truth).mean()
     return round(float(true), 5), round(float(1 - same), 5)
 
 

@@ -7,8 +7,8 @@ import pytest
 
 from model.errors import InvalidInputError
 from model.imaging import MeasuredFlux, center_of_mass, measure
-from model.imaging.camera import CameraOptions, photograph, target_corners
 from model.imaging.rectify import rectify
+from service.cli.demo_camera import CameraOptions, photograph, target_corners
 from tests.imaging import accuracy, gaussian
 
 SIZE = (5.4, 6.4)
@@ -115,7 +115,7 @@ def test_separated_flux_is_only_normalised(plane, spot):
 def test_a_centred_flux_has_no_place_on_the_target(plane):
     wide = dataclasses.replace(plane, width=6.1, height=6.1)
     image = np.round(255 * gaussian(wide, 0, 0, 0.8, 0.5, 0.3, size=64)).astype(np.uint8)
-    result = measure(image, "flux-centered", plane)
+    result = measure(image, "flux-centered", plane, side=6.1)
     assert result.flux is None
     assert result.center_of_mass is None
     expected = gaussian(dataclasses.replace(plane, width=4.0, height=4.0), 0, 0, 0.8, 0.5, 0.3, size=64)
@@ -124,7 +124,7 @@ def test_a_centred_flux_has_no_place_on_the_target(plane):
 
 @pytest.mark.parametrize("kind", ["raw", "cropped", "flux", "flux-centered"])
 def test_black_images_are_refused_and_not_raised(plane, kind):
-    quality = measure(np.zeros((256, 256), np.uint8), kind, plane).quality
+    quality = measure(np.zeros((256, 256), np.uint8), kind, plane, side=6.1).quality
     assert quality.reason == ("target_not_found" if kind == "raw" else "no_spot")
 
 
@@ -135,6 +135,7 @@ def test_black_images_are_refused_and_not_raised(plane, kind):
         (np.zeros((256, 256, 4), np.uint8), "cropped"),
         (np.zeros((5, 256), np.uint8), "cropped"),
         (np.zeros((256, 256), np.uint8), "sketch"),
+        (np.zeros((256, 256), np.uint8), "flux-centered"),  # without its side
     ],
 )
 def test_malformed_arguments_raise(plane, image, kind):

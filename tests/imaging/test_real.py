@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from model.imaging import decode_image, measure
+from model.imaging import measure
+from service.sources.decode import decode_image
 from tests.benchmarks.imaging import correlation, data_folder, figures, main, read_case
 
 

@@ -3,10 +3,11 @@ import numpy as np
 import pytest
 
 from model.errors import ImageRefusedError, InvalidInputError
-from model.imaging.camera import CameraOptions, photograph, target_corners
 from model.imaging.marks import find_marks
 from model.imaging.rectify import check_corners, find_corners, rectify
 from model.plant import TargetPlane
+from service.cli.demo_camera import CameraOptions, photograph, target_corners
+from service.sources.juelich import mark_layouts
 
 ARM, STROKE = 0.74, 0.16  # [m]
 
@@ -66,7 +67,7 @@ def two_targets():
 def test_targets_that_share_an_edge_are_told_apart_by_name(which):
     frame, upper, lower = two_targets()
     plane = TargetPlane(f"solar_tower_{which}", np.zeros(3), np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), 8.6, 7.2)
-    found = find_corners(frame, plane)
+    found = find_corners(frame, plane, mark_layouts(plane.name))
     assert np.abs(found - (upper if which == "upper" else lower)).max() < 1.0
 
 
@@ -76,7 +77,7 @@ def test_a_hidden_mark_is_replaced_by_those_of_the_other_target(corner):
     x, y = np.round(upper[corner]).astype(int)
     frame[max(y - 60, 0) : y + 60, max(x - 60, 0) : x + 60] = 150
     plane = TargetPlane("t", np.zeros(3), np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), 8.6, 7.2)
-    assert np.abs(find_corners(frame, plane, "solar_tower_upper") - upper).max() < 3.0
+    assert np.abs(find_corners(frame, plane, mark_layouts("solar_tower_upper")) - upper).max() < 3.0
 
 
 @pytest.mark.parametrize("corner", range(4))

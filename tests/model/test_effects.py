@@ -17,7 +17,7 @@ from model.effects.sun_position import SunPosition
 from model.effects.sun_shape import SunShapeEffect
 from model.effects.tracking_jitter import TrackingJitter
 from model.errors import InvalidInputError
-from model.forecast import Shot, View, align, forecast_shots
+from model.forecast import Setup, View, align, forecast_setups
 from model.frames import sun_direction, sun_direction_at
 from model.mount import Mount
 from model.sunshape import Gaussian
@@ -30,10 +30,10 @@ from tests.conftest import flat_heliostat, target
 SUN = sun_direction(25.0, 40.0)
 
 
-def shot(sun=SUN, position=(20.0, 70.0, 1.8), focal_length=75.0, mount=None, z=None, **given) -> Shot:
+def setup(sun=SUN, position=(20.0, 70.0, 1.8), focal_length=75.0, mount=None, z=None, **given) -> Setup:
     heliostat, plane = flat_heliostat(position, focal_length, mount), target()
     given.setdefault("spot", plane.center)
-    return Shot(heliostat, control_points(heliostat, z), np.asarray(sun), plane, **given)
+    return Setup(heliostat, control_points(heliostat, z), np.asarray(sun), plane, **given)
 
 
 def waves(seed=0, scale=2e-4) -> np.ndarray:
@@ -41,7 +41,7 @@ def waves(seed=0, scale=2e-4) -> np.ndarray:
     return z - z.mean(axis=(1, 2), keepdims=True)
 
 
-def scene_of(one: Shot, *effects) -> Scene:
+def scene_of(one: Setup, *effects) -> Scene:
     return align([one], effects, dtype=torch.float64).groups[0].scene
 
 
@@ -117,7 +117,7 @@ def test_a_list_is_needed():
 
 def test_values_must_match_the_facets():
     with pytest.raises(InvalidInputError, match="flat has 4 facets, got 3 values"):
-        align([shot()], [Soiling({"flat": np.ones(3)})])
+        align([setup()], [Soiling({"flat": np.ones(3)})])
 
 
 def test_version_names_the_effects_in_the_order_of_light():
@@ -129,8 +129,8 @@ def test_version_names_the_effects_in_the_order_of_light():
 
 @pytest.mark.parametrize("name", CATALOGUE)
 def test_without_parameters_nothing_changes(name):
-    shots, view = [shot(), shot(sun_direction(-50.0, 25.0), z=waves())], View(64, 64, samples=8)
-    plain, neutral = (forecast_shots(shots, None, e, view, dtype=torch.float64) for e in ((), [CATALOGUE[name]()]))
+    setups, view = [setup(), setup(sun_direction(-50.0, 25.0), z=waves())], View(64, 64, samples=8)
+    plain, neutral = (forecast_setups(setups, None, e, view, dtype=torch.float64) for e in ((), [CATALOGUE[name]()]))
     np.testing.assert_allclose(neutral, plain, atol=1e-3 * float(plain.max()))
 
 
@@ -153,7 +153,7 @@ def test_a_later_sun_stands_further_west():
 @pytest.mark.parametrize("tilt", [AxisTilt(north_deg=2.0), AxisTilt(up_deg=-3.0)])
 def test_what_is_left_of_a_tilt_is_a_roll_of_the_mirror(tilt):
     """The normal stays where sun and spot demand it; its y stays perpendicular to the first axis, which moved."""
-    upright, tilted = (scene_of(shot(sun_direction(50.0, 25.0)), *effects) for effects in ([], [tilt]))
+    upright, tilted = (scene_of(setup(sun_direction(50.0, 25.0)), *effects) for effects in ([], [tilt]))
     normals = upright.attitude[0, :, 2], tilted.attitude[0, :, 2]
     np.testing.assert_allclose(*normals, atol=1e-4)
     axis = tilt.on_mount(Mount.juelich()).first_axis
@@ -173,7 +173,7 @@ def test_axis_tilt_turns_both_axes_right_handed():
 
 
 def test_gravity_bends_the_mirror_to_a_paraboloid_from_where_it_was_measured():
-    one = shot(z=waves())
+    one = setup(z=waves())
     bent, straight = (scene_of(one, *effects) for effects in ([GravityBending(6.0)], []))
     sine = float(bent.attitude[0, 2, 2])
     grid = np.linspace(0, 1, 21)
@@ -191,7 +191,7 @@ def test_gravity_follows_the_mirrors_attitude():
     """A low sun behind the target stands the mirror up, one overhead lays it down: the same amplitude, another sag."""
     amplitude, sag = GravityBending(5.0), []
     for elevation in (15.0, 60.0):
-        scenes = [scene_of(shot(sun_direction(10.0, elevation)), *e) for e in ([amplitude], [])]
+        scenes = [scene_of(setup(sun_direction(10.0, elevation)), *e) for e in ([amplitude], [])]
         sunk = (scenes[1].control_points - scenes[0].control_points)[0, :, 2]
         edge = sunk.flatten()[sunk.abs().argmax()]
         sag.append(float(edge) / (float(scenes[0].attitude[0, 2, 2]) - REFERENCE))
@@ -201,7 +201,7 @@ def test_gravity_follows_the_mirrors_attitude():
 
 def test_canting_of_one_heliostat_leaves_the_others_alone():
     tilt = FacetCanting(x_mrad={"flat": [2.0, 0, 0, 0]}, y_mrad={"other": [1.0, 1.0, 1.0, 1.0]})
-    one = shot(focal_length=None)
+    one = setup(focal_length=None)
     before, after = (central_rays(scene_of(one, *e), 8) for e in ([], [tilt]))
     spots = (after.hits - before.hits)[0].view(2, 4, -1).mean(-1).numpy()
     # Alignment holds the common centre, so that the facet goes three quarters of the way and the others one back.
@@ -212,7 +212,7 @@ def test_canting_of_one_heliostat_leaves_the_others_alone():
 
 
 def test_soiling_dims_facets():
-    base, soiled = scene_of(shot()), scene_of(shot(), Soiling({"flat": [1, 0.5, 1, 0.25]}))
+    base, soiled = scene_of(setup()), scene_of(setup(), Soiling({"flat": [1, 0.5, 1, 0.25]}))
     ratio = central_rays(soiled, 8).power.view(4, -1).sum(1) / central_rays(base, 8).power.view(4, -1).sum(1)
     np.testing.assert_allclose(ratio, [1, 0.5, 1, 0.25], rtol=0.01)
 
@@ -221,14 +221,14 @@ def test_soiling_dims_facets():
 @pytest.mark.parametrize("samples", [3, 16])
 def test_blocking_takes_its_share_of_the_mirror_at_any_sampling(fraction, samples):
     """Between the rows of facets lies a gap of 10 mm, so that the share of the height is not quite that of the area."""
-    free, cut = scene_of(shot()), scene_of(shot(), Blocking({"flat": fraction}))
+    free, cut = scene_of(setup()), scene_of(setup(), Blocking({"flat": fraction}))
     lost = 1 - float(central_rays(cut, samples).power.sum() / central_rays(free, samples).power.sum())
     height = max(0.0, min(fraction * 2.56, 1.275)) + max(0.0, fraction * 2.56 - 1.285)
     assert lost == pytest.approx(height / 2.55, abs=2e-3)
 
 
 def test_blocking_hides_the_lower_facets():
-    cut = scene_of(shot(), Blocking({"flat": 0.5}))
+    cut = scene_of(setup(), Blocking({"flat": 0.5}))
     power = central_rays(cut, 8).power.view(4, -1).sum(1)
     assert float(power[2:].sum()) == pytest.approx(0, abs=1e-12)
     assert (power[:2] > 1).all()
@@ -254,7 +254,7 @@ def test_jitter_smears_along_the_way_that_the_spot_goes_as_the_mount_turns(mount
     ]
     moved = ((spots[1] - spots[0]) / (2 * step))[0].numpy()
     still = Scene.build([heliostat], [points], [angles], [SUN], [plane], dtype=torch.float64)
-    np.testing.assert_allclose(central_rays(still, 8).swing[0], moved, atol=0.01 * np.linalg.norm(moved))
+    np.testing.assert_allclose(central_rays(still, 8).spot_per_angle[0], moved, atol=0.01 * np.linalg.norm(moved))
     window, soft = Window(12.0, 12.0, 96, 96, on_spot=True), Gaussian(1e-3)
     spread = [
         _covariance(trace(still, window, Optics(sun_shape=soft, tracking_jitter=sigma), samples=12), window)
@@ -275,7 +275,7 @@ def _covariance(flux, window: Window) -> np.ndarray:
 
 
 def test_jitter_needs_to_know_the_axis():
-    scene = scene_of(shot()).with_(first_axis=None)
+    scene = scene_of(setup()).with_(first_axis=None)
     for tracer in (trace, trace_montecarlo):
         with pytest.raises(InvalidInputError, match="first_axis"):
             tracer(scene, Window(), Optics(tracking_jitter=1e-3))
@@ -300,14 +300,14 @@ STRONG = [
 def test_both_tracers_show_the_effect_alike(effect):
     """L1 distance of the images within the Monte Carlo tracer's noise."""
     rays, view, optics = 400_000, View(32, 32, window=6.0, samples=24, cones="facet"), Optics(sun_shape=Gaussian(3e-3))
-    aligned = align([shot(z=waves())], [effect], dtype=torch.float64)
+    aligned = align([setup(z=waves())], [effect], dtype=torch.float64)
 
     def montecarlo(scene: Scene, window: Window, optics: Optics) -> torch.Tensor:
         return torch.as_tensor(trace_montecarlo(scene, window, optics, rays=rays)[0])
 
     smooth = aligned.flux(optics, [effect], view)[0].clamp(min=0).numpy()
     thrown = aligned.flux(optics, [effect], view, montecarlo)[0].numpy()
-    plain = align([shot(z=waves())], dtype=torch.float64).flux(optics, (), view)[0].numpy()
+    plain = align([setup(z=waves())], dtype=torch.float64).flux(optics, (), view)[0].numpy()
     # Half the rays or more count: the others meet dirt or a neighbour.
     noise = np.sqrt(2 / np.pi) * np.sqrt(smooth / smooth.sum() / (rays / 2)).sum()
     assert np.abs(thrown - smooth).sum() / smooth.sum() < 1.1 * noise
@@ -316,7 +316,7 @@ def test_both_tracers_show_the_effect_alike(effect):
 
 @pytest.mark.parametrize("effect", [SunShapeEffect(0.3), SlopeError(2.0), TrackingJitter(3.0)], ids=lambda e: e.name)
 def test_optics_spread_light_and_lose_none(effect):
-    aligned, window = align([shot()], dtype=torch.float64), View(96, 96, window=30.0, samples=12)
+    aligned, window = align([setup()], dtype=torch.float64), View(96, 96, window=30.0, samples=12)
     plain, spread = (aligned.flux(None, effects, window).sum() for effects in ((), [effect]))
     assert float(spread / plain) == pytest.approx(1, abs=2e-3)
 
@@ -340,8 +340,8 @@ def test_optics_spread_light_and_lose_none(effect):
 )
 def test_gradients_agree_with_finite_differences(make, value):
     """With the alignment held, which is not differentiable."""
-    held, view = align([shot(z=waves())], dtype=torch.float64).groups[0], View(24, 24, samples=8)
-    heliostats = [shot().heliostat]
+    held, view = align([setup(z=waves())], dtype=torch.float64).groups[0], View(24, 24, samples=8)
+    heliostats = [setup().heliostat]
     weights = torch.as_tensor(np.random.default_rng(1).normal(size=(24, 24)))
 
     def total(parameter: torch.Tensor) -> torch.Tensor:

@@ -10,8 +10,8 @@ from model.effects.blocking import Blocking
 from model.effects.camera_blur import CameraBlur
 from model.effects.camera_response import CameraResponse
 from model.effects.slope_error import SlopeError
-from model.fleet import Superposition, Threads, standing, superpose, tile_of, tiles
-from model.forecast import Shot
+from model.fleet import Superposition, aligned_field, superpose, tile_of, tiles
+from model.forecast import Setup
 from model.frames import sun_direction
 from model.neighbours import clear
 from model.plant import Cylinder, Facet, Heliostat
@@ -40,39 +40,39 @@ def field(rows: int, columns: int, apart: tuple[float, float], near: float) -> l
     ]
 
 
-def shots(heliostats: list[Heliostat], sun=SUN, aim=None) -> list[Shot]:
+def setups(heliostats: list[Heliostat], sun=SUN, aim=None) -> list[Setup]:
     plane = target()
-    return [Shot(one, control_points(one), sun, plane, aim=aim) for one in heliostats]
+    return [Setup(one, control_points(one), sun, plane, aim=aim) for one in heliostats]
 
 
 def test_fleet_is_the_sum_of_its_mirrors_however_it_is_tiled():
-    some, plane = shots(field(3, 3, (20.0, 20.0), 60.0)), target(10.0)
+    some, plane = setups(field(3, 3, (20.0, 20.0), 60.0)), target(10.0)
     task = Superposition(plane, (48, 64), OPTICS, (SlopeError(sigma_mrad=1.0),))
     whole = superpose(task, tiles(some))
     assert (whole.heliostats, whole.skipped) == (9, {})
-    angles = [shot.heliostat.mount.align(shot.heliostat.position, SUN, plane.center) for shot in some]
+    angles = [setup.heliostat.mount.align(setup.heliostat.position, SUN, plane.center) for setup in some]
     scene = Scene.build(
-        [shot.heliostat for shot in some], [shot.control_points for shot in some], angles, [SUN] * 9, [plane] * 9
+        [setup.heliostat for setup in some], [setup.control_points for setup in some], angles, [SUN] * 9, [plane] * 9
     )
     each = trace(scene, Window.of(plane, 48, 64), replace(OPTICS, slope_error=1e-3), samples=16, padding=0.25)
     np.testing.assert_allclose(whole.irradiance, each.irradiance.sum(0), atol=1e-5 * whole.irradiance.max())
     assert whole.power == pytest.approx(float(each.power.sum()), rel=1e-5)
-    for engine, size in ((Threads(1), 1), (Threads(3), 2)):
-        again = superpose(task, tiles(some, size=size), engine)
+    for size in (1, 2):
+        again = superpose(task, tiles(some, size=size))
         np.testing.assert_allclose(again.irradiance, whole.irradiance, atol=1e-6 * whole.irradiance.max())
 
 
 def test_heliostat_that_cannot_send_light_there_is_skipped_by_name():
     heliostats = field(2, 3, (20.0, 20.0), 60.0)
     heliostats[4] = Heliostat.juelich("behind", np.array([0.0, -60.0, 1.8]), 70.0)
-    total = superpose(Superposition(target(), (16, 16), OPTICS), tiles(shots(heliostats), standing_of(heliostats)))
+    total = superpose(Superposition(target(), (16, 16), OPTICS), tiles(setups(heliostats), standing_of(heliostats)))
     assert total.heliostats == 5
     assert list(total.skipped) == ["behind"]
     assert "back" in total.skipped["behind"]
 
 
 def test_camera_says_nothing_of_light_on_a_receiver():
-    some = shots(field(1, 2, (20.0, 20.0), 60.0))
+    some = setups(field(1, 2, (20.0, 20.0), 60.0))
     light = superpose(Superposition(target(), (32, 32), OPTICS), tiles(some))
     camera = (CameraResponse(gamma=0.5), CameraBlur(sigma_m=0.4))
     seen = superpose(Superposition(target(), (32, 32), OPTICS, camera), tiles(some))
@@ -83,7 +83,7 @@ def test_camera_says_nothing_of_light_on_a_receiver():
 
 
 def standing_of(heliostats, sun=SUN, aim=(0.0, 0.0, 40.0)):
-    return standing([(one, aim) for one in heliostats], sun)
+    return aligned_field([(one, aim) for one in heliostats], sun)
 
 
 def test_half_a_mirror_behind_another():
@@ -131,14 +131,14 @@ def test_blocking_and_shading_of_a_dense_field_against_monte_carlo():
         rays=40_000,
         seed=1,
     )
-    some = shots(heliostats, sun, plane.center)
+    some = setups(heliostats, sun, plane.center)
     neighbours = standing_of(heliostats, sun, plane.center)
     task = Superposition(plane, (18, 18), OPTICS)
     shaded, free = superpose(task, tiles(some, neighbours)), superpose(task, tiles(some))
     assert powers.sum() < 0.8 * free.power  # the field is dense
     assert shaded.power == pytest.approx(powers.sum(), rel=3e-3)
-    for shot, power in zip(some, powers, strict=True):
-        assert task(tile_of([shot], neighbours)).power == pytest.approx(power, abs=0.01 * free.power / 25)
+    for setup, power in zip(some, powers, strict=True):
+        assert task(tile_of([setup], neighbours)).power == pytest.approx(power, abs=0.01 * free.power / 25)
     assert np.abs(shaded.irradiance - expected).sum() < 0.02 * expected.sum()
     assert np.abs(free.irradiance - expected).sum() > 0.2 * expected.sum()
 
@@ -162,8 +162,8 @@ def test_neighbours_take_the_place_of_the_effect_that_stands_for_them():
     heliostats = field(1, 1, (4.0, 4.0), 60.0)
     effects = (Blocking(lower_fraction={"H0": 0.5}),)
     task = Superposition(target(), (16, 16), OPTICS, effects)
-    alone = superpose(task, tiles(shots(heliostats), standing_of(heliostats))).power
-    assert superpose(task, tiles(shots(heliostats))).power == pytest.approx(alone / 2, rel=1e-3)
+    alone = superpose(task, tiles(setups(heliostats), standing_of(heliostats))).power
+    assert superpose(task, tiles(setups(heliostats))).power == pytest.approx(alone / 2, rel=1e-3)
 
 
 # --- cylinders --------------------------------------------------------------------------------------------------------
@@ -173,7 +173,7 @@ def test_cylinder_takes_in_all_that_is_thrown_at_it():
     cylinder = Cylinder("r", [0, 3.0, 40], [0, 1, 0], [0, 0, 1], 3.0, 24.0)
     heliostats = field(2, 4, (30.0, 30.0), 90.0)
     aim = np.array([0.0, 0.0, 40.0])
-    total = superpose(Superposition(cylinder, (96, 180), OPTICS), tiles(shots(heliostats, aim=aim)))
+    total = superpose(Superposition(cylinder, (96, 180), OPTICS), tiles(setups(heliostats, aim=aim)))
     pixel = cylinder.width * cylinder.height / (96 * 180)
     assert total.irradiance.sum() * pixel == pytest.approx(total.power, rel=3e-3)
     assert total.irradiance[:, :30].max() < 0.01 * total.irradiance.max()  # its back, away from the field
@@ -185,7 +185,7 @@ def test_cylinder_in_parallel_light_has_the_cosine_of_its_angle():
     far = replace(Heliostat.juelich("far", np.array([0.0, 400.0, 40.0])), facets=(flat,), width=20.0, height=16.0)
     cylinder = Cylinder("r", [0, 2.0, 40], [0, 1, 0], [0, 0, 1], 2.0, 2.0, 120.0)
     task = Superposition(cylinder, (8, 60), Optics(sun_shape=Pillbox(1e-3)), samples=96)
-    found = superpose(task, tiles(shots([far], sun_direction(180.0, 60.0), np.array([0.0, 0.0, 40.0]))))
+    found = superpose(task, tiles(setups([far], sun_direction(180.0, 60.0), np.array([0.0, 0.0, 40.0]))))
     angle = np.radians((np.arange(60) + 0.5) / 60 * 120 - 60)
     np.testing.assert_allclose(found.irradiance / np.cos(angle), 1000.0, rtol=0.01)
 
@@ -193,7 +193,7 @@ def test_cylinder_in_parallel_light_has_the_cosine_of_its_angle():
 def test_mirror_behind_the_lit_part_of_a_cylinder_is_skipped():
     cylinder = Cylinder("r", [0, 2.0, 40], [0, 1, 0], [0, 0, 1], 2.0, 4.0, 60.0)
     heliostats = [*field(1, 2, (20.0, 20.0), 60.0), Heliostat.juelich("south", np.array([0.0, -80.0, 1.8]), 90.0)]
-    total = superpose(Superposition(cylinder, (16, 16), OPTICS), tiles(shots(heliostats, aim=cylinder.center)))
+    total = superpose(Superposition(cylinder, (16, 16), OPTICS), tiles(setups(heliostats, aim=cylinder.center)))
     assert (total.heliostats, list(total.skipped)) == (2, ["south"])
     assert "behind the lit part" in total.skipped["south"]
 
@@ -216,7 +216,7 @@ def test_cylinder_against_monte_carlo(opening: float):
         seed=2,
         shadows=False,
     )
-    found = superpose(Superposition(cylinder, (48, 96), OPTICS), tiles(shots(heliostats, aim=aim)))
+    found = superpose(Superposition(cylinder, (48, 96), OPTICS), tiles(setups(heliostats, aim=aim)))
     coarse = found.irradiance.reshape(12, 4, 24, 4).mean(axis=(1, 3))
     assert found.power == pytest.approx(powers.sum(), rel=3e-3)
     assert coarse.sum() == pytest.approx(expected.sum(), rel=5e-3)

@@ -1,4 +1,4 @@
-"""Forecasts of shots: alignment under effects, batches of unlike shots, reuse."""
+"""Forecasts of setups: alignment under effects, batches of unlike setups, reuse."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ from model.effects.gravity_bending import GravityBending
 from model.effects.slope_error import SlopeError
 from model.effects.sun_position import SunPosition
 from model.errors import UnreachableError
-from model.forecast import Shot, View, align, forecast_shots
+from model.forecast import Setup, View, align, forecast_setups
 from model.frames import sun_direction
 from model.surface import control_points
 from model.tracing import Optics
@@ -33,8 +33,8 @@ GEOMETRY = [
 ]
 
 
-def shots(count: int = 3) -> list[Shot]:
-    """Shots of several heliostats and suns at spots off the target's centre."""
+def setups(count: int = 3) -> list[Setup]:
+    """Setups of several heliostats and suns at spots off the target's centre."""
     rng = np.random.default_rng(5)
     made = []
     for index in range(count):
@@ -42,13 +42,13 @@ def shots(count: int = 3) -> list[Shot]:
         points = control_points(heliostat, rng.normal(0, 2e-4, (4, 8, 8)))
         sun, plane = sun_direction(rng.uniform(-60, 60), rng.uniform(20, 60)), target()
         spot = plane.to_enu(rng.uniform(-0.5, 0.5, 2))
-        made.append(Shot(heliostat, points, sun, plane, spot=spot, identifier=str(index)))
+        made.append(Setup(heliostat, points, sun, plane, spot=spot, identifier=str(index)))
     return made
 
 
 @pytest.mark.parametrize("effects", [[], GEOMETRY], ids=["none", "geometry"])
 def test_spots_lie_where_they_were_measured_whatever_the_effects(effects):
-    given = shots()
+    given = setups()
     group = align(given, effects, dtype=torch.float64).groups[0]
     spots = central_rays(group.scene, 12).spot.numpy()
     np.testing.assert_allclose(spots, [s.plane.to_plane(s.spot) for s in given], atol=2e-5)
@@ -56,7 +56,7 @@ def test_spots_lie_where_they_were_measured_whatever_the_effects(effects):
 
 def test_unlike_shots_come_back_in_their_order():
     """Of other targets, other splines, with and without a spot: each as if it were alone."""
-    a, b, c = shots()
+    a, b, c = setups()
     wide = replace(a, plane=target(10.0, center=(0.0, 0.0, 38.0)), spot=np.array([0.2, 0.0, 38.0]))
     aimed = replace(b, spot=None, aim=b.plane.center + [0.3, 0, 0.2])
     still = replace(c, spot=None, angles=c.heliostat.mount.align(c.heliostat.position, c.sun, c.plane.center))
@@ -67,38 +67,38 @@ def test_unlike_shots_come_back_in_their_order():
     assert len(together.groups) == 3
     images = together.images(None, effects, view)
     assert images.shape == (7, 40, 32)
-    for image, angles, shot in zip(images, together.angles, mixed, strict=True):
-        alone = align([shot], effects)
+    for image, angles, setup in zip(images, together.angles, mixed, strict=True):
+        alone = align([setup], effects)
         np.testing.assert_allclose(angles, alone.angles[0], atol=1e-6)
         expected = alone.images(None, effects, view)[0]
         np.testing.assert_allclose(image, expected, atol=2e-3 * float(expected.max()))
 
 
 def test_an_alignment_serves_other_optics_and_cameras():
-    given, view = shots(), View(32, 32, samples=8)
+    given, view = setups(), View(32, 32, samples=8)
     aligned = align(given, GEOMETRY)
     flux = aligned.flux(None, [SlopeError(1.0)], view)
     for camera in ([CameraBlur(0.2)], [CameraResponse(1.5), Background(0.1)]):
-        whole = forecast_shots(given, None, [*GEOMETRY, SlopeError(1.0), *camera], view)
-        np.testing.assert_allclose(aligned.photographs(flux, camera, view), whole, rtol=1e-5, atol=1e-2)
+        whole = forecast_setups(given, None, [*GEOMETRY, SlopeError(1.0), *camera], view)
+        np.testing.assert_allclose(aligned.camera_images(flux, camera, view), whole, rtol=1e-5, atol=1e-2)
 
 
 def test_the_order_of_the_list_is_of_no_account():
-    given, view = shots(1), View(32, 32, samples=8)
+    given, view = setups(1), View(32, 32, samples=8)
     effects = [CameraResponse(1.5), Background(0.1), SlopeError(1.0), GravityBending(3.0)]
-    a, b = (forecast_shots(given, None, e, view) for e in (effects, effects[::-1]))
+    a, b = (forecast_setups(given, None, e, view) for e in (effects, effects[::-1]))
     np.testing.assert_array_equal(a, b)
 
 
 def test_a_start_nearby_ends_at_the_same_alignment():
-    given = shots()
+    given = setups()
     before = align(given, [GravityBending(3.0)])
     warm, cold = (align(given, [GravityBending(3.5)], start=start) for start in (before, None))
     np.testing.assert_allclose(warm.angles, cold.angles, atol=1e-6)
 
 
 def test_windows_about_the_spot_or_of_the_whole_target():
-    given = shots()
+    given = setups()
     about = align(given).flux(view=View(64, 64, window=4.0)).clamp(min=0).numpy()
     columns = np.arange(64) * 4 / 64 - 2 + 2 / 64
     centers = (about.sum(axis=1) * columns).sum(axis=1) / about.sum(axis=(1, 2))
@@ -118,12 +118,12 @@ def test_an_effect_of_no_catalogue_is_applied():
         def on_image(self, images, window):
             return 0.5 * images
 
-    given, view = shots(1), View(16, 16, samples=4)
-    plain, dimmed = (forecast_shots(given, None, effects, view) for effects in ((), [Vignette()]))
+    given, view = setups(1), View(16, 16, samples=4)
+    plain, dimmed = (forecast_setups(given, None, effects, view) for effects in ((), [Vignette()]))
     np.testing.assert_allclose(dimmed, 0.5 * plain)
 
 
 def test_a_clock_that_puts_the_sun_behind_the_mirror_is_refused():
-    low = replace(shots(1)[0], sun=sun_direction(80.0, 3.0))
+    low = replace(setups(1)[0], sun=sun_direction(80.0, 3.0))
     with pytest.raises(UnreachableError):
         align([replace(low, plane=replace(low.plane, normal=-low.plane.normal))])

@@ -9,13 +9,13 @@ from model.network.paper import PaperConfig, PaperNetwork
 from model.network.predictor import INPUTS, SurfacePredictor, default_predictor, mirrored_inputs, model_card
 from model.observation import Observation, spread_suns
 from model.plant import TargetPlane
-from model.refinement import default_prior
+from model.prior import default_prior
 from model.surface import control_points, mirrored
 from model.tracing import Scene
 from model.tracing.convolution import central_rays
 from tests.conftest import flat_heliostat, target
 from training.export import PARITY_MM, example, export, parity, rounded
-from training.render import Shots, Situations
+from training.render import Setups, Situations
 
 SMALL = NetworkConfig(encoder_channels=(8, 16, 16), features=32, heads=2, style_features=8, decoder_channels=16)
 
@@ -92,15 +92,17 @@ def test_conditions_say_how_slopes_and_places_move_light():
 def test_a_descent_leads_towards_the_surface_that_threw_the_images():
     rng, prior = np.random.default_rng(0), default_prior()
     suns = Situations().suns(4, rng)
-    shots = Shots.of([flat_heliostat(focal_length=75.0)], suns, np.tile([0.0, 0.0, 40.0], (4, 1)), torch.device("cpu"))
+    setups = Setups.of(
+        [flat_heliostat(focal_length=75.0)], suns, np.tile([0.0, 0.0, 40.0], (4, 1)), torch.device("cpu")
+    )
     mean, basis = (torch.as_tensor(values, dtype=torch.float32) for values in (prior.mean[None], prior.basis))
     truth = torch.as_tensor(prior.surface(rng.normal(size=len(prior.basis)))[None], dtype=torch.float32)
-    flux = shots.trace(truth)
-    descent = shots.descents(mean, flux, basis)
+    flux = setups.trace(truth)
+    descent = setups.descents(mean, flux, basis)
     assert descent.shape == (1, 4, 4, 8, 8)
-    misfit = [float((shots.trace(z) - flux).square().sum()) for z in (mean, mean + descent.sum(dim=1))]
+    misfit = [float((setups.trace(z) - flux).square().sum()) for z in (mean, mean + descent.sum(dim=1))]
     assert misfit[1] < 0.5 * misfit[0]
-    arrived = shots.descents(truth, flux, basis)
+    arrived = setups.descents(truth, flux, basis)
     assert float(arrived.abs().max()) < 0.1 * float(descent.abs().max())
 
 
@@ -114,13 +116,13 @@ def test_the_mirrored_world_is_told_as_such():
     for sign in (1.0, -1.0):
         flip = [sign, 1.0, 1.0]
         heliostat = flat_heliostat((sign * 25.0, 70.0, 1.8), focal_length=75.0)
-        shots = Shots.of([heliostat], suns * flip, aims * flip, torch.device("cpu"))
+        setups = Setups.of([heliostat], suns * flip, aims * flip, torch.device("cpu"))
         surfaces = [values if sign > 0 else mirrored(values.numpy()).copy() for values in (z, truth)]
         guess, thrower = (torch.as_tensor(values) for values in surfaces)
-        flux = shots.trace(thrower)
-        descent = shots.descents(guess, flux, basis)
-        mask, seen = torch.ones(1, 3), shots.trace(guess)
-        values = (flux, shots.conditions(), mask, seen, guess, descent)
+        flux = setups.trace(thrower)
+        descent = setups.descents(guess, flux, basis)
+        mask, seen = torch.ones(1, 3), setups.trace(guess)
+        values = (flux, setups.conditions(), mask, seen, guess, descent)
         told.append({name: value.numpy() for name, value in zip(INPUTS, values, strict=True)})
     for name, expected in mirrored_inputs(told[0]).items():
         scale = np.abs(expected).max()

@@ -9,12 +9,12 @@ from model.effects.camera_response import CameraResponse
 from model.errors import InvalidInputError
 from model.frames import sun_direction_at
 from model.metrics import surface_error
-from model.observation import TRUSTED_STRANGENESS, Observation, render_observations
+from model.observation import Observation, render_observations
 from model.plant import Heliostat
-from model.refinement import RefinementOptions, default_prior, misfits, refine
+from model.prior import default_prior
+from model.refinement import RefinementOptions, misfits, refine
 from tests.conftest import flat_heliostat, target
 from tests.rendered import observe
-from training.surfaces import tilt_modes
 
 SUNS = sun_direction_at(np.array([-20.0, -5, 5, 20, 15, 0]), np.array([-40.0, 30, -15, 50, 0, 10]), 50.9)
 
@@ -70,15 +70,6 @@ def test_misfit_tells_a_surface_from_another(heliostat, truth, refined):
     assert mean_misfit(heliostat, default_prior().mean, truth) > 1.5 * refined.misfit
 
 
-def test_a_mirror_unlike_those_known_is_strange(truth):
-    """Half of the facets turned by three milliradians, five times what the prior expects of canting."""
-    prior = default_prior()
-    assert prior.strangeness(prior.mean) == pytest.approx(0, abs=1e-6)
-    assert prior.strangeness(truth) < TRUSTED_STRANGENESS
-    tilt = np.einsum("f,kij->fij", [3e-3, -3e-3, 0, 0], tilt_modes())
-    assert prior.strangeness(truth + tilt) > TRUSTED_STRANGENESS
-
-
 def test_a_foreign_image_is_named(heliostat, truth):
     """On one of six images another heliostat's spot lies beside: the others still agree, and that one is found out."""
     observations = images(heliostat, truth)
@@ -103,12 +94,6 @@ def test_effects_that_are_believed_are_not_taken_for_shape(heliostat, truth):
     ]
     known = refine(heliostat, seen, effects=response, options=options)
     assert surface_error(known.z, truth) < 0.8 * surface_error(refine(heliostat, seen, options=options).z, truth)
-
-
-def test_prior_inverts_its_own_coefficients():
-    prior = default_prior()
-    c = np.random.default_rng(0).normal(size=len(prior.basis))
-    np.testing.assert_allclose(prior.coefficients(prior.surface(c)), c, rtol=1e-4, atol=1e-5)
 
 
 def test_no_image_is_named(heliostat):

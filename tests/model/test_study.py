@@ -16,16 +16,17 @@ from model.effects.facet_canting import FacetCanting
 from model.effects.slope_error import SlopeError
 from model.effects.sun_shape import SunShapeEffect
 from model.errors import InvalidInputError
-from model.forecast import Shot, View, forecast_shots
+from model.forecast import Setup, View, forecast_setups
 from model.frames import sun_direction
+from model.metrics import flux_accuracies
 from model.plant import Heliostat
-from model.study import Photograph, StudyOptions, study
+from model.study import FluxImage, StudyOptions, study
 from model.study.advice import PHOTOGRAPHS, SAME_SCALING, SCALES_WITH, told_apart_by
 from model.study.covariates import RECORDED_TIME, covariates_of
 from model.study.fitting import Fitter
-from model.study.judging import accuracies, paired_gain, rank_correlation, split
+from model.study.flux_images import Forecaster, cut, in_pixels, spot_window
+from model.study.judging import paired_gain, rank_correlation, split
 from model.study.noise import grain_variance
-from model.study.photographs import Forecaster, cut, in_pixels, spot_window
 from model.study.unknowns import Unknowns
 from model.surface import control_points
 from model.tracing import Optics
@@ -39,7 +40,7 @@ QUICK = StudyOptions(candidates=("sun_shape", "gravity_bending"), fit_view=FINE)
 NOISE = 0.003
 
 
-def shots(heliostats: int = 2, count: int = 4) -> list[Shot]:
+def setups(heliostats: int = 2, count: int = 4) -> list[Setup]:
     """Wavy mirrors under suns around the day."""
     rng, plane, made = np.random.default_rng(7), target(), []
     for name, place in list(PLACES.items())[:heliostats]:
@@ -48,28 +49,28 @@ def shots(heliostats: int = 2, count: int = 4) -> list[Shot]:
         points = control_points(mirror, rng.normal(0, 2e-4, (4, 8, 8)))
         for number, azimuth in enumerate(np.linspace(-60, 60, count)):
             sun, spot = sun_direction(azimuth, 50 - abs(azimuth) / 2), plane.to_enu(rng.uniform(-0.3, 0.3, 2))
-            made.append(Shot(mirror, points, sun, plane, spot=spot, identifier=f"{name}/{number}"))
+            made.append(Setup(mirror, points, sun, plane, spot=spot, identifier=f"{name}/{number}"))
     return made
 
 
-def photographs(
+def flux_images(
     effects: Sequence[Effect] = (), noise: float = 0.0, view: View = CAMERA, heliostats: int = 2, count: int = 4
-) -> list[Photograph]:
+) -> list[FluxImage]:
     """What the forecaster expects under ``effects``, with noise in shares of the peak."""
-    rng, taken = np.random.default_rng(3), shots(heliostats, count)
-    images = forecast_shots(taken, Optics(), effects, view).double().numpy()
+    rng, taken = np.random.default_rng(3), setups(heliostats, count)
+    images = forecast_setups(taken, Optics(), effects, view).double().numpy()
     images = images + noise * images.max(axis=(1, 2), keepdims=True) * rng.standard_normal(images.shape)
-    return [Photograph(shot, image) for shot, image in zip(taken, images, strict=True)]
+    return [FluxImage(setup, image) for setup, image in zip(taken, images, strict=True)]
 
 
 @pytest.fixture(scope="module")
-def clean() -> list[Photograph]:
-    return photographs(noise=NOISE)
+def clean() -> list[FluxImage]:
+    return flux_images(noise=NOISE)
 
 
 @pytest.fixture(scope="module")
-def hazy() -> list[Photograph]:
-    return photographs([SunShapeEffect(0.15)], noise=NOISE)
+def hazy() -> list[FluxImage]:
+    return flux_images([SunShapeEffect(0.15)], noise=NOISE)
 
 
 # --- unknowns ---------------------------------------------------------------------------------------------------------
@@ -101,7 +102,7 @@ def test_unknowns_go_into_others_by_what_they_are():
 
 def test_unknowns_of_one_colour_belong_to_different_heliostats():
     unknowns = Unknowns((FacetCanting, SlopeError), (("A", 4), ("B", 4)))
-    groups = list(unknowns.colours.values())
+    groups = list(unknowns.groups.values())
     assert sorted(place for group in groups for place in group) == list(range(len(unknowns.all)))
     for group in groups:
         owners = [unknowns.all[place].heliostat for place in group]
@@ -113,7 +114,7 @@ def test_unknowns_of_one_colour_belong_to_different_heliostats():
 
 @pytest.mark.parametrize("heliostats", [1, 2, 3])
 def test_a_split_parts_images_and_keeps_one_heliostat_of_several(heliostats):
-    taken = photographs(view=SMALL, heliostats=heliostats, count=5)
+    taken = flux_images(view=SMALL, heliostats=heliostats, count=5)
     parts = split(taken)
     rows = np.concatenate([parts.fit, parts.own, parts.held_out])
     assert sorted(rows) == list(range(len(taken)))
@@ -123,7 +124,7 @@ def test_a_split_parts_images_and_keeps_one_heliostat_of_several(heliostats):
 
 
 def test_images_that_surfaces_were_predicted_from_judge_only_for_want_of_others():
-    taken = photographs(view=SMALL, heliostats=2, count=5)
+    taken = flux_images(view=SMALL, heliostats=2, count=5)
     unseen = {2, 3, 7}
     parts = split([replace(p, seen=row not in unseen) for row, p in enumerate(taken)])
     assert set(parts.held_out) == unseen
@@ -142,7 +143,7 @@ def test_accuracy_is_one_less_the_summed_difference():
     a = np.zeros((2, 4, 4))
     b = a.copy()
     a[:, 0, 0] = b[0, 0, 0] = b[1, 3, 3] = 1.0
-    np.testing.assert_allclose(accuracies(a, b), [1.0, -1.0])
+    np.testing.assert_allclose(flux_accuracies(a, b), [1.0, -1.0])
 
 
 def test_the_interval_of_a_gain_covers_the_truth_about_as_often_as_it_says():
@@ -200,25 +201,25 @@ CAMERAS: dict[str, Callable[[np.ndarray, np.random.Generator], np.ndarray]] = {
 def test_the_share_of_noise_is_the_error_it_makes(camera):
     """Roughly, whatever the camera does to the noise: where it is far too low, a study calls noise unexplained."""
     rng, errors, shares = np.random.default_rng(5), [], []
-    for exact in photographs():
+    for exact in flux_images():
         light = exact.image / exact.image.max()
-        taken = Photograph(exact.shot, CAMERAS[camera](light, rng))
-        true = cut(in_pixels(light[None], *taken.image.shape), [exact.shot.plane], 4.0, 64)
-        errors.append(1 - accuracies(cut(taken.image[None], [exact.shot.plane], 4.0, 64), true)[0])
+        taken = FluxImage(exact.setup, CAMERAS[camera](light, rng))
+        true = cut(in_pixels(light[None], *taken.image.shape), [exact.setup.plane], 4.0, 64)
+        errors.append(1 - flux_accuracies(cut(taken.image[None], [exact.setup.plane], 4.0, 64), true)[0])
         shares.append(taken.noise_share(4.0))
     assert 0.5 < np.mean(shares) / np.mean(errors) < 1.35
 
 
 @pytest.mark.parametrize("image", [np.ones((64, 64)), np.ones((4, 4)), np.eye(16)], ids=["even", "tiny", "lines"])
 def test_noise_is_finite_whatever_the_image(image):
-    assert np.isfinite(Photograph(shots()[0], image).noise_share(4.0))
+    assert np.isfinite(FluxImage(setups()[0], image).noise_share(4.0))
 
 
 def test_a_coarse_camera_is_forecast_in_its_own_pixels():
-    taken = photographs()
-    coarse = [Photograph(p.shot, in_pixels(p.image[None], 32, 32)[0]) for p in taken]
+    taken = flux_images()
+    coarse = [FluxImage(p.setup, in_pixels(p.image[None], 32, 32)[0]) for p in taken]
     forecaster = Forecaster(coarse, Optics(), [], 4.0, View(128, 128, samples=12))
-    assert accuracies(forecaster.measured(), forecaster.cuts([])).min() > 0.99
+    assert flux_accuracies(forecaster.measured(), forecaster.cuts([])).min() > 0.99
 
 
 def test_the_window_holds_the_spots(clean, hazy):
@@ -241,7 +242,7 @@ def test_a_forecaster_repeats_itself_whatever_it_has_kept(clean):
 
 def fitted(truth: Effect) -> tuple[Unknowns, np.ndarray, np.ndarray]:
     """Unknowns of a kind, their fit to forecasts that hold ``truth``, and the spread of it."""
-    forecaster = Forecaster(photographs([truth], view=SMALL), Optics(), [], 6.0, SMALL)
+    forecaster = Forecaster(flux_images([truth], view=SMALL), Optics(), [], 6.0, SMALL)
     unknowns = Unknowns((type(truth),), (("far", 4), ("near", 4)))
     fit = Fitter(forecaster).fit(unknowns, unknowns.neutral)
     return unknowns, fit.values, fit.spread
@@ -322,13 +323,13 @@ def test_an_error_that_grows_with_time_is_seen_where_times_were_recorded(hazy):
     first = datetime(2026, 6, 1, 12, tzinfo=UTC)
     dated = [replace(p, taken_at=first + timedelta(days=day)) for day, p in enumerate(hazy)]
     found = study(dated, Optics(), options=replace(QUICK, candidates=("axis_tilt",)))
-    days = covariates_of(found.photographs, found.latitude_deg)[RECORDED_TIME]
+    days = covariates_of(found.images, found.latitude_deg)[RECORDED_TIME]
     assert days.min() == 0
     np.testing.assert_allclose(days, np.round(days))
     assert found.covariates()["recorded time"] == pytest.approx(
         rank_correlation(1 - found.accuracy_after, days), abs=5e-4
     )
-    assert RECORDED_TIME not in covariates_of([*found.photographs, hazy[0]], found.latitude_deg)
+    assert RECORDED_TIME not in covariates_of([*found.images, hazy[0]], found.latitude_deg)
 
 
 def test_what_is_declared_is_no_candidate(hazy):
@@ -347,7 +348,7 @@ def test_too_few_photographs_or_two_of_one_name_are_refused(clean):
 @pytest.mark.parametrize("image", [np.zeros((8, 8)), np.full((8, 8), np.nan), np.ones(8)], ids=["dark", "nan", "line"])
 def test_a_photograph_that_holds_no_image_is_named(clean, image):
     with pytest.raises(InvalidInputError, match="photograph near/0"):
-        Photograph(clean[0].shot, image)
+        FluxImage(clean[0].setup, image)
 
 
 # --- advice -----------------------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ import pytest
 
 from model.plant import Heliostat
 from model.surface import control_points, evaluate
-from training.fit import Deflectometry, fit, flux_accuracies, read_deflectometry, row
+from training.fit import Deflectometry, fit, fit_accuracies, read_deflectometry, row
 
 GRID = (np.arange(40) + 0.5) / 40
 
@@ -58,9 +58,9 @@ def test_places_off_the_facet_and_normals_that_failed_are_not_used(measured, tru
 
 def test_flux_is_lost_by_what_the_heights_leave_out(heliostat, truth, measured):
     fine = control_points(heliostat, truth)
-    assert flux_accuracies(heliostat, fine, fine).min() == pytest.approx(1)
+    assert fit_accuracies(heliostat, fine, fine).min() == pytest.approx(1)
     coarse = control_points(heliostat, truth + 1e-4 * np.cos(np.pi * np.arange(8)))
-    assert 0.5 < flux_accuracies(heliostat, fine, coarse).mean() < 0.98
+    assert 0.5 < fit_accuracies(heliostat, fine, coarse).mean() < 0.98
     assert row(replace(measured, fine=fine), fit(measured))[-1] == "0.000"
     assert row(measured, fit(measured))[-1] == ""
 

@@ -85,9 +85,9 @@ def test_fresh_samples_are_no_mixtures_of_the_measured_surfaces(surfaces):
 def test_rendered_images_are_normalised_and_reproducible(surfaces, stj):
     field, device = load_field(stj), torch.device("cpu")
     first, again, other = (render(surfaces[:3], 4, field, Situations(), Camera(), device, seed) for seed in (1, 1, 2))
-    flux, shots = first
+    flux, setups = first
     assert flux.shape == (3, 4, 64, 64)
-    assert shots.conditions().shape == (3, 4, 12)
+    assert setups.conditions().shape == (3, 4, 12)
     torch.testing.assert_close(flux.sum(dim=(2, 3)), torch.full((3, 4), 100.0))
     torch.testing.assert_close(flux, again[0], rtol=0, atol=0)
     assert not torch.equal(flux, other[0])

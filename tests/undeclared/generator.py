@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.effects import Effect, effects_from_json
-from model.forecast import Shot
+from model.forecast import Setup
 from model.plant import Heliostat, TargetPlane
-from model.refinement import default_prior
+from model.prior import default_prior
 from model.surface import control_points
 from tests.undeclared.camera import photograph
 from tests.undeclared.rays import Exposure, Sun, throw
@@ -61,19 +61,19 @@ class Plan:
         sun = self.sun(world.clock_minutes)
         return Exposure(world, self.index, self.heliostat, self.heights, sun, self.plane, self.goal, self.warmth)
 
-    def shot(self, identifier: str) -> Shot:
+    def setup(self, identifier: str) -> Setup:
         """What is recorded."""
         points = control_points(self.heliostat, self.heights)
-        return Shot(self.heliostat, points, self.sun(), self.plane, self.goal, identifier=identifier)
+        return Setup(self.heliostat, points, self.sun(), self.plane, self.goal, identifier=identifier)
 
 
 @dataclass(frozen=True, eq=False)
 class MeasurementSet:
-    """Photographs (256, 256) of shots in a world, whose effects of the catalogue are ``truth``, as JSON."""
+    """Photographs (256, 256) of setups in a world, whose effects of the catalogue are ``truth``, as JSON."""
 
     world: World
     truth: list[dict[str, Any]]
-    shots: list[Shot]
+    setups: list[Setup]
     images: list[Array]
 
     @property
@@ -89,7 +89,7 @@ def generate(
     surfaces: Array,
     *,
     heliostats: int = 4,
-    shots: int = 6,
+    setups: int = 6,
     side: int = 192,
     fan: int = 24,
 ) -> MeasurementSet:
@@ -97,12 +97,12 @@ def generate(
 
     ``surfaces`` (N, 4, 8, 8) [m] are mirrors to draw from; an image has 4 * side**2 * fan rays.
     """
-    plans = _plans(heliostats, shots, surfaces, np.random.default_rng(seed))
+    plans = _plans(heliostats, setups, surfaces, np.random.default_rng(seed))
     rng = np.random.default_rng((seed, crc32(case.encode())))
     world, truth = disturb(case, level, list(dict.fromkeys(plan.heliostat.name for plan in plans)), rng)
     sun = Sun.of(world, rng)
     images = [photograph(throw(plan.exposure(world), sun, side, fan, rng), plan.plane, world, rng) for plan in plans]
-    recorded = [plan.shot(f"{plan.heliostat.name}/{number}") for number, plan in enumerate(plans, start=100)]
+    recorded = [plan.setup(f"{plan.heliostat.name}/{number}") for number, plan in enumerate(plans, start=100)]
     return MeasurementSet(world, truth, recorded, images)
 
 
@@ -115,14 +115,14 @@ def mirrors(data: Path | None = None, count: int = 200, seed: int = 1) -> Array:
     return np.array([prior.surface(rng.normal(size=len(prior.basis))) for _ in range(count)])
 
 
-def _plans(heliostats: int, shots: int, surfaces: Array, rng: np.random.Generator) -> list[Plan]:
+def _plans(heliostats: int, setups: int, surfaces: Array, rng: np.random.Generator) -> list[Plan]:
     """Heliostats spread over the slant ranges, evenly in their logarithm, each with a random mirror."""
     plans = []
     for index, heights in enumerate(surfaces[rng.choice(len(surfaces), heliostats, replace=False)]):
         share = (index + rng.random()) / heliostats
         distance = RANGES[0] * (RANGES[1] / RANGES[0]) ** share
         heliostat = _heliostat(f"A{chr(65 + index)}{rng.integers(10, 60)}", distance, rng)
-        plans += [_plan(index, heliostat, heights, rng) for _ in range(shots)]
+        plans += [_plan(index, heliostat, heights, rng) for _ in range(setups)]
     return plans
 
 

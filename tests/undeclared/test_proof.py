@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from model.effects import CATALOGUE
-from model.forecast import View, forecast_shots
+from model.forecast import View, forecast_setups
 from model.metrics import compare_on_target
-from model.study import Photograph, StudyOptions, study
+from model.study import FluxImage, StudyOptions, study
 from model.tracing import Optics
 from tests.undeclared import world
 from tests.undeclared.generator import MeasurementSet, generate, mirrors
@@ -25,14 +25,14 @@ OPTIONS = StudyOptions(
 @cache
 def measured(case: str) -> MeasurementSet:
     """A small set with few rays."""
-    return generate(case, STRONG, 5, mirrors(count=8), heliostats=3, shots=5, side=128, fan=16)
+    return generate(case, STRONG, 5, mirrors(count=8), heliostats=3, setups=5, side=128, fan=16)
 
 
 @cache
 def report(case: str) -> dict[str, Any]:
     """The study of a small set."""
     made = measured(case)
-    photographs = [Photograph(shot, image) for shot, image in zip(made.shots, made.images, strict=True)]
+    photographs = [FluxImage(setup, image) for setup, image in zip(made.setups, made.images, strict=True)]
     return study(photographs, Optics(), options=OPTIONS).to_json()
 
 
@@ -43,10 +43,10 @@ def test_the_generator_has_every_effect_of_the_catalogue():
 @pytest.mark.parametrize("case", ["clean", *world.CATALOGUE])
 def test_the_model_with_the_truth_explains_what_the_generator_throws(case):
     """Generator and model share no code, so that each is a test of the other."""
-    made = generate(case, STRONG, 3, mirrors(count=8), heliostats=2, shots=1, side=128, fan=16)
-    forecasts = forecast_shots(made.shots, None, made.effects, View(96, 96)).numpy()
-    for shot, image, forecast in zip(made.shots, made.images, forecasts, strict=True):
-        size = (shot.plane.width, shot.plane.height)
+    made = generate(case, STRONG, 3, mirrors(count=8), heliostats=2, setups=1, side=128, fan=16)
+    forecasts = forecast_setups(made.setups, None, made.effects, View(96, 96)).numpy()
+    for setup, image, forecast in zip(made.setups, made.images, forecasts, strict=True):
+        size = (setup.plane.width, setup.plane.height)
         assert compare_on_target(image, forecast, size, 4.0, 32).accuracy > 0.975
 
 

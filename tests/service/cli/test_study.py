@@ -220,7 +220,7 @@ def test_the_page_says_what_was_found(hazy):
     ratio = hazy.study.to_json()["effects"][0]["parameters"]["circumsolar_ratio"]
     assert f"{ratio['value']:.3f}{ratio['ci95'][0]:.3f} to {ratio['ci95'][1]:.3f}" in words
     assert "camera blur" in words
-    for photograph in hazy.study.photographs:
+    for photograph in hazy.study.images:
         assert photograph.key in words
 
 
@@ -254,10 +254,10 @@ def test_parameters_of_facets_stand_in_columns(hazy):
 def test_names_are_text_wherever_they_come_from(hazy):
     evil = '"><script>alert(1)</script>'
     photographs = [
-        replace(p, shot=replace(p.shot, identifier=f"{evil}/{n}", heliostat=replace(p.shot.heliostat, name=evil)))
-        for n, p in enumerate(hazy.study.photographs)
+        replace(p, setup=replace(p.setup, identifier=f"{evil}/{n}", heliostat=replace(p.setup.heliostat, name=evil)))
+        for n, p in enumerate(hazy.study.images)
     ]
-    page = study_page(replace(hazy.study, photographs=photographs), evil, {evil: evil})
+    page = study_page(replace(hazy.study, images=photographs), evil, {evil: evil})
     assert "<script" not in page
     assert "script" not in read(page).tags
     assert evil in "".join(read(page).words)

@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from model.fleet import FleetFlux, Superposition, Threads, Tile, standing, superpose, tiles
-from model.forecast import Shot
+from model.fleet import FleetFlux, Superposition, Tile, aligned_field, superpose, tiles
+from model.forecast import Setup
 from model.frames import sun_direction
 from model.plant import Heliostat
 from model.surface import control_points
 from service.base.faults import ConflictError
 from service.jobs.kinds import KINDS
 from service.jobs.worker import Worker
-from service.twin.engines import Ray, engine_of
+from service.twin.engines import Ray, Threads, engine_of
 from tests.conftest import target
 from tests.service.twin.test_field_light import FLEET, field, runtime_of  # noqa: F401  # a fixture
 
@@ -30,8 +30,8 @@ def some_tiles() -> list[Tile]:
     positions = [np.array([-20.0 + 5 * (i % 8), 60.0 + 5 * (i // 8), 1.8]) for i in range(32)]
     heliostats = [Heliostat.juelich(f"H{i}", position, 80.0) for i, position in enumerate(positions)]
     plane = target(10.0)
-    shots = [Shot(one, control_points(one), SUN, plane) for one in heliostats]
-    return list(tiles(shots, standing([(one, plane.center) for one in heliostats], SUN), size=8))
+    shots = [Setup(one, control_points(one), SUN, plane) for one in heliostats]
+    return list(tiles(shots, aligned_field([(one, plane.center) for one in heliostats], SUN), size=8))
 
 
 @pytest.fixture(scope="module")
@@ -43,6 +43,14 @@ def cluster() -> Iterator[Any]:
 
 
 pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning:ray", "ignore::ResourceWarning")
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_threads_give_the_same_light_whatever_their_number(count: int):
+    task, parts = Superposition(target(10.0), (32, 32)), some_tiles()
+    expected, made = superpose(task, parts), superpose(task, parts, Threads(count))
+    assert (made.heliostats, made.power) == (expected.heliostats, expected.power)
+    np.testing.assert_array_equal(made.irradiance, expected.irradiance)
 
 
 @pytest.mark.slow
@@ -57,7 +65,7 @@ def test_cluster_gives_the_same_light_also_where_a_worker_is_killed(cluster: Any
         receiver, resolution = task.receiver, task.resolution
 
         def __call__(self, tile: Tile) -> tuple[int, FleetFlux]:
-            if tile.shots[0].heliostat.name == "H8" and not died.exists():
+            if tile.setups[0].heliostat.name == "H8" and not died.exists():
                 died.touch()
                 os.kill(os.getpid(), signal.SIGKILL)
             return os.getpid(), task(tile)

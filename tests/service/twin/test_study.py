@@ -14,7 +14,7 @@ from fastapi.testclient import TestClient
 from sqlalchemy import URL, select
 
 from model.effects.camera_response import CameraResponse
-from model.forecast import Shot, View, forecast_shots
+from model.forecast import Setup, View, forecast_setups
 from model.frames import sun_angles, sun_direction
 from model.imaging.window import center_of_mass
 from model.plant import Heliostat, Plant
@@ -58,8 +58,8 @@ def photographs(mirror: Heliostat, z: np.ndarray, rng: np.random.Generator) -> t
     """Suns (IMAGES, 3) and 8-bit images of the whole target by a camera with a gamma that nobody declared."""
     suns = sun_direction(np.linspace(-60, 60, IMAGES), np.linspace(25, 60, IMAGES))
     points = control_points(mirror, z)
-    shots = [Shot(mirror, points, sun, TARGET, spot=TARGET.to_enu(rng.uniform(-0.4, 0.4, 2))) for sun in suns]
-    images = forecast_shots(shots, effects=[CameraResponse(gamma=GAMMA)], view=View(128, 128)).numpy()
+    shots = [Setup(mirror, points, sun, TARGET, spot=TARGET.to_enu(rng.uniform(-0.4, 0.4, 2))) for sun in suns]
+    images = forecast_setups(shots, effects=[CameraResponse(gamma=GAMMA)], view=View(128, 128)).numpy()
     counts = 240 * images / images.max(axis=(1, 2), keepdims=True) + rng.normal(0, 0.5, images.shape)
     return suns, np.clip(np.round(counts), 0, 255)
 
@@ -211,9 +211,9 @@ def test_photograph_shows_its_heliostat_with_the_stored_surface(filled: Database
     photograph = min(material.photographs, key=lambda p: p.key)
     assert photograph.key == "AB12/AB120"
     points = unpack(row.arrays)["control_points"]
-    np.testing.assert_allclose(photograph.shot.control_points, points, atol=1e-9)
+    np.testing.assert_allclose(photograph.setup.control_points, points, atol=1e-9)
     center = center_of_mass(photograph.image, (TARGET.width, TARGET.height))
-    np.testing.assert_allclose(photograph.shot.spot, TARGET.to_enu(center), atol=1e-6)
+    np.testing.assert_allclose(photograph.setup.spot, TARGET.to_enu(center), atol=1e-6)
 
 
 def test_time_and_number_of_photographs_are_bounded(filled: Database):
@@ -244,8 +244,8 @@ def test_measured_surface_goes_before_a_newer_prediction(store_url: URL):
         only = gather(session, StudyRequest(surfaces="measured", heliostats=list(FIELD)))
     assert (both.heliostats, only.heliostats) == (["AB12", "AK08"], ["AB12"])
     assert "no measured surface" in only.skipped["AK08"]
-    depth = {p.heliostat: np.ptp(p.shot.control_points[0, :, :, 2]) for p in both.photographs}
-    flat_depth = np.ptp(control_points(both.photographs[-1].shot.heliostat)[0, :, :, 2])
+    depth = {p.heliostat: np.ptp(p.setup.control_points[0, :, :, 2]) for p in both.photographs}
+    flat_depth = np.ptp(control_points(both.photographs[-1].setup.heliostat)[0, :, :, 2])
     assert depth["AK08"] == pytest.approx(flat_depth)
     database.close()
 
@@ -254,8 +254,8 @@ def test_photograph_that_cannot_have_been_is_left_out_by_name(filled: Database):
     with filled.reading() as session:
         material = gather(session, StudyRequest())
     whole, behind = material.photographs[0], material.photographs[1]
-    shot = replace(behind.shot, plane=replace(TARGET, normal=-TARGET.normal))
-    odd = replace(material, photographs=[whole, replace(behind, shot=shot)])
+    shot = replace(behind.setup, plane=replace(TARGET, normal=-TARGET.normal))
+    odd = replace(material, photographs=[whole, replace(behind, setup=shot)])
     left = odd.without_untraceable()
     assert [p.key for p in left.photographs] == [whole.key]
     assert set(left.skipped) == {behind.key}
@@ -279,8 +279,8 @@ def test_centred_flux_needs_a_spot_on_its_target(database: Database, up: float |
         assert reason in material.skipped["AB12/centred"]
         return
     (photograph,) = material.photographs
-    assert (photograph.shot.plane.width, photograph.image.shape) == (4.0, (64, 64))
-    np.testing.assert_allclose(photograph.shot.plane.center, TARGET.to_enu((0.25, 0.5)), atol=1e-6)
+    assert (photograph.setup.plane.width, photograph.image.shape) == (4.0, (64, 64))
+    np.testing.assert_allclose(photograph.setup.plane.center, TARGET.to_enu((0.25, 0.5)), atol=1e-6)
 
 
 def test_too_few_photographs_end_the_job_with_the_reasons(client: TestClient):

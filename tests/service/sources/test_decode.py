@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from model.errors import InvalidInputError
-from model.imaging import decode_image
+from service.sources.decode import decode_image
 
 
 @pytest.fixture(scope="module")

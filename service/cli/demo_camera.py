@@ -1,8 +1,8 @@
 """A synthetic camera: photographs of a calibration target as a plant's camera takes them, with known truth.
 
-It serves the demonstration and the tests of this package. The target's sheet is drawn with its grid, marks and daylight
-on a fine raster, the flux is added, and the camera sees it in perspective with blur, noise, a limited range and a time
-stamp in the picture.
+It serves the demonstration and the tests of `model.imaging`. The target's sheet is drawn with its grid, marks and
+daylight on a fine raster, the flux is added, and the camera sees it in perspective with blur, noise, a limited range
+and a time stamp in the picture.
 """
 
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Photographs and their forecasts, cut alike, so that only their shapes are compared."""
+"""Measured flux images and their forecasts, cut alike, so that only their shapes are compared."""
 
 import json
 from collections.abc import Sequence
@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from model.effects import JUELICH_LATITUDE, Effect, effect_to_json
 from model.errors import InvalidInputError
-from model.forecast import Aligned, Shot, View, align
+from model.forecast import Aligned, Setup, View, align
+from model.images import FLUX_SIZE
 from model.imaging.window import overlap_matrix
-from model.metrics import compare_on_target
+from model.metrics import accuracy_window
 from model.plant import TargetPlane
 from model.study.noise import black_lift, grain_variance
 from model.study.unknowns import copied, copy_name
@@ -24,23 +25,15 @@ from model.tracing import Optics, Scene, Window, trace
 
 Array = NDArray[np.float64]
 
-WINDOWS = (4.0, 6.0, 8.0, 12.0)
-"""Sides [m] of the comparison's window: the paper's, unless more than `SPILL` of the energy lies outside."""
-
-SPILL = 0.02
-
-RESOLUTION = 64
-"""Pixels a side of the window in which accuracy is counted (DESIGN.md, section 7)."""
-
 
 @dataclass(frozen=True, eq=False)
-class Photograph:
-    """A measured flux image and the shot it was taken of.
+class FluxImage:
+    """A measured flux image and the setup that it was taken in.
 
     Attributes
     ----------
-    shot : Shot
-        With the measured spot; ``shot.identifier`` is unique.
+    setup : Setup
+        With the measured spot; ``setup.identifier`` is unique.
     image : (rows, columns)
         Over the whole target, row 0 at the top, in any unit.
     seen : bool
@@ -49,7 +42,7 @@ class Photograph:
         When it was taken, with time zone, where that was recorded.
     """
 
-    shot: Shot
+    setup: Setup
     image: NDArray[np.floating]
     seen: bool = False
     taken_at: datetime | None = None
@@ -61,48 +54,42 @@ class Photograph:
     @property
     def key(self) -> str:
         """What names it in the report: ``H/ID``."""
-        return self.shot.identifier
+        return self.setup.identifier
 
     @property
     def heliostat(self) -> str:
         """Name of the heliostat."""
-        return self.shot.heliostat.name
+        return self.setup.heliostat.name
 
     @property
     def elevation_deg(self) -> float:
         """Elevation [deg] of the sun."""
-        return float(np.degrees(np.arcsin(self.shot.sun[2])))
+        return float(np.degrees(np.arcsin(self.setup.sun[2])))
 
     @property
     def azimuth_deg(self) -> float:
         """Azimuth [deg] of the sun from south, positive to the east."""
-        return float(np.degrees(np.arctan2(self.shot.sun[0], -self.shot.sun[1])))
+        return float(np.degrees(np.arctan2(self.setup.sun[0], -self.setup.sun[1])))
 
     @property
     def slant_range(self) -> float:
         """Distance [m] from the heliostat to its target."""
-        return float(np.linalg.norm(self.shot.heliostat.position - self.shot.plane.center))
+        return float(np.linalg.norm(self.setup.heliostat.position - self.setup.plane.center))
 
     def noise_share(self, window: float) -> float:
         """The error (one minus accuracy) that this image's noise alone makes, in a cut of side ``window`` [m]."""
-        images, planes = np.stack([self.image, black_lift(self.image)]), [self.shot.plane] * 2
-        seen, lift = windows(images, planes, centers(images[:1], planes[:1]).repeat(2, axis=0), window, RESOLUTION)
+        images, planes = np.stack([self.image, black_lift(self.image)]), [self.setup.plane] * 2
+        seen, lift = windows(images, planes, centers(images[:1], planes[:1]).repeat(2, axis=0), window, FLUX_SIZE)
         # A lift of the dark takes from the light's share of the sum.
         lifted = lift - seen * lift.sum() / seen.sum()
         grain = np.sqrt(2 / np.pi * grain_variance(seen))
         return float(np.hypot(lifted, grain).sum() / seen.sum())
 
 
-def spot_window(photographs: Sequence[Photograph]) -> float:
+def spot_window(flux_images: Sequence[FluxImage]) -> float:
     """Side [m] of the window that holds nearly all of every spot's energy."""
-    for window in WINDOWS:
-        outside = [
-            compare_on_target(p.image, p.image, (p.shot.plane.width, p.shot.plane.height), window).measured_outside
-            for p in photographs
-        ]
-        if np.median(outside) <= SPILL:
-            return window
-    return WINDOWS[-1]
+    sizes = [(p.setup.plane.width, p.setup.plane.height) for p in flux_images]
+    return accuracy_window([p.image for p in flux_images], sizes)
 
 
 def centers(images: NDArray[np.floating], planes: Sequence[TargetPlane]) -> Array:
@@ -168,18 +155,18 @@ class Forecaster:
 
     def __init__(
         self,
-        photographs: Sequence[Photograph],
+        flux_images: Sequence[FluxImage],
         optics: Optics,
         declared: Sequence[Effect],
         window: float,
         view: View,
         latitude_deg: float = JUELICH_LATITUDE,
     ) -> None:
-        self.photographs, self.optics, self.declared = photographs, optics, list(declared)
+        self.flux_images, self.optics, self.declared = flux_images, optics, list(declared)
         self.window, self.view, self.latitude_deg = window, view, latitude_deg
-        self.shots = [p.shot for p in photographs]
-        self.planes = [shot.plane for shot in self.shots]
-        self.cameras = np.array([p.image.shape for p in photographs])
+        self.setups = [p.setup for p in flux_images]
+        self.planes = [setup.plane for setup in self.setups]
+        self.cameras = np.array([p.image.shape for p in flux_images])
         self._aligned: dict[str, Aligned] = {}
         self._flux: dict[str, torch.Tensor] = {}
         self._start: Aligned | None = None
@@ -192,24 +179,24 @@ class Forecaster:
         one.
         """
         if count not in self._copies:
-            heliostats = {id(s.heliostat): s.heliostat for s in self.shots}
-            photographs = []
+            heliostats = {id(s.heliostat): s.heliostat for s in self.setups}
+            flux_images = []
             for number in range(count):
                 renamed = {k: replace(h, name=copy_name(h.name, number)) for k, h in heliostats.items()}
-                shots = [replace(s, heliostat=renamed[id(s.heliostat)]) for s in self.shots]
-                photographs += [replace(p, shot=s) for s, p in zip(shots, self.photographs, strict=True)]
+                setups = [replace(s, heliostat=renamed[id(s.heliostat)]) for s in self.setups]
+                flux_images += [replace(p, setup=s) for s, p in zip(setups, self.flux_images, strict=True)]
             declared = [copied(effect, count) for effect in self.declared]
             self._copies[count] = Forecaster(
-                photographs, self.optics, declared, self.window, self.view, self.latitude_deg
+                flux_images, self.optics, declared, self.window, self.view, self.latitude_deg
             )
         return self._copies[count]
 
-    def measured(self, resolution: int = RESOLUTION) -> Array:
+    def measured(self, resolution: int = FLUX_SIZE) -> Array:
         """The photographs' cuts (N, resolution, resolution)."""
-        cuts = [cut(p.image[None], [p.shot.plane], self.window, resolution) for p in self.photographs]
+        cuts = [cut(p.image[None], [p.setup.plane], self.window, resolution) for p in self.flux_images]
         return np.concatenate(cuts)
 
-    def cuts(self, effects: Sequence[Effect], resolution: int = RESOLUTION) -> Array:
+    def cuts(self, effects: Sequence[Effect], resolution: int = FLUX_SIZE) -> Array:
         """The forecasts' cuts (N, resolution, resolution) under the declared effects and these.
 
         Raises
@@ -222,7 +209,7 @@ class Forecaster:
         model = [*self.declared, *effects]
         aligned, flux = self._traced(model)
         with torch.no_grad():
-            images = aligned.photographs(flux, model, self.view).double().numpy().clip(min=0)
+            images = aligned.camera_images(flux, model, self.view).double().numpy().clip(min=0)
         cuts = np.empty((len(images), resolution, resolution))
         for camera in np.unique(self.cameras, axis=0):
             rows = np.flatnonzero((self.cameras == camera).all(axis=1))
@@ -231,12 +218,12 @@ class Forecaster:
         return cuts
 
     def _traced(self, model: Sequence[Effect]) -> tuple[Aligned, torch.Tensor]:
-        """Aligned shots and their flux; both are kept while only later stages change."""
+        """Aligned setups and their flux; both are kept while only later stages change."""
         geometry = _name(model, ("geometry",))
         if geometry not in self._aligned:
             # The one before differs little: fits go by small steps. Their differences take double precision.
             self._start = align(
-                self.shots, model, latitude_deg=self.latitude_deg, dtype=torch.float64, start=self._start
+                self.setups, model, latitude_deg=self.latitude_deg, dtype=torch.float64, start=self._start
             )
             self._aligned = {geometry: self._start}
             self._flux = {}

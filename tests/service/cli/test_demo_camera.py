@@ -2,7 +2,19 @@ import numpy as np
 import pytest
 
 from model.errors import InvalidInputError
-from model.imaging.camera import CameraOptions, photograph, target_corners
+from model.plant import TargetPlane
+from service.cli.demo_camera import CameraOptions, photograph, target_corners
+from tests.imaging import gaussian
+
+
+@pytest.fixture
+def plane():
+    return TargetPlane("tower", np.zeros(3), np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), 5.4, 6.4)
+
+
+@pytest.fixture
+def spot(plane):
+    return gaussian(plane, 0.3, -0.2, 0.8, 0.5, 0.6)
 
 
 def test_a_frame_depends_on_its_generator_alone(plane, spot):
