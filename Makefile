@@ -20,7 +20,7 @@ demo: install ## photographs in, mirror surfaces and flux forecasts out, under o
 	$(BIN)/heliotwin demo $(ARGS)
 
 test: install ## every test
-	$(BIN)/pytest -n 2 $(ARGS)
+	$(BIN)/pytest -n 2 --dist loadgroup $(ARGS)
 
 lint: install ## ruff and mypy
 	$(BIN)/ruff check .
