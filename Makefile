@@ -20,12 +20,13 @@ demo: install ## photographs in, mirror surfaces and flux forecasts out, under o
 	$(BIN)/heliotwin demo $(ARGS)
 
 test: install ## every test
-	$(BIN)/pytest -n 2 $(ARGS)
+	$(BIN)/pytest -n 2 --dist loadgroup $(ARGS)
 
-lint: install ## ruff and mypy
+lint: install ## ruff, mypy and the arrows between packages and rooms
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports
 
 serve: install ## the service on http://127.0.0.1:8000
 	$(BIN)/heliotwin serve $(ARGS)

@@ -11,6 +11,7 @@ from model.effects import Effect
 from model.errors import InvalidInputError
 from model.forecast import Aligned, Setup, View, align
 from model.images import FLUX_SHAPE, FLUX_WINDOW, normalized
+from model.metrics import flux_accuracy
 from model.plant import Heliostat, TargetPlane
 from model.surface import control_points
 from model.tracing import Optics, Scene
@@ -175,3 +176,15 @@ def spread_suns(suns: NDArray[np.float64], count: int) -> list[int]:
         nearest[chosen] = np.inf
         chosen.append(int(nearest.argmin()))
     return chosen
+
+
+def misfits(
+    heliostat: Heliostat,
+    observations: Sequence[Observation],
+    z: NDArray[np.float64],
+    optics: Optics | None = None,
+    effects: Sequence[Effect] = (),
+) -> tuple[float, ...]:
+    """One minus the accuracy with which heights ``z`` (4, 8, 8) [m] re-render each of the images they came from."""
+    images = render_observations(heliostat, observations, z, optics, effects).clip(min=0)
+    return tuple(1 - flux_accuracy(o.flux, image) for o, image in zip(observations, images, strict=True))

@@ -24,9 +24,8 @@ from model.errors import InvalidInputError
 from model.forecast import Aligned, View
 from model.images import COARSE_SIZE, FLUX_WINDOW, binned, normalized
 from model.least_squares import Descent, minimize
-from model.metrics import flux_accuracy
 from model.network.inputs import STEP_HEIGHT
-from model.observation import Observation, SurfacePrediction, align_observations, render_observations
+from model.observation import Observation, SurfacePrediction, align_observations, misfits
 from model.plant import Heliostat
 from model.prior import SurfacePrior, default_prior
 from model.surface import control_points
@@ -318,15 +317,3 @@ def refine(
         used=tuple(o.identifier for o in observations),
         mahalanobis=prior.mahalanobis(z),
     )
-
-
-def misfits(
-    heliostat: Heliostat,
-    observations: Sequence[Observation],
-    z: NDArray[np.float64],
-    optics: Optics | None = None,
-    effects: Sequence[Effect] = (),
-) -> tuple[float, ...]:
-    """One minus the accuracy with which heights ``z`` (4, 8, 8) [m] re-render each of the images they came from."""
-    images = render_observations(heliostat, observations, z, optics, effects).clip(min=0)
-    return tuple(1 - flux_accuracy(o.flux, image) for o, image in zip(observations, images, strict=True))

@@ -2,13 +2,13 @@
 
 import hashlib
 import json
+import os
 from collections.abc import Mapping, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnxruntime
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -25,10 +25,9 @@ from model.network.inputs import (
     conditions,
     descents,
 )
-from model.observation import Observation, SurfacePrediction, align_observations
+from model.observation import Observation, SurfacePrediction, align_observations, misfits
 from model.plant import Heliostat
 from model.prior import default_prior
-from model.refinement import misfits
 from model.surface import FACETS, control_points, mirrored
 from model.tracing import Optics
 
@@ -56,8 +55,11 @@ class SurfacePredictor:
     """
 
     def __init__(self, path: Path = WEIGHTS, threads: int = 1) -> None:
-        # A plant's computer reports to nobody.
-        onnxruntime.disable_telemetry_events()
+        # A plant's computer reports to nobody. onnxruntime asks this when it is loaded; its disable_telemetry_events()
+        # comes too late: by then an id lies in the home folder, and the maker's host is looked up all the same.
+        os.environ["ORT_DISABLE_TELEMETRY"] = "1"
+        import onnxruntime
+
         content = path.read_bytes()
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = threads

@@ -1,5 +1,6 @@
 """The database: connections to SQLite or PostgreSQL, transactions, and the schema's version."""
 
+import logging
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -8,9 +9,8 @@ from typing import Any
 
 from alembic import command
 from alembic.config import Config
-from alembic.runtime.migration import MigrationContext
 from alembic.script import ScriptDirectory
-from sqlalchemy import URL, Connection, Engine, create_engine, event, text
+from sqlalchemy import URL, Connection, Engine, create_engine, event, inspect, text
 from sqlalchemy.orm import Session
 
 import migrations
@@ -27,6 +27,8 @@ _ALIVE = {"keepalives_idle": 30, "keepalives_interval": 10, "keepalives_count": 
 # Beyond the five that are kept open; together they are enough for the 40 threads that Starlette runs routes in, those
 # that ask for keys, follow jobs and check readiness, and a few workers with their heartbeats.
 _MORE_CONNECTIONS = 64
+
+logger = logging.getLogger("heliotwin.service")
 
 # Alembic keeps its context in module globals: one migration at a time in a process.
 _alembic = threading.Lock()
@@ -115,8 +117,12 @@ class Database:
 
     def revision(self) -> str | None:
         """The schema's present version."""
+        # Alembic's own question writes two lines to the log, and readiness is asked for every few seconds.
         with self.engine.connect() as connection:
-            return MigrationContext.configure(connection).get_current_revision()
+            if not inspect(connection).has_table("alembic_version"):
+                return None
+            found: str | None = connection.execute(text("SELECT version_num FROM alembic_version")).scalar_one_or_none()
+            return found
 
     def revisions(self) -> list[str]:
         """All versions of the schema that this code knows, the oldest first."""
@@ -133,6 +139,7 @@ class Database:
                 f"the store's schema is at {self.revision()}, this version works with {self.revisions()[-1]}: run "
                 "`heliotwin migrate`, or the version that fits"
             )
+        logger.info("the store's schema is at %s, its newest version", self.revisions()[-1])
 
     def close(self) -> None:
         """Close all pooled connections."""

@@ -8,9 +8,9 @@ business of ``python -m training.evaluate``.
 import numpy as np
 
 from model.network.predictor import default_predictor
-from model.observation import Observation
+from model.observation import Observation, misfits
 from model.plant import Heliostat
-from model.refinement import misfits, refine
+from model.refinement import refine
 from service.cli import folder as verbs
 from service.cli.folder import surface_errors
 from service.sources.folder import MeasurementFolder, measured_heights, read_folder

@@ -251,10 +251,10 @@ def test_health_check_command(
 _TRY = """
 import service, pathlib, sys
 assert pathlib.Path(service.__file__).is_relative_to(sys.argv[1]), service.__file__
-from service.server import migrate
-from service.metrics import registry
-from service.runtime import Runtime
-from service.settings import Settings
+from service.store.database import migrate
+from service.web.metrics import registry
+from service.twin.runtime import Runtime
+from service.base.settings import Settings
 print(migrate(Settings(data_dir=pathlib.Path(sys.argv[2]))))
 from model.network.predictor import default_predictor
 print(default_predictor().name)

@@ -1,3 +1,8 @@
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -176,3 +181,19 @@ def test_spread_suns_takes_the_extremes():
     suns = np.stack([np.sin(angles), -np.cos(angles), np.zeros(6)], axis=-1)
     assert sorted(spread_suns(suns, 3)) in ([0, 4, 5], [0, 3, 5])
     assert len(spread_suns(suns, 8)) == 6
+
+
+_LOADS = """
+from model.network.predictor import default_predictor
+default_predictor()
+"""
+
+
+def test_runtime_of_the_network_keeps_no_id_and_has_nothing_to_send(tmp_path: Path):
+    """With telemetry on it writes an id and a queue of events under the home folder, as soon as it is loaded."""
+    places = {"HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path), "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run(
+        [sys.executable, "-c", _LOADS], env=os.environ | places, check=True, capture_output=True, text=True
+    )
+    assert "telemetry" not in done.stderr
+    assert list(tmp_path.iterdir()) == []

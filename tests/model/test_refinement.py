@@ -9,10 +9,10 @@ from model.effects.camera_response import CameraResponse
 from model.errors import InvalidInputError
 from model.frames import sun_direction_at
 from model.metrics import surface_error
-from model.observation import Observation, render_observations
+from model.observation import Observation, misfits, render_observations
 from model.plant import Heliostat
 from model.prior import default_prior
-from model.refinement import RefinementOptions, misfits, refine
+from model.refinement import RefinementOptions, refine
 from tests.conftest import flat_heliostat, target
 from tests.rendered import observe
 

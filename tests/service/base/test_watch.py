@@ -32,7 +32,7 @@ from service.store.queue import add_job
 from service.store.tables import DriftRow, HeliostatRow
 from service.twin.runtime import Runtime
 from service.web import metrics
-from tests.service.conftest import FakeOperations, Post, free_port, png
+from tests.service.conftest import FakeOperations, Post, client_of, free_port, png
 
 ROOT = Path(__file__).parents[3]
 
@@ -244,7 +244,7 @@ def log(request: pytest.FixtureRequest) -> Iterator[tuple[str, io.StringIO]]:
     root.handlers, root.level = handlers, level
 
 
-def test_every_line_bears_the_request_id(log: tuple[str, io.StringIO], bare: TestClient, monkeypatch: Any):
+def test_every_line_bears_the_request_id(bare: TestClient, log: tuple[str, io.StringIO], monkeypatch: Any):
     def note(*_: Any) -> list[Any]:  # in a thread of the pool
         logging.getLogger("heliotwin.test").warning("from the inside")
         return []
@@ -268,7 +268,7 @@ def test_every_line_bears_the_request_id(log: tuple[str, io.StringIO], bare: Tes
         assert entry["time"]
 
 
-def test_nobody_forges_a_line(log: tuple[str, io.StringIO], bare: TestClient):
+def test_nobody_forges_a_line(bare: TestClient, log: tuple[str, io.StringIO]):
     bare.get("/v1/heliostats/%0a2026-11-21 00:00:00 INFO forged%0d%1b[2J%E2%80%A8")
     try:
         raise ValueError("no\n2026-11-21 00:00:00 INFO forged")
@@ -280,6 +280,18 @@ def test_nobody_forges_a_line(log: tuple[str, io.StringIO], bare: TestClient):
     if log[0] == "json":
         assert len(lines) == 2
         assert "ValueError" in json.loads(lines[1])["exception"]
+
+
+def test_schema_is_told_at_start_and_readiness_asks_in_silence(app: FastAPI, caplog: pytest.LogCaptureFixture):
+    caplog.set_level(logging.INFO)
+    with client_of(app) as client:
+        newest = app.state.runtime.database.revisions()[-1]
+        told = [record.getMessage() for record in caplog.records if record.name == "heliotwin.service"]
+        assert [line for line in told if "schema" in line] == [f"the store's schema is at {newest}, its newest version"]
+        caplog.clear()
+        for _ in range(3):
+            assert client.get("/readyz").json()["checks"]["migrations"] == "ok"
+        assert [record.getMessage() for record in caplog.records if record.name != "httpx"] == []
 
 
 # --- traces -----------------------------------------------------------------------------------------------------------

@@ -1,0 +1,199 @@
+"""A container engine, where there is one: images of this checkout, and compositions that leave nothing behind."""
+
+import json
+import os
+import shutil
+import subprocess
+import tarfile
+import uuid
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+from tests.faults.harness import until
+from tests.service.conftest import free_port
+
+ROOT = Path(__file__).parents[2]
+
+_PREVIOUS = """
+FROM {image}
+USER root
+COPY . /opt/previous
+RUN /opt/heliotwin/bin/pip install --no-deps --no-index --no-build-isolation --force-reinstall /opt/previous
+USER heliotwin
+"""
+
+
+def absent() -> str | None:
+    """Why no composition can run here; None where it can."""
+    if shutil.which("docker") is None:
+        return "no container engine: there is no docker"
+    asked = subprocess.run(["docker", "info"], capture_output=True, text=True, check=False)
+    if asked.returncode:
+        return f"no container engine: docker info says {asked.stderr.strip() or asked.stdout.strip()}"
+    return None if _compose_is_new() or shutil.which("docker-compose") else "neither docker compose nor docker-compose"
+
+
+def _compose_is_new() -> bool:
+    return subprocess.run(["docker", "compose", "version"], capture_output=True, check=False).returncode == 0
+
+
+def run(*command: str | Path, folder: Path = ROOT, environment: Mapping[str, str] | None = None) -> str:
+    """What a command prints; where it fails, the test fails with all that it said."""
+    settings = os.environ | (environment or {})
+    done = subprocess.run(command, cwd=folder, env=settings, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, (
+        f"{command} ended with {done.returncode}:\n{done.stdout[-4000:]}\n{done.stderr[-4000:]}"
+    )
+    return done.stdout
+
+
+def clone(folder: Path) -> Path:
+    """A clean clone of this checkout, with what is changed in it and not yet committed."""
+    run("git", "clone", "--quiet", ROOT, folder)
+    for name in run("git", "ls-files", "-z", "--modified", "--others", "--exclude-standard").split("\0"):
+        if name and (ROOT / name).is_file():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, folder / name)
+    for name in run("git", "ls-files", "-z", "--deleted").split("\0"):
+        if name:
+            (folder / name).unlink()
+    return folder
+
+
+def build(context: Path, dockerfile: Path, image: str) -> str:
+    """Build an image with the builder that every engine has."""
+    index = os.environ.get("TORCH_INDEX_URL", "")
+    arguments = ["--build-arg", f"TORCH_INDEX_URL={index}"] if index else []
+    command = ["docker", "build", "--quiet", "--network", "host", *arguments, "-f", str(dockerfile), "-t", image]
+    run(*command, str(context), environment={"DOCKER_BUILDKIT": "0"})
+    return image
+
+
+def newest_revision() -> str:
+    """The schema's newest version, by the names of the migrations."""
+    return max(path.name[:4] for path in (ROOT / "migrations" / "versions").glob("[0-9]*.py"))
+
+
+def before_newest_schema() -> str | None:
+    """The last commit whose schema is the one before the newest; None where the history does not reach so far."""
+    (path,) = (ROOT / "migrations" / "versions").glob(f"{newest_revision()}_*.py")
+    inside = str(path.relative_to(ROOT))
+    added = run("git", "log", "--diff-filter=A", "--format=%H", "--", inside).split()
+    if not added:
+        return None
+    parent = ["git", "rev-parse", "--quiet", "--verify", f"{added[-1]}^"]
+    asked = subprocess.run(parent, cwd=ROOT, capture_output=True, text=True, check=False)
+    return asked.stdout.strip() or None
+
+
+def build_previous(commit: str, folder: Path, image: str) -> str:
+    """``image`` with the code of an older commit in place of its own."""
+    content = subprocess.run(["git", "archive", commit], cwd=ROOT, capture_output=True, check=True).stdout
+    with tarfile.open(fileobj=BytesIO(content)) as archive:
+        archive.extractall(folder, filter="data")
+    dockerfile = folder / "Dockerfile"
+    dockerfile.write_text(_PREVIOUS.format(image=image), encoding="utf-8")
+    return build(folder, dockerfile, f"{image}-previous")
+
+
+class Composition:
+    """docker/compose.yaml of a clone under a name, and on a port, of its own; ``version`` is the image's tag."""
+
+    def __init__(self, checkout: Path, version: str, imports: Path) -> None:
+        self.project = f"heliotwin-test-{uuid.uuid4().hex[:8]}"
+        self.folder = checkout / "docker"
+        self.port = free_port()
+        password = self.folder / "secrets" / f"{self.project}-password"
+        password.parent.mkdir(exist_ok=True)
+        password.write_text(uuid.uuid4().hex, encoding="utf-8")
+        password.chmod(0o644)
+        self.environment = {
+            "HELIOTWIN_VERSION": version,
+            "HELIOTWIN_PUBLISHED_PORT": str(self.port),
+            "HELIOTWIN_PASSWORD_FILE": str(password),
+            "HELIOTWIN_IMPORT_FOLDER": str(imports),
+        }
+        self._command = self._of_this_engine()
+
+    def _of_this_engine(self) -> list[str]:
+        if _compose_is_new():
+            return ["docker", "compose", "-p", self.project, "-f", str(self.folder / "compose.yaml")]
+        # docker-compose 1.29 takes no name in the file and wants a version; all else of it it understands.
+        lines = (self.folder / "compose.yaml").read_text(encoding="utf-8").splitlines()
+        old = self.folder / f".{self.project}.yaml"
+        old.write_text("\n".join(['version: "3.9"', *(line for line in lines if not line.startswith("name:"))]))
+        return ["docker-compose", "-p", self.project, "-f", str(old)]
+
+    def __call__(self, *arguments: str) -> str:
+        """What a command of compose prints."""
+        return run(*self._command, *arguments, folder=self.folder.parent, environment=self.environment)
+
+    def verb(self, *words: str, service: str = "service", mounted: Path | None = None, needed: bool = True) -> str:
+        """What ``heliotwin WORDS`` prints in a container of its own; ``mounted`` is its /backup."""
+        volume = [] if mounted is None else ["-v", f"{mounted}:/backup"]
+        return self("run", "--rm", "-T", *([] if needed else ["--no-deps"]), *volume, service, *words)
+
+    def up(self, *services: str) -> None:
+        """Start, and wait until all is well."""
+        self("up", "-d", *services)
+        for name in services or ("database", "service", "worker"):
+            until(lambda name=name: self.health(name) == "healthy", f"{name} is healthy", 180)
+
+    def health(self, name: str) -> str:
+        """What the health check of a service's container says."""
+        return self.inspect(name, "{{.State.Health.Status}}")
+
+    def inspect(self, name: str, what: str) -> str:
+        """What the engine knows of a service's container."""
+        return run("docker", "inspect", "--format", what, self("ps", "-q", name).strip()).strip()
+
+    def tear_down(self) -> None:
+        """Remove its containers, networks and volumes."""
+        self("down", "-v", "--remove-orphans", "--timeout", "5")
+
+    @contextmanager
+    def client(self, key: str) -> Iterator["Client"]:
+        """Somebody with a key."""
+        headers = {"Authorization": f"Bearer {key}"}
+        with httpx.Client(base_url=f"http://127.0.0.1:{self.port}", headers=headers, timeout=60) as http:
+            yield Client(http)
+
+
+class Client:
+    """What a plant asks of its service."""
+
+    def __init__(self, http: httpx.Client) -> None:
+        self._http = http
+
+    def get(self, path: str) -> Any:
+        """The document of a resource."""
+        answer = self._http.get(path)
+        assert answer.status_code == 200, (path, answer.status_code, answer.text)
+        return answer.json()
+
+    def post(self, path: str, document: dict[str, Any]) -> httpx.Response:
+        """The answer to a document that is welcome."""
+        answer = self._http.post(path, json=document)
+        assert answer.is_success, (path, answer.status_code, answer.text)
+        return answer
+
+    def job(self, path: str) -> dict[str, Any]:
+        """A job as it stands; nothing while the service is away."""
+        try:
+            document: dict[str, Any] = self.get(path)
+        except httpx.TransportError:
+            return {"state": "unknown"}
+        return document
+
+    def done(self, path: str) -> dict[str, Any]:
+        """A job when it is done."""
+        ended = until(
+            lambda: (job := self.job(path))["state"] not in ("unknown", "queued", "running") and job, path, 240
+        )
+        assert ended["state"] == "done", json.dumps(ended, indent=1)
+        return dict(ended)

@@ -1,0 +1,198 @@
+"""The image and the composition as a plant runs them: from a clean clone, on real photographs, through a bad week.
+
+What docker/OPERATING.md tells to do is done here, by the same commands.
+"""
+
+import json
+import os
+import re
+import subprocess
+import uuid
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.faults.harness import until
+
+from . import engine
+from .engine import Client, Composition
+
+# One worker of pytest-xdist does all of this file: its tests share an image, and two compositions would be no faster.
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900), pytest.mark.xdist_group("containers")]
+
+Start = Callable[[str], Composition]
+
+
+@pytest.fixture(scope="module")
+def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    reason = engine.absent()
+    if reason:
+        pytest.skip(reason)
+    return engine.clone(tmp_path_factory.mktemp("clone") / "heliotwin")
+
+
+@pytest.fixture(scope="module")
+def version(checkout: Path) -> Iterator[str]:
+    """The tag of an image that was built from a clean clone."""
+    tag = f"test-{uuid.uuid4().hex[:8]}"
+    engine.build(checkout, checkout / "docker" / "Dockerfile", f"heliotwin:{tag}")
+    yield tag
+    engine.run("docker", "rmi", "--force", f"heliotwin:{tag}")
+
+
+@pytest.fixture(scope="module")
+def previous(version: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """The tag of an image of the last code whose schema is older than today's."""
+    commit = engine.before_newest_schema()
+    if commit is None:
+        pytest.skip("this checkout's history does not reach back to the schema before the newest")
+    engine.build_previous(commit, tmp_path_factory.mktemp("previous"), f"heliotwin:{version}")
+    yield f"{version}-previous"
+    engine.run("docker", "rmi", "--force", f"heliotwin:{version}-previous")
+
+
+@pytest.fixture
+def start(checkout: Path, stj: Path) -> Iterator[Start]:
+    """Makes compositions that may import the real measurements; removes them at the end."""
+    started: list[Composition] = []
+
+    def make(tag: str) -> Composition:
+        started.append(Composition(checkout, tag, stj.resolve().parent))
+        return started[-1]
+
+    yield make
+    for composition in started:
+        composition.tear_down()
+
+
+@pytest.fixture
+def backups(tmp_path: Path) -> Path:
+    """A folder that the containers' user may write to."""
+    folder = tmp_path / "backup"
+    folder.mkdir()
+    if os.geteuid() == 0:
+        os.chown(folder, 10001, 10001)
+    else:
+        folder.chmod(0o777)
+    return folder
+
+
+def imported(client: Client, stj: Path) -> dict[str, Any]:
+    """What a job that imports the real measurements counted."""
+    job = client.post("/v1/jobs/imports", {"folder": stj.name}).headers["Location"]
+    counts: dict[str, Any] = client.done(job)["result"]["counts"]
+    return counts
+
+
+def unchanged(counts: dict[str, int]) -> dict[str, int]:
+    """The counts of an import that finds everything there already."""
+    return {re.sub(r" (new|changed)\b", " unchanged", name): count for name, count in sorted(counts.items())}
+
+
+def kept(client: Client) -> dict[str, Any]:
+    """All that must come through an upgrade and a restoration."""
+    names = [item["name"] for item in client.get("/v1/heliostats")["items"]]
+    return {
+        name: {what: client.get(f"/v1/heliostats/{name}/{what}") for what in ("measurements", "surfaces")}
+        for name in names
+    } | {"jobs": client.get("/v1/jobs"), "targets": client.get("/v1/targets"), "models": client.get("/v1/models")}
+
+
+def versions(client: Client) -> dict[str, int]:
+    """How many surfaces each heliostat has."""
+    names = [item["name"] for item in client.get("/v1/heliostats")["items"]]
+    return {name: len(client.get(f"/v1/heliostats/{name}/surfaces")["items"]) for name in names}
+
+
+def test_image_starts_without_a_place_to_write(version: str):
+    """Read-only, as the composition runs it, each command says nothing that it was not asked."""
+    command = ["docker", "run", "--rm", "--read-only", "--tmpfs", "/tmp", "--network", "none", f"heliotwin:{version}"]
+    done = subprocess.run([*command, "--help"], capture_output=True, text=True, check=True)
+    assert "serve" in done.stdout
+    assert done.stderr == ""
+
+
+def test_plant_from_empty_to_restored(start: Start, version: str, stj: Path, backups: Path):
+    plant = start(version)
+    plant.up()
+    key = plant.verb("keys", "create", "admin", "--role", "admin").strip()
+    with plant.client("wrong") as stranger, pytest.raises(AssertionError, match="401"):
+        stranger.get("/v1/heliostats")
+    with plant.client(key) as client:
+        first, again = imported(client, stj), imported(client, stj)
+        assert first["heliostats new"] >= 1
+        assert first["images new"] >= 1
+        assert again == unchanged(first)
+        predicts_and_forecasts(client)
+        survives_a_killed_worker(plant, client)
+        before = kept(client)
+        assert before["AA39"]["measurements"]["items"]
+    assert "0 " in plant.verb("check")
+    plant.verb("backup", "/backup/today", mounted=backups)
+    assert json.loads((backups / "today" / "manifest.json").read_text(encoding="utf-8"))["images"]
+    says_nothing_wrong(plant)
+
+    plant.tear_down()
+    plant.up("database")
+    plant.verb("restore", "/backup/today", mounted=backups, needed=False)
+    plant.up()
+    with plant.client(key) as client:
+        assert kept(client) == before
+
+
+def predicts_and_forecasts(client: Client) -> None:
+    surface = client.post("/v1/heliostats/AA39/surfaces", {"method": "network"}).json()
+    assert surface["version"] >= 1
+    sun = {"azimuth_deg": -20, "elevation_deg": 45}
+    wanted = {"heliostat": "AA39", "target": "multi_focus_tower", "sun": sun}
+    assert client.post("/v1/forecasts", wanted).json()["power_w"] > 1000
+    field = {"target": "multi_focus_tower", "sun": sun, "surface": "ideal", "resolution": [64, 64]}
+    job = client.done(client.post("/v1/forecasts", field).headers["Location"])
+    assert job["result"]["heliostats"] >= 1
+
+
+def survives_a_killed_worker(plant: Composition, client: Client) -> None:
+    """Killed in the middle of a job, the worker comes back and ends it, and nothing of it is there twice."""
+    before = versions(client)
+    path = client.post("/v1/jobs/predictions", {"method": "refined", "images": 2}).headers["Location"]
+    until(lambda: client.job(path).get("progress", 0) > 0, "the job is under way")
+    plant("restart", "-t", "0", "worker")
+    assert client.job(path)["state"] == "running"
+    job = client.done(path)
+    assert job["attempts"] == 2
+    made = {name: count - before[name] for name, count in versions(client).items()}
+    assert made == {name: int(name in job["result"]["surfaces"]) for name in before}
+    assert sum(made.values()) >= 2
+
+
+def says_nothing_wrong(plant: Composition) -> None:
+    """No traceback and nothing about telemetry in the logs; of the schema one line for each start."""
+    for name in ("service", "worker"):
+        log = plant("logs", "--no-color", name)
+        assert "Traceback" not in log
+        assert "telemetry" not in log
+        assert 1 <= log.count("schema") <= 2
+
+
+def test_upgrade_from_the_previous_image(start: Start, version: str, previous: str, stj: Path, backups: Path):
+    plant = start(previous)
+    plant.up()
+    key = plant.verb("keys", "create", "admin", "--role", "admin").strip()
+    with plant.client(key) as client:
+        imported(client, stj)
+        client.post("/v1/heliostats/AA39/surfaces", {"method": "network"})
+        before = kept(client)
+    plant.verb("backup", "/backup/before-upgrade", mounted=backups)
+    manifest = json.loads((backups / "before-upgrade" / "manifest.json").read_text(encoding="utf-8"))
+    assert manifest["revision"] < engine.newest_revision()
+
+    plant.environment["HELIOTWIN_VERSION"] = version
+    plant.up()
+    plant.verb("check")
+    assert plant.inspect("service", "{{.Config.Image}}") == f"heliotwin:{version}"
+    with plant.client(key) as client:
+        assert kept(client) == before
+        assert "images new" not in imported(client, stj)
+        predicts_and_forecasts(client)

@@ -1,0 +1,111 @@
+"""The built wheel alone, in an environment that holds nothing but what it asks for: what a plain installation gets."""
+
+import json
+import os
+import subprocess
+import venv
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+from service.cli.demo_plant import write_plant
+from tests.docker.engine import ROOT, clone, run
+from tests.faults.harness import until
+from tests.service.conftest import free_port
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+
+
+def _bare() -> dict[str, str]:
+    """This process's environment without what would lead to this checkout or its packages."""
+    return {
+        name: value for name, value in os.environ.items() if not name.startswith(("HELIOTWIN_", "PYTHON", "VIRTUAL"))
+    }
+
+
+@pytest.fixture(scope="module")
+def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The interpreter of a fresh environment with the wheel and, by the locked versions, its dependencies."""
+    folder = tmp_path_factory.mktemp("wheel")
+    venv.create(folder / "environment", with_pip=True)
+    python = folder / "environment" / "bin" / "python"
+    pip = [str(python), "-m", "pip", "--quiet", "--disable-pip-version-check"]
+    probe = [*pip, "download", "--no-deps", "--no-cache-dir", "--dest", str(folder / "probe"), "setuptools>=77"]
+    asked = subprocess.run(probe, capture_output=True, text=True, check=False)
+    if asked.returncode:
+        pytest.skip(f"no package registry answers: {asked.stderr.strip().splitlines()[-1]}")
+    run(*pip, "wheel", "--no-deps", "--wheel-dir", folder, clone(folder / "clone"), environment=_bare())
+    (wheel,) = folder.glob("heliotwin-*.whl")
+    # Without bytecode, which would be made of all packages and is needed of few.
+    run(*pip, "install", "--no-compile", "-c", ROOT / "constraints.txt", wheel, environment=_bare())
+    return python
+
+
+@pytest.fixture(scope="module")
+def plant(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of measurements, as small as a study can be."""
+    root = tmp_path_factory.mktemp("plant")
+    write_plant(root, images=4, rays=60_000)
+    return root
+
+
+def heliotwin(python: Path, folder: Path, *arguments: object) -> str:
+    """What the installed command prints when it is run in ``folder``."""
+    command = [python.parent / "heliotwin", *map(str, arguments)]
+    done = subprocess.run(command, cwd=folder, env=_bare(), capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    return done.stdout
+
+
+def report(python: Path, folder: Path, *arguments: object) -> dict[str, Any]:
+    """The same of a verb with ``--json``."""
+    document: dict[str, Any] = json.loads(heliotwin(python, folder, *arguments, "--json"))
+    return document
+
+
+def test_nothing_of_development_is_there(python: Path):
+    names = ("httpx", "pytest", "ray", "onnx", "opentelemetry.sdk", "tests")
+    ask = f"import importlib.util as u; print([name for name in {names} if u.find_spec(name)])"
+    done = subprocess.run([python, "-c", ask], cwd="/", env=_bare(), capture_output=True, text=True, check=False)
+    assert done.stdout.strip() == "[]", done.stderr
+
+
+def test_verbs_on_a_folder(python: Path, plant: Path, tmp_path: Path):
+    assert "predict" in heliotwin(python, tmp_path, "--help")
+    assert len(report(python, tmp_path, "flux", plant, "--out", "flux")["images"]) == 16
+    predicted = report(python, tmp_path, "predict", plant, "--out", "predicted", "--images", 2)["heliostats"]
+    for name in predicted:
+        with np.load(tmp_path / "predicted" / name / "Deflectometry" / f"{name}-nurbs-surface.npz") as surface:
+            assert surface["z"].shape == (4, 8, 8)
+    study = report(python, tmp_path, "study", plant, "--out", "study.json", "--html", "study.html")
+    assert study["verdict"] in ("effect", "none", "unexplained")
+    assert "<html" in (tmp_path / "study.html").read_text(encoding="utf-8")
+
+
+def test_service(python: Path, tmp_path: Path):
+    port = free_port()
+    settings = {"HELIOTWIN_DATA_DIR": str(tmp_path / "data"), "HELIOTWIN_PORT": str(port)}
+    program = str(python.parent / "heliotwin")
+    run(program, "migrate", folder=tmp_path, environment=settings)
+    with (tmp_path / "log").open("wb") as log:
+        process = subprocess.Popen([program, "serve"], cwd=tmp_path, env=_bare() | settings, stderr=log)
+    try:
+
+        def answers() -> bool:
+            assert process.poll() is None, (tmp_path / "log").read_text(encoding="utf-8")
+            try:
+                return httpx.get(f"http://127.0.0.1:{port}/livez", timeout=10).status_code == 200
+            except httpx.TransportError:
+                return False
+
+        until(answers, "the service answers")
+        assert httpx.get(f"http://127.0.0.1:{port}/readyz", timeout=60).json()["status"] == "ok"
+        assert httpx.get(f"http://127.0.0.1:{port}/", timeout=30).status_code == 200
+    finally:
+        process.terminate()
+        assert process.wait(60) in (0, -15)
+    assert "Traceback" not in (tmp_path / "log").read_text(encoding="utf-8")
