@@ -6,8 +6,8 @@ import typer
 from pydantic import ValidationError
 
 from model.errors import InvalidInputError, ModelError
+from service.base.discovery import modules_of
 from service.base.faults import ServiceError
-from service.cli import keys, models, photographs, recovery, service
 
 app = typer.Typer(
     name="heliotwin",
@@ -19,7 +19,7 @@ app = typer.Typer(
 )
 
 
-for _group in (photographs, service, keys, models, recovery):
+for _group in modules_of("service.cli.verbs"):
     app.add_typer(_group.app)
 
 

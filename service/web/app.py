@@ -9,6 +9,7 @@ from anyio import to_thread
 from fastapi import APIRouter, FastAPI
 from fastapi.routing import APIRoute
 
+from service.base.discovery import modules_of
 from service.base.meters import listening
 from service.base.settings import Settings
 from service.jobs.kind import Kinds
@@ -17,26 +18,10 @@ from service.jobs.worker import Workers
 from service.twin.field import FieldBook
 from service.twin.runtime import Operations, Runtime
 from service.web.answers import openapi, problems
-from service.web.api import (
-    audit,
-    forecasts,
-    health,
-    heliostats,
-    jobs,
-    measurements,
-    metrics,
-    models,
-    plant,
-    session,
-    studies,
-    surfaces,
-)
+from service.web.api import jobs
 from service.web.door import security
 from service.web.metrics import registry
 from service.web.middleware import BodyLimitMiddleware, DoorMiddleware, RequestIdMiddleware, SecurityHeadersMiddleware
-from service.web.pages import assets, documentation, field, forecast, heliostat, login
-from service.web.pages import jobs as job_pages
-from service.web.pages import studies as study_pages
 
 _DESCRIPTION = (
     "Post the target photographs of a solar tower, read back each heliostat's flux and surface, and forecast the "
@@ -92,19 +77,17 @@ def create_app(settings: Settings, operations: Operations | None = None, kinds: 
         lifespan=lifespan,
         generate_unique_id_function=_operation_id,
         redirect_slashes=False,
-        docs_url=None,  # service.web.pages.documentation has its own page
+        docs_url=None,  # service.web.root.documentation has its own page
         redoc_url=None,
     )
     app.state.stopping = threading.Event()
     v1 = APIRouter(prefix="/v1")
-    for module in (plant, heliostats, measurements, surfaces, forecasts, studies, models, audit):
-        v1.include_router(module.router)
-    v1.include_router(jobs.make_router(kinds))
+    for resource in modules_of("service.web.api"):
+        v1.include_router(resource.router)
+    v1.include_router(jobs.creators(kinds))
     app.include_router(v1)
-    for router in (health.router, metrics.router, session.router, documentation.router):
-        app.include_router(router)
-    for page in (assets, login, field, heliostat, forecast, job_pages, study_pages):
-        app.include_router(page.router)
+    for place in (*modules_of("service.web.root"), *modules_of("service.web.pages")):
+        app.include_router(place.router)
     security.require_declared_roles(app)
     problems.install(app)
     openapi.install(app)

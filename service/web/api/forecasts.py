@@ -12,7 +12,7 @@ from service.base.arrays import pack, pair
 from service.base.fields import Model, ModelVersion, Name, Plane, Position, Resolution, Sun, Version
 from service.drawing.pictures import flux_picture
 from service.jobs.asking import ask_for
-from service.jobs.field_forecasts import FleetForecastIn
+from service.jobs.kinds.field_forecasts import FleetForecastIn
 from service.store.tables import ForecastRow
 from service.twin.forecast import ForecastRequest, flux_of, make_forecast
 from service.web.answers import formats

@@ -136,15 +136,12 @@ IdempotencyKey = Annotated[
 KindName = Annotated[str | None, Query(pattern=r"^[a-z]{1,32}$", description="Only jobs of this kind.")]
 
 
-def make_router(kinds: Kinds) -> APIRouter:
-    """The routes, with one to ask for a job of each of ``kinds``."""
-    router = APIRouter(prefix="/jobs", tags=["jobs"])
+def creators(kinds: Kinds) -> APIRouter:
+    """Routes that ask for a job, one for each of ``kinds``."""
+    asking = APIRouter(prefix="/jobs", tags=["jobs"])
     for kind in kinds.values():
-        add_creator(router, kind, f"/{kind.name}", f"post_{kind.name}_job")
-    both = APIRouter()
-    both.include_router(router)
-    both.include_router(_existing)
-    return both
+        add_creator(asking, kind, f"/{kind.name}", f"post_{kind.name}_job")
+    return asking
 
 
 def add_creator(router: APIRouter, kind: Kind[Any], path: str, name: str) -> None:
@@ -174,10 +171,10 @@ def add_creator(router: APIRouter, kind: Kind[Any], path: str, name: str) -> Non
     )(create)
 
 
-_existing = APIRouter(prefix="/jobs", tags=["jobs"])
+router = APIRouter(prefix="/jobs", tags=["jobs"])
 
 
-@_existing.get("", responses=problems(), dependencies=[READ])
+@router.get("", responses=problems(), dependencies=[READ])
 def list_jobs(
     runtime: RuntimeDep,
     limit: Limit = 100,
@@ -192,14 +189,14 @@ def list_jobs(
     return page(items, limit)
 
 
-@_existing.get("/{number}", responses=problems(404), dependencies=[READ])
+@router.get("/{number}", responses=problems(404), dependencies=[READ])
 def get_job(number: Number, runtime: RuntimeDep) -> JobOut:
     """A job with its progress, and its result when it is done."""
     with runtime.database.reading() as session:
         return job_out(queue.get_job(session, number))
 
 
-@_existing.get(
+@router.get(
     "/{number}/flux",
     responses={**problems(404, 406), **arrays("`flux` (rows, columns) [W/m2].")},
     dependencies=[READ],
@@ -211,7 +208,7 @@ def get_job_flux(number: Number, runtime: RuntimeDep, media_type: MediaType) -> 
     return job_flux(row, media_type)
 
 
-@_existing.get(
+@router.get(
     "/{number}/events",
     response_class=Response,
     responses={
@@ -231,7 +228,7 @@ def get_job_events(
     return stream(runtime, number, last_event_id, stopping)
 
 
-@_existing.post("/{number}/cancel", responses=problems(404, 409), dependencies=[OPERATE])
+@router.post("/{number}/cancel", responses=problems(404, 409), dependencies=[OPERATE])
 def cancel_job(number: Number, runtime: RuntimeDep, identity: IdentityDep) -> JobOut:
     """Cancel a job: at once where it waits; a running one ends at its next report."""
     return job_out(cancel_for(runtime, number, identity.name))

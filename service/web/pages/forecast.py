@@ -15,7 +15,7 @@ from service import store
 from service.base.fields import Azimuth, Elevation, Model, Name, Sun, Version
 from service.drawing import charts
 from service.jobs.asking import ask_for
-from service.jobs.field_forecasts import FleetForecastIn
+from service.jobs.kinds.field_forecasts import FleetForecastIn
 from service.store.columns import now
 from service.store.tables import ForecastRow, HeliostatRow, PlantRow, ReceiverRow, TargetRow
 from service.twin.forecast import ForecastRequest, flux_of, make_forecast

@@ -10,7 +10,7 @@ from service.base.fields import Method, Model, Name, Version
 from service.drawing import charts
 from service.drawing.charts import HeatMap
 from service.jobs.asking import ask_for, cancel_for
-from service.jobs.predictions import PredictionsIn
+from service.jobs.kinds.predictions import PredictionsIn
 from service.store import queue
 from service.store.tables import JobRow
 from service.web.answers.pages import go_to, render

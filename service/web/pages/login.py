@@ -7,8 +7,8 @@ from fastapi import APIRouter, Form, Query, Request, Response
 from fastapi.responses import HTMLResponse
 
 from service.web.answers.pages import go_to, render
-from service.web.api.session import forget_key, keep_key, require_valid
 from service.web.door.dependencies import RuntimeDep
+from service.web.root.session import forget_key, keep_key, require_valid
 
 router = APIRouter(include_in_schema=False)
 

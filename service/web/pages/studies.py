@@ -9,7 +9,7 @@ from service import store
 from service.base.faults import NotFoundError
 from service.base.fields import Model, Version
 from service.jobs.asking import ask_for
-from service.jobs.studies import StudyIn
+from service.jobs.kinds.studies import StudyIn
 from service.twin import versions
 from service.web.answers.pages import go_to, render
 from service.web.door.dependencies import OPERATE, READ, IdentityDep, RuntimeDep

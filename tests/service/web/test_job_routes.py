@@ -19,7 +19,7 @@ from fastapi.testclient import TestClient
 from service.base.settings import Settings
 from service.jobs.kind import Context
 from service.jobs.kinds import KINDS
-from service.jobs.predictions import PredictionsIn, predict_many
+from service.jobs.kinds.predictions import PredictionsIn, predict_many
 from service.store import queue
 from service.store.tables import JobRow
 from service.web.app import create_app

@@ -169,7 +169,7 @@ def test_service_does_not_start_on_an_unmigrated_store(settings: Settings, opera
 
 
 def test_ready(bare: TestClient, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("service.web.api.health.default_predictor", lambda: None)
+    monkeypatch.setattr("service.web.root.health.default_predictor", lambda: None)
     ready = bare.get("/readyz")
     assert ready.status_code == 200
     assert ready.json() == {"status": "ok", "checks": {"database": "ok", "migrations": "ok", "weights": "ok"}}
@@ -179,7 +179,7 @@ def test_unready_without_weights(bare: TestClient, monkeypatch: pytest.MonkeyPat
     def missing() -> None:
         raise FileNotFoundError("/inside/weights.onnx")
 
-    monkeypatch.setattr("service.web.api.health.default_predictor", missing)
+    monkeypatch.setattr("service.web.root.health.default_predictor", missing)
     ready = bare.get("/readyz")
     assert ready.status_code == 503
     assert ready.json()["checks"]["weights"] == "unavailable"

@@ -7,8 +7,8 @@ from typing import Annotated, Any
 import typer
 
 from service.cli.output import AsJson, console, make_table, progress, show
-from service.cli.photographs import Folder
 from service.cli.store import actor
+from service.cli.verbs.photographs import Folder
 from service.store import database
 
 app = typer.Typer()

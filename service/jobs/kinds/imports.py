@@ -8,7 +8,7 @@ from model.errors import InvalidInputError
 from service.base.faults import ConflictError
 from service.base.fields import Model
 from service.base.progress import Steps
-from service.jobs.kind import Context, Result
+from service.jobs.kind import Context, Kind, Result
 from service.sources.folder import read_folder
 from service.twin.importing import import_folder
 
@@ -54,3 +54,6 @@ def import_allowed(context: Context, payload: ImportIn) -> Result:
     images = [len(item.images) for name in folder.plant.heliostats for item in folder.measurements(name, False)]
     steps = Steps(len(folder.plant.heliostats) + sum(images), context.report)
     return Result(import_folder(context.runtime, folder, steps, context.created_by))
+
+
+KIND = Kind("imports", ImportIn, import_allowed, "Load a measurement folder into the store.")

@@ -5,7 +5,7 @@ from pydantic import Field
 from service.base.faults import SKIPPED
 from service.base.fields import Method, Model, ModelVersion
 from service.jobs.common import Heliostats, chosen_names, require_some
-from service.jobs.kind import Context, Result
+from service.jobs.kind import Context, Kind, Result
 from service.twin import versions
 from service.twin.prediction import compute_surface, keep_surface
 from service.twin.runtime import Runtime
@@ -52,3 +52,6 @@ def _predict_step(context: Context, payload: PredictionsIn, name: str, model_ver
     except SKIPPED as error:
         with context.runtime.database.writing() as session:
             context.keep(session, name, {"skipped": str(error)})
+
+
+KIND = Kind("predictions", PredictionsIn, predict_many, "Predict the surfaces of many heliostats.")

@@ -5,7 +5,7 @@ from pydantic import Field, field_validator
 from model.effects import CATALOGUE
 from service import store
 from service.base.fields import Model, Moment, Name
-from service.jobs.kind import Context, Result
+from service.jobs.kind import Context, Kind, Result
 from service.twin.study import StudyRequest, Surfaces, study_row, study_store
 
 
@@ -54,3 +54,6 @@ def make_study(context: Context, payload: StudyIn) -> Result:
             about = {"study": row.id, "verdict": row.verdict, "conclusion": row.conclusion, "skipped": row.skipped}
             context.keep(session, "study", about)
     return Result(context.steps()["study"])
+
+
+KIND = Kind("studies", StudyIn, make_study, "Find the effect that photographs demand and the model lacks.")

@@ -12,7 +12,7 @@ from model.plant import Receiver
 from service import store
 from service.base.fields import Model, ModelVersion, Name, Plane, Position, ReceiverIn, Resolution, Sun
 from service.jobs.common import Heliostats, chosen_names, require_some
-from service.jobs.kind import Context, Result
+from service.jobs.kind import Context, Kind, Result
 from service.twin import versions
 from service.twin.field_light import Fleet, forecast_fleet
 from service.twin.forecast import receiver_as_json
@@ -94,3 +94,6 @@ def _figures(flux: np.ndarray[Any, Any], receiver: Receiver) -> dict[str, Any]:
         "power_w": float(flux.sum() * pixel_m2),
         "plane": receiver_as_json(receiver),
     }
+
+
+KIND = Kind("forecasts", FleetForecastIn, forecast_field, "Superpose the flux of many heliostats on one receiver.")

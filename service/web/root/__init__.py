@@ -1,0 +1,1 @@
+"""What stands at the root beside the pages: probes, metrics, the session, the documentation, styles and scripts."""
