@@ -196,6 +196,10 @@ class TargetPlane:
         """ENU points (..., 3) of coordinates (..., 2) [m] right and up of the centre."""
         return np.asarray(self.center + np.asarray(coordinates, dtype=np.float64) @ self.axes[:2])
 
+    def holds(self, point: ArrayLike) -> bool:
+        """Whether a point (3,) [m] of the plane lies within the rectangle."""
+        return bool((np.abs(self.to_plane(point)) <= np.array([self.width, self.height]) / 2).all())
+
 
 @dataclass(frozen=True, eq=False)
 class Cylinder:

@@ -11,7 +11,7 @@ from model.study import FluxImage, Study, StudyOptions, study
 from model.surface import DEGREE, control_points
 from service.base.progress import Progress, quiet
 from service.cli.folder import check_surfaces, evidence_of, surface_of
-from service.sources.documents import read_json
+from service.sources.documents import Measurement, read_json
 from service.sources.folder import MeasurementFolder
 
 
@@ -45,11 +45,19 @@ def photographs_of(folder: MeasurementFolder, surfaces: str = "measured") -> tup
         points, degree = (control_points(heliostat), DEGREE) if surface is None else surface
         for measurement in folder.measurements(name):
             try:
+                _require_on_target(folder, measurement)
                 evidence, was_used = evidence_of(folder, measurement), measurement.identifier in seen.get(name, ())
                 photographs.append(evidence.photograph(heliostat, points, degree, was_used))
             except ModelError as error:
                 skipped[measurement.key] = str(error)
     return photographs, skipped
+
+
+def _require_on_target(folder: MeasurementFolder, measurement: Measurement) -> None:
+    """A spot that is said to lie elsewhere makes a photograph of another target, or of another heliostat, likely."""
+    target = folder.plant.targets[measurement.target]
+    if measurement.spot is not None and not target.holds(measurement.spot):
+        raise InvalidInputError(f"{measurement.key}: 'focal_spot' lies off its target {measurement.target}")
 
 
 def predicted_from(surfaces: str) -> dict[str, list[str]]:

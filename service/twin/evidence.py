@@ -91,7 +91,7 @@ class Evidence:
         key = f"{heliostat.name}/{self.identifier}"
         if self.spot is None:
             raise InvalidInputError(f"{key}: a centred flux without 'focal_spot' has no place on the target")
-        if (np.abs(self.target.to_plane(self.spot)) > np.array([self.target.width, self.target.height]) / 2).any():
+        if not self.target.holds(self.spot):
             raise InvalidInputError(f"{key}: 'focal_spot' lies off its target {self.target.name}")
         image, plane = self.flux, self.target
         if image is None:  # the part about the spot is all there is

@@ -270,10 +270,11 @@ def test_centred_flux_needs_a_spot_on_its_target(database: Database, up: float |
     with database.writing() as session:
         row = store.get_heliostat(session, "AB12")
         target = store.get_target(session, TARGET.name)
-        about = measurement(target, "centred", sun_direction(0, 40), np.ones((64, 64)), 20)
-        store.add_measurement(
-            session, row, replace(about, flux=None, center_of_mass=None, focal_spot_wgs84=spot, kind="flux-centered")
-        )
+        image, about = measurement(target, "centred", sun_direction(0, 40), np.ones((64, 64)), 20)
+        about.arrays = pack({"centered": np.ones((64, 64), np.float32)})
+        about.center_right_m = about.center_up_m = None
+        about.focal_spot_wgs84, about.kind = None if spot is None else list(spot), "flux-centered"
+        store.add_measurement(session, row, image, about)
         material = gather(session, StudyRequest(heliostats=["AB12"], since=BEGIN + timedelta(days=19)))
     if reason is not None:
         assert reason in material.skipped["AB12/centred"]
