@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from service.cli.demo_plant import write_plant
-from tests.docker.engine import ROOT, clone, run
+from tests.docker.engine import ROOT, clone
 from tests.faults.harness import until
 from tests.service.conftest import free_port
 
@@ -26,6 +26,15 @@ def _bare() -> dict[str, str]:
     }
 
 
+def _run(*command: str | Path, folder: Path, **settings: str) -> str:
+    """What a command prints that must succeed, in the bare environment with ``settings``."""
+    environment = _bare() | settings
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    return done.stdout
+
+
 @pytest.fixture(scope="module")
 def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The interpreter of a fresh environment with the wheel and, by the locked versions, its dependencies."""
@@ -34,13 +43,13 @@ def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
     python = folder / "environment" / "bin" / "python"
     pip = [str(python), "-m", "pip", "--quiet", "--disable-pip-version-check"]
     probe = [*pip, "download", "--no-deps", "--no-cache-dir", "--dest", str(folder / "probe"), "setuptools>=77"]
-    asked = subprocess.run(probe, capture_output=True, text=True, check=False)
+    asked = subprocess.run(probe, env=_bare(), capture_output=True, text=True, check=False)
     if asked.returncode:
         pytest.skip(f"no package registry answers: {asked.stderr.strip().splitlines()[-1]}")
-    run(*pip, "wheel", "--no-deps", "--wheel-dir", folder, clone(folder / "clone"), environment=_bare())
+    _run(*pip, "wheel", "--no-deps", "--wheel-dir", folder, clone(folder / "clone"), folder=folder)
     (wheel,) = folder.glob("heliotwin-*.whl")
     # Without bytecode, which would be made of all packages and is needed of few.
-    run(*pip, "install", "--no-compile", "-c", ROOT / "constraints.txt", wheel, environment=_bare())
+    _run(*pip, "install", "--no-compile", "-c", ROOT / "constraints.txt", wheel, folder=folder)
     return python
 
 
@@ -54,11 +63,7 @@ def plant(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def heliotwin(python: Path, folder: Path, *arguments: object) -> str:
     """What the installed command prints when it is run in ``folder``."""
-    command = [python.parent / "heliotwin", *map(str, arguments)]
-    done = subprocess.run(command, cwd=folder, env=_bare(), capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "Traceback" not in done.stderr
-    return done.stdout
+    return _run(python.parent / "heliotwin", *map(str, arguments), folder=folder)
 
 
 def report(python: Path, folder: Path, *arguments: object) -> dict[str, Any]:
@@ -90,7 +95,7 @@ def test_service(python: Path, tmp_path: Path):
     port = free_port()
     settings = {"HELIOTWIN_DATA_DIR": str(tmp_path / "data"), "HELIOTWIN_PORT": str(port)}
     program = str(python.parent / "heliotwin")
-    run(program, "migrate", folder=tmp_path, environment=settings)
+    _run(program, "migrate", folder=tmp_path, **settings)
     with (tmp_path / "log").open("wb") as log:
         process = subprocess.Popen([program, "serve"], cwd=tmp_path, env=_bare() | settings, stderr=log)
     try:

@@ -133,10 +133,10 @@ class Composition:
         """What a command of compose prints."""
         return run(*self._command, *arguments, folder=self.folder.parent, environment=self.environment)
 
-    def verb(self, *words: str, service: str = "service", mounted: Path | None = None, needed: bool = True) -> str:
+    def verb(self, *words: str, mounted: Path | None = None) -> str:
         """What ``heliotwin WORDS`` prints in a container of its own; ``mounted`` is its /backup."""
         volume = [] if mounted is None else ["-v", f"{mounted}:/backup"]
-        return self("run", "--rm", "-T", *([] if needed else ["--no-deps"]), *volume, service, *words)
+        return self("run", "--rm", "--no-deps", "-T", *volume, "service", *words)
 
     def up(self, *services: str) -> None:
         """Start, and wait until all is well."""
@@ -193,7 +193,7 @@ class Client:
     def done(self, path: str) -> dict[str, Any]:
         """A job when it is done."""
         ended = until(
-            lambda: (job := self.job(path))["state"] not in ("unknown", "queued", "running") and job, path, 240
+            lambda: (job := self.job(path))["state"] not in ("unknown", "queued", "running") and job, path, 400
         )
         assert ended["state"] == "done", json.dumps(ended, indent=1)
         return dict(ended)

@@ -20,7 +20,7 @@ from . import engine
 from .engine import Client, Composition
 
 # One worker of pytest-xdist does all of this file: its tests share an image, and two compositions would be no faster.
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(900), pytest.mark.xdist_group("containers")]
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200), pytest.mark.xdist_group("containers")]
 
 Start = Callable[[str], Composition]
 
@@ -129,14 +129,14 @@ def test_plant_from_empty_to_restored(start: Start, version: str, stj: Path, bac
         survives_a_killed_worker(plant, client)
         before = kept(client)
         assert before["AA39"]["measurements"]["items"]
-    assert "0 " in plant.verb("check")
+    plant.verb("check")  # ends with 1 where something is lost
     plant.verb("backup", "/backup/today", mounted=backups)
     assert json.loads((backups / "today" / "manifest.json").read_text(encoding="utf-8"))["images"]
     says_nothing_wrong(plant)
 
     plant.tear_down()
     plant.up("database")
-    plant.verb("restore", "/backup/today", mounted=backups, needed=False)
+    plant.verb("restore", "/backup/today", mounted=backups)
     plant.up()
     with plant.client(key) as client:
         assert kept(client) == before
@@ -155,16 +155,17 @@ def predicts_and_forecasts(client: Client) -> None:
 
 def survives_a_killed_worker(plant: Composition, client: Client) -> None:
     """Killed in the middle of a job, the worker comes back and ends it, and nothing of it is there twice."""
-    before = versions(client)
-    path = client.post("/v1/jobs/predictions", {"method": "refined", "images": 2}).headers["Location"]
+    before, wanted = versions(client), ["AA39", "AC43"]
+    asked = {"heliostats": wanted, "method": "refined", "images": 2}
+    path = client.post("/v1/jobs/predictions", asked).headers["Location"]
     until(lambda: client.job(path).get("progress", 0) > 0, "the job is under way")
     plant("restart", "-t", "0", "worker")
     assert client.job(path)["state"] == "running"
     job = client.done(path)
     assert job["attempts"] == 2
     made = {name: count - before[name] for name, count in versions(client).items()}
-    assert made == {name: int(name in job["result"]["surfaces"]) for name in before}
-    assert sum(made.values()) >= 2
+    assert made == {name: int(name in wanted) for name in before}
+    assert sorted(job["result"]["surfaces"]) == wanted
 
 
 def says_nothing_wrong(plant: Composition) -> None:
