@@ -8,7 +8,6 @@ import typer
 
 from service.cli.output import AsJson, console, make_table, progress, show
 from service.cli.photographs import Folder
-from service.store import database
 
 app = typer.Typer()
 
@@ -81,6 +80,7 @@ def migrate(
 ) -> None:
     """Bring the database to its newest schema, or back to an older one."""
     from service.base.settings import Settings
+    from service.store import database
 
     settings = Settings()
     settings.data_dir.mkdir(parents=True, exist_ok=True)
