@@ -3,8 +3,8 @@
 from alembic import context
 from sqlalchemy import Connection, text
 
-from service.store.database import make_engine
 from service.base.settings import Settings
+from service.store.database import make_engine
 from service.store.tables import Base
 
 # Any fixed number: it names the lock that lets one migration run at a time on PostgreSQL.

@@ -7,6 +7,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from service.base.choices import RoleName
 from service.cli.output import AsJson
 from service.cli.store import actor, writing
 
@@ -18,7 +19,7 @@ app = typer.Typer(name="keys", help="API keys: make, list, withdraw.", no_args_i
 @app.command()
 def create(
     name: Name,
-    role: Annotated[str, typer.Option(help="read, ingest, operate or admin; each includes those before it.")],
+    role: Annotated[RoleName, typer.Option(help="read, ingest, operate or admin; each includes those before it.")],
     as_json: AsJson = False,
 ) -> None:
     """Make a key and print it, this once."""

@@ -5,7 +5,7 @@ and are referred to by their SHA-256.
 """
 
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, get_args
 
 from sqlalchemy import (
     JSON,
@@ -25,6 +25,8 @@ from sqlalchemy import (
 )
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column, relationship
 
+from service.base.choices import RoleName
+
 _NAMING = {
     "ix": "ix_%(table_name)s_%(column_0_N_name)s",
     "uq": "uq_%(table_name)s_%(column_0_N_name)s",
@@ -36,7 +38,7 @@ _NAMING = {
 KINDS = ("raw", "cropped", "flux", "flux-centered")
 SOURCES = ("measured", "network", "refined", "imported")
 STATES = ("queued", "running", "done", "failed", "cancelled")
-ROLES = ("read", "ingest", "operate", "admin")
+ROLES: tuple[str, ...] = get_args(RoleName)
 VERDICTS = ("effect", "none", "unexplained")
 
 MODEL_VERSION = 256
