@@ -4,36 +4,15 @@ Arrays live in compressed npz blobs that are loaded only when asked for; images 
 and are referred to by their SHA-256.
 """
 
-from datetime import UTC, datetime
+from datetime import datetime
 from typing import Any, get_args
 
-from sqlalchemy import (
-    JSON,
-    CheckConstraint,
-    Column,
-    DateTime,
-    Dialect,
-    ForeignKey,
-    Index,
-    LargeBinary,
-    MetaData,
-    String,
-    Table,
-    Text,
-    TypeDecorator,
-    UniqueConstraint,
-)
-from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column, relationship
+from sqlalchemy import CheckConstraint, Column, ForeignKey, Index, LargeBinary, String, Table, Text, UniqueConstraint
+from sqlalchemy.orm import Mapped, mapped_column, relationship
 
 from service.base.choices import RoleName
-
-_NAMING = {
-    "ix": "ix_%(table_name)s_%(column_0_N_name)s",
-    "uq": "uq_%(table_name)s_%(column_0_N_name)s",
-    "ck": "ck_%(table_name)s_%(constraint_name)s",
-    "fk": "fk_%(table_name)s_%(column_0_name)s_%(referred_table_name)s",
-    "pk": "pk_%(table_name)s",
-}
+from service.store.columns import Base as Base
+from service.store.columns import now as now
 
 KINDS = ("raw", "cropped", "flux", "flux-centered")
 SOURCES = ("measured", "network", "refined", "imported")
@@ -44,51 +23,9 @@ VERDICTS = ("effect", "none", "unexplained")
 MODEL_VERSION = 256
 """Characters that name a version of the plant's model: its number and all effects of the catalogue."""
 
-# A missing JSON value is SQL's NULL, not the JSON text "null".
-_Json = JSON(none_as_null=True)
-
 
 def _one_of(column: str, values: tuple[str, ...]) -> CheckConstraint:
     return CheckConstraint(f"{column} IN ({', '.join(repr(value) for value in values)})", name=column)
-
-
-class UtcDateTime(TypeDecorator[datetime]):
-    """A moment in UTC; SQLite keeps no zone, so it is put back on the way out."""
-
-    impl = DateTime(timezone=True)
-    cache_ok = True
-
-    def process_bind_param(self, value: datetime | None, dialect: Dialect) -> datetime | None:
-        """In UTC; a moment without a zone is a programming error."""
-        if value is None:
-            return None
-        if value.tzinfo is None:
-            raise ValueError("a stored moment needs a time zone")
-        return value.astimezone(UTC)
-
-    def process_result_value(self, value: datetime | None, dialect: Dialect) -> datetime | None:
-        """With its zone."""
-        if value is None:
-            return None
-        return value.replace(tzinfo=UTC) if value.tzinfo is None else value.astimezone(UTC)
-
-
-def now() -> datetime:
-    """The present moment in UTC."""
-    return datetime.now(UTC)
-
-
-class Base(DeclarativeBase):
-    """What all tables share: constraint names that migrations can refer to."""
-
-    metadata = MetaData(naming_convention=_NAMING)
-    type_annotation_map = {  # noqa: RUF012
-        datetime: UtcDateTime,
-        dict[str, Any]: _Json,
-        list[dict[str, Any]]: _Json,
-        list[float]: _Json,
-        list[str]: _Json,
-    }
 
 
 class PlantRow(Base):
