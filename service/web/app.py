@@ -103,8 +103,10 @@ def create_app(settings: Settings, operations: Operations | None = None, kinds: 
     app.include_router(v1)
     for router in (health.router, metrics.router, session.router, documentation.router):
         app.include_router(router)
-    for page in (assets, login, field, heliostat, forecast, job_pages, study_pages):
+    for page in (login, field, heliostat, forecast, job_pages, study_pages):
         app.include_router(page.router)
+    app.mount("/static", assets.FILES)
+    app.mount("/docs", documentation.FILES)
     security.require_declared_roles(app)
     problems.install(app)
     openapi.install(app)

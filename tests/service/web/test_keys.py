@@ -373,7 +373,7 @@ def test_documentation_asks_nobody_else(bare: TestClient):
         assert answer.status_code == 200
         assert answer.headers["Content-Type"].startswith(kind)
     assert "validatorUrl: null" in bare.get("/docs/start.js").text
-    assert bare.get("/docs/other.js").status_code == 422
+    assert bare.get("/docs/other.js").status_code == 404
 
 
 # --- the audit trail --------------------------------------------------------------------------------------------------
