@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import AfterValidator, AwareDatetime, BaseModel, BeforeValidator, ConfigDict, Field, StringConstraints
 
 from model.plant import Cylinder, TargetPlane
+from service.base.choices import Method as Method  # one of these types, and a choice of the command line
 from service.base.names import IDENTIFIER, NAME
 
 Name = Annotated[
@@ -32,7 +33,6 @@ MeasurementName = Annotated[
 
 Kind = Literal["raw", "cropped", "flux", "flux-centered"]
 Source = Literal["measured", "network", "refined", "imported"]
-Method = Literal["network", "refined"]
 Verdict = Literal["effect", "none", "unexplained"]
 State = Literal["queued", "running", "done", "failed", "cancelled"]
 Metres = Annotated[float, Field(ge=-1e6, le=1e6)]

@@ -3,12 +3,14 @@
 import getpass
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
-from sqlalchemy.orm import Session
+if TYPE_CHECKING:
+    from sqlalchemy.orm import Session
 
 
 @contextmanager
-def writing() -> Iterator[Session]:
+def writing() -> Iterator["Session"]:
     """The store that the settings name; an embedded one is made and migrated first."""
     from service.base.settings import Settings
     from service.store.database import Database

@@ -3,6 +3,7 @@
 import hashlib
 import os
 import tempfile
+from io import BufferedReader
 from pathlib import Path
 
 from service.base.faults import StoreDamagedError, UnsupportedImageError
@@ -36,6 +37,11 @@ def media_type(data: bytes) -> str:
 def digest(data: bytes) -> str:
     """SHA-256 of ``data`` in hexadecimal."""
     return hashlib.sha256(data).hexdigest()
+
+
+def _require_same(sha256: str, found: str) -> None:
+    if found != sha256:
+        raise StoreDamagedError(f"image {sha256} is damaged in the store; {_REMEDY}")
 
 
 def _sync_folder(folder: Path) -> None:
@@ -90,10 +96,25 @@ class ImageStore:
         StoreDamagedError
             Where the file is gone or is not what was put there.
         """
+        with self._opened(sha256) as file:
+            data = file.read()
+        _require_same(sha256, digest(data))
+        return data
+
+    def checked(self, sha256: str) -> Path:
+        """Where the image lies, after all its bytes were read and found to be those that were put there.
+
+        Raises
+        ------
+        StoreDamagedError
+            Where the file is gone or is not what was put there.
+        """
+        with self._opened(sha256) as file:
+            _require_same(sha256, hashlib.file_digest(file, "sha256").hexdigest())
+        return self.path(sha256)
+
+    def _opened(self, sha256: str) -> BufferedReader:
         try:
-            data = self.path(sha256).read_bytes()
+            return self.path(sha256).open("rb")
         except FileNotFoundError as error:
             raise StoreDamagedError(f"image {sha256} is missing from the store; {_REMEDY}") from error
-        if digest(data) != sha256:
-            raise StoreDamagedError(f"image {sha256} is damaged in the store; {_REMEDY}")
-        return data

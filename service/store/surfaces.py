@@ -74,7 +74,6 @@ def _surface_row(heliostat: HeliostatRow, version: int, new: NewSurface, content
         misfit=new.misfit,
         content_sha256=content,
         arrays=pack({name: np.asarray(array, np.float64) for name, array in arrays.items()}),
-        measurements=sorted(new.measurements, key=lambda measurement: measurement.id),
     )
 
 
@@ -95,6 +94,7 @@ def add_surface(
         last = session.scalar(select(func.max(SurfaceRow.version)).where(SurfaceRow.heliostat_id == heliostat.id))
         row = _surface_row(heliostat, (last or 0) + 1, new, content)
         if insert(session, row):
+            row.measurements = sorted(new.measurements, key=lambda measurement: measurement.id)
             return row, True
     raise ConflictError("too many writers on the same heliostat's surfaces; try again")
 

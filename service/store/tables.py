@@ -5,27 +5,18 @@ and are referred to by their SHA-256.
 """
 
 from datetime import datetime
-from typing import Any
+from typing import Any, get_args
 
-from sqlalchemy import (
-    CheckConstraint,
-    Column,
-    ForeignKey,
-    Index,
-    LargeBinary,
-    String,
-    Table,
-    Text,
-    UniqueConstraint,
-)
+from sqlalchemy import CheckConstraint, Column, ForeignKey, Index, LargeBinary, String, Table, Text, UniqueConstraint
 from sqlalchemy.orm import Mapped, mapped_column, relationship
 
+from service.base.choices import RoleName
 from service.store.columns import Base, now, one_of
 
 KINDS = ("raw", "cropped", "flux", "flux-centered")
 SOURCES = ("measured", "network", "refined", "imported")
 STATES = ("queued", "running", "done", "failed", "cancelled")
-ROLES = ("read", "ingest", "operate", "admin")
+ROLES: tuple[str, ...] = get_args(RoleName)
 VERDICTS = ("effect", "none", "unexplained")
 
 MODEL_VERSION = 256

@@ -87,7 +87,10 @@ def create_app(settings: Settings, operations: Operations | None = None, kinds: 
     v1.include_router(jobs.creators(kinds))
     app.include_router(v1)
     for place in (*modules_of("service.web.root"), *modules_of("service.web.pages")):
-        app.include_router(place.router)
+        if hasattr(place, "router"):
+            app.include_router(place.router)
+        if hasattr(place, "MOUNT"):  # files, at a path; its page, in the router, comes first
+            app.mount(*place.MOUNT)
     security.require_declared_roles(app)
     problems.install(app)
     openapi.install(app)

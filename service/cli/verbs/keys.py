@@ -7,9 +7,9 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from service.base.choices import RoleName
 from service.cli.output import AsJson
 from service.cli.store import actor, writing
-from service.store import keys
 
 Name = Annotated[str, typer.Argument(help="Who will use it, for example `calibration`.", metavar="NAME")]
 
@@ -19,10 +19,12 @@ app = typer.Typer(name="keys", help="API keys: make, list, withdraw.", no_args_i
 @app.command()
 def create(
     name: Name,
-    role: Annotated[str, typer.Option(help="read, ingest, operate or admin; each includes those before it.")],
+    role: Annotated[RoleName, typer.Option(help="read, ingest, operate or admin; each includes those before it.")],
     as_json: AsJson = False,
 ) -> None:
     """Make a key and print it, this once."""
+    from service.store import keys
+
     with writing() as session:
         key = keys.create(session, name, role, actor())
     typer.echo(json.dumps({"name": name, "role": role, "key": key}) if as_json else key)
@@ -31,6 +33,8 @@ def create(
 @app.command("list")
 def list_(as_json: AsJson = False) -> None:
     """All keys, by name and prefix; the keys themselves are not stored."""
+    from service.store import keys
+
     with writing() as session:
         rows = keys.list_keys(session)
     if as_json:
@@ -49,6 +53,8 @@ def list_(as_json: AsJson = False) -> None:
 @app.command()
 def withdraw(name: Name, as_json: AsJson = False) -> None:
     """Make a key useless from now on."""
+    from service.store import keys
+
     with writing() as session:
         keys.withdraw(session, name, actor())
     typer.echo(json.dumps({"withdrawn": name}) if as_json else f"{name} is withdrawn")

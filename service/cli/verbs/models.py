@@ -8,10 +8,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from service import store
 from service.cli.output import AsJson
 from service.cli.store import actor, writing
-from service.twin import versions
 
 app = typer.Typer(name="models", help="Versions of the plant's model: list, adopt, withdraw.", no_args_is_help=True)
 
@@ -41,7 +39,9 @@ def adopt(
     as_json: AsJson = False,
 ) -> None:
     """Add what the study of a folder found to the model it was made with, which is used from then on."""
+    from service import store
     from service.sources.documents import read_json
+    from service.twin import versions
     from service.twin.study import model_of_report, row_of_report
 
     document, name = read_json(report), report.name
@@ -58,6 +58,8 @@ def withdraw(
     as_json: AsJson = False,
 ) -> None:
     """Take back what was adopted from a study; the version before is current again."""
+    from service.twin import versions
+
     with writing() as session:
         versions.withdraw(session, study, actor())
         version = versions.get_model(session).version

@@ -7,11 +7,11 @@ import typer
 from rich.table import Table
 
 from model.errors import InvalidInputError
+from service.base.choices import Method
 from service.cli.output import AsJson, make_table, progress, show
 
 if TYPE_CHECKING:  # what reads folders brings the tracer's libraries with it, which take seconds to load
     from service.sources.folder import MeasurementFolder
-    from service.twin.compute import Method
 
 app = typer.Typer()
 
@@ -55,7 +55,7 @@ def predict(
     folder: Folder,
     out: Out,
     method: Annotated[
-        str, typer.Option(help="network, or refined: the network, then MAP through the tracer.")
+        Method, typer.Option(help="network, or refined: the network, then MAP through the tracer.")
     ] = "network",
     images: Annotated[int, typer.Option(help="Most images used for a heliostat, 1 to 8.")] = 8,
     as_json: AsJson = False,
@@ -64,12 +64,9 @@ def predict(
     from service.cli.folder import predict_folder
     from service.sources.folder import read_folder
 
-    if method not in ("network", "refined"):
-        raise InvalidInputError(f"--method must be 'network' or 'refined', got {method!r}")
-    chosen: Method = "network" if method == "network" else "refined"
     source = read_folder(folder)
     with progress(len(source.plant.heliostats), "predict") as step:
-        report = predict_folder(source, out, chosen, images, step)
+        report = predict_folder(source, out, method, images, step)
     table = make_table("Surfaces", "heliostat", "images", "misfit", "rms [mm]", "error to measured [mm]")
     for name, entry in report["heliostats"].items():
         error = entry.get("against_measured", {}).get("mae_mm")

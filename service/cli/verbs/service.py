@@ -9,7 +9,6 @@ import typer
 from service.cli.output import AsJson, console, make_table, progress, show
 from service.cli.store import actor
 from service.cli.verbs.photographs import Folder
-from service.store import database
 
 app = typer.Typer()
 
@@ -82,6 +81,7 @@ def migrate(
 ) -> None:
     """Bring the database to its newest schema, or back to an older one."""
     from service.base.settings import Settings
+    from service.store import database
 
     settings = Settings()
     settings.data_dir.mkdir(parents=True, exist_ok=True)

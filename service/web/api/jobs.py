@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import anyio
 from anyio import CapacityLimiter, to_thread
 from fastapi import APIRouter, Depends, Header, Path, Query, Response, status
-from fastapi.responses import StreamingResponse
+from fastapi.sse import EventSourceResponse, format_sse_event
 from pydantic import BaseModel, Field
 
 from service.base.arrays import unpack
@@ -87,20 +87,20 @@ def _look(runtime: Runtime, number: int, seen: int) -> tuple[int, bool, str] | N
     return row.revision, row.state in queue.ENDED, json.dumps(job_out(row).model_dump(mode="json"))
 
 
-async def _events(runtime: Runtime, number: int, seen: int, stopping: threading.Event) -> AsyncIterator[str]:
+async def _events(runtime: Runtime, number: int, seen: int, stopping: threading.Event) -> AsyncIterator[bytes]:
     """The job each time it has changed, numbered by its revision, until its end; comments in between."""
     quiet_since = time.monotonic()
-    yield "retry: 2000\n\n"
+    yield format_sse_event(retry=2000)
     while not stopping.is_set():
         news = await to_thread.run_sync(_look, runtime, number, seen, limiter=_watchers)
         if news is not None:
             seen, has_ended, document = news
-            yield f"id: {seen}\nevent: {'end' if has_ended else 'progress'}\ndata: {document}\n\n"
+            yield format_sse_event(data_str=document, event="end" if has_ended else "progress", id=str(seen))
             if has_ended:
                 return
             quiet_since = time.monotonic()
         elif time.monotonic() - quiet_since > _COMMENT_EVERY_S:
-            yield ": still here\n\n"
+            yield format_sse_event(comment="still here")
             quiet_since = time.monotonic()
         await anyio.sleep(_LOOK_EVERY_S)
 
@@ -119,7 +119,8 @@ def stream(runtime: Runtime, number: int, last_event_id: str | None, stopping: t
     if row.state in queue.ENDED and row.revision <= seen:
         return Response(status_code=204)
     headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
-    return StreamingResponse(_events(runtime, number, seen, stopping), media_type="text/event-stream", headers=headers)
+    # FastAPI's own routes for generators could not answer 204.
+    return EventSourceResponse(_events(runtime, number, seen, stopping), headers=headers)
 
 
 Number = Annotated[Version, Path(description="Id of the job.")]

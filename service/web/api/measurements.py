@@ -3,7 +3,7 @@
 from datetime import datetime
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Depends, File, Form, Query, Response, UploadFile, status
+from fastapi import APIRouter, Depends, File, Form, Header, Query, Response, UploadFile, status
 from pydantic import BaseModel, BeforeValidator, Field, Json
 
 from service import store
@@ -16,6 +16,7 @@ from service.sources.schema import paint_motors, paint_spot
 from service.store.tables import MeasurementRow
 from service.twin.ingest import ingest
 from service.web.answers import formats
+from service.web.answers.files import WholeFile, is_held
 from service.web.answers.formats import MediaType, file_answer, json_answer
 from service.web.answers.openapi import arrays, problems
 from service.web.answers.paging import Page, page
@@ -205,15 +206,28 @@ def get_measurement(name: NamePath, measurement: MeasurementPath, runtime: Runti
 @router.get(
     "/{measurement}/image",
     response_class=Response,
-    responses={**problems(404), 200: {"description": "The file as it was sent.", "content": {"image/*": {}}}},
+    responses={
+        **problems(404),
+        200: {"description": "The file as it was sent.", "content": {"image/*": {}}},
+        304: {"description": "If-None-Match names the file, which the client holds already."},
+    },
     dependencies=[READ],
 )
-def get_image(name: NamePath, measurement: MeasurementPath, runtime: RuntimeDep) -> Response:
-    """The image as it was sent."""
+def get_image(
+    name: NamePath,
+    measurement: MeasurementPath,
+    runtime: RuntimeDep,
+    if_none_match: Annotated[str | None, Header(description="The ETag of a file that is held already.")] = None,
+) -> Response:
+    """The image as it was sent; every byte of it is checked before the first one leaves."""
     with runtime.database.reading() as session:
         row = store.get_measurement(session, store.get_heliostat(session, name), measurement)
-    headers = {"ETag": f'"{row.image_sha256}"', "X-Content-Type-Options": "nosniff"}
-    return Response(runtime.images.read(row.image_sha256), media_type=row.image.media_type, headers=headers)
+    # It may be kept, but every use asks again, and shows its key again.
+    headers = {"ETag": f'"{row.image_sha256}"', "Cache-Control": "private, no-cache"}
+    if is_held(headers["ETag"], if_none_match):
+        return Response(status_code=status.HTTP_304_NOT_MODIFIED, headers=headers)
+    headers["X-Content-Type-Options"] = "nosniff"
+    return WholeFile(runtime.images.checked(row.image_sha256), media_type=row.image.media_type, headers=headers)
 
 
 @router.get(

@@ -139,7 +139,7 @@ def declared_roles(app: FastAPI) -> dict[tuple[str, str], Role | None]:
     for context in iter_route_contexts(app.routes):
         calls = _calls(context.dependant) if getattr(context, "dependant", None) is not None else ()
         found = [call.role for call in calls if isinstance(call, Requires)]
-        for method in context.methods or {"*"}:
+        for method in context.methods or {"*"}:  # a mounted application takes any, and declares no role
             roles[method, str(context.path)] = max(found, key=ROLES.index, default=None)
     return roles
 

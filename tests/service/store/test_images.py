@@ -32,13 +32,18 @@ def test_cut_off_file_is_mended(tmp_path: Path):
     images.path(sha256).write_bytes(b"abc")
     with pytest.raises(StoreDamagedError, match="damaged"):
         images.read(sha256)
+    with pytest.raises(StoreDamagedError, match="damaged"):
+        images.checked(sha256)
     images.put(b"abcdef")
     assert images.read(sha256) == b"abcdef"
+    assert images.checked(sha256).read_bytes() == b"abcdef"
 
 
 def test_missing_file_is_said(tmp_path: Path):
     with pytest.raises(StoreDamagedError, match="missing"):
         ImageStore(tmp_path).read("0" * 64)
+    with pytest.raises(StoreDamagedError, match="missing"):
+        ImageStore(tmp_path).checked("0" * 64)
 
 
 def test_failed_write_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

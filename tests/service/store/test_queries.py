@@ -1,5 +1,7 @@
 """The store's functions: idempotent, paged, and safe against others who write the same thing."""
 
+import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
@@ -7,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from model.errors import InvalidInputError
@@ -14,10 +17,12 @@ from model.plant import TargetPlane
 from service import store
 from service.base.arrays import pack, unpack
 from service.base.faults import ConflictError, NotFoundError
+from service.store import keys
+from service.store.columns import now
 from service.store.database import Database
 from service.store.rows import Change
 from service.store.surfaces import NewSurface
-from service.store.tables import HeliostatRow, ImageRow, MeasurementRow, TargetRow
+from service.store.tables import HeliostatRow, ImageRow, KeyRow, MeasurementRow, SurfaceRow, TargetRow
 from tests.service.conftest import ORIGIN
 
 PLANE = TargetPlane("lower", np.zeros(3), np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), 8.6, 7.2)
@@ -306,3 +311,73 @@ def test_many_writers_of_surfaces_make_consecutive_versions(database: Database):
 
     with ThreadPoolExecutor(4) as pool:
         assert sorted(pool.map(write, range(8))) == list(range(1, 9))
+
+
+def test_many_creators_of_a_key_make_one(database: Database):
+    def write(_: int) -> str:
+        try:
+            with database.writing() as session:
+                return keys.create(session, "plant", "read", "tester")
+        except ConflictError as error:
+            return str(error)
+
+    with ThreadPoolExecutor(8) as pool:
+        answers = list(pool.map(write, range(8)))
+    made = [answer for answer in answers if answer.startswith("htw_")]
+    assert len(made) == 1
+    assert all("choose another name" in answer for answer in answers if answer not in made)
+    with database.reading() as session:
+        found = keys.find(session, made[0])
+        assert found is not None
+        assert found.name == "plant"
+
+
+def test_what_another_writer_undoes_is_free_again(database: Database):
+    """The second of two writers waits for the first; where that one fails, the second is the one that wrote."""
+    waiting, failing = threading.Event(), RuntimeError("on purpose")
+
+    def fail() -> None:
+        with database.writing() as session:
+            store.put_heliostat(session, "AA39", {"a": 1}, (1, 2, 3))
+            waiting.set()
+            time.sleep(0.3)
+            raise failing
+
+    with ThreadPoolExecutor(1) as pool:
+        first = pool.submit(fail)
+        waiting.wait(10)
+        with database.writing() as session:
+            row, change = store.put_heliostat(session, "AA39", {"a": 2}, (1, 2, 3))
+        assert first.exception() is failing
+    assert (change, row.properties) == (Change.NEW, {"a": 2})
+
+
+def test_inserted_row_has_what_the_database_made(database: Database):
+    with database.writing() as session:
+        row = KeyRow(name="a", prefix="b", sha256="c", role="read")
+        assert store.insert(session, row)
+    assert row.id >= 1
+    assert row.withdrawn_at is None
+    assert row.created_at.tzinfo is UTC
+    with database.writing() as session:
+        kept = session.merge(row, load=False)
+        kept.role = "ingest"  # it is the session's: a change of it is written
+    with database.writing() as session:
+        again = KeyRow(name="a", prefix="d", sha256="e", role="read")
+        assert not store.insert(session, again)
+        assert session.get_one(KeyRow, row.id).role == "ingest"
+
+
+def test_what_a_check_forbids_is_no_other_writers_fault(database: Database):
+    """It was told as too many writers, or not at all, while every broken constraint counted as a lost race."""
+    with database.writing() as session:
+        heliostat, target = setup(session)
+    with pytest.raises(IntegrityError, match="ck_measurements_kind"), database.writing() as session:
+        store.add_measurement(session, heliostat, new(target, kind="photo"))
+    with pytest.raises(IntegrityError, match="ck_surfaces_source"), database.writing() as session:
+        store.add_surface(session, heliostat, replace(surface(1), source="guess"))
+    nowhere = SurfaceRow(heliostat_id=99, version=1, valid_from=now(), source="network", arrays=b"")
+    with pytest.raises(IntegrityError, match=r"(?i)foreign key"), database.writing() as session:
+        store.insert(session, nowhere)
+    with database.reading() as session:
+        assert store.counts(session)["measurements"] == 0

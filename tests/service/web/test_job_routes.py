@@ -315,6 +315,8 @@ def test_silent_stream_is_kept_open_by_comments(server: str, monkeypatch: pytest
     job = httpx.post(f"{server}/v1/jobs/squares", json={"steps": 1, "pause_s": 2.0}).json()
     text = httpx.get(f"{server}/v1/jobs/{job['id']}/events", timeout=30).text
     assert "\n: still here\n\n" in text
+    assert text.startswith("retry: 2000\n\n")
+    assert text.endswith("\n\n")
 
 
 def test_open_stream_does_not_keep_the_service_from_stopping(app: FastAPI, server: str):

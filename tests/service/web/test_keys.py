@@ -373,7 +373,7 @@ def test_documentation_asks_nobody_else(bare: TestClient):
         assert answer.status_code == 200
         assert answer.headers["Content-Type"].startswith(kind)
     assert "validatorUrl: null" in bare.get("/docs/start.js").text
-    assert bare.get("/docs/other.js").status_code == 422
+    assert bare.get("/docs/other.js").status_code == 404
 
 
 # --- the audit trail --------------------------------------------------------------------------------------------------
@@ -443,7 +443,14 @@ def test_keys_by_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert heliotwin("keys", "withdraw", "plant") == 1
     assert capsys.readouterr().err.count("\n") == 1
     assert heliotwin("keys", "create", "a b", "--role", "read") == 2
+    capsys.readouterr()
     assert heliotwin("keys", "create", "x", "--role", "root") == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "--role must be" in said
+    assert all(f"'{role}'" in said for role in ROLES)
+    assert heliotwin("keys", "create", "x") == 2
+    assert capsys.readouterr().err.count("\n") == 1
     assert heliotwin("worker", "--count", "0") == 2
 
 

@@ -97,13 +97,29 @@ def test_image_comes_back_byte_for_byte(client: TestClient, post: Post):
     assert answer.headers["X-Content-Type-Options"] == "nosniff"
 
 
+def test_image_that_the_client_holds_is_not_sent_again(client: TestClient, post: Post):
+    body = post(png(5)).json()
+    path = f"{BASE}/{body['id']}/image"
+    etag = client.get(path).headers["ETag"]
+    for tags in (etag, f"W/{etag}", f'"other", {etag}', "*"):
+        answer = client.get(path, headers={"If-None-Match": tags})
+        assert (answer.status_code, answer.content) == (304, b"")
+        assert answer.headers["ETag"] == etag
+        assert "no-cache" in answer.headers["Cache-Control"]
+    answer = client.get(path, headers={"If-None-Match": f'"{"0" * 64}"', "Range": "bytes=0-9"})
+    assert (answer.status_code, answer.content) == (200, png(5))
+    assert client.get(f"{BASE}/nothing/image", headers={"If-None-Match": "*"}).status_code == 404
+
+
 def test_damaged_image_file_is_no_answer(client: TestClient, post: Post, settings: Settings):
     body = post(png(5)).json()
     sha256 = body["image_sha256"]
     (settings.data_dir / "images" / sha256[:2] / sha256[2:]).write_bytes(b"rotten")
-    answer = client.get(f"{BASE}/{body['id']}/image")
+    answer = client.get(f"{BASE}/{body['id']}/image", headers={"If-None-Match": '"other"'})
     assert answer.status_code == 500
     assert str(settings.data_dir) not in answer.text
+    assert answer.headers["Content-Type"] == "application/problem+json"
+    assert b"rotten" not in answer.content
     assert post(png(5)).status_code == 200  # the caller's copy mends it
     assert client.get(f"{BASE}/{body['id']}/image").content == png(5)
 
