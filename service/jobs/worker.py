@@ -181,7 +181,9 @@ class Worker:
         return _Ending("retried", lambda session: queue.retry(session, lease, reason, delay))
 
     def _store(self, context: Context, write: Callable[[Session], None]) -> None:
-        """Write how the job ended; while the database is away, again and again until the lease is lost."""
+        """Write how the job ended; while that cannot be, again and again, with pauses, until the lease is lost."""
+        reason = "its result cannot be stored; the worker's log has more"
+        failed = partial(queue.fail, lease=context.lease, reason=reason)
         while True:
             try:
                 with self.runtime.database.writing() as session:
@@ -189,12 +191,13 @@ class Worker:
                 return
             except OperationalError as error:
                 logger.error("%s: the end of job %d is not stored yet: %s", self.name, context.lease.job_id, error)
-                if self.stopping.wait(self.runtime.settings.job_poll_s):
-                    return  # the lease runs out, and another worker does it again
             except (StatementError, ValueError):  # a result that the database does not take
                 logger.exception("%s: the end of job %d cannot be stored", self.name, context.lease.job_id)
-                reason = "its result cannot be stored; the worker's log has more"
-                write = partial(queue.fail, lease=context.lease, reason=reason)
+                if write is not failed:
+                    write = failed
+                    continue
+            if context.lost.is_set() or self.stopping.wait(self.runtime.settings.job_poll_s):
+                return  # the lease runs out, and another worker does it again
 
 
 class Workers:

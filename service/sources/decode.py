@@ -20,6 +20,9 @@ _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _PNG_NEEDED = {b"IHDR", b"PLTE", b"IDAT", b"IEND"}
 # Start-of-frame markers of JPEG: C0 to CF without DHT (C4), JPG (C8) and DAC (CC).
 _JPEG_FRAMES = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+# Markers without a length: TEM and the restarts; SOI and EOI have no business before the scan.
+_JPEG_BARE = {0x01, *range(0xD0, 0xD8)}
+_JPEG_SCAN = 0xDA
 # Sizes [bytes] of TIFF's field types BYTE, SHORT and LONG, the only ones of the fields read here.
 _TIFF_TYPES = {1: ("B", 1), 3: ("H", 2), 4: ("I", 4)}
 _TIFF_WIDTH, _TIFF_HEIGHT, _TIFF_SAMPLES, _TIFF_BITS = 256, 257, 277, 258
@@ -116,16 +119,28 @@ def _read_png(data: bytes) -> tuple[bytes, tuple[int, int]]:
 def _read_jpeg(data: bytes) -> tuple[bytes, tuple[int, int]]:
     if not data.rstrip(b"\x00").endswith(b"\xff\xd9"):
         raise _trailing() if b"\xff\xd9" in data[-(1 << 16) :] else _truncated()
-    position = 2
+    position, size = 2, None
     while position + 9 <= len(data) and data[position] == 0xFF:
         marker = data[position + 1]
         if marker == 0xFF:  # a fill byte
             position += 1
-        elif marker in _JPEG_FRAMES:
+            continue
+        if marker in _JPEG_BARE:
+            position += 2
+            continue
+        if marker in _JPEG_FRAMES:
+            # Two sizes, of which the decoder takes the one that was not looked at, are a trap.
+            if size is not None:
+                raise InvalidInputError("image: a JPEG of more than one frame is not supported; send a photograph")
             height, width = struct.unpack_from(">HH", data, position + 5)
-            return data, (width, height)
-        else:
-            position += 2 + struct.unpack_from(">H", data, position + 2)[0]
+            size = (width, height)
+        if marker in (0xD8, 0xD9):
+            raise _truncated()
+        if marker == _JPEG_SCAN:
+            if size is None:
+                raise _truncated()
+            return data, size
+        position += 2 + max(2, struct.unpack_from(">H", data, position + 2)[0])
     raise _truncated()
 
 

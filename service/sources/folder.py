@@ -149,20 +149,28 @@ def read_folder(root: Path, heliostats: list[str] | None = None) -> MeasurementF
     found: dict[str, Heliostat] = {}
     skipped: dict[str, str] = {}
     properties: dict[str, Any] = {}
-    for path in sorted(root.glob("*/Properties/*heliostat-properties.json")):
-        name = path.parent.parent.name
-        if heliostats is None or name in heliostats:
-            try:
-                document = read_json(path)
-                found[name], properties[name] = read_heliostat(name, document, origin), document
-            except InvalidInputError as error:
-                skipped[name] = str(error)
+    for folder in sorted(root.glob("*/Properties")):
+        name, files = folder.parent.name, sorted(folder.glob("*heliostat-properties.json"))
+        if not files or (heliostats is not None and name not in heliostats):
+            continue
+        try:
+            if len(files) > 1:
+                names = ", ".join(file.name for file in files)
+                raise InvalidInputError(f"{folder}: more than one file of properties ({names}); leave the right one")
+            document = read_json(files[0])
+            found[name], properties[name] = read_heliostat(name, document, origin), document
+        except InvalidInputError as error:
+            skipped[name] = str(error)
     if not found:
         raise InvalidInputError(f"{root}: no heliostat with a readable 'Properties/*heliostat-properties.json'")
-    plant = Plant(
-        towers[0].name.removesuffix("-tower-measurements.json"), origin, targets, found, read_receivers(tower)
-    )
+    plant = Plant(_plant_name(tower, towers[0]), origin, targets, found, read_receivers(tower))
     return MeasurementFolder(root, plant, *read_declared(root / "twin.json"), skipped, properties)
+
+
+def _plant_name(tower: Any, file: Path) -> str:
+    """PAINT's ID of the plant; older files have none, and bear the name themselves."""
+    name = tower["power_plant_properties"].get("ID")
+    return name if isinstance(name, str) and name else file.name.removesuffix("-tower-measurements.json")
 
 
 def read_declared(path: Path) -> tuple[Optics, tuple[Effect, ...]]:

@@ -86,6 +86,8 @@ def _measured(heliostat: Heliostat, measured: tuple[Any, int]) -> store.NewSurfa
 
 def _put_image(runtime: Runtime, folder: MeasurementFolder, measurement: Measurement, kind: ImageKind) -> str:
     photograph = measurement.photograph(kind, folder.plant)
-    row, is_new = ingest(runtime, measurement.heliostat, photograph, measurement.images[kind].read_bytes())
+    row, is_new = ingest(
+        runtime, measurement.heliostat, photograph, measurement.images[kind].read_bytes(), is_live=False
+    )
     state = "new" if is_new else "unchanged"
     return f"images {state}" if row.accepted else f"images {state}, refused"

@@ -42,10 +42,13 @@ class _Known:
     measurement: MeasurementRow | None
 
 
-def ingest(runtime: Runtime, heliostat: str, photograph: Photograph, data: bytes) -> tuple[MeasurementRow, bool]:
+def ingest(
+    runtime: Runtime, heliostat: str, photograph: Photograph, data: bytes, is_live: bool = True
+) -> tuple[MeasurementRow, bool]:
     """Measure and keep a photograph; the second value is False where it was there already.
 
-    An image that cannot be measured is kept too, not accepted, with its reason.
+    An image that cannot be measured is kept too, not accepted, with its reason. One that is not ``is_live``, out of an
+    archive, says nothing of today's twin, and is not held against it.
 
     Raises
     ------
@@ -65,7 +68,7 @@ def ingest(runtime: Runtime, heliostat: str, photograph: Photograph, data: bytes
         return known.measurement, False
     pixels, measured = _measure(runtime, photograph, data, known.plane)
     row = _row(photograph, measured, known.target_id)
-    judged = _judge(runtime, known, row)
+    judged = _judge(runtime, known, row) if is_live else None
     height, width = pixels.shape[:2]
     image = ImageRow(sha256=runtime.images.put(data), media_type=kind_of_file, size_bytes=len(data))
     image.width_px, image.height_px = width, height

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -343,6 +344,27 @@ def away_twice(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
         return real(*arguments)
 
     monkeypatch.setattr(queue, name, fails_twice)
+
+
+def test_an_end_that_cannot_be_stored_at_all_is_tried_with_pauses_until_the_worker_stops(
+    runtime: Runtime, monkeypatch: pytest.MonkeyPatch
+):
+    tries = itertools.count()
+
+    def never(*_: Any, **__: Any) -> None:
+        next(tries)
+        raise ValueError("no")
+
+    monkeypatch.setattr(queue, "finish", never)
+    monkeypatch.setattr(queue, "fail", never)
+    number = ask(runtime, value=6)
+    started = time.monotonic()
+    with working(runtime):
+        until(lambda: look(runtime, number).state == "running")
+        time.sleep(0.3)
+    assert time.monotonic() - started < 10
+    assert 2 <= next(tries) < 2 + 2 * 10 / runtime.settings.job_poll_s
+    assert look(runtime, number).state == "running"  # its lease will run out
 
 
 def test_worker_outlives_a_database_that_is_away(runtime: Runtime, monkeypatch: pytest.MonkeyPatch):

@@ -1,4 +1,6 @@
 import struct
+import subprocess
+import sys
 import zlib
 
 import cv2
@@ -119,3 +121,50 @@ def test_random_bytes_behind_a_signature_never_crash():
         for _ in range(40):
             with pytest.raises(InvalidInputError):
                 decode_image(start + rng.bytes(int(rng.integers(0, 300))))
+
+
+def jpeg_with_a_trap(picture, marker):
+    """A bare marker before an APP1 that holds a small frame header just where that marker's "length" would lead.
+
+    The real frame, which the decoder meets, is huge.
+    """
+    data = encoded(picture, ".jpg")
+    frame = next(i for i in range(len(data)) if data[i : i + 2] == b"\xff\xc0")
+    huge = data[:frame] + data[frame : frame + 5] + struct.pack(">HH", 32000, 32000) + data[frame + 9 :]
+    hidden = bytearray(b"\xff\xe1" + struct.pack(">H", 65533) + bytes(65531))
+    landing = 0xFFE1  # read from the APP1's own marker, counted from there
+    hidden[landing : landing + 19] = data[frame : frame + 19]
+    return huge[:2] + bytes((0xFF, marker)) + bytes(hidden) + huge[2:]
+
+
+@pytest.mark.parametrize("marker", [0x01, 0xD0, 0xD7])
+def test_a_bare_marker_does_not_hide_the_real_size(picture, marker):
+    with pytest.raises(InvalidInputError, match="32000 x 32000 pixels"):
+        decode_image(jpeg_with_a_trap(picture, marker))
+
+
+def test_a_second_frame_is_refused(picture):
+    data = encoded(picture, ".jpg")
+    frame = next(i for i in range(len(data)) if data[i : i + 2] == b"\xff\xc0")
+    length = struct.unpack_from(">H", data, frame + 2)[0]
+    with pytest.raises(InvalidInputError, match="more than one frame"):
+        decode_image(data[:frame] + data[frame : frame + 2 + length] + data[frame:])
+
+
+def test_bare_markers_do_no_harm(picture):
+    data = encoded(picture, ".jpg")
+    np.testing.assert_array_equal(decode_image(data[:2] + b"\xff\x01" + data[2:]), decode_image(data))
+
+
+def test_the_decoder_has_a_limit_of_its_own():
+    """Behind the checks: OpenCV itself refuses, whoever calls it in a process of the service."""
+    code = (
+        "import service, cv2, numpy as np, sys\n"
+        "data = sys.stdin.buffer.read()\n"
+        "try:\n    cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)\n"
+        "except cv2.error as error:\n    print('refused' if 'pixels' in str(error).lower() else error)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], input=png_claiming(20000, 20000), capture_output=True, check=True
+    )
+    assert done.stdout.strip() == b"refused"

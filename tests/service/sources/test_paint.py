@@ -1,5 +1,6 @@
 import json
 from datetime import UTC, datetime
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -13,6 +14,7 @@ from model.surface import control_points, evaluate
 from service.sources.documents import read_heliostat, read_measurement, read_moment, read_targets
 from service.sources.folder import measured_heights, read_declared, read_deflectometry, read_folder
 from tests.conftest import flat_heliostat
+from tests.service.conftest import properties_document, tower_document
 
 
 def test_the_real_plant(stj):
@@ -142,3 +144,17 @@ def test_a_stac_item_tells_when_a_measurement_was_taken(moment):
 def test_a_stac_item_without_a_time_is_named(moment):
     with pytest.raises(InvalidInputError, match="item: 'datetime' must be an ISO 8601 time"):
         read_moment({"properties": {"datetime": moment}}, "item")
+
+
+def test_two_files_of_properties_are_refused_by_name_and_the_plant_has_its_own(tmp_path: Path):
+    """Neither of the two is taken in part, and a file's name is no plant's."""
+    for name in ("AA39", "AB12"):
+        folder = tmp_path / name / "Properties"
+        folder.mkdir(parents=True)
+        (folder / f"{name}-heliostat-properties.json").write_text(json.dumps(properties_document()))
+    (tmp_path / "AB12" / "Properties" / "old-heliostat-properties.json").write_text(json.dumps(properties_document()))
+    (tmp_path / "renamed-tower-measurements.json").write_text(json.dumps(tower_document()))
+    folder = read_folder(tmp_path)
+    assert folder.plant.name == "WRI1030197"
+    assert list(folder.plant.heliostats) == ["AA39"]
+    assert "AB12-heliostat-properties.json, old-heliostat-properties.json" in folder.skipped["AB12"]

@@ -1,10 +1,15 @@
 import json
+from collections import Counter
 from pathlib import Path
+
+from sqlalchemy import select
 
 from model.sunshape import Pillbox
 from service import store
 from service.base.settings import Settings
 from service.sources.folder import read_folder
+from service.store import audit
+from service.store.tables import DriftRow
 from service.twin import versions
 from service.twin.importing import import_folder
 from service.twin.runtime import Runtime
@@ -17,9 +22,15 @@ def test_a_second_import_changes_nothing(stj: Path, tmp_path: Path):
     runtime = Runtime.from_settings(Settings(data_dir=tmp_path))
     try:
         runtime.database.upgrade()
-        first, second = import_folder(runtime, folder), import_folder(runtime, folder)
+        first = import_folder(runtime, folder, actor="cli tester")
+        with runtime.database.reading() as session:
+            entries = audit.entries(session, 100)
+        second = import_folder(runtime, folder)
         with runtime.database.reading() as session:
             stored = store.counts(session)
+            assert len(audit.entries(session, 100)) == len(entries)
+            # Photographs of an archive say nothing of today's twin.
+            assert session.scalars(select(DriftRow)).all() == []
     finally:
         runtime.close()
     assert first["counts"]["heliostats new"] == 7
@@ -30,6 +41,9 @@ def test_a_second_import_changes_nothing(stj: Path, tmp_path: Path):
     assert stored["measurements"] == 54
     assert first["skipped"] == second["skipped"]
     assert first["skipped"]["AA39/156500"] == "no image"
+    assert {entry.actor for entry in entries} == {"cli tester"}
+    actions = Counter(entry.action for entry in entries)
+    assert actions == {"plant.set": 1, "heliostat.set": 7, "surface.imported": 3}
 
 
 def test_declared_model_of_a_folder_is_the_store_s(tmp_path: Path):
