@@ -24,6 +24,7 @@ from service.base.arrays import unpack
 from service.base.settings import Settings
 from service.cli.demo_plant import write_plant
 from service.cli.folder import observations_of, surface_errors, write_json
+from service.cli.output import make_table
 from service.drawing.pictures import comparison_picture, surface_picture
 from service.sources.folder import MeasurementFolder, measured_heights, read_folder
 from service.twin import compute
@@ -254,8 +255,6 @@ def _row(result: Result) -> tuple[str, ...]:
 
 
 def _print(console: Console, results: list[Result], out: Path, store: Path) -> None:
-    from service.cli.output import make_table
-
     table = make_table("What the surfaces are worth", *COLUMNS)
     table.caption, table.caption_justify = CAPTION, "left"
     for result in results:

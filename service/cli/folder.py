@@ -11,6 +11,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -119,8 +120,6 @@ def _write_flux(folder: Path, identifier: str, measured: MeasuredFlux) -> None:
 
 def write_gray(path: Path, image: NDArray[Any]) -> None:
     """An 8-bit grey picture, the peak at 255."""
-    import cv2
-
     scaled = np.round(np.asarray(image, dtype=np.float64) / max(float(image.max()), 1e-30) * 255).astype(np.uint8)
     if not cv2.imwrite(str(path), scaled):
         raise OSError(f"{path} could not be written")

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 import torch
@@ -24,11 +23,12 @@ from model.study import study as study_photographs
 from model.surface import COLUMNS, DEGREE, FACETS, ROWS, control_points
 from model.tracing import Optics
 from model.tracing.convolution import central_rays
+from service.base.choices import Method
 from service.base.progress import Progress, quiet
 from service.sources.juelich import CENTERED_WINDOW, mark_layouts
 
 Array = NDArray[np.float64]
-Method = Literal["network", "refined"]
+
 
 SAMPLES = 64
 """Points along each side of a facet: measured surfaces of 20 x 20 control points converge to 0.2 % (L1)."""
