@@ -3,7 +3,9 @@
 import pytest
 
 from service.base.faults import NotAcceptableError
-from service.web.answers.formats import ARRAYS, JSON, NPZ, NPZ_VENDOR, PNG, choose
+from service.web.answers.formats import ARRAYS, JSON, choose
+from service.web.answers.representations.npz import NPZ, NPZ_VENDOR
+from service.web.answers.representations.png import PNG
 
 
 @pytest.mark.parametrize(
