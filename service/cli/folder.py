@@ -252,8 +252,10 @@ def surface_of(folder: MeasurementFolder, heliostat: Heliostat, surfaces: str) -
     """The surface to trace: None for the ideal one; refused where it is missing."""
     if surfaces == "ideal":
         return None
-    root = folder.root if surfaces == "measured" else Path(surfaces)
-    found = read_surface(root, heliostat)
+    if surfaces == "measured":
+        root, found = folder.root, folder.measured_surface(heliostat.name)
+    else:
+        root, found = Path(surfaces), read_surface(Path(surfaces), heliostat)
     if found is None:
         raise InvalidInputError(f"no surface in {root / heliostat.name / 'Deflectometry'}")
     return found
