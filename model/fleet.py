@@ -14,7 +14,6 @@ Approximation: the cone of the sun is taken at each mirror's centre. A cylinder 
 that touch it.
 """
 
-import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import islice
@@ -30,7 +29,7 @@ from model.effects.blocking import Blocking
 from model.errors import ModelError, UnreachableError
 from model.forecast import Setup, align, altered, optics_under
 from model.neighbours import Neighbours, outlines
-from model.plant import Cylinder, Heliostat, Receiver, TargetPlane
+from model.plant import Heliostat, Receiver, TargetPlane
 from model.sunshape import transfer_table
 from model.tracing import Optics, Scene, Window
 from model.tracing.convolution import superpose as superpose_scene
@@ -52,9 +51,6 @@ Some = TypeVar("Some", bound=_Items)
 
 TILE = 32
 """Heliostats of a tile: some milliseconds' work each, which is much against what handing a tile over costs."""
-
-STEP_DEG = 8.0
-"""Most [deg] between the planes that stand for a cylinder: they leave it by no more than 1 % of the radius."""
 
 # Pixels of maps that are traced at a time: so few that the processor's cache holds them.
 _PIXELS = 2**18
@@ -125,7 +121,7 @@ class Superposition:
 
     Attributes
     ----------
-    receiver : TargetPlane or Cylinder
+    receiver : Receiver
     resolution : (rows, columns)
     optics : Optics
     effects : tuple of Effect
@@ -174,10 +170,10 @@ class Superposition:
         for start in range(0, scene.batch, step):
             rows = list(range(start, min(start + step, scene.batch)))
             part = scene.subset(rows), aims[rows], optics, table
-            if isinstance(self.receiver, Cylinder):
-                image, power = self._on_cylinder(self.receiver, *part)
-            else:
+            if isinstance(self.receiver, TargetPlane):
                 image, power = self._on_plane(self.receiver, self.resolution[1], *part)
+            else:
+                image, power = self._on_patches(*part)
             yield image, float(power.sum())
 
     def _on_plane(
@@ -195,19 +191,18 @@ class Superposition:
         window = Window.of(plane, self.resolution[0], columns)
         return superpose_scene(scene, window, optics, samples=self.samples, padding=padding, table=table)
 
-    def _on_cylinder(
-        self, cylinder: Cylinder, scene: Scene, aims: Array, optics: Optics, table: Tensor
-    ) -> tuple[Tensor, Tensor]:
+    def _on_patches(self, scene: Scene, aims: Array, optics: Optics, table: Tensor) -> tuple[Tensor, Tensor]:
         """Unrolled map (rows, columns) [W/m2] and power (B,) [W], plane by plane."""
         image, power = torch.zeros(self.resolution), torch.zeros(scene.batch)
         directions, seen = _beams(scene, aims)[0], np.zeros(scene.batch, dtype=bool)
-        for columns, shares, plane in tangents(cylinder, self.resolution[1]):
+        for patch in self.receiver.patches(self.resolution[1]):
+            plane, shares = patch.plane, torch.as_tensor(patch.shares, dtype=torch.float32)
             before = (scene.center.double().numpy() - plane.center) @ plane.normal > 0
             lighting = np.flatnonzero(before & (directions @ plane.normal < -_GRAZING)).tolist()
             if lighting:
                 lit = scene.subset(lighting), aims[lighting], optics, table
                 part, thrown = self._on_plane(plane, len(shares), *lit)
-                image[:, columns] += part * shares
+                image[:, patch.columns] += part * shares
                 power[lighting] = torch.maximum(power[lighting], thrown)
                 seen[lighting] = True
         if not seen.all():
@@ -222,26 +217,6 @@ def _beams(scene: Scene, aims: Array) -> tuple[Array, Array]:
     outgoing = aims - scene.center.double().numpy()
     ranges = np.linalg.norm(outgoing, axis=1)
     return outgoing / ranges[:, None], ranges
-
-
-def tangents(cylinder: Cylinder, columns: int) -> Iterator[tuple[slice, Tensor, TargetPlane]]:
-    """Planes that touch a cylinder, each with the columns of the map about it and its share (n,) in them.
-
-    Between the lines where two planes touch, their light is blended in proportion: the cosine of incidence goes from
-    column to column as it does on the cylinder.
-    """
-    step = np.radians(cylinder.opening_deg) / columns
-    count = min(columns, math.ceil(cylinder.opening_deg / STEP_DEG))
-    edges = np.linspace(0, columns, count + 1).round().astype(int)
-    # A cosine that is drawn by straight lines falls short by this on average.
-    blended = np.sinc(cylinder.opening_deg / count / 360) ** 2
-    for index, edge in enumerate(edges):
-        first, last = edges[max(index - 1, 0)], edges[min(index + 1, count)]
-        middles = np.arange(first, last) + 0.5
-        shares = np.interp(middles, edges, np.eye(count + 1)[index])
-        left, right = (edge - first) * step * cylinder.radius, (last - edge) * step * cylinder.radius
-        plane = cylinder.tangent((edge - columns / 2) * step, left, right)
-        yield slice(first, last), torch.as_tensor(shares / blended, dtype=torch.float32), plane
 
 
 def in_parts(work: Callable[[Some], Made], items: Some) -> Iterator[tuple[Some, Made | ModelError]]:

@@ -3,7 +3,10 @@
 Plain frozen data in numpy; the tracers turn it into batched tensors (`model.tracing.scene`).
 """
 
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,6 +16,9 @@ from model.frames import enu_to_wgs84, wgs84_to_enu
 from model.mount import Mount
 
 Vector = NDArray[np.float64]
+
+STEP_DEG = 8.0
+"""Most [deg] between the planes that stand for a cylinder: they leave it by no more than 1 % of the radius."""
 
 
 def _vector(name: str, value: ArrayLike) -> Vector:
@@ -188,6 +194,20 @@ class TargetPlane:
         """Rows right, up, normal (3, 3)."""
         return np.stack([self.right, self.up, self.normal])
 
+    @property
+    def middle(self) -> "TargetPlane":
+        """Itself."""
+        return self
+
+    @property
+    def shape(self) -> dict[str, float]:
+        """Nothing beside its rectangle."""
+        return {}
+
+    def patches(self, columns: int) -> "Iterator[Patch]":
+        """Itself, all over."""
+        yield Patch(slice(0, columns), np.ones(columns), self)
+
     def to_plane(self, points: ArrayLike) -> NDArray[np.float64]:
         """Coordinates (..., 2) [m] right and up of the centre, of ENU points (..., 3)."""
         return np.asarray((np.asarray(points, dtype=np.float64) - self.center) @ self.axes[:2].T)
@@ -199,6 +219,63 @@ class TargetPlane:
     def holds(self, point: ArrayLike) -> bool:
         """Whether a point (3,) [m] of the plane lies within the rectangle."""
         return bool((np.abs(self.to_plane(point)) <= np.array([self.width, self.height]) / 2).all())
+
+
+@dataclass(frozen=True, eq=False)
+class Patch:
+    """A plane that stands for a part of a receiver's surface.
+
+    Attributes
+    ----------
+    columns : slice
+        Of the receiver's map, about the plane.
+    shares : (n,)
+        How much of the light on the plane counts in each of those columns.
+    plane : TargetPlane
+    """
+
+    columns: slice
+    shares: Vector
+    plane: TargetPlane
+
+
+class Receiver(Protocol):
+    """What a field's light falls on, and all that is asked of its shape; its map is the lit surface unrolled."""
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+
+    @property
+    def center(self) -> Vector:
+        """The middle of the lit surface (3,) [m], in ENU, where mirrors aim unless they are told otherwise."""
+
+    @property
+    def normal(self) -> Vector:
+        """Unit normal (3,) there."""
+
+    @property
+    def up(self) -> Vector:
+        """Unit vector (3,) along the map's rows there, upwards."""
+
+    @property
+    def width(self) -> float:
+        """Length of the map [m]."""
+
+    @property
+    def height(self) -> float:
+        """Height of the map [m]."""
+
+    @property
+    def shape(self) -> dict[str, float]:
+        """What describes the surface beside all this, by names that forecasts keep."""
+
+    @property
+    def middle(self) -> TargetPlane:
+        """A plane that touches the surface in its middle."""
+
+    def patches(self, columns: int) -> Iterator[Patch]:
+        """Planes that stand for the surface, whose map has so many columns."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,9 +333,33 @@ class Cylinder:
         aside = (right - left) / 2 * np.cross(self.up, normal)
         return TargetPlane(self.name, touched + aside, normal, self.up, left + right, self.height)
 
+    @property
+    def shape(self) -> dict[str, float]:
+        """Radius [m] and opening [deg]."""
+        return {"radius": self.radius, "opening_deg": self.opening_deg}
 
-Receiver = TargetPlane | Cylinder
-"""What a field's light falls on."""
+    @property
+    def middle(self) -> TargetPlane:
+        """The plane that touches it in its middle, as wide as the cylinder."""
+        return self.tangent(0.0, self.radius, self.radius)
+
+    def patches(self, columns: int) -> Iterator[Patch]:
+        """Planes that touch it, every few degrees.
+
+        Between the lines where two planes touch, their light is blended in proportion: the cosine of incidence goes
+        from column to column as it does on the cylinder.
+        """
+        step = np.radians(self.opening_deg) / columns
+        count = min(columns, math.ceil(self.opening_deg / STEP_DEG))
+        edges = np.linspace(0, columns, count + 1).round().astype(int)
+        # A cosine that is drawn by straight lines falls short by this on average.
+        blended = np.sinc(self.opening_deg / count / 360) ** 2
+        for index, edge in enumerate(edges):
+            first, last = edges[max(index - 1, 0)], edges[min(index + 1, count)]
+            shares = np.interp(np.arange(first, last) + 0.5, edges, np.eye(count + 1)[index])
+            left, right = (edge - first) * step * self.radius, (last - edge) * step * self.radius
+            plane = self.tangent((edge - columns / 2) * step, left, right)
+            yield Patch(slice(first, last), shares / blended, plane)
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,9 +3,10 @@
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from model.network.architecture import NetworkConfig
-from model.network.paper import PaperConfig
+from model.network.catalogue import NETWORKS, sizes_of
 from training.render import Camera, Situations
 from training.surfaces import Augmentation
 
@@ -14,7 +15,8 @@ from training.surfaces import Augmentation
 class TrainConfig:
     """Everything that decides a run; stored beside its result.
 
-    ``paper`` takes the place of ``network`` where it is given; ``looks`` is how often the network sees its own guess.
+    ``architecture`` is a name of `model.network.catalogue`, and ``network`` has its sizes. ``looks`` is how often the
+    network sees its own guess.
     ``fold`` counts which ``held_out`` heliostats are kept back; ``batch`` is shared among processes.
     """
 
@@ -32,24 +34,26 @@ class TrainConfig:
     ema: float = 0.999
     bfloat16: bool = True
     looks: int = 2
-    network: NetworkConfig = field(default_factory=NetworkConfig)
-    paper: PaperConfig | None = None
+    architecture: str = "ours"
+    network: Any = field(default_factory=NetworkConfig)
     augmentation: Augmentation = field(default_factory=Augmentation)
     situations: Situations = field(default_factory=Situations)
     camera: Camera = field(default_factory=Camera)
 
     @classmethod
     def read(cls, path: Path) -> "TrainConfig":
-        """A config from JSON; keys that are left out keep their defaults."""
+        """A config from JSON; keys that are left out keep their defaults.
+
+        Another network may be named by its sizes alone, as in ``{"paper": {}}``.
+        """
         values = json.loads(path.read_text(encoding="utf-8"))
-        parts = {
-            "network": NetworkConfig,
-            "paper": PaperConfig,
-            "augmentation": Augmentation,
-            "situations": Situations,
-            "camera": Camera,
-        }
-        for name, part in parts.items():
+        for name in NETWORKS:
+            sizes = values.pop(name, None)
+            if sizes is not None:
+                values |= {"architecture": name, "network": sizes}
+        if "network" in values:
+            values["network"] = sizes_of(values.get("architecture", cls.architecture), values["network"])
+        for name, part in {"augmentation": Augmentation, "situations": Situations, "camera": Camera}.items():
             if values.get(name) is not None:
                 values[name] = part(**{k: tuple(v) if isinstance(v, list) else v for k, v in values[name].items()})
         return cls(**values)

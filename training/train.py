@@ -20,8 +20,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from model.network.architecture import MAX_IMAGES, SurfaceNetwork
-from model.network.paper import PaperNetwork
+from model.network.architecture import MAX_IMAGES
+from model.network.catalogue import build
 from training import parallel
 from training.config import TrainConfig
 from training.prior import estimate
@@ -57,7 +57,7 @@ class Run:
             torch.as_tensor(values, dtype=torch.float32, device=device) for values in (prior.mean, prior.basis)
         )
         torch.manual_seed(config.seed)
-        network = SurfaceNetwork(config.network) if config.paper is None else PaperNetwork(config.paper)
+        network = build(config.architecture, config.network)
         self.network = network.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.average = copy.deepcopy(self.network).requires_grad_(False)
         self.optimizer = torch.optim.AdamW(

@@ -34,7 +34,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from model.effects.base import Effect, Stage, parameter
+from model.effects.base import Effect, Factor, Stage, parameter
 from model.mount import Mount, rotation
 
 
@@ -44,6 +44,7 @@ class AxisTilt(Effect):
 
     name: ClassVar[str] = "axis_tilt"
     stage: ClassVar[Stage] = "geometry"
+    scales_with: ClassVar[frozenset[Factor]] = frozenset({"roll"})
 
     north_deg: float = parameter(0.0, -3.0, 3.0, "deg")
     up_deg: float = parameter(0.0, -3.0, 3.0, "deg")

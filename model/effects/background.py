@@ -34,7 +34,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from model.effects.base import Effect, Scalar, Stage, parameter
+from model.effects.base import Effect, Factor, Scalar, Stage, parameter
 from model.tracing.scene import Window
 
 
@@ -47,6 +47,7 @@ class Background(Effect):
 
     name: ClassVar[str] = "background"
     stage: ClassVar[Stage] = "image"
+    scales_with: ClassVar[frozenset[Factor]] = frozenset({"weather", "camera"})
 
     level: Scalar = parameter(0.0, -0.2, 0.5, "1", "camera")
     gradient_x: Scalar = parameter(0.0, -0.3, 0.3, "1", "camera")

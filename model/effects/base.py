@@ -28,6 +28,8 @@ ByHeliostat = Mapping[str, Any]
 
 Scope = Literal["set", "camera", "heliostat", "facet"]
 Stage = Literal["geometry", "optics", "image"]
+Factor = Literal["distance", "heliostat", "elevation", "side", "roll", "weather", "camera"]
+"""What may vary between photographs; `model.study.advice` says which photographs vary it."""
 
 JUELICH_LATITUDE = 50.913
 """Latitude [deg] of the Solar Tower Juelich."""
@@ -89,6 +91,8 @@ class Effect:
         As in DESIGN.md, section 5.
     stage : {"geometry", "optics", "image"}
         What must be done anew when a parameter changes: the alignment of the mirrors, the tracing, or only the image.
+    scales_with : frozenset of Factor
+        What changes the effect's mark in an image; what is not named leaves it alone.
     guesses : tuple of dict
         Parameters to begin a fit from, where those near neutral lead nowhere one by one.
     prior_std : float
@@ -98,6 +102,7 @@ class Effect:
 
     name: ClassVar[str]
     stage: ClassVar[Stage]
+    scales_with: ClassVar[frozenset[Factor]]
     guesses: ClassVar[tuple[dict[str, float], ...]] = ()
     prior_std: ClassVar[float] = 1.0
 

@@ -32,7 +32,7 @@ from typing import ClassVar
 
 import torch
 
-from model.effects.base import ByHeliostat, Effect, Stage, parameter, stacked
+from model.effects.base import ByHeliostat, Effect, Factor, Stage, parameter, stacked
 from model.plant import Heliostat
 from model.tracing.scene import Scene
 
@@ -43,6 +43,7 @@ class Blocking(Effect):
 
     name: ClassVar[str] = "blocking"
     stage: ClassVar[Stage] = "geometry"
+    scales_with: ClassVar[frozenset[Factor]] = frozenset({"heliostat", "elevation"})
 
     lower_fraction: ByHeliostat = parameter(0.0, 0.0, 0.6, "1", "heliostat")
 

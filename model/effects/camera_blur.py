@@ -33,7 +33,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from model.effects.base import Effect, Scalar, Stage, parameter
+from model.effects.base import Effect, Factor, Scalar, Stage, parameter
 from model.tracing.scene import Window
 
 
@@ -43,6 +43,7 @@ class CameraBlur(Effect):
 
     name: ClassVar[str] = "camera_blur"
     stage: ClassVar[Stage] = "image"
+    scales_with: ClassVar[frozenset[Factor]] = frozenset({"camera"})
 
     sigma_m: Scalar = parameter(0.0, 0.0, 0.5, "m", "camera")
 

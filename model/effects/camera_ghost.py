@@ -33,7 +33,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import affine_grid, grid_sample
 
-from model.effects.base import Effect, Scalar, Stage, parameter
+from model.effects.base import Effect, Factor, Scalar, Stage, parameter
 from model.tracing.scene import Window
 
 
@@ -43,6 +43,7 @@ class CameraGhost(Effect):
 
     name: ClassVar[str] = "camera_ghost"
     stage: ClassVar[Stage] = "image"
+    scales_with: ClassVar[frozenset[Factor]] = frozenset({"camera"})
     guesses: ClassVar[tuple[dict[str, float], ...]] = tuple(
         {"share": 0.05, "right_m": size * right, "up_m": size * up}
         for size in (0.4, 0.9)

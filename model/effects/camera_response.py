@@ -38,7 +38,7 @@ from typing import ClassVar
 
 from torch import Tensor
 
-from model.effects.base import Effect, Scalar, Stage, parameter
+from model.effects.base import Effect, Factor, Scalar, Stage, parameter
 from model.tracing.scene import Window
 
 
@@ -48,6 +48,7 @@ class CameraResponse(Effect):
 
     name: ClassVar[str] = "camera_response"
     stage: ClassVar[Stage] = "image"
+    scales_with: ClassVar[frozenset[Factor]] = frozenset({"camera"})
 
     gamma: Scalar = parameter(1.0, 0.3, 3.0, "1", "camera")
     saturation: Scalar = parameter(1.0, 0.3, 1.0, "1", "camera")

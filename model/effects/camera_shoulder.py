@@ -36,7 +36,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from model.effects.base import Effect, Scalar, Stage, parameter
+from model.effects.base import Effect, Factor, Scalar, Stage, parameter
 from model.tracing.scene import Window
 
 LEAST = 1e-3
@@ -49,6 +49,7 @@ class CameraShoulder(Effect):
 
     name: ClassVar[str] = "camera_shoulder"
     stage: ClassVar[Stage] = "image"
+    scales_with: ClassVar[frozenset[Factor]] = frozenset({"camera"})
 
     compression: Scalar = parameter(0.0, 0.0, 5.0, "1", "camera")
 

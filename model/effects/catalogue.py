@@ -1,49 +1,42 @@
 """The catalogue of effects, and effects as JSON: ``{"name": .., "parameters": {..}}`` (DESIGN.md, section 5)."""
 
 from collections.abc import Iterable, Mapping
+from importlib import import_module
 from typing import Any
 
 import numpy as np
 from torch import Tensor
 
-from model.effects.axis_tilt import AxisTilt
-from model.effects.background import Background
 from model.effects.base import Effect, Parameter
-from model.effects.blocking import Blocking
-from model.effects.camera_blur import CameraBlur
-from model.effects.camera_ghost import CameraGhost
-from model.effects.camera_response import CameraResponse
-from model.effects.camera_shoulder import CameraShoulder
-from model.effects.facet_canting import FacetCanting
-from model.effects.gravity_bending import GravityBending
-from model.effects.slope_error import SlopeError
-from model.effects.soiling import Soiling
-from model.effects.sun_position import SunPosition
-from model.effects.sun_shape import SunShapeEffect
-from model.effects.target_registration import TargetRegistration
-from model.effects.tracking_jitter import TrackingJitter
 from model.errors import InvalidInputError
 
-CATALOGUE: dict[str, type[Effect]] = {
-    effect.name: effect
-    for effect in (
-        SunPosition,
-        AxisTilt,
-        FacetCanting,
-        GravityBending,
-        Soiling,
-        Blocking,
-        SunShapeEffect,
-        SlopeError,
-        TrackingJitter,
-        Background,
-        CameraBlur,
-        CameraGhost,
-        CameraResponse,
-        CameraShoulder,
-        TargetRegistration,
-    )
-}
+ORDER = (
+    "sun_position",
+    "axis_tilt",
+    "facet_canting",
+    "gravity_bending",
+    "soiling",
+    "blocking",
+    "sun_shape",
+    "slope_error",
+    "tracking_jitter",
+    "background",
+    "camera_blur",
+    "camera_ghost",
+    "camera_response",
+    "camera_shoulder",
+    "target_registration",
+)
+"""The order in which light meets effects; each is the file of that name in this package."""
+
+
+def _effect_of(name: str) -> type[Effect]:
+    """The class that a file of this package has for its effect."""
+    module = import_module(f"model.effects.{name}").__name__
+    return next(effect for effect in Effect.__subclasses__() if effect.__module__ == module)
+
+
+CATALOGUE: dict[str, type[Effect]] = {name: _effect_of(name) for name in ORDER}
 """Every effect by its name, in the order in which light meets them."""
 
 

@@ -32,7 +32,7 @@ from typing import ClassVar
 
 import torch
 
-from model.effects.base import ByHeliostat, Effect, Stage, parameter, stacked
+from model.effects.base import ByHeliostat, Effect, Factor, Stage, parameter, stacked
 from model.plant import Heliostat
 from model.surface import canted
 from model.tracing.scene import Scene
@@ -44,6 +44,7 @@ class FacetCanting(Effect):
 
     name: ClassVar[str] = "facet_canting"
     stage: ClassVar[Stage] = "geometry"
+    scales_with: ClassVar[frozenset[Factor]] = frozenset({"distance", "heliostat", "roll"})
     prior_std: ClassVar[float] = 0.1  # the mount takes back what a mirror's facets share, and no image shows it
 
     x_mrad: ByHeliostat = parameter(0.0, -5.0, 5.0, "mrad", "facet")

@@ -40,7 +40,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from model.effects.base import Effect, Scalar, Stage, parameter
+from model.effects.base import Effect, Factor, Scalar, Stage, parameter
 from model.plant import Heliostat
 from model.surface import basis, greville
 from model.tracing.scene import Scene
@@ -58,6 +58,7 @@ class GravityBending(Effect):
 
     name: ClassVar[str] = "gravity_bending"
     stage: ClassVar[Stage] = "geometry"
+    scales_with: ClassVar[frozenset[Factor]] = frozenset({"distance", "elevation"})
 
     amplitude_mm: Scalar = parameter(0.0, -8.0, 8.0, "mm")
 

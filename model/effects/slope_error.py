@@ -29,7 +29,7 @@ What it is confused with
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
-from model.effects.base import Effect, Scalar, Stage, parameter, quadrature
+from model.effects.base import Effect, Factor, Scalar, Stage, parameter, quadrature
 from model.tracing.scene import Optics
 
 
@@ -39,6 +39,7 @@ class SlopeError(Effect):
 
     name: ClassVar[str] = "slope_error"
     stage: ClassVar[Stage] = "optics"
+    scales_with: ClassVar[frozenset[Factor]] = frozenset({"distance", "heliostat"})
 
     sigma_mrad: Scalar = parameter(0.0, 0.0, 4.0, "mrad")
 

@@ -30,7 +30,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
-from model.effects.base import ByHeliostat, Effect, Stage, parameter, stacked
+from model.effects.base import ByHeliostat, Effect, Factor, Stage, parameter, stacked
 from model.plant import Heliostat
 from model.tracing.scene import Scene
 
@@ -41,6 +41,7 @@ class Soiling(Effect):
 
     name: ClassVar[str] = "soiling"
     stage: ClassVar[Stage] = "geometry"
+    scales_with: ClassVar[frozenset[Factor]] = frozenset({"heliostat"})
 
     reflectivity_ratio: ByHeliostat = parameter(1.0, 0.0, 1.0, "1", "facet")
 

@@ -31,7 +31,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from model.effects.base import Array, Effect, Stage, parameter
+from model.effects.base import Array, Effect, Factor, Stage, parameter
 from model.mount import rotation
 
 DEGREES_PER_MINUTE = 0.25
@@ -43,6 +43,7 @@ class SunPosition(Effect):
 
     name: ClassVar[str] = "sun_position"
     stage: ClassVar[Stage] = "geometry"
+    scales_with: ClassVar[frozenset[Factor]] = frozenset({"roll", "side"})
 
     minutes: float = parameter(0.0, -90.0, 90.0, "min")
 

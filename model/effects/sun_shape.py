@@ -33,7 +33,7 @@ Neutral where the declared sun is Buie's with 0.02, the default.
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
-from model.effects.base import Effect, Scalar, Stage, parameter
+from model.effects.base import Effect, Factor, Scalar, Stage, parameter
 from model.sunshape import Buie
 from model.tracing.scene import Optics
 
@@ -47,6 +47,7 @@ class SunShapeEffect(Effect):
 
     name: ClassVar[str] = "sun_shape"
     stage: ClassVar[Stage] = "optics"
+    scales_with: ClassVar[frozenset[Factor]] = frozenset({"distance", "weather"})
 
     circumsolar_ratio: Scalar = parameter(0.02, 0.0, 0.5, "1")
 

@@ -36,7 +36,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import affine_grid, grid_sample
 
-from model.effects.base import Effect, Scalar, Stage, parameter
+from model.effects.base import Effect, Factor, Scalar, Stage, parameter
 from model.tracing.scene import Window
 
 
@@ -50,6 +50,7 @@ class TargetRegistration(Effect):
 
     name: ClassVar[str] = "target_registration"
     stage: ClassVar[Stage] = "image"
+    scales_with: ClassVar[frozenset[Factor]] = frozenset({"camera"})
 
     scale_x: Scalar = parameter(1.0, 0.8, 1.25, "1", "camera")
     scale_y: Scalar = parameter(1.0, 0.8, 1.25, "1", "camera")

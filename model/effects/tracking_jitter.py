@@ -30,7 +30,7 @@ What it is confused with
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
-from model.effects.base import Effect, Scalar, Stage, parameter, quadrature
+from model.effects.base import Effect, Factor, Scalar, Stage, parameter, quadrature
 from model.tracing.scene import Optics
 
 
@@ -40,6 +40,7 @@ class TrackingJitter(Effect):
 
     name: ClassVar[str] = "tracking_jitter"
     stage: ClassVar[Stage] = "optics"
+    scales_with: ClassVar[frozenset[Factor]] = frozenset({"distance", "roll", "weather"})
 
     sigma_mrad: Scalar = parameter(0.0, 0.0, 4.0, "mrad")
 

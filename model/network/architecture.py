@@ -257,3 +257,6 @@ class SurfaceNetwork(nn.Module):
         heights = heights + self.bypass(torch.cat([pooled, step], dim=1)).view_as(heights)  # (B, 4, 8, 8)
         heights = heights - heights.mean(dim=(2, 3), keepdim=True)
         return guess + self.scale * heights, self.scale * torch.exp(log_spread.clamp(-6, 2))
+
+
+SIZES, NETWORK = NetworkConfig, SurfaceNetwork

@@ -66,3 +66,6 @@ class PaperNetwork(nn.Module):
         heights, log_spread = self.decoder(styles)
         heights = heights - heights.mean(dim=(2, 3), keepdim=True)
         return guess + self.scale * heights, self.scale * torch.exp(log_spread.clamp(-6, 2))
+
+
+SIZES, NETWORK = PaperConfig, PaperNetwork

@@ -1,9 +1,12 @@
 """Which photographs tell effects apart that a study could not: those under which one changes and the other does not.
 
-Drawn from what each effect scales with, which its own file says at length.
+Drawn from what each effect scales with, which its class names and its file says at length.
 """
 
-PHOTOGRAPHS = {
+from model.effects.base import Factor
+from model.effects.catalogue import CATALOGUE
+
+PHOTOGRAPHS: dict[Factor, str] = {
     "distance": "a near and a far heliostat under the same sun",
     "heliostat": "several heliostats within the same hour",
     "elevation": "the same heliostat under a high and a low sun",
@@ -14,26 +17,7 @@ PHOTOGRAPHS = {
 }
 """What varies, and the photographs that vary it; those that tell most come first."""
 
-SCALES_WITH: dict[str, frozenset[str]] = {
-    name: frozenset(factors.split())
-    for name, factors in {
-        "sun_position": "roll side",
-        "axis_tilt": "roll",
-        "facet_canting": "distance heliostat roll",
-        "gravity_bending": "distance elevation",
-        "soiling": "heliostat",
-        "blocking": "heliostat elevation",
-        "sun_shape": "distance weather",
-        "slope_error": "distance heliostat",
-        "tracking_jitter": "distance roll weather",
-        "background": "weather camera",
-        "camera_blur": "camera",
-        "camera_ghost": "camera",
-        "camera_response": "camera",
-        "camera_shoulder": "camera",
-        "target_registration": "camera",
-    }.items()
-}
+SCALES_WITH: dict[str, frozenset[Factor]] = {name: effect.scales_with for name, effect in CATALOGUE.items()}
 """What changes each effect's mark in an image; what is not named leaves it alone."""
 
 SAME_SCALING = "a lamp or an edge of known shape on the target, for both effects are the camera's own"

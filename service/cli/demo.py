@@ -21,6 +21,7 @@ from model.observation import Observation
 from model.plant import Heliostat
 from model.tracing import Optics
 from service.base.arrays import unpack
+from service.base.choices import Method
 from service.base.settings import Settings
 from service.cli.demo_plant import write_plant
 from service.cli.folder import observations_of, surface_errors, write_json
@@ -28,7 +29,6 @@ from service.cli.output import make_table
 from service.drawing.pictures import comparison_picture, surface_picture
 from service.sources.folder import MeasurementFolder, measured_heights, read_folder
 from service.twin import compute
-from service.twin.compute import Method
 from service.twin.evidence import choose
 from service.twin.forecast import ForecastRequest, make_forecast
 from service.twin.importing import import_folder

@@ -23,12 +23,12 @@ from model.network.architecture import MAX_IMAGES
 from model.observation import Observation, SurfacePrediction
 from model.plant import Heliostat, TargetPlane
 from model.surface import split_canting
+from service.base.choices import Method
 from service.base.progress import Progress, quiet
 from service.sources.decode import decode_image
 from service.sources.documents import IMAGE_KINDS, Measurement
 from service.sources.folder import MeasurementFolder, measured_heights, read_surface
 from service.twin import compute
-from service.twin.compute import Method
 from service.twin.evidence import Evidence, choose
 
 Array = NDArray[np.float64]
@@ -251,8 +251,10 @@ def surface_of(folder: MeasurementFolder, heliostat: Heliostat, surfaces: str) -
     """The surface to trace: None for the ideal one; refused where it is missing."""
     if surfaces == "ideal":
         return None
-    root = folder.root if surfaces == "measured" else Path(surfaces)
-    found = read_surface(root, heliostat)
+    if surfaces == "measured":
+        root, found = folder.root, folder.measured_surface(heliostat.name)
+    else:
+        root, found = Path(surfaces), read_surface(Path(surfaces), heliostat)
     if found is None:
         raise InvalidInputError(f"no surface in {root / heliostat.name / 'Deflectometry'}")
     return found

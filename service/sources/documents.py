@@ -18,7 +18,7 @@ from model.frames import sun_direction
 from model.imaging import ImageKind
 from model.mount import LinearActuator, Mount
 from model.plant import Cylinder, Facet, Heliostat, Plant, TargetPlane
-from model.sunshape import Buie, Gaussian, Pillbox, SunShape
+from model.sunshape import SHAPES, SunShape
 from model.tracing import Optics
 from service.sources.photograph import Photograph
 
@@ -276,14 +276,12 @@ def read_moment(item: Any, where: str) -> datetime:
 
 
 def _sun_shape(declared: Any, where: str) -> SunShape:
-    shape = get(declared, where, "shape")
-    if shape == "buie":
-        return Buie(_number(declared, where, "circumsolar_ratio"))
-    if shape == "pillbox":
-        return Pillbox(_number(declared, where, "half_angle_mrad") * 1e-3)
-    if shape == "gaussian":
-        return Gaussian(_number(declared, where, "sigma_mrad") * 1e-3)
-    raise InvalidInputError(f"{where}: 'shape' must be buie, pillbox or gaussian, got {shape!r}")
+    name = get(declared, where, "shape")
+    if not isinstance(name, str) or name not in SHAPES:
+        *names, last = SHAPES
+        raise InvalidInputError(f"{where}: 'shape' must be {', '.join(names)} or {last}, got {name!r}")
+    shape = SHAPES[name]
+    return shape(*(_number(declared, where, key) * unit for key, unit in shape.units.items()))
 
 
 def parse_declared(declared: Any, where: str) -> tuple[Optics, tuple[Effect, ...]]:

@@ -1,10 +1,11 @@
-"""Measurement folders in PAINT's layout: the plant, its heliostats, measurements, measured surfaces, declared model.
+"""Measurement folders: the plant, its heliostats, measurements, measured surfaces, declared model.
 
-Source: the PAINT database of the Solar Tower Juelich, https://paint-database.org; DESIGN.md, section 6.
+Whose folder it is and what its files look like `service.sources.importers` know. See DESIGN.md, section 6.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,30 +17,19 @@ from model.errors import InvalidInputError
 from model.plant import Heliostat, Plant
 from model.surface import control_points, fit_heights, heights
 from model.tracing import Optics
-from service.sources.documents import (
-    IMAGE_KINDS,
-    Array,
-    Measurement,
-    get,
-    parse_declared,
-    read_heliostat,
-    read_json,
-    read_measurement,
-    read_moment,
-    read_receivers,
-    read_targets,
-)
+from service.base.discovery import modules_of
+from service.sources.documents import Array, Measurement, get, parse_declared, read_json
 
 
 @dataclass(frozen=True, eq=False)
-class MeasurementFolder:
-    """A folder in PAINT's layout.
+class MeasurementFolder(ABC):
+    """A folder of measurements, whatever its layout: each importer derives its own.
 
     Attributes
     ----------
     root : Path
     plant : Plant
-        Its targets, and every heliostat that has a properties file.
+        Its targets, and every heliostat that could be read.
     optics : Optics
         The declared model (``twin.json``), Buie's sun with 0.02 without one.
     effects : tuple of Effect
@@ -47,7 +37,7 @@ class MeasurementFolder:
     skipped : dict
         Heliostats and measurements that are there but could not be read, with the reason.
     properties : dict
-        The heliostats' property documents, by name, as their files have them.
+        The heliostats' property documents, by name, in PAINT's form: the store keeps them.
     """
 
     root: Path
@@ -62,28 +52,17 @@ class MeasurementFolder:
 
         A file that cannot be read is noted in ``skipped`` with its reason and costs none of the others.
         """
-        return [m for m in self._measurements(heliostat) if m.images or not with_images]
+        return [m for m in self.read_measurements(heliostat) if m.images or not with_images]
 
-    def _measurements(self, heliostat: str) -> Iterator[Measurement]:
-        folder = self.root / heliostat / "Calibration"
-        for path in sorted(folder.glob("*calibration-properties.json")):
-            identifier = path.name.removesuffix("calibration-properties.json").removesuffix("-")
-            if not identifier:
-                continue  # a sample that PAINT ships without a number; nothing could refer to it
-            try:
-                measurement = read_measurement(identifier, heliostat, read_json(path), self.plant)
-                item = folder / f"{identifier}-calibration-item-stac.json"
-                if item.is_file():
-                    measurement = replace(measurement, taken_at=read_moment(read_json(item), str(item)))
-            except InvalidInputError as error:
-                self.skipped[f"{heliostat}/{identifier}"] = str(error)
-                continue
-            images = {kind: folder / f"{identifier}-{kind}.png" for kind in IMAGE_KINDS}
-            measurement.images.update({kind: file for kind, file in images.items() if file.is_file()})
-            yield measurement
+    @abstractmethod
+    def read_measurements(self, heliostat: str) -> Iterator[Measurement]:
+        """All measurements of a heliostat by identifier, with the files of their images."""
 
     def measured_surface(self, heliostat: str) -> tuple[Array, int] | None:
-        """Control points (F, I, J, 3) [m] in mirror coordinates and degree of a measured surface, None without one."""
+        """Control points (F, I, J, 3) [m] in mirror coordinates and degree of a measured surface, None without one.
+
+        By default they lie where PAINT has them.
+        """
         return read_surface(self.root, self.plant.heliostats[heliostat])
 
 
@@ -131,46 +110,41 @@ def measured_heights(heliostat: Heliostat, surface: tuple[Array, int]) -> Array:
     return heights(heliostat, surface[0], surface[1])
 
 
+@dataclass(frozen=True)
+class Importer:
+    """Reads the folders of one source.
+
+    Attributes
+    ----------
+    recognises : callable
+        Whether a folder is one of them.
+    read : callable
+        The folder, with these heliostats or, for None, all; raises `InvalidInputError` where nothing can be read.
+    otherwise : str
+        What to say of a folder that it does not recognise.
+    """
+
+    recognises: Callable[[Path], bool]
+    read: Callable[[Path, list[str] | None], MeasurementFolder]
+    otherwise: str
+
+
 def read_folder(root: Path, heliostats: list[str] | None = None) -> MeasurementFolder:
-    """Read the plant of a measurement folder.
+    """Read the plant of a measurement folder by the first importer that recognises it.
 
     Raises
     ------
     InvalidInputError
-        Where the folder has no tower file, or no heliostat that can be read.
+        Where none does, or no heliostat can be read.
     """
     if not root.is_dir():
         raise InvalidInputError(f"{root}: no such folder")
-    towers = sorted(root.glob("*tower-measurements.json"))
-    if not towers:
-        raise InvalidInputError(f"{root}: no '*tower-measurements.json' at the root; is it a PAINT folder?")
-    tower = read_json(towers[0])
-    origin, targets = read_targets(tower)
-    found: dict[str, Heliostat] = {}
-    skipped: dict[str, str] = {}
-    properties: dict[str, Any] = {}
-    for folder in sorted(root.glob("*/Properties")):
-        name, files = folder.parent.name, sorted(folder.glob("*heliostat-properties.json"))
-        if not files or (heliostats is not None and name not in heliostats):
-            continue
-        try:
-            if len(files) > 1:
-                names = ", ".join(file.name for file in files)
-                raise InvalidInputError(f"{folder}: more than one file of properties ({names}); leave the right one")
-            document = read_json(files[0])
-            found[name], properties[name] = read_heliostat(name, document, origin), document
-        except InvalidInputError as error:
-            skipped[name] = str(error)
-    if not found:
-        raise InvalidInputError(f"{root}: no heliostat with a readable 'Properties/*heliostat-properties.json'")
-    plant = Plant(_plant_name(tower, towers[0]), origin, targets, found, read_receivers(tower))
-    return MeasurementFolder(root, plant, *read_declared(root / "twin.json"), skipped, properties)
-
-
-def _plant_name(tower: Any, file: Path) -> str:
-    """PAINT's ID of the plant; older files have none, and bear the name themselves."""
-    name = tower["power_plant_properties"].get("ID")
-    return name if isinstance(name, str) and name else file.name.removesuffix("-tower-measurements.json")
+    # Importers build on this module, so they are looked for only now.
+    importers: list[Importer] = [module.IMPORTER for module in modules_of("service.sources.importers")]
+    for importer in importers:
+        if importer.recognises(root):
+            return importer.read(root, heliostats)
+    raise InvalidInputError(f"{root}: {'; '.join(importer.otherwise for importer in importers)}")
 
 
 def read_declared(path: Path) -> tuple[Optics, tuple[Effect, ...]]:

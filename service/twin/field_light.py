@@ -11,7 +11,7 @@ from model.errors import ModelError
 from model.fleet import TILE, Engine, FleetFlux, Tile, aligned_field, tile_of
 from model.forecast import Setup
 from model.neighbours import Neighbours
-from model.plant import Cylinder, Heliostat, Receiver, TargetPlane
+from model.plant import Heliostat, Receiver
 from model.surface import control_points
 from model.tracing import Optics
 from service import store
@@ -33,7 +33,7 @@ class Fleet:
     Attributes
     ----------
     names : sequence of str
-    receiver : TargetPlane or Cylinder
+    receiver : Receiver
     sun : (3,)
         Unit vector towards the recorded sun.
     optics : Optics
@@ -64,13 +64,6 @@ class Fleet:
     def aim_of(self, name: str) -> Array:
         """Where a heliostat aims (3,) [m]."""
         return np.asarray(self.aims.get(name, self.aim), dtype=np.float64)
-
-    @property
-    def plane(self) -> TargetPlane:
-        """The receiver, or the plane that touches a cylinder in its middle."""
-        if isinstance(self.receiver, Cylinder):
-            return self.receiver.tangent(0.0, self.receiver.radius, self.receiver.radius)
-        return self.receiver
 
 
 def forecast_fleet(
@@ -154,4 +147,4 @@ def _shots(
             fleet.skipped[name] = f'surface: heliostat {name} has no surface yet; predict one, or ask for "ideal"'
             continue
         points = control_points(heliostat, heights.get(name))
-        yield Setup(heliostat, points, fleet.sun, fleet.plane, aim=fleet.aim_of(name), identifier=name)
+        yield Setup(heliostat, points, fleet.sun, fleet.receiver.middle, aim=fleet.aim_of(name), identifier=name)

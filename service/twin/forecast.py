@@ -96,10 +96,8 @@ def trace_request(runtime: Runtime, request: ForecastRequest) -> Traced:
 
 def receiver_as_json(receiver: Receiver) -> dict[str, Any]:
     """A receiver's geometry, as forecasts keep it [m]; a cylinder's width is the length of its arc."""
-    plane = {name: plain(getattr(receiver, name)) for name in ("center", "normal", "up", "width", "height")}
-    if isinstance(receiver, TargetPlane):
-        return plane
-    return plane | {"radius": receiver.radius, "opening_deg": receiver.opening_deg}
+    outline = {name: plain(getattr(receiver, name)) for name in ("center", "normal", "up", "width", "height")}
+    return outline | receiver.shape
 
 
 def _forecast_row(request: ForecastRequest, traced: Traced) -> ForecastRow:

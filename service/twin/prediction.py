@@ -7,10 +7,10 @@ from sqlalchemy.orm import Session
 
 from model.observation import SurfacePrediction
 from service import store
+from service.base.choices import Method
 from service.store import NewSurface, audit
 from service.store.keys import RESERVED
 from service.store.tables import SurfaceRow
-from service.twin.compute import Method
 from service.twin.evidence import Twin, choose_measurements, evidence_of, load_twin, named_measurements
 from service.twin.runtime import Runtime
 

@@ -17,11 +17,12 @@ from model.plant import Heliostat, Receiver, TargetPlane
 from model.study import FluxImage, Study, StudyOptions
 from model.tracing import Optics
 from service.base import meters
+from service.base.choices import Method
 from service.base.progress import Progress
 from service.base.settings import Settings
 from service.store.database import Database
 from service.store.images import ImageStore
-from service.twin.compute import Forecast, Method
+from service.twin.compute import Forecast
 
 
 class Operations(Protocol):

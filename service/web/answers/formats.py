@@ -1,6 +1,7 @@
-"""Representations: what is offered as JSON, npz or PNG, and which of them a client likes best."""
+"""Representations: what is offered beside JSON, and which of them a client likes best."""
 
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Annotated, Any
 
 import numpy as np
@@ -9,12 +10,24 @@ from fastapi import Depends, Header, Response
 from pydantic import BaseModel
 
 from service.base.faults import NotAcceptableError
+from service.web.answers.representation import Maps, Representation
 
 JSON = "application/json"
-NPZ = "application/x-npz"
-NPZ_VENDOR = "application/vnd.numpy.npz"
-PNG = "image/png"
-ARRAYS = (JSON, NPZ, NPZ_VENDOR, PNG)
+
+OFFERED = (
+    "npz",
+    "png",
+)
+"""Other representations, where a client likes two alike the one that it gets first; files of `representations`."""
+
+_WRITERS: dict[str, Representation] = {
+    media_type: representation
+    for name in OFFERED
+    for representation in [import_module(f"service.web.answers.representations.{name}").REPRESENTATION]
+    for media_type in representation.media_types
+}
+
+ARRAYS = (JSON, *_WRITERS)
 """What flux maps and surfaces are offered as, the default first."""
 
 
@@ -105,3 +118,9 @@ def file_answer(content: bytes, media_type: str, name: str) -> Response:
     """A file that a browser shows, under a name to keep it by."""
     headers = {"Vary": "Accept", "Content-Disposition": f'inline; filename="{name}"'}
     return Response(content, media_type=media_type, headers=headers)
+
+
+def maps_answer(maps: Maps, media_type: str) -> Response:
+    """Maps as a file of one of the representations beside JSON."""
+    chosen = _WRITERS[media_type]
+    return file_answer(chosen.write(maps), media_type, f"{maps.name}.{chosen.suffix}")

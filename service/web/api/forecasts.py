@@ -1,6 +1,7 @@
 """Flux forecasts."""
 
 from datetime import datetime
+from functools import partial
 from typing import Annotated, Any, Literal, Self
 
 from fastapi import APIRouter, Body, Depends, Path, Query, Response, status
@@ -8,7 +9,7 @@ from fastapi.responses import JSONResponse
 from pydantic import BaseModel, Discriminator, Field, Tag, model_validator
 
 from service import store
-from service.base.arrays import pack, pair
+from service.base.arrays import pair
 from service.base.fields import Model, ModelVersion, Name, Plane, Position, Resolution, Sun, Version
 from service.drawing.pictures import flux_picture
 from service.jobs.asking import ask_for
@@ -16,9 +17,10 @@ from service.jobs.kinds.field_forecasts import FleetForecastIn
 from service.store.tables import ForecastRow
 from service.twin.forecast import ForecastRequest, flux_of, make_forecast
 from service.web.answers import formats
-from service.web.answers.formats import MediaType, file_answer, json_answer
+from service.web.answers.formats import MediaType, json_answer, maps_answer
 from service.web.answers.openapi import arrays, problems
 from service.web.answers.paging import Page, page
+from service.web.answers.representation import Maps
 from service.web.api.jobs import IdempotencyKey, JobOut, job_out
 from service.web.door.dependencies import OPERATE, READ, IdentityDep, Limit, RuntimeDep, require_json
 
@@ -110,15 +112,12 @@ def forecast_summary(row: ForecastRow) -> ForecastSummary:
 def forecast_answer(row: ForecastRow, media_type: str) -> Response:
     """A forecast as the client wants it."""
     flux = flux_of(row)
-    name = f"{row.heliostat.name}-forecast-{row.id}"
-    if media_type == formats.PNG:
-        unit = "flux [% per pixel]" if row.normalised else "W/m²"
-        size = (row.window_m or row.plane["width"], row.window_m or row.plane["height"])
-        title = f"{row.heliostat.name}, forecast {row.id}"
-        return file_answer(flux_picture(flux, size, unit, title), media_type, f"{name}.png")
-    if media_type != formats.JSON:
-        return file_answer(pack({"flux": flux}), media_type, f"{name}.npz")
-    return json_answer(forecast_summary(row), flux=flux)
+    if media_type == formats.JSON:
+        return json_answer(forecast_summary(row), flux=flux)
+    unit = "flux [% per pixel]" if row.normalised else "W/m²"
+    size = (row.window_m or row.plane["width"], row.window_m or row.plane["height"])
+    name, title = f"{row.heliostat.name}-forecast-{row.id}", f"{row.heliostat.name}, forecast {row.id}"
+    return maps_answer(Maps(name, title, {"flux": flux}, partial(flux_picture, flux, size, unit)), media_type)
 
 
 router = APIRouter(prefix="/forecasts", tags=["forecasts"])

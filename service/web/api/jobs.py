@@ -5,6 +5,7 @@ import threading
 import time
 from collections.abc import AsyncIterator
 from datetime import datetime
+from functools import partial
 from typing import Annotated, Any
 
 import anyio
@@ -23,9 +24,10 @@ from service.store import queue
 from service.store.tables import JobRow
 from service.twin.runtime import Runtime
 from service.web.answers import formats
-from service.web.answers.formats import MediaType, file_answer, json_answer
+from service.web.answers.formats import MediaType, json_answer, maps_answer
 from service.web.answers.openapi import arrays, problems
 from service.web.answers.paging import Page, page
+from service.web.answers.representation import Maps
 from service.web.door.dependencies import OPERATE, READ, IdentityDep, Limit, RuntimeDep, StoppingDep, require_json
 
 
@@ -58,16 +60,13 @@ def job_flux(row: JobRow, media_type: str) -> Response:
     """The flux map of a job; NotFoundError where it has none."""
     if row.arrays is None or row.result is None:
         raise NotFoundError(f"job {row.id} ({row.kind}, {row.state}) has no flux map")
-    flux, name = unpack(row.arrays)["flux"], f"job-{row.id}-flux"
-    if media_type == formats.PNG:
-        plane = row.result["plane"]
-        title = f"job {row.id}, {row.result['heliostats']} heliostats"
-        return file_answer(
-            flux_picture(flux, (plane["width"], plane["height"]), "W/m²", title), media_type, f"{name}.png"
-        )
-    if media_type != formats.JSON:
-        return file_answer(row.arrays, media_type, f"{name}.npz")
-    return json_answer(job_out(row), flux=flux)
+    flux = unpack(row.arrays)["flux"]
+    if media_type == formats.JSON:
+        return json_answer(job_out(row), flux=flux)
+    plane = row.result["plane"]
+    picture = partial(flux_picture, flux, (plane["width"], plane["height"]), "W/m²")
+    title = f"job {row.id}, {row.result['heliostats']} heliostats"
+    return maps_answer(Maps(f"job-{row.id}-flux", title, {"flux": flux}, picture, row.arrays), media_type)
 
 
 # How often the store is asked for news [s], and after how much silence a comment keeps the connection open [s].

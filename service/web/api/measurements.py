@@ -1,6 +1,7 @@
 """Photographs and what was measured in them."""
 
 from datetime import datetime
+from functools import partial
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, File, Form, Header, Query, Response, UploadFile, status
@@ -17,9 +18,10 @@ from service.store.tables import MeasurementRow
 from service.twin.ingest import ingest
 from service.web.answers import formats
 from service.web.answers.files import WholeFile, is_held
-from service.web.answers.formats import MediaType, file_answer, json_answer
+from service.web.answers.formats import MediaType, json_answer, maps_answer
 from service.web.answers.openapi import arrays, problems
 from service.web.answers.paging import Page, page
+from service.web.answers.representation import Maps
 from service.web.door.dependencies import INGEST, READ, Limit, MeasurementPath, NamePath, RuntimeDep, require_multipart
 
 Motors = Annotated[
@@ -111,16 +113,14 @@ def flux_answer(heliostat_name: str, row: MeasurementRow, media_type: str) -> Re
     if row.arrays is None:
         raise NotFoundError(f"measurement {row.identifier} was refused ({row.reason}), so it has no flux")
     arrays = unpack(row.arrays)
-    name = f"{heliostat_name}-{row.identifier}-flux"
-    if media_type == formats.PNG:
-        whole = "flux" in arrays
-        size = (row.target.width_m, row.target.height_m) if whole else None
-        shown = arrays["flux" if whole else "centered"]
-        title = f"{heliostat_name} {row.identifier}, measured"
-        return file_answer(flux_picture(shown, size, "flux [% per pixel]", title), media_type, f"{name}.png")
-    if media_type != formats.JSON:
-        return file_answer(row.arrays, media_type, f"{name}.npz")
-    return json_answer(measurement_out(heliostat_name, row), flux=arrays.get("flux"), centered=arrays.get("centered"))
+    if media_type == formats.JSON:
+        document = measurement_out(heliostat_name, row)
+        return json_answer(document, flux=arrays.get("flux"), centered=arrays.get("centered"))
+    whole = "flux" in arrays
+    size = (row.target.width_m, row.target.height_m) if whole else None
+    picture = partial(flux_picture, arrays["flux" if whole else "centered"], size, "flux [% per pixel]")
+    name, title = f"{heliostat_name}-{row.identifier}-flux", f"{heliostat_name} {row.identifier}, measured"
+    return maps_answer(Maps(name, title, arrays, picture, row.arrays), media_type)
 
 
 router = APIRouter(prefix="/heliostats/{name}/measurements", tags=["measurements"])

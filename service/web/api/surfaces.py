@@ -1,6 +1,7 @@
 """Surfaces by version."""
 
 from datetime import datetime
+from functools import partial
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Body, Depends, Path, Query, Response, status
@@ -14,9 +15,10 @@ from service.store.tables import SurfaceRow
 from service.twin.prediction import predict_surface
 from service.twin.runtime import Runtime
 from service.web.answers import formats
-from service.web.answers.formats import MediaType, file_answer, json_answer
+from service.web.answers.formats import MediaType, json_answer, maps_answer
 from service.web.answers.openapi import arrays, problems
 from service.web.answers.paging import Page, page
+from service.web.answers.representation import Maps
 from service.web.door.dependencies import OPERATE, READ, IdentityDep, Limit, NamePath, RuntimeDep, require_json
 
 
@@ -87,13 +89,11 @@ def surface_out(heliostat_name: str, row: SurfaceRow) -> SurfaceOut:
 
 def surface_answer(heliostat_name: str, row: SurfaceRow, media_type: str) -> Response:
     """A surface as the client wants it."""
-    name = f"{heliostat_name}-surface-{row.version}"
-    if media_type == formats.PNG:
-        title = f"{heliostat_name}, surface {row.version} ({row.source})"
-        return file_answer(surface_picture(unpack(row.arrays)["z"], title), media_type, f"{name}.png")
-    if media_type != formats.JSON:
-        return file_answer(row.arrays, media_type, f"{name}.npz")
-    return json_answer(surface_summary(heliostat_name, row), **unpack(row.arrays))
+    arrays = unpack(row.arrays)
+    if media_type == formats.JSON:
+        return json_answer(surface_summary(heliostat_name, row), **arrays)
+    name, title = f"{heliostat_name}-surface-{row.version}", f"{heliostat_name}, surface {row.version} ({row.source})"
+    return maps_answer(Maps(name, title, arrays, partial(surface_picture, arrays["z"]), row.arrays), media_type)
 
 
 router = APIRouter(prefix="/heliostats/{name}/surfaces", tags=["surfaces"])

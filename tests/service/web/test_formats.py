@@ -8,7 +8,9 @@ import pytest
 from pydantic import BaseModel
 
 from service.base.faults import NotAcceptableError
-from service.web.answers.formats import ARRAYS, JSON, NPZ, NPZ_VENDOR, PNG, choose, json_answer
+from service.web.answers.formats import ARRAYS, JSON, choose, json_answer
+from service.web.answers.representations.npz import NPZ, NPZ_VENDOR
+from service.web.answers.representations.png import PNG
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,1 @@
+"""Whose folders are read, one file a source, with its `IMPORTER`."""

@@ -1,0 +1,1 @@
+"""The representations of maps beside JSON, one file each, with its `REPRESENTATION`."""

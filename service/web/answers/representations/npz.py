@@ -1,0 +1,14 @@
+"""NumPy's archive of the arrays themselves."""
+
+from service.base.arrays import pack
+from service.web.answers.representation import Maps, Representation
+
+NPZ = "application/x-npz"
+NPZ_VENDOR = "application/vnd.numpy.npz"
+
+
+def _write(maps: Maps) -> bytes:
+    return pack(maps.arrays) if maps.packed is None else maps.packed
+
+
+REPRESENTATION = Representation((NPZ, NPZ_VENDOR), "npz", _write)
