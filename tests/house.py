@@ -12,7 +12,7 @@ import grimp
 ROOT = Path(__file__).parents[1]
 
 ROOMS = (
-    *("model.imaging", "model.network", "model.tracing", "model.effects", "model.study"),
+    *("model.sunshape", "model.imaging", "model.network", "model.tracing", "model.effects", "model.study"),
     *(f"service.{room}" for room in ("base", "drawing", "sources", "store", "twin", "jobs", "web", "cli")),
     "training",
 )
