@@ -9,7 +9,9 @@ import pytest
 import torch
 
 from model.effects import effect_to_json
+from model.errors import InvalidInputError
 from model.network.architecture import NetworkConfig
+from model.network.catalogue import sizes_of
 from model.surface import mirrored, split_canting
 from training.config import TrainConfig
 from training.prior import estimate
@@ -166,3 +168,8 @@ def test_unfinished_training_stops_when_time_is_up(stj, tmp_path):
     assert run.step == 0
     assert (tmp_path / "checkpoint.pt").is_file()
     assert json.loads(Path(tmp_path / "config.json").read_text())["steps"] == 5
+
+
+def test_a_network_of_no_catalogue_is_refused_by_name():
+    with pytest.raises(InvalidInputError, match="'architecture' 'magic' is unknown; it must be one of ours, paper"):
+        sizes_of("magic", {})
