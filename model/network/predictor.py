@@ -62,7 +62,7 @@ class SurfacePredictor:
 
         content = path.read_bytes()
         options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = threads
+        options.intra_op_num_threads = options.inter_op_num_threads = threads
         self.session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
         self.name = f"{path.stem}-{hashlib.sha256(content).hexdigest()[:12]}"
 
