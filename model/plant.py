@@ -14,6 +14,9 @@ from model.mount import Mount
 
 Vector = NDArray[np.float64]
 
+JUELICH_LATITUDE = 50.913
+"""Latitude [deg] of the Solar Tower Juelich: that of synthetic fields, and never a default of what acts on a plant."""
+
 
 def _vector(name: str, value: ArrayLike) -> Vector:
     vector = np.array(value, dtype=np.float64)

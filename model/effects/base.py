@@ -29,9 +29,6 @@ ByHeliostat = Mapping[str, Any]
 Scope = Literal["set", "camera", "heliostat", "facet"]
 Stage = Literal["geometry", "optics", "image"]
 
-JUELICH_LATITUDE = 50.913
-"""Latitude [deg] of the Solar Tower Juelich."""
-
 
 @dataclass(frozen=True)
 class Parameter:

@@ -172,7 +172,14 @@ def predict_heliostat(
     if not usable:
         reason = f"every image was refused: {next(iter(refused.values()))}" if refused else "no image"
         raise InvalidInputError(reason)
-    predicted = compute.predict(heliostat, choose(usable, images), method, folder.optics, folder.effects)
+    predicted = compute.predict(
+        heliostat,
+        choose(usable, images),
+        method,
+        folder.optics,
+        folder.effects,
+        latitude_deg=float(folder.plant.origin[0]),
+    )
     entry: dict[str, Any] = {
         "method": method,
         "weights": predicted.weights,

@@ -87,7 +87,14 @@ def forecasts_of(runtime: Runtime, twin: Twin, shown: Sequence[Evidence], surfac
     """What a stored surface, or the ideal one, throws where each photograph shows its spot: (n, 64, 64), sum 100."""
     observations, model = [evidence.observation() for evidence in shown], twin.model
     with runtime.computing("compare") as operations:
-        return operations.render(twin.heliostat, observations, heights_of(surface), model.optics, model.effects)
+        return operations.render(
+            twin.heliostat,
+            observations,
+            heights_of(surface),
+            model.optics,
+            model.effects,
+            latitude_deg=twin.origin[0],
+        )
 
 
 @dataclass(frozen=True)

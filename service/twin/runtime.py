@@ -39,6 +39,8 @@ class Operations(Protocol):
         method: Method = "network",
         optics: Optics | None = None,
         effects: Sequence[Effect] = (),
+        *,
+        latitude_deg: float,
     ) -> SurfacePrediction:
         """A surface from observations."""
 
@@ -49,6 +51,8 @@ class Operations(Protocol):
         z: NDArray[Any] | None,
         optics: Optics | None = None,
         effects: Sequence[Effect] = (),
+        *,
+        latitude_deg: float,
     ) -> NDArray[Any]:
         """What a surface would have thrown where fluxes were observed."""
 
@@ -64,7 +68,7 @@ class Operations(Protocol):
         window: float | None = None,
         optics: Optics | None = None,
         effects: Sequence[Effect] = (),
-        latitude_deg: float = ...,
+        latitude_deg: float,
     ) -> Forecast:
         """The flux of a heliostat on a plane."""
 
@@ -76,7 +80,7 @@ class Operations(Protocol):
         resolution: tuple[int, int] = (256, 256),
         optics: Optics | None = None,
         effects: Sequence[Effect] = (),
-        latitude_deg: float = ...,
+        latitude_deg: float,
         engine: Engine | None = None,
     ) -> FleetFlux:
         """The light of many heliostats on one receiver."""
@@ -88,6 +92,8 @@ class Operations(Protocol):
         effects: Sequence[Effect] = (),
         options: StudyOptions | None = None,
         progress: Progress = ...,
+        *,
+        latitude_deg: float,
     ) -> Study:
         """Which effects photographs demand that a model with these optics and effects lacks."""
 

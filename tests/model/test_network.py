@@ -13,7 +13,7 @@ from model.network.inputs import conditions
 from model.network.paper import PaperConfig, PaperNetwork
 from model.network.predictor import INPUTS, SurfacePredictor, default_predictor, mirrored_inputs, model_card
 from model.observation import Observation, spread_suns
-from model.plant import TargetPlane
+from model.plant import JUELICH_LATITUDE, TargetPlane
 from model.prior import default_prior
 from model.surface import control_points, mirrored
 from model.tracing import Scene
@@ -142,7 +142,9 @@ def observation(identifier="1") -> Observation:
 
 
 def test_shipped_predictor_names_its_weights_and_keeps_the_contract():
-    predicted = default_predictor().predict(flat_heliostat(focal_length=75.0), [observation("a"), observation("b")])
+    predicted = default_predictor().predict(
+        flat_heliostat(focal_length=75.0), [observation("a"), observation("b")], latitude_deg=JUELICH_LATITUDE
+    )
     assert predicted.z.shape == predicted.z_std.shape == (4, 8, 8)
     assert predicted.control_points.shape == (4, 8, 8, 3)
     assert predicted.used == ("a", "b")
@@ -168,7 +170,7 @@ def test_shipped_network_beats_the_mean_surface_by_its_own_card():
 def test_wrong_number_of_images_is_named():
     for images in ([], [observation(str(i)) for i in range(9)]):
         with pytest.raises(InvalidInputError, match="1 to 8 images"):
-            default_predictor().predict(flat_heliostat(), images)
+            default_predictor().predict(flat_heliostat(), images, latitude_deg=JUELICH_LATITUDE)
 
 
 def test_bad_flux_is_named():
