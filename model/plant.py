@@ -104,6 +104,16 @@ class Heliostat:
         return cls(name, np.asarray(position, dtype=np.float64), mount or Mount.juelich(), facets)
 
     @property
+    def has_facets_in_order(self) -> bool:
+        """Whether four facets in two rows and two columns are listed as `facets` says; true of any other mirror.
+
+        Surfaces are lists of facets, and one that is listed elsewhere would be taken for another.
+        """
+        places = np.array([facet.position[:2] for facet in self.facets])
+        quarters = [(bool(x), bool(y)) for x, y in places > places.mean(axis=0)]
+        return len(set(quarters)) < 4 or quarters == [(False, True), (True, True), (False, False), (True, False)]
+
+    @property
     def facet_frames(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Centres (F, 3) [m], axes (F, 3 axes, 3) and half sizes (F, 2) [m] of the facets in mirror coordinates.
 

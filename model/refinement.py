@@ -28,7 +28,7 @@ from model.network.inputs import STEP_HEIGHT
 from model.observation import Observation, SurfacePrediction, align_observations, misfits
 from model.plant import Heliostat
 from model.prior import SurfacePrior, default_prior
-from model.surface import control_points
+from model.surface import control_points, require_own_grid
 from model.tracing import Optics
 
 Array = NDArray[np.float64]
@@ -302,10 +302,11 @@ def refine(
     Raises
     ------
     InvalidInputError
-        Without images.
+        Without images, or for a heliostat that does not have four facets.
     """
     if not observations:
         raise InvalidInputError("a refinement takes at least one image")
+    require_own_grid(heliostat)
     prior, optics = prior or default_prior(), optics or Optics()
     options = options or RefinementOptions()
     posterior = _Posterior(heliostat, observations, prior, (optics, effects), latitude_deg, options)

@@ -28,7 +28,7 @@ from model.network.inputs import (
 from model.observation import Observation, SurfacePrediction, align_observations, misfits
 from model.plant import Heliostat
 from model.prior import default_prior
-from model.surface import FACETS, control_points, mirrored
+from model.surface import control_points, mirrored, require_own_grid
 from model.tracing import Optics
 
 Array = NDArray[np.float64]
@@ -85,8 +85,7 @@ class SurfacePredictor:
         """Heights and their standard deviation, each (4, 8, 8) [m], from one to eight images; see `predict`."""
         if not 1 <= len(observations) <= MAX_IMAGES:
             raise InvalidInputError(f"a prediction takes 1 to {MAX_IMAGES} images, got {len(observations)}")
-        if len(heliostat.facets) != FACETS:
-            raise InvalidInputError(f"the network knows mirrors of {FACETS} facets, {heliostat.name} has other")
+        require_own_grid(heliostat)
         network_inputs = _NetworkInputs(heliostat, observations, optics, effects, latitude_deg)
         z = default_prior().mean
         inputs = network_inputs.inputs(z)

@@ -152,7 +152,8 @@ def _mount(kinematics: Any, where: str) -> Mount:
 def read_heliostat(name: str, properties: Any, origin: Array) -> Heliostat:
     """A heliostat of the contents of PAINT's ``heliostat-properties.json``.
 
-    ``origin`` (3,) is the tower base in WGS84. Raises `InvalidInputError`, which names the field.
+    ``origin`` (3,) is the tower base in WGS84. Raises `InvalidInputError`, which names the field. Facets in another
+    order are refused, not sorted: measured surfaces of the same heliostat are listed as its properties are.
     """
     where = f"properties of {name}"
     if not isinstance(properties, dict):
@@ -161,7 +162,9 @@ def read_heliostat(name: str, properties: Any, origin: Array) -> Heliostat:
     if kinematics is None:
         raise InvalidInputError(f"{where}: 'kinematics_properties' is missing")
     facets = get(properties, where, "facet_properties", "facets")
-    return Heliostat(
+    if not isinstance(facets, list):
+        raise InvalidInputError(f"{where}: 'facets' must be a list")
+    heliostat = Heliostat(
         name=name,
         position=Plant("", origin).to_enu(_numbers(properties, where, "heliostat_position", count=3)),
         mount=_mount(kinematics, where),
@@ -176,6 +179,11 @@ def read_heliostat(name: str, properties: Any, origin: Array) -> Heliostat:
         width=_number(properties, where, "width"),
         height=_number(properties, where, "height"),
     )
+    if not heliostat.has_facets_in_order:
+        raise InvalidInputError(
+            f"{where}: 'facets' must be listed upper left, upper right, lower left, lower right, seen from the front"
+        )
+    return heliostat
 
 
 def read_targets(tower: Any) -> tuple[Array, dict[str, TargetPlane]]:

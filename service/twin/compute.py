@@ -21,7 +21,7 @@ from model.plant import Heliostat, Receiver, TargetPlane
 from model.refinement import refine
 from model.study import FluxImage, Study, StudyOptions
 from model.study import study as study_photographs
-from model.surface import COLUMNS, DEGREE, FACETS, ROWS, control_points
+from model.surface import COLUMNS, DEGREE, ROWS, control_points
 from model.tracing import Optics
 from model.tracing.convolution import central_rays
 from service.base.progress import Progress, quiet
@@ -81,11 +81,11 @@ def render(
     *,
     latitude_deg: float,
 ) -> Array:
-    """What a surface (4, 8, 8) [m], None the ideal one, would have thrown where M fluxes were observed.
+    """What a surface (F, 8, 8) [m], None the ideal one, would have thrown where M fluxes were observed.
 
     (M, 64, 64), each with sum 100, in the observations' own windows.
     """
-    heights = np.zeros((FACETS, ROWS, COLUMNS)) if z is None else np.asarray(z, dtype=np.float64)
+    heights = np.zeros((len(heliostat.facets), ROWS, COLUMNS)) if z is None else np.asarray(z, dtype=np.float64)
     return render_observations(heliostat, observations, heights, optics, effects, latitude_deg=latitude_deg)
 
 

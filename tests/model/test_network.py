@@ -1,6 +1,7 @@
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +16,11 @@ from model.network.predictor import INPUTS, SurfacePredictor, default_predictor,
 from model.observation import Observation, spread_suns
 from model.plant import JUELICH_LATITUDE, TargetPlane
 from model.prior import default_prior
+from model.refinement import refine
 from model.surface import control_points, mirrored
 from model.tracing import Scene
 from model.tracing.convolution import central_rays
+from service.twin import compute
 from tests.conftest import flat_heliostat, target
 from training.export import PARITY_MM, example, export, parity, rounded
 from training.render import Setups, Situations
@@ -199,3 +202,14 @@ def test_runtime_of_the_network_keeps_no_id_and_has_nothing_to_send(tmp_path: Pa
     )
     assert "telemetry" not in done.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_mirror_of_other_facets_is_refused_with_its_count_and_rendered_all_the_same():
+    three = replace(flat_heliostat(), facets=flat_heliostat().facets[:3])
+    for ask in (default_predictor().predict, refine):
+        with pytest.raises(InvalidInputError, match="mirrors of 4 facets, flat has 3"):
+            ask(three, [observation("a")], latitude_deg=JUELICH_LATITUDE)
+    flux = compute.render(three, [observation("a")], None, latitude_deg=JUELICH_LATITUDE)
+    assert flux.shape == (1, 64, 64)
+    with pytest.raises(InvalidInputError, match="for 3 facets"):
+        compute.render(three, [observation("a")], np.zeros((4, 8, 8)), latitude_deg=JUELICH_LATITUDE)

@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -158,3 +159,24 @@ def test_two_files_of_properties_are_refused_by_name_and_the_plant_has_its_own(t
     assert folder.plant.name == "WRI1030197"
     assert list(folder.plant.heliostats) == ["AA39"]
     assert "AB12-heliostat-properties.json, old-heliostat-properties.json" in folder.skipped["AB12"]
+
+
+def test_facets_in_another_order_are_refused():
+    document = properties_document()
+    origin, _ = read_targets(tower_document())
+    facets = document["facet_properties"]["facets"]
+    assert len(read_heliostat("AA39", document, origin).facets) == 4
+    for order in ([1, 0, 2, 3], [2, 3, 0, 1], [0, 2, 1, 3]):
+        document["facet_properties"]["facets"] = [facets[index] for index in order]
+        with pytest.raises(InvalidInputError, match="AA39: 'facets' must be listed upper left, upper right"):
+            read_heliostat("AA39", document, origin)
+    for some in (facets[:1], facets[:3]):
+        document["facet_properties"]["facets"] = some
+        assert len(read_heliostat("AA39", document, origin).facets) == len(some)
+    one = flat_heliostat()
+    three = replace(one, facets=one.facets[:3])
+    with pytest.raises(InvalidInputError, match="a surface of 4 facets for flat, which has 3"):
+        measured_heights(three, (control_points(one), 3))
+    document["facet_properties"]["facets"] = 4
+    with pytest.raises(InvalidInputError, match="'facets' must be a list"):
+        read_heliostat("AA39", document, origin)
