@@ -24,7 +24,7 @@ from model.plant import Heliostat, TargetPlane
 from model.surface import split_canting
 from service.base.progress import Progress, quiet
 from service.sources.decode import decode_image
-from service.sources.documents import IMAGE_KINDS, Measurement
+from service.sources.documents import IMAGE_KINDS, Measurement, optics_to_json
 from service.sources.folder import MeasurementFolder, measured_heights, read_surface
 from service.twin import compute
 from service.twin.compute import Method
@@ -323,6 +323,7 @@ def forecast_folder(
         "surfaces": surfaces,
         "model_version": model_version([*folder.effects, *effects]),
         "effects": [effect_to_json(effect) for effect in (*folder.effects, *effects)],
+        "optics": {"dni_w_m2": folder.optics.dni, **optics_to_json(folder.optics)},
         "measurements": {},
         "skipped": {},
     }

@@ -12,7 +12,7 @@ from model.errors import InvalidInputError
 from model.metrics import surface_error
 from model.sunshape import Buie, Gaussian, Pillbox
 from model.surface import control_points, evaluate
-from service.sources.documents import read_heliostat, read_measurement, read_moment, read_targets
+from service.sources.documents import optics_to_json, read_heliostat, read_measurement, read_moment, read_targets
 from service.sources.folder import measured_heights, read_declared, read_deflectometry, read_folder
 from tests.conftest import flat_heliostat
 from tests.service.conftest import properties_document, tower_document
@@ -87,6 +87,16 @@ def test_undeclared_sun_is_buies(tmp_path):
     assert read_declared(tmp_path / "twin.json")[0].sun_shape == Buie(0.02)
 
 
+def test_declared_optics_and_their_defaults(tmp_path):
+    plain, _ = read_declared(tmp_path / "twin.json")
+    assert optics_to_json(plain) == {"reflectivity": 1.0, "attenuation": []}
+    declared = {"reflectivity": 0.9, "attenuation": [0.01, 0.1]}
+    (tmp_path / "twin.json").write_text(json.dumps({"declared": {"optics": declared}}))
+    optics, _ = read_declared(tmp_path / "twin.json")
+    assert optics_to_json(optics) == declared
+    assert optics.sun_shape == Buie(0.02)
+
+
 def test_declared_effects(tmp_path):
     effects = [{"name": "soiling", "parameters": {"reflectivity_ratio": {"AA39": [1.0, 0.8, 1.0, 0.9]}}}]
     (tmp_path / "twin.json").write_text(json.dumps({"declared": {"effects": effects}}))
@@ -104,6 +114,12 @@ def test_declared_effects(tmp_path):
         ('{"declared": {"effects": [{"name": "dust"}]}}', "twin.json: effect 'dust' is unknown"),
         ('{"declared": {"effects": [{"name": "slope_error", "parameters": {"sigma_mrad": 9}}]}}', "sigma_mrad"),
         ('{"declared": []}', "'declared' must be a JSON object"),
+        ('{"declared": {"optics": []}}', "'optics' must be a JSON object"),
+        ('{"declared": {"optics": {"reflectivity": 1.2}}}', "'reflectivity' must lie in 0 to 1, got 1.2"),
+        ('{"declared": {"optics": {"reflectivity": true}}}', "'reflectivity' must be a finite number"),
+        ('{"declared": {"optics": {"attenuation": 0.1}}}', "'attenuation' must be a list"),
+        ('{"declared": {"optics": {"attenuation": [0, "a"]}}}', "must be a finite number, got a"),
+        ('{"declared": {"optics": {"shine": 1}}}', "not 'shine'"),
     ],
 )
 def test_bad_declarations_name_the_field(tmp_path, content, says):
