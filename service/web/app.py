@@ -15,6 +15,7 @@ from service.base.settings import Settings
 from service.jobs.kind import Kinds
 from service.jobs.kinds import KINDS
 from service.jobs.worker import Workers
+from service.twin.accuracy import ComparisonBook
 from service.twin.field import FieldBook
 from service.twin.runtime import Operations, Runtime
 from service.web.answers import openapi, problems
@@ -59,6 +60,7 @@ def create_app(settings: Settings, operations: Operations | None = None, kinds: 
             await to_thread.run_sync(security.require_closed_door, settings, runtime.database)
             app.state.runtime = runtime
             app.state.field = FieldBook(runtime)
+            app.state.comparisons = ComparisonBook(runtime)
             workers = Workers(runtime, kinds, settings.job_workers)
             workers.start()
             try:
@@ -67,6 +69,7 @@ def create_app(settings: Settings, operations: Operations | None = None, kinds: 
             finally:
                 await to_thread.run_sync(workers.stop)
                 await to_thread.run_sync(app.state.field.close)
+                await to_thread.run_sync(app.state.comparisons.close)
         finally:
             runtime.close()
 
