@@ -115,7 +115,9 @@ def _number(data: Any, where: str, *keys: str | int) -> float:
 
 
 def read_json(path: Path) -> Any:
-    """Parsed JSON of a file; a file that is missing or not JSON is named."""
+    """Parsed JSON of a file; one that is missing, no regular file (a pipe is waited for) or not JSON is named."""
+    if path.exists() and not path.is_file():
+        raise InvalidInputError(f"{path}: no regular file")
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
