@@ -5,7 +5,7 @@ from types import FrameType
 
 import uvicorn
 
-from service.base import logs, telemetry
+from service.base import logs, memory, telemetry
 from service.base.faults import NotStartedError
 from service.base.settings import Settings
 from service.store.database import Database
@@ -41,6 +41,7 @@ def serve(settings: Settings) -> None:
     SchemaError, OpenDoorError
         Where the store or the door do.
     """
+    memory.limit()
     logs.set_up(settings)
     telemetry.set_up(settings, "heliotwin")
     _require_fit(settings)
