@@ -3,7 +3,7 @@
 Heliostats come in tiles, which an `Engine` may work at in any number of threads or machines; what a tile gives is one
 map, so that memory does not grow with the field::
 
-    task = Superposition(receiver, resolution=(128, 128), optics=optics, effects=effects)
+    task = Superposition(receiver, resolution=(128, 128), optics=optics, effects=effects, latitude_deg=37.4)
     total = superpose(task, tiles(setups), engine)
 
 Forecasts for a receiver are light in W/m2: effects of the camera, of stage "image", say how a photograph differs from
@@ -24,7 +24,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from model.effects import JUELICH_LATITUDE, Effect, light_effects
+from model.effects import Effect, light_effects
 from model.effects.blocking import Blocking
 from model.errors import ModelError, UnreachableError
 from model.forecast import Setup, align, altered, optics_under
@@ -135,7 +135,7 @@ class Superposition:
     resolution: tuple[int, int] = (256, 256)
     optics: Optics = field(default_factory=Optics)
     effects: tuple[Effect, ...] = ()
-    latitude_deg: float = JUELICH_LATITUDE
+    latitude_deg: float = field(kw_only=True)
     samples: int = 16
 
     def __call__(self, tile: Tile) -> FleetFlux:
@@ -261,7 +261,8 @@ def aligned_field(
     field: Iterable[tuple[Heliostat, ArrayLike]],
     sun: ArrayLike,
     effects: Iterable[Effect] = (),
-    latitude_deg: float = JUELICH_LATITUDE,
+    *,
+    latitude_deg: float,
 ) -> Neighbours:
     """The aligned mirrors of heliostats with their aim points (3,) [m] under the recorded ``sun`` (3,).
 

@@ -19,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from model.effects import JUELICH_LATITUDE, Effect, in_light_order
+from model.effects import Effect, in_light_order
 from model.mount import Mount
 from model.plant import Heliostat, TargetPlane
 from model.surface import DEGREE
@@ -237,7 +237,7 @@ def align(
     setups: Sequence[Setup],
     effects: Iterable[Effect] = (),
     *,
-    latitude_deg: float = JUELICH_LATITUDE,
+    latitude_deg: float,
     dtype: torch.dtype = torch.float32,
     start: Aligned | None = None,
 ) -> Aligned:
@@ -337,7 +337,7 @@ def forecast_setups(
     effects: Sequence[Effect] = (),
     view: View | None = None,
     *,
-    latitude_deg: float = JUELICH_LATITUDE,
+    latitude_deg: float,
     dtype: torch.dtype = torch.float32,
 ) -> Tensor:
     """Images (B, rows, columns) that the model, with its effects, expects of setups, in W/m2 but for the camera.

@@ -137,16 +137,17 @@ def align_observations(
     z: NDArray[np.float64],
     effects: Sequence[Effect] = (),
     *,
+    latitude_deg: float,
     start: Aligned | None = None,
 ) -> Aligned:
     """The heliostat with surface ``z`` (4, 8, 8) [m] turned so that its spots lie where the M were observed.
 
     A tilt of the whole mirror is taken back by the mount and leaves no trace. ``start`` is what this gave for a surface
-    that differs little, and saves rounds.
+    that differs little, and saves rounds. ``latitude_deg`` [deg] is the plant's, along which the sun's clock runs.
     """
     points = control_points(heliostat, z)
     setups = [Setup(heliostat, points, o.sun, o.target, spot=o.center_of_mass) for o in observations]
-    return align(setups, effects, start=start)
+    return align(setups, effects, latitude_deg=latitude_deg, start=start)
 
 
 def render_observations(
@@ -156,12 +157,14 @@ def render_observations(
     optics: Optics | None = None,
     effects: Sequence[Effect] = (),
     *,
+    latitude_deg: float,
     samples: int = 24,
 ) -> NDArray[np.float64]:
     """What a surface ``z`` (4, 8, 8) [m] would have thrown where M fluxes were observed: (M, 64, 64), sum 100."""
     view = View(*FLUX_SHAPE, window=FLUX_WINDOW, samples=samples)
     with torch.no_grad():
-        flux = align_observations(heliostat, observations, z, effects).images(optics, effects, view).double()
+        aligned = align_observations(heliostat, observations, z, effects, latitude_deg=latitude_deg)
+        flux = aligned.images(optics, effects, view).double()
     return normalized(flux).numpy()
 
 
@@ -184,7 +187,9 @@ def misfits(
     z: NDArray[np.float64],
     optics: Optics | None = None,
     effects: Sequence[Effect] = (),
+    *,
+    latitude_deg: float,
 ) -> tuple[float, ...]:
     """One minus the accuracy with which heights ``z`` (4, 8, 8) [m] re-render each of the images they came from."""
-    images = render_observations(heliostat, observations, z, optics, effects).clip(min=0)
+    images = render_observations(heliostat, observations, z, optics, effects, latitude_deg=latitude_deg).clip(min=0)
     return tuple(1 - flux_accuracy(o.flux, image) for o, image in zip(observations, images, strict=True))

@@ -17,6 +17,9 @@ from model.mount import Mount
 
 Vector = NDArray[np.float64]
 
+JUELICH_LATITUDE = 50.913
+"""Latitude [deg] of the Solar Tower Juelich: that of synthetic fields, and never a default of what acts on a plant."""
+
 STEP_DEG = 8.0
 """Most [deg] between the planes that stand for a cylinder: they leave it by no more than 1 % of the radius."""
 
@@ -105,6 +108,16 @@ class Heliostat:
             for x, y in ((-0.8075, 0.6425), (0.8075, 0.6425), (-0.8075, -0.6425), (0.8075, -0.6425))
         )
         return cls(name, np.asarray(position, dtype=np.float64), mount or Mount.juelich(), facets)
+
+    @property
+    def has_facets_in_order(self) -> bool:
+        """Whether four facets in two rows and two columns are listed as `facets` says; true of any other mirror.
+
+        Surfaces are lists of facets, and one that is listed elsewhere would be taken for another.
+        """
+        places = np.array([facet.position[:2] for facet in self.facets])
+        quarters = [(bool(x), bool(y)) for x, y in places > places.mean(axis=0)]
+        return len(set(quarters)) < 4 or quarters == [(False, True), (True, True), (False, False), (True, False)]
 
     @property
     def facet_frames(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:

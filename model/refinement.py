@@ -28,7 +28,7 @@ from model.network.inputs import STEP_HEIGHT
 from model.observation import Observation, SurfacePrediction, align_observations, misfits
 from model.plant import Heliostat
 from model.prior import SurfacePrior, default_prior
-from model.surface import control_points
+from model.surface import control_points, require_own_grid
 from model.tracing import Optics
 
 Array = NDArray[np.float64]
@@ -124,11 +124,12 @@ class _Posterior:
         observations: Sequence[Observation],
         prior: SurfacePrior,
         model: tuple[Optics, Sequence[Effect]],
+        latitude_deg: float,
         options: RefinementOptions,
     ) -> None:
         self.heliostat, self.observations = heliostat, observations
         self.prior, self.options = prior, options
-        self.optics, self.effects = model
+        (self.optics, self.effects), self.latitude_deg = model, latitude_deg
         self.view = View(options.resolution, options.resolution, window=FLUX_WINDOW)
         self.measured = binned(np.array([o.flux for o in observations], dtype=np.float64), options.resolution)
         # The same height for each direction: small enough for images to be linear in it, large enough to stand out from
@@ -147,7 +148,9 @@ class _Posterior:
 
     def state(self, c: Array) -> _State:
         """The mirror of coefficients (K,), aligned under each sun."""
-        aligned = align_observations(self.heliostat, self.observations, self.prior.surface(c), self.effects)
+        aligned = align_observations(
+            self.heliostat, self.observations, self.prior.surface(c), self.effects, latitude_deg=self.latitude_deg
+        )
         return _State(c, aligned, self._rendered(aligned, self.options.samples))
 
     def jacobian(self, state: _State, count: int) -> Array:
@@ -278,6 +281,7 @@ def refine(
     observations: Sequence[Observation],
     start: NDArray[np.float64] | None = None,
     *,
+    latitude_deg: float,
     prior: SurfacePrior | None = None,
     optics: Optics | None = None,
     effects: Sequence[Effect] = (),
@@ -292,17 +296,20 @@ def refine(
         Any number from one.
     start : (4, 8, 8) [m], optional
         Where to begin besides the prior's mean: the network's prediction, say.
+    latitude_deg : float [deg]
+        Of the plant.
 
     Raises
     ------
     InvalidInputError
-        Without images.
+        Without images, or for a heliostat that does not have four facets.
     """
     if not observations:
         raise InvalidInputError("a refinement takes at least one image")
+    require_own_grid(heliostat)
     prior, optics = prior or default_prior(), optics or Optics()
     options = options or RefinementOptions()
-    posterior = _Posterior(heliostat, observations, prior, (optics, effects), options)
+    posterior = _Posterior(heliostat, observations, prior, (optics, effects), latitude_deg, options)
     starts = [np.zeros(len(prior.basis))] + ([] if start is None else [prior.coefficients(start)])
     optima = [posterior.optimum(c) for c in starts]
     state, jacobian = min(optima, key=lambda optimum: posterior.cost(optimum[0], options.noise))
@@ -313,7 +320,7 @@ def refine(
         control_points=control_points(heliostat, z),
         method="refined",
         weights=prior.name,
-        misfits=misfits(heliostat, observations, z, optics, effects),
+        misfits=misfits(heliostat, observations, z, optics, effects, latitude_deg=latitude_deg),
         used=tuple(o.identifier for o in observations),
         mahalanobis=prior.mahalanobis(z),
     )

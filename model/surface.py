@@ -26,6 +26,18 @@ FACETS, ROWS, COLUMNS, DEGREE = 4, 8, 8, 3
 Array = NDArray[np.float64]
 
 
+def require_own_grid(heliostat: Heliostat) -> None:
+    """Refuse a heliostat that has not as many facets as predicted surfaces: what was learnt says nothing of it.
+
+    Raises
+    ------
+    InvalidInputError
+    """
+    count = len(heliostat.facets)
+    if count != FACETS:
+        raise InvalidInputError(f"surfaces are predicted of mirrors of {FACETS} facets, {heliostat.name} has {count}")
+
+
 def knots(count: int, degree: int) -> Array:
     """Clamped uniform knots (count + degree + 1,) on [0, 1] for ``count`` control points."""
     if not 1 <= degree < count:
@@ -180,6 +192,9 @@ def heights(heliostat: Heliostat, points: ArrayLike, degree: int = DEGREE, sampl
     ideal place keep their own centre.
     """
     _, axes, half_sizes = heliostat.facet_frames
+    count = len(np.asarray(points))
+    if count != len(axes):
+        raise InvalidInputError(f"a surface of {count} facets for {heliostat.name}, which has {len(axes)}")
     grid = (np.arange(samples) + 0.5) / samples
     _, normals = evaluate(points, grid, grid, degree)
     u, v = (a.ravel() for a in np.meshgrid(grid, grid, indexing="ij"))

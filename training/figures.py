@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from model.metrics import flux_accuracies, surface_error
 from model.network.architecture import MAX_IMAGES
 from model.observation import render_observations
+from model.plant import JUELICH_LATITUDE
 from training.cases import NEW_SUNS, Case
 from training.methods import Method
 
@@ -36,7 +37,10 @@ class Outcome:
 
 def judge(case: Case, z: Array, z_std: Array | None) -> Outcome:
     """Compare a predicted surface (4, 8, 8) [m], and its standard deviation, with the true one."""
-    truth, forecast = (render_observations(case.heliostat, case.forecasts, s).clip(min=0) for s in (case.truth, z))
+    truth, forecast = (
+        render_observations(case.heliostat, case.forecasts, s, latitude_deg=JUELICH_LATITUDE).clip(min=0)
+        for s in (case.truth, z)
+    )
     accuracies = flux_accuracies(truth, forecast)
     return Outcome(
         surface=case.surface,

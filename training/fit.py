@@ -24,7 +24,7 @@ from model.frames import wgs84_to_enu
 from model.images import FLUX_SHAPE, FLUX_WINDOW
 from model.metrics import flux_accuracies
 from model.mount import Mount
-from model.plant import Facet, Heliostat
+from model.plant import JUELICH_LATITUDE, Facet, Heliostat
 from model.surface import COLUMNS, DEGREE, ROWS, basis, control_points, fit_heights
 from training.cases import SOURCE
 from training.figures import markdown, shown
@@ -143,7 +143,11 @@ def fit_accuracies(heliostat: Heliostat, fine: Array, coarse: Array, seed: int =
     suns = Situations().suns(SUNS, np.random.default_rng(seed))
     view = View(*FLUX_SHAPE, window=FLUX_WINDOW, samples=64, cones="facet")
     truth, fitted = (
-        forecast_setups([Setup(heliostat, points, sun, SOURCE, spot=SOURCE.center) for sun in suns], view=view)
+        forecast_setups(
+            [Setup(heliostat, points, sun, SOURCE, spot=SOURCE.center) for sun in suns],
+            view=view,
+            latitude_deg=JUELICH_LATITUDE,
+        )
         .clamp(min=0)
         .numpy()
         for points in (fine, coarse)

@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from model.network.predictor import LOOKS, SurfacePredictor
+from model.plant import JUELICH_LATITUDE
 from model.prior import SurfacePrior
 from model.refinement import refine
 from training.cases import Case
@@ -30,7 +31,9 @@ def by_onnx(predictor: SurfacePredictor, looks: int = LOOKS) -> Method:
     """An exported network, asked as the product asks it."""
 
     def method(case: Case, images: int) -> tuple[Array, Array | None]:
-        predicted = predictor.predict(case.heliostat, case.observations[:images], looks=looks)
+        predicted = predictor.predict(
+            case.heliostat, case.observations[:images], looks=looks, latitude_deg=JUELICH_LATITUDE
+        )
         return predicted.z, predicted.z_std
 
     return method
@@ -54,7 +57,13 @@ def by_refinement(start: Method, prior: SurfacePrior | None = None) -> Method:
     """What refinement makes of another method's surface; with the shipped prior unless another is given."""
 
     def method(case: Case, images: int) -> tuple[Array, Array | None]:
-        refined = refine(case.heliostat, case.observations[:images], start(case, images)[0], prior=prior)
+        refined = refine(
+            case.heliostat,
+            case.observations[:images],
+            start(case, images)[0],
+            prior=prior,
+            latitude_deg=JUELICH_LATITUDE,
+        )
         return refined.z, refined.z_std
 
     return method

@@ -24,13 +24,11 @@ from model.images import COARSE_SIZE, FLUX_SHAPE, FLUX_SIZE, normalized
 from model.network.architecture import CONDITIONS
 from model.network.inputs import DESCENT_SAMPLES, GUESS_SAMPLES, conditions, descents
 from model.observation import Observation, scene_of
-from model.plant import Heliostat, TargetPlane
+from model.plant import JUELICH_LATITUDE, Heliostat, TargetPlane
 from model.surface import control_points
 from model.tracing import Optics, Scene, Window, trace
 
 Array = NDArray[np.float64]
-
-JUELICH_LATITUDE = 50.913
 
 TOWER_TOP = (0.0, 0.0, 55.0)
 """What heliostats are canted for [m]: the receiver of Juelich, about."""

@@ -1,6 +1,6 @@
 """Effects that a plant's model may lack: one file an effect, found by studies, adopted into forecasts."""
 
-from model.effects.base import JUELICH_LATITUDE, Effect, Parameter, Scope, Stage, parameter
+from model.effects.base import Effect, Parameter, Scope, Stage, parameter
 from model.effects.catalogue import (
     CATALOGUE,
     effect_from_json,
@@ -13,7 +13,6 @@ from model.effects.catalogue import (
 
 __all__ = [
     "CATALOGUE",
-    "JUELICH_LATITUDE",
     "Effect",
     "Parameter",
     "Scope",

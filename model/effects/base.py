@@ -31,9 +31,6 @@ Stage = Literal["geometry", "optics", "image"]
 Factor = Literal["distance", "heliostat", "elevation", "side", "roll", "weather", "camera"]
 """What may vary between photographs; `model.study.advice` says which photographs vary it."""
 
-JUELICH_LATITUDE = 50.913
-"""Latitude [deg] of the Solar Tower Juelich."""
-
 
 @dataclass(frozen=True)
 class Parameter:

@@ -28,7 +28,7 @@ from model.network.inputs import (
 from model.observation import Observation, SurfacePrediction, align_observations, misfits
 from model.plant import Heliostat
 from model.prior import default_prior
-from model.surface import FACETS, control_points, mirrored
+from model.surface import control_points, mirrored, require_own_grid
 from model.tracing import Optics
 
 Array = NDArray[np.float64]
@@ -62,7 +62,7 @@ class SurfacePredictor:
 
         content = path.read_bytes()
         options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = threads
+        options.intra_op_num_threads = options.inter_op_num_threads = threads
         self.session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
         self.name = f"{path.stem}-{hashlib.sha256(content).hexdigest()[:12]}"
 
@@ -79,14 +79,14 @@ class SurfacePredictor:
         optics: Optics | None = None,
         effects: Sequence[Effect] = (),
         *,
+        latitude_deg: float,
         looks: int = LOOKS,
     ) -> tuple[Array, Array]:
         """Heights and their standard deviation, each (4, 8, 8) [m], from one to eight images; see `predict`."""
         if not 1 <= len(observations) <= MAX_IMAGES:
             raise InvalidInputError(f"a prediction takes 1 to {MAX_IMAGES} images, got {len(observations)}")
-        if len(heliostat.facets) != FACETS:
-            raise InvalidInputError(f"the network knows mirrors of {FACETS} facets, {heliostat.name} has other")
-        network_inputs = _NetworkInputs(heliostat, observations, optics, effects)
+        require_own_grid(heliostat)
+        network_inputs = _NetworkInputs(heliostat, observations, optics, effects, latitude_deg)
         z = default_prior().mean
         inputs = network_inputs.inputs(z)
         for _ in range(looks - 1):
@@ -104,23 +104,26 @@ class SurfacePredictor:
         optics: Optics | None = None,
         effects: Sequence[Effect] = (),
         *,
+        latitude_deg: float,
         looks: int = LOOKS,
     ) -> SurfacePrediction:
         """The surface of a heliostat from one to eight of its images, as a model with these optics and effects sees it.
+
+        ``latitude_deg`` [deg] is the plant's.
 
         Raises
         ------
         InvalidInputError
             Without images, with more than eight, or for a heliostat that does not have four facets.
         """
-        z, z_std = self.heights(heliostat, observations, optics, effects, looks=looks)
+        z, z_std = self.heights(heliostat, observations, optics, effects, latitude_deg=latitude_deg, looks=looks)
         return SurfacePrediction(
             z=z,
             z_std=z_std,
             control_points=control_points(heliostat, z),
             method="network",
             weights=self.name,
-            misfits=misfits(heliostat, observations, z, optics, effects),
+            misfits=misfits(heliostat, observations, z, optics, effects, latitude_deg=latitude_deg),
             used=tuple(o.identifier for o in observations),
             mahalanobis=default_prior().mahalanobis(z),
         )
@@ -135,8 +138,10 @@ class _NetworkInputs:
         observations: Sequence[Observation],
         optics: Optics | None,
         effects: Sequence[Effect],
+        latitude_deg: float,
     ) -> None:
         self.heliostat, self.observations, self.optics, self.effects = heliostat, observations, optics, effects
+        self.latitude_deg = latitude_deg
         self.flux = torch.as_tensor(np.array([o.flux for o in observations]), dtype=torch.float32)
         self.ideal = torch.as_tensor(control_points(heliostat), dtype=torch.float32).movedim(-1, -3)
         self.normals = torch.as_tensor(heliostat.facet_normals, dtype=torch.float32)
@@ -146,7 +151,9 @@ class _NetworkInputs:
     def inputs(self, z: Array) -> dict[str, NDArray[Any]]:
         """`INPUTS` of a look at a guessed surface (4, 8, 8) [m]."""
         # The guess before differs little, and from its alignment few rounds are left.
-        aligned = align_observations(self.heliostat, self.observations, z, self.effects, start=self.aligned)
+        aligned = align_observations(
+            self.heliostat, self.observations, z, self.effects, latitude_deg=self.latitude_deg, start=self.aligned
+        )
         self.aligned = aligned
         with torch.no_grad():
             guess_flux = self._images(aligned, FLUX_SIZE, GUESS_SAMPLES)

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from model.effects import JUELICH_LATITUDE, Effect, effect_to_json
+from model.effects import Effect, effect_to_json
 from model.errors import InvalidInputError
 from model.forecast import Aligned, Setup, View, align
 from model.images import FLUX_SIZE
@@ -160,7 +160,8 @@ class Forecaster:
         declared: Sequence[Effect],
         window: float,
         view: View,
-        latitude_deg: float = JUELICH_LATITUDE,
+        *,
+        latitude_deg: float,
     ) -> None:
         self.flux_images, self.optics, self.declared = flux_images, optics, list(declared)
         self.window, self.view, self.latitude_deg = window, view, latitude_deg
@@ -187,7 +188,7 @@ class Forecaster:
                 flux_images += [replace(p, setup=s) for s, p in zip(setups, self.flux_images, strict=True)]
             declared = [copied(effect, count) for effect in self.declared]
             self._copies[count] = Forecaster(
-                flux_images, self.optics, declared, self.window, self.view, self.latitude_deg
+                flux_images, self.optics, declared, self.window, self.view, latitude_deg=self.latitude_deg
             )
         return self._copies[count]
 

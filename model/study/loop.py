@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from model.effects import CATALOGUE, JUELICH_LATITUDE, Effect
+from model.effects import CATALOGUE, Effect
 from model.errors import InvalidInputError
 from model.forecast import View
 from model.images import FLUX_SIZE
@@ -42,7 +42,6 @@ class StudyOptions:
     least_gain: float = 0.004
     most: int = 3
     window: float | None = None
-    latitude_deg: float = JUELICH_LATITUDE
     fit_view: View = field(default_factory=lambda: View(64, 64, samples=12, padding=0.125))
     view: View = field(default_factory=lambda: View(128, 128, samples=24))
 
@@ -66,7 +65,12 @@ class _Loop:
     """One study while it goes on."""
 
     def __init__(
-        self, flux_images: Sequence[FluxImage], optics: Optics, declared: Sequence[Effect], options: StudyOptions
+        self,
+        flux_images: Sequence[FluxImage],
+        optics: Optics,
+        declared: Sequence[Effect],
+        options: StudyOptions,
+        latitude_deg: float,
     ) -> None:
         self.flux_images, self.options = flux_images, options
         self.window = options.window or spot_window(flux_images)
@@ -75,7 +79,7 @@ class _Loop:
 
         def forecaster(rows: NDArray[np.int64], view: View) -> Forecaster:
             chosen = [flux_images[row] for row in rows]
-            return Forecaster(chosen, optics, declared, self.window, view, options.latitude_deg)
+            return Forecaster(chosen, optics, declared, self.window, view, latitude_deg=latitude_deg)
 
         self.fit, self.own = (
             (forecaster(rows, options.fit_view), forecaster(rows, options.view)) if len(rows) else None
@@ -177,6 +181,8 @@ def study(
     effects: Sequence[Effect] = (),
     options: StudyOptions | None = None,
     progress: Callable[[str], None] = lambda message: None,
+    *,
+    latitude_deg: float,
 ) -> Study:
     """Which effects photographs demand that a model with these optics and effects lacks, and what they buy.
 
@@ -188,6 +194,8 @@ def study(
         The declared model.
     progress : callable
         Told what is being fitted.
+    latitude_deg : float [deg]
+        Of the plant.
 
     Raises
     ------
@@ -201,7 +209,7 @@ def study(
         raise InvalidInputError(f"a study takes at least {LEAST_IMAGES} photographs, got {len(flux_images)}")
     if len({p.key for p in flux_images}) < len(flux_images):
         raise InvalidInputError("photographs of a study must have identifiers of their own")
-    loop = _Loop(flux_images, optics, effects, options)
+    loop = _Loop(flux_images, optics, effects, options, latitude_deg)
     declared = {effect.name for effect in effects}
     before = current = loop.trial([])
     found: list[Found] = []
@@ -237,5 +245,5 @@ def study(
         found=[f.fitted(current.unknowns, current.values, current.spread) for f in found],
         candidates=sorted(candidates, key=lambda c: -c.accuracy_after),
         effects=current.effects,
-        latitude_deg=options.latitude_deg,
+        latitude_deg=latitude_deg,
     )

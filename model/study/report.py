@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from model.effects import CATALOGUE, JUELICH_LATITUDE, Effect
+from model.effects import CATALOGUE, Effect
 from model.metrics import flux_accuracies
 from model.study.advice import told_apart_by
 from model.study.covariates import covariates_of
@@ -100,7 +100,7 @@ class Study:
     found: list[Found]
     candidates: list[Candidate]
     effects: list[Effect]
-    latitude_deg: float = JUELICH_LATITUDE
+    latitude_deg: float
 
     @cached_property
     def accuracy_before(self) -> Array:

@@ -45,6 +45,8 @@ class Optics:
             raise InvalidInputError(f"reflectivity must lie in [0, 1], got {self.reflectivity}")
         if not 0 <= self.dni < 1e5:
             raise InvalidInputError(f"dni [W/m2] must lie in [0, 100000), got {self.dni}")
+        if not np.isfinite(self.attenuation).all():
+            raise InvalidInputError(f"attenuation must be finite coefficients, got {self.attenuation}")
 
     def irradiance(self, slant_range: Tensor) -> Tensor:
         """DNI [W/m2] after the mirror and the air, for slant ranges [m]."""

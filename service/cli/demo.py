@@ -19,7 +19,6 @@ from model.metrics import flux_accuracy
 from model.network.architecture import MAX_IMAGES
 from model.observation import Observation
 from model.plant import Heliostat
-from model.tracing import Optics
 from service.base.arrays import unpack
 from service.base.choices import Method
 from service.base.settings import Settings
@@ -148,11 +147,11 @@ def _predict(
     surfaces["network"] = _stored(runtime, name, "network", used)
     surfaces["refined"] = _stored(runtime, name, "refined", used)
     _store_forecast(runtime, name, judged[0])
-    fluxes = {key: [_forecast(heliostat, o, folder.optics, (z, None)) for o in judged] for key, z in surfaces.items()}
+    fluxes = {key: [_forecast(heliostat, o, folder, (z, None)) for o in judged] for key, z in surfaces.items()}
     errors: dict[str, dict[str, float]] = {}
     measured = folder.measured_surface(name)
     if measured is not None:
-        fluxes["measured"] = [_forecast(heliostat, o, folder.optics, (None, measured)) for o in judged]
+        fluxes["measured"] = [_forecast(heliostat, o, folder, (None, measured)) for o in judged]
         truth = measured_heights(heliostat, measured)
         errors = {key: surface_errors(z, truth) for key, z in surfaces.items() if z is not None}
         surfaces["measured"] = truth
@@ -188,7 +187,7 @@ def _store_forecast(runtime: Runtime, name: str, observation: Observation) -> No
 
 
 def _forecast(
-    heliostat: Heliostat, observation: Observation, optics: Optics, surface: tuple[Array | None, Any]
+    heliostat: Heliostat, observation: Observation, folder: MeasurementFolder, surface: tuple[Array | None, Any]
 ) -> Array:
     """Forecast (64, 64) in the window of an observation, about its own centre of mass.
 
@@ -204,8 +203,9 @@ def _forecast(
         spot=observation.center_of_mass,
         resolution=(96, 96),
         window=wide,
-        optics=optics,
+        optics=folder.optics,
         surface=measured,
+        latitude_deg=float(folder.plant.origin[0]),
     )
     center = center_of_mass(traced.flux, (wide, wide))
     return flux_window(traced.flux, (wide, wide), center, FLUX_WINDOW, FLUX_SIZE)

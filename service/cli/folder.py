@@ -26,7 +26,7 @@ from model.surface import split_canting
 from service.base.choices import Method
 from service.base.progress import Progress, quiet
 from service.sources.decode import decode_image
-from service.sources.documents import IMAGE_KINDS, Measurement
+from service.sources.documents import IMAGE_KINDS, Measurement, optics_to_json
 from service.sources.folder import MeasurementFolder, measured_heights, read_surface
 from service.twin import compute
 from service.twin.evidence import Evidence, choose
@@ -68,10 +68,14 @@ def measure(folder: MeasurementFolder, measurement: Measurement, kind: ImageKind
     return _measure(measurement.images[chosen], chosen, plane)
 
 
-def _finish(folder: MeasurementFolder, report: dict[str, Any], path: Path, done: str) -> dict[str, Any]:
-    """Write the report with all that was skipped; refuse to call nothing a success."""
+def _write_report(folder: MeasurementFolder, report: dict[str, Any], path: Path) -> None:
     report["skipped"] = {**folder.skipped, **report["skipped"]}
     write_json(path, report)
+
+
+def _finish(folder: MeasurementFolder, report: dict[str, Any], path: Path, done: str) -> dict[str, Any]:
+    """Write the report with all that was skipped; refuse to call nothing a success."""
+    _write_report(folder, report, path)
     if not report[done]:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in list(report["skipped"].items())[:3])
         raise ModelError(f"nothing was left to do, everything was skipped ({reasons}); see {path}")
@@ -171,7 +175,14 @@ def predict_heliostat(
     if not usable:
         reason = f"every image was refused: {next(iter(refused.values()))}" if refused else "no image"
         raise InvalidInputError(reason)
-    predicted = compute.predict(heliostat, choose(usable, images), method, folder.optics, folder.effects)
+    predicted = compute.predict(
+        heliostat,
+        choose(usable, images),
+        method,
+        folder.optics,
+        folder.effects,
+        latitude_deg=float(folder.plant.origin[0]),
+    )
     entry: dict[str, Any] = {
         "method": method,
         "weights": predicted.weights,
@@ -213,15 +224,21 @@ def predict_folder(
     if not 1 <= images <= MAX_IMAGES:
         raise InvalidInputError(f"--images must lie in 1 to {MAX_IMAGES}, got {images}")
     report: dict[str, Any] = {"method": method, "heliostats": {}, "skipped": {}}
-    for name, heliostat in folder.plant.heliostats.items():
-        progress(name)
-        try:
-            predicted, entry = predict_heliostat(folder, heliostat, method, images)
-        except ModelError as error:
-            report["skipped"][name] = str(error)
-            continue
-        write_surface(out, name, predicted)
-        report["heliostats"][name] = entry
+    try:
+        for name, heliostat in folder.plant.heliostats.items():
+            progress(name)
+            try:
+                predicted, entry = predict_heliostat(folder, heliostat, method, images)
+            except ModelError as error:
+                report["skipped"][name] = str(error)
+                continue
+            write_surface(out, name, predicted)
+            report["heliostats"][name] = entry
+    except KeyboardInterrupt:  # hours of work may lie behind it
+        left = [name for name in folder.plant.heliostats if name not in report["heliostats"]]
+        report["skipped"] = dict.fromkeys(left, "interrupted") | report["skipped"]
+        _write_report(folder, report, out / "predictions.json")
+        raise
     return _finish(folder, report, out / "predictions.json", "heliostats")
 
 
@@ -239,6 +256,10 @@ def write_surface(out: Path, name: str, predicted: SurfacePrediction) -> None:
 
 
 # --- forecast ---------------------------------------------------------------------------------------------------------
+
+
+# Side [m] of a window that no target reaches.
+_WIDEST_WINDOW = 1000.0
 
 
 def check_surfaces(surfaces: str) -> None:
@@ -313,10 +334,13 @@ def forecast_folder(
     ``effects`` come in addition to those that the folder declares.
     """
     check_surfaces(surfaces)
+    if window is not None and not 0 < window <= _WIDEST_WINDOW:
+        raise InvalidInputError(f"--window must lie in 0 to {_WIDEST_WINDOW:g} m, got {window:g}")
     report: dict[str, Any] = {
         "surfaces": surfaces,
         "model_version": model_version([*folder.effects, *effects]),
         "effects": [effect_to_json(effect) for effect in (*folder.effects, *effects)],
+        "optics": {"dni_w_m2": folder.optics.dni, **optics_to_json(folder.optics)},
         "measurements": {},
         "skipped": {},
     }

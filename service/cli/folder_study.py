@@ -1,7 +1,7 @@
 """The study of a measurement folder: ``heliotwin study``."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -88,9 +88,9 @@ def study_folder(
     check_surfaces(surfaces)
     photographs, skipped = photographs_of(folder, surfaces)
     known = [*folder.effects, *effects]
-    options = replace(options or StudyOptions(), latitude_deg=float(folder.plant.origin[0]))
     try:
-        found = study(photographs, folder.optics, known, options, progress)
+        latitude_deg = float(folder.plant.origin[0])
+        found = study(photographs, folder.optics, known, options, progress, latitude_deg=latitude_deg)
     except InvalidInputError as error:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in list(skipped.items())[:5])
         raise InvalidInputError(f"{error}" + (f" ({reasons})" if reasons else "")) from None

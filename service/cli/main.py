@@ -1,7 +1,8 @@
 """The command ``heliotwin``."""
 
 import sys
-from typing import Any
+from importlib.metadata import PackageNotFoundError, version
+from typing import Annotated, Any
 
 import typer
 from pydantic import ValidationError
@@ -26,6 +27,23 @@ class _Group(TyperGroup):
             raise InvalidInputError(" ".join(said.split())) from None
 
 
+def _say_version(is_asked: bool) -> None:
+    if is_asked:
+        try:
+            typer.echo(f"heliotwin {version('heliotwin')}")
+        except PackageNotFoundError:
+            typer.echo("heliotwin, not installed")
+        raise typer.Exit
+
+
+def _options(
+    _version: Annotated[
+        bool, typer.Option("--version", callback=_say_version, is_eager=True, help="Print the version and end.")
+    ] = False,
+) -> None:
+    """What stands before a verb; without a word for help, so that the group's own text stays."""
+
+
 app = typer.Typer(
     name="heliotwin",
     cls=_Group,
@@ -34,6 +52,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
+    callback=_options,
 )
 
 
@@ -42,7 +61,7 @@ for _group in modules_of("service.cli.verbs"):
 
 
 def main() -> None:
-    """Run the command; bad input ends with exit code 2 and one line, other failures of the model with 1."""
+    """Run the command; bad input ends with exit code 2 and one line, other failures, the database's too, with 1."""
     try:
         app()
     except InvalidInputError as error:
@@ -52,6 +71,18 @@ def main() -> None:
         _fail(f"setting {'.'.join(map(str, first['loc'])) or 'combination'}: {first['msg']}", 2)
     except (ModelError, ServiceError, OSError) as error:
         _fail(error, 1)
+    except _database_errors() as error:
+        _fail(f"the database: {' '.join(str(getattr(error, 'orig', None) or error).split())[:_LONGEST]}", 1)
+
+
+# Characters of a database's complaint that are shown.
+_LONGEST = 300
+
+
+def _database_errors() -> tuple[type[Exception], ...]:
+    """SQLAlchemy's and Alembic's, where the verb loaded them; loading them for the others' sake takes too long."""
+    known = {"sqlalchemy.exc": "SQLAlchemyError", "alembic.util.exc": "CommandError"}
+    return tuple(getattr(sys.modules[module], name) for module, name in known.items() if module in sys.modules)
 
 
 def _fail(error: object, code: int) -> None:

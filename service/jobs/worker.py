@@ -19,7 +19,7 @@ from sqlalchemy.exc import OperationalError, SQLAlchemyError, StatementError
 from sqlalchemy.orm import Session
 
 from model.errors import InvalidInputError, ModelError
-from service.base import logs, telemetry
+from service.base import logs, memory, telemetry
 from service.base.arrays import pack
 from service.base.faults import ServiceError
 from service.base.meters import JOB_ATTEMPTS, JOB_SECONDS, PROCESS, listening, timed
@@ -243,6 +243,7 @@ def work(settings: Settings, kinds: Kinds, operations: Operations | None = None)
     """
     if not settings.job_workers:
         raise InvalidInputError("job_workers: 0 works at nothing; give --count or HELIOTWIN_JOB_WORKERS")
+    memory.limit()
     logs.set_up(settings)
     telemetry.set_up(settings, "heliotwin-worker")
     runtime = Runtime.from_settings(settings, operations)

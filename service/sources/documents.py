@@ -4,7 +4,7 @@ Source: the PAINT database of the Solar Tower Juelich, https://paint-database.or
 """
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,10 @@ from model.tracing import Optics
 from service.sources.photograph import Photograph
 
 Array = NDArray[np.float64]
+
+# Coefficients that an attenuation may have: published ones have four.
+_MAX_COEFFICIENTS = 8
+
 IMAGE_KINDS: tuple[ImageKind, ...] = ("flux", "cropped", "raw", "flux-centered")
 """Kinds of image that a measurement may hold, the most worked-out one with a known place on the target first."""
 
@@ -111,7 +115,9 @@ def _number(data: Any, where: str, *keys: str | int) -> float:
 
 
 def read_json(path: Path) -> Any:
-    """Parsed JSON of a file; a file that is missing or not JSON is named."""
+    """Parsed JSON of a file; one that is missing, no regular file (a pipe is waited for) or not JSON is named."""
+    if path.exists() and not path.is_file():
+        raise InvalidInputError(f"{path}: no regular file")
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -152,7 +158,8 @@ def _mount(kinematics: Any, where: str) -> Mount:
 def read_heliostat(name: str, properties: Any, origin: Array) -> Heliostat:
     """A heliostat of the contents of PAINT's ``heliostat-properties.json``.
 
-    ``origin`` (3,) is the tower base in WGS84. Raises `InvalidInputError`, which names the field.
+    ``origin`` (3,) is the tower base in WGS84. Raises `InvalidInputError`, which names the field. Facets in another
+    order are refused, not sorted: measured surfaces of the same heliostat are listed as its properties are.
     """
     where = f"properties of {name}"
     if not isinstance(properties, dict):
@@ -161,7 +168,9 @@ def read_heliostat(name: str, properties: Any, origin: Array) -> Heliostat:
     if kinematics is None:
         raise InvalidInputError(f"{where}: 'kinematics_properties' is missing")
     facets = get(properties, where, "facet_properties", "facets")
-    return Heliostat(
+    if not isinstance(facets, list):
+        raise InvalidInputError(f"{where}: 'facets' must be a list")
+    heliostat = Heliostat(
         name=name,
         position=Plant("", origin).to_enu(_numbers(properties, where, "heliostat_position", count=3)),
         mount=_mount(kinematics, where),
@@ -176,6 +185,11 @@ def read_heliostat(name: str, properties: Any, origin: Array) -> Heliostat:
         width=_number(properties, where, "width"),
         height=_number(properties, where, "height"),
     )
+    if not heliostat.has_facets_in_order:
+        raise InvalidInputError(
+            f"{where}: 'facets' must be listed upper left, upper right, lower left, lower right, seen from the front"
+        )
+    return heliostat
 
 
 def read_targets(tower: Any) -> tuple[Array, dict[str, TargetPlane]]:
@@ -284,12 +298,44 @@ def _sun_shape(declared: Any, where: str) -> SunShape:
     return shape(*(_number(declared, where, key) * unit for key, unit in shape.units.items()))
 
 
+def _optics(declared: Any, where: str) -> Optics:
+    """Declared ``reflectivity`` (0 to 1) and ``attenuation`` (`Optics.attenuation`); each has the model's default."""
+    if not isinstance(declared, dict):
+        raise InvalidInputError(f"{where}: 'optics' must be a JSON object")
+    unknown = sorted(set(declared) - {"reflectivity", "attenuation"})
+    if unknown:
+        raise InvalidInputError(f"{where}: 'optics' knows reflectivity and attenuation, not {unknown[0]!r}")
+    plain = Optics()
+    coefficients = declared.get("attenuation", [])
+    if not isinstance(coefficients, list) or len(coefficients) > _MAX_COEFFICIENTS:
+        raise InvalidInputError(f"{where}: 'attenuation' must be a list of up to {_MAX_COEFFICIENTS} numbers")
+    return replace(
+        plain,
+        reflectivity=_share(declared, where, "reflectivity") if "reflectivity" in declared else plain.reflectivity,
+        attenuation=tuple(_number(declared, where, "attenuation", place) for place in range(len(coefficients))),
+    )
+
+
+def _share(data: Any, where: str, key: str) -> float:
+    value = _number(data, where, key)
+    if not 0 <= value <= 1:
+        raise InvalidInputError(f"{where}: '{key}' must lie in 0 to 1, got {value}")
+    return value
+
+
+def optics_to_json(optics: Optics) -> dict[str, Any]:
+    """What besides the sun makes W/m2 of a forecast, in the form of ``twin.json``, defaults included."""
+    return {"reflectivity": optics.reflectivity, "attenuation": list(optics.attenuation)}
+
+
 def parse_declared(declared: Any, where: str) -> tuple[Optics, tuple[Effect, ...]]:
-    """Optics and effects of a declared model, which ``where`` holds."""
+    """Optics and effects of a declared model, which ``where`` holds; each part has the model's default."""
     if not isinstance(declared, dict):
         raise InvalidInputError(f"{where}: 'declared' must be a JSON object")
     sun = declared.get("sun")
-    optics = Optics() if sun is None else Optics(sun_shape=_sun_shape(sun, where))
+    optics = _optics(declared.get("optics", {}), where)
+    if sun is not None:
+        optics = replace(optics, sun_shape=_sun_shape(sun, where))
     return optics, _effects(declared.get("effects", []), where)
 
 

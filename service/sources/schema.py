@@ -68,6 +68,13 @@ class TowerMeasurements(Document):
     """PAINT's ``tower-measurements.json``: the tower base, and each planar target by its WGS84 corners."""
 
     power_plant_properties: PowerPlantProperties
+    declared: dict[str, Any] | None = Field(
+        default=None,
+        description="What twin.json declares of the plant's model: `sun`, `effects`, and `optics` with `reflectivity` "
+        "(0 to 1, by default 1) and `attenuation`, the share of light lost between mirror and target as coefficients "
+        "of a polynomial in the slant range in kilometres, the constant first (by default none: clear air).",
+        examples=[{"optics": {"reflectivity": 0.92, "attenuation": [0.006739, 0.1046, -0.017, 0.002845]}}],
+    )
 
 
 class KinematicsProperties(BaseModel):

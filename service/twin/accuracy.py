@@ -6,15 +6,13 @@ another photograph, or the plant's model another version.
 """
 
 import logging
-import threading
-from collections import OrderedDict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from statistics import fmean
 from typing import Any
 
 from numpy.typing import NDArray
-from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from model.errors import ModelError
@@ -22,6 +20,8 @@ from model.metrics import flux_accuracy
 from service import store
 from service.base.faults import ServiceError
 from service.store.tables import DriftRow, HeliostatRow, MeasurementRow, SurfaceRow
+from service.twin import versions
+from service.twin.book import Book
 from service.twin.evidence import Evidence, Twin, evidence_of, heights_of, load_twin
 from service.twin.runtime import Runtime
 
@@ -32,6 +32,9 @@ RECENT = 8
 
 # Results that are kept [1]: the field of the largest plant several times over.
 _MOST = 200_000
+
+# Heliostats whose comparisons are kept: half a megabyte each.
+_MOST_COMPARED = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +90,14 @@ def forecasts_of(runtime: Runtime, twin: Twin, shown: Sequence[Evidence], surfac
     """What a stored surface, or the ideal one, throws where each photograph shows its spot: (n, 64, 64), sum 100."""
     observations, model = [evidence.observation() for evidence in shown], twin.model
     with runtime.computing("compare") as operations:
-        return operations.render(twin.heliostat, observations, heights_of(surface), model.optics, model.effects)
+        return operations.render(
+            twin.heliostat,
+            observations,
+            heights_of(surface),
+            model.optics,
+            model.effects,
+            latitude_deg=twin.origin[0],
+        )
 
 
 @dataclass(frozen=True)
@@ -104,56 +114,20 @@ class State:
 
 
 class AccuracyBook:
-    """Mean accuracies [1] by `State`; those that are missing are worked out by one thread, in the background."""
+    """Mean accuracies [1] by `State`; those that are missing are worked out in the background."""
 
     def __init__(self, runtime: Runtime) -> None:
         self._runtime = runtime
-        self._lock = threading.Lock()
-        self._known: OrderedDict[State, float | None] = OrderedDict()
-        self._wanted: OrderedDict[State, None] = OrderedDict()
-        self._is_closed = False
-        self._thread: threading.Thread | None = None
+        self._book: Book[State, float | None] = Book(self._accuracy, None, "accuracy", _MOST)
 
     def look_up(self, states: Iterable[State]) -> tuple[dict[str, float | None], int]:
         """What is known, by heliostat (None: it could not be told), and how many are still being worked out."""
-        with self._lock:
-            asked = list(states)
-            missing = [state for state in asked if state not in self._known]
-            # What nobody asks for any more is not worth the work.
-            self._wanted = OrderedDict.fromkeys(missing)
-            if missing and not self._is_closed and self._thread is None:
-                self._thread = threading.Thread(target=self._work, name="accuracy", daemon=True)
-                self._thread.start()
-            known = {state.heliostat: self._known[state] for state in asked if state in self._known}
-            return known, len(missing)
+        known, missing = self._book.look_up(states)
+        return {state.heliostat: accuracy for state, accuracy in known.items()}, missing
 
     def close(self) -> None:
         """Stop working, and wait for what is under way."""
-        with self._lock:
-            self._is_closed = True
-            self._wanted.clear()
-            thread = self._thread
-        if thread is not None:
-            thread.join()
-
-    def _next(self) -> State | None:
-        with self._lock:
-            if not self._wanted:
-                self._thread = None
-                return None
-            return self._wanted.popitem(last=False)[0]
-
-    def _work(self) -> None:
-        while (state := self._next()) is not None:
-            try:
-                accuracy = self._accuracy(state)
-            except SQLAlchemyError as error:  # asked for again, it is tried again
-                logger.warning("the accuracy of heliostat %s waits for the database: %s", state.heliostat, error)
-                continue
-            with self._lock:
-                self._known[state] = accuracy
-                while len(self._known) > _MOST:
-                    self._known.popitem(last=False)
+        self._book.close()
 
     def _accuracy(self, state: State) -> float | None:
         """Of the surface that is current by now; None where it cannot be told, which the log explains."""
@@ -162,13 +136,63 @@ class AccuracyBook:
                 surface = store.get_surface_at(session, store.get_heliostat(session, state.heliostat))
             compared = compare(self._runtime, state.heliostat, surface)
             return fmean(comparison.accuracy for comparison in compared) if compared else None
-        except SQLAlchemyError:
-            raise
         except (ModelError, ServiceError) as error:
             logger.warning("the accuracy of heliostat %s cannot be told: %s", state.heliostat, error)
-        except Exception:  # whatever it is, the one thread that there is must live for the other heliostats
-            logger.exception("the accuracy of heliostat %s cannot be told", state.heliostat)
         return None
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What a heliostat's comparisons depend on; ``surface`` is a version, None the ideal mirror."""
+
+    heliostat: str
+    surface: int | None
+    newest: int
+    model: int
+
+
+@dataclass(frozen=True)
+class Compared:
+    """Comparisons with the newest photographs, or why there are none."""
+
+    comparisons: tuple[Comparison, ...] = ()
+    trouble: str | None = None
+
+
+class ComparisonBook:
+    """Comparisons by what they depend on: traced once, however often and by however many they are looked at."""
+
+    def __init__(self, runtime: Runtime) -> None:
+        self._runtime = runtime
+        failed = Compared(trouble="the comparison failed; the log says why")
+        self._book: Book[Shown, Compared] = Book(self._compared, failed, "comparisons", _MOST_COMPARED)
+
+    def read(self, session: Session, heliostat: HeliostatRow, surface: SurfaceRow | None) -> Shown | None:
+        """What the comparisons of a heliostat with a surface depend on by now; None where there is no photograph."""
+        photographs = select(func.max(MeasurementRow.id)).where(MeasurementRow.heliostat_id == heliostat.id)
+        newest = session.scalar(photographs.where(MeasurementRow.accepted))
+        if newest is None:
+            return None
+        model = versions.current_number(session)
+        return Shown(heliostat.name, None if surface is None else surface.version, newest, model)
+
+    def wait_for(self, shown: Shown, seconds: float = 5.0) -> Compared | None:
+        """Them; None where they are still being worked out after so many seconds."""
+        return self._book.wait_for(shown, seconds)
+
+    def close(self) -> None:
+        """Stop working, and wait for what is under way."""
+        self._book.close()
+
+    def _compared(self, shown: Shown) -> Compared:
+        try:
+            with self._runtime.database.reading() as session:
+                heliostat = store.get_heliostat(session, shown.heliostat)
+                surface = None if shown.surface is None else store.get_surface(session, heliostat, shown.surface)
+            return Compared(tuple(compare(self._runtime, shown.heliostat, surface)))
+        except (ModelError, ServiceError) as error:
+            logger.warning("heliostat %s cannot be compared with its photographs: %s", shown.heliostat, error)
+            return Compared(trouble=str(error))
 
 
 # --- drift ------------------------------------------------------------------------------------------------------------

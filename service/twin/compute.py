@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from model.effects import JUELICH_LATITUDE, Effect, model_version
+from model.effects import Effect, model_version
 from model.errors import InvalidInputError
 from model.fleet import Engine, FleetFlux, Superposition, Tile
 from model.fleet import superpose as superpose_tiles
@@ -20,7 +20,7 @@ from model.plant import Heliostat, Receiver, TargetPlane
 from model.refinement import refine
 from model.study import FluxImage, Study, StudyOptions
 from model.study import study as study_photographs
-from model.surface import COLUMNS, DEGREE, FACETS, ROWS, control_points
+from model.surface import COLUMNS, DEGREE, ROWS, control_points
 from model.tracing import Optics
 from model.tracing.convolution import central_rays
 from service.base.choices import Method
@@ -50,10 +50,12 @@ def predict(
     method: Method = "network",
     optics: Optics | None = None,
     effects: Sequence[Effect] = (),
+    *,
+    latitude_deg: float,
 ) -> SurfacePrediction:
     """The mirror surface of a heliostat from its images, by the network alone or refined through the tracer.
 
-    ``optics`` and ``effects`` are those of the model that is believed.
+    ``optics`` and ``effects`` are those of the model that is believed, ``latitude_deg`` [deg] is the plant's.
 
     Raises
     ------
@@ -64,9 +66,9 @@ def predict(
         raise InvalidInputError(f"method must be 'network' or 'refined', got {method!r}")
     predictor = default_predictor()
     if method == "network":
-        return predictor.predict(heliostat, observations, optics, effects)
-    start, _ = predictor.heights(heliostat, observations, optics, effects)
-    refined = refine(heliostat, observations, start, optics=optics, effects=effects)
+        return predictor.predict(heliostat, observations, optics, effects, latitude_deg=latitude_deg)
+    start, _ = predictor.heights(heliostat, observations, optics, effects, latitude_deg=latitude_deg)
+    refined = refine(heliostat, observations, start, latitude_deg=latitude_deg, optics=optics, effects=effects)
     return replace(refined, weights=f"{predictor.name}+{refined.weights}")
 
 
@@ -76,13 +78,15 @@ def render(
     z: ArrayLike | None,
     optics: Optics | None = None,
     effects: Sequence[Effect] = (),
+    *,
+    latitude_deg: float,
 ) -> Array:
-    """What a surface (4, 8, 8) [m], None the ideal one, would have thrown where M fluxes were observed.
+    """What a surface (F, 8, 8) [m], None the ideal one, would have thrown where M fluxes were observed.
 
     (M, 64, 64), each with sum 100, in the observations' own windows.
     """
-    heights = np.zeros((FACETS, ROWS, COLUMNS)) if z is None else np.asarray(z, dtype=np.float64)
-    return render_observations(heliostat, observations, heights, optics, effects)
+    heights = np.zeros((len(heliostat.facets), ROWS, COLUMNS)) if z is None else np.asarray(z, dtype=np.float64)
+    return render_observations(heliostat, observations, heights, optics, effects, latitude_deg=latitude_deg)
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +126,7 @@ def forecast(
     optics: Optics | None = None,
     surface: tuple[ArrayLike, int] | None = None,
     effects: Sequence[Effect] = (),
-    latitude_deg: float = JUELICH_LATITUDE,
+    latitude_deg: float,
 ) -> Forecast:
     """Trace the flux of a heliostat on a plane, as its model, with its effects, expects a camera to show it.
 
@@ -186,11 +190,11 @@ def superpose(
     resolution: tuple[int, int] = (256, 256),
     optics: Optics | None = None,
     effects: Sequence[Effect] = (),
-    latitude_deg: float = JUELICH_LATITUDE,
+    latitude_deg: float,
     engine: Engine | None = None,
 ) -> FleetFlux:
     """The light [W/m2] of many heliostats on one receiver; see `model.fleet`."""
-    task = Superposition(receiver, resolution, optics or Optics(), tuple(effects), latitude_deg)
+    task = Superposition(receiver, resolution, optics or Optics(), tuple(effects), latitude_deg=latitude_deg)
     return superpose_tiles(task, tiles, engine)
 
 
@@ -200,6 +204,8 @@ def study(
     effects: Sequence[Effect] = (),
     options: StudyOptions | None = None,
     progress: Progress = quiet,
+    *,
+    latitude_deg: float,
 ) -> Study:
     """Which effects photographs demand that a model with these optics and effects lacks; see `model.study.study`."""
-    return study_photographs(photographs, optics, effects, options, progress)
+    return study_photographs(photographs, optics, effects, options, progress, latitude_deg=latitude_deg)

@@ -73,6 +73,10 @@ class Line:
 
 
 def _current_surfaces(session: Session) -> dict[int, Current]:
+    place = func.row_number().over(
+        partition_by=SurfaceRow.heliostat_id, order_by=(SurfaceRow.valid_from.desc(), SurfaceRow.version.desc())
+    )
+    ranked = select(SurfaceRow.id, place.label("place")).subquery()
     query = select(
         SurfaceRow.heliostat_id,
         SurfaceRow.id,
@@ -81,8 +85,8 @@ def _current_surfaces(session: Session) -> dict[int, Current]:
         SurfaceRow.valid_from,
         SurfaceRow.misfit,
     )
-    # In this order the current one of each heliostat comes last and stays.
-    query = query.order_by(SurfaceRow.valid_from, SurfaceRow.version)
+    # The database picks them: a plant has many versions, and this is read at every refresh.
+    query = query.join(ranked, ranked.c.id == SurfaceRow.id).where(ranked.c.place == 1)
     return {row.heliostat_id: Current(*row[1:]) for row in session.execute(query)}
 
 
@@ -120,14 +124,16 @@ class FieldBook:
         self._accuracies.close()
 
     def _figures_of(self, session: Session, surfaces: Sequence[int]) -> dict[int, Figures]:
-        missing = [number for number in surfaces if number not in self._figures]
+        known = self._figures  # another request may put its own in their place meanwhile
+        missing = [number for number in surfaces if number not in known]
         fresh: dict[int, Figures] = {}
         for start in range(0, len(missing), _CHUNK):
             chunk = select(SurfaceRow.id, SurfaceRow.arrays).where(SurfaceRow.id.in_(missing[start : start + _CHUNK]))
             fresh.update((number, figures_of(arrays)) for number, arrays in session.execute(chunk))
-        # One assignment, so that two requests at a time do no harm; surfaces that are no longer current are let go.
-        self._figures = {**{number: self._figures[number] for number in surfaces if number not in missing}, **fresh}
-        return self._figures
+        # Surfaces that are no longer current are let go.
+        figures = {**{number: known[number] for number in surfaces if number in known}, **fresh}
+        self._figures = figures
+        return figures
 
     def read(self, session: Session) -> tuple[list[Line], int]:
         """All heliostats, and how many accuracies are still being worked out."""

@@ -117,7 +117,7 @@ def _standing(runtime: Runtime, fleet: Fleet, report: Callable[[float], None]) -
             for heliostat in _heliostats(fleet, rows, names):
                 yield heliostat, fleet.aim_of(heliostat.name)
 
-    return aligned_field(all_of_them(), fleet.sun, fleet.model.effects, fleet.origin[0])
+    return aligned_field(all_of_them(), fleet.sun, fleet.model.effects, latitude_deg=fleet.origin[0])
 
 
 def _tiles(

@@ -48,7 +48,14 @@ def compute_surface(
         chosen = named_measurements(session, twin.row, measurements)
     observations = [evidence_of(row, twin.origin).observation() for row in chosen]
     with runtime.computing(f"predict_{method}") as operations:
-        surface = operations.predict(twin.heliostat, observations, method, twin.model.optics, twin.model.effects)
+        surface = operations.predict(
+            twin.heliostat,
+            observations,
+            method,
+            twin.model.optics,
+            twin.model.effects,
+            latitude_deg=twin.origin[0],
+        )
     return Predicted(twin, method, surface)
 
 

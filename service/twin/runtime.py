@@ -40,6 +40,8 @@ class Operations(Protocol):
         method: Method = "network",
         optics: Optics | None = None,
         effects: Sequence[Effect] = (),
+        *,
+        latitude_deg: float,
     ) -> SurfacePrediction:
         """A surface from observations."""
 
@@ -50,6 +52,8 @@ class Operations(Protocol):
         z: NDArray[Any] | None,
         optics: Optics | None = None,
         effects: Sequence[Effect] = (),
+        *,
+        latitude_deg: float,
     ) -> NDArray[Any]:
         """What a surface would have thrown where fluxes were observed."""
 
@@ -65,7 +69,7 @@ class Operations(Protocol):
         window: float | None = None,
         optics: Optics | None = None,
         effects: Sequence[Effect] = (),
-        latitude_deg: float = ...,
+        latitude_deg: float,
     ) -> Forecast:
         """The flux of a heliostat on a plane."""
 
@@ -77,7 +81,7 @@ class Operations(Protocol):
         resolution: tuple[int, int] = (256, 256),
         optics: Optics | None = None,
         effects: Sequence[Effect] = (),
-        latitude_deg: float = ...,
+        latitude_deg: float,
         engine: Engine | None = None,
     ) -> FleetFlux:
         """The light of many heliostats on one receiver."""
@@ -89,6 +93,8 @@ class Operations(Protocol):
         effects: Sequence[Effect] = (),
         options: StudyOptions | None = None,
         progress: Progress = ...,
+        *,
+        latitude_deg: float,
     ) -> Study:
         """Which effects photographs demand that a model with these optics and effects lacks."""
 

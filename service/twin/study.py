@@ -67,12 +67,12 @@ class Material:
         known = [p.taken_at for p in self.photographs if p.taken_at is not None]
         return min(known, default=None), max(known, default=None)
 
-    def without_untraceable(self) -> "Material":
+    def without_untraceable(self, latitude_deg: float) -> "Material":
         """The same without photographs that no attitude of their heliostat can have made: one would end the study."""
         kept, skipped = [], dict(self.skipped)
         for photograph in self.photographs:
             try:
-                align([photograph.setup])
+                align([photograph.setup], latitude_deg=latitude_deg)
             except UnreachableError as error:
                 skipped[photograph.key] = str(error)
             else:
@@ -160,14 +160,16 @@ def study_store(runtime: Runtime, request: StudyRequest, report: Report = lambda
     with runtime.database.reading() as session:
         model, latitude_deg = versions.get_model(session), store.get_plant(session).latitude_deg
         material = gather(session, request)
-    options = StudyOptions(latitude_deg=latitude_deg)
+    options = StudyOptions()
     if request.candidates is not None:
         options = replace(options, candidates=tuple(request.candidates))
     steps = Steps(len(options.candidates) * options.most, report)
     with runtime.computing("study") as operations:
-        material = material.without_untraceable()
+        material = material.without_untraceable(latitude_deg)
         _require_enough(material)
-        study = operations.study(material.photographs, model.optics, model.effects, options, steps)
+        study = operations.study(
+            material.photographs, model.optics, model.effects, options, steps, latitude_deg=latitude_deg
+        )
     return Studied(request, model, material, study)
 
 

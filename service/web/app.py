@@ -15,6 +15,8 @@ from service.base.settings import Settings
 from service.jobs.kind import Kinds
 from service.jobs.kinds import KINDS
 from service.jobs.worker import Workers
+from service.store.database import Database
+from service.twin.accuracy import ComparisonBook
 from service.twin.field import FieldBook
 from service.twin.runtime import Operations, Runtime
 from service.web.answers import openapi, problems
@@ -40,6 +42,19 @@ def _operation_id(route: APIRoute) -> str:
     return route.name
 
 
+def require_fit(settings: Settings, database: Database) -> None:
+    """Migrate an embedded store; refuse one that nobody migrated, and a door that would stand open to others.
+
+    Raises
+    ------
+    SchemaError, OpenDoorError
+    """
+    if settings.migrates_on_start:
+        database.upgrade()
+    database.require_current()
+    security.require_closed_door(settings, database)
+
+
 def create_app(settings: Settings, operations: Operations | None = None, kinds: Kinds = KINDS) -> FastAPI:
     """The service for these settings.
 
@@ -53,12 +68,10 @@ def create_app(settings: Settings, operations: Operations | None = None, kinds: 
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         runtime = await to_thread.run_sync(Runtime.from_settings, settings, operations)
         try:
-            if settings.migrates_on_start:
-                await to_thread.run_sync(runtime.database.upgrade)
-            await to_thread.run_sync(runtime.database.require_current)
-            await to_thread.run_sync(security.require_closed_door, settings, runtime.database)
+            await to_thread.run_sync(require_fit, settings, runtime.database)
             app.state.runtime = runtime
             app.state.field = FieldBook(runtime)
+            app.state.comparisons = ComparisonBook(runtime)
             workers = Workers(runtime, kinds, settings.job_workers)
             workers.start()
             try:
@@ -67,6 +80,7 @@ def create_app(settings: Settings, operations: Operations | None = None, kinds: 
             finally:
                 await to_thread.run_sync(workers.stop)
                 await to_thread.run_sync(app.state.field.close)
+                await to_thread.run_sync(app.state.comparisons.close)
         finally:
             runtime.close()
 

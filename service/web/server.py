@@ -5,10 +5,11 @@ from types import FrameType
 
 import uvicorn
 
-from service.base import logs, telemetry
+from service.base import logs, memory, telemetry
 from service.base.faults import NotStartedError
 from service.base.settings import Settings
-from service.web.app import create_app
+from service.store.database import Database
+from service.web.app import create_app, require_fit
 
 # Seconds that requests under way get to finish when the service is told to stop.
 _GRACE_S = 30
@@ -36,10 +37,14 @@ def serve(settings: Settings) -> None:
     Raises
     ------
     NotStartedError
-        Where the store or the door keeps it from starting.
+        Where the port keeps it from starting.
+    SchemaError, OpenDoorError
+        Where the store or the door do.
     """
+    memory.limit()
     logs.set_up(settings)
     telemetry.set_up(settings, "heliotwin")
+    _require_fit(settings)
     app = create_app(settings)
     config = uvicorn.Config(
         app,
@@ -56,3 +61,13 @@ def serve(settings: Settings) -> None:
         server.run()
     except SystemExit as refusal:  # uvicorn's way to say that the application or the port failed
         raise NotStartedError("the service could not start; the log above says why") from refusal
+
+
+def _require_fit(settings: Settings) -> None:
+    """`require_fit`, before the server: what it raises inside of that is buried in a traceback."""
+    settings.data_dir.mkdir(parents=True, exist_ok=True)
+    database = Database(settings.database)
+    try:
+        require_fit(settings, database)
+    finally:
+        database.close()

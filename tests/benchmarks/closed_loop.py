@@ -19,7 +19,7 @@ from model.forecast import View
 from model.metrics import flux_accuracies, flux_accuracy
 from model.network.predictor import default_predictor
 from model.observation import Observation, align_observations, render_observations
-from model.plant import Heliostat, TargetPlane
+from model.plant import JUELICH_LATITUDE, Heliostat, TargetPlane
 from model.refinement import refine
 from model.study import FluxImage, Study, StudyOptions
 from model.study.fitting import Fitter
@@ -126,9 +126,11 @@ def left_out(photographs: Sequence[FluxImage], kinds: tuple[str, ...], window: f
         effects: list[Effect] = []
         if kinds:
             views = StudyOptions().fit_view, StudyOptions().view
-            fitter = Fitter(*(Forecaster(rest, optics, [], window, view) for view in views))
+            fitter = Fitter(
+                *(Forecaster(rest, optics, [], window, view, latitude_deg=JUELICH_LATITUDE) for view in views)
+            )
             effects = unknowns.effects(fitter.fit(unknowns, unknowns.neutral).values)
-        judge = Forecaster([photograph], optics, [], window, StudyOptions().view)
+        judge = Forecaster([photograph], optics, [], window, StudyOptions().view, latitude_deg=JUELICH_LATITUDE)
         accuracy[index] = flux_accuracies(judge.measured(), judge.cuts(effects))[0]
     return accuracy
 
@@ -150,12 +152,12 @@ Method = Callable[[Heliostat, list[Observation], Sequence[Effect]], np.ndarray]
 
 def by_network(heliostat: Heliostat, images: list[Observation], effects: Sequence[Effect]) -> np.ndarray:
     """Heights (4, 8, 8) [m] that the network predicts."""
-    return default_predictor().heights(heliostat, images, None, effects)[0]
+    return default_predictor().heights(heliostat, images, None, effects, latitude_deg=JUELICH_LATITUDE)[0]
 
 
 def by_refinement(heliostat: Heliostat, images: list[Observation], effects: Sequence[Effect]) -> np.ndarray:
     """Heights (4, 8, 8) [m] of the most probable surface."""
-    return refine(heliostat, images, effects=effects).z
+    return refine(heliostat, images, effects=effects, latitude_deg=JUELICH_LATITUDE).z
 
 
 METHODS = {"predicted": by_network, "refined": by_refinement}
@@ -192,7 +194,7 @@ def left_out_accuracy(
     """Mean accuracy of every fourth image under the surface made from the others."""
     kept = images[::4]
     z = surface(heliostat, [o for o in images if o not in kept][:8], effects)
-    traced = render_observations(heliostat, kept, z, None, effects).clip(min=0)
+    traced = render_observations(heliostat, kept, z, None, effects, latitude_deg=JUELICH_LATITUDE).clip(min=0)
     return float(np.mean([flux_accuracy(o.flux, image) for o, image in zip(kept, traced, strict=True)]))
 
 
@@ -225,7 +227,11 @@ def photograph(
     setups = places(suns, planes)
     view = View(64, 64, window=4.0, samples=48)
     with torch.no_grad():
-        flux = align_observations(heliostat, setups, z, effects).images(None, effects, view).numpy()
+        flux = (
+            align_observations(heliostat, setups, z, effects, latitude_deg=JUELICH_LATITUDE)
+            .images(None, effects, view)
+            .numpy()
+        )
     images = []
     for setup, image in zip(setups, flux, strict=True):
         noisy = image / image.max() + rng.normal(0, CleanCamera().noise, image.shape)

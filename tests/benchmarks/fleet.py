@@ -18,7 +18,7 @@ import torch
 from model.fleet import Superposition, aligned_field, superpose, tiles
 from model.forecast import Setup
 from model.frames import sun_direction
-from model.plant import Cylinder, Heliostat, Plant, Receiver, TargetPlane
+from model.plant import JUELICH_LATITUDE, Cylinder, Heliostat, Plant, Receiver, TargetPlane
 from model.prior import default_prior
 from model.sunshape import Pillbox
 from model.surface import control_points
@@ -120,9 +120,9 @@ def against_monte_carlo() -> None:
             for shadows in (True, False)
         }
         expected, powers = traced[True]
-        task = Superposition(receiver, (72, 72), Optics(Pillbox(half_angle)))
+        task = Superposition(receiver, (72, 72), Optics(Pillbox(half_angle)), latitude_deg=JUELICH_LATITUDE)
         some = [Setup(one, control_points(one), sun, square, aim=aim) for one in heliostats]
-        neighbours = aligned_field([(one, aim) for one in heliostats], sun)
+        neighbours = aligned_field([(one, aim) for one in heliostats], sun, latitude_deg=JUELICH_LATITUDE)
         found = superpose(task, tiles(some, neighbours))
         coarse = found.irradiance.reshape(18, 4, 18, 4).mean(axis=(1, 3))
         print(
@@ -147,8 +147,12 @@ def field_of_2000() -> None:
         with Meter() as meter:
             neighbours = None
             if has_neighbours:
-                neighbours = aligned_field([(setup.heliostat, square.center) for setup in some], some[0].sun)
-            total = superpose(Superposition(receiver, (side, side)), tiles(some, neighbours))
+                neighbours = aligned_field(
+                    [(setup.heliostat, square.center) for setup in some], some[0].sun, latitude_deg=JUELICH_LATITUDE
+                )
+            total = superpose(
+                Superposition(receiver, (side, side), latitude_deg=JUELICH_LATITUDE), tiles(some, neighbours)
+            )
         landed = total.irradiance.mean() * receiver.width * receiver.height
         print(f"  2,000 heliostats, {name}: {meter}; {total.power / 1e6:.2f} MW thrown, {landed / 1e6:.2f} MW land")
 
@@ -182,13 +186,17 @@ def field_of_200000(part: int) -> None:
     field, square = Field(200_000, 100.0), plane(200.0, 25.0)
     print(f"  200,000 heliostats: memory before {peak_mib():.0f} MiB")
     with Meter() as meter:
-        neighbours = aligned_field(((one, square.center) for one in field.every()), sun_direction(*SUN))
+        neighbours = aligned_field(
+            ((one, square.center) for one in field.every()), sun_direction(*SUN), latitude_deg=JUELICH_LATITUDE
+        )
     print(f"  where all 200,000 mirrors stand: {meter}; memory {peak_mib():.0f} MiB")
     rates = []
     for count in (part // 16, part // 4, part):
         some = setups(field, square, every=200_000 // count)
         with Meter() as meter:
-            total = superpose(Superposition(square, (128, 128)), tiles(some, neighbours), Threads(2))
+            total = superpose(
+                Superposition(square, (128, 128), latitude_deg=JUELICH_LATITUDE), tiles(some, neighbours), Threads(2)
+            )
         rates.append((total.heliostats, meter.cpu))
         print(
             f"  {total.heliostats:,} of them traced, 128 x 128: {meter.cpu:.1f} s of CPU, "

@@ -16,6 +16,7 @@ from model.images import normalized
 from model.metrics import surface_error
 from model.network.predictor import WEIGHTS
 from model.observation import SurfacePrediction, render_observations
+from model.plant import JUELICH_LATITUDE
 from service.sources.folder import read_folder
 from service.twin.compute import predict
 from service.twin.evidence import choose
@@ -56,7 +57,11 @@ def canted(case: Case, other: Case, rng: np.random.Generator) -> Case:
     angle, facet, z = rng.uniform(0, 2 * np.pi), rng.integers(4), case.truth.copy()
     slopes = CANTING_ERROR_MRAD * 1e-3 * np.array([np.cos(angle), np.sin(angle)])
     z[facet] += np.tensordot(slopes, tilt_modes(), axes=1)
-    return seen(replace(case, truth=z), render_observations(case.heliostat, case.observations, z), rng)
+    return seen(
+        replace(case, truth=z),
+        render_observations(case.heliostat, case.observations, z, latitude_deg=JUELICH_LATITUDE),
+        rng,
+    )
 
 
 def broken(case: Case, other: Case, rng: np.random.Generator) -> Case:
@@ -64,7 +69,13 @@ def broken(case: Case, other: Case, rng: np.random.Generator) -> Case:
     clean = np.ones(4)
     clean[rng.integers(4)] = 0
     effects = [Soiling({case.heliostat.name: clean})]
-    return seen(case, render_observations(case.heliostat, case.observations, case.truth, effects=effects), rng)
+    return seen(
+        case,
+        render_observations(
+            case.heliostat, case.observations, case.truth, effects=effects, latitude_deg=JUELICH_LATITUDE
+        ),
+        rng,
+    )
 
 
 def of_another(case: Case, other: Case, rng: np.random.Generator) -> Case:
@@ -121,7 +132,14 @@ def rendered(count: int) -> None:
     for label, fault in FAULTS.items():
         pairs = zip(cases, cases[1:] + cases[:1], strict=True)
         wrong = [fault(case, other, np.random.default_rng((301, i))) for i, (case, other) in enumerate(pairs)]
-        print(line(label, wrong, [predict(c.heliostat, c.observations, "refined") for c in wrong]), flush=True)
+        print(
+            line(
+                label,
+                wrong,
+                [predict(c.heliostat, c.observations, "refined", latitude_deg=JUELICH_LATITUDE) for c in wrong],
+            ),
+            flush=True,
+        )
 
 
 def photographed() -> None:
@@ -129,7 +147,7 @@ def photographed() -> None:
     found = mirrors(read_folder(data_folder(), ["AA39", "AC43"]))
     for heliostat, _, _ in found:
         for owner, observations, _ in found:
-            predicted = predict(heliostat, choose(observations, IMAGES), "refined")
+            predicted = predict(heliostat, choose(observations, IMAGES), "refined", latitude_deg=JUELICH_LATITUDE)
             verdict, shown = (
                 "trusted" if predicted.trusted else "doubted",
                 " ".join(f"{m:.3f}" for m in predicted.misfits),

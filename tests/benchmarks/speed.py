@@ -9,7 +9,7 @@ import torch
 from model.frames import sun_direction
 from model.network.architecture import MAX_IMAGES
 from model.network.predictor import INPUTS, LOOKS, SurfacePredictor
-from model.plant import Heliostat, TargetPlane
+from model.plant import JUELICH_LATITUDE, Heliostat, TargetPlane
 from model.prior import default_prior
 from model.refinement import refine
 from model.surface import control_points
@@ -79,10 +79,12 @@ def main() -> None:
     taken = seconds(lambda: [predictor.look(inputs) for inputs in [one] * (LOOKS - 1) + [two]], 20) * 1e3
     print(f"  network, one heliostat, 8 images, 1 core, {LOOKS} looks: {taken:.1f} ms")
     for looks in (1, LOOKS):
-        taken = seconds(lambda n=looks: predictor.heights(mirror, images, looks=n), 20) * 1e3
+        taken = (
+            seconds(lambda n=looks: predictor.heights(mirror, images, looks=n, latitude_deg=JUELICH_LATITUDE), 20) * 1e3
+        )
         print(f"  the same with alignment and tracing of its guesses, looks {looks}: {taken:.1f} ms")
     torch.set_num_threads(threads)
-    taken = seconds(lambda: refine(mirror, images), 3)
+    taken = seconds(lambda: refine(mirror, images, latitude_deg=JUELICH_LATITUDE), 3)
     print(f"  refinement, one heliostat, 8 images: {taken:.1f} s")
 
 

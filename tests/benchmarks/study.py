@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from model.effects import CATALOGUE as KINDS
 from model.metrics import flux_accuracies
+from model.plant import JUELICH_LATITUDE
 from model.study import FluxImage, Study, StudyOptions, study
 from model.study.flux_images import Forecaster
 from model.tracing import Optics
@@ -68,7 +69,11 @@ def answer(case: Case) -> Record:
     torch.set_num_threads(1)
     made = generate(case.name, case.level, case.seed, mirrors(data_folder()))
     start = process_time()
-    found = study([FluxImage(setup, image) for setup, image in zip(made.setups, made.images, strict=True)], Optics())
+    found = study(
+        [FluxImage(setup, image) for setup, image in zip(made.setups, made.images, strict=True)],
+        Optics(),
+        latitude_deg=JUELICH_LATITUDE,
+    )
     seconds = process_time() - start
     report = found.to_json()
     true, change = upper_bound(made, found)
@@ -95,7 +100,9 @@ def answer(case: Case) -> Record:
 
 def upper_bound(made: MeasurementSet, found: Study) -> tuple[float, float]:
     """Accuracy on the held-out images with the true effects, and by how much those change the forecast."""
-    forecaster = Forecaster(found.images, Optics(), [], found.window, StudyOptions().view)
+    forecaster = Forecaster(
+        found.images, Optics(), [], found.window, StudyOptions().view, latitude_deg=JUELICH_LATITUDE
+    )
     with_truth = forecaster.cuts(made.effects)
     true, same = flux_accuracies(found.measured, with_truth).mean(), flux_accuracies(found.before, with_truth).mean()
     return round(float(true), 5), round(float(1 - same), 5)

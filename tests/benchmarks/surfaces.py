@@ -9,7 +9,7 @@ import numpy as np
 
 from model.network.predictor import default_predictor
 from model.observation import Observation, misfits
-from model.plant import Heliostat
+from model.plant import JUELICH_LATITUDE, Heliostat
 from model.refinement import refine
 from service.cli import folder as verbs
 from service.cli.folder import surface_errors
@@ -23,18 +23,19 @@ IMAGES = 8
 def predicted(heliostat: Heliostat, observations: list[Observation]) -> dict[str, np.ndarray]:
     """Heights (4, 8, 8) [m] by the network and refined, from up to `IMAGES` observations."""
     used = choose(observations, IMAGES)
-    network = default_predictor().predict(heliostat, used).z
-    return {"network": network, "refined": refine(heliostat, used, network).z}
+    network = default_predictor().predict(heliostat, used, latitude_deg=JUELICH_LATITUDE).z
+    return {"network": network, "refined": refine(heliostat, used, network, latitude_deg=JUELICH_LATITUDE).z}
 
 
 def errors(heliostat: Heliostat, observations: list[Observation], truth: np.ndarray) -> None:
     """Print how far the surfaces from all images lie off the measured one."""
     for label, z in {"ideal": np.zeros_like(truth), **predicted(heliostat, observations)}.items():
         found = surface_errors(z, truth)
+        misfit = misfits(heliostat, observations, z, latitude_deg=JUELICH_LATITUDE)
         print(
             f"  {heliostat.name} {label:<8} from {min(IMAGES, len(observations))} images: all {found['mae_mm']:.3f}  "
             f"canting {found['mae_canting_mm']:.3f}  waviness {found['mae_waviness_mm']:.3f}  "
-            f"flux accuracy on all images {1 - np.mean(misfits(heliostat, observations, z)):.3f}"
+            f"flux accuracy on all images {1 - np.mean(misfit):.3f}"
         )
 
 
@@ -44,7 +45,9 @@ def left_out(heliostat: Heliostat, observations: list[Observation], truth: np.nd
     for index, image in enumerate(observations):
         others = observations[:index] + observations[index + 1 :]
         surfaces = {"ideal": np.zeros_like(truth), **predicted(heliostat, others), "measured": truth}
-        rows.append({name: 1 - misfits(heliostat, [image], z)[0] for name, z in surfaces.items()})
+        rows.append(
+            {name: 1 - misfits(heliostat, [image], z, latitude_deg=JUELICH_LATITUDE)[0] for name, z in surfaces.items()}
+        )
     for name in rows[0]:
         values = np.array([row[name] for row in rows])
         figures = f"mean {values.mean():.3f}  median {np.median(values):.3f}  min {values.min():.3f}"

@@ -20,6 +20,7 @@ from model.errors import InvalidInputError
 from model.forecast import Setup, View, align, forecast_setups
 from model.frames import sun_direction, sun_direction_at
 from model.mount import Mount
+from model.plant import JUELICH_LATITUDE
 from model.sunshape import Gaussian
 from model.surface import control_points, evaluate
 from model.tracing import Optics, Scene, Window, trace
@@ -42,7 +43,7 @@ def waves(seed=0, scale=2e-4) -> np.ndarray:
 
 
 def scene_of(one: Setup, *effects) -> Scene:
-    return align([one], effects, dtype=torch.float64).groups[0].scene
+    return align([one], effects, dtype=torch.float64, latitude_deg=JUELICH_LATITUDE).groups[0].scene
 
 
 # --- effects as data --------------------------------------------------------------------------------------------------
@@ -117,7 +118,7 @@ def test_a_list_is_needed():
 
 def test_values_must_match_the_facets():
     with pytest.raises(InvalidInputError, match="flat has 4 facets, got 3 values"):
-        align([setup()], [Soiling({"flat": np.ones(3)})])
+        align([setup()], [Soiling({"flat": np.ones(3)})], latitude_deg=JUELICH_LATITUDE)
 
 
 def test_version_names_the_effects_in_the_order_of_light():
@@ -130,7 +131,10 @@ def test_version_names_the_effects_in_the_order_of_light():
 @pytest.mark.parametrize("name", CATALOGUE)
 def test_without_parameters_nothing_changes(name):
     setups, view = [setup(), setup(sun_direction(-50.0, 25.0), z=waves())], View(64, 64, samples=8)
-    plain, neutral = (forecast_setups(setups, None, e, view, dtype=torch.float64) for e in ((), [CATALOGUE[name]()]))
+    plain, neutral = (
+        forecast_setups(setups, None, e, view, dtype=torch.float64, latitude_deg=JUELICH_LATITUDE)
+        for e in ((), [CATALOGUE[name]()])
+    )
     np.testing.assert_allclose(neutral, plain, atol=1e-3 * float(plain.max()))
 
 
@@ -300,14 +304,16 @@ STRONG = [
 def test_both_tracers_show_the_effect_alike(effect):
     """L1 distance of the images within the Monte Carlo tracer's noise."""
     rays, view, optics = 400_000, View(32, 32, window=6.0, samples=24, cones="facet"), Optics(sun_shape=Gaussian(3e-3))
-    aligned = align([setup(z=waves())], [effect], dtype=torch.float64)
+    aligned = align([setup(z=waves())], [effect], dtype=torch.float64, latitude_deg=JUELICH_LATITUDE)
 
     def montecarlo(scene: Scene, window: Window, optics: Optics) -> torch.Tensor:
         return torch.as_tensor(trace_montecarlo(scene, window, optics, rays=rays)[0])
 
     smooth = aligned.flux(optics, [effect], view)[0].clamp(min=0).numpy()
     thrown = aligned.flux(optics, [effect], view, montecarlo)[0].numpy()
-    plain = align([setup(z=waves())], dtype=torch.float64).flux(optics, (), view)[0].numpy()
+    plain = (
+        align([setup(z=waves())], dtype=torch.float64, latitude_deg=JUELICH_LATITUDE).flux(optics, (), view)[0].numpy()
+    )
     # Half the rays or more count: the others meet dirt or a neighbour.
     noise = np.sqrt(2 / np.pi) * np.sqrt(smooth / smooth.sum() / (rays / 2)).sum()
     assert np.abs(thrown - smooth).sum() / smooth.sum() < 1.1 * noise
@@ -316,7 +322,10 @@ def test_both_tracers_show_the_effect_alike(effect):
 
 @pytest.mark.parametrize("effect", [SunShapeEffect(0.3), SlopeError(2.0), TrackingJitter(3.0)], ids=lambda e: e.name)
 def test_optics_spread_light_and_lose_none(effect):
-    aligned, window = align([setup()], dtype=torch.float64), View(96, 96, window=30.0, samples=12)
+    aligned, window = (
+        align([setup()], dtype=torch.float64, latitude_deg=JUELICH_LATITUDE),
+        View(96, 96, window=30.0, samples=12),
+    )
     plain, spread = (aligned.flux(None, effects, window).sum() for effects in ((), [effect]))
     assert float(spread / plain) == pytest.approx(1, abs=2e-3)
 
@@ -340,7 +349,10 @@ def test_optics_spread_light_and_lose_none(effect):
 )
 def test_gradients_agree_with_finite_differences(make, value):
     """With the alignment held, which is not differentiable."""
-    held, view = align([setup(z=waves())], dtype=torch.float64).groups[0], View(24, 24, samples=8)
+    held, view = (
+        align([setup(z=waves())], dtype=torch.float64, latitude_deg=JUELICH_LATITUDE).groups[0],
+        View(24, 24, samples=8),
+    )
     heliostats = [setup().heliostat]
     weights = torch.as_tensor(np.random.default_rng(1).normal(size=(24, 24)))
 

@@ -14,7 +14,7 @@ from model.fleet import Superposition, aligned_field, superpose, tile_of, tiles
 from model.forecast import Setup
 from model.frames import sun_direction
 from model.neighbours import clear
-from model.plant import Cylinder, Facet, Heliostat
+from model.plant import JUELICH_LATITUDE, Cylinder, Facet, Heliostat
 from model.sunshape import Pillbox
 from model.surface import control_points
 from model.tracing import Optics, Scene, Window, trace
@@ -47,7 +47,7 @@ def setups(heliostats: list[Heliostat], sun=SUN, aim=None) -> list[Setup]:
 
 def test_fleet_is_the_sum_of_its_mirrors_however_it_is_tiled():
     some, plane = setups(field(3, 3, (20.0, 20.0), 60.0)), target(10.0)
-    task = Superposition(plane, (48, 64), OPTICS, (SlopeError(sigma_mrad=1.0),))
+    task = Superposition(plane, (48, 64), OPTICS, (SlopeError(sigma_mrad=1.0),), latitude_deg=JUELICH_LATITUDE)
     whole = superpose(task, tiles(some))
     assert (whole.heliostats, whole.skipped) == (9, {})
     angles = [setup.heliostat.mount.align(setup.heliostat.position, SUN, plane.center) for setup in some]
@@ -65,7 +65,10 @@ def test_fleet_is_the_sum_of_its_mirrors_however_it_is_tiled():
 def test_heliostat_that_cannot_send_light_there_is_skipped_by_name():
     heliostats = field(2, 3, (20.0, 20.0), 60.0)
     heliostats[4] = Heliostat.juelich("behind", np.array([0.0, -60.0, 1.8]), 70.0)
-    total = superpose(Superposition(target(), (16, 16), OPTICS), tiles(setups(heliostats), standing_of(heliostats)))
+    total = superpose(
+        Superposition(target(), (16, 16), OPTICS, latitude_deg=JUELICH_LATITUDE),
+        tiles(setups(heliostats), standing_of(heliostats)),
+    )
     assert total.heliostats == 5
     assert list(total.skipped) == ["behind"]
     assert "back" in total.skipped["behind"]
@@ -73,9 +76,9 @@ def test_heliostat_that_cannot_send_light_there_is_skipped_by_name():
 
 def test_camera_says_nothing_of_light_on_a_receiver():
     some = setups(field(1, 2, (20.0, 20.0), 60.0))
-    light = superpose(Superposition(target(), (32, 32), OPTICS), tiles(some))
+    light = superpose(Superposition(target(), (32, 32), OPTICS, latitude_deg=JUELICH_LATITUDE), tiles(some))
     camera = (CameraResponse(gamma=0.5), CameraBlur(sigma_m=0.4))
-    seen = superpose(Superposition(target(), (32, 32), OPTICS, camera), tiles(some))
+    seen = superpose(Superposition(target(), (32, 32), OPTICS, camera, latitude_deg=JUELICH_LATITUDE), tiles(some))
     np.testing.assert_array_equal(seen.irradiance, light.irradiance)
 
 
@@ -83,7 +86,7 @@ def test_camera_says_nothing_of_light_on_a_receiver():
 
 
 def standing_of(heliostats, sun=SUN, aim=(0.0, 0.0, 40.0)):
-    return aligned_field([(one, aim) for one in heliostats], sun)
+    return aligned_field([(one, aim) for one in heliostats], sun, latitude_deg=JUELICH_LATITUDE)
 
 
 def test_half_a_mirror_behind_another():
@@ -133,7 +136,7 @@ def test_blocking_and_shading_of_a_dense_field_against_monte_carlo():
     )
     some = setups(heliostats, sun, plane.center)
     neighbours = standing_of(heliostats, sun, plane.center)
-    task = Superposition(plane, (18, 18), OPTICS)
+    task = Superposition(plane, (18, 18), OPTICS, latitude_deg=JUELICH_LATITUDE)
     shaded, free = superpose(task, tiles(some, neighbours)), superpose(task, tiles(some))
     assert powers.sum() < 0.8 * free.power  # the field is dense
     assert shaded.power == pytest.approx(powers.sum(), rel=3e-3)
@@ -161,7 +164,7 @@ def test_both_tracers_cast_the_same_shadows():
 def test_neighbours_take_the_place_of_the_effect_that_stands_for_them():
     heliostats = field(1, 1, (4.0, 4.0), 60.0)
     effects = (Blocking(lower_fraction={"H0": 0.5}),)
-    task = Superposition(target(), (16, 16), OPTICS, effects)
+    task = Superposition(target(), (16, 16), OPTICS, effects, latitude_deg=JUELICH_LATITUDE)
     alone = superpose(task, tiles(setups(heliostats), standing_of(heliostats))).power
     assert superpose(task, tiles(setups(heliostats))).power == pytest.approx(alone / 2, rel=1e-3)
 
@@ -173,7 +176,9 @@ def test_cylinder_takes_in_all_that_is_thrown_at_it():
     cylinder = Cylinder("r", [0, 3.0, 40], [0, 1, 0], [0, 0, 1], 3.0, 24.0)
     heliostats = field(2, 4, (30.0, 30.0), 90.0)
     aim = np.array([0.0, 0.0, 40.0])
-    total = superpose(Superposition(cylinder, (96, 180), OPTICS), tiles(setups(heliostats, aim=aim)))
+    total = superpose(
+        Superposition(cylinder, (96, 180), OPTICS, latitude_deg=JUELICH_LATITUDE), tiles(setups(heliostats, aim=aim))
+    )
     pixel = cylinder.width * cylinder.height / (96 * 180)
     assert total.irradiance.sum() * pixel == pytest.approx(total.power, rel=3e-3)
     assert total.irradiance[:, :30].max() < 0.01 * total.irradiance.max()  # its back, away from the field
@@ -184,7 +189,7 @@ def test_cylinder_in_parallel_light_has_the_cosine_of_its_angle():
     flat = Facet(np.zeros(3), np.array([10.0, 0, 0]), np.array([0, 8.0, 0]))
     far = replace(Heliostat.juelich("far", np.array([0.0, 400.0, 40.0])), facets=(flat,), width=20.0, height=16.0)
     cylinder = Cylinder("r", [0, 2.0, 40], [0, 1, 0], [0, 0, 1], 2.0, 2.0, 120.0)
-    task = Superposition(cylinder, (8, 60), Optics(sun_shape=Pillbox(1e-3)), samples=96)
+    task = Superposition(cylinder, (8, 60), Optics(sun_shape=Pillbox(1e-3)), samples=96, latitude_deg=JUELICH_LATITUDE)
     found = superpose(task, tiles(setups([far], sun_direction(180.0, 60.0), np.array([0.0, 0.0, 40.0]))))
     angle = np.radians((np.arange(60) + 0.5) / 60 * 120 - 60)
     np.testing.assert_allclose(found.irradiance / np.cos(angle), 1000.0, rtol=0.01)
@@ -193,7 +198,10 @@ def test_cylinder_in_parallel_light_has_the_cosine_of_its_angle():
 def test_mirror_behind_the_lit_part_of_a_cylinder_is_skipped():
     cylinder = Cylinder("r", [0, 2.0, 40], [0, 1, 0], [0, 0, 1], 2.0, 4.0, 60.0)
     heliostats = [*field(1, 2, (20.0, 20.0), 60.0), Heliostat.juelich("south", np.array([0.0, -80.0, 1.8]), 90.0)]
-    total = superpose(Superposition(cylinder, (16, 16), OPTICS), tiles(setups(heliostats, aim=cylinder.center)))
+    total = superpose(
+        Superposition(cylinder, (16, 16), OPTICS, latitude_deg=JUELICH_LATITUDE),
+        tiles(setups(heliostats, aim=cylinder.center)),
+    )
     assert (total.heliostats, list(total.skipped)) == (2, ["south"])
     assert "behind the lit part" in total.skipped["south"]
 
@@ -216,7 +224,9 @@ def test_cylinder_against_monte_carlo(opening: float):
         seed=2,
         shadows=False,
     )
-    found = superpose(Superposition(cylinder, (48, 96), OPTICS), tiles(setups(heliostats, aim=aim)))
+    found = superpose(
+        Superposition(cylinder, (48, 96), OPTICS, latitude_deg=JUELICH_LATITUDE), tiles(setups(heliostats, aim=aim))
+    )
     coarse = found.irradiance.reshape(12, 4, 24, 4).mean(axis=(1, 3))
     assert found.power == pytest.approx(powers.sum(), rel=3e-3)
     assert coarse.sum() == pytest.approx(expected.sum(), rel=5e-3)

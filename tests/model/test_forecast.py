@@ -19,6 +19,7 @@ from model.effects.sun_position import SunPosition
 from model.errors import UnreachableError
 from model.forecast import Setup, View, align, forecast_setups
 from model.frames import sun_direction
+from model.plant import JUELICH_LATITUDE
 from model.surface import control_points
 from model.tracing import Optics
 from model.tracing.convolution import central_rays
@@ -49,7 +50,7 @@ def setups(count: int = 3) -> list[Setup]:
 @pytest.mark.parametrize("effects", [[], GEOMETRY], ids=["none", "geometry"])
 def test_spots_lie_where_they_were_measured_whatever_the_effects(effects):
     given = setups()
-    group = align(given, effects, dtype=torch.float64).groups[0]
+    group = align(given, effects, dtype=torch.float64, latitude_deg=JUELICH_LATITUDE).groups[0]
     spots = central_rays(group.scene, 12).spot.numpy()
     np.testing.assert_allclose(spots, [s.plane.to_plane(s.spot) for s in given], atol=2e-5)
 
@@ -63,12 +64,12 @@ def test_unlike_shots_come_back_in_their_order():
     coarse = replace(c, control_points=control_points(c.heliostat, np.zeros((4, 5, 6))))
     mixed = [a, wide, b, aimed, coarse, still, c]
     view, effects = View(40, 32, samples=8), [*GEOMETRY, SlopeError(1.0), Background(0.1, 0.05, 0.0)]
-    together = align(mixed, effects)
+    together = align(mixed, effects, latitude_deg=JUELICH_LATITUDE)
     assert len(together.groups) == 3
     images = together.images(None, effects, view)
     assert images.shape == (7, 40, 32)
     for image, angles, setup in zip(images, together.angles, mixed, strict=True):
-        alone = align([setup], effects)
+        alone = align([setup], effects, latitude_deg=JUELICH_LATITUDE)
         np.testing.assert_allclose(angles, alone.angles[0], atol=1e-6)
         expected = alone.images(None, effects, view)[0]
         np.testing.assert_allclose(image, expected, atol=2e-3 * float(expected.max()))
@@ -76,34 +77,36 @@ def test_unlike_shots_come_back_in_their_order():
 
 def test_an_alignment_serves_other_optics_and_cameras():
     given, view = setups(), View(32, 32, samples=8)
-    aligned = align(given, GEOMETRY)
+    aligned = align(given, GEOMETRY, latitude_deg=JUELICH_LATITUDE)
     flux = aligned.flux(None, [SlopeError(1.0)], view)
     for camera in ([CameraBlur(0.2)], [CameraResponse(1.5), Background(0.1)]):
-        whole = forecast_setups(given, None, [*GEOMETRY, SlopeError(1.0), *camera], view)
+        whole = forecast_setups(given, None, [*GEOMETRY, SlopeError(1.0), *camera], view, latitude_deg=JUELICH_LATITUDE)
         np.testing.assert_allclose(aligned.camera_images(flux, camera, view), whole, rtol=1e-5, atol=1e-2)
 
 
 def test_the_order_of_the_list_is_of_no_account():
     given, view = setups(1), View(32, 32, samples=8)
     effects = [CameraResponse(1.5), Background(0.1), SlopeError(1.0), GravityBending(3.0)]
-    a, b = (forecast_setups(given, None, e, view) for e in (effects, effects[::-1]))
+    a, b = (forecast_setups(given, None, e, view, latitude_deg=JUELICH_LATITUDE) for e in (effects, effects[::-1]))
     np.testing.assert_array_equal(a, b)
 
 
 def test_a_start_nearby_ends_at_the_same_alignment():
     given = setups()
-    before = align(given, [GravityBending(3.0)])
-    warm, cold = (align(given, [GravityBending(3.5)], start=start) for start in (before, None))
+    before = align(given, [GravityBending(3.0)], latitude_deg=JUELICH_LATITUDE)
+    warm, cold = (
+        align(given, [GravityBending(3.5)], start=start, latitude_deg=JUELICH_LATITUDE) for start in (before, None)
+    )
     np.testing.assert_allclose(warm.angles, cold.angles, atol=1e-6)
 
 
 def test_windows_about_the_spot_or_of_the_whole_target():
     given = setups()
-    about = align(given).flux(view=View(64, 64, window=4.0)).clamp(min=0).numpy()
+    about = align(given, latitude_deg=JUELICH_LATITUDE).flux(view=View(64, 64, window=4.0)).clamp(min=0).numpy()
     columns = np.arange(64) * 4 / 64 - 2 + 2 / 64
     centers = (about.sum(axis=1) * columns).sum(axis=1) / about.sum(axis=(1, 2))
     np.testing.assert_allclose(centers, 0, atol=0.02)
-    whole = align(given).flux(Optics(), view=View(64, 64)).clamp(min=0).numpy()
+    whole = align(given, latitude_deg=JUELICH_LATITUDE).flux(Optics(), view=View(64, 64)).clamp(min=0).numpy()
     columns = np.arange(64) * 8 / 64 - 4 + 4 / 64
     centers = (whole.sum(axis=1) * columns).sum(axis=1) / whole.sum(axis=(1, 2))
     np.testing.assert_allclose(centers, [s.plane.to_plane(s.spot)[0] for s in given], atol=0.05)
@@ -119,11 +122,13 @@ def test_an_effect_of_no_catalogue_is_applied():
             return 0.5 * images
 
     given, view = setups(1), View(16, 16, samples=4)
-    plain, dimmed = (forecast_setups(given, None, effects, view) for effects in ((), [Vignette()]))
+    plain, dimmed = (
+        forecast_setups(given, None, effects, view, latitude_deg=JUELICH_LATITUDE) for effects in ((), [Vignette()])
+    )
     np.testing.assert_allclose(dimmed, 0.5 * plain)
 
 
 def test_a_clock_that_puts_the_sun_behind_the_mirror_is_refused():
     low = replace(setups(1)[0], sun=sun_direction(80.0, 3.0))
     with pytest.raises(UnreachableError):
-        align([replace(low, plane=replace(low.plane, normal=-low.plane.normal))])
+        align([replace(low, plane=replace(low.plane, normal=-low.plane.normal))], latitude_deg=JUELICH_LATITUDE)

@@ -1,6 +1,7 @@
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,11 +14,13 @@ from model.network.inputs import conditions
 from model.network.paper import PaperConfig, PaperNetwork
 from model.network.predictor import INPUTS, SurfacePredictor, default_predictor, mirrored_inputs, model_card
 from model.observation import Observation, spread_suns
-from model.plant import TargetPlane
+from model.plant import JUELICH_LATITUDE, TargetPlane
 from model.prior import default_prior
+from model.refinement import refine
 from model.surface import control_points, mirrored
 from model.tracing import Scene
 from model.tracing.convolution import central_rays
+from service.twin import compute
 from tests.conftest import flat_heliostat, target
 from training.export import PARITY_MM, example, export, parity, rounded
 from training.render import Setups, Situations
@@ -142,7 +145,9 @@ def observation(identifier="1") -> Observation:
 
 
 def test_shipped_predictor_names_its_weights_and_keeps_the_contract():
-    predicted = default_predictor().predict(flat_heliostat(focal_length=75.0), [observation("a"), observation("b")])
+    predicted = default_predictor().predict(
+        flat_heliostat(focal_length=75.0), [observation("a"), observation("b")], latitude_deg=JUELICH_LATITUDE
+    )
     assert predicted.z.shape == predicted.z_std.shape == (4, 8, 8)
     assert predicted.control_points.shape == (4, 8, 8, 3)
     assert predicted.used == ("a", "b")
@@ -168,7 +173,7 @@ def test_shipped_network_beats_the_mean_surface_by_its_own_card():
 def test_wrong_number_of_images_is_named():
     for images in ([], [observation(str(i)) for i in range(9)]):
         with pytest.raises(InvalidInputError, match="1 to 8 images"):
-            default_predictor().predict(flat_heliostat(), images)
+            default_predictor().predict(flat_heliostat(), images, latitude_deg=JUELICH_LATITUDE)
 
 
 def test_bad_flux_is_named():
@@ -197,3 +202,14 @@ def test_runtime_of_the_network_keeps_no_id_and_has_nothing_to_send(tmp_path: Pa
     )
     assert "telemetry" not in done.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_mirror_of_other_facets_is_refused_with_its_count_and_rendered_all_the_same():
+    three = replace(flat_heliostat(), facets=flat_heliostat().facets[:3])
+    for ask in (default_predictor().predict, refine):
+        with pytest.raises(InvalidInputError, match="mirrors of 4 facets, flat has 3"):
+            ask(three, [observation("a")], latitude_deg=JUELICH_LATITUDE)
+    flux = compute.render(three, [observation("a")], None, latitude_deg=JUELICH_LATITUDE)
+    assert flux.shape == (1, 64, 64)
+    with pytest.raises(InvalidInputError, match="for 3 facets"):
+        compute.render(three, [observation("a")], np.zeros((4, 8, 8)), latitude_deg=JUELICH_LATITUDE)

@@ -10,7 +10,7 @@ from model.errors import InvalidInputError
 from model.frames import sun_direction_at
 from model.metrics import surface_error
 from model.observation import Observation, misfits, render_observations
-from model.plant import Heliostat
+from model.plant import JUELICH_LATITUDE, Heliostat
 from model.prior import default_prior
 from model.refinement import RefinementOptions, refine
 from tests.conftest import flat_heliostat, target
@@ -37,7 +37,7 @@ def truth() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def refined(heliostat, truth):
-    return refine(heliostat, images(heliostat, truth))
+    return refine(heliostat, images(heliostat, truth), latitude_deg=JUELICH_LATITUDE)
 
 
 def test_the_true_surface_is_approached(refined, truth):
@@ -46,7 +46,7 @@ def test_the_true_surface_is_approached(refined, truth):
 
 
 def mean_misfit(heliostat: Heliostat, z: np.ndarray, truth: np.ndarray) -> float:
-    return float(np.mean(misfits(heliostat, images(heliostat, truth), z)))
+    return float(np.mean(misfits(heliostat, images(heliostat, truth), z, latitude_deg=JUELICH_LATITUDE)))
 
 
 def test_the_images_are_explained_as_well_as_by_the_truth(refined, heliostat, truth):
@@ -76,7 +76,7 @@ def test_a_foreign_image_is_named(heliostat, truth):
     observations[2] = replace(
         observations[2], flux=observations[2].flux + 0.5 * np.roll(observations[2].flux, 20, axis=1)
     )
-    found = refine(heliostat, observations, options=RefinementOptions(rounds=2))
+    found = refine(heliostat, observations, options=RefinementOptions(rounds=2), latitude_deg=JUELICH_LATITUDE)
     assert found.suspicious == ("2",)
     assert not found.trusted
 
@@ -88,14 +88,18 @@ def test_effects_that_are_believed_are_not_taken_for_shape(heliostat, truth):
         replace(o, flux=image.astype(np.float32))
         for o, image in zip(
             images(heliostat, truth),
-            render_observations(heliostat, images(heliostat, truth), truth, effects=response),
+            render_observations(
+                heliostat, images(heliostat, truth), truth, effects=response, latitude_deg=JUELICH_LATITUDE
+            ),
             strict=True,
         )
     ]
-    known = refine(heliostat, seen, effects=response, options=options)
-    assert surface_error(known.z, truth) < 0.8 * surface_error(refine(heliostat, seen, options=options).z, truth)
+    known = refine(heliostat, seen, effects=response, options=options, latitude_deg=JUELICH_LATITUDE)
+    assert surface_error(known.z, truth) < 0.8 * surface_error(
+        refine(heliostat, seen, options=options, latitude_deg=JUELICH_LATITUDE).z, truth
+    )
 
 
 def test_no_image_is_named(heliostat):
     with pytest.raises(InvalidInputError, match="at least one image"):
-        refine(heliostat, [])
+        refine(heliostat, [], latitude_deg=JUELICH_LATITUDE)

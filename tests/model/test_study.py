@@ -19,7 +19,7 @@ from model.errors import InvalidInputError
 from model.forecast import Setup, View, forecast_setups
 from model.frames import sun_direction
 from model.metrics import flux_accuracies
-from model.plant import Heliostat
+from model.plant import JUELICH_LATITUDE, Heliostat
 from model.study import FluxImage, StudyOptions, study
 from model.study.advice import PHOTOGRAPHS, SAME_SCALING, SCALES_WITH, told_apart_by
 from model.study.covariates import RECORDED_TIME, covariates_of
@@ -58,7 +58,7 @@ def flux_images(
 ) -> list[FluxImage]:
     """What the forecaster expects under ``effects``, with noise in shares of the peak."""
     rng, taken = np.random.default_rng(3), setups(heliostats, count)
-    images = forecast_setups(taken, Optics(), effects, view).double().numpy()
+    images = forecast_setups(taken, Optics(), effects, view, latitude_deg=JUELICH_LATITUDE).double().numpy()
     images = images + noise * images.max(axis=(1, 2), keepdims=True) * rng.standard_normal(images.shape)
     return [FluxImage(setup, image) for setup, image in zip(taken, images, strict=True)]
 
@@ -134,7 +134,9 @@ def test_images_that_surfaces_were_predicted_from_judge_only_for_want_of_others(
 
 
 def test_a_report_says_where_the_judging_images_are_not_independent_of_the_surfaces(clean):
-    report = study([replace(p, seen=True) for p in clean], Optics(), options=QUICK).to_json()
+    report = study(
+        [replace(p, seen=True) for p in clean], Optics(), options=QUICK, latitude_deg=JUELICH_LATITUDE
+    ).to_json()
     assert report["images"]["held_out_but_predicted_from"] == report["images"]["held_out"] == 4
     assert "flatters both accuracies" in report["conclusion"]
 
@@ -218,7 +220,7 @@ def test_noise_is_finite_whatever_the_image(image):
 def test_a_coarse_camera_is_forecast_in_its_own_pixels():
     taken = flux_images()
     coarse = [FluxImage(p.setup, in_pixels(p.image[None], 32, 32)[0]) for p in taken]
-    forecaster = Forecaster(coarse, Optics(), [], 4.0, View(128, 128, samples=12))
+    forecaster = Forecaster(coarse, Optics(), [], 4.0, View(128, 128, samples=12), latitude_deg=JUELICH_LATITUDE)
     assert flux_accuracies(forecaster.measured(), forecaster.cuts([])).min() > 0.99
 
 
@@ -228,12 +230,14 @@ def test_the_window_holds_the_spots(clean, hazy):
 
 
 def test_a_forecaster_repeats_itself_whatever_it_has_kept(clean):
-    forecaster = Forecaster(clean, Optics(), [], 4.0, SMALL)
+    forecaster = Forecaster(clean, Optics(), [], 4.0, SMALL, latitude_deg=JUELICH_LATITUDE)
     plain = forecaster.cuts([])
     for effects in ([SlopeError(1.0)], [CameraBlur(0.2)], [FacetCanting(x_mrad={"near": np.array([2.0, 0, 0, -2])})]):
         changed = forecaster.cuts(effects)
         assert np.abs(changed - plain).sum(axis=(1, 2)).max() > 0.01
-        np.testing.assert_allclose(changed, Forecaster(clean, Optics(), [], 4.0, SMALL).cuts(effects), atol=1e-6)
+        np.testing.assert_allclose(
+            changed, Forecaster(clean, Optics(), [], 4.0, SMALL, latitude_deg=JUELICH_LATITUDE).cuts(effects), atol=1e-6
+        )
     np.testing.assert_allclose(forecaster.cuts([]), plain, atol=1e-6)
 
 
@@ -242,7 +246,7 @@ def test_a_forecaster_repeats_itself_whatever_it_has_kept(clean):
 
 def fitted(truth: Effect) -> tuple[Unknowns, np.ndarray, np.ndarray]:
     """Unknowns of a kind, their fit to forecasts that hold ``truth``, and the spread of it."""
-    forecaster = Forecaster(flux_images([truth], view=SMALL), Optics(), [], 6.0, SMALL)
+    forecaster = Forecaster(flux_images([truth], view=SMALL), Optics(), [], 6.0, SMALL, latitude_deg=JUELICH_LATITUDE)
     unknowns = Unknowns((type(truth),), (("far", 4), ("near", 4)))
     fit = Fitter(forecaster).fit(unknowns, unknowns.neutral)
     return unknowns, fit.values, fit.spread
@@ -267,7 +271,7 @@ def test_a_fit_recovers_the_canting_of_every_facet():
 
 def test_where_the_model_fails_the_residual_is_infinite(clean):
     """All light blocked, or the sun below the horizon: as wrong as can be, and no reason to stop."""
-    fitter = Fitter(Forecaster(clean, Optics(), [], 4.0, SMALL))
+    fitter = Fitter(Forecaster(clean, Optics(), [], 4.0, SMALL, latitude_deg=JUELICH_LATITUDE))
     unknowns = Unknowns((CATALOGUE["soiling"],), (("far", 4), ("near", 4)))
     dark = np.zeros(len(unknowns.all))
     assert np.isinf(fitter.residuals(unknowns, dark)).all()
@@ -278,7 +282,7 @@ def test_where_the_model_fails_the_residual_is_infinite(clean):
 
 
 def test_no_effect_is_found_in_clean_photographs(clean):
-    found = study(clean, Optics(), options=QUICK)
+    found = study(clean, Optics(), options=QUICK, latitude_deg=JUELICH_LATITUDE)
     assert found.verdict == "none"
     assert found.effects == found.found == []
     np.testing.assert_array_equal(found.after, found.before)
@@ -287,7 +291,7 @@ def test_no_effect_is_found_in_clean_photographs(clean):
 
 def test_an_effect_is_found_with_its_parameter_and_what_it_buys(hazy):
     told: list[str] = []
-    found = study(hazy, Optics(), options=QUICK, progress=told.append)
+    found = study(hazy, Optics(), options=QUICK, progress=told.append, latitude_deg=JUELICH_LATITUDE)
     report = found.to_json()
     assert found.verdict == "effect"
     (effect,) = found.effects
@@ -306,7 +310,7 @@ def test_an_effect_is_found_with_its_parameter_and_what_it_buys(hazy):
 
 
 def test_what_no_candidate_explains_is_said(hazy):
-    found = study(hazy, Optics(), options=replace(QUICK, candidates=("axis_tilt",)))
+    found = study(hazy, Optics(), options=replace(QUICK, candidates=("axis_tilt",)), latitude_deg=JUELICH_LATITUDE)
     assert found.verdict == "unexplained"
     assert found.unexplained_share == 1.0
     assert [c.name for c in found.candidates] == ["axis_tilt"]
@@ -322,7 +326,7 @@ def test_what_no_candidate_explains_is_said(hazy):
 def test_an_error_that_grows_with_time_is_seen_where_times_were_recorded(hazy):
     first = datetime(2026, 6, 1, 12, tzinfo=UTC)
     dated = [replace(p, taken_at=first + timedelta(days=day)) for day, p in enumerate(hazy)]
-    found = study(dated, Optics(), options=replace(QUICK, candidates=("axis_tilt",)))
+    found = study(dated, Optics(), options=replace(QUICK, candidates=("axis_tilt",)), latitude_deg=JUELICH_LATITUDE)
     days = covariates_of(found.images, found.latitude_deg)[RECORDED_TIME]
     assert days.min() == 0
     np.testing.assert_allclose(days, np.round(days))
@@ -333,16 +337,16 @@ def test_an_error_that_grows_with_time_is_seen_where_times_were_recorded(hazy):
 
 
 def test_what_is_declared_is_no_candidate(hazy):
-    found = study(hazy, Optics(), [SunShapeEffect(0.15)], QUICK)
+    found = study(hazy, Optics(), [SunShapeEffect(0.15)], QUICK, latitude_deg=JUELICH_LATITUDE)
     assert found.verdict == "none"
     assert [c.name for c in found.candidates] == ["gravity_bending"]
 
 
 def test_too_few_photographs_or_two_of_one_name_are_refused(clean):
     with pytest.raises(InvalidInputError, match="at least 4 photographs, got 3"):
-        study(clean[:3], Optics())
+        study(clean[:3], Optics(), latitude_deg=JUELICH_LATITUDE)
     with pytest.raises(InvalidInputError, match="identifiers of their own"):
-        study([*clean[:4], clean[0]], Optics())
+        study([*clean[:4], clean[0]], Optics(), latitude_deg=JUELICH_LATITUDE)
 
 
 @pytest.mark.parametrize("image", [np.zeros((8, 8)), np.full((8, 8), np.nan), np.ones(8)], ids=["dark", "nan", "line"])

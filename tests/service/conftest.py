@@ -152,6 +152,7 @@ class FakeOperations:
 
     predictions: list[list[Observation]] = field(default_factory=list)
     believed: list[Any] = field(default_factory=list)
+    latitudes: list[float] = field(default_factory=list)
     forecasts: list[dict[str, Any]] = field(default_factory=list)
     fleets: list[dict[str, Any]] = field(default_factory=list)
     measured: int = 0
@@ -174,7 +175,10 @@ class FakeOperations:
         method: str = "network",
         optics: Any = None,
         effects: Any = (),
+        *,
+        latitude_deg: float,
     ) -> SurfacePrediction:
+        self.latitudes.append(latitude_deg)
         self.predictions.append(list(observations))
         self.believed.append(effects)
         z = np.linspace(-1e-3, 1e-3, 256).reshape(4, 8, 8)
@@ -189,8 +193,16 @@ class FakeOperations:
         )
 
     def render(
-        self, heliostat: Heliostat, observations: list[Observation], z: Any, optics: Any = None, effects: Any = ()
+        self,
+        heliostat: Heliostat,
+        observations: list[Observation],
+        z: Any,
+        optics: Any = None,
+        effects: Any = (),
+        *,
+        latitude_deg: float,
     ) -> Any:
+        self.latitudes.append(latitude_deg)
         self.rendered += 1
         return np.stack([observation.flux for observation in observations])
 

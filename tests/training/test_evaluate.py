@@ -9,6 +9,7 @@ import torch
 from model.metrics import surface_error
 from model.network.architecture import MAX_IMAGES, NetworkConfig
 from model.network.predictor import WEIGHTS, default_predictor
+from model.plant import JUELICH_LATITUDE
 from training import crossvalidate, plots
 from training.cases import ELSEWHERE, MAX_DISTANCE, SOURCE, Case, make_cases, within_reach
 from training.config import TrainConfig
@@ -104,7 +105,9 @@ def test_a_runs_folder_is_evaluated_from_as_many_images_as_asked(run, cases):
 
 def test_the_exported_network_is_asked_as_the_product_asks_it(cases):
     z, z_std = by_onnx(default_predictor(), looks=1)(cases[0], 2)
-    expected = default_predictor().predict(cases[0].heliostat, cases[0].observations[:2], looks=1)
+    expected = default_predictor().predict(
+        cases[0].heliostat, cases[0].observations[:2], looks=1, latitude_deg=JUELICH_LATITUDE
+    )
     np.testing.assert_array_equal(z, expected.z)
     assert z_std is not None
     assert len(held_out_of(WEIGHTS)) == 8

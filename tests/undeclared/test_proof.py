@@ -9,6 +9,7 @@ import pytest
 from model.effects import CATALOGUE
 from model.forecast import View, forecast_setups
 from model.metrics import compare_on_target
+from model.plant import JUELICH_LATITUDE
 from model.study import FluxImage, StudyOptions, study
 from model.tracing import Optics
 from tests.undeclared import world
@@ -33,7 +34,7 @@ def report(case: str) -> dict[str, Any]:
     """The study of a small set."""
     made = measured(case)
     photographs = [FluxImage(setup, image) for setup, image in zip(made.setups, made.images, strict=True)]
-    return study(photographs, Optics(), options=OPTIONS).to_json()
+    return study(photographs, Optics(), options=OPTIONS, latitude_deg=JUELICH_LATITUDE).to_json()
 
 
 def test_the_generator_has_every_effect_of_the_catalogue():
@@ -44,7 +45,7 @@ def test_the_generator_has_every_effect_of_the_catalogue():
 def test_the_model_with_the_truth_explains_what_the_generator_throws(case):
     """Generator and model share no code, so that each is a test of the other."""
     made = generate(case, STRONG, 3, mirrors(count=8), heliostats=2, setups=1, side=128, fan=16)
-    forecasts = forecast_setups(made.setups, None, made.effects, View(96, 96)).numpy()
+    forecasts = forecast_setups(made.setups, None, made.effects, View(96, 96), latitude_deg=JUELICH_LATITUDE).numpy()
     for setup, image, forecast in zip(made.setups, made.images, forecasts, strict=True):
         size = (setup.plane.width, setup.plane.height)
         assert compare_on_target(image, forecast, size, 4.0, 32).accuracy > 0.975

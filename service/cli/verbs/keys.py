@@ -9,7 +9,7 @@ from rich.table import Table
 
 from service.base.choices import RoleName
 from service.cli.output import AsJson
-from service.cli.store import actor, writing
+from service.cli.store import actor, reading, writing
 
 Name = Annotated[str, typer.Argument(help="Who will use it, for example `calibration`.", metavar="NAME")]
 
@@ -35,8 +35,8 @@ def list_(as_json: AsJson = False) -> None:
     """All keys, by name and prefix; the keys themselves are not stored."""
     from service.store import keys
 
-    with writing() as session:
-        rows = keys.list_keys(session)
+    with reading() as session:
+        rows = [] if session is None else keys.list_keys(session)
     if as_json:
         fields = ("name", "role", "prefix", "created_at", "withdrawn_at")
         typer.echo(

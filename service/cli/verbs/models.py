@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from service.cli.output import AsJson
-from service.cli.store import actor, writing
+from service.cli.store import actor, reading, writing
 
 app = typer.Typer(name="models", help="Versions of the plant's model: list, adopt, withdraw.", no_args_is_help=True)
 
@@ -17,10 +17,10 @@ app = typer.Typer(name="models", help="Versions of the plant's model: list, adop
 @app.command("list")
 def list_(as_json: AsJson = False) -> None:
     """All versions, oldest first; the current one is the newest that is not withdrawn."""
-    from service.web.api.models import all_models
+    from service.web.api.models import all_models, declared_model
 
-    with writing() as session:
-        versions = all_models(session)
+    with reading() as session:
+        versions = [declared_model(is_current=True)] if session is None else all_models(session)
     if as_json:
         typer.echo(json.dumps([version.model_dump(mode="json") for version in versions], indent=1))
         return

@@ -26,6 +26,7 @@ def import_(folder: Folder, as_json: AsJson = False) -> None:
     try:
         if runtime.settings.migrates_on_start:
             runtime.database.upgrade()
+        runtime.database.require_current()
         with progress(None, "import") as step:
             report = import_folder(runtime, source, step, actor())
     finally:

@@ -1,5 +1,6 @@
 """The job `imports`: a measurement folder into the store."""
 
+import stat
 from pathlib import Path
 
 from pydantic import Field
@@ -25,6 +26,10 @@ class ImportIn(Model):
     )
 
 
+# The largest file of a measurement folder is deflectometry, some tens of megabytes.
+_MOST_BYTES = 2**30
+
+
 def allowed_folder(root: Path | None, folder: str) -> Path:
     """The folder of this name under ``root``; nothing that a link or a ``..`` leads to outside of it.
 
@@ -33,7 +38,8 @@ def allowed_folder(root: Path | None, folder: str) -> Path:
     ConflictError
         Where the operator allowed no folder.
     InvalidInputError
-        Where it is none, leads outside, or holds a link that does.
+        Where it is none, leads outside, or holds a link that does, or what is no file of a bearable size: a pipe would
+        be waited for without end, and the job with it.
     """
     if root is None:
         raise ConflictError("no folder may be imported: the operator sets HELIOTWIN_IMPORT_ROOT first")
@@ -45,7 +51,18 @@ def allowed_folder(root: Path | None, folder: str) -> Path:
     for entry in path.rglob("*"):
         if entry.is_symlink() and not entry.resolve().is_relative_to(top):
             raise InvalidInputError(f"folder: {entry.relative_to(top)} leads outside; copy what it links to")
+        if not entry.is_dir():
+            _require_file(entry, str(entry.relative_to(top)))
     return path
+
+
+def _require_file(path: Path, name: str) -> None:
+    """Refuse what is no regular file, or too large to be read into memory; nothing is opened for it."""
+    found = path.stat()
+    if not stat.S_ISREG(found.st_mode):
+        raise InvalidInputError(f"folder: {name} is no regular file")
+    if found.st_size > _MOST_BYTES:
+        raise InvalidInputError(f"folder: {name} has {found.st_size} bytes, {_MOST_BYTES} are the most")
 
 
 def import_allowed(context: Context, payload: ImportIn) -> Result:

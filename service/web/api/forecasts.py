@@ -70,7 +70,10 @@ class ForecastSummary(BaseModel):
     window: float | None = Field(description="Side of the mapped square about the centre of mass [m]; null: the plane.")
     resolution: tuple[int, int] = Field(description="Rows, columns.")
     normalised: bool
-    unit: str = Field(description="Unit of the map: W/m2, or 1 where it is normalised to a sum of 100.")
+    unit: str = Field(
+        description="Unit of the map: W/m2, or 1 where it is normalised to a sum of 100. W/m2 are those of the "
+        "declared optics (GET /v1/plant); without any, of reflectivity 1 and no attenuation."
+    )
     peak_w_m2: float = Field(description="Largest irradiance [W/m2].")
     power_w: float = Field(description="Power on the mapped area [W].")
     center_of_mass: tuple[float, float] | None = Field(description="Right and up of the plane's centre [m].")

@@ -10,7 +10,7 @@ from model.frames import wgs84_to_enu
 from model.plant import TargetPlane
 from service import store
 from service.base.fields import Model, Plane, ReceiverIn, Wgs84
-from service.sources.documents import read_receivers, read_targets
+from service.sources.documents import parse_declared, read_receivers, read_targets
 from service.sources.schema import TowerMeasurements
 from service.store.tables import PlantRow, ReceiverRow, TargetRow
 from service.twin import geometry
@@ -27,7 +27,8 @@ class PlantOut(BaseModel):
         description="Tower base: latitude [deg], longitude [deg], altitude [m]."
     )
     declared: dict[str, Any] | None = Field(
-        description="What is declared of its model, as in twin.json; null: Buie's sun with a ratio of 0.02, no effects."
+        description="What is declared of its model, as in twin.json; null: Buie's sun with a ratio of 0.02, no "
+        "effects, and optics of reflectivity 1 without attenuation."
     )
 
 
@@ -137,9 +138,13 @@ def get_plant(runtime: RuntimeDep) -> PlantOut:
 
 @router.put("/plant", responses=problems(409, 413, 415), dependencies=[OPERATE, Depends(require_json)])
 def put_plant(document: TowerMeasurements, runtime: RuntimeDep, identity: IdentityDep) -> PlantOut:
-    """Set the tower base, all planar targets and receivers from PAINT's tower measurements; again changes nothing."""
+    """Set the tower base, all planar targets and receivers from PAINT's tower measurements; again changes nothing.
+
+    What is `declared` of the plant's model comes with them, where it is given.
+    """
     origin, targets = read_targets(document.raw)
     receivers = read_receivers(document.raw)
+    parse_declared(document.declared or {}, "declared")  # what is stored can be computed with
     with runtime.database.writing() as session:
         geometry.set_plant(
             session,
@@ -148,6 +153,7 @@ def put_plant(document: TowerMeasurements, runtime: RuntimeDep, identity: Identi
             origin,
             targets.values(),
             receivers.values(),
+            document.declared,
             corners={name: _paint_corners(document.raw, name) for name in targets},
         )
         return plant_out(store.get_plant(session))

@@ -2,20 +2,18 @@
 
 import itertools
 import json
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import fmean
 from typing import Annotated, Any
 
 import numpy as np
-from fastapi import APIRouter, Query, Request
+from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import HTMLResponse
 from numpy.typing import NDArray
 from sqlalchemy import select
 from sqlalchemy.orm import Session, undefer
 
-from model.errors import ModelError
 from service import store
 from service.base.arrays import unpack
 from service.base.fields import Version
@@ -23,14 +21,12 @@ from service.drawing import charts
 from service.drawing.charts import HeatMap, History, Scale
 from service.drawing.pictures import mirror_heights
 from service.store.tables import HeliostatRow, MeasurementRow, SurfaceRow
-from service.twin.accuracy import RECENT, Comparison, compare
+from service.twin.accuracy import RECENT, Compared, Comparison, ComparisonBook
 from service.twin.field import Figures, figures_of
-from service.twin.runtime import Runtime
 from service.web.answers.pages import render
 from service.web.door.dependencies import READ, NamePath, RuntimeDep
 
 router = APIRouter(include_in_schema=False, dependencies=[READ])
-logger = logging.getLogger("heliotwin.service")
 
 # Newest surfaces and photographs that the page lists.
 _MOST_SURFACES = 40
@@ -109,13 +105,14 @@ def _comparison_figure(comparison: Comparison) -> ComparisonFigure:
     )
 
 
-def _compare(runtime: Runtime, name: str, surface: SurfaceRow | None) -> tuple[list[Comparison], str | None]:
-    """Comparisons, or why there are none; the rest of the page does not depend on them."""
-    try:
-        return compare(runtime, name, surface), None
-    except ModelError as error:
-        logger.warning("heliostat %s cannot be compared with its photographs: %s", name, error)
-        return [], str(error)
+async def _book(request: Request) -> ComparisonBook:
+    book: ComparisonBook = request.app.state.comparisons
+    return book
+
+
+ComparisonBookDep = Annotated[ComparisonBook, Depends(_book)]
+
+_UNDER_WAY = Compared(trouble="The forecasts of its photographs are being worked out; look again in a moment.")
 
 
 def _means(comparisons: Sequence[Comparison]) -> dict[str, float | None]:
@@ -146,7 +143,11 @@ def _size(row: HeliostatRow) -> tuple[float, float]:
 
 @router.get("/heliostats/{name}")
 def get_heliostat_page(
-    name: NamePath, request: Request, runtime: RuntimeDep, version: Annotated[Version | None, Query()] = None
+    name: NamePath,
+    request: Request,
+    runtime: RuntimeDep,
+    book: ComparisonBookDep,
+    version: Annotated[Version | None, Query()] = None,
 ) -> HTMLResponse:
     """A heliostat with its current surface, or an earlier ``version``."""
     with runtime.database.reading() as session:
@@ -155,7 +156,10 @@ def get_heliostat_page(
         surface = today if version is None else store.get_surface(session, row, version)
         listed = versions(_newest_surfaces(session, row))
         photographs = _newest_photographs(session, row)
-    comparisons, trouble = _compare(runtime, name, surface)
+        shown = book.read(session, row, surface)
+    # The rest of the page does not depend on them.
+    compared = Compared() if shown is None else book.wait_for(shown) or _UNDER_WAY
+    comparisons = compared.comparisons
     return render(
         request,
         "heliostat.html",
@@ -166,7 +170,7 @@ def get_heliostat_page(
         versions=listed,
         histories=_histories(listed) if listed else [],
         comparisons=[_comparison_figure(comparison) for comparison in comparisons],
-        trouble=trouble,
+        trouble=compared.trouble,
         recent=RECENT,
         photographs=photographs,
         **_means(comparisons),

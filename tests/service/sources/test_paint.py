@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from model.errors import InvalidInputError
 from model.metrics import surface_error
 from model.sunshape import Buie, Gaussian, Pillbox
 from model.surface import control_points, evaluate
-from service.sources.documents import read_heliostat, read_measurement, read_moment, read_targets
+from service.sources.documents import optics_to_json, read_heliostat, read_measurement, read_moment, read_targets
 from service.sources.folder import measured_heights, read_declared, read_deflectometry, read_folder
 from tests.conftest import flat_heliostat
 from tests.service.conftest import properties_document, tower_document
@@ -86,6 +87,16 @@ def test_undeclared_sun_is_buies(tmp_path):
     assert read_declared(tmp_path / "twin.json")[0].sun_shape == Buie(0.02)
 
 
+def test_declared_optics_and_their_defaults(tmp_path):
+    plain, _ = read_declared(tmp_path / "twin.json")
+    assert optics_to_json(plain) == {"reflectivity": 1.0, "attenuation": []}
+    declared = {"reflectivity": 0.9, "attenuation": [0.01, 0.1]}
+    (tmp_path / "twin.json").write_text(json.dumps({"declared": {"optics": declared}}))
+    optics, _ = read_declared(tmp_path / "twin.json")
+    assert optics_to_json(optics) == declared
+    assert optics.sun_shape == Buie(0.02)
+
+
 def test_declared_effects(tmp_path):
     effects = [{"name": "soiling", "parameters": {"reflectivity_ratio": {"AA39": [1.0, 0.8, 1.0, 0.9]}}}]
     (tmp_path / "twin.json").write_text(json.dumps({"declared": {"effects": effects}}))
@@ -103,6 +114,12 @@ def test_declared_effects(tmp_path):
         ('{"declared": {"effects": [{"name": "dust"}]}}', "twin.json: effect 'dust' is unknown"),
         ('{"declared": {"effects": [{"name": "slope_error", "parameters": {"sigma_mrad": 9}}]}}', "sigma_mrad"),
         ('{"declared": []}', "'declared' must be a JSON object"),
+        ('{"declared": {"optics": []}}', "'optics' must be a JSON object"),
+        ('{"declared": {"optics": {"reflectivity": 1.2}}}', "'reflectivity' must lie in 0 to 1, got 1.2"),
+        ('{"declared": {"optics": {"reflectivity": true}}}', "'reflectivity' must be a finite number"),
+        ('{"declared": {"optics": {"attenuation": 0.1}}}', "'attenuation' must be a list"),
+        ('{"declared": {"optics": {"attenuation": [0, "a"]}}}', "must be a finite number, got a"),
+        ('{"declared": {"optics": {"shine": 1}}}', "not 'shine'"),
     ],
 )
 def test_bad_declarations_name_the_field(tmp_path, content, says):
@@ -158,3 +175,24 @@ def test_two_files_of_properties_are_refused_by_name_and_the_plant_has_its_own(t
     assert folder.plant.name == "WRI1030197"
     assert list(folder.plant.heliostats) == ["AA39"]
     assert "AB12-heliostat-properties.json, old-heliostat-properties.json" in folder.skipped["AB12"]
+
+
+def test_facets_in_another_order_are_refused():
+    document = properties_document()
+    origin, _ = read_targets(tower_document())
+    facets = document["facet_properties"]["facets"]
+    assert len(read_heliostat("AA39", document, origin).facets) == 4
+    for order in ([1, 0, 2, 3], [2, 3, 0, 1], [0, 2, 1, 3]):
+        document["facet_properties"]["facets"] = [facets[index] for index in order]
+        with pytest.raises(InvalidInputError, match="AA39: 'facets' must be listed upper left, upper right"):
+            read_heliostat("AA39", document, origin)
+    for some in (facets[:1], facets[:3]):
+        document["facet_properties"]["facets"] = some
+        assert len(read_heliostat("AA39", document, origin).facets) == len(some)
+    one = flat_heliostat()
+    three = replace(one, facets=one.facets[:3])
+    with pytest.raises(InvalidInputError, match="a surface of 4 facets for flat, which has 3"):
+        measured_heights(three, (control_points(one), 3))
+    document["facet_properties"]["facets"] = 4
+    with pytest.raises(InvalidInputError, match="'facets' must be a list"):
+        read_heliostat("AA39", document, origin)

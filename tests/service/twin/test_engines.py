@@ -14,7 +14,7 @@ import pytest
 from model.fleet import FleetFlux, Superposition, Tile, aligned_field, superpose, tiles
 from model.forecast import Setup
 from model.frames import sun_direction
-from model.plant import Heliostat
+from model.plant import JUELICH_LATITUDE, Heliostat
 from model.surface import control_points
 from service.base.faults import ConflictError
 from service.jobs.kinds import KINDS
@@ -31,7 +31,13 @@ def some_tiles() -> list[Tile]:
     heliostats = [Heliostat.juelich(f"H{i}", position, 80.0) for i, position in enumerate(positions)]
     plane = target(10.0)
     shots = [Setup(one, control_points(one), SUN, plane) for one in heliostats]
-    return list(tiles(shots, aligned_field([(one, plane.center) for one in heliostats], SUN), size=8))
+    return list(
+        tiles(
+            shots,
+            aligned_field([(one, plane.center) for one in heliostats], SUN, latitude_deg=JUELICH_LATITUDE),
+            size=8,
+        )
+    )
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +53,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning:ray", "ignore::Re
 
 @pytest.mark.parametrize("count", [1, 3])
 def test_threads_give_the_same_light_whatever_their_number(count: int):
-    task, parts = Superposition(target(10.0), (32, 32)), some_tiles()
+    task, parts = Superposition(target(10.0), (32, 32), latitude_deg=JUELICH_LATITUDE), some_tiles()
     expected, made = superpose(task, parts), superpose(task, parts, Threads(count))
     assert (made.heliostats, made.power) == (expected.heliostats, expected.power)
     np.testing.assert_array_equal(made.irradiance, expected.irradiance)
@@ -55,7 +61,7 @@ def test_threads_give_the_same_light_whatever_their_number(count: int):
 
 @pytest.mark.slow
 def test_cluster_gives_the_same_light_also_where_a_worker_is_killed(cluster: Any, tmp_path: Path):
-    task, parts = Superposition(target(10.0), (32, 32)), some_tiles()
+    task, parts = Superposition(target(10.0), (32, 32), latitude_deg=JUELICH_LATITUDE), some_tiles()
     expected = superpose(task, parts, Threads(1))
     begun = tmp_path / "begun"
 

@@ -17,7 +17,7 @@ from model.effects.camera_response import CameraResponse
 from model.forecast import Setup, View, forecast_setups
 from model.frames import sun_angles, sun_direction
 from model.imaging.window import center_of_mass
-from model.plant import Heliostat, Plant
+from model.plant import JUELICH_LATITUDE, Heliostat, Plant
 from model.surface import control_points
 from service import store
 from service.base.arrays import pack, unpack
@@ -59,7 +59,9 @@ def photographs(mirror: Heliostat, z: np.ndarray, rng: np.random.Generator) -> t
     suns = sun_direction(np.linspace(-60, 60, IMAGES), np.linspace(25, 60, IMAGES))
     points = control_points(mirror, z)
     shots = [Setup(mirror, points, sun, TARGET, spot=TARGET.to_enu(rng.uniform(-0.4, 0.4, 2))) for sun in suns]
-    images = forecast_setups(shots, effects=[CameraResponse(gamma=GAMMA)], view=View(128, 128)).numpy()
+    images = forecast_setups(
+        shots, effects=[CameraResponse(gamma=GAMMA)], view=View(128, 128), latitude_deg=JUELICH_LATITUDE
+    ).numpy()
     counts = 240 * images / images.max(axis=(1, 2), keepdims=True) + rng.normal(0, 0.5, images.shape)
     return suns, np.clip(np.round(counts), 0, 255)
 
@@ -256,7 +258,7 @@ def test_photograph_that_cannot_have_been_is_left_out_by_name(filled: Database):
     whole, behind = material.photographs[0], material.photographs[1]
     shot = replace(behind.setup, plane=replace(TARGET, normal=-TARGET.normal))
     odd = replace(material, photographs=[whole, replace(behind, setup=shot)])
-    left = odd.without_untraceable()
+    left = odd.without_untraceable(JUELICH_LATITUDE)
     assert [p.key for p in left.photographs] == [whole.key]
     assert set(left.skipped) == {behind.key}
     assert whole.taken_at is not None

@@ -318,6 +318,8 @@ def test_everything_that_is_made_uses_the_model_that_is_asked_for(
         work(client)
         assert client.get("/v1/heliostats/AA39/surfaces/current").json()["model_version"] == version
     assert operations.forecasts[-1]["latitude_deg"] == pytest.approx(ORIGIN[0])
+    assert operations.latitudes
+    assert operations.latitudes == pytest.approx([ORIGIN[0]] * len(operations.latitudes))
 
 
 def test_forecast_is_made_under_the_declared_sun(client: TestClient, stored: Database, operations: FakeOperations):

@@ -209,3 +209,24 @@ def test_names_fit_the_pattern(refusing: TestClient, properties: dict[str, Any],
     for answer in (refusing.get(f"/v1/{resource}/{name}"), refusing.put(f"/v1/{resource}/{name}", json=properties)):
         assert answer.status_code in (404, 405, 422)
         assert answer.headers["Content-Type"] == "application/problem+json"
+
+
+def test_declared_optics_make_the_light_of_forecasts(client: TestClient, tower: dict[str, Any], operations: Any):
+    request = {
+        "heliostat": "AA39",
+        "target": "lower",
+        "surface": "ideal",
+        "sun": {"azimuth_deg": 20, "elevation_deg": 45},
+        "dni_w_m2": 800,
+    }
+    assert client.post("/v1/forecasts", json=request).status_code == 201
+    assert operations.forecasts[-1]["optics"].reflectivity == 1.0
+    bad = client.put("/v1/plant", json=tower | {"declared": {"optics": {"reflectivity": 1.5}}})
+    assert bad.status_code == 422
+    assert "'reflectivity' must lie in 0 to 1" in bad.json()["detail"]
+    declared = {"optics": {"reflectivity": 0.9, "attenuation": [0.01, 0.1]}}
+    assert client.put("/v1/plant", json=tower | {"declared": declared}).json()["declared"] == declared
+    assert client.post("/v1/forecasts", json=request).status_code == 201
+    optics = operations.forecasts[-1]["optics"]
+    assert (optics.dni, optics.reflectivity, optics.attenuation) == (800, 0.9, (0.01, 0.1))
+    assert client.put("/v1/plant", json=tower).json()["declared"] == declared

@@ -1,0 +1,104 @@
+"""How verbs end: one clear line and the right code, whatever went wrong."""
+
+import json
+import os
+import sqlite3
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from service.base.settings import Settings
+from service.cli import folder as verbs
+from service.cli.demo_plant import write_plant
+from service.sources.folder import read_folder
+from service.store.database import migrate
+
+ROOT = Path(__file__).parents[3]
+
+
+def heliotwin(data: Path, *arguments: object, **settings: str) -> subprocess.CompletedProcess[str]:
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("HELIOTWIN_")}
+    environment |= {"HELIOTWIN_DATA_DIR": str(data), "PYTHONPATH": str(ROOT)} | settings
+    command = [sys.executable, "-m", "service", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, env=environment, cwd=data.parent, check=False)
+
+
+def ends(done: subprocess.CompletedProcess[str], code: int, says: str) -> None:
+    assert done.returncode == code, done.stderr
+    assert says in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1, done.stderr
+
+
+def test_a_database_that_cannot_be_read_is_one_line(tmp_path: Path):
+    data = tmp_path / "data"
+    data.mkdir()
+    (data / "heliotwin.sqlite").write_bytes(b"no database at all, but long enough to look like one" * 100)
+    for verb in (("keys", "list"), ("models", "list"), ("migrate",)):
+        ends(heliotwin(data, *verb), 1, "heliotwin: the database: file is not a database")
+
+
+def test_lists_take_no_lock_and_migrate_nothing(tmp_path: Path):
+    data = tmp_path / "data"
+    for verb in ("keys", "models"):
+        assert heliotwin(data, verb, "list").returncode == 0
+    assert not data.exists()
+    settings = Settings(data_dir=data)
+    assert migrate(settings, "0001")
+    ends(heliotwin(data, "keys", "list"), 1, "heliotwin migrate")
+    ends(heliotwin(data, "import", _plant(tmp_path), HELIOTWIN_MIGRATE_ON_START="false"), 1, "heliotwin migrate")
+    migrate(settings)
+    held = sqlite3.connect(data / "heliotwin.sqlite", isolation_level=None)
+    held.execute("BEGIN IMMEDIATE")
+    try:
+        for verb in ("keys", "models"):
+            assert heliotwin(data, verb, "list").returncode == 0
+    finally:
+        held.close()
+
+
+def _plant(folder: Path) -> Path:
+    write_plant(folder / "plant", images=1, rays=1000)
+    return folder / "plant"
+
+
+def test_an_open_door_is_refused_in_one_line(tmp_path: Path):
+    done = heliotwin(tmp_path / "data", "serve", "--host", "0.0.0.0")
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    told = [line for line in done.stderr.splitlines() if "holds no key" in line]
+    assert len(told) == 1
+    assert done.stderr.strip().splitlines()[-1] == told[0]
+
+
+@pytest.mark.parametrize("window", ["-4", "0", "nan", "1e9"])
+def test_a_window_that_is_none_is_bad_input(tmp_path: Path, window: str):
+    done = heliotwin(tmp_path / "data", "forecast", _plant(tmp_path), "--out", tmp_path / "out", "--window", window)
+    ends(done, 2, "--window must lie in 0 to 1000 m")
+
+
+def test_version(tmp_path: Path):
+    done = heliotwin(tmp_path / "data", "--version")
+    assert done.returncode == 0
+    assert done.stdout.startswith("heliotwin")
+
+
+def test_an_interrupted_prediction_leaves_what_was_done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    folder, calls = read_folder(_plant(tmp_path)), []
+    predict = verbs.predict_heliostat
+
+    def interrupted(*arguments: Any) -> Any:
+        calls.append(arguments)
+        if len(calls) > 1:
+            raise KeyboardInterrupt
+        return predict(*arguments)
+
+    monkeypatch.setattr(verbs, "predict_heliostat", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        verbs.predict_folder(folder, tmp_path / "out")
+    first, *others = folder.plant.heliostats
+    report = json.loads((tmp_path / "out" / "predictions.json").read_text())
+    assert list(report["heliostats"]) == [first]
+    assert report["skipped"] == dict.fromkeys(others, "interrupted")
