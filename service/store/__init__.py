@@ -11,6 +11,7 @@ from service.store.measurements import (
     recent_measurements,
 )
 from service.store.plant import (
+    add_heliostat,
     find_heliostat,
     find_receiver,
     get_heliostat,
@@ -30,8 +31,9 @@ from service.store.plant import (
     require_same_properties,
     target_plane,
 )
+from service.store.removal import remove_heliostat, remove_receiver, remove_target
 from service.store.results import add_forecast, add_study, counts, get_forecast, get_study, list_forecasts, list_studies
-from service.store.rows import Change, insert
+from service.store.rows import Change, insert, one_at_a_time
 from service.store.surfaces import (
     NewSurface,
     add_surface,
@@ -47,6 +49,7 @@ __all__ = [
     "Change",
     "NewSurface",
     "add_forecast",
+    "add_heliostat",
     "add_measurement",
     "add_study",
     "add_surface",
@@ -76,12 +79,16 @@ __all__ = [
     "list_studies",
     "list_surfaces",
     "list_targets",
+    "one_at_a_time",
     "put_declared",
     "put_heliostat",
     "put_plant",
     "put_receiver",
     "put_target",
     "recent_measurements",
+    "remove_heliostat",
+    "remove_receiver",
+    "remove_target",
     "require_same_properties",
     "target_plane",
 ]

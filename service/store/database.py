@@ -2,15 +2,16 @@
 
 import logging
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from alembic import command
 from alembic.config import Config
 from alembic.script import ScriptDirectory
 from sqlalchemy import URL, Connection, Engine, create_engine, event, inspect, text
+from sqlalchemy.exc import DBAPIError, OperationalError
 from sqlalchemy.orm import Session
 
 import migrations
@@ -27,6 +28,11 @@ _ALIVE = {"keepalives_idle": 30, "keepalives_interval": 10, "keepalives_count": 
 # Beyond the five that are kept open; together they are enough for the 40 threads that Starlette runs routes in, those
 # that ask for keys, follow jobs and check readiness, and a few workers with their heartbeats.
 _MORE_CONNECTIONS = 64
+
+# How often a deed is begun that PostgreSQL ended because it and another waited for each other.
+_ATTEMPTS = 5
+_DEADLOCK = "40P01"
+Done = TypeVar("Done")
 
 logger = logging.getLogger("heliotwin.service")
 
@@ -69,6 +75,11 @@ def make_engine(url: URL) -> Engine:
     return engine
 
 
+def is_deadlock(error: BaseException) -> bool:
+    """Whether PostgreSQL ended a transaction that waited for another, and that for it; begun again it may pass."""
+    return isinstance(error, DBAPIError) and getattr(error.orig, "sqlstate", None) == _DEADLOCK
+
+
 class Database:
     """A connection pool and its transactions.
 
@@ -92,6 +103,19 @@ class Database:
         """A session in one transaction; on SQLite it holds the only write lock, so compute before entering."""
         with Session(self._writer, expire_on_commit=False) as session, session.begin():
             yield session
+
+    def written(self, deed: Callable[[Session], Done]) -> Done:
+        """Do ``deed`` in a session of `writing`, and again where that was ended as a deadlock; what it returns."""
+        for _ in range(_ATTEMPTS - 1):
+            try:
+                with self.writing() as session:
+                    return deed(session)
+            except OperationalError as error:
+                if not is_deadlock(error):
+                    raise
+                logger.info("a write and another waited for each other; it is begun again")
+        with self.writing() as session:
+            return deed(session)
 
     def upgrade(self, revision: str = "head") -> None:
         """Bring the schema up to ``revision``."""

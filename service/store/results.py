@@ -8,11 +8,13 @@ from sqlalchemy.orm import Session, undefer
 
 from service.base.faults import NotFoundError
 from service.store.columns import Base
+from service.store.rows import hold
 from service.store.tables import ForecastRow, HeliostatRow, ImageRow, MeasurementRow, StudyRow, SurfaceRow, TargetRow
 
 
 def add_forecast(session: Session, row: ForecastRow) -> ForecastRow:
-    """Store a forecast."""
+    """Store a forecast; NotFoundError where its heliostat was deleted since it was read."""
+    hold(session, HeliostatRow, row.heliostat_id, "its heliostat")
     session.add(row)
     session.flush()
     session.refresh(row, ["heliostat", "surface"])

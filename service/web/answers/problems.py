@@ -16,6 +16,7 @@ from starlette.types import Scope
 
 from model.errors import ImageRefusedError, InvalidInputError, ModelError, UnreachableError
 from service.base import faults
+from service.store.database import is_deadlock
 from service.web.answers import pages
 
 logger = logging.getLogger("heliotwin.service")
@@ -148,6 +149,10 @@ def database_away(scope: Scope, error: Exception) -> Response:
     """The answer while the database does not give one, or can store no more."""
     if _is_full(error):
         return _no_room(scope, error)
+    if is_deadlock(error):
+        logger.warning("writers waited for each other, request %s: %s", request_id(scope), error)
+        detail = "another request was changing the same things and nothing of this one was kept; send it again"
+        return problem(scope, HTTPStatus.SERVICE_UNAVAILABLE, detail, {"Retry-After": "1"})
     logger.error("database unavailable, request %s: %s", request_id(scope), error)
     detail = "the database does not answer; try again later"
     return problem(scope, HTTPStatus.SERVICE_UNAVAILABLE, detail, {"Retry-After": "5"})

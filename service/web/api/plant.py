@@ -119,6 +119,7 @@ _PLANE_EXAMPLE = {"plane": {"center": [0, -3.2, 35.9], "normal": [0, 1, 0], "wid
 
 
 def _from_corners(session: Session, name: str, corners: Corners) -> TargetPlane:
+    store.one_at_a_time(session)  # the origin must not move until the target stands upon it
     origin = store.get_plant(session).origin
     return TargetPlane.from_corners(name, *(wgs84_to_enu(getattr(corners, corner), origin) for corner in _CORNERS))
 
@@ -140,17 +141,14 @@ def put_plant(document: TowerMeasurements, runtime: RuntimeDep, identity: Identi
     """Set the tower base, all planar targets and receivers from PAINT's tower measurements; again changes nothing."""
     origin, targets = read_targets(document.raw)
     receivers = read_receivers(document.raw)
-    with runtime.database.writing() as session:
-        geometry.set_plant(
-            session,
-            identity.name,
-            document.power_plant_properties.ID,
-            origin,
-            targets.values(),
-            receivers.values(),
-            corners={name: _paint_corners(document.raw, name) for name in targets},
-        )
+    corners = {name: _paint_corners(document.raw, name) for name in targets}
+
+    def deed(session: Session) -> PlantOut:
+        name = document.power_plant_properties.ID
+        geometry.set_plant(session, identity.name, name, origin, targets.values(), receivers.values(), corners=corners)
         return plant_out(store.get_plant(session))
+
+    return runtime.database.written(deed)
 
 
 @router.get("/targets", responses=problems(), dependencies=[READ])
@@ -181,17 +179,27 @@ def put_target(
     response: Response,
 ) -> TargetOut:
     """Set a target plane, by its rectangle [m] or by its four corners in WGS84."""
-    with runtime.database.writing() as session:
+
+    def deed(session: Session) -> tuple[TargetRow, store.Change]:
         if request.corners is not None:
             plane = _from_corners(session, name, request.corners)
             corners = {corner: list(getattr(request.corners, corner)) for corner in _CORNERS}
-        else:
-            assert request.plane is not None  # the schema wants one of both
-            plane, corners = request.plane.named(name), None
-        row, change = geometry.set_target(session, identity.name, plane, corners)
-        if change is store.Change.NEW:
-            response.status_code = status.HTTP_201_CREATED
-        return target_out(row)
+            return geometry.set_target(session, identity.name, plane, corners)
+        assert request.plane is not None  # the schema wants one of both
+        return geometry.set_target(session, identity.name, request.plane.named(name))
+
+    row, change = runtime.database.written(deed)
+    if change is store.Change.NEW:
+        response.status_code = status.HTTP_201_CREATED
+    return target_out(row)
+
+
+@router.delete(
+    "/targets/{name}", status_code=status.HTTP_204_NO_CONTENT, responses=problems(404, 409), dependencies=[OPERATE]
+)
+def delete_target(name: NamePath, runtime: RuntimeDep, identity: IdentityDep) -> None:
+    """Delete a target plane that was made by mistake; not where photographs, forecasts or waiting jobs name it."""
+    runtime.database.written(lambda session: geometry.remove(session, identity.name, "target", name))
 
 
 @router.get("/receivers", responses=problems(), dependencies=[READ])
@@ -222,8 +230,17 @@ def put_receiver(
     response: Response,
 ) -> ReceiverOut:
     """Set a cylindrical receiver."""
-    with runtime.database.writing() as session:
-        row, change = geometry.set_receiver(session, identity.name, request.named(name))
-        if change is store.Change.NEW:
-            response.status_code = status.HTTP_201_CREATED
-        return receiver_out(row)
+    row, change = runtime.database.written(
+        lambda session: geometry.set_receiver(session, identity.name, request.named(name))
+    )
+    if change is store.Change.NEW:
+        response.status_code = status.HTTP_201_CREATED
+    return receiver_out(row)
+
+
+@router.delete(
+    "/receivers/{name}", status_code=status.HTTP_204_NO_CONTENT, responses=problems(404, 409), dependencies=[OPERATE]
+)
+def delete_receiver(name: NamePath, runtime: RuntimeDep, identity: IdentityDep) -> None:
+    """Delete a receiver that was made by mistake; not where waiting jobs name it."""
+    runtime.database.written(lambda session: geometry.remove(session, identity.name, "receiver", name))
