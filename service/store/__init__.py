@@ -10,6 +10,7 @@ from service.store.measurements import (
     list_measurements,
     recent_measurements,
 )
+from service.store.models import put_declared
 from service.store.plant import (
     add_heliostat,
     find_heliostat,
@@ -23,7 +24,6 @@ from service.store.plant import (
     list_heliostats,
     list_receivers,
     list_targets,
-    put_declared,
     put_heliostat,
     put_plant,
     put_receiver,

@@ -12,7 +12,9 @@ from model.plant import Cylinder, Receiver, TargetPlane
 from service.base import names
 from service.base.faults import ConflictError, NotFoundError
 from service.store.rows import Change, assign, floats, insert, insert_or_find, one_at_a_time
-from service.store.tables import HeliostatRow, PlantRow, ReceiverRow, StudyRow, TargetRow
+from service.store.tables import HeliostatRow, PlantRow, ReceiverRow, TargetRow
+
+_NEW_PLANT = "heliotwin.new_plant"
 
 
 def get_plant(session: Session) -> PlantRow:
@@ -39,6 +41,7 @@ def put_plant(session: Session, name: str, origin: ArrayLike) -> Change:
     plant = session.get(PlantRow, 1)
     if plant is None:
         if insert(session, PlantRow(id=1, **values)):
+            session.info[_NEW_PLANT] = True  # a session of `Database.writing` is one transaction
             return Change.NEW
         plant = get_plant(session)
     if plant.origin != (latitude, longitude, altitude) and _has_positions(session):
@@ -46,19 +49,9 @@ def put_plant(session: Session, name: str, origin: ArrayLike) -> Change:
     return assign(plant, values)
 
 
-def put_declared(session: Session, declared: dict[str, Any]) -> Change:
-    """Set what is declared of the plant's model, in the form of ``twin.json``.
-
-    Raises
-    ------
-    ConflictError
-        Where studies were made with another: what they found adds to that.
-    """
-    plant = get_plant(session)
-    studied = session.scalar(select(StudyRow.id).limit(1)) is not None
-    if studied and (plant.declared or {}) != declared:
-        raise ConflictError("the declared model is fixed: studies were made with it; adopt what they find instead")
-    return assign(plant, {"declared": declared})
+def is_plant_new(session: Session) -> bool:
+    """Whether the plant was made in this very transaction, so that nothing can have been computed by its model."""
+    return bool(session.info.get(_NEW_PLANT))
 
 
 def _has_positions(session: Session) -> bool:

@@ -51,7 +51,7 @@ def set_plant(
     given = corners or {}
     change = PlantChange(
         store.put_plant(session, name, origin),
-        store.put_declared(session, declared) if declared else None,
+        store.put_declared(session, declared, actor) if declared else None,
         {plane.name: store.put_target(session, plane, given.get(plane.name))[1] for plane in targets},
         {cylinder.name: store.put_receiver(session, cylinder)[1] for cylinder in receivers},
     )

@@ -12,7 +12,8 @@ from service import store
 from service.base.fields import Model, Plane, ReceiverIn, Wgs84
 from service.sources.documents import read_receivers, read_targets
 from service.sources.schema import TowerMeasurements
-from service.store.tables import PlantRow, ReceiverRow, TargetRow
+from service.store.models import declared_of, find_current
+from service.store.tables import ReceiverRow, TargetRow
 from service.twin import geometry
 from service.web.answers.openapi import problems
 from service.web.answers.paging import Page
@@ -77,9 +78,10 @@ class TargetOut(BaseModel):
     corners: dict[str, Any] | None = Field(description="The WGS84 corners that it was made from, if it was.")
 
 
-def plant_out(row: PlantRow) -> PlantOut:
-    """A plant as JSON."""
-    return PlantOut(name=row.name, origin_wgs84=row.origin, declared=row.declared)
+def plant_out(session: Session) -> PlantOut:
+    """The plant as JSON."""
+    row, declared = store.get_plant(session), declared_of(session, find_current(session))
+    return PlantOut(name=row.name, origin_wgs84=row.origin, declared=declared)
 
 
 def target_out(row: TargetRow) -> TargetOut:
@@ -133,7 +135,7 @@ def _paint_corners(document: dict[str, Any], name: str) -> dict[str, list[float]
 def get_plant(runtime: RuntimeDep) -> PlantOut:
     """The plant's name and the tower base."""
     with runtime.database.reading() as session:
-        return plant_out(store.get_plant(session))
+        return plant_out(session)
 
 
 @router.put("/plant", responses=problems(409, 413, 415), dependencies=[OPERATE, Depends(require_json)])
@@ -146,7 +148,7 @@ def put_plant(document: TowerMeasurements, runtime: RuntimeDep, identity: Identi
     def deed(session: Session) -> PlantOut:
         name = document.power_plant_properties.ID
         geometry.set_plant(session, identity.name, name, origin, targets.values(), receivers.values(), corners=corners)
-        return plant_out(store.get_plant(session))
+        return plant_out(session)
 
     return runtime.database.written(deed)
 
