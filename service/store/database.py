@@ -1,6 +1,7 @@
 """The database: connections to SQLite or PostgreSQL, transactions, and the schema's version."""
 
 import logging
+import sqlite3
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -10,13 +11,13 @@ from typing import Any, TypeVar
 from alembic import command
 from alembic.config import Config
 from alembic.script import ScriptDirectory
-from sqlalchemy import URL, Connection, Engine, create_engine, event, inspect, text
+from sqlalchemy import URL, Connection, Engine, NullPool, create_engine, event, inspect, text
 from sqlalchemy.exc import DBAPIError, OperationalError
 from sqlalchemy.orm import Session
 
 import migrations
 from model.errors import InvalidInputError
-from service.base.faults import SchemaError
+from service.base.faults import SchemaError, StoreDamagedError
 from service.base.settings import Settings
 
 # Seconds that a writer waits for another on SQLite, and that a connection to PostgreSQL may take.
@@ -80,6 +81,12 @@ def is_deadlock(error: BaseException) -> bool:
     return isinstance(error, DBAPIError) and getattr(error.orig, "sqlstate", None) == _DEADLOCK
 
 
+def _damage(error: DBAPIError) -> str | None:
+    """What SQLite says of its file where that is none of its own any more."""
+    code = getattr(error.orig, "sqlite_errorcode", 0) & 0xFF  # the lowest byte is the kind, the others say more of it
+    return str(error.orig) if code in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB) else None
+
+
 class Database:
     """A connection pool and its transactions.
 
@@ -135,9 +142,36 @@ class Database:
             yield config
 
     def ping(self) -> None:
-        """Ask the database for an answer; raises SQLAlchemy's error where there is none."""
-        with self.engine.connect() as connection:
-            connection.execute(text("SELECT 1"))
+        """Ask the database for an answer; raises SQLAlchemy's error where there is none.
+
+        Raises
+        ------
+        StoreDamagedError
+            Where SQLite's file is damaged at the head of a table. Deeper down `heliotwin check` looks.
+        """
+        with self.telling_damage():
+            with self.engine.connect() as connection:
+                connection.execute(text("SELECT 1"))
+            if self.url.get_backend_name() == "sqlite":
+                self._look_at_file()
+
+    def _look_at_file(self) -> None:
+        fresh = create_engine(self.url, poolclass=NullPool)  # the pool's would answer out of their memory of the file
+        with fresh.connect() as connection:
+            for name in inspect(connection).get_table_names():
+                connection.execute(text(f'SELECT 1 FROM "{name}" NOT INDEXED LIMIT 1'))
+
+    @contextmanager
+    def telling_damage(self) -> Iterator[None]:
+        """Say in one line, as `StoreDamagedError`, where SQLite's file proves damaged inside the block."""
+        try:
+            yield
+        except DBAPIError as error:
+            if (said := _damage(error)) is None:
+                raise
+            raise StoreDamagedError(
+                f"the database {self.url.database} is damaged ({said}): restore it from a back-up"
+            ) from error
 
     def revision(self) -> str | None:
         """The schema's present version."""
