@@ -105,7 +105,7 @@ def adopt(session: Session, number: int, actor: str, force: bool = False) -> Mod
     """Make what a study found the plant's next model: the effects that it was made with, and those that it found.
 
     That is the very model that the study's held-out photographs have judged, also where ``force`` adopts it in place
-    of another that is current by now.
+    of another that is current by now. Where it is the current one already, it stays that.
 
     Raises
     ------
@@ -128,6 +128,9 @@ def adopt(session: Session, number: int, actor: str, force: bool = False) -> Mod
             f"study {number} was made with version {study.model} of the model, {current} is current; "
             "make another study, or force it to put this one in place of the current model"
         )
+    held = find_adopted(session, number)
+    if held is not None and held.number == current:
+        return held
     base = _row(session, study.model)
     before = () if base is None else _effects(base.effects)
     row = add_model(session, (*before, *found), declared_of(session, base), study.id, actor)

@@ -17,7 +17,7 @@ from service import store
 from service.base.faults import ConflictError, NotFoundError
 from service.jobs.kinds import KINDS
 from service.jobs.worker import Worker
-from service.store import keys
+from service.store import audit, keys
 from service.store.database import Database
 from service.store.tables import MODEL_VERSION, AuditRow, ModelRow, StudyRow
 from service.twin import versions
@@ -167,6 +167,18 @@ def test_study_of_another_version_takes_its_place_only_by_force(database: Databa
         adopt(database, second)
     assert current(database) == "2:camera_response"
     assert adopt(database, second, force=True) == "3:slope_error"
+
+
+def test_study_that_is_adopted_by_force_again_stays_one_version(database: Database):
+    first, second = add(database, GAMMA), add(database, SLOPE)
+    assert [adopt(database, first, force=True) for _ in range(8)] == ["2:camera_response"] * 8
+    with database.reading() as session:
+        assert len(versions.list_models(session)) == 1
+        assert len(audit.entries(session, 10)) == 1
+    # Over another that is current by now it is another version again.
+    assert adopt(database, second, force=True) == "3:slope_error"
+    with ThreadPoolExecutor(4) as pool:
+        assert set(pool.map(lambda _: adopt(database, first, force=True), range(8))) == {"4:camera_response"}
 
 
 def test_study_that_found_nothing_is_not_adopted(database: Database):
