@@ -18,7 +18,7 @@ from sqlalchemy.orm import Session
 import migrations
 from model.errors import InvalidInputError
 from service.base.faults import SchemaError, StoreDamagedError
-from service.base.settings import Settings
+from service.base.settings import WEB_CONNECTIONS, Settings
 
 # Seconds that a writer waits for another on SQLite, and that a connection to PostgreSQL may take.
 _PATIENCE_S = 15
@@ -26,9 +26,8 @@ _PATIENCE_S = 15
 # A PostgreSQL server that vanished without a word is given up after about a minute, not after the system's two hours.
 _ALIVE = {"keepalives_idle": 30, "keepalives_interval": 10, "keepalives_count": 3, "tcp_user_timeout": 60_000}
 
-# Beyond the five that are kept open; together they are enough for the 40 threads that Starlette runs routes in, those
-# that ask for keys, follow jobs and check readiness, and a few workers with their heartbeats.
-_MORE_CONNECTIONS = 64
+# Connections that are kept open; those beyond are closed after use.
+_KEPT_CONNECTIONS = 5
 
 # How often a deed is begun that PostgreSQL ended because it and another waited for each other.
 _ATTEMPTS = 5
@@ -64,14 +63,16 @@ def _prepare_sqlite(engine: Engine) -> None:
         connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
 
 
-def make_engine(url: URL) -> Engine:
-    """A connection pool for ``url``; SQLite with write-ahead log, durable commits and foreign keys."""
+def make_engine(url: URL, connections: int = WEB_CONNECTIONS) -> Engine:
+    """A pool of ``connections`` for ``url``; SQLite with write-ahead log, durable commits and foreign keys."""
+    kept = min(_KEPT_CONNECTIONS, connections)
+    pool = {"pool_size": kept, "max_overflow": connections - kept, "pool_timeout": _PATIENCE_S}
     if url.get_backend_name() != "sqlite":
         connect = {"connect_timeout": _PATIENCE_S, **_ALIVE}
-        return create_engine(url, pool_pre_ping=True, connect_args=connect, max_overflow=_MORE_CONNECTIONS)
+        return create_engine(url, pool_pre_ping=True, connect_args=connect, **pool)
     if url.database:
         Path(url.database).parent.mkdir(parents=True, exist_ok=True)
-    engine = create_engine(url, max_overflow=_MORE_CONNECTIONS)
+    engine = create_engine(url, **pool)
     _prepare_sqlite(engine)
     return engine
 
@@ -94,9 +95,9 @@ class Database:
     latter commits at the end of its block, or rolls back when the block raises.
     """
 
-    def __init__(self, url: URL) -> None:
+    def __init__(self, url: URL, connections: int = WEB_CONNECTIONS) -> None:
         self.url = url
-        self.engine = make_engine(url)
+        self.engine = make_engine(url, connections)
         self._writer = self.engine.execution_options(writes=True)
 
     @contextmanager

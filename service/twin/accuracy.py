@@ -111,6 +111,7 @@ class AccuracyBook:
         self._lock = threading.Lock()
         self._known: OrderedDict[State, float | None] = OrderedDict()
         self._wanted: OrderedDict[State, None] = OrderedDict()
+        self._working: State | None = None
         self._is_closed = False
         self._thread: threading.Thread | None = None
 
@@ -120,7 +121,7 @@ class AccuracyBook:
             asked = list(states)
             missing = [state for state in asked if state not in self._known]
             # What nobody asks for any more is not worth the work.
-            self._wanted = OrderedDict.fromkeys(missing)
+            self._wanted = OrderedDict.fromkeys(state for state in missing if state != self._working)
             if missing and not self._is_closed and self._thread is None:
                 self._thread = threading.Thread(target=self._work, name="accuracy", daemon=True)
                 self._thread.start()
@@ -138,10 +139,12 @@ class AccuracyBook:
 
     def _next(self) -> State | None:
         with self._lock:
+            self._working = None
             if not self._wanted:
                 self._thread = None
                 return None
-            return self._wanted.popitem(last=False)[0]
+            self._working = self._wanted.popitem(last=False)[0]
+            return self._working
 
     def _work(self) -> None:
         while (state := self._next()) is not None:
