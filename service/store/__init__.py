@@ -7,6 +7,7 @@ from service.store.measurements import (
     add_measurement,
     find_measurement_of_image,
     get_measurement,
+    get_measurements,
     list_measurements,
     recent_measurements,
 )
@@ -32,7 +33,16 @@ from service.store.plant import (
     target_plane,
 )
 from service.store.removal import remove_heliostat, remove_receiver, remove_target
-from service.store.results import add_forecast, add_study, counts, get_forecast, get_study, list_forecasts, list_studies
+from service.store.results import (
+    add_forecast,
+    add_study,
+    counts,
+    get_forecast,
+    get_study,
+    list_forecasts,
+    list_studies,
+    recent_forecasts,
+)
 from service.store.rows import Change, insert, one_at_a_time
 from service.store.surfaces import (
     NewSurface,
@@ -64,6 +74,7 @@ __all__ = [
     "get_heliostat",
     "get_heliostats",
     "get_measurement",
+    "get_measurements",
     "get_plant",
     "get_receiver",
     "get_study",
@@ -85,6 +96,7 @@ __all__ = [
     "put_plant",
     "put_receiver",
     "put_target",
+    "recent_forecasts",
     "recent_measurements",
     "remove_heliostat",
     "remove_receiver",

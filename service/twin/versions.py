@@ -26,6 +26,7 @@ __all__ = [
     "DECLARED",
     "PlantModel",
     "adopt",
+    "adopted_from",
     "current_number",
     "find_adopted",
     "find_current",
@@ -52,8 +53,15 @@ class PlantModel:
 
 def find_adopted(session: Session, study: int) -> ModelRow | None:
     """The newest version that stands for what a study found, unless it is withdrawn."""
-    query = select(ModelRow).where(ModelRow.study_id == study, ModelRow.withdrawn_at.is_(None))
-    return session.scalar(query.order_by(ModelRow.number.desc()).limit(1))
+    return adopted_from(session, [study]).get(study)
+
+
+def adopted_from(session: Session, studies: Sequence[int]) -> dict[int, ModelRow]:
+    """What `find_adopted` has of each of these studies that has one, by its id."""
+    query = select(ModelRow).where(ModelRow.study_id.in_(studies), ModelRow.withdrawn_at.is_(None))
+    # Of a study's versions the last one stays.
+    rows = session.scalars(query.order_by(ModelRow.number))
+    return {row.study_id: row for row in rows if row.study_id is not None}
 
 
 def current_number(session: Session) -> int:
