@@ -103,6 +103,12 @@ class Settings(BaseSettings):
     job_retention_days: float = Field(
         default=90.0, ge=0, le=36500, description="Jobs that ended so long ago [days] are deleted; 0 keeps all."
     )
+    forecast_retention_days: float = Field(
+        default=365.0, ge=0, le=36500, description="Forecasts made so long ago [days] are deleted; 0 keeps all."
+    )
+    audit_retention_days: float = Field(
+        default=1825.0, ge=0, le=36500, description="Audit entries so old [days] are deleted; 0 keeps all."
+    )
     log_level: LogLevel = "info"
     log_format: Literal["text", "json"] = Field(default="text", description="json: one object a line.")
     metrics_port: int | None = Field(

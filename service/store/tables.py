@@ -340,7 +340,7 @@ class KeyRow(Base):
 
 
 class AuditRow(Base):
-    """Who did what when; rows are only ever added."""
+    """Who did what when; rows are only ever added, and go when they are old (`service.store.retention`)."""
 
     __tablename__ = "audit"
 
