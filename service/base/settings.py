@@ -2,9 +2,9 @@
 
 import ipaddress
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
-from pydantic import Field, SecretStr, field_validator
+from pydantic import Field, SecretStr, field_validator, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 from sqlalchemy import URL, make_url
 from sqlalchemy.exc import ArgumentError
@@ -12,6 +12,15 @@ from sqlalchemy.exc import ArgumentError
 LogLevel = Literal["critical", "error", "warning", "info", "debug"]
 
 _DRIVERS = {"sqlite": "sqlite", "postgresql": "postgresql+psycopg"}
+
+WEB_CONNECTIONS = 48
+"""Database connections of a process without workers: one for each of the 40 threads that routes run in, and some for
+those that ask for keys, follow jobs and check readiness."""
+
+WORKER_CONNECTIONS = 2
+"""Those of a worker: for its work and for its heartbeat."""
+
+_LEAST_WEB_CONNECTIONS = 8
 
 
 def is_loopback(host: str) -> bool:
@@ -39,6 +48,13 @@ class Settings(BaseSettings):
     )
     database_password_file: Path | None = Field(
         default=None, description="File holding the database password, so that no URL or environment does."
+    )
+    database_connections: int | None = Field(
+        default=None,
+        ge=1,
+        le=1000,
+        description="Most connections of this process, at least 8 and 2 for each of its job_workers; without it 48 and "
+        "2 for each. PostgreSQL's max_connections must hold those of all processes.",
     )
     migrate_on_start: bool | None = Field(
         default=None, description="Bring the schema to its newest version at start; without it only SQLite is migrated."
@@ -87,6 +103,12 @@ class Settings(BaseSettings):
     job_retention_days: float = Field(
         default=90.0, ge=0, le=36500, description="Jobs that ended so long ago [days] are deleted; 0 keeps all."
     )
+    forecast_retention_days: float = Field(
+        default=365.0, ge=0, le=36500, description="Forecasts made so long ago [days] are deleted; 0 keeps all."
+    )
+    audit_retention_days: float = Field(
+        default=1825.0, ge=0, le=36500, description="Audit entries so old [days] are deleted; 0 keeps all."
+    )
     log_level: LogLevel = "info"
     log_format: Literal["text", "json"] = Field(default="text", description="json: one object a line.")
     metrics_port: int | None = Field(
@@ -115,6 +137,22 @@ class Settings(BaseSettings):
         if backend not in _DRIVERS:
             raise ValueError(f"must be a sqlite or postgresql URL, not {backend}")
         return value
+
+    @model_validator(mode="after")
+    def _enough_connections(self) -> Self:
+        """With fewer, workers could hold all there are, and requests and heartbeats would wait for them."""
+        least = _LEAST_WEB_CONNECTIONS + WORKER_CONNECTIONS * self.job_workers
+        if self.database_connections is not None and self.database_connections < least:
+            raise ValueError(
+                f"database_connections: {self.database_connections} are too few for job_workers {self.job_workers}; "
+                f"set at least {least}"
+            )
+        return self
+
+    @property
+    def connections(self) -> int:
+        """Most database connections of this process."""
+        return self.database_connections or WEB_CONNECTIONS + WORKER_CONNECTIONS * self.job_workers
 
     @property
     def password(self) -> SecretStr | None:

@@ -25,7 +25,7 @@ from service.base.faults import ServiceError
 from service.base.meters import JOB_ATTEMPTS, JOB_SECONDS, PROCESS, listening, timed
 from service.base.settings import Settings
 from service.jobs.kind import CancelRequestedError, Context, Kinds, WorkerStoppingError
-from service.store import queue
+from service.store import queue, retention
 from service.store.tables import JobRow
 from service.twin.runtime import Operations, Runtime
 
@@ -80,16 +80,23 @@ class Worker:
                 self.runtime.job_came.acquire(timeout=self.runtime.settings.job_poll_s)
 
     def _purge(self) -> None:
-        """Delete old jobs, now and then, a few at a time."""
-        settings = self.runtime.settings
-        if not settings.job_retention_days or time.monotonic() - self._purged_s < _PURGE_EVERY_S:
+        """Delete what is kept for a time only, now and then, a few rows of each table at a time."""
+        if time.monotonic() - self._purged_s < _PURGE_EVERY_S:
             return
-        with self.runtime.database.writing() as session:
-            count = queue.purge(session, timedelta(days=settings.job_retention_days))
-        if count:
-            logger.info("%s: %d jobs deleted that ended %g days ago", self.name, count, settings.job_retention_days)
-            return  # there may be more
-        self._purged_s = time.monotonic()
+        settings, deleted = self.runtime.settings, 0
+        for what, days, purge in (
+            ("jobs", settings.job_retention_days, queue.purge),
+            ("forecasts", settings.forecast_retention_days, retention.prune_forecasts),
+            ("audit entries", settings.audit_retention_days, retention.prune_audit),
+        ):
+            if days:
+                with self.runtime.database.writing() as session:
+                    count = purge(session, timedelta(days=days))
+                if count:
+                    logger.info("%s: %d %s deleted that were older than %g days", self.name, count, what, days)
+                deleted += count
+        if not deleted:  # else there may be more
+            self._purged_s = time.monotonic()
 
     def work(self) -> bool:
         """Take a job, if there is one, and bring it to an end; whether there was one."""

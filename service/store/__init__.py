@@ -7,10 +7,12 @@ from service.store.measurements import (
     add_measurement,
     find_measurement_of_image,
     get_measurement,
+    get_measurements,
     list_measurements,
     recent_measurements,
 )
 from service.store.plant import (
+    add_heliostat,
     find_heliostat,
     find_receiver,
     get_heliostat,
@@ -22,7 +24,6 @@ from service.store.plant import (
     list_heliostats,
     list_receivers,
     list_targets,
-    put_declared,
     put_heliostat,
     put_plant,
     put_receiver,
@@ -30,8 +31,18 @@ from service.store.plant import (
     require_same_properties,
     target_plane,
 )
-from service.store.results import add_forecast, add_study, counts, get_forecast, get_study, list_forecasts, list_studies
-from service.store.rows import Change, insert
+from service.store.removal import remove_heliostat, remove_receiver, remove_target
+from service.store.results import (
+    add_forecast,
+    add_study,
+    counts,
+    get_forecast,
+    get_study,
+    list_forecasts,
+    list_studies,
+    recent_forecasts,
+)
+from service.store.rows import Change, insert, one_at_a_time
 from service.store.surfaces import (
     NewSurface,
     add_surface,
@@ -47,6 +58,7 @@ __all__ = [
     "Change",
     "NewSurface",
     "add_forecast",
+    "add_heliostat",
     "add_measurement",
     "add_study",
     "add_surface",
@@ -61,6 +73,7 @@ __all__ = [
     "get_heliostat",
     "get_heliostats",
     "get_measurement",
+    "get_measurements",
     "get_plant",
     "get_receiver",
     "get_study",
@@ -76,12 +89,16 @@ __all__ = [
     "list_studies",
     "list_surfaces",
     "list_targets",
-    "put_declared",
+    "one_at_a_time",
     "put_heliostat",
     "put_plant",
     "put_receiver",
     "put_target",
+    "recent_forecasts",
     "recent_measurements",
+    "remove_heliostat",
+    "remove_receiver",
+    "remove_target",
     "require_same_properties",
     "target_plane",
 ]

@@ -1,6 +1,7 @@
 """`heliotwin check`: whether the store still is what it promised to keep."""
 
 import re
+from collections.abc import Sequence
 from typing import Any
 
 from sqlalchemy import select
@@ -11,6 +12,9 @@ from service.base.progress import Progress
 from service.store.database import Database
 from service.store.images import ImageStore
 from service.store.tables import HeliostatRow, ImageRow, MeasurementRow
+
+# Images that are asked for in one statement.
+_CHUNK = 500
 
 _IMAGE = re.compile(r"[0-9a-f]{2}/[0-9a-f]{62}")
 
@@ -28,8 +32,10 @@ def inspect_store(database: Database, images: ImageStore, step: Progress) -> dic
     with database.reading() as session:
         known = list(session.scalars(select(ImageRow.sha256).order_by(ImageRow.sha256)))
         faults = _database_faults(session)
-        bad = {sha256: reason for sha256 in known if (reason := _reason(images, sha256, step)) is not None}
-        listed = {sha256: {"reason": reason, "measurements": _of(session, sha256)} for sha256, reason in bad.items()}
+    # Terabytes take hours to read: no transaction waits for that.
+    bad = {sha256: reason for sha256 in known if (reason := _reason(images, sha256, step)) is not None}
+    owners = _owners(database, list(bad))
+    listed = {sha256: {"reason": reason, "measurements": owners[sha256]} for sha256, reason in bad.items()}
     names = set(known)
     files = [path.relative_to(images.root).as_posix() for path in images.root.rglob("*") if path.is_file()]
     stored = [name for name in files if _IMAGE.fullmatch(name)]
@@ -58,13 +64,18 @@ def _reason(images: ImageStore, sha256: str, step: Progress) -> str | None:
     return None
 
 
-def _of(session: Session, sha256: str) -> list[str]:
-    query = (
-        select(HeliostatRow.name, MeasurementRow.identifier)
-        .join(MeasurementRow, MeasurementRow.heliostat_id == HeliostatRow.id)
-        .where(MeasurementRow.image_sha256 == sha256)
+def _owners(database: Database, images: Sequence[str]) -> dict[str, list[str]]:
+    """The measurements (H/ID) that these images belong to."""
+    owners: dict[str, list[str]] = {sha256: [] for sha256 in images}
+    query = select(MeasurementRow.image_sha256, HeliostatRow.name, MeasurementRow.identifier).join(
+        HeliostatRow, MeasurementRow.heliostat_id == HeliostatRow.id
     )
-    return [f"{name}/{identifier}" for name, identifier in session.execute(query)]
+    with database.reading() as session:
+        for start in range(0, len(images), _CHUNK):
+            some = query.where(MeasurementRow.image_sha256.in_(images[start : start + _CHUNK]))
+            for sha256, name, identifier in session.execute(some.order_by(MeasurementRow.id)):
+                owners[sha256].append(f"{name}/{identifier}")
+    return owners
 
 
 def _database_faults(session: Session) -> list[str]:

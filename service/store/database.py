@@ -1,22 +1,24 @@
 """The database: connections to SQLite or PostgreSQL, transactions, and the schema's version."""
 
 import logging
+import sqlite3
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from alembic import command
 from alembic.config import Config
 from alembic.script import ScriptDirectory
-from sqlalchemy import URL, Connection, Engine, create_engine, event, inspect, text
+from sqlalchemy import URL, Connection, Engine, NullPool, create_engine, event, inspect, text
+from sqlalchemy.exc import DBAPIError, OperationalError
 from sqlalchemy.orm import Session
 
 import migrations
 from model.errors import InvalidInputError
-from service.base.faults import SchemaError
-from service.base.settings import Settings
+from service.base.faults import SchemaError, StoreDamagedError
+from service.base.settings import WEB_CONNECTIONS, Settings
 
 # Seconds that a writer waits for another on SQLite, and that a connection to PostgreSQL may take.
 _PATIENCE_S = 15
@@ -24,9 +26,13 @@ _PATIENCE_S = 15
 # A PostgreSQL server that vanished without a word is given up after about a minute, not after the system's two hours.
 _ALIVE = {"keepalives_idle": 30, "keepalives_interval": 10, "keepalives_count": 3, "tcp_user_timeout": 60_000}
 
-# Beyond the five that are kept open; together they are enough for the 40 threads that Starlette runs routes in, those
-# that ask for keys, follow jobs and check readiness, and a few workers with their heartbeats.
-_MORE_CONNECTIONS = 64
+# Connections that are kept open; those beyond are closed after use.
+_KEPT_CONNECTIONS = 5
+
+# How often a deed is begun that PostgreSQL ended because it and another waited for each other.
+_ATTEMPTS = 5
+_DEADLOCK = "40P01"
+Done = TypeVar("Done")
 
 logger = logging.getLogger("heliotwin.service")
 
@@ -57,16 +63,29 @@ def _prepare_sqlite(engine: Engine) -> None:
         connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
 
 
-def make_engine(url: URL) -> Engine:
-    """A connection pool for ``url``; SQLite with write-ahead log, durable commits and foreign keys."""
+def make_engine(url: URL, connections: int = WEB_CONNECTIONS) -> Engine:
+    """A pool of ``connections`` for ``url``; SQLite with write-ahead log, durable commits and foreign keys."""
+    kept = min(_KEPT_CONNECTIONS, connections)
+    pool = {"pool_size": kept, "max_overflow": connections - kept, "pool_timeout": _PATIENCE_S}
     if url.get_backend_name() != "sqlite":
         connect = {"connect_timeout": _PATIENCE_S, **_ALIVE}
-        return create_engine(url, pool_pre_ping=True, connect_args=connect, max_overflow=_MORE_CONNECTIONS)
+        return create_engine(url, pool_pre_ping=True, connect_args=connect, **pool)
     if url.database:
         Path(url.database).parent.mkdir(parents=True, exist_ok=True)
-    engine = create_engine(url, max_overflow=_MORE_CONNECTIONS)
+    engine = create_engine(url, **pool)
     _prepare_sqlite(engine)
     return engine
+
+
+def is_deadlock(error: BaseException) -> bool:
+    """Whether PostgreSQL ended a transaction that waited for another, and that for it; begun again it may pass."""
+    return isinstance(error, DBAPIError) and getattr(error.orig, "sqlstate", None) == _DEADLOCK
+
+
+def _damage(error: DBAPIError) -> str | None:
+    """What SQLite says of its file where that is none of its own any more."""
+    code = getattr(error.orig, "sqlite_errorcode", 0) & 0xFF  # the lowest byte is the kind, the others say more of it
+    return str(error.orig) if code in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB) else None
 
 
 class Database:
@@ -76,9 +95,9 @@ class Database:
     latter commits at the end of its block, or rolls back when the block raises.
     """
 
-    def __init__(self, url: URL) -> None:
+    def __init__(self, url: URL, connections: int = WEB_CONNECTIONS) -> None:
         self.url = url
-        self.engine = make_engine(url)
+        self.engine = make_engine(url, connections)
         self._writer = self.engine.execution_options(writes=True)
 
     @contextmanager
@@ -92,6 +111,19 @@ class Database:
         """A session in one transaction; on SQLite it holds the only write lock, so compute before entering."""
         with Session(self._writer, expire_on_commit=False) as session, session.begin():
             yield session
+
+    def written(self, deed: Callable[[Session], Done]) -> Done:
+        """Do ``deed`` in a session of `writing`, and again where that was ended as a deadlock; what it returns."""
+        for _ in range(_ATTEMPTS - 1):
+            try:
+                with self.writing() as session:
+                    return deed(session)
+            except OperationalError as error:
+                if not is_deadlock(error):
+                    raise
+                logger.info("a write and another waited for each other; it is begun again")
+        with self.writing() as session:
+            return deed(session)
 
     def upgrade(self, revision: str = "head") -> None:
         """Bring the schema up to ``revision``."""
@@ -111,9 +143,36 @@ class Database:
             yield config
 
     def ping(self) -> None:
-        """Ask the database for an answer; raises SQLAlchemy's error where there is none."""
-        with self.engine.connect() as connection:
-            connection.execute(text("SELECT 1"))
+        """Ask the database for an answer; raises SQLAlchemy's error where there is none.
+
+        Raises
+        ------
+        StoreDamagedError
+            Where SQLite's file is damaged at the head of a table. Deeper down `heliotwin check` looks.
+        """
+        with self.telling_damage():
+            with self.engine.connect() as connection:
+                connection.execute(text("SELECT 1"))
+            if self.url.get_backend_name() == "sqlite":
+                self._look_at_file()
+
+    def _look_at_file(self) -> None:
+        fresh = create_engine(self.url, poolclass=NullPool)  # the pool's would answer out of their memory of the file
+        with fresh.connect() as connection:
+            for name in inspect(connection).get_table_names():
+                connection.execute(text(f'SELECT 1 FROM "{name}" NOT INDEXED LIMIT 1'))
+
+    @contextmanager
+    def telling_damage(self) -> Iterator[None]:
+        """Say in one line, as `StoreDamagedError`, where SQLite's file proves damaged inside the block."""
+        try:
+            yield
+        except DBAPIError as error:
+            if (said := _damage(error)) is None:
+                raise
+            raise StoreDamagedError(
+                f"the database {self.url.database} is damaged ({said}): restore it from a back-up"
+            ) from error
 
     def revision(self) -> str | None:
         """The schema's present version."""

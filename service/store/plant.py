@@ -11,8 +11,10 @@ from sqlalchemy.orm import Session, defer
 from model.plant import Cylinder, Receiver, TargetPlane
 from service.base import names
 from service.base.faults import ConflictError, NotFoundError
-from service.store.rows import Change, assign, floats, insert, insert_or_find
-from service.store.tables import HeliostatRow, PlantRow, ReceiverRow, StudyRow, TargetRow
+from service.store.rows import Change, assign, floats, insert, insert_or_find, one_at_a_time
+from service.store.tables import HeliostatRow, PlantRow, ReceiverRow, TargetRow
+
+_NEW_PLANT = "heliotwin.new_plant"
 
 
 def get_plant(session: Session) -> PlantRow:
@@ -33,11 +35,13 @@ def put_plant(session: Session, name: str, origin: ArrayLike) -> Change:
     ConflictError
         Where heliostats or targets are already stored relative to another origin.
     """
+    one_at_a_time(session)
     latitude, longitude, altitude = floats(origin)
     values = {"name": name, "latitude_deg": latitude, "longitude_deg": longitude, "altitude_m": altitude}
     plant = session.get(PlantRow, 1)
     if plant is None:
         if insert(session, PlantRow(id=1, **values)):
+            session.info[_NEW_PLANT] = True  # a session of `Database.writing` is one transaction
             return Change.NEW
         plant = get_plant(session)
     if plant.origin != (latitude, longitude, altitude) and _has_positions(session):
@@ -45,19 +49,9 @@ def put_plant(session: Session, name: str, origin: ArrayLike) -> Change:
     return assign(plant, values)
 
 
-def put_declared(session: Session, declared: dict[str, Any]) -> Change:
-    """Set what is declared of the plant's model, in the form of ``twin.json``.
-
-    Raises
-    ------
-    ConflictError
-        Where studies were made with another: what they found adds to that.
-    """
-    plant = get_plant(session)
-    studied = session.scalar(select(StudyRow.id).limit(1)) is not None
-    if studied and (plant.declared or {}) != declared:
-        raise ConflictError("the declared model is fixed: studies were made with it; adopt what they find instead")
-    return assign(plant, {"declared": declared})
+def is_plant_new(session: Session) -> bool:
+    """Whether the plant was made in this very transaction, so that nothing can have been computed by its model."""
+    return bool(session.info.get(_NEW_PLANT))
 
 
 def _has_positions(session: Session) -> bool:
@@ -99,11 +93,33 @@ def put_heliostat(
     session: Session, name: str, properties: dict[str, Any], position: ArrayLike
 ) -> tuple[HeliostatRow, Change]:
     """Keep a heliostat's PAINT ``properties`` and its ENU ``position`` (3,) [m]; InvalidInputError for a bad name."""
-    names.require(names.NAME, name, "heliostat")
-    east, north, up = floats(position)
-    values = {"properties": properties, "east_m": east, "north_m": north, "up_m": up}
+    values = _heliostat_values(session, name, properties, position)
     row, is_new = insert_or_find(session, HeliostatRow(name=name, **values))
     return row, Change.NEW if is_new else assign(row, values)
+
+
+def add_heliostat(
+    session: Session, name: str, properties: dict[str, Any], position: ArrayLike
+) -> tuple[HeliostatRow, Change]:
+    """Keep a heliostat as `put_heliostat` does, but never over another.
+
+    Raises
+    ------
+    ConflictError
+        Where one of this name, also of another writer at the same moment, has other properties.
+    """
+    values = _heliostat_values(session, name, properties, position)
+    row, is_new = insert_or_find(session, HeliostatRow(name=name, **values))
+    if not is_new:
+        require_same_properties(row, properties)
+    return row, Change.NEW if is_new else Change.UNCHANGED
+
+
+def _heliostat_values(session: Session, name: str, properties: dict[str, Any], position: ArrayLike) -> dict[str, Any]:
+    names.require(names.NAME, name, "heliostat")
+    one_at_a_time(session)
+    east, north, up = floats(position)
+    return {"properties": properties, "east_m": east, "north_m": north, "up_m": up}
 
 
 def find_target(session: Session, name: str) -> TargetRow | None:
@@ -133,6 +149,7 @@ def put_target(
     Raises `InvalidInputError` for a bad name, ConflictError where a receiver has it.
     """
     names.require(names.NAME, plane.name, "target")
+    one_at_a_time(session)
     if find_receiver(session, plane.name) is not None:
         raise ConflictError(f"name: {plane.name} is a receiver; choose another name for the target plane")
     values: dict[str, Any] = {
@@ -192,6 +209,7 @@ def put_receiver(session: Session, cylinder: Cylinder) -> tuple[ReceiverRow, Cha
         Where a target has that name.
     """
     names.require(names.NAME, cylinder.name, "receiver")
+    one_at_a_time(session)
     if find_target(session, cylinder.name) is not None:
         raise ConflictError(f"name: {cylinder.name} is a target plane; choose another name for the receiver")
     values: dict[str, Any] = {

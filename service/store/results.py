@@ -4,15 +4,23 @@ from collections.abc import Sequence
 from typing import cast
 
 from sqlalchemy import func, select
-from sqlalchemy.orm import Session, undefer
+from sqlalchemy.orm import Session, joinedload, lazyload, load_only, undefer
 
 from service.base.faults import NotFoundError
 from service.store.columns import Base
+from service.store.rows import hold
 from service.store.tables import ForecastRow, HeliostatRow, ImageRow, MeasurementRow, StudyRow, SurfaceRow, TargetRow
+
+# What a forecast tells of its heliostat and surface is a name and a number; the rest would be megabytes in a list.
+_NAMES = (
+    joinedload(ForecastRow.heliostat, innerjoin=True).load_only(HeliostatRow.name),
+    joinedload(ForecastRow.surface).options(load_only(SurfaceRow.version), lazyload(SurfaceRow.measurements)),
+)
 
 
 def add_forecast(session: Session, row: ForecastRow) -> ForecastRow:
-    """Store a forecast."""
+    """Store a forecast; NotFoundError where its heliostat was deleted since it was read."""
+    hold(session, HeliostatRow, row.heliostat_id, "its heliostat")
     session.add(row)
     session.flush()
     session.refresh(row, ["heliostat", "surface"])
@@ -21,7 +29,9 @@ def add_forecast(session: Session, row: ForecastRow) -> ForecastRow:
 
 def get_forecast(session: Session, number: int) -> ForecastRow:
     """A forecast with its flux; NotFoundError where there is none."""
-    row = session.scalar(select(ForecastRow).where(ForecastRow.id == number).options(undefer(ForecastRow.flux)))
+    row = session.scalar(
+        select(ForecastRow).where(ForecastRow.id == number).options(undefer(ForecastRow.flux), *_NAMES)
+    )
     if row is None:
         raise NotFoundError(f"there is no forecast {number}")
     return row
@@ -31,10 +41,15 @@ def list_forecasts(
     session: Session, limit: int, after: int | None = None, heliostat: HeliostatRow | None = None
 ) -> Sequence[ForecastRow]:
     """Up to ``limit`` forecasts in the order they were made, those after number ``after``."""
-    query = select(ForecastRow).order_by(ForecastRow.id).limit(limit)
+    query = select(ForecastRow).options(*_NAMES).order_by(ForecastRow.id).limit(limit)
     if heliostat is not None:
         query = query.where(ForecastRow.heliostat_id == heliostat.id)
     return session.scalars(query.where(ForecastRow.id > after) if after else query).all()
+
+
+def recent_forecasts(session: Session, limit: int) -> Sequence[ForecastRow]:
+    """The newest ``limit`` forecasts, the newest first."""
+    return session.scalars(select(ForecastRow).options(*_NAMES).order_by(ForecastRow.id.desc()).limit(limit)).all()
 
 
 def add_study(session: Session, row: StudyRow) -> StudyRow:

@@ -6,11 +6,12 @@ from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
-from sqlalchemy import inspect, select
+from sqlalchemy import func, inspect, select
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.orm import Session, make_transient_to_detached
 from sqlalchemy.orm.attributes import set_committed_value
 
+from service.base.faults import NotFoundError
 from service.store.columns import Base
 from service.store.tables import HeliostatRow, ReceiverRow, TargetRow
 
@@ -21,6 +22,9 @@ _INSERTS: dict[str, Callable[..., Any]] = {"postgresql": postgresql.insert, "sql
 ROUNDS = 8
 Named = TypeVar("Named", HeliostatRow, TargetRow, ReceiverRow)
 
+# The number under which PostgreSQL keeps the lock of `one_at_a_time`: any, as long as it is always the same.
+_PLANT_LOCK = 0x68656C69
+
 
 class Change(StrEnum):
     """What a write did."""
@@ -28,6 +32,31 @@ class Change(StrEnum):
     NEW = "new"
     CHANGED = "changed"
     UNCHANGED = "unchanged"
+
+
+def one_at_a_time(session: Session) -> None:
+    """Wait for whoever else changes what the plant is made of, and keep others waiting until the transaction ends.
+
+    A name is one thing's among targets and receivers, which no constraint of a single table can hold; and who sets
+    many things at once would meet another who sets them in another order. On SQLite a writer is alone anyway. The
+    plant's row would not do as the lock: targets may be set before there is one.
+    """
+    if session.get_bind().dialect.name == "postgresql":
+        session.execute(select(func.pg_advisory_xact_lock(_PLANT_LOCK)))
+
+
+def hold(session: Session, table: type[Base], number: int, what: str) -> None:
+    """Keep a row that was read in an earlier transaction from being deleted in this one.
+
+    Raises
+    ------
+    NotFoundError
+        Where it was deleted since; ``what`` names it.
+    """
+    key = inspect(table).primary_key[0]
+    query = select(key).where(key == number).with_for_update(read=True, key_share=True)
+    if session.scalar(query) is None:
+        raise NotFoundError(f"{what} was deleted in the meantime")
 
 
 def insert(session: Session, row: Base) -> bool:

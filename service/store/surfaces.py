@@ -14,7 +14,7 @@ from sqlalchemy.orm import Session, undefer
 from service.base.arrays import pack
 from service.base.faults import ConflictError, NotFoundError
 from service.store.columns import now
-from service.store.rows import ROUNDS, insert
+from service.store.rows import ROUNDS, hold, insert
 from service.store.tables import HeliostatRow, MeasurementRow, SurfaceRow
 
 
@@ -83,8 +83,9 @@ def add_surface(
     """Store a surface as the heliostat's next version.
 
     With ``once`` (imports) the same control points from the same source are stored only the first time; the second
-    value is False where they were there already.
+    value is False where they were there already. NotFoundError where the heliostat was deleted since it was read.
     """
+    hold(session, HeliostatRow, heliostat.id, f"heliostat {heliostat.name}")
     content = new.content if once else None
     for _ in range(ROUNDS):
         if content is not None:

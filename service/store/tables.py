@@ -26,7 +26,8 @@ MODEL_VERSION = 256
 class PlantRow(Base):
     """The plant: one row, written before anything that needs its origin.
 
-    ``declared`` is what ``twin.json`` declares of its model (DESIGN.md, section 6); the defaults without it.
+    ``declared`` is what ``twin.json`` declared of the first version of its model (DESIGN.md, section 6); the defaults
+    without it.
     """
 
     __tablename__ = "plant"
@@ -256,9 +257,11 @@ class StudyRow(Base):
 
 
 class ModelRow(Base):
-    """A version of the plant's model from the second on: the declared one, with all its ``effects``.
+    """A version of the plant's model from the second on: all its adopted ``effects`` upon what was ``declared`` then.
 
-    The first version is the declared model itself; it has no row, for nobody adopted it. Rows are never deleted.
+    ``study_id`` names the study that it was adopted from; without it the version came of another declaration. The first
+    version is what the plant began with; it has no row, and the plant's ``declared`` is its own. Rows never change but
+    for their withdrawal, and are never deleted.
     """
 
     __tablename__ = "models"
@@ -266,7 +269,8 @@ class ModelRow(Base):
     number: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
     version: Mapped[str] = mapped_column(String(MODEL_VERSION))
     effects: Mapped[list[dict[str, Any]]]
-    study_id: Mapped[int] = mapped_column(ForeignKey("studies.id"), index=True)
+    declared: Mapped[dict[str, Any] | None]
+    study_id: Mapped[int | None] = mapped_column(ForeignKey("studies.id"), index=True)
     adopted_at: Mapped[datetime] = mapped_column(default=now)
     adopted_by: Mapped[str] = mapped_column(String(64))
     withdrawn_at: Mapped[datetime | None]
@@ -336,7 +340,7 @@ class KeyRow(Base):
 
 
 class AuditRow(Base):
-    """Who did what when; rows are only ever added."""
+    """Who did what when; rows are only ever added, and go when they are old (`service.store.retention`)."""
 
     __tablename__ = "audit"
 

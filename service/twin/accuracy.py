@@ -60,7 +60,7 @@ class Comparison:
 
 def _newest(session: Session, heliostat: HeliostatRow) -> list[MeasurementRow]:
     recent = store.recent_measurements(session, heliostat, RECENT)
-    return [store.get_measurement(session, heliostat, row.identifier, arrays=True) for row in recent]
+    return store.get_measurements(session, heliostat, [row.identifier for row in recent], arrays=True)
 
 
 def compare(runtime: Runtime, name: str, surface: SurfaceRow | None) -> list[Comparison]:

@@ -184,7 +184,7 @@ def choose_measurements(
 
 def named_measurements(session: Session, heliostat: HeliostatRow, names: Sequence[str]) -> list[MeasurementRow]:
     """Accepted measurements by their identifiers, with their arrays; ConflictError where one was refused."""
-    rows = [store.get_measurement(session, heliostat, name, arrays=True) for name in dict.fromkeys(names)]
+    rows = store.get_measurements(session, heliostat, list(dict.fromkeys(names)), arrays=True)
     for row in rows:
         if not row.accepted or row.arrays is None:
             raise ConflictError(f"measurements: {row.identifier} was refused ({row.reason}); choose accepted ones")

@@ -5,16 +5,17 @@ A deed that changes nothing leaves no entry.
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from sqlalchemy.orm import Session
 
 from model.plant import Cylinder, TargetPlane
 from service import store
 from service.sources.documents import read_heliostat
 from service.store import Change, audit
+from service.store.models import put_declared
 from service.store.tables import HeliostatRow, ReceiverRow, TargetRow
 
 Corners = dict[str, list[float]]
@@ -51,7 +52,7 @@ def set_plant(
     given = corners or {}
     change = PlantChange(
         store.put_plant(session, name, origin),
-        store.put_declared(session, declared) if declared else None,
+        put_declared(session, declared, actor) if declared else None,
         {plane.name: store.put_target(session, plane, given.get(plane.name))[1] for plane in targets},
         {cylinder.name: store.put_receiver(session, cylinder)[1] for cylinder in receivers},
     )
@@ -90,10 +91,34 @@ def set_heliostat(session: Session, actor: str, name: str, properties: dict[str,
     InvalidInputError
         Where the model cannot read them: what is stored can be traced.
     """
-    heliostat = read_heliostat(name, properties, np.array(store.get_plant(session).origin))
-    row, change = store.put_heliostat(session, name, properties, heliostat.position)
+    row, change = store.put_heliostat(session, name, properties, _position(session, name, properties))
     _note(session, actor, "heliostat", name, change)
     return row, change
+
+
+def add_heliostat(session: Session, actor: str, name: str, properties: dict[str, Any]) -> tuple[HeliostatRow, Change]:
+    """Add a heliostat; ConflictError where there is one of its name with other properties, else as `set_heliostat`."""
+    row, change = store.add_heliostat(session, name, properties, _position(session, name, properties))
+    _note(session, actor, "heliostat", name, change)
+    return row, change
+
+
+def remove(session: Session, actor: str, what: Literal["target", "receiver", "heliostat"], name: str) -> None:
+    """Delete what was set by mistake; raises what `store.remove_target` raises."""
+    _REMOVERS[what](session, name)
+    audit.record(session, actor, f"{what}.deleted", f"{what} {name}")
+
+
+_REMOVERS = {
+    "target": store.remove_target,
+    "receiver": store.remove_receiver,
+    "heliostat": store.remove_heliostat,
+}
+
+
+def _position(session: Session, name: str, properties: dict[str, Any]) -> NDArray[np.float64]:
+    store.one_at_a_time(session)  # the origin must not move between here and the row that stands upon it
+    return read_heliostat(name, properties, np.array(store.get_plant(session).origin)).position
 
 
 def _note(session: Session, actor: str, what: str, name: str, change: Change) -> None:

@@ -52,10 +52,10 @@ def import_folder(
 def _put_plant(runtime: Runtime, folder: MeasurementFolder, actor: str) -> Counter[str]:
     """The plant with its targets, receivers and declared model: one deed."""
     plant, declared = folder.plant, declared_json(folder.root / "twin.json")
-    with runtime.database.writing() as session:
-        done = geometry.set_plant(
-            session, actor, plant.name, plant.origin, plant.targets.values(), plant.receivers.values(), declared
-        )
+    targets, receivers = plant.targets.values(), plant.receivers.values()
+    done = runtime.database.written(
+        lambda session: geometry.set_plant(session, actor, plant.name, plant.origin, targets, receivers, declared)
+    )
     counts = Counter([f"plants {done.plant}"])
     counts.update(f"targets {change}" for change in done.targets.values())
     counts.update(f"receivers {change}" for change in done.receivers.values())

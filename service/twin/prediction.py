@@ -65,7 +65,7 @@ def keep_surface(session: Session, predicted: Predicted, actor: str) -> SurfaceR
     It is valid from when the newest of its images was taken, where that is known, else from now.
     """
     heliostat, surface = predicted.twin.row, predicted.surface
-    used = [store.get_measurement(session, heliostat, name) for name in surface.used]
+    used = store.get_measurements(session, heliostat, surface.used)
     new = NewSurface(
         source=predicted.method,
         z=surface.z,

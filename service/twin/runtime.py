@@ -122,7 +122,7 @@ class Runtime:
         settings.data_dir.mkdir(parents=True, exist_ok=True)
         return cls(
             settings=settings,
-            database=Database(settings.database),
+            database=Database(settings.database, settings.connections),
             images=ImageStore(settings.data_dir / "images"),
             operations=operations or load_operations(),
             _gate=threading.Semaphore(settings.parallel_computations),

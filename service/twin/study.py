@@ -124,13 +124,13 @@ def _surface(session: Session, heliostat: HeliostatRow, surfaces: Surfaces) -> S
 def _gather_heliostat(session: Session, row: HeliostatRow, request: StudyRequest, material: Material) -> None:
     twin, surface = load_twin(session, row.name), _surface(session, row, request.surfaces)
     points, seen = control_points(twin.heliostat, heights_of(surface)), {m.identifier for m in surface.measurements}
-    for chosen in choose_measurements(session, row, request.images, request.since, request.until):
-        measurement = store.get_measurement(session, row, chosen.identifier, arrays=True)
+    chosen = choose_measurements(session, row, request.images, request.since, request.until)
+    for measurement in store.get_measurements(session, row, [found.identifier for found in chosen], arrays=True):
         try:
             evidence = evidence_of(measurement, twin.origin)
-            photograph = evidence.photograph(twin.heliostat, points, seen=chosen.identifier in seen)
+            photograph = evidence.photograph(twin.heliostat, points, seen=measurement.identifier in seen)
         except SKIPPED as error:
-            material.skipped[f"{row.name}/{chosen.identifier}"] = str(error)
+            material.skipped[f"{row.name}/{measurement.identifier}"] = str(error)
             continue
         material.photographs.append(photograph)
 

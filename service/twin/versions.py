@@ -1,5 +1,6 @@
-"""Versions of the plant's model: the declared one, then one more for every study that an operator adopts.
+"""Versions of the plant's model: the declared one, then one more for each that is declared otherwise or adopted.
 
+A version never changes: it keeps what was declared when it was made, and its effects, for forecasts name it.
 The current version is the newest that is not withdrawn. Nothing is deleted: whoever asks for an earlier version, even
 a withdrawn one, gets it.
 """
@@ -8,20 +9,33 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import func, select
+from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from model.effects import Effect, effect_to_json, effects_from_json, in_light_order, model_version
+from model.effects import Effect, effect_to_json, effects_from_json, in_light_order
 from model.tracing import Optics
 from service import store
 from service.base.faults import ConflictError, NotFoundError
 from service.sources.documents import parse_declared
 from service.store import audit
 from service.store.columns import now
-from service.store.tables import ModelRow, PlantRow, StudyRow
+from service.store.models import DECLARED, add_model, declared_of, find_current, list_models, version_name
+from service.store.tables import ModelRow
 
-DECLARED = 1
-"""Number of the declared model, which has no effect but the declared ones."""
+__all__ = [
+    "DECLARED",
+    "PlantModel",
+    "adopt",
+    "adopted_from",
+    "current_number",
+    "find_adopted",
+    "find_current",
+    "find_model",
+    "get_model",
+    "list_models",
+    "version_name",
+    "withdraw",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,29 +48,20 @@ class PlantModel:
     effects: tuple[Effect, ...]
 
 
-def version_name(number: int, effects: Sequence[Effect]) -> str:
-    """``number:names``, the names of adopted effects as `model.effects.model_version` has them."""
-    return f"{number}:{model_version(effects).partition(':')[2]}"
-
-
 # --- reading ----------------------------------------------------------------------------------------------------------
-
-
-def list_models(session: Session) -> Sequence[ModelRow]:
-    """The versions that were ever adopted, oldest first."""
-    return session.scalars(select(ModelRow).order_by(ModelRow.number)).all()
-
-
-def find_current(session: Session) -> ModelRow | None:
-    """The current version; None where that is the declared model."""
-    query = select(ModelRow).where(ModelRow.withdrawn_at.is_(None)).order_by(ModelRow.number.desc()).limit(1)
-    return session.scalar(query)
 
 
 def find_adopted(session: Session, study: int) -> ModelRow | None:
     """The newest version that stands for what a study found, unless it is withdrawn."""
-    query = select(ModelRow).where(ModelRow.study_id == study, ModelRow.withdrawn_at.is_(None))
-    return session.scalar(query.order_by(ModelRow.number.desc()).limit(1))
+    return adopted_from(session, [study]).get(study)
+
+
+def adopted_from(session: Session, studies: Sequence[int]) -> dict[int, ModelRow]:
+    """What `find_adopted` has of each of these studies that has one, by its id."""
+    query = select(ModelRow).where(ModelRow.study_id.in_(studies), ModelRow.withdrawn_at.is_(None))
+    # Of a study's versions the last one stays.
+    rows = session.scalars(query.order_by(ModelRow.number))
+    return {row.study_id: row for row in rows if row.study_id is not None}
 
 
 def current_number(session: Session) -> int:
@@ -67,9 +72,22 @@ def current_number(session: Session) -> int:
 
 def get_model(session: Session, number: int | None = None) -> PlantModel:
     """A version of the plant's model, by default the current one; NotFoundError where there is none."""
-    number = current_number(session) if number is None else number
-    plant, adopted = session.get(PlantRow, 1), _adopted_effects(session, number)
-    optics, declared = parse_declared({} if plant is None else plant.declared or {}, "the plant")
+    return _plant_model(session, find_current(session) if number is None else _row(session, number))
+
+
+def _row(session: Session, number: int) -> ModelRow | None:
+    """A version as it is kept; None for the first, which the plant has."""
+    if number == DECLARED:
+        return None
+    row = session.get(ModelRow, number)
+    if row is None:
+        raise NotFoundError(f"model_version: the plant's model has no version {number}; see /v1/models")
+    return row
+
+
+def _plant_model(session: Session, row: ModelRow | None) -> PlantModel:
+    number, adopted = (DECLARED, ()) if row is None else (row.number, _effects(row.effects))
+    optics, declared = parse_declared(declared_of(session, row) or {}, "the plant")
     return PlantModel(number, version_name(number, adopted), optics, (*declared, *adopted))
 
 
@@ -79,19 +97,9 @@ def find_model(session: Session, effects: Sequence[Effect]) -> PlantModel | None
     def plain(some: Sequence[Effect]) -> list[dict[str, Any]]:
         return [effect_to_json(effect) for effect in in_light_order(some)]
 
-    numbers = [row.number for row in list_models(session) if row.withdrawn_at is None]
-    versions = (get_model(session, number) for number in (*reversed(numbers), DECLARED))
+    rows = [row for row in list_models(session) if row.withdrawn_at is None]
+    versions = (_plant_model(session, row) for row in (*reversed(rows), None))
     return next((version for version in versions if plain(version.effects) == plain(effects)), None)
-
-
-def _adopted_effects(session: Session, number: int) -> tuple[Effect, ...]:
-    """The effects of a version beside the declared ones."""
-    if number == DECLARED:
-        return ()
-    row = session.get(ModelRow, number)
-    if row is None:
-        raise NotFoundError(f"model_version: the plant's model has no version {number}; see /v1/models")
-    return _effects(row.effects)
 
 
 def _effects(data: Any) -> tuple[Effect, ...]:
@@ -105,7 +113,7 @@ def adopt(session: Session, number: int, actor: str, force: bool = False) -> Mod
     """Make what a study found the plant's next model: the effects that it was made with, and those that it found.
 
     That is the very model that the study's held-out photographs have judged, also where ``force`` adopts it in place
-    of another that is current by now.
+    of another that is current by now. Where it is the current one already, it stays that.
 
     Raises
     ------
@@ -115,7 +123,7 @@ def adopt(session: Session, number: int, actor: str, force: bool = False) -> Mod
         Where it found no effect; unless ``force``, where its verdict does not rest on its effects, or where it was
         made with another version than the current one.
     """
-    _change_one_at_a_time(session)
+    store.one_at_a_time(session)
     study = store.get_study(session, number)
     found = _effects(study.report)
     current = current_number(session)
@@ -128,23 +136,14 @@ def adopt(session: Session, number: int, actor: str, force: bool = False) -> Mod
             f"study {number} was made with version {study.model} of the model, {current} is current; "
             "make another study, or force it to put this one in place of the current model"
         )
-    row = _next_version(session, study, (*_adopted_effects(session, study.model), *found), actor)
+    held = find_adopted(session, number)
+    if held is not None and held.number == current:
+        return held
+    base = _row(session, study.model)
+    before = () if base is None else _effects(base.effects)
+    row = add_model(session, (*before, *found), declared_of(session, base), study.id, actor)
     names = [effect.name for effect in found]
     audit.record(session, actor, "effect.adopted", f"study {number}", model=row.version, effects=names)
-    return row
-
-
-def _next_version(session: Session, study: StudyRow, effects: Sequence[Effect], actor: str) -> ModelRow:
-    number = (session.scalar(select(func.max(ModelRow.number))) or DECLARED) + 1
-    row = ModelRow(
-        number=number,
-        version=version_name(number, effects),
-        effects=[effect_to_json(effect) for effect in effects],
-        study_id=study.id,
-        adopted_by=actor,
-    )
-    if not store.insert(session, row):
-        raise ConflictError("another study was adopted at the same moment; try again")
     return row
 
 
@@ -158,7 +157,7 @@ def withdraw(session: Session, study: int, actor: str) -> ModelRow:
     ConflictError
         Where it is not adopted, or a later version stands upon it.
     """
-    _change_one_at_a_time(session)
+    store.one_at_a_time(session)
     store.get_study(session, study)
     row, current = find_adopted(session, study), find_current(session)
     if row is None or current is None:
@@ -171,8 +170,3 @@ def withdraw(session: Session, study: int, actor: str) -> ModelRow:
     row.withdrawn_at, row.withdrawn_by = now(), actor
     audit.record(session, actor, "effect.withdrawn", f"study {study}", model=row.version)
     return row
-
-
-def _change_one_at_a_time(session: Session) -> None:
-    """Wait for whoever else adopts or withdraws; SQLite has one writer at a time anyway."""
-    session.get(PlantRow, 1, with_for_update=True)

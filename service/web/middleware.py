@@ -11,6 +11,7 @@ from urllib.parse import urlsplit
 from anyio import CapacityLimiter, to_thread
 from fastapi import HTTPException, Response
 from sqlalchemy.exc import OperationalError
+from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -130,7 +131,7 @@ class DoorMiddleware:
         if not security.is_public(scope["path"]):
             try:
                 identity = await self._identify(scope, headers)
-            except OperationalError as error:
+            except (OperationalError, PoolTimeoutError) as error:
                 return problems.database_away(scope, error)
         if identity == security.LOCAL and self._is_rebound(headers):
             return problem(scope, HTTPStatus.FORBIDDEN, "Host: without a key use one of this machine's own names")

@@ -20,7 +20,7 @@ def list_(as_json: AsJson = False) -> None:
     from service.web.api.models import all_models, declared_model
 
     with reading() as session:
-        versions = [declared_model(is_current=True)] if session is None else all_models(session)
+        versions = [declared_model(None, is_current=True)] if session is None else all_models(session)
     if as_json:
         typer.echo(json.dumps([version.model_dump(mode="json") for version in versions], indent=1))
         return

@@ -61,8 +61,8 @@ def check(as_json: AsJson = False) -> None:
     settings = Settings()
     database = Database(settings.database)
     try:
-        database.require_current()
-        with _showing("check") as step:
+        with database.telling_damage(), _showing("check") as step:
+            database.require_current()
             report = inspect_store(database, images_of(settings), step)
     finally:
         database.close()

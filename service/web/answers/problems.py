@@ -11,11 +11,13 @@ from typing import Any
 from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
 from sqlalchemy.exc import OperationalError
+from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from starlette.exceptions import HTTPException
 from starlette.types import Scope
 
 from model.errors import ImageRefusedError, InvalidInputError, ModelError, UnreachableError
 from service.base import faults
+from service.store.database import is_deadlock
 from service.web.answers import pages
 
 logger = logging.getLogger("heliotwin.service")
@@ -148,6 +150,14 @@ def database_away(scope: Scope, error: Exception) -> Response:
     """The answer while the database does not give one, or can store no more."""
     if _is_full(error):
         return _no_room(scope, error)
+    if is_deadlock(error):
+        logger.warning("writers waited for each other, request %s: %s", request_id(scope), error)
+        detail = "another request was changing the same things and nothing of this one was kept; send it again"
+        return problem(scope, HTTPStatus.SERVICE_UNAVAILABLE, detail, {"Retry-After": "1"})
+    if isinstance(error, PoolTimeoutError):
+        logger.warning("no free database connection, request %s", request_id(scope))
+        detail = "all connections to the database are busy; try again later"
+        return problem(scope, HTTPStatus.SERVICE_UNAVAILABLE, detail, {"Retry-After": "5"})
     logger.error("database unavailable, request %s: %s", request_id(scope), error)
     detail = "the database does not answer; try again later"
     return problem(scope, HTTPStatus.SERVICE_UNAVAILABLE, detail, {"Retry-After": "5"})
@@ -179,5 +189,6 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(RequestValidationError, _on_validation)
     app.add_exception_handler(HTTPException, _on_http)
     app.add_exception_handler(OperationalError, _on_database_away)
+    app.add_exception_handler(PoolTimeoutError, _on_database_away)
     app.add_exception_handler(OSError, _on_os)
     app.add_exception_handler(Exception, _on_unexpected)

@@ -74,14 +74,13 @@ def post_heliostat(
     request: HeliostatIn, runtime: RuntimeDep, identity: IdentityDep, response: Response
 ) -> HeliostatOut:
     """Add a heliostat; the same one again is no error, the same name with other properties is (use PUT)."""
-    with runtime.database.writing() as session:
-        known = store.find_heliostat(session, request.name)
-        if known is not None:
-            store.require_same_properties(known, request.properties.raw)
-            response.status_code = status.HTTP_200_OK
-            return heliostat_out(known)
-        row, _ = geometry.set_heliostat(session, identity.name, request.name, request.properties.raw)
-    response.headers["Location"] = f"/v1/heliostats/{request.name}"
+    row, change = runtime.database.written(
+        lambda session: geometry.add_heliostat(session, identity.name, request.name, request.properties.raw)
+    )
+    if change is store.Change.UNCHANGED:
+        response.status_code = status.HTTP_200_OK
+    else:
+        response.headers["Location"] = f"/v1/heliostats/{request.name}"
     return heliostat_out(row)
 
 
@@ -105,8 +104,20 @@ def put_heliostat(
     response: Response,
 ) -> HeliostatOut:
     """Set a heliostat's PAINT properties."""
-    with runtime.database.writing() as session:
-        row, change = geometry.set_heliostat(session, identity.name, name, properties.raw)
+    row, change = runtime.database.written(
+        lambda session: geometry.set_heliostat(session, identity.name, name, properties.raw)
+    )
     if change is store.Change.NEW:
         response.status_code = status.HTTP_201_CREATED
     return heliostat_out(row)
+
+
+@router.delete(
+    "/heliostats/{name}",
+    status_code=status.HTTP_204_NO_CONTENT,
+    responses=problems(404, 409),
+    dependencies=[OPERATE],
+)
+def delete_heliostat(name: NamePath, runtime: RuntimeDep, identity: IdentityDep) -> None:
+    """Delete a heliostat that was made by mistake; not where photographs, surfaces or anything else refers to it."""
+    runtime.database.written(lambda session: geometry.remove(session, identity.name, "heliostat", name))

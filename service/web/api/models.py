@@ -7,6 +7,7 @@ from fastapi import APIRouter
 from pydantic import BaseModel, Field
 from sqlalchemy.orm import Session
 
+from service.store.models import declared_of
 from service.store.tables import ModelRow
 from service.twin import versions
 from service.web.answers.openapi import problems
@@ -22,23 +23,31 @@ class ModelOut(BaseModel):
     number: int = Field(description="Ask for it as `model_version`.")
     version: str = Field(description="Number and names of its effects.", examples=["2:camera_response"])
     is_current: bool = Field(description="Whether forecasts and predictions are made by it.")
-    effects: list[dict[str, Any]] = Field(description="Its effects with their parameters.")
-    study: int | None = Field(description="The study that it was adopted from; null: the declared model.")
+    effects: list[dict[str, Any]] = Field(description="Its effects with their parameters, but for declared ones.")
+    declared: dict[str, Any] | None = Field(
+        description="What was declared when it was made, as in twin.json; null: Buie's sun with a ratio of 0.02."
+    )
+    study: int | None = Field(description="The study that it was adopted from; null: a declared model.")
     adopted_at: datetime | None
     adopted_by: str | None
     withdrawn_at: datetime | None
     withdrawn_by: str | None
 
 
-def declared_model(is_current: bool) -> ModelOut:
-    """The model that nobody had to adopt."""
+def declared_model(declared: dict[str, Any] | None, is_current: bool) -> ModelOut:
+    """The model that the plant began with."""
     unknown = dict.fromkeys(("study", "adopted_at", "adopted_by", "withdrawn_at", "withdrawn_by"))
-    about = {"number": versions.DECLARED, "version": versions.version_name(versions.DECLARED, ()), "effects": []}
+    about: dict[str, Any] = {
+        "number": versions.DECLARED,
+        "version": versions.version_name(versions.DECLARED, ()),
+        "effects": [],
+    }
+    about["declared"] = declared
     return ModelOut.model_validate({**about, "is_current": is_current, **unknown})
 
 
 def model_out(row: ModelRow, is_current: bool) -> ModelOut:
-    """An adopted version of the plant's model."""
+    """A later version of the plant's model."""
     names = ModelOut.model_fields.keys() - {"is_current", "study"}
     fields = {name: getattr(row, name) for name in names}
     return ModelOut.model_validate({**fields, "is_current": is_current, "study": row.study_id})
@@ -48,13 +57,13 @@ def all_models(session: Session) -> list[ModelOut]:
     """All versions of the plant's model, oldest first, withdrawn ones too."""
     current = versions.current_number(session)
     adopted = [model_out(row, row.number == current) for row in versions.list_models(session)]
-    return [declared_model(current == versions.DECLARED), *adopted]
+    return [declared_model(declared_of(session, None), current == versions.DECLARED), *adopted]
 
 
 def current_out(session: Session) -> ModelOut:
     """The current version, adopted or declared."""
     row = versions.find_current(session)
-    return declared_model(True) if row is None else model_out(row, is_current=True)
+    return declared_model(declared_of(session, None), True) if row is None else model_out(row, is_current=True)
 
 
 @router.get("/models", responses=problems(), dependencies=[READ])

@@ -12,7 +12,8 @@ from service import store
 from service.base.fields import Model, Plane, ReceiverIn, Wgs84
 from service.sources.documents import parse_declared, read_receivers, read_targets
 from service.sources.schema import TowerMeasurements
-from service.store.tables import PlantRow, ReceiverRow, TargetRow
+from service.store.models import declared_of, find_current
+from service.store.tables import ReceiverRow, TargetRow
 from service.twin import geometry
 from service.web.answers.openapi import problems
 from service.web.answers.paging import Page
@@ -78,9 +79,10 @@ class TargetOut(BaseModel):
     corners: dict[str, Any] | None = Field(description="The WGS84 corners that it was made from, if it was.")
 
 
-def plant_out(row: PlantRow) -> PlantOut:
-    """A plant as JSON."""
-    return PlantOut(name=row.name, origin_wgs84=row.origin, declared=row.declared)
+def plant_out(session: Session) -> PlantOut:
+    """The plant as JSON."""
+    row, declared = store.get_plant(session), declared_of(session, find_current(session))
+    return PlantOut(name=row.name, origin_wgs84=row.origin, declared=declared)
 
 
 def target_out(row: TargetRow) -> TargetOut:
@@ -120,6 +122,7 @@ _PLANE_EXAMPLE = {"plane": {"center": [0, -3.2, 35.9], "normal": [0, 1, 0], "wid
 
 
 def _from_corners(session: Session, name: str, corners: Corners) -> TargetPlane:
+    store.one_at_a_time(session)  # the origin must not move until the target stands upon it
     origin = store.get_plant(session).origin
     return TargetPlane.from_corners(name, *(wgs84_to_enu(getattr(corners, corner), origin) for corner in _CORNERS))
 
@@ -133,7 +136,7 @@ def _paint_corners(document: dict[str, Any], name: str) -> dict[str, list[float]
 def get_plant(runtime: RuntimeDep) -> PlantOut:
     """The plant's name and the tower base."""
     with runtime.database.reading() as session:
-        return plant_out(store.get_plant(session))
+        return plant_out(session)
 
 
 @router.put("/plant", responses=problems(409, 413, 415), dependencies=[OPERATE, Depends(require_json)])
@@ -145,18 +148,16 @@ def put_plant(document: TowerMeasurements, runtime: RuntimeDep, identity: Identi
     origin, targets = read_targets(document.raw)
     receivers = read_receivers(document.raw)
     parse_declared(document.declared or {}, "declared")  # what is stored can be computed with
-    with runtime.database.writing() as session:
+    corners = {name: _paint_corners(document.raw, name) for name in targets}
+
+    def deed(session: Session) -> PlantOut:
+        name, declared = document.power_plant_properties.ID, document.declared
         geometry.set_plant(
-            session,
-            identity.name,
-            document.power_plant_properties.ID,
-            origin,
-            targets.values(),
-            receivers.values(),
-            document.declared,
-            corners={name: _paint_corners(document.raw, name) for name in targets},
+            session, identity.name, name, origin, targets.values(), receivers.values(), declared, corners=corners
         )
-        return plant_out(store.get_plant(session))
+        return plant_out(session)
+
+    return runtime.database.written(deed)
 
 
 @router.get("/targets", responses=problems(), dependencies=[READ])
@@ -187,17 +188,27 @@ def put_target(
     response: Response,
 ) -> TargetOut:
     """Set a target plane, by its rectangle [m] or by its four corners in WGS84."""
-    with runtime.database.writing() as session:
+
+    def deed(session: Session) -> tuple[TargetRow, store.Change]:
         if request.corners is not None:
             plane = _from_corners(session, name, request.corners)
             corners = {corner: list(getattr(request.corners, corner)) for corner in _CORNERS}
-        else:
-            assert request.plane is not None  # the schema wants one of both
-            plane, corners = request.plane.named(name), None
-        row, change = geometry.set_target(session, identity.name, plane, corners)
-        if change is store.Change.NEW:
-            response.status_code = status.HTTP_201_CREATED
-        return target_out(row)
+            return geometry.set_target(session, identity.name, plane, corners)
+        assert request.plane is not None  # the schema wants one of both
+        return geometry.set_target(session, identity.name, request.plane.named(name))
+
+    row, change = runtime.database.written(deed)
+    if change is store.Change.NEW:
+        response.status_code = status.HTTP_201_CREATED
+    return target_out(row)
+
+
+@router.delete(
+    "/targets/{name}", status_code=status.HTTP_204_NO_CONTENT, responses=problems(404, 409), dependencies=[OPERATE]
+)
+def delete_target(name: NamePath, runtime: RuntimeDep, identity: IdentityDep) -> None:
+    """Delete a target plane that was made by mistake; not where photographs, forecasts or waiting jobs name it."""
+    runtime.database.written(lambda session: geometry.remove(session, identity.name, "target", name))
 
 
 @router.get("/receivers", responses=problems(), dependencies=[READ])
@@ -228,8 +239,17 @@ def put_receiver(
     response: Response,
 ) -> ReceiverOut:
     """Set a cylindrical receiver."""
-    with runtime.database.writing() as session:
-        row, change = geometry.set_receiver(session, identity.name, request.named(name))
-        if change is store.Change.NEW:
-            response.status_code = status.HTTP_201_CREATED
-        return receiver_out(row)
+    row, change = runtime.database.written(
+        lambda session: geometry.set_receiver(session, identity.name, request.named(name))
+    )
+    if change is store.Change.NEW:
+        response.status_code = status.HTTP_201_CREATED
+    return receiver_out(row)
+
+
+@router.delete(
+    "/receivers/{name}", status_code=status.HTTP_204_NO_CONTENT, responses=problems(404, 409), dependencies=[OPERATE]
+)
+def delete_receiver(name: NamePath, runtime: RuntimeDep, identity: IdentityDep) -> None:
+    """Delete a receiver that was made by mistake; not where waiting jobs name it."""
+    runtime.database.written(lambda session: geometry.remove(session, identity.name, "receiver", name))

@@ -93,7 +93,9 @@ def list_studies(
     """Studies, newest first."""
     with runtime.database.reading() as session:
         rows = store.list_studies(session, limit + 1, after)
-        items = [study_summary(row, _adopted(session, row)) for row in rows]
+        adopted = versions.adopted_from(session, [row.id for row in rows])
+    versions_of = {study: version.version for study, version in adopted.items()}
+    items = [study_summary(row, versions_of.get(row.id)) for row in rows]
     return page(items, limit)
 
 

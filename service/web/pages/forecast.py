@@ -7,7 +7,7 @@ from fastapi import APIRouter, Form, Path, Query, Request, Response
 from fastapi.responses import HTMLResponse
 from pydantic import AfterValidator, Field, model_validator
 from sqlalchemy import select
-from sqlalchemy.orm import Session, defer
+from sqlalchemy.orm import Session
 
 from model.ephemeris import sun_angles_at
 from model.errors import InvalidInputError
@@ -17,7 +17,7 @@ from service.drawing import charts
 from service.jobs.asking import ask_for
 from service.jobs.kinds.field_forecasts import FleetForecastIn
 from service.store.columns import now
-from service.store.tables import ForecastRow, HeliostatRow, PlantRow, ReceiverRow, TargetRow
+from service.store.tables import HeliostatRow, PlantRow, ReceiverRow, TargetRow
 from service.twin.forecast import ForecastRequest, flux_of, make_forecast
 from service.twin.runtime import Runtime
 from service.web.answers.pages import go_to, leave_for, render
@@ -81,12 +81,11 @@ def _sun_now(plant: PlantRow | None) -> tuple[float, float]:
 
 
 def _choices(session: Session) -> dict[str, Any]:
-    newest = select(ForecastRow).options(defer(ForecastRow.plane)).order_by(ForecastRow.id.desc()).limit(_RECENT)
     return {
         "heliostats": session.scalars(select(HeliostatRow.name).order_by(HeliostatRow.name)).all(),
         "targets": session.scalars(select(TargetRow.name).order_by(TargetRow.name)).all(),
         "receivers": session.scalars(select(ReceiverRow.name).order_by(ReceiverRow.name)).all(),
-        "recent": session.scalars(newest).all(),
+        "recent": store.recent_forecasts(session, _RECENT),
         "moment": now().strftime("%Y-%m-%dT%H:%M"),
     }
 

@@ -44,7 +44,7 @@ def get_studies_page(
     """Studies, newest first, and the versions of the plant's model that came of them."""
     with runtime.database.reading() as session:
         rows = store.list_studies(session, _PAGE + 1, after)
-        adopted = {row.id for row in rows if versions.find_adopted(session, row.id) is not None}
+        adopted = versions.adopted_from(session, [row.id for row in rows])
         current, adoptions = versions.get_model(session), versions.list_models(session)
     more = rows[_PAGE - 1].id if len(rows) > _PAGE else None
     return render(

@@ -9,6 +9,7 @@ from fastapi import APIRouter, Response, status
 from pydantic import BaseModel
 
 from model.network.predictor import default_predictor
+from service.base.faults import StoreDamagedError
 from service.twin.runtime import Runtime
 from service.web.door.dependencies import RuntimeDep
 
@@ -30,6 +31,9 @@ _checker = CapacityLimiter(1)
 def _check(name: str, question: Callable[[], str]) -> str:
     try:
         return question()
+    except StoreDamagedError as error:
+        logger.error("readiness check failed: %s: %s", name, error)
+        return "damaged: run `heliotwin check`, and restore a back-up"
     except Exception:  # whatever it is, not being ready is the answer; the log has the rest
         logger.exception("readiness check failed: %s", name)
         return "unavailable"

@@ -53,3 +53,12 @@ def test_anything_else_may_be_reached_by_others(host: str):
 def test_other_databases_are_refused(url: str):
     with pytest.raises(ValidationError, match="database_url"):
         Settings(database_url=url)
+
+
+def test_workers_have_connections_of_their_own():
+    """64 workers with their heartbeats shared 69 connections with 40 threads of requests."""
+    for workers in (0, 1, 64):
+        assert Settings(job_workers=workers).connections >= 40 + 2 * workers
+    assert Settings(job_workers=64, database_connections=136).connections == 136
+    with pytest.raises(ValidationError, match="too few for job_workers 64; set at least 136"):
+        Settings(job_workers=64, database_connections=100)

@@ -373,7 +373,7 @@ def test_what_a_check_forbids_is_no_other_writers_fault(database: Database):
     with database.writing() as session:
         heliostat, target = setup(session)
     with pytest.raises(IntegrityError, match="ck_measurements_kind"), database.writing() as session:
-        store.add_measurement(session, heliostat, new(target, kind="photo"))
+        store.add_measurement(session, heliostat, *new(target, kind="photo"))
     with pytest.raises(IntegrityError, match="ck_surfaces_source"), database.writing() as session:
         store.add_surface(session, heliostat, replace(surface(1), source="guess"))
     nowhere = SurfaceRow(heliostat_id=99, version=1, valid_from=now(), source="network", arrays=b"")

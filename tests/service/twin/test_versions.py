@@ -17,9 +17,10 @@ from service import store
 from service.base.faults import ConflictError, NotFoundError
 from service.jobs.kinds import KINDS
 from service.jobs.worker import Worker
-from service.store import keys
+from service.store import audit, keys
 from service.store.database import Database
-from service.store.tables import MODEL_VERSION, AuditRow, StudyRow
+from service.store.models import put_declared
+from service.store.tables import MODEL_VERSION, AuditRow, ModelRow, StudyRow
 from service.twin import versions
 from tests.service.conftest import ORIGIN, FakeOperations, Post, png
 from tests.service.web.test_keys import heliotwin
@@ -99,8 +100,8 @@ DECLARED = {"sun": {"shape": "gaussian", "sigma_mrad": 2.0}, "effects": [GAMMA]}
 def test_declared_sun_and_effects_are_part_of_every_version(database: Database):
     with database.writing() as session:
         store.put_plant(session, "plant", ORIGIN)
-        assert store.put_declared(session, DECLARED) is store.Change.CHANGED
-        assert store.put_declared(session, DECLARED) is store.Change.UNCHANGED
+        assert put_declared(session, DECLARED) is store.Change.CHANGED
+        assert put_declared(session, DECLARED) is store.Change.UNCHANGED
     assert adopt(database, add(database, SLOPE)) == "2:slope_error"
     with database.reading() as session:
         first, second = versions.get_model(session, 1), versions.get_model(session, 2)
@@ -108,7 +109,29 @@ def test_declared_sun_and_effects_are_part_of_every_version(database: Database):
     assert [effect.name for effect in first.effects] == ["camera_response"]
     assert [effect.name for effect in second.effects] == ["camera_response", "slope_error"]
     with database.writing() as session, pytest.raises(ConflictError, match="studies were made with it"):
-        store.put_declared(session, {})
+        put_declared(session, {})
+
+
+def test_what_is_declared_otherwise_is_another_version(database: Database):
+    """Version 1 was pillbox one day and Buie the next, under forecasts that name it."""
+    with database.writing() as session:
+        store.put_plant(session, "plant", ORIGIN)
+    with database.reading() as session:
+        before = versions.get_model(session, 1)
+    for number, sigma in ((2, 2.0), (3, 3.0)):
+        declared = {"sun": {"shape": "gaussian", "sigma_mrad": sigma}, "effects": [GAMMA]}
+        with database.writing() as session:
+            assert put_declared(session, declared, "tester") is store.Change.CHANGED
+            assert put_declared(session, declared, "tester") is store.Change.UNCHANGED
+        assert current(database) == f"{number}:none"
+    assert adopt(database, add(database, SLOPE, model=2), force=True) == "4:slope_error"
+    with database.reading() as session:
+        found = {number: versions.get_model(session, number) for number in (1, 2, 3, 4)}
+    assert (repr(found[1].optics), found[1].effects) == (repr(before.optics), before.effects)
+    assert [found[number].optics.sun_shape for number in (2, 3)] == [Gaussian(0.002), Gaussian(0.003)]
+    # What was adopted stands upon what its study was made with.
+    assert found[4].optics.sun_shape == Gaussian(0.002)
+    assert [effect.name for effect in found[4].effects] == ["camera_response", "slope_error"]
 
 
 def test_versions_build_upon_each_other_and_are_withdrawn_from_the_top(database: Database):
@@ -145,6 +168,18 @@ def test_study_of_another_version_takes_its_place_only_by_force(database: Databa
         adopt(database, second)
     assert current(database) == "2:camera_response"
     assert adopt(database, second, force=True) == "3:slope_error"
+
+
+def test_study_that_is_adopted_by_force_again_stays_one_version(database: Database):
+    first, second = add(database, GAMMA), add(database, SLOPE)
+    assert [adopt(database, first, force=True) for _ in range(8)] == ["2:camera_response"] * 8
+    with database.reading() as session:
+        assert len(versions.list_models(session)) == 1
+        assert len(audit.entries(session, 10)) == 1
+    # Over another that is current by now it is another version again.
+    assert adopt(database, second, force=True) == "3:slope_error"
+    with ThreadPoolExecutor(4) as pool:
+        assert set(pool.map(lambda _: adopt(database, first, force=True), range(8))) == {"4:camera_response"}
 
 
 def test_study_that_found_nothing_is_not_adopted(database: Database):
@@ -209,6 +244,33 @@ def test_what_was_stored_before_goes_up_and_down(empty_url: URL):
         assert kept[0] == 2
         assert kept[1].startswith("2:x")
     database.upgrade()
+    database.close()
+
+
+def test_declared_models_go_up_and_down(empty_url: URL):
+    """All versions so far were made with what the plant declares; going back, that of the current one is kept."""
+    database = Database(empty_url)
+    database.upgrade("0005")
+    with database.writing() as session:
+        session.execute(text("INSERT INTO plant VALUES (1, 'p', 50, 6, 0, '{\"sun\": null}')"))
+        session.execute(
+            text(
+                "INSERT INTO studies (id, created_at, created_by, options, heliostats, model, model_version, verdict, "
+                "conclusion, report, skipped) VALUES "
+                "(1, '2024-06-01', 'x', '{}', '[]', 1, '1:none', 'effect', '', '{}', '{}')"
+            )
+        )
+        session.execute(text("INSERT INTO models VALUES (2, '2:x', '[]', 1, '2024-06-01', 'x', NULL, NULL)"))
+    database.upgrade()
+    with database.writing() as session:
+        row = session.get_one(ModelRow, 2)
+        assert row.declared == {"sun": None}
+        session.add(ModelRow(number=3, version="3:none", effects=[], declared=DECLARED, adopted_by="x"))
+    database.downgrade("0005")
+    with database.reading() as session:
+        assert session.execute(text("SELECT number FROM models")).scalars().all() == [2]
+        kept = session.execute(text("SELECT declared FROM plant")).scalar_one()
+        assert (json.loads(kept) if isinstance(kept, str) else kept) == DECLARED
     database.close()
 
 
@@ -324,11 +386,29 @@ def test_everything_that_is_made_uses_the_model_that_is_asked_for(
 
 def test_forecast_is_made_under_the_declared_sun(client: TestClient, stored: Database, operations: FakeOperations):
     with stored.writing() as session:
-        store.put_declared(session, {"sun": {"shape": "gaussian", "sigma_mrad": 2.0}})
+        put_declared(session, {"sun": {"shape": "gaussian", "sigma_mrad": 2.0}})
     assert client.get("/v1/plant").json()["declared"]["sun"]["shape"] == "gaussian"
     client.post("/v1/forecasts", json=FORECAST | {"dni_w_m2": 800})
     optics = operations.forecasts[-1]["optics"]
     assert (optics.sun_shape, optics.dni) == (Gaussian(0.002), 800)
+
+
+def test_forecast_by_the_first_version_stays_the_same(client: TestClient, stored: Database, operations: FakeOperations):
+    wanted = FORECAST | {"model_version": 1}
+    client.post("/v1/forecasts", json=wanted)
+    with stored.writing() as session:
+        put_declared(session, DECLARED, "tester")
+    again = client.post("/v1/forecasts", json=wanted).json()
+    first, second = operations.forecasts
+    assert (repr(first["optics"]), first["effects"]) == (repr(second["optics"]), second["effects"])
+    assert again["model_version"] == "1:none"
+    assert client.post("/v1/forecasts", json=FORECAST).json()["model_version"] == "2:none"
+    listed = client.get("/v1/models").json()["items"]
+    assert [(m["version"], m["declared"], m["study"]) for m in listed] == [
+        ("1:none", None, None),
+        ("2:none", DECLARED, None),
+    ]
+    assert "another declaration" in client.get("/studies").text
 
 
 def test_version_that_is_not_there_is_not_found(client: TestClient, post: Post):

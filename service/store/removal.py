@@ -1,0 +1,90 @@
+"""Taking back what was set by mistake: a target, a receiver or a heliostat that nothing refers to."""
+
+from sqlalchemy import ColumnElement, func, select
+from sqlalchemy.orm import Session
+
+from service.base.faults import ConflictError
+from service.store.columns import Base
+from service.store.plant import get_heliostat, get_receiver, get_target
+from service.store.queue import ENDED
+from service.store.rows import one_at_a_time
+from service.store.tables import (
+    DriftRow,
+    ForecastRow,
+    HeliostatRow,
+    JobRow,
+    MeasurementRow,
+    ReceiverRow,
+    StudyRow,
+    SurfaceRow,
+    TargetRow,
+)
+
+
+def remove_target(session: Session, name: str) -> None:
+    """Delete a target plane.
+
+    Raises
+    ------
+    NotFoundError
+        Where there is none of this name.
+    ConflictError
+        Where something refers to it; it says what.
+    """
+    one_at_a_time(session)
+    row = get_target(session, name)
+    _lock(session, TargetRow, row.id)
+    users = {
+        "measurements": _count(session, MeasurementRow, MeasurementRow.target_id == row.id),
+        **_users_of_name(session, name),
+    }
+    _delete_unused(session, row, f"target {name}", users)
+
+
+def remove_receiver(session: Session, name: str) -> None:
+    """Delete a receiver; raises what `remove_target` raises."""
+    one_at_a_time(session)
+    row = get_receiver(session, name)
+    _delete_unused(session, row, f"receiver {name}", _users_of_name(session, name))
+
+
+def remove_heliostat(session: Session, name: str) -> None:
+    """Delete a heliostat; raises what `remove_target` raises."""
+    one_at_a_time(session)
+    row = get_heliostat(session, name)
+    _lock(session, HeliostatRow, row.id)
+    users = {
+        table.__tablename__: _count(session, table, table.heliostat_id == row.id)
+        for table in (MeasurementRow, SurfaceRow, ForecastRow, DriftRow)
+    }
+    # A study keeps names, for its photographs may be gone before it.
+    studied = sum(name in heliostats for heliostats in session.scalars(select(StudyRow.heliostats)))
+    _delete_unused(session, row, f"heliostat {name}", {**users, "studies": studied})
+
+
+def _lock(session: Session, table: type[TargetRow] | type[HeliostatRow], number: int) -> None:
+    """Wait for transactions that begin to refer to it, and have those that come wait for its end."""
+    session.execute(select(table.id).where(table.id == number).with_for_update())
+
+
+def _count(session: Session, table: type[Base], condition: ColumnElement[bool]) -> int:
+    return session.scalars(select(func.count()).select_from(table).where(condition)).one()
+
+
+def _users_of_name(session: Session, name: str) -> dict[str, int]:
+    """Forecasts keep the name of what the light falls on, and jobs that have not ended will ask for it."""
+    waiting = JobRow.state.not_in(ENDED) & (JobRow.payload["target"].as_string() == name)
+    return {
+        "forecasts": _count(session, ForecastRow, ForecastRow.target_name == name),
+        "jobs": _count(session, JobRow, waiting),
+    }
+
+
+def _delete_unused(
+    session: Session, row: TargetRow | ReceiverRow | HeliostatRow, what: str, users: dict[str, int]
+) -> None:
+    found = [f"{name} ({count})" for name, count in users.items() if count]
+    if found:
+        raise ConflictError(f"{what} stays: it is referred to by {', '.join(found)}")
+    session.delete(row)
+    session.flush()
