@@ -57,7 +57,10 @@ class Settings(BaseSettings):
         default=2**20, ge=1024, description="Largest request body that is not an image [bytes]."
     )
     requests_per_s: float = Field(
-        default=200.0, gt=0, le=1e6, description="Requests of one key, or one client without a key, each second."
+        default=200.0,
+        gt=0,
+        le=1e6,
+        description="Requests of one key, or one client without a key, each second; 64 KiB of answers count as one.",
     )
     requests_burst: int = Field(default=400, ge=1, le=10**6, description="Most of them at once after a pause.")
     parallel_computations: int = Field(

@@ -20,6 +20,7 @@ from service.twin.runtime import Operations, Runtime
 from service.web.answers import openapi, problems
 from service.web.api import jobs
 from service.web.door import security
+from service.web.door.turns import Turns
 from service.web.metrics import registry
 from service.web.middleware import BodyLimitMiddleware, DoorMiddleware, RequestIdMiddleware, SecurityHeadersMiddleware
 
@@ -81,6 +82,7 @@ def create_app(settings: Settings, operations: Operations | None = None, kinds: 
         redoc_url=None,
     )
     app.state.stopping = threading.Event()
+    app.state.turns = Turns()
     v1 = APIRouter(prefix="/v1")
     for resource in modules_of("service.web.api"):
         v1.include_router(resource.router)

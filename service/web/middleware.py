@@ -28,6 +28,8 @@ _REQUEST_ID = re.compile(r"[A-Za-z0-9_-]{8,64}")
 # Methods that are told apart in metrics, and paths that are asked for too often to log each time.
 _METHODS = ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS")
 _PROBES = ("/livez", "/readyz", "/metrics")
+# Bytes of an answer that count as another request: a map of 1024 x 1024 as JSON counts as some three hundred.
+_BYTES_A_TOKEN = 64 * 1024
 # What multipart boundaries, part headers and the metadata may add to an image [bytes].
 _MULTIPART_OVERHEAD = 64 * 1024
 
@@ -120,7 +122,18 @@ class DoorMiddleware:
             if refusal is not None:
                 await refusal(scope, receive, send)
                 return
+            send = self._charging(scope, send)
         await self.app(scope, receive, send)
+
+    def _charging(self, scope: Scope, send: Send) -> Send:
+        """The same ``send``, which charges whoever asked for what is sent, so that large answers cost what they are."""
+        bucket = _bucket(scope)
+
+        async def charging(message: Message) -> None:
+            self.buckets.charge(bucket, len(message.get("body", b"")) / _BYTES_A_TOKEN)
+            await send(message)
+
+        return charging
 
     async def _refusal(self, scope: Scope) -> Response | None:
         headers = Headers(scope=scope)
@@ -134,7 +147,7 @@ class DoorMiddleware:
                 return problems.database_away(scope, error)
         if identity == security.LOCAL and self._is_rebound(headers):
             return problem(scope, HTTPStatus.FORBIDDEN, "Host: without a key use one of this machine's own names")
-        return self._too_often(scope, identity) or self._unknown(scope, identity)
+        return self._too_often(scope) or self._unknown(scope, identity)
 
     def _is_rebound(self, headers: Headers) -> bool:
         """Whether a page may have reached this machine by a name that its owner lets point here (DNS rebinding)."""
@@ -146,10 +159,8 @@ class DoorMiddleware:
         scope.setdefault("state", {})["identity"] = identity
         return identity
 
-    def _too_often(self, scope: Scope, identity: security.Identity | None) -> Response | None:
-        client = scope.get("client")
-        address = client[0] if client else ""
-        wait_s = self.buckets.wait_s(f"address {address}" if identity is None else f"key {identity.name}")
+    def _too_often(self, scope: Scope) -> Response | None:
+        wait_s = self.buckets.wait_s(_bucket(scope))
         if not wait_s:
             return None
         headers = {"Retry-After": str(math.ceil(wait_s))}
@@ -169,6 +180,12 @@ class DoorMiddleware:
         if "hx-request" in Headers(scope=scope):
             return Response(status_code=HTTPStatus.UNAUTHORIZED, headers={"HX-Redirect": path})
         return pages.go_to(path)
+
+
+def _bucket(scope: Scope) -> str:
+    """The name of the bucket that a request takes from: its key's, or without one its address's."""
+    identity, client = scope.get("state", {}).get("identity"), scope.get("client")
+    return f"address {client[0] if client else ''}" if identity is None else f"key {identity.name}"
 
 
 def _is_loopback_name(host: str) -> bool:

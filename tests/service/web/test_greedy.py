@@ -1,0 +1,85 @@
+"""Clients that take more than their share: they wait, and nobody else does."""
+
+import anyio
+import pytest
+from fastapi import FastAPI
+from fastapi.testclient import TestClient
+
+from service.base.faults import BusyError
+from service.base.settings import Settings
+from service.web.app import create_app
+from service.web.door.limits import Buckets
+from service.web.door.turns import Turns
+from tests.service.conftest import FakeOperations, client_of
+from tests.service.web.test_keys import bearer, make_key
+
+FORECAST = {"heliostat": "AA39", "target": "lower", "sun": {"azimuth_deg": 0.0, "elevation_deg": 45.0}}
+
+
+def _hold_all(client: TestClient, app: FastAPI) -> None:
+    app.state.turns = Turns(count=1, most_waiting=0)
+    assert client.portal is not None
+    client.portal.call(app.state.turns._limiter.acquire_on_behalf_of_nowait, "the test")
+
+
+def test_maps_have_turns_of_their_own_and_light_requests_need_none(client: TestClient, app: FastAPI):
+    made = client.post("/v1/forecasts", json={**FORECAST, "surface": "ideal"})
+    _hold_all(client, app)
+    refused = client.get(made.headers["Location"])
+    assert (refused.status_code, refused.headers["Retry-After"]) == (503, "5")
+    assert refused.headers["Content-Type"] == "application/problem+json"
+    for light in ("/v1/plant", "/v1/heliostats/AA39", "/v1/forecasts", "/readyz"):
+        assert client.get(light).status_code == 200, light
+
+
+def test_a_turn_ends_with_its_request(client: TestClient, app: FastAPI):
+    made = client.post("/v1/forecasts", json={**FORECAST, "surface": "ideal"})
+    app.state.turns = Turns(count=1, most_waiting=1)
+    assert [client.get(made.headers["Location"]).status_code for _ in range(3)] == [200] * 3
+    assert client.get("/v1/forecasts/999").status_code == 404
+    assert client.get(made.headers["Location"]).status_code == 200
+
+
+def test_turns_are_bounded_in_number_and_time():
+    async def ask() -> list[str]:
+        turns, said = Turns(count=1, most_waiting=1, patience_s=0.05), []
+        async with turns.one():
+            with pytest.raises(BusyError) as late:
+                async with turns.one():
+                    pass
+            said.append(str(late.value))
+        async with turns.one():  # the one that gave up holds nothing
+            pass
+        full = Turns(count=1, most_waiting=0)
+        async with full.one():
+            with pytest.raises(BusyError, match="too many"):
+                async with full.one():
+                    pass
+        return said
+
+    assert "one after the other" in anyio.run(ask)[0]
+
+
+def test_a_debt_is_paid_before_the_next_request():
+    moment = [0.0]
+    buckets = Buckets(10.0, 20, lambda: moment[0])
+    buckets.charge("greedy", 50.0)
+    assert buckets.wait_s("greedy") == pytest.approx(3.1)
+    assert buckets.wait_s("another") == 0
+    moment[0] = 3.2
+    assert buckets.wait_s("greedy") == 0
+
+
+def test_large_answers_cost_their_key_more_and_others_nothing(tmp_path, tower, properties):
+    settings = Settings(data_dir=tmp_path, job_workers=0, requests_per_s=0.001, requests_burst=12)
+    app = create_app(settings, FakeOperations())
+    with client_of(app) as client:
+        assert client.put("/v1/plant", json=tower).status_code == 200
+        assert client.put("/v1/heliostats/AA39", json=properties).status_code == 201
+        large = client.post("/v1/forecasts", json={**FORECAST, "surface": "ideal", "resolution": 1024})
+        assert large.status_code == 201
+        greedy, victim = bearer(make_key(app, "greedy", "read")), bearer(make_key(app, "victim", "read"))
+        first = client.get(large.headers["Location"], headers=greedy)
+        assert len(first.content) > 12 * 65536
+        assert client.get("/v1/plant", headers=greedy).status_code == 429
+        assert client.get("/v1/plant", headers=victim).status_code == 200
