@@ -28,6 +28,8 @@ _REQUEST_ID = re.compile(r"[A-Za-z0-9_-]{8,64}")
 # Methods that are told apart in metrics, and paths that are asked for too often to log each time.
 _METHODS = ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS")
 _PROBES = ("/livez", "/readyz", "/metrics")
+# What supervisors ask without a key; it costs little, and `/readyz` has one thread of its own.
+_HEALTH = ("/livez", "/readyz")
 # Bytes of an answer that count as another request: a map of 1024 x 1024 as JSON counts as some three hundred.
 _BYTES_A_TOKEN = 64 * 1024
 # What multipart boundaries, part headers and the metadata may add to an image [bytes].
@@ -105,7 +107,8 @@ class DoorMiddleware:
     """Finds out who asks, before anything of the body is read, and turns away who may not come in.
 
     The request's `service.web.door.security.Identity` is left in its state for the routes. Whoever may come in is
-    let in as often as the settings allow; failed attempts count for the client's address.
+    let in as often as the settings allow. Attempts that fail count for the client's address in a bucket of their own:
+    they shut out neither what is public nor supervisors, who are never refused for asking too often.
     """
 
     def __init__(self, app: ASGIApp, settings: Settings) -> None:
@@ -160,6 +163,8 @@ class DoorMiddleware:
         return identity
 
     def _too_often(self, scope: Scope) -> Response | None:
+        if scope["path"] in _HEALTH:
+            return None
         wait_s = self.buckets.wait_s(_bucket(scope))
         if not wait_s:
             return None
@@ -183,9 +188,12 @@ class DoorMiddleware:
 
 
 def _bucket(scope: Scope) -> str:
-    """The name of the bucket that a request takes from: its key's, or without one its address's."""
+    """The name of the bucket that a request takes from: its key's, its address's, or its address's for failures."""
     identity, client = scope.get("state", {}).get("identity"), scope.get("client")
-    return f"address {client[0] if client else ''}" if identity is None else f"key {identity.name}"
+    if identity is not None:
+        return f"key {identity.name}"
+    address = client[0] if client else ""
+    return f"address {address}" if security.is_public(scope["path"]) else f"failures of {address}"
 
 
 def _is_loopback_name(host: str) -> bool:

@@ -1,6 +1,9 @@
 """Clients that take more than their share: they wait, and nobody else does."""
 
+import socket
+
 import anyio
+import httpx
 import pytest
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
@@ -10,7 +13,8 @@ from service.base.settings import Settings
 from service.web.app import create_app
 from service.web.door.limits import Buckets
 from service.web.door.turns import Turns
-from tests.service.conftest import FakeOperations, client_of
+from service.web.server import Protocol, config_of
+from tests.service.conftest import QUIET, FakeOperations, client_of, serving
 from tests.service.web.test_keys import bearer, make_key
 
 FORECAST = {"heliostat": "AA39", "target": "lower", "sun": {"azimuth_deg": 0.0, "elevation_deg": 45.0}}
@@ -83,3 +87,41 @@ def test_large_answers_cost_their_key_more_and_others_nothing(tmp_path, tower, p
         assert len(first.content) > 12 * 65536
         assert client.get("/v1/plant", headers=greedy).status_code == 429
         assert client.get("/v1/plant", headers=victim).status_code == 200
+
+
+def test_bad_keys_shut_out_neither_probes_nor_the_login_of_their_address(tmp_path):
+    settings = Settings(data_dir=tmp_path, job_workers=0, requests_per_s=0.001, requests_burst=3)
+    app = create_app(settings, FakeOperations())
+    with client_of(app) as client:
+        good, bad = bearer(make_key(app, "good", "read")), bearer("htw_" + "0" * 12 + "_" + "A" * 43)
+        assert [client.get("/v1/audit", headers=bad).status_code for _ in range(5)] == [401] * 3 + [429] * 2
+        assert {client.get(probe).status_code for probe in ("/livez", "/readyz") for _ in range(8)} == {200}
+        assert client.get("/login").status_code == 200
+        assert client.get("/v1/heliostats", headers=good).status_code == 200
+
+
+def test_server_bounds_connections_and_heads():
+    settings = Settings(most_connections=77)
+    config = config_of(settings, create_app(settings, FakeOperations()))
+    assert (config.limit_concurrency, config.h11_max_incomplete_event_size, config.http) == (77, 32768, Protocol)
+
+
+def test_half_a_head_is_not_waited_for_for_ever(app: FastAPI):
+    class Hasty(Protocol):
+        head_s = 0.2
+
+    with serving(app, http=Hasty) as address:
+        port = int(address.rsplit(":", 1)[1])
+        for sent in (b"", b"GET /livez HTTP/1.1\r\nHost: 127", b"GET /livez HTTP/1.1\r\nHost: x\r\n\r\nGET /li"):
+            with socket.create_connection(("127.0.0.1", port), timeout=60) as half:
+                half.sendall(sent)
+                while half.recv(65536):
+                    pass
+
+
+def test_one_connection_too_many_is_answered_503(tmp_path):
+    settings = Settings(data_dir=tmp_path, **QUIET)
+    app = create_app(settings, FakeOperations())
+    with serving(app, limit_concurrency=2) as address, httpx.Client(base_url=address) as first:
+        assert first.get("/livez").status_code == 200  # keeps its connection
+        assert httpx.get(f"{address}/livez").status_code == 503
