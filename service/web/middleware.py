@@ -8,7 +8,7 @@ import uuid
 from http import HTTPStatus
 from urllib.parse import urlsplit
 
-from anyio import CapacityLimiter, to_thread
+from anyio import CapacityLimiter, move_on_after, to_thread
 from fastapi import HTTPException, Response
 from sqlalchemy.exc import OperationalError
 from starlette.datastructures import Headers, MutableHeaders
@@ -32,6 +32,11 @@ _PROBES = ("/livez", "/readyz", "/metrics")
 _HEALTH = ("/livez", "/readyz")
 # Bytes of an answer that count as another request: a map of 1024 x 1024 as JSON counts as some three hundred.
 _BYTES_A_TOKEN = 64 * 1024
+# Largest body where no key is needed [bytes], and its only media type: a form with a key.
+_PUBLIC_BYTES = 4096
+_FORM = "application/x-www-form-urlencoded"
+# Longest pause before the next part of a body [s].
+_BODY_PAUSE_S = 30.0
 # What multipart boundaries, part headers and the metadata may add to an image [bytes].
 _MULTIPART_OVERHEAD = 64 * 1024
 
@@ -130,10 +135,14 @@ class DoorMiddleware:
 
     def _charging(self, scope: Scope, send: Send) -> Send:
         """The same ``send``, which charges whoever asked for what is sent, so that large answers cost what they are."""
-        bucket = _bucket(scope)
+        bucket, paid = _bucket(scope), _BYTES_A_TOKEN  # the request's own token pays for the first ones
 
         async def charging(message: Message) -> None:
-            self.buckets.charge(bucket, len(message.get("body", b"")) / _BYTES_A_TOKEN)
+            nonlocal paid
+            size = len(message.get("body", b""))
+            if size > paid:
+                self.buckets.charge(bucket, (size - paid) / _BYTES_A_TOKEN)
+            paid = max(0, paid - size)
             await send(message)
 
         return charging
@@ -213,13 +222,19 @@ def _is_cross_site(headers: Headers) -> bool:
 
 
 class BodyLimitMiddleware:
-    """Stops reading a body at its bound: at once where its length is announced, else when the bound is passed."""
+    """Stops reading a body at its bound: at once where its length is announced, else when the bound is passed.
+
+    Who comes without a key may send a small form and nothing else. No part of a body may be long in coming.
+    """
 
     def __init__(self, app: ASGIApp, settings: Settings) -> None:
         self.app = app
         self.settings = settings
+        self.patience_s = _BODY_PAUSE_S
 
-    def _limit(self, headers: Headers) -> int:
+    def _limit(self, scope: Scope, headers: Headers) -> int:
+        if security.is_public(scope["path"]):
+            return _PUBLIC_BYTES
         if headers.get("content-type", "").lower().startswith("multipart/form-data"):
             return self.settings.max_image_bytes + _MULTIPART_OVERHEAD
         return self.settings.max_json_bytes
@@ -230,17 +245,26 @@ class BodyLimitMiddleware:
             await self.app(scope, receive, send)
             return
         headers = Headers(scope=scope)
-        limit = self._limit(headers)
+        limit = self._limit(scope, headers)
         detail = f"body: larger than the {limit} bytes allowed; send less"
         announced = headers.get("content-length", "0")
         if announced.isdecimal() and int(announced[:20]) > limit:
             await problem(scope, HTTPStatus.REQUEST_ENTITY_TOO_LARGE, detail)(scope, receive, send)
             return
-        received = 0
+        if security.is_public(scope["path"]) and headers.get("content-type", _FORM).partition(";")[0].strip() != _FORM:
+            refused = f"Content-Type: send {_FORM}"
+            await problem(scope, HTTPStatus.UNSUPPORTED_MEDIA_TYPE, refused)(scope, receive, send)
+            return
+        received, is_whole = 0, False
 
         async def bounded() -> Message:
-            nonlocal received
-            message = await receive()
+            nonlocal received, is_whole
+            # After the body only the client's going is waited for, however long that takes.
+            with move_on_after(None if is_whole else self.patience_s) as waiting:
+                message = await receive()
+            if waiting.cancelled_caught:
+                raise HTTPException(HTTPStatus.REQUEST_TIMEOUT, "body: it did not come in time; send it again")
+            is_whole = not message.get("more_body", False)
             received += len(message.get("body", b""))
             if received > limit:
                 raise HTTPException(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, detail)

@@ -5,14 +5,16 @@ import socket
 import anyio
 import httpx
 import pytest
-from fastapi import FastAPI
+from fastapi import FastAPI, HTTPException
 from fastapi.testclient import TestClient
+from starlette.types import Message, Receive, Scope, Send
 
 from service.base.faults import BusyError
 from service.base.settings import Settings
 from service.web.app import create_app
 from service.web.door.limits import Buckets
 from service.web.door.turns import Turns
+from service.web.middleware import BodyLimitMiddleware
 from service.web.server import Protocol, config_of
 from tests.service.conftest import QUIET, FakeOperations, client_of, serving
 from tests.service.web.test_keys import bearer, make_key
@@ -125,3 +127,40 @@ def test_one_connection_too_many_is_answered_503(tmp_path):
     with serving(app, limit_concurrency=2) as address, httpx.Client(base_url=address) as first:
         assert first.get("/livez").status_code == 200  # keeps its connection
         assert httpx.get(f"{address}/livez").status_code == 503
+
+
+def test_public_paths_take_small_forms_only(bare: TestClient):
+    for path in ("/login", "/session"):
+        assert bare.post(path, data={"key": "x" * 5000}).status_code == 413
+        assert bare.post(path, files={"key": ("a", b"x")}).status_code == 415
+        assert bare.post(path, data={"key": "nonsense"}).status_code == 401
+
+
+def test_a_body_that_does_not_come_is_not_waited_for(settings: Settings):
+    answers: list[str] = []
+
+    async def reads_its_body(scope: Scope, receive: Receive, send: Send) -> None:
+        try:
+            while (await receive()).get("more_body", False):
+                pass
+        except HTTPException as error:
+            answers.append(f"{error.status_code}")
+
+    async def ask() -> None:
+        parts = iter([{"type": "http.request", "body": b"{", "more_body": True}])
+
+        async def receive() -> Message:
+            part = next(parts, None)
+            if part is None:
+                await anyio.sleep_forever()
+            return part
+
+        async def send(message: Message) -> None:
+            pass
+
+        middleware = BodyLimitMiddleware(reads_its_body, settings)
+        middleware.patience_s = 0.01
+        await middleware({"type": "http", "path": "/v1/plant", "headers": []}, receive, send)
+
+    anyio.run(ask)
+    assert answers == ["408"]
