@@ -58,7 +58,7 @@ def create_app(settings: Settings, operations: Operations | None = None, kinds: 
                 await to_thread.run_sync(runtime.database.upgrade)
             await to_thread.run_sync(runtime.database.require_current)
             await to_thread.run_sync(security.require_closed_door, settings, runtime.database)
-            app.state.runtime = runtime
+            app.state.runtime = runtime.for_requests()
             app.state.field = FieldBook(runtime)
             workers = Workers(runtime, kinds, settings.job_workers)
             workers.start()

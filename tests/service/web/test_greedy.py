@@ -1,6 +1,7 @@
 """Clients that take more than their share: they wait, and nobody else does."""
 
 import socket
+from dataclasses import replace
 
 import anyio
 import httpx
@@ -11,6 +12,8 @@ from starlette.types import Message, Receive, Scope, Send
 
 from service.base.faults import BusyError
 from service.base.settings import Settings
+from service.twin.gate import Gate
+from service.twin.runtime import Runtime
 from service.web.app import create_app
 from service.web.door.limits import Buckets
 from service.web.door.turns import Turns
@@ -164,3 +167,18 @@ def test_a_body_that_does_not_come_is_not_waited_for(settings: Settings):
 
     anyio.run(ask)
     assert answers == ["408"]
+
+
+def test_a_busy_model_is_503_for_requests_and_nothing_for_the_light(client: TestClient, app: FastAPI):
+    busy = Gate(1, most_waiting=0)
+    busy.enter()
+    app.state.runtime = replace(app.state.runtime, gate=busy)
+    refused = client.post("/v1/forecasts", json={**FORECAST, "surface": "ideal"})
+    assert (refused.status_code, refused.headers["Retry-After"]) == (503, "5")
+    assert client.get("/v1/plant").status_code == 200
+    busy.leave()
+
+
+def test_requests_have_little_patience_and_jobs_all(bare: TestClient, app: FastAPI):
+    assert app.state.runtime.patience_s is not None
+    assert Runtime.from_settings(app.state.runtime.settings, FakeOperations()).patience_s is None
