@@ -23,6 +23,10 @@ class TooManyError(ServiceError):
     """More is asked at a time than is allowed; what is there must be done first."""
 
 
+class BusyError(ServiceError):
+    """Others were first, and their work did not end in time; the same may be asked again in a while."""
+
+
 class UnsupportedImageError(ServiceError):
     """An image file of a format that is not accepted."""
 

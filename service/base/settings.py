@@ -73,9 +73,15 @@ class Settings(BaseSettings):
         default=2**20, ge=1024, description="Largest request body that is not an image [bytes]."
     )
     requests_per_s: float = Field(
-        default=200.0, gt=0, le=1e6, description="Requests of one key, or one client without a key, each second."
+        default=200.0,
+        gt=0,
+        le=1e6,
+        description="Requests of one key, or one client without a key, each second; 64 KiB of answers count as one.",
     )
     requests_burst: int = Field(default=400, ge=1, le=10**6, description="Most of them at once after a pause.")
+    most_connections: int = Field(
+        default=1000, ge=10, le=100_000, description="Open connections beyond which requests are answered 503."
+    )
     parallel_computations: int = Field(
         default=2, ge=1, le=64, description="Measurements, predictions and tracings at a time."
     )

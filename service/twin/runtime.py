@@ -3,7 +3,7 @@
 import threading
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import import_module
 from typing import Any, Protocol, cast
 
@@ -23,6 +23,10 @@ from service.base.settings import Settings
 from service.store.database import Database
 from service.store.images import ImageStore
 from service.twin.compute import Forecast
+from service.twin.gate import Gate
+
+# Longest time that a request waits for others to be done with the model [s].
+_PATIENCE_S = 10.0
 
 
 class Operations(Protocol):
@@ -114,7 +118,10 @@ class Runtime:
     operations: Operations
     job_came: threading.Semaphore = field(default_factory=lambda: threading.Semaphore(0))
     """Released when a job is queued in this process, so that its workers need not wait until they look again."""
-    _gate: threading.Semaphore = field(default_factory=lambda: threading.Semaphore(2))
+    gate: Gate = field(default_factory=lambda: Gate(2))
+    """What all that use the model go through, `computing` for one use."""
+    patience_s: float | None = None
+    """How long to wait there: a job as long as it takes, a request no longer than a client would."""
 
     @classmethod
     def from_settings(cls, settings: Settings, operations: Operations | None = None) -> "Runtime":
@@ -125,7 +132,7 @@ class Runtime:
             database=Database(settings.database, settings.connections),
             images=ImageStore(settings.data_dir / "images"),
             operations=operations or load_operations(),
-            _gate=threading.Semaphore(settings.parallel_computations),
+            gate=Gate(settings.parallel_computations),
         )
 
     @contextmanager
@@ -133,9 +140,13 @@ class Runtime:
         """The model, while no more than ``parallel_computations`` callers use it; ``operation`` names the meter."""
         with ExitStack() as held:
             with meters.timed(meters.WAITING_SECONDS, "wait"):
-                held.enter_context(self._gate)
+                held.enter_context(self.gate.turn(self.patience_s))
             with meters.timed(meters.MODEL_SECONDS.labels(operation), operation):
                 yield self.operations
+
+    def for_requests(self) -> "Runtime":
+        """The same for whoever does not wait long: `computing` raises BusyError then."""
+        return replace(self, patience_s=_PATIENCE_S)
 
     def close(self) -> None:
         """Close the database's connections."""

@@ -164,11 +164,17 @@ def study_store(runtime: Runtime, request: StudyRequest, report: Report = lambda
     if request.candidates is not None:
         options = replace(options, candidates=tuple(request.candidates))
     steps = Steps(len(options.candidates) * options.most, report)
+
+    def step(name: str) -> None:
+        """Tell it, and let others at the model before it is done: a study is long."""
+        runtime.gate.pause()
+        steps(name)
+
     with runtime.computing("study") as operations:
         material = material.without_untraceable(latitude_deg)
         _require_enough(material)
         study = operations.study(
-            material.photographs, model.optics, model.effects, options, steps, latitude_deg=latitude_deg
+            material.photographs, model.optics, model.effects, options, step, latitude_deg=latitude_deg
         )
     return Studied(request, model, material, study)
 

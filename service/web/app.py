@@ -22,6 +22,7 @@ from service.twin.runtime import Operations, Runtime
 from service.web.answers import openapi, problems
 from service.web.api import jobs
 from service.web.door import security
+from service.web.door.turns import Turns
 from service.web.metrics import registry
 from service.web.middleware import BodyLimitMiddleware, DoorMiddleware, RequestIdMiddleware, SecurityHeadersMiddleware
 
@@ -69,7 +70,7 @@ def create_app(settings: Settings, operations: Operations | None = None, kinds: 
         runtime = await to_thread.run_sync(Runtime.from_settings, settings, operations)
         try:
             await to_thread.run_sync(require_fit, settings, runtime.database)
-            app.state.runtime = runtime
+            app.state.runtime = runtime.for_requests()
             app.state.field = FieldBook(runtime)
             app.state.comparisons = ComparisonBook(runtime)
             workers = Workers(runtime, kinds, settings.job_workers)
@@ -95,6 +96,7 @@ def create_app(settings: Settings, operations: Operations | None = None, kinds: 
         redoc_url=None,
     )
     app.state.stopping = threading.Event()
+    app.state.turns = Turns()
     v1 = APIRouter(prefix="/v1")
     for resource in modules_of("service.web.api"):
         v1.include_router(resource.router)

@@ -8,7 +8,7 @@ import uuid
 from http import HTTPStatus
 from urllib.parse import urlsplit
 
-from anyio import CapacityLimiter, to_thread
+from anyio import CapacityLimiter, move_on_after, to_thread
 from fastapi import HTTPException, Response
 from sqlalchemy.exc import OperationalError
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
@@ -29,6 +29,15 @@ _REQUEST_ID = re.compile(r"[A-Za-z0-9_-]{8,64}")
 # Methods that are told apart in metrics, and paths that are asked for too often to log each time.
 _METHODS = ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS")
 _PROBES = ("/livez", "/readyz", "/metrics")
+# What supervisors ask without a key; it costs little, and `/readyz` has one thread of its own.
+_HEALTH = ("/livez", "/readyz")
+# Bytes of an answer that count as another request: a map of 1024 x 1024 as JSON counts as some three hundred.
+_BYTES_A_TOKEN = 64 * 1024
+# Largest body where no key is needed [bytes], and its only media type: a form with a key.
+_PUBLIC_BYTES = 4096
+_FORM = "application/x-www-form-urlencoded"
+# Longest pause before the next part of a body [s].
+_BODY_PAUSE_S = 30.0
 # What multipart boundaries, part headers and the metadata may add to an image [bytes].
 _MULTIPART_OVERHEAD = 64 * 1024
 
@@ -104,7 +113,8 @@ class DoorMiddleware:
     """Finds out who asks, before anything of the body is read, and turns away who may not come in.
 
     The request's `service.web.door.security.Identity` is left in its state for the routes. Whoever may come in is
-    let in as often as the settings allow; failed attempts count for the client's address.
+    let in as often as the settings allow. Attempts that fail count for the client's address in a bucket of their own:
+    they shut out neither what is public nor supervisors, who are never refused for asking too often.
     """
 
     def __init__(self, app: ASGIApp, settings: Settings) -> None:
@@ -121,7 +131,22 @@ class DoorMiddleware:
             if refusal is not None:
                 await refusal(scope, receive, send)
                 return
+            send = self._charging(scope, send)
         await self.app(scope, receive, send)
+
+    def _charging(self, scope: Scope, send: Send) -> Send:
+        """The same ``send``, which charges whoever asked for what is sent, so that large answers cost what they are."""
+        bucket, paid = _bucket(scope), _BYTES_A_TOKEN  # the request's own token pays for the first ones
+
+        async def charging(message: Message) -> None:
+            nonlocal paid
+            size = len(message.get("body", b""))
+            if size > paid:
+                self.buckets.charge(bucket, (size - paid) / _BYTES_A_TOKEN)
+            paid = max(0, paid - size)
+            await send(message)
+
+        return charging
 
     async def _refusal(self, scope: Scope) -> Response | None:
         headers = Headers(scope=scope)
@@ -135,7 +160,7 @@ class DoorMiddleware:
                 return problems.database_away(scope, error)
         if identity == security.LOCAL and self._is_rebound(headers):
             return problem(scope, HTTPStatus.FORBIDDEN, "Host: without a key use one of this machine's own names")
-        return self._too_often(scope, identity) or self._unknown(scope, identity)
+        return self._too_often(scope) or self._unknown(scope, identity)
 
     def _is_rebound(self, headers: Headers) -> bool:
         """Whether a page may have reached this machine by a name that its owner lets point here (DNS rebinding)."""
@@ -147,10 +172,10 @@ class DoorMiddleware:
         scope.setdefault("state", {})["identity"] = identity
         return identity
 
-    def _too_often(self, scope: Scope, identity: security.Identity | None) -> Response | None:
-        client = scope.get("client")
-        address = client[0] if client else ""
-        wait_s = self.buckets.wait_s(f"address {address}" if identity is None else f"key {identity.name}")
+    def _too_often(self, scope: Scope) -> Response | None:
+        if scope["path"] in _HEALTH:
+            return None
+        wait_s = self.buckets.wait_s(_bucket(scope))
         if not wait_s:
             return None
         headers = {"Retry-After": str(math.ceil(wait_s))}
@@ -172,6 +197,15 @@ class DoorMiddleware:
         return pages.go_to(path)
 
 
+def _bucket(scope: Scope) -> str:
+    """The name of the bucket that a request takes from: its key's, its address's, or its address's for failures."""
+    identity, client = scope.get("state", {}).get("identity"), scope.get("client")
+    if identity is not None:
+        return f"key {identity.name}"
+    address = client[0] if client else ""
+    return f"address {address}" if security.is_public(scope["path"]) else f"failures of {address}"
+
+
 def _is_loopback_name(host: str) -> bool:
     try:
         return is_loopback(urlsplit(f"//{host}").hostname or "")
@@ -189,13 +223,19 @@ def _is_cross_site(headers: Headers) -> bool:
 
 
 class BodyLimitMiddleware:
-    """Stops reading a body at its bound: at once where its length is announced, else when the bound is passed."""
+    """Stops reading a body at its bound: at once where its length is announced, else when the bound is passed.
+
+    Who comes without a key may send a small form and nothing else. No part of a body may be long in coming.
+    """
 
     def __init__(self, app: ASGIApp, settings: Settings) -> None:
         self.app = app
         self.settings = settings
+        self.patience_s = _BODY_PAUSE_S
 
-    def _limit(self, headers: Headers) -> int:
+    def _limit(self, scope: Scope, headers: Headers) -> int:
+        if security.is_public(scope["path"]):
+            return _PUBLIC_BYTES
         if headers.get("content-type", "").lower().startswith("multipart/form-data"):
             return self.settings.max_image_bytes + _MULTIPART_OVERHEAD
         return self.settings.max_json_bytes
@@ -206,17 +246,26 @@ class BodyLimitMiddleware:
             await self.app(scope, receive, send)
             return
         headers = Headers(scope=scope)
-        limit = self._limit(headers)
+        limit = self._limit(scope, headers)
         detail = f"body: larger than the {limit} bytes allowed; send less"
         announced = headers.get("content-length", "0")
         if announced.isdecimal() and int(announced[:20]) > limit:
             await problem(scope, HTTPStatus.REQUEST_ENTITY_TOO_LARGE, detail)(scope, receive, send)
             return
-        received = 0
+        if security.is_public(scope["path"]) and headers.get("content-type", _FORM).partition(";")[0].strip() != _FORM:
+            refused = f"Content-Type: send {_FORM}"
+            await problem(scope, HTTPStatus.UNSUPPORTED_MEDIA_TYPE, refused)(scope, receive, send)
+            return
+        received, is_whole = 0, False
 
         async def bounded() -> Message:
-            nonlocal received
-            message = await receive()
+            nonlocal received, is_whole
+            # After the body only the client's going is waited for, however long that takes.
+            with move_on_after(None if is_whole else self.patience_s) as waiting:
+                message = await receive()
+            if waiting.cancelled_caught:
+                raise HTTPException(HTTPStatus.REQUEST_TIMEOUT, "body: it did not come in time; send it again")
+            is_whole = not message.get("more_body", False)
             received += len(message.get("body", b""))
             if received > limit:
                 raise HTTPException(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, detail)

@@ -1,9 +1,13 @@
 """Running the service: what the command line's ``serve`` and ``migrate`` call."""
 
+import asyncio
 import threading
 from types import FrameType
 
+import h11
 import uvicorn
+from fastapi import FastAPI
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from service.base import logs, memory, telemetry
 from service.base.faults import NotStartedError
@@ -16,6 +20,46 @@ _GRACE_S = 30
 
 # Seconds that an idle connection stays open: longer than clients and proxies usually keep one for their next request.
 _KEEP_ALIVE_S = 75
+
+# Most bytes of a request's head.
+_MOST_HEAD_BYTES = 32 * 1024
+
+# Seconds that a client may take for it.
+_HEAD_S = 20.0
+
+
+class Protocol(H11Protocol):
+    """Ends connections whose request's head does not come in time, for which uvicorn has no option."""
+
+    head_s = _HEAD_S
+    _late: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as uvicorn has it
+        """Wait for the first head from now on."""
+        super().connection_made(transport)
+        self._await_head()
+
+    def data_received(self, data: bytes) -> None:
+        """Wait on where the head is not whole, and no more where it is."""
+        super().data_received(data)
+        if self.conn.their_state is h11.IDLE:
+            self._await_head()
+        else:
+            self._stop_waiting()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """There is nothing to wait for."""
+        self._stop_waiting()
+        super().connection_lost(exc)
+
+    def _await_head(self) -> None:
+        if self._late is None:
+            self._late = self.loop.call_later(self.head_s, self.transport.close)
+
+    def _stop_waiting(self) -> None:
+        if self._late is not None:
+            self._late.cancel()
+            self._late = None
 
 
 class _Server(uvicorn.Server):
@@ -46,8 +90,25 @@ def serve(settings: Settings) -> None:
     telemetry.set_up(settings, "heliotwin")
     _require_fit(settings)
     app = create_app(settings)
-    config = uvicorn.Config(
+    config = config_of(settings, app)
+    server = _Server(config, app.state.stopping)
+    try:
+        server.run()
+    except SystemExit as refusal:  # uvicorn's way to say that the application or the port failed
+        raise NotStartedError("the service could not start; the log above says why") from refusal
+
+
+def config_of(settings: Settings, app: FastAPI) -> uvicorn.Config:
+    """How uvicorn serves.
+
+    It answers 503 by itself beyond ``limit_concurrency`` connections or requests, and bounds a request's head by its
+    bytes; connections without a request count, too. It has no time-outs for heads, so `Protocol` has.
+    """
+    return uvicorn.Config(
         app,
+        http=Protocol,
+        limit_concurrency=settings.most_connections,
+        h11_max_incomplete_event_size=_MOST_HEAD_BYTES,
         host=settings.host,
         port=settings.port,
         log_config=None,  # ours above
@@ -56,11 +117,6 @@ def serve(settings: Settings) -> None:
         timeout_graceful_shutdown=_GRACE_S,
         timeout_keep_alive=_KEEP_ALIVE_S,
     )
-    server = _Server(config, app.state.stopping)
-    try:
-        server.run()
-    except SystemExit as refusal:  # uvicorn's way to say that the application or the port failed
-        raise NotStartedError("the service could not start; the log above says why") from refusal
 
 
 def _require_fit(settings: Settings) -> None:

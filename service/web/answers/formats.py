@@ -1,12 +1,13 @@
 """Representations: what is offered beside JSON, and which of them a client likes best."""
 
+from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Annotated, Any
 
 import numpy as np
 import orjson
-from fastapi import Depends, Header, Response
+from fastapi import Depends, Header, Request, Response
 from pydantic import BaseModel
 
 from service.base.faults import NotAcceptableError
@@ -93,12 +94,17 @@ def choose(accept: str | None, offered: tuple[str, ...] = ARRAYS) -> str:
 
 
 async def _media_type(
+    request: Request,
     accept: Annotated[str | None, Header(description=f"One of {', '.join(ARRAYS)}; JSON by default.")] = None,
-) -> str:
-    return choose(accept)
+) -> AsyncIterator[str]:
+    media_type = choose(accept)
+    async with request.app.state.turns.one():
+        yield media_type
 
 
-MediaType = Annotated[str, Depends(_media_type)]
+MediaType = Annotated[str, Depends(_media_type, scope="function")]
+"""What to answer with, and a turn at making it: maps are heavy, and what is light shall not wait for them. The turn
+ends before the answer is sent, so that a slow reader keeps nobody waiting."""
 
 
 def json_answer(model: BaseModel, **arrays: Any) -> Response:

@@ -21,7 +21,7 @@ _MEANINGS = {
     422: "A field is wrong; the detail names it.",
     429: "Too many requests, or too many jobs that wait; see Retry-After.",
     500: "The service failed.",
-    503: "The database does not answer.",
+    503: "The database does not answer, or the service is busy; see Retry-After.",
 }
 
 _ANYWHERE = (401, 403, 422, 429, 500, 503)

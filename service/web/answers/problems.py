@@ -49,6 +49,7 @@ STATUS: dict[type[Exception], HTTPStatus] = {
     faults.NotAcceptableError: HTTPStatus.NOT_ACCEPTABLE,
     faults.TooLargeError: HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
     faults.TooManyError: HTTPStatus.TOO_MANY_REQUESTS,
+    faults.BusyError: HTTPStatus.SERVICE_UNAVAILABLE,
     faults.UnsupportedImageError: HTTPStatus.UNSUPPORTED_MEDIA_TYPE,
     faults.UnsupportedContentError: HTTPStatus.UNSUPPORTED_MEDIA_TYPE,
     faults.StoreDamagedError: HTTPStatus.INTERNAL_SERVER_ERROR,
@@ -106,6 +107,8 @@ def _on_known(request: Request, error: Exception) -> Response:
         logger.error("%s, request %s", error, request_id(request.scope))
     if isinstance(error, faults.TooManyError):
         return problem(request.scope, status, str(error), {"Retry-After": "30"})
+    if isinstance(error, faults.BusyError):
+        return problem(request.scope, status, str(error), {"Retry-After": "5"})
     if isinstance(error, faults.NotAcceptableError):
         return problem(request.scope, status, str(error), offered=list(error.offered))
     return problem(request.scope, status, str(error))

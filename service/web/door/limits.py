@@ -9,7 +9,7 @@ _MOST = 10_000
 
 
 class Buckets:
-    """Each name has a bucket of ``burst`` tokens that fills at ``rate_per_s``; a request takes one.
+    """Each name has a bucket of ``burst`` tokens that fills at ``rate_per_s``; a request takes one, and may owe more.
 
     For one event loop: nothing here waits, so nothing needs a lock.
     """
@@ -22,11 +22,21 @@ class Buckets:
 
     def wait_s(self, name: str) -> float:
         """Take a token of ``name``: 0 where there was one, else the seconds until there is."""
-        at = self._clock()
-        tokens, since = self._buckets.pop(name, (float(self.burst), at))
-        tokens = min(float(self.burst), tokens + (at - since) * self.rate_per_s)
+        tokens = self._tokens(name)
         has_one = tokens >= 1
-        self._buckets[name] = (tokens - 1 if has_one else tokens, at)
+        self._put(name, tokens - 1 if has_one else tokens)
+        return 0.0 if has_one else (1 - tokens) / self.rate_per_s
+
+    def charge(self, name: str, cost: float) -> None:
+        """Take ``cost`` tokens of ``name`` for what is known only afterwards; where there are less it owes them."""
+        self._put(name, self._tokens(name) - cost)
+
+    def _tokens(self, name: str) -> float:
+        tokens, since = self._buckets.get(name, (float(self.burst), self._clock()))
+        return min(float(self.burst), tokens + (self._clock() - since) * self.rate_per_s)
+
+    def _put(self, name: str, tokens: float) -> None:
+        self._buckets[name] = (tokens, self._clock())
+        self._buckets.move_to_end(name)
         if len(self._buckets) > _MOST:
             self._buckets.popitem(last=False)
-        return 0.0 if has_one else (1 - tokens) / self.rate_per_s

@@ -1,0 +1,64 @@
+"""A gate before the model: a few callers at a time, first come, first served."""
+
+import threading
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from service.base.faults import BusyError
+
+
+class Gate:
+    """Lets ``slots`` callers in at a time, in the order in which they came.
+
+    Who has patience, such as a job, waits as long as it takes. Who has little, such as a request, which holds one of
+    the web server's threads meanwhile, waits behind up to ``most_waiting`` others of its kind and no longer than it
+    says.
+    """
+
+    def __init__(self, slots: int, most_waiting: int = 8) -> None:
+        self._free = slots
+        self._most_waiting = most_waiting
+        self._hurried = 0
+        self._changed = threading.Condition()
+        self._line: deque[object] = deque()
+
+    @contextmanager
+    def turn(self, patience_s: float | None = None) -> Iterator[None]:
+        """A slot while the block runs; BusyError where it is not had in ``patience_s`` (None: however long)."""
+        self.enter(patience_s)
+        try:
+            yield
+        finally:
+            self.leave()
+
+    def enter(self, patience_s: float | None = None) -> None:
+        """Take a slot, as `turn` does."""
+        ticket = object()
+        with self._changed:
+            self._refuse_crowds(patience_s)
+            self._line.append(ticket)
+            self._hurried += patience_s is not None
+            try:
+                if not self._changed.wait_for(lambda: self._free and self._line[0] is ticket, patience_s):
+                    raise BusyError("the model is busy; ask again as Retry-After says")
+                self._free -= 1
+            finally:
+                self._hurried -= patience_s is not None
+                self._line.remove(ticket)
+                self._changed.notify_all()  # the next one may be first now
+
+    def _refuse_crowds(self, patience_s: float | None) -> None:
+        if patience_s is not None and self._hurried >= self._most_waiting:
+            raise BusyError("too many requests wait for the model; ask again as Retry-After says")
+
+    def leave(self) -> None:
+        """Give the slot back."""
+        with self._changed:
+            self._free += 1
+            self._changed.notify_all()
+
+    def pause(self) -> None:
+        """Let those go first that wait by now; for whoever holds a slot for long, between two steps."""
+        self.leave()
+        self.enter()

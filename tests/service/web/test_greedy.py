@@ -1,0 +1,184 @@
+"""Clients that take more than their share: they wait, and nobody else does."""
+
+import socket
+from dataclasses import replace
+
+import anyio
+import httpx
+import pytest
+from fastapi import FastAPI, HTTPException
+from fastapi.testclient import TestClient
+from starlette.types import Message, Receive, Scope, Send
+
+from service.base.faults import BusyError
+from service.base.settings import Settings
+from service.twin.gate import Gate
+from service.twin.runtime import Runtime
+from service.web.app import create_app
+from service.web.door.limits import Buckets
+from service.web.door.turns import Turns
+from service.web.middleware import BodyLimitMiddleware
+from service.web.server import Protocol, config_of
+from tests.service.conftest import QUIET, FakeOperations, client_of, serving
+from tests.service.web.test_keys import bearer, make_key
+
+FORECAST = {"heliostat": "AA39", "target": "lower", "sun": {"azimuth_deg": 0.0, "elevation_deg": 45.0}}
+
+
+def _hold_all(client: TestClient, app: FastAPI) -> None:
+    app.state.turns = Turns(count=1, most_waiting=0)
+    assert client.portal is not None
+    client.portal.call(app.state.turns._limiter.acquire_on_behalf_of_nowait, "the test")
+
+
+def test_maps_have_turns_of_their_own_and_light_requests_need_none(client: TestClient, app: FastAPI):
+    made = client.post("/v1/forecasts", json={**FORECAST, "surface": "ideal"})
+    _hold_all(client, app)
+    refused = client.get(made.headers["Location"])
+    assert (refused.status_code, refused.headers["Retry-After"]) == (503, "5")
+    assert refused.headers["Content-Type"] == "application/problem+json"
+    for light in ("/v1/plant", "/v1/heliostats/AA39", "/v1/forecasts", "/readyz"):
+        assert client.get(light).status_code == 200, light
+
+
+def test_a_turn_ends_with_its_request(client: TestClient, app: FastAPI):
+    made = client.post("/v1/forecasts", json={**FORECAST, "surface": "ideal"})
+    app.state.turns = Turns(count=1, most_waiting=1)
+    assert [client.get(made.headers["Location"]).status_code for _ in range(3)] == [200] * 3
+    assert client.get("/v1/forecasts/999").status_code == 404
+    assert client.get(made.headers["Location"]).status_code == 200
+
+
+def test_turns_are_bounded_in_number_and_time():
+    async def ask() -> list[str]:
+        turns, said = Turns(count=1, most_waiting=1, patience_s=0.05), []
+        async with turns.one():
+            with pytest.raises(BusyError) as late:
+                async with turns.one():
+                    pass
+            said.append(str(late.value))
+        async with turns.one():  # the one that gave up holds nothing
+            pass
+        full = Turns(count=1, most_waiting=0)
+        async with full.one():
+            with pytest.raises(BusyError, match="too many"):
+                async with full.one():
+                    pass
+        return said
+
+    assert "one after the other" in anyio.run(ask)[0]
+
+
+def test_a_debt_is_paid_before_the_next_request():
+    moment = [0.0]
+    buckets = Buckets(10.0, 20, lambda: moment[0])
+    buckets.charge("greedy", 50.0)
+    assert buckets.wait_s("greedy") == pytest.approx(3.1)
+    assert buckets.wait_s("another") == 0
+    moment[0] = 3.2
+    assert buckets.wait_s("greedy") == 0
+
+
+def test_large_answers_cost_their_key_more_and_others_nothing(tmp_path, tower, properties):
+    settings = Settings(data_dir=tmp_path, job_workers=0, requests_per_s=0.001, requests_burst=12)
+    app = create_app(settings, FakeOperations())
+    with client_of(app) as client:
+        assert client.put("/v1/plant", json=tower).status_code == 200
+        assert client.put("/v1/heliostats/AA39", json=properties).status_code == 201
+        large = client.post("/v1/forecasts", json={**FORECAST, "surface": "ideal", "resolution": 1024})
+        assert large.status_code == 201
+        greedy, victim = bearer(make_key(app, "greedy", "read")), bearer(make_key(app, "victim", "read"))
+        first = client.get(large.headers["Location"], headers=greedy)
+        assert len(first.content) > 12 * 65536
+        assert client.get("/v1/plant", headers=greedy).status_code == 429
+        assert client.get("/v1/plant", headers=victim).status_code == 200
+
+
+def test_bad_keys_shut_out_neither_probes_nor_the_login_of_their_address(tmp_path):
+    settings = Settings(data_dir=tmp_path, job_workers=0, requests_per_s=0.001, requests_burst=3)
+    app = create_app(settings, FakeOperations())
+    with client_of(app) as client:
+        good, bad = bearer(make_key(app, "good", "read")), bearer("htw_" + "0" * 12 + "_" + "A" * 43)
+        assert [client.get("/v1/audit", headers=bad).status_code for _ in range(5)] == [401] * 3 + [429] * 2
+        assert {client.get(probe).status_code for probe in ("/livez", "/readyz") for _ in range(8)} == {200}
+        assert client.get("/login").status_code == 200
+        assert client.get("/v1/heliostats", headers=good).status_code == 200
+
+
+def test_server_bounds_connections_and_heads():
+    settings = Settings(most_connections=77)
+    config = config_of(settings, create_app(settings, FakeOperations()))
+    assert (config.limit_concurrency, config.h11_max_incomplete_event_size, config.http) == (77, 32768, Protocol)
+
+
+def test_half_a_head_is_not_waited_for_for_ever(app: FastAPI):
+    class Hasty(Protocol):
+        head_s = 0.2
+
+    with serving(app, http=Hasty) as address:
+        port = int(address.rsplit(":", 1)[1])
+        for sent in (b"", b"GET /livez HTTP/1.1\r\nHost: 127", b"GET /livez HTTP/1.1\r\nHost: x\r\n\r\nGET /li"):
+            with socket.create_connection(("127.0.0.1", port), timeout=60) as half:
+                half.sendall(sent)
+                while half.recv(65536):
+                    pass
+
+
+def test_one_connection_too_many_is_answered_503(tmp_path):
+    settings = Settings(data_dir=tmp_path, **QUIET)
+    app = create_app(settings, FakeOperations())
+    with serving(app, limit_concurrency=2) as address, httpx.Client(base_url=address) as first:
+        assert first.get("/livez").status_code == 200  # keeps its connection
+        assert httpx.get(f"{address}/livez").status_code == 503
+
+
+def test_public_paths_take_small_forms_only(bare: TestClient):
+    for path in ("/login", "/session"):
+        assert bare.post(path, data={"key": "x" * 5000}).status_code == 413
+        assert bare.post(path, files={"key": ("a", b"x")}).status_code == 415
+        assert bare.post(path, data={"key": "nonsense"}).status_code == 401
+
+
+def test_a_body_that_does_not_come_is_not_waited_for(settings: Settings):
+    answers: list[str] = []
+
+    async def reads_its_body(scope: Scope, receive: Receive, send: Send) -> None:
+        try:
+            while (await receive()).get("more_body", False):
+                pass
+        except HTTPException as error:
+            answers.append(f"{error.status_code}")
+
+    async def ask() -> None:
+        parts = iter([{"type": "http.request", "body": b"{", "more_body": True}])
+
+        async def receive() -> Message:
+            part = next(parts, None)
+            if part is None:
+                await anyio.sleep_forever()
+            return part
+
+        async def send(message: Message) -> None:
+            pass
+
+        middleware = BodyLimitMiddleware(reads_its_body, settings)
+        middleware.patience_s = 0.01
+        await middleware({"type": "http", "path": "/v1/plant", "headers": []}, receive, send)
+
+    anyio.run(ask)
+    assert answers == ["408"]
+
+
+def test_a_busy_model_is_503_for_requests_and_nothing_for_the_light(client: TestClient, app: FastAPI):
+    busy = Gate(1, most_waiting=0)
+    busy.enter()
+    app.state.runtime = replace(app.state.runtime, gate=busy)
+    refused = client.post("/v1/forecasts", json={**FORECAST, "surface": "ideal"})
+    assert (refused.status_code, refused.headers["Retry-After"]) == (503, "5")
+    assert client.get("/v1/plant").status_code == 200
+    busy.leave()
+
+
+def test_requests_have_little_patience_and_jobs_all(bare: TestClient, app: FastAPI):
+    assert app.state.runtime.patience_s is not None
+    assert Runtime.from_settings(app.state.runtime.settings, FakeOperations()).patience_s is None
