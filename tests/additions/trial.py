@@ -21,7 +21,7 @@ from model.effects import CATALOGUE, effect_from_json
 from model.fleet import Superposition, superpose, tile_of
 from model.forecast import Setup
 from model.frames import sun_direction
-from model.plant import Heliostat, TargetPlane
+from model.plant import JUELICH_LATITUDE, Heliostat, TargetPlane
 from model.study import StudyOptions
 from model.study.advice import told_apart_by
 from model.surface import control_points
@@ -132,7 +132,8 @@ def _wall() -> TargetPlane:
 def _superposed(receiver: Any, optics: Optics) -> Any:
     heliostat = Heliostat.juelich("H", np.array([0.0, 80.0, 1.8]), 90.0)
     setup = Setup(heliostat, control_points(heliostat), sun_direction(0.0, 50.0), receiver.middle, aim=receiver.center)
-    return superpose(Superposition(receiver, (16, 16), optics), [tile_of([setup])]).irradiance
+    task = Superposition(receiver, (16, 16), optics, latitude_deg=JUELICH_LATITUDE)
+    return superpose(task, [tile_of([setup])]).irradiance
 
 
 def receiver(client: Client) -> None:
