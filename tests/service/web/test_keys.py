@@ -462,5 +462,7 @@ def test_serve_refuses_to_stand_open(
 ):
     monkeypatch.setenv("HELIOTWIN_DATA_DIR", str(tmp_path / "data"))
     assert heliotwin("serve", "--host", "0.0.0.0", "--port", str(free_port())) == 1
-    assert "heliotwin keys create" in caplog.text
-    assert "could not start" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "heliotwin: host 0.0.0.0" in said
+    assert "heliotwin keys create" in said
+    assert "Traceback" not in said + caplog.text
