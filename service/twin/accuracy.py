@@ -1,8 +1,8 @@
 """How well the current surfaces forecast what was photographed: heliostat by heliostat, computed once and remembered.
 
 Forecast and photograph are compared in the photograph's own 4 m window about its centre of mass, as everywhere
-(DESIGN.md, section 7). A result holds until the heliostat gets another surface or
-another photograph, or the plant's model another version.
+(DESIGN.md, section 7). A result holds until the heliostat gets another surface or another photograph, or the plant's
+model another version.
 """
 
 import logging

@@ -10,6 +10,7 @@ from sqlalchemy.orm import Session
 from model.effects import light_effects
 from model.errors import InvalidInputError
 from model.frames import sun_direction
+from model.images import FLUX_SUM
 from model.plant import Receiver, TargetPlane
 from service import store
 from service.base.arrays import pack, plain, unpack
@@ -152,12 +153,8 @@ def _trace(
         )
 
 
-# A flux map's sum where it is normalised (the paper's rule).
-_NORMALISED_SUM = 100.0
-
-
 def flux_of(row: ForecastRow) -> NDArray[np.float32]:
     """The map in the unit that was asked for."""
     flux = unpack(row.flux)["flux"]
     total = float(flux.sum(dtype=np.float64))
-    return flux * np.float32(_NORMALISED_SUM / total) if row.normalised and total > 0 else flux
+    return flux * np.float32(FLUX_SUM / total) if row.normalised and total > 0 else flux

@@ -81,12 +81,6 @@ class ForecastSummary(BaseModel):
     created_at: datetime
 
 
-class ForecastOut(ForecastSummary):
-    """A computed flux map."""
-
-    flux: list[Any] = Field(description="Rows from the top, columns from the left as seen from the lit side.")
-
-
 def forecast_summary(row: ForecastRow) -> ForecastSummary:
     """A forecast without its pixels."""
     return ForecastSummary.model_validate(
