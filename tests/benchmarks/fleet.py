@@ -151,7 +151,9 @@ def field_of_2000() -> None:
                     [(setup.heliostat, square.center) for setup in some], some[0].sun, latitude_deg=JUELICH_LATITUDE
                 )
             total = superpose(
-                Superposition(receiver, (side, side), latitude_deg=JUELICH_LATITUDE), tiles(some, neighbours)
+                Superposition(receiver, (side, side), latitude_deg=JUELICH_LATITUDE),
+                tiles(some, neighbours),
+                Threads(2),
             )
         landed = total.irradiance.mean() * receiver.width * receiver.height
         print(f"  2,000 heliostats, {name}: {meter}; {total.power / 1e6:.2f} MW thrown, {landed / 1e6:.2f} MW land")
