@@ -30,7 +30,7 @@ from model.errors import ModelError, UnreachableError
 from model.forecast import Setup, align, altered, optics_under
 from model.neighbours import Neighbours, outlines
 from model.plant import Heliostat, Receiver, TargetPlane
-from model.sunshape import transfer_table
+from model.sunshape import half_angle
 from model.tracing import Optics, Scene, Window
 from model.tracing.convolution import superpose as superpose_scene
 
@@ -54,8 +54,8 @@ TILE = 32
 
 # Pixels of maps that are traced at a time: so few that the processor's cache holds them.
 _PIXELS = 2**18
-# Half angle [rad] of the cone in which light is followed beyond a map's edge: the sun's disc and the usual errors.
-_CONE = 8e-3
+# Light is followed beyond a map's edge as far as this share of the sun's cone reaches, with room for errors [rad].
+_CONE_SHARE, _ERRORS = 0.98, 3e-3
 # Cosine to a plane's normal below which light that grazes it is left out.
 _GRAZING = 0.02
 
@@ -152,24 +152,23 @@ class Superposition:
         if tile.obstacles is not None:
             acting = [effect for effect in acting if not isinstance(effect, Blocking)]
         optics = optics_under(acting, self.optics)
-        table = transfer_table(optics.sun_shape, torch.float32, torch.device("cpu"))
         flux, power = torch.zeros(self.resolution, dtype=torch.float64), 0.0
         with torch.no_grad():
             for group in align(tile.setups, acting, latitude_deg=self.latitude_deg).groups:
                 scene = group.scene
                 if tile.obstacles is not None:
                     scene = scene.with_(obstacles=torch.as_tensor(tile.obstacles[group.rows]).to(scene.sun))
-                for image, thrown in self._images(scene, group.aims, optics, table):
+                for image, thrown in self._images(scene, group.aims, optics):
                     flux += image
                     power += thrown
         return FleetFlux(flux.numpy(), power, len(tile))
 
-    def _images(self, scene: Scene, aims: Array, optics: Optics, table: Tensor) -> Iterator[tuple[Tensor, float]]:
+    def _images(self, scene: Scene, aims: Array, optics: Optics) -> Iterator[tuple[Tensor, float]]:
         """Maps (rows, columns) [W/m2] and power [W], of a few mirrors at a time."""
         step = max(1, _PIXELS // (self.resolution[0] * self.resolution[1]))
         for start in range(0, scene.batch, step):
             rows = list(range(start, min(start + step, scene.batch)))
-            part = scene.subset(rows), aims[rows], optics, table
+            part = scene.subset(rows), aims[rows], optics
             if isinstance(self.receiver, TargetPlane):
                 image, power = self._on_plane(self.receiver, self.resolution[1], *part)
             else:
@@ -177,7 +176,7 @@ class Superposition:
             yield image, float(power.sum())
 
     def _on_plane(
-        self, plane: TargetPlane, columns: int, scene: Scene, aims: Array, optics: Optics, table: Tensor
+        self, plane: TargetPlane, columns: int, scene: Scene, aims: Array, optics: Optics
     ) -> tuple[Tensor, Tensor]:
         """Map (rows, columns) [W/m2] and power (B,) [W] on a plane that takes the place of the scene's own."""
         scene = scene.with_(
@@ -185,13 +184,14 @@ class Superposition:
             plane_axes=torch.tensor(plane.axes).to(scene.sun).expand(scene.batch, 3, 3),
         )
         directions, ranges = _beams(scene, aims)
-        beyond = float((ranges * _CONE / -(directions @ plane.normal).clip(max=-0.25)).max())
+        cone = half_angle(optics.sun_shape, _CONE_SHARE) + _ERRORS
+        beyond = float((ranges * cone / -(directions @ plane.normal).clip(max=-0.25)).max())
         beyond = min(beyond, max(plane.width, plane.height))
         padding = max(0.1, beyond / plane.height), max(0.1, beyond / plane.width)
         window = Window.of(plane, self.resolution[0], columns)
-        return superpose_scene(scene, window, optics, samples=self.samples, padding=padding, table=table)
+        return superpose_scene(scene, window, optics, samples=self.samples, padding=padding)
 
-    def _on_patches(self, scene: Scene, aims: Array, optics: Optics, table: Tensor) -> tuple[Tensor, Tensor]:
+    def _on_patches(self, scene: Scene, aims: Array, optics: Optics) -> tuple[Tensor, Tensor]:
         """Unrolled map (rows, columns) [W/m2] and power (B,) [W], plane by plane."""
         image, power = torch.zeros(self.resolution), torch.zeros(scene.batch)
         directions, seen = _beams(scene, aims)[0], np.zeros(scene.batch, dtype=bool)
@@ -200,7 +200,7 @@ class Superposition:
             before = (scene.center.double().numpy() - plane.center) @ plane.normal > 0
             lighting = np.flatnonzero(before & (directions @ plane.normal < -_GRAZING)).tolist()
             if lighting:
-                lit = scene.subset(lighting), aims[lighting], optics, table
+                lit = scene.subset(lighting), aims[lighting], optics
                 part, thrown = self._on_plane(plane, len(shares), *lit)
                 image[:, patch.columns] += part * shares
                 power[lighting] = torch.maximum(power[lighting], thrown)

@@ -27,30 +27,29 @@ What it is confused with
       and not the distance, and that lifts the background with it.
     - A background: has no maximum at the spot.
 
-Neutral where the declared sun is Buie's with 0.02, the default.
+Neutral at 0.02, a clear sky's, which any declared sun is taken to have: what counts is the haze over that.
 """
 
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
 from model.effects.base import Effect, Factor, Scalar, Stage, parameter
-from model.sunshape import Buie
+from model.sunshape import CLEAR_SKY, Buie, Hazy
 from model.tracing.scene import Optics
 
 
 @dataclass(frozen=True, eq=False)
 class SunShapeEffect(Effect):
-    """The sun has Buie's shape with ``circumsolar_ratio``, whatever shape was declared.
-
-    Neutral at the default sun's 0.02.
-    """
+    """The declared sun behind haze; Buie's sun with 0.02, the default, becomes Buie's with ``circumsolar_ratio``."""
 
     name: ClassVar[str] = "sun_shape"
     stage: ClassVar[Stage] = "optics"
     scales_with: ClassVar[frozenset[Factor]] = frozenset({"distance", "weather"})
 
-    circumsolar_ratio: Scalar = parameter(0.02, 0.0, 0.5, "1")
+    circumsolar_ratio: Scalar = parameter(CLEAR_SKY, 0.0, 0.5, "1")
 
     def on_optics(self, optics: Optics) -> Optics:
-        """Replace the sun."""
-        return replace(optics, sun_shape=Buie(self.circumsolar_ratio))
+        """Put the haze before the sun."""
+        if optics.sun_shape == Buie(CLEAR_SKY):
+            return replace(optics, sun_shape=Buie(self.circumsolar_ratio))
+        return replace(optics, sun_shape=Hazy(optics.sun_shape, self.circumsolar_ratio))

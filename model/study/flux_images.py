@@ -4,8 +4,6 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
-from functools import lru_cache
-from typing import Any
 
 import numpy as np
 import torch
@@ -20,8 +18,7 @@ from model.metrics import accuracy_window
 from model.plant import TargetPlane
 from model.study.noise import black_lift, grain_variance
 from model.study.unknowns import copied, copy_name
-from model.sunshape import transfer_table
-from model.tracing import Optics, Scene, Window, trace
+from model.tracing import Optics
 
 Array = NDArray[np.float64]
 
@@ -231,19 +228,8 @@ class Forecaster:
         light = _name(model, ("geometry", "optics"))
         if light not in self._flux:
             with torch.no_grad():
-                self._flux = {light: self._aligned[geometry].flux(self.optics, model, self.view, self._trace)}
+                self._flux = {light: self._aligned[geometry].flux(self.optics, model, self.view)}
         return self._aligned[geometry], self._flux[light]
-
-    def _trace(self, scene: Scene, window: Window, optics: Optics) -> torch.Tensor:
-        """As `View.trace` does it, with the sun's transfer table kept."""
-        sun: Any = optics.sun_shape  # all are frozen dataclasses of numbers, which the protocol cannot say
-        view, table = self.view, _table(sun, scene.sun.dtype)
-        return trace(scene, window, optics, samples=view.samples, padding=view.padding, table=table).irradiance
-
-
-@lru_cache(maxsize=64)
-def _table(sun: Any, dtype: torch.dtype) -> torch.Tensor:
-    return transfer_table(sun, dtype, torch.device("cpu"))
 
 
 def _name(effects: Sequence[Effect], stages: tuple[str, ...]) -> str:

@@ -7,25 +7,30 @@ from model.sunshape.base import (
     FREQUENCY_STEP,
     SOLAR_DISC,
     SunShape,
+    half_angle,
     random_angles,
     transfer_table,
 )
 from model.sunshape.buie import AUREOLE_EDGE, Buie
 from model.sunshape.gaussian import Gaussian
+from model.sunshape.hazy import CLEAR_SKY, Hazy
 from model.sunshape.pillbox import Pillbox
 from model.sunshape.tabulated import Tabulated
 
 __all__ = [
     "AUREOLE_EDGE",
+    "CLEAR_SKY",
     "FREQUENCY_COUNT",
     "FREQUENCY_STEP",
     "SHAPES",
     "SOLAR_DISC",
     "Buie",
     "Gaussian",
+    "Hazy",
     "Pillbox",
     "SunShape",
     "Tabulated",
+    "half_angle",
     "random_angles",
     "transfer_table",
 ]

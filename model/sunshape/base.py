@@ -4,8 +4,9 @@ The convolution tracer needs a shape's transfer function (its Hankel transform o
 tracer needs random angles; both come from the one profile that each class states.
 """
 
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from itertools import pairwise
 from typing import ClassVar
@@ -24,6 +25,9 @@ FREQUENCY_STEP = 2.0
 """Spacing of tabulated transfer functions [cycles/rad]."""
 
 FREQUENCY_COUNT = 4096
+
+SOFT_FROM = 0.9
+"""Share of the angle at which a transfer function's light ends, from which on it fades."""
 
 
 class SunShape(ABC):
@@ -57,11 +61,14 @@ def check(name: str, value: float | Tensor, low: float, high: float) -> None:
 @lru_cache(maxsize=16)
 def _quadrature(edges: tuple[float, ...]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Gauss-Legendre angles and weights (n,) over each smooth piece."""
-    # 320 nodes resolve the aureole's Bessel oscillations up to the highest tabulated frequency; few pieces get more.
-    nodes, weights = np.polynomial.legendre.leggauss(max(16, 640 // (len(edges) - 1)))
-    halves = np.diff(edges) / 2
-    angles = (np.asarray(edges[:-1]) + halves)[:, None] + halves[:, None] * nodes
-    return angles.ravel(), (halves[:, None] * weights).ravel()
+    # Gauss and Legendre need pi nodes a cycle at a piece's middle, for the Bessel function's at the highest frequency.
+    densest = np.pi * FREQUENCY_STEP * FREQUENCY_COUNT
+    pieces = [
+        (low, high, *np.polynomial.legendre.leggauss(16 + math.ceil(densest * (high - low))))
+        for low, high in pairwise(edges)
+    ]
+    angles = [low + (high - low) / 2 * (1 + nodes) for low, high, nodes, _ in pieces]
+    return np.concatenate(angles), np.concatenate([(high - low) / 2 * weights for low, high, _, weights in pieces])
 
 
 @lru_cache(maxsize=8)
@@ -75,15 +82,41 @@ def _hankel(edges: tuple[float, ...], dtype: torch.dtype, device: torch.device) 
     return on_angles, on_weights, on_kernel
 
 
-def transfer_table(shape: SunShape, dtype: torch.dtype, device: torch.device) -> Tensor:
+def transfer_table(
+    shape: SunShape, dtype: torch.dtype, device: torch.device, ends: Sequence[float] | None = None
+) -> Tensor:
     """The shape's transfer function (K,) at multiples of `FREQUENCY_STEP`, one at frequency zero.
 
     The two-dimensional Fourier transform of the normalised radiance in the small-angle plane, which for a profile
     that depends on the angle alone is its Hankel transform. Differentiable in the shape's tensor parameters.
+
+    With ``ends`` (E,) [rad] it is that of the light up to each of these angles, (E, K), less than one at frequency zero
+    by the light beyond.
     """
     angles, weights, kernel = _hankel(shape.edges, dtype, device)
     density = shape.profile(angles) * weights
-    return kernel @ (density / density.sum())
+    density = density / density.sum()
+    if ends is None:
+        return kernel @ density
+    # A soft end leaves no ripples: all that is left of it lies where the light counts no more.
+    past = angles / torch.as_tensor(ends, dtype=dtype, device=device)[:, None]
+    kept = 0.5 + 0.5 * torch.cos(np.pi * ((past - SOFT_FROM) / (1 - SOFT_FROM)).clamp(0, 1))
+    return (density * kept) @ kernel.T
+
+
+def integral(shape: SunShape) -> Tensor:
+    """Radiance times angle (scalar) over the whole shape: what makes a profile a share of the light."""
+    angles, weights = (torch.as_tensor(values) for values in _quadrature(shape.edges))
+    return (shape.profile(angles) * angles * weights).sum()
+
+
+def half_angle(shape: SunShape, share: float) -> float:
+    """Angle [rad] from the sun's centre within which ``share`` of its light lies."""
+    angles, weights = _quadrature(shape.edges)
+    with torch.no_grad():
+        density = shape.profile(torch.as_tensor(angles)).double().cpu().numpy() * weights * angles
+    cumulative = np.cumsum(density)
+    return float(np.interp(share * cumulative[-1], cumulative, angles))
 
 
 def random_angles(shape: SunShape, count: int, rng: np.random.Generator) -> NDArray[np.float64]:

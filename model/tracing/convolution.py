@@ -7,6 +7,9 @@ frequency space, where everything is exact and smooth: the cone enters by its tr
 range and by the beam's slope on the plane, and what spreading a ray over pixels has smeared is divided out again, so
 that a pixel holds its area's mean irradiance.
 
+A transform is periodic: light that leaves the padded window on one side would come back on the other. The sun's shape
+is therefore cut off where that would begin, so that far light that misses the window is lost, as it is in the field.
+
 Approximations: the cone's size is taken at each mirror's or each facet's centre, and the cone is small.
 
 Source: the idea of analytic cone optics is that of HELIOS and of Lipps and Walzel, Solar Energy 21 (1978); the
@@ -14,9 +17,10 @@ formulation in frequency space, with the transfer function's argument in closed 
 """
 
 import math
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Literal
+from typing import Any, Literal, TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -24,9 +28,12 @@ from torch import Tensor
 from model.errors import InvalidInputError, UnreachableError
 from model.images import normalized
 from model.neighbours import clear
-from model.sunshape import FREQUENCY_COUNT, FREQUENCY_STEP, transfer_table
+from model.sunshape import FREQUENCY_COUNT, FREQUENCY_STEP, SunShape, half_angle, transfer_table
+from model.sunshape.base import SOFT_FROM
 from model.surface import edge_basis, midpoint_basis, sample
 from model.tracing.scene import Optics, Scene, Window
+
+Made = TypeVar("Made")
 
 
 @dataclass(frozen=True, eq=False)
@@ -273,9 +280,55 @@ def _quadratic(offset: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return 0.5 * (0.5 - offset) ** 2, 0.75 - offset**2, 0.5 * (0.5 + offset) ** 2
 
 
-def _padded(size: int, padding: float) -> int:
-    """An even length of small prime factors that leaves ``padding`` of the window on each side."""
-    length = math.ceil(size * (1 + 2 * padding) / 2) * 2
+_CONE_SHARE = 0.99  # of the sun's light: windows are padded by its reach
+_ENDS_PER_OCTAVE = 4  # mirrors whose light is cut off at about the same angle share a table
+_ROOM = 2 ** (1 / _ENDS_PER_OCTAVE) / SOFT_FROM  # for the step to such an angle, and for the soft end there
+
+
+def _reach(rays: Rays, optics: Optics) -> float:
+    """How far [m] on the plane nearly all light of a ray lands from its centre, for the farthest of the mirrors."""
+    errors = [float(torch.as_tensor(sigma).detach().max()) for sigma in (optics.slope_error, optics.tracking_jitter)]
+    angle = _ROOM * _kept(half_angle, optics.sun_shape, _CONE_SHARE) + 6 * math.hypot(*errors)
+    return float(angle * _per_angle(rays).max())
+
+
+def _per_angle(rays: Rays) -> Tensor:
+    """Distance (B,) [m/rad] on the plane per angle off the beam, in the plane of incidence, where it is longest."""
+    return (rays.slant_range / -rays.direction[:, 2]).detach()
+
+
+def _sun_tables(sun: SunShape, rays: Rays, free: float) -> Tensor:
+    """The sun's transfer (K,) or (B, K) without the light that would land farther than ``free`` [m] off a ray."""
+    dtype, device = rays.hits.dtype, rays.hits.device
+    steps = (torch.log2(free / _per_angle(rays)) * _ENDS_PER_OCTAVE).floor()
+    # One step above the sun's edge nothing of it is cut off.
+    whole = math.ceil(math.log2(sun.edges[-1]) * _ENDS_PER_OCTAVE) + 1
+    different, which = torch.unique(steps.clamp(max=whole), return_inverse=True)
+    if float(different[0]) == whole:
+        return _kept(transfer_table, sun, dtype, device)
+    ends = tuple((2 ** (different / _ENDS_PER_OCTAVE)).tolist())
+    tables = _kept(transfer_table, sun, dtype, device, ends)
+    return tables[0] if len(ends) == 1 else tables[which]
+
+
+def _kept(work: Callable[..., Made], sun: SunShape, *given: Hashable) -> Made:
+    """What ``work`` makes of a sun; kept for the next time where the sun is made of plain numbers."""
+    if any(isinstance(value, Tensor) for value in vars(sun).values()):
+        return work(sun, *given)
+    return cast(Made, _remembered(work, sun, *given))
+
+
+@lru_cache(maxsize=128)
+def _remembered(work: Callable[..., object], sun: Any, *given: Hashable) -> object:
+    return work(sun, *given)
+
+
+def _padded(size: int, padding: float, reach: float) -> int:
+    """An even length of small prime factors that leaves ``padding`` of the window on each side.
+
+    In all it leaves ``reach`` [px], but no more than the window itself: nothing comes from farther to where it counts.
+    """
+    length = math.ceil((size + max(2 * padding * size, min(reach, size))) / 2) * 2
     while not _smooth(length):
         length += 2
     return length
@@ -295,7 +348,6 @@ def trace(
     *,
     samples: int = 32,
     padding: float = 0.5,
-    table: Tensor | None = None,
     cones: Literal["mirror", "facet"] = "mirror",
 ) -> Flux:
     """Trace the flux of every mirror of a scene.
@@ -309,9 +361,8 @@ def trace(
     samples : int
         Points along each side of each facet.
     padding : float
-        How far beyond the window, in windows, light is followed before it is lost.
-    table : Tensor (K,) or (B, K), optional
-        A transfer table in place of the sun shape's own (`model.sunshape.transfer_table`); one for each mirror, say.
+        How far beyond the window, in windows, rays are followed before they are lost; more where the sun's cone reaches
+        farther.
     cones : {"mirror", "facet"}
         Whether the reflected cone is taken at each mirror's centre or at each facet's, which costs four times as much
         and counts for mirrors near the tower, where a facet is visibly nearer than the next.
@@ -328,19 +379,13 @@ def trace(
     parts = len(rays.power) // scene.batch
     spot = rays.spot_of(parts)
     center = spot if window.on_spot else torch.zeros_like(spot)
-    if table is None:
-        table = transfer_table(optics.sun_shape, spot.dtype, spot.device)
-    elif table.ndim == 2:
-        table = table.repeat_interleave(parts, dim=0)
     optics = replace(
         optics,
         slope_error=_of_parts(optics.slope_error, parts),
         tracking_jitter=_of_parts(optics.tracking_jitter, parts),
     )
     irradiance = optics.irradiance(rays.slant_range)
-    image = _image(
-        rays, center.repeat_interleave(parts, dim=0), window, optics, table, irradiance, (padding, padding), parts
-    )
+    image = _image(rays, center.repeat_interleave(parts, dim=0), window, optics, irradiance, (padding, padding), parts)
     power = (rays.power.sum(-1) * irradiance).view(-1, parts).sum(1)
     return Flux(irradiance=image, spot=spot, center=center, power=power)
 
@@ -352,7 +397,6 @@ def superpose(
     *,
     samples: int = 16,
     padding: tuple[float, float] = (0.25, 0.25),
-    table: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """The sum of the flux of all mirrors of a scene, which share one target plane.
 
@@ -371,10 +415,8 @@ def superpose(
         Where a mirror shows its back to the sun or to the target.
     """
     optics, rays = optics or Optics(), central_rays(scene, samples)
-    if table is None:
-        table = transfer_table(optics.sun_shape, rays.hits.dtype, rays.hits.device)
     irradiance, center = optics.irradiance(rays.slant_range), rays.hits.new_zeros(scene.batch, 2)
-    image = _image(rays, center, window, optics, table, irradiance, padding, parts=scene.batch)
+    image = _image(rays, center, window, optics, irradiance, padding, parts=scene.batch)
     return image[0], rays.power.sum(-1) * irradiance
 
 
@@ -388,14 +430,19 @@ def _image(
     center: Tensor,
     window: Window,
     optics: Optics,
-    table: Tensor,
     irradiance: Tensor,
     padding: tuple[float, float],
     parts: int,
 ) -> Tensor:
     """Irradiance (B / parts, rows, columns) [W/m2] of rays (B) in windows about ``center`` (B, 2) [m]."""
-    rows, columns = _padded(window.rows, padding[0]), _padded(window.columns, padding[1])
     pixel_x, pixel_y = window.pixel
+    reach = _reach(rays, optics)
+    rows, columns = (
+        _padded(window.rows, padding[0], reach / pixel_y),
+        _padded(window.columns, padding[1], reach / pixel_x),
+    )
+    free = min((rows - window.rows) * pixel_y, (columns - window.columns) * pixel_x)
+    table = _sun_tables(optics.sun_shape, rays, free)
     first_row, first_column = (rows - window.rows) // 2, (columns - window.columns) // 2
     x = (rays.hits[:, 0] - center[:, :1] + window.width / 2) / pixel_x + first_column - 0.5
     y = (window.height / 2 - rays.hits[:, 1] + center[:, 1:]) / pixel_y + first_row - 0.5

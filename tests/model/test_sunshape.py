@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import torch
 
+from model.effects.sun_shape import SunShapeEffect
 from model.errors import InvalidInputError
 from model.sunshape import (
     FREQUENCY_STEP,
@@ -10,9 +11,11 @@ from model.sunshape import (
     Gaussian,
     Pillbox,
     Tabulated,
+    half_angle,
     random_angles,
     transfer_table,
 )
+from model.tracing import Optics
 
 CPU = torch.device("cpu")
 SHAPES = [Pillbox(), Gaussian(2.5e-3), Buie(0.02), Buie(0.2), Tabulated((0.0, 4e-3, 5e-3), (1.0, 0.8, 0.0))]
@@ -76,3 +79,24 @@ def test_gradient_in_the_circumsolar_ratio():
 def test_bounds_are_named(make, field):
     with pytest.raises(InvalidInputError, match=field):
         make()
+
+
+@pytest.mark.parametrize("shape", [*SHAPES, Pillbox(2e-3), Gaussian(8e-3)], ids=repr)
+def test_a_clear_sky_leaves_any_declared_sun_as_it_is(shape):
+    neutral = SunShapeEffect().on_optics(Optics(sun_shape=shape)).sun_shape
+    np.testing.assert_allclose(table(neutral), table(shape), atol=2e-6)
+
+
+def test_haze_before_a_pillbox_takes_light_from_the_disc_into_the_aureole():
+    hazy = SunShapeEffect(circumsolar_ratio=0.2).on_optics(Optics(sun_shape=Pillbox())).sun_shape
+    angles = random_angles(hazy, 400_000, np.random.default_rng(2))
+    assert (angles > SOLAR_DISC).mean() == pytest.approx(0.2, rel=0.25)
+    assert SunShapeEffect(circumsolar_ratio=0.2).on_optics(Optics()).sun_shape == Buie(0.2)
+
+
+def test_light_beyond_an_end_is_lost_and_the_rest_stays():
+    whole, near = table(Buie(0.3)), transfer_table(Buie(0.3), torch.float64, CPU, (20e-3, 0.1)).numpy()
+    np.testing.assert_allclose(near[1], whole, atol=1e-12)
+    angles = random_angles(Buie(0.3), 400_000, np.random.default_rng(3))
+    assert (angles < 18e-3).mean() < near[0, 0] < (angles < 20e-3).mean()
+    assert half_angle(Buie(0.3), 0.9) == pytest.approx(np.quantile(angles, 0.9), rel=0.01)

@@ -1,0 +1,35 @@
+"""A declared sun behind more haze, or less, than a clear sky's. It stands in no ``twin.json``: an effect makes it."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from model.sunshape.base import SunShape, integral
+from model.sunshape.buie import Buie
+
+CLEAR_SKY = 0.02
+"""Circumsolar ratio of the haze that is in any sun already."""
+
+
+@dataclass(frozen=True)
+class Hazy(SunShape):
+    """``sun`` with what Buie's sun of ``circumsolar_ratio`` has, share by share of its light, over that of a clear sky.
+
+    At `CLEAR_SKY` it is ``sun`` itself, whatever its shape. The ratio may be a tensor, for gradients.
+    """
+
+    sun: SunShape
+    circumsolar_ratio: float | Tensor = CLEAR_SKY
+
+    @property
+    def edges(self) -> tuple[float, ...]:
+        """Those of the sun and of Buie's [rad]."""
+        return tuple(sorted({*self.sun.edges, *Buie().edges}))
+
+    def profile(self, angle: Tensor) -> Tensor:
+        """Shares of the light per solid angle; haze takes no more from a direction than there is."""
+        suns = self.sun, Buie(self.circumsolar_ratio), Buie(CLEAR_SKY)
+        own, hazy, clear = (sun.profile(angle) / integral(sun).to(angle) for sun in suns)
+        within = angle <= self.sun.edges[-1]
+        return (torch.where(within, own, torch.zeros_like(own)) + hazy - clear).clamp(min=0)
