@@ -10,6 +10,7 @@ camera, as often as needed::
 or, in one step, `forecast_setups`. Gradients with respect to an effect's parameters hold the alignment fixed.
 """
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from model.effects import Effect, in_light_order
+from model.images import FLUX_SIZE, FLUX_WINDOW, normalized
 from model.mount import Mount
 from model.plant import Heliostat, TargetPlane
 from model.surface import DEGREE
@@ -122,6 +124,26 @@ def images_under(effects: Iterable[Effect], flux: Tensor, window: Window) -> Ten
     return flux
 
 
+def centered(images: Tensor, whole: Window, size: int) -> Tensor:
+    """Energy (B, size, size) of images (B, rows, columns) in windows of `FLUX_WINDOW` about their centres of mass.
+
+    As `model.imaging.window.flux_window` cuts measured images, differentiable.
+    """
+    shares = [_overlap(images.sum(dim=axis), extent, size) for axis, extent in ((-1, whole.height), (-2, whole.width))]
+    cut: Tensor = shares[0] @ images @ shares[1].transpose(-1, -2)
+    return cut
+
+
+def _overlap(line: Tensor, extent: float, size: int) -> Tensor:
+    """Share (B, size, n) of n cells over ``extent`` [m] in those of the window about the centre of ``line`` (B, n)."""
+    cell = extent / line.shape[-1]
+    low = torch.arange(line.shape[-1], dtype=line.dtype, device=line.device) * cell
+    center = (line @ (low + cell / 2) / line.sum(dim=-1).clamp(min=1e-30))[:, None, None]
+    edges = torch.linspace(-FLUX_WINDOW / 2, FLUX_WINDOW / 2, size + 1, dtype=line.dtype, device=line.device)
+    first, last = center + edges[:-1, None], center + edges[1:, None]
+    return (torch.minimum(last, low + cell) - torch.maximum(first, low)).clamp(min=0) / cell
+
+
 @dataclass(frozen=True, eq=False)
 class Group:
     """Aligned setups whose mirrors are alike in their splines.
@@ -216,6 +238,27 @@ class Aligned:
     ) -> Tensor:
         """`flux`, then `camera_images`: images (B, rows, columns)."""
         return self.camera_images(self.flux(optics, effects, view, tracer), effects, view)
+
+    def flux_images(
+        self, optics: Optics | None = None, effects: Sequence[Effect] = (), *, size: int = FLUX_SIZE, samples: int = 20
+    ) -> Tensor:
+        """What would be measured of the same light: flux images (B, size, size) about their own centres, sum 100.
+
+        As a measurement has it: what the camera shows of the whole target, and of that the window about its centre of
+        mass. Where no effect of a camera acts, that is the window about the light's.
+        """
+        pixel = FLUX_WINDOW / size
+        if not any(effect.stage == "image" for effect in effects):
+            return normalized(self.flux(optics, effects, View(size, size, window=FLUX_WINDOW, samples=samples)))
+        planes = [plane for group in self.groups for plane in group.planes]
+        rows, columns = (math.ceil(max(getattr(p, side) for p in planes) / pixel) for side in ("height", "width"))
+        view, effective = View(rows, columns, samples=samples), optics_under(effects, optics or Optics())
+
+        def measured(group: Group, window: Window, rows: list[int]) -> Tensor:
+            flux = view.trace(group.scene.subset(rows), window, effective)
+            return centered(images_under(effects, flux, window).clamp(min=0), window, size)
+
+        return normalized(self._each_window(view, measured))
 
     def _each_window(self, view: View, act: Callable[[Group, Window, list[int]], Tensor]) -> Tensor:
         """What ``act`` makes (b, ...) of the setups in each window of each group, in the setups' order (B, ...)."""

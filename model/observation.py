@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from model.effects import Effect
 from model.errors import InvalidInputError
-from model.forecast import Aligned, Setup, View, align
-from model.images import FLUX_SHAPE, FLUX_WINDOW, normalized
+from model.forecast import Aligned, Setup, align
+from model.images import FLUX_SHAPE
 from model.metrics import flux_accuracy
 from model.plant import Heliostat, TargetPlane
 from model.surface import control_points
@@ -161,11 +161,9 @@ def render_observations(
     samples: int = 24,
 ) -> NDArray[np.float64]:
     """What a surface ``z`` (4, 8, 8) [m] would have thrown where M fluxes were observed: (M, 64, 64), sum 100."""
-    view = View(*FLUX_SHAPE, window=FLUX_WINDOW, samples=samples)
     with torch.no_grad():
         aligned = align_observations(heliostat, observations, z, effects, latitude_deg=latitude_deg)
-        flux = aligned.images(optics, effects, view).double()
-    return normalized(flux).numpy()
+        return aligned.flux_images(optics, effects, samples=samples).double().numpy()
 
 
 def spread_suns(suns: NDArray[np.float64], count: int) -> list[int]:

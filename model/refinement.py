@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from model.effects import Effect
 from model.errors import InvalidInputError
-from model.forecast import Aligned, View
-from model.images import COARSE_SIZE, FLUX_WINDOW, binned, normalized
+from model.forecast import Aligned
+from model.images import COARSE_SIZE, FLUX_WINDOW, binned
 from model.least_squares import Descent, minimize
 from model.network.inputs import STEP_HEIGHT
 from model.observation import Observation, SurfacePrediction, align_observations, misfits
@@ -130,7 +130,6 @@ class _Posterior:
         self.heliostat, self.observations = heliostat, observations
         self.prior, self.options = prior, options
         (self.optics, self.effects), self.latitude_deg = model, latitude_deg
-        self.view = View(options.resolution, options.resolution, window=FLUX_WINDOW)
         self.measured = binned(np.array([o.flux for o in observations], dtype=np.float64), options.resolution)
         # The same height for each direction: small enough for images to be linear in it, large enough to stand out from
         # their last digits.
@@ -143,8 +142,8 @@ class _Posterior:
     def _rendered(self, aligned: Aligned, samples: int) -> Array:
         """Images (B, R, R), sum 100, of aligned mirrors."""
         with torch.no_grad():
-            images = aligned.images(self.optics, self.effects, replace(self.view, samples=samples)).double().numpy()
-        return normalized(images)
+            images = aligned.flux_images(self.optics, self.effects, size=self.options.resolution, samples=samples)
+        return images.double().numpy()
 
     def state(self, c: Array) -> _State:
         """The mirror of coefficients (K,), aligned under each sun."""

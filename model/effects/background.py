@@ -6,8 +6,8 @@ What it is
 
         seen = light + peak * (level + gradient_x * x + gradient_y * y)
 
-    with x to the right and y upwards, from -1 to 1 over the image. The level is negative where too much was
-    subtracted.
+    with x to the right and y upwards of the image's centre, in metres on the target. The level is negative where too
+    much was subtracted.
 
 Source
     Radiometry; the subtraction of an image of the empty target, and what it leaves, in Roeger et al., *Techniques to
@@ -42,7 +42,7 @@ from model.tracing.scene import Window
 class Background(Effect):
     """A plane is added to the image, in shares of its peak: ``level + gradient_x * x + gradient_y * y``.
 
-    x counts to the right and y upwards, from -1 to 1 over the image.
+    x counts to the right and y upwards of the image's centre, in metres: the same plane in any window.
     """
 
     name: ClassVar[str] = "background"
@@ -50,16 +50,16 @@ class Background(Effect):
     scales_with: ClassVar[frozenset[Factor]] = frozenset({"weather", "camera"})
 
     level: Scalar = parameter(0.0, -0.2, 0.5, "1", "camera")
-    gradient_x: Scalar = parameter(0.0, -0.3, 0.3, "1", "camera")
-    gradient_y: Scalar = parameter(0.0, -0.3, 0.3, "1", "camera")
+    gradient_x: Scalar = parameter(0.0, -0.1, 0.1, "1/m", "camera")
+    gradient_y: Scalar = parameter(0.0, -0.1, 0.1, "1/m", "camera")
 
     def on_image(self, images: Tensor, window: Window) -> Tensor:
         """Add the plane."""
         peak = images.amax(dim=(-2, -1), keepdim=True)
-        x, y = (_centers(size, images) for size in (images.shape[-1], images.shape[-2]))
+        x, y = _centers(images.shape[-1], window.width, images), _centers(images.shape[-2], window.height, images)
         return images + peak * (self.level + self.gradient_x * x - self.gradient_y * y[:, None])
 
 
-def _centers(size: int, like: Tensor) -> Tensor:
-    """Centres (size,) of pixels on [-1, 1]; rows count downwards."""
-    return (2 * torch.arange(size, dtype=like.dtype, device=like.device) + 1) / size - 1
+def _centers(size: int, extent: float, like: Tensor) -> Tensor:
+    """Centres (size,) [m] of pixels off the middle of ``extent`` [m]; rows count downwards."""
+    return extent * ((torch.arange(size, dtype=like.dtype, device=like.device) + 0.5) / size - 0.5)

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from model.effects import Effect
 from model.errors import InvalidInputError
-from model.forecast import Aligned, View
-from model.images import COARSE_SIZE, FLUX_SIZE, FLUX_WINDOW, normalized
+from model.forecast import Aligned
+from model.images import COARSE_SIZE, FLUX_SIZE
 from model.network.architecture import MAX_IMAGES
 from model.network.inputs import (
     DESCENT_SAMPLES,
@@ -169,8 +169,7 @@ class _NetworkInputs:
 
     def _images(self, aligned: Aligned, size: int, samples: int) -> Tensor:
         """Images (M, size, size), sum 100, of aligned mirrors."""
-        view = View(size, size, window=FLUX_WINDOW, samples=samples)
-        return normalized(aligned.images(self.optics, self.effects, view))
+        return aligned.flux_images(self.optics, self.effects, size=size, samples=samples)
 
     def _changed(self, aligned: Aligned, changes: Tensor) -> Tensor:
         """Images (1, M, R, R), sum 100, of aligned mirrors, deformed by heights (1, M, 4, 8, 8) [m]."""

@@ -11,7 +11,9 @@ from model.effects.background import Background
 from model.effects.base import Effect
 from model.effects.blocking import Blocking
 from model.effects.camera_blur import CameraBlur
+from model.effects.camera_ghost import CameraGhost
 from model.effects.camera_response import CameraResponse
+from model.effects.camera_shoulder import CameraShoulder
 from model.effects.facet_canting import FacetCanting
 from model.effects.gravity_bending import GravityBending
 from model.effects.slope_error import SlopeError
@@ -19,6 +21,8 @@ from model.effects.sun_position import SunPosition
 from model.errors import UnreachableError
 from model.forecast import Setup, View, align, forecast_setups
 from model.frames import sun_direction
+from model.imaging import center_of_mass, flux_window
+from model.metrics import flux_accuracy
 from model.plant import JUELICH_LATITUDE
 from model.surface import control_points
 from model.tracing import Optics
@@ -82,6 +86,22 @@ def test_an_alignment_serves_other_optics_and_cameras():
     for camera in ([CameraBlur(0.2)], [CameraResponse(1.5), Background(0.1)]):
         whole = forecast_setups(given, None, [*GEOMETRY, SlopeError(1.0), *camera], view, latitude_deg=JUELICH_LATITUDE)
         np.testing.assert_allclose(aligned.camera_images(flux, camera, view), whole, rtol=1e-5, atol=1e-2)
+
+
+CAMERAS = [[], [CameraGhost(0.1, 0.8, -0.5)], [Background(0.01, 0.004, -0.003)], [CameraShoulder(1.5), CameraBlur(0.1)]]
+
+
+@pytest.mark.parametrize("camera", CAMERAS, ids=["none", "ghost", "background", "shoulder"])
+def test_a_flux_image_is_what_is_measured_of_the_whole_targets_image(camera):
+    """One rule for centring: a ghost or a background moves the centre of mass of measurement and forecast alike."""
+    given = setups()
+    wide = [replace(given[0], plane=target(10.0, center=(0.0, 0.0, 38.0)), spot=np.array([0.2, 0.0, 38.0])), *given[1:]]
+    aligned = align(wide, camera, latitude_deg=JUELICH_LATITUDE)
+    images = aligned.images(None, camera, View(256, 256, samples=24)).clamp(min=0).numpy()
+    for seen, image, setup in zip(aligned.flux_images(None, camera, samples=24), images, wide, strict=True):
+        size = setup.plane.width, setup.plane.height
+        measured = flux_window(image, size, center_of_mass(image, size))
+        assert flux_accuracy(measured, seen.numpy()) > 0.99
 
 
 def test_the_order_of_the_list_is_of_no_account():

@@ -26,7 +26,7 @@ def photograph(rays: Iterable[tuple[Rays, Rays]], plane: TargetPlane, world: Wor
         for seen, share in _seen(hits, light, plane, world, rng):
             image += _histogram(seen, share, plane)
         total, photons = total + float(light.sum()), photons + light.size
-    return _developed(image * photons / total, world, rng)
+    return _developed(image * photons / total, plane, world, rng)
 
 
 def _seen(
@@ -60,11 +60,11 @@ def _histogram(hits: Rays, light: Rays, plane: TargetPlane) -> Array:
     return np.bincount(cell, light[inside], PIXELS**2).reshape(PIXELS, PIXELS)
 
 
-def _developed(photons: Array, world: World, rng: np.random.Generator) -> Array:
+def _developed(photons: Array, plane: TargetPlane, world: World, rng: np.random.Generator) -> Array:
     """Counts of an image in photons, whose noise is the rays' own: stray light, the sensor's response, its noise."""
     level, gradient_x, gradient_y = world.stray
-    x = (2 * np.arange(PIXELS) + 1) / PIXELS - 1
-    stray = _peak(photons) * (level + gradient_x * x - gradient_y * x[:, None])
+    x, y = (size * ((np.arange(PIXELS) + 0.5) / PIXELS - 0.5) for size in (plane.width, plane.height))
+    stray = _peak(photons) * (level + gradient_x * x - gradient_y * y[:, None])
     photons = photons + rng.poisson(stray.clip(min=0))
     share = (photons / _peak(photons)).clip(max=world.saturation) ** world.gamma
     if world.compression:

@@ -126,9 +126,9 @@ def camera_blur(level: int, names: Sequence[str], rng: np.random.Generator) -> D
 
 
 def background(level: int, names: Sequence[str], rng: np.random.Generator) -> Drawn:
-    """Never darker than black."""
+    """Never darker than black on a target of 7 m."""
     lift = (0.0015, 0.003, 0.006)[level]
-    x, y = np.round(lift * rng.uniform(-0.5, 0.5, 2), 5).tolist()
+    x, y = np.round(lift * rng.uniform(-0.5, 0.5, 2) / 3.5, 6).tolist()
     return {"stray": (lift, x, y)}, {"level": lift, "gradient_x": x, "gradient_y": y}
 
 
