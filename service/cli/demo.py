@@ -207,8 +207,8 @@ def _forecast(
         surface=measured,
         latitude_deg=float(folder.plant.origin[0]),
     )
-    center = center_of_mass(traced.flux, (wide, wide))
-    return flux_window(traced.flux, (wide, wide), center, FLUX_WINDOW, FLUX_SIZE)
+    center = center_of_mass(traced.camera_view, (wide, wide))
+    return flux_window(traced.camera_view, (wide, wide), center, FLUX_WINDOW, FLUX_SIZE)
 
 
 def _draw(

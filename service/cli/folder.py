@@ -287,7 +287,7 @@ def forecast_measurement(
     surface: tuple[Array, int] | None,
     effects: Sequence[Effect] = (),
 ) -> compute.Forecast:
-    """Flux over the whole target of a measurement, with ``effects`` besides those that are declared.
+    """Light over a measurement's whole target, and what the camera shows of it; ``effects`` add to the declared ones.
 
     The heliostat is aligned by its measured spot; without one by its motors; without those at the target's centre.
     """
@@ -318,7 +318,7 @@ def compare(
     plane = folder.plant.targets[measurement.target]
     size = (plane.width, plane.height)
     window = window or accuracy_window([gray], [size], spill=SPILL, widest=WIDEST)
-    return asdict(compare_on_target(gray, traced.flux, size, window))
+    return asdict(compare_on_target(gray, traced.camera_view, size, window))
 
 
 def forecast_folder(
@@ -379,7 +379,7 @@ def _forecast_entry(
     traced = forecast_measurement(folder, measurement, surface, effects)
     path = out / measurement.heliostat / f"{measurement.identifier}-forecast.npz"
     path.parent.mkdir(parents=True, exist_ok=True)
-    np.savez_compressed(path, flux=traced.flux)
+    np.savez_compressed(path, flux=traced.flux, camera_view=traced.camera_view)
     entry: dict[str, Any] = {"target": measurement.target, "peak_w_m2": traced.peak, "power_w": traced.power}
     comparison = compare(folder, measurement, traced, window)
     return entry if comparison is None else {**entry, **comparison}

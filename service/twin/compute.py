@@ -91,11 +91,12 @@ def render(
 
 @dataclass(frozen=True, eq=False)
 class Forecast:
-    """Flux of one heliostat on a plane.
+    """Flux of one heliostat on a plane: light, and what a camera would show of it.
 
     Attributes
     ----------
     flux : (rows, columns) float32 [W/m2]
+        Light, whatever the camera.
     center_of_mass : (2,) [m]
         Right and up of the plane's centre.
     peak : float [W/m2]
@@ -103,12 +104,16 @@ class Forecast:
         On the imaged part of the plane.
     model_version : str
         Version of the plant's model and the effects it holds.
+    camera_view : (rows, columns) float32
+        What the camera shows of that light, by the model's effects: the light itself where it holds none of a camera.
+        This is what photographs are held against.
     """
 
     flux: NDArray[np.float32]
     center_of_mass: Array
     peak: float
     power: float
+    camera_view: NDArray[np.float32]
     model_version: str = MODEL_VERSION
 
 
@@ -128,7 +133,7 @@ def forecast(
     effects: Sequence[Effect] = (),
     latitude_deg: float,
 ) -> Forecast:
-    """Trace the flux of a heliostat on a plane, as its model, with its effects, expects a camera to show it.
+    """Trace the flux of a heliostat on a plane by its model, with its effects.
 
     Parameters
     ----------
@@ -170,17 +175,28 @@ def forecast(
     view = View(*resolution, window=window, samples=SAMPLES, padding=0.5, cones="facet")
     aligned = align([shot], effects, latitude_deg=latitude_deg, dtype=torch.float64)
     with torch.no_grad():
-        traced = aligned.images(optics, effects, view)
+        light = aligned.flux(optics, effects, view)
+        flux, shown = (_smooth(image[0]) for image in (light, aligned.camera_images(light, effects, view)))
         center = central_rays(aligned.groups[0].scene, SAMPLES).spot
-    # Frequency space leaves ripples of some 1e-5 of the peak below zero.
-    flux = traced[0].clamp(min=0).float().numpy()
     return Forecast(
         flux=flux,
         center_of_mass=center[0].numpy(),
         peak=float(flux.max()),
         power=float(flux.sum(dtype=np.float64) * np.prod(view.of(plane).pixel)),
+        camera_view=shown,
         model_version=model_version(effects),
     )
+
+
+def _smooth(image: torch.Tensor) -> NDArray[np.float32]:
+    """An image (rows, columns) without the ripples of some 1e-5 of its peak that frequency space leaves below zero.
+
+    The energy stays, so that no forecast holds more power than the mirror reflects.
+    """
+    positive = image.clamp(min=0)
+    total = positive.sum()
+    kept = positive * (image.sum().clamp(min=0) / total) if total > 0 else positive
+    return np.asarray(kept.float().numpy())
 
 
 def superpose(

@@ -4,14 +4,16 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from sqlalchemy.orm import Session
 
-from model.effects import light_effects
 from model.errors import InvalidInputError
+from model.forecast import images_under
 from model.frames import sun_direction
 from model.images import FLUX_SUM
 from model.plant import Receiver, TargetPlane
+from model.tracing import Window
 from service import store
 from service.base.arrays import pack, plain, unpack
 from service.base.faults import ConflictError, NotFoundError
@@ -19,7 +21,7 @@ from service.store.tables import ForecastRow, HeliostatRow, SurfaceRow
 from service.twin.compute import Forecast
 from service.twin.evidence import Twin, heights_of, load_twin
 from service.twin.runtime import Runtime
-from service.twin.versions import PlantModel
+from service.twin.versions import PlantModel, get_model
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,14 +149,30 @@ def _trace(
             resolution=request.resolution,
             window=request.window,
             optics=replace(model.optics, dni=request.dni),
-            # A stored target is what the camera looks at; on any other plane there is only light.
-            effects=model.effects if request.plane is None else light_effects(model.effects),
+            effects=model.effects,
             latitude_deg=twin.origin[0],
         )
 
 
-def flux_of(row: ForecastRow) -> NDArray[np.float32]:
-    """The map in the unit that was asked for."""
-    flux = unpack(row.flux)["flux"]
+def camera_view(session: Session, row: ForecastRow) -> NDArray[np.float32]:
+    """What the camera would show of a forecast's light (rows, columns), by the model that it was made with.
+
+    Raises
+    ------
+    ConflictError
+        Where the light falls on no stored target, which a camera looks at.
+    """
+    if row.target_name is None:
+        raise ConflictError("view: a camera looks at stored targets; of any other plane there is only the light")
+    light = torch.as_tensor(unpack(row.flux)["flux"])
+    size = row.window_m or row.plane["width"], row.window_m or row.plane["height"]
+    effects = [e for e in get_model(session, int(row.model_version.partition(":")[0])).effects if e.stage == "image"]
+    with torch.no_grad():
+        return images_under(effects, light[None], Window(*size, *light.shape))[0].clamp(min=0).numpy()
+
+
+def flux_of(row: ForecastRow, flux: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
+    """The map, or ``flux`` in its place, in the unit that was asked for."""
+    flux = unpack(row.flux)["flux"] if flux is None else flux
     total = float(flux.sum(dtype=np.float64))
     return flux * np.float32(FLUX_SUM / total) if row.normalised and total > 0 else flux

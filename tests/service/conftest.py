@@ -212,7 +212,7 @@ class FakeOperations:
             raise UnreachableError("the aim point lies behind the mirror")
         flux = np.full(options["resolution"], 2.0, dtype=np.float32)
         center = np.array([0.1, 0.2])
-        return Forecast(flux=flux, center_of_mass=center, peak=2.0, power=50.0, model_version="fake")
+        return Forecast(flux=flux, center_of_mass=center, peak=2.0, power=50.0, camera_view=flux, model_version="fake")
 
     def superpose(self, receiver: Any, tiles: Any, **options: Any) -> FleetFlux:
         self.fleets.append({"receiver": receiver, **options})

@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal, Self
 
 from fastapi import APIRouter, Body, Depends, Path, Query, Response, status
 from fastapi.responses import JSONResponse
+from numpy.typing import NDArray
 from pydantic import BaseModel, Discriminator, Field, Tag, model_validator
 
 from service import store
@@ -15,7 +16,7 @@ from service.drawing.pictures import flux_picture
 from service.jobs.asking import ask_for
 from service.jobs.kinds.field_forecasts import FleetForecastIn
 from service.store.tables import ForecastRow
-from service.twin.forecast import ForecastRequest, flux_of, make_forecast
+from service.twin.forecast import ForecastRequest, camera_view, flux_of, make_forecast
 from service.web.answers import formats
 from service.web.answers.formats import MediaType, json_answer, maps_answer
 from service.web.answers.openapi import arrays, problems
@@ -106,9 +107,9 @@ def forecast_summary(row: ForecastRow) -> ForecastSummary:
     )
 
 
-def forecast_answer(row: ForecastRow, media_type: str) -> Response:
-    """A forecast as the client wants it."""
-    flux = flux_of(row)
+def forecast_answer(row: ForecastRow, media_type: str, shown: NDArray[Any] | None = None) -> Response:
+    """A forecast as the client wants it, with ``shown`` (rows, columns) in place of its light."""
+    flux = flux_of(row, shown)
     if media_type == formats.JSON:
         return json_answer(forecast_summary(row), flux=flux)
     unit = "flux [% per pixel]" if row.normalised else "W/m²"
@@ -204,11 +205,19 @@ def list_forecasts(
     return page(items, limit)
 
 
-@router.get("/{number}", responses={**problems(404, 406), **arrays("`flux` (rows, columns).")}, dependencies=[READ])
+@router.get(
+    "/{number}", responses={**problems(404, 406, 409), **arrays("`flux` (rows, columns).")}, dependencies=[READ]
+)
 def get_forecast(
-    number: Annotated[Version, Path(description="Id of the forecast.")], runtime: RuntimeDep, media_type: MediaType
+    number: Annotated[Version, Path(description="Id of the forecast.")],
+    runtime: RuntimeDep,
+    media_type: MediaType,
+    view: Annotated[
+        Literal["light", "camera"], Query(description="The light, or what the model's camera would show of it.")
+    ] = "light",
 ) -> Response:
-    """A forecast with its map."""
+    """A forecast with its map: light, or what a photograph of it would be held against."""
     with runtime.database.reading() as session:
         row = store.get_forecast(session, number)
-    return forecast_answer(row, media_type)
+        shown = camera_view(session, row) if view == "camera" else None
+    return forecast_answer(row, media_type, shown)

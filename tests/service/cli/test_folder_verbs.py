@@ -75,6 +75,24 @@ def test_forecast_reaches_the_goal_on_real_images(stj, tmp_path):
     assert "AD37" in report["skipped"]
 
 
+SHOULDER = {"name": "camera_shoulder", "parameters": {"compression": 2.0}}
+
+
+@pytest.mark.parametrize("effects", [[], [SHOULDER], [{"name": "sun_shape", "parameters": {"circumsolar_ratio": 0.4}}]])
+def test_no_forecast_holds_more_power_than_the_mirror_reflects(made_plant, tmp_path, effects):
+    """Whatever the camera: an adopted shoulder made 8.8 kW out of a mirror of 8.2 m2 under 1000 W/m2."""
+    (tmp_path / "effects.json").write_text(json.dumps({"effects": effects}))
+    report = succeeds("forecast", made_plant, "--out", tmp_path, "--effects", tmp_path / "effects.json")
+    folder = read_folder(made_plant)
+    for key, entry in report["measurements"].items():
+        _, _, half_sizes = folder.plant.heliostats[key.split("/")[0]].facet_frames
+        area = 4 * half_sizes.prod(axis=1).sum()
+        assert 0.5 * area < entry["power_w"] / 1000 <= area
+        with np.load(tmp_path / f"{key}-forecast.npz") as made:
+            assert made["flux"].dtype == np.float32
+            assert np.array_equal(made["flux"], made["camera_view"]) == (effects != [SHOULDER])
+
+
 def test_effects_of_a_studys_report_are_added_to_the_declared_ones(made_plant, tmp_path):
     sigma = {"sigma_mrad": {"value": 2.0, "ci95": [1.9, 2.1], "unit": "mrad"}}
     found = {"verdict": "effect", "effects": [{"name": "slope_error", "parameters": sigma}]}

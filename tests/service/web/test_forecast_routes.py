@@ -1,12 +1,14 @@
 """Forecasts over HTTP."""
 
 import io
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
+from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
+from service.store.models import put_declared
 from tests.service.conftest import FakeOperations, Post
 
 SUN = {"azimuth_deg": 0.0, "elevation_deg": 30.0}
@@ -59,6 +61,17 @@ def test_forecast_in_every_representation(client: TestClient):
     picture = client.get(path, headers={"Accept": "image/png"})
     assert picture.content.startswith(b"\x89PNG")
     assert client.get(path, headers={"Accept": "audio/*"}).status_code == 406
+
+
+def test_what_a_camera_would_show_is_a_view_of_its_own(client: TestClient):
+    database = cast(FastAPI, client.app).state.runtime.database
+    with database.writing() as session:
+        put_declared(session, {"effects": [{"name": "background", "parameters": {"level": 0.1}}]}, "tester")
+    path = f"/v1/forecasts/{ask(client, target='lower', resolution=32).json()['id']}"
+    light, shown = (client.get(f"{path}{view}").json()["flux"][0][0] for view in ("", "?view=camera"))
+    assert (light, shown) == (2.0, pytest.approx(2.2))
+    refused = client.get(f"/v1/forecasts/{ask(client, plane=PLANE).json()['id']}?view=camera")
+    assert (refused.status_code, "stored targets" in refused.json()["detail"]) == (409, True)
 
 
 def test_surface_of_a_forecast(client: TestClient, post: Post, operations: FakeOperations):
