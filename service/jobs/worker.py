@@ -85,7 +85,7 @@ class Worker:
             return
         settings, deleted = self.runtime.settings, 0
         for what, days, purge in (
-            ("jobs", settings.job_retention_days, queue.purge),
+            ("jobs", settings.job_retention_days, retention.prune_jobs),
             ("forecasts", settings.forecast_retention_days, retention.prune_forecasts),
             ("audit entries", settings.audit_retention_days, retention.prune_audit),
         ):
