@@ -16,7 +16,6 @@ from service.twin.runtime import Runtime
 from tests.service.conftest import FakeOperations
 from tests.service.store.test_statements import fill
 
-
 _RETENTIONS = ("job_retention_days", "forecast_retention_days", "audit_retention_days")
 
 
