@@ -82,6 +82,12 @@ class Settings(BaseSettings):
     most_connections: int = Field(
         default=1000, ge=10, le=100_000, description="Open connections beyond which requests are answered 503."
     )
+    most_watchers: int = Field(
+        default=200, ge=1, le=10_000, description="Jobs that are followed at a time (event streams); 503 beyond."
+    )
+    most_watchers_of_key: int = Field(
+        default=50, ge=1, le=10_000, description="Those of one key, or of all without a key; 429 beyond."
+    )
     parallel_computations: int = Field(
         default=2, ge=1, le=64, description="Measurements, predictions and tracings at a time."
     )

@@ -20,6 +20,7 @@ from service.twin.accuracy import ComparisonBook
 from service.twin.field import FieldBook
 from service.twin.runtime import Operations, Runtime
 from service.web.answers import openapi, problems
+from service.web.answers.watching import Watchers
 from service.web.api import jobs
 from service.web.door import security
 from service.web.door.turns import Turns
@@ -72,6 +73,7 @@ def create_app(settings: Settings, operations: Operations | None = None, kinds: 
             await to_thread.run_sync(require_fit, settings, runtime.database)
             app.state.runtime = runtime.for_requests()
             app.state.field = FieldBook(runtime)
+            app.state.watchers = Watchers(runtime)
             app.state.comparisons = ComparisonBook(runtime)
             workers = Workers(runtime, kinds, settings.job_workers)
             workers.start()
