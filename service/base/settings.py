@@ -103,6 +103,12 @@ class Settings(BaseSettings):
     job_lease_s: float = Field(
         default=30.0, ge=0.5, le=3600, description="A worker that was silent for so long [s] has lost its job."
     )
+    job_silence_s: float = Field(
+        default=3600.0,
+        ge=0.5,
+        le=604_800,
+        description="A job that told nothing of itself for so long [s] hangs: its worker gives it up, and ends.",
+    )
     job_poll_s: float = Field(default=0.5, ge=0.05, le=60, description="How often workers look for jobs [s].")
     job_attempts: int = Field(default=3, ge=1, le=20, description="How often a job is tried before it has failed.")
     job_retry_s: float = Field(

@@ -1,7 +1,7 @@
 """A gate before the model: a few callers at a time, first come, first served."""
 
 import threading
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -22,6 +22,8 @@ class Gate:
         self._hurried = 0
         self._changed = threading.Condition()
         self._line: deque[object] = deque()
+        self._held_by: Counter[int] = Counter()
+        self._forgotten: Counter[int] = Counter()
 
     @contextmanager
     def turn(self, patience_s: float | None = None) -> Iterator[None]:
@@ -43,6 +45,7 @@ class Gate:
                 if not self._changed.wait_for(lambda: self._free and self._line[0] is ticket, patience_s):
                     raise BusyError("the model is busy; ask again as Retry-After says")
                 self._free -= 1
+                self._held_by[threading.get_ident()] += 1
             finally:
                 self._hurried -= patience_s is not None
                 self._line.remove(ticket)
@@ -53,9 +56,22 @@ class Gate:
             raise BusyError("too many requests wait for the model; ask again as Retry-After says")
 
     def leave(self) -> None:
-        """Give the slot back."""
+        """Give the slot back; nothing where others have it already, because this thread was forgotten."""
+        thread = threading.get_ident()
         with self._changed:
+            if self._forgotten[thread]:
+                self._forgotten -= Counter([thread])
+                return
+            self._held_by -= Counter([thread])
             self._free += 1
+            self._changed.notify_all()
+
+    def forget(self, thread: int) -> None:
+        """Give back what a thread, by its identifier, holds: it hangs, and may never do that itself."""
+        with self._changed:
+            held = self._held_by.pop(thread, 0)
+            self._forgotten[thread] += held
+            self._free += held
             self._changed.notify_all()
 
     def pause(self) -> None:
