@@ -7,6 +7,9 @@ from contextlib import contextmanager
 
 from service.base.faults import BusyError
 
+STOPPING = "the service is stopping; send the same again when it is back"
+"""What requests are told that a stop ends."""
+
 
 class Gate:
     """Lets ``slots`` callers in at a time, in the order in which they came.
@@ -20,6 +23,7 @@ class Gate:
         self._free = slots
         self._most_waiting = most_waiting
         self._hurried = 0
+        self._is_closed = False
         self._changed = threading.Condition()
         self._line: deque[object] = deque()
         self._held_by: Counter[int] = Counter()
@@ -42,8 +46,9 @@ class Gate:
             self._line.append(ticket)
             self._hurried += patience_s is not None
             try:
-                if not self._changed.wait_for(lambda: self._free and self._line[0] is ticket, patience_s):
+                if not self._changed.wait_for(lambda: self._may_enter(ticket, patience_s), patience_s):
                     raise BusyError("the model is busy; ask again as Retry-After says")
+                self.refuse_closed(patience_s)
                 self._free -= 1
                 self._held_by[threading.get_ident()] += 1
             finally:
@@ -54,6 +59,20 @@ class Gate:
     def _refuse_crowds(self, patience_s: float | None) -> None:
         if patience_s is not None and self._hurried >= self._most_waiting:
             raise BusyError("too many requests wait for the model; ask again as Retry-After says")
+
+    def _may_enter(self, ticket: object, patience_s: float | None) -> bool:
+        return (self._free > 0 and self._line[0] is ticket) or (self._is_closed and patience_s is not None)
+
+    def close(self) -> None:
+        """Let nobody in any more who has little patience: they are told to ask again, those that wait at once."""
+        with self._changed:
+            self._is_closed = True
+            self._changed.notify_all()
+
+    def refuse_closed(self, patience_s: float | None) -> None:
+        """BusyError for those whom `close` turned away."""
+        if self._is_closed and patience_s is not None:
+            raise BusyError(STOPPING)
 
     def leave(self) -> None:
         """Give the slot back; nothing where others have it already, because this thread was forgotten."""

@@ -25,7 +25,13 @@ from service.web.api import jobs
 from service.web.door import security
 from service.web.door.turns import Turns
 from service.web.metrics import registry
-from service.web.middleware import BodyLimitMiddleware, DoorMiddleware, RequestIdMiddleware, SecurityHeadersMiddleware
+from service.web.middleware import (
+    BodyLimitMiddleware,
+    DoorMiddleware,
+    RequestIdMiddleware,
+    SecurityHeadersMiddleware,
+    StoppingMiddleware,
+)
 
 _DESCRIPTION = (
     "Post the target photographs of a solar tower, read back each heliostat's flux and surface, and forecast the "
@@ -112,6 +118,7 @@ def create_app(settings: Settings, operations: Operations | None = None, kinds: 
     security.require_declared_roles(app)
     problems.install(app)
     openapi.install(app)
+    app.add_middleware(StoppingMiddleware)
     app.add_middleware(BodyLimitMiddleware, settings=settings)
     app.add_middleware(DoorMiddleware, settings=settings)
     app.add_middleware(SecurityHeadersMiddleware)

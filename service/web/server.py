@@ -17,8 +17,9 @@ from service.base.settings import Settings
 from service.store.database import Database
 from service.web.app import create_app, require_fit
 
-# Seconds that requests under way get to finish when the service is told to stop.
-_GRACE_S = 30
+# Seconds that answers which have begun get to be sent when the service is told to stop; all others are answered before
+# (`service.web.middleware.StoppingMiddleware`). Jobs get 20 s after that, and supervisors usually wait 30 to 40.
+_GRACE_S = 10
 
 # Seconds that an idle connection stays open: longer than clients and proxies usually keep one for their next request.
 _KEEP_ALIVE_S = 75
