@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 
 import httpx
@@ -87,12 +88,11 @@ def test_requests_at_the_model_are_told_to_come_again_when_the_service_stops(tmp
         "PYTHONPATH": os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")])),
     }
     command = [sys.executable, "-c", _SLOW]
-    with (
-        subprocess.Popen(
-            command, cwd=tmp_path, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE
-        ) as process,
-        ThreadPoolExecutor(3) as threads,
-    ):
+    with ExitStack() as held:
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
+        process = held.enter_context(subprocess.Popen(command, cwd=tmp_path, env=environment, **pipes))
+        threads = held.enter_context(ThreadPoolExecutor(3))
+        held.callback(process.kill)
         assert process.stdout is not None
         base = f"http://127.0.0.1:{port}"
         _wait(f"{base}/livez", process)
@@ -116,7 +116,7 @@ def test_requests_at_the_model_are_told_to_come_again_when_the_service_stops(tmp
             assert answer.headers["Content-Type"] == "application/problem+json"
             assert answer.headers["X-Request-ID"] == answer.json()["request_id"]
         assert any("stopping" in answer.json()["detail"] for answer in answers)
-        process.communicate(timeout=60)
+        process.wait(60)
         assert time.monotonic() - started < 40
     with sqlite3.connect(tmp_path / "data" / "heliotwin.sqlite") as store:
         assert store.execute("SELECT count(*) FROM surfaces").fetchone() == (0,)
