@@ -78,7 +78,7 @@ WAITING_SECONDS = Histogram(
 
 JOB_ATTEMPTS = Counter(
     "heliotwin_job_attempts",
-    "Attempts at jobs by how they ended: done, failed, retried, cancelled, released, lost.",
+    "Attempts at jobs by how they ended: done, failed, retried, cancelled, released, lost, stuck.",
     ["kind", "outcome"],
     registry=PROCESS,
 )

@@ -82,6 +82,12 @@ class Settings(BaseSettings):
     most_connections: int = Field(
         default=1000, ge=10, le=100_000, description="Open connections beyond which requests are answered 503."
     )
+    most_watchers: int = Field(
+        default=200, ge=1, le=10_000, description="Jobs that are followed at a time (event streams); 503 beyond."
+    )
+    most_watchers_of_key: int = Field(
+        default=50, ge=1, le=10_000, description="Those of one key, or of all without a key; 429 beyond."
+    )
     parallel_computations: int = Field(
         default=2, ge=1, le=64, description="Measurements, predictions and tracings at a time."
     )
@@ -96,6 +102,12 @@ class Settings(BaseSettings):
     )
     job_lease_s: float = Field(
         default=30.0, ge=0.5, le=3600, description="A worker that was silent for so long [s] has lost its job."
+    )
+    job_silence_s: float = Field(
+        default=3600.0,
+        ge=0.5,
+        le=604_800,
+        description="A job that told nothing of itself for so long [s] hangs: its worker gives it up, and ends.",
     )
     job_poll_s: float = Field(default=0.5, ge=0.05, le=60, description="How often workers look for jobs [s].")
     job_attempts: int = Field(default=3, ge=1, le=20, description="How often a job is tried before it has failed.")

@@ -27,6 +27,7 @@ from service.base.choices import Method
 from service.base.progress import Progress, quiet
 from service.sources.decode import decode_image
 from service.sources.documents import IMAGE_KINDS, Measurement, optics_to_json
+from service.sources.files import require_regular
 from service.sources.folder import MeasurementFolder, measured_heights, read_surface
 from service.twin import compute
 from service.twin.evidence import Evidence, choose
@@ -51,7 +52,7 @@ def write_json(path: Path, content: Any) -> None:
 def read_image(path: Path) -> NDArray[np.uint8]:
     """Decode an image file; a file that is no image is named."""
     try:
-        return decode_image(path.read_bytes())
+        return decode_image(require_regular(path).read_bytes())
     except InvalidInputError as error:
         raise InvalidInputError(f"{path}: {error}") from None
 

@@ -68,7 +68,8 @@ def main() -> None:
         _fail(error, 2)
     except ValidationError as error:
         first = error.errors()[0]
-        _fail(f"setting {'.'.join(map(str, first['loc'])) or 'combination'}: {first['msg']}", 2)
+        said = first["msg"].removeprefix("Value error, ")
+        _fail(f"setting {'.'.join(map(str, first['loc'])) or 'combination'}: {said}", 2)
     except (ModelError, ServiceError, OSError) as error:
         _fail(error, 1)
     except _database_errors() as error:

@@ -41,8 +41,8 @@ class Context:
     """A handler's view of its job.
 
     A handler calls `report` every second or so: that is where it learns, by an exception that it lets pass, that the
-    job was cancelled, lost or put back. What must happen once although the job may be started again is written in one
-    transaction together with `keep`.
+    job was cancelled, lost or put back; and it is its sign of life, without which it is given up in the end. What must
+    happen once although the job may be started again is written in one transaction together with `keep`.
     """
 
     runtime: Runtime
@@ -52,9 +52,16 @@ class Context:
     cancelled: threading.Event = field(default_factory=threading.Event)
     lost: threading.Event = field(default_factory=threading.Event)
     reported_s: float = -math.inf
+    alive_s: float = field(default_factory=time.monotonic)
+
+    @property
+    def silent_s(self) -> float:
+        """How long ago the last sign of life was [s]."""
+        return time.monotonic() - self.alive_s
 
     def check(self) -> None:
         """Raise `LeaseLostError`, `CancelRequestedError` or `WorkerStoppingError` where the work shall end."""
+        self.alive_s = time.monotonic()
         if self.lost.is_set():
             raise queue.LeaseLostError(f"job {self.lease.job_id}")
         if self.cancelled.is_set():
@@ -80,6 +87,7 @@ class Context:
 
     def keep(self, session: Session, name: str, result: dict[str, Any]) -> None:
         """Note a part as done in the transaction that did it; LeaseLostError undoes both."""
+        self.alive_s = time.monotonic()
         queue.keep_step(session, self.lease, name, result)
 
 

@@ -1,5 +1,6 @@
 """Workers: threads that take jobs, run their handlers, and see that each ends exactly once."""
 
+import itertools
 import logging
 import math
 import os
@@ -57,19 +58,28 @@ def _failed(lease: queue.Lease, reason: str) -> _Ending:
 
 
 class Worker:
-    """Takes one job after the other until it is told to stop."""
+    """Takes one job after the other until it is told to stop, or hangs; ``on_stuck`` is told then."""
 
-    def __init__(self, runtime: Runtime, kinds: Kinds, name: str, stopping: threading.Event) -> None:
+    def __init__(
+        self,
+        runtime: Runtime,
+        kinds: Kinds,
+        name: str,
+        stopping: threading.Event,
+        on_stuck: Callable[[], None] = lambda: None,
+    ) -> None:
         self.runtime = runtime
         self.kinds = kinds
         self.name = name
         self.stopping = stopping
+        self._on_stuck = on_stuck
+        self._stuck = threading.Event()
         self._random = random.Random(name)
         self._purged_s = -math.inf
 
     def run(self) -> None:
         """Work; a database that is away is waited for."""
-        while not self.stopping.is_set():
+        while not (self.stopping.is_set() or self._stuck.is_set()):
             try:
                 self._purge()
                 worked = self.work()
@@ -85,7 +95,7 @@ class Worker:
             return
         settings, deleted = self.runtime.settings, 0
         for what, days, purge in (
-            ("jobs", settings.job_retention_days, queue.purge),
+            ("jobs", settings.job_retention_days, retention.prune_jobs),
             ("forecasts", settings.forecast_retention_days, retention.prune_forecasts),
             ("audit entries", settings.audit_retention_days, retention.prune_audit),
         ):
@@ -113,7 +123,7 @@ class Worker:
     def _attempt(self, context: Context, job: JobRow) -> str:
         """Work at the job, store how that ended, and name it."""
         try:
-            with self._heart(context):
+            with self._heart(context, job):
                 ending = self._ending(context, job)
                 self._store(context, ending.write)
                 return ending.outcome
@@ -130,10 +140,11 @@ class Worker:
             return queue.claim(session, self.kinds, self.name, settings.job_lease_s, settings.job_attempts)
 
     @contextmanager
-    def _heart(self, context: Context) -> Iterator[None]:
-        """Renew the lease from a thread of its own, until the block ends."""
+    def _heart(self, context: Context, job: JobRow) -> Iterator[None]:
+        """Renew the lease from a thread of its own, until the block ends or the work in it gives no sign of life."""
         ended = threading.Event()
-        thread = threading.Thread(target=self._beat, args=(context, ended), name=f"{self.name}-heart", daemon=True)
+        arguments = (context, job, ended)
+        thread = threading.Thread(target=self._beat, args=arguments, name=f"{self.name}-heart", daemon=True)
         thread.start()
         try:
             yield
@@ -141,18 +152,41 @@ class Worker:
             ended.set()
             thread.join()
 
-    def _beat(self, context: Context, ended: threading.Event) -> None:
-        lease_s = self.runtime.settings.job_lease_s
-        while not ended.wait(lease_s / 3):
-            try:
-                with self.runtime.database.writing() as session:
-                    if queue.renew(session, context.lease, lease_s):
-                        context.cancelled.set()
-            except queue.LeaseLostError:
-                context.lost.set()
+    def _beat(self, context: Context, job: JobRow, ended: threading.Event) -> None:
+        settings = self.runtime.settings
+        while not ended.wait(min(settings.job_lease_s, settings.job_silence_s) / 3):
+            if context.silent_s > settings.job_silence_s:
+                self._give_up(context, job)
                 return
-            except SQLAlchemyError as error:  # the next beat may succeed before the lease runs out
-                logger.warning("%s: no heartbeat of job %d: %s", self.name, context.lease.job_id, error)
+            if not context.lost.is_set():
+                self._renew(context)
+
+    def _renew(self, context: Context) -> None:
+        lease_s = self.runtime.settings.job_lease_s
+        try:
+            with self.runtime.database.writing() as session:
+                if queue.renew(session, context.lease, lease_s):
+                    context.cancelled.set()
+        except queue.LeaseLostError:
+            context.lost.set()
+        except SQLAlchemyError as error:  # the next beat may succeed before the lease runs out
+            logger.warning("%s: no heartbeat of job %d: %s", self.name, context.lease.job_id, error)
+
+    def _give_up(self, context: Context, job: JobRow) -> None:
+        """End the attempt from outside: that this thread lives proves nothing of the one that works."""
+        context.lost.set()
+        why = f"no sign of life for {self.runtime.settings.job_silence_s:g} s"
+        logger.error("%s: job %d (%s) hangs, %s in attempt %d", self.name, job.id, job.kind, why, job.attempts)
+        try:
+            with self.runtime.database.writing() as session:
+                self._again(context.lease, job.attempts, why).write(session)
+        except queue.LeaseLostError:
+            logger.warning("%s: job %d went to another worker", self.name, job.id)
+        except SQLAlchemyError as error:  # the work may hold SQLite's lock
+            logger.error("%s: job %d is left to its lease: %s", self.name, job.id, error)
+        JOB_ATTEMPTS.labels(job.kind, "stuck").inc()
+        self._stuck.set()
+        self._on_stuck()
 
     def _ending(self, context: Context, job: JobRow) -> _Ending:
         """Run the handler; how that ended."""
@@ -173,11 +207,11 @@ class Worker:
             return _failed(lease, "its payload is not one that this version takes")
         except Exception as error:  # a handler's fault must end with its job, not with the worker
             logger.exception("%s: job %d failed in attempt %d", self.name, job.id, job.attempts)
-            return self._after_fault(lease, job.attempts, error)
+            return self._again(lease, job.attempts, type(error).__name__)
 
-    def _after_fault(self, lease: queue.Lease, attempts: int, error: Exception) -> _Ending:
-        """Try again later, or give up; the reason names the fault's type only, the log has the rest."""
-        settings, fault = self.runtime.settings, type(error).__name__
+    def _again(self, lease: queue.Lease, attempts: int, fault: str) -> _Ending:
+        """Try again later, or give up; ``fault`` names no more than its type, the log has the rest."""
+        settings = self.runtime.settings
         if attempts >= settings.job_attempts:
             return _failed(
                 lease,
@@ -192,6 +226,7 @@ class Worker:
         reason = "its result cannot be stored; the worker's log has more"
         failed = partial(queue.fail, lease=context.lease, reason=reason)
         while True:
+            context.alive_s = time.monotonic()  # a database that is away makes nothing hang
             try:
                 with self.runtime.database.writing() as session:
                     write(session)
@@ -208,23 +243,40 @@ class Worker:
 
 
 class Workers:
-    """Some workers as threads of this process."""
+    """Some workers as threads of this process.
 
-    def __init__(self, runtime: Runtime, kinds: Kinds, count: int) -> None:
+    A thread that hangs cannot be ended. ``on_stuck`` is told of it; without that another thread takes its place, also
+    before the model, and it keeps its memory and whatever else it holds until the process ends.
+    """
+
+    def __init__(self, runtime: Runtime, kinds: Kinds, count: int, on_stuck: Callable[[], None] | None = None) -> None:
         self.stopping = threading.Event()
         self._runtime = runtime
-        name = f"{socket.gethostname()[:48]}-{os.getpid()}"
-        self._threads = [
-            threading.Thread(
-                target=Worker(runtime, kinds, f"{name}-{number}", self.stopping).run, name=f"job-{number}", daemon=True
-            )
-            for number in range(count)
-        ]
+        self._kinds = kinds
+        self._count = count
+        self._on_stuck = on_stuck
+        self._numbers = itertools.count()
+        self._threads: dict[int, threading.Thread] = {}
 
     def start(self) -> None:
         """Begin to take jobs."""
-        for thread in self._threads:
-            thread.start()
+        for _ in range(self._count):
+            self._start_one()
+
+    def _start_one(self) -> None:
+        number = next(self._numbers)
+        name = f"{socket.gethostname()[:48]}-{os.getpid()}-{number}"
+        on_stuck = self._on_stuck or partial(self._replace, number)
+        worker = Worker(self._runtime, self._kinds, name, self.stopping, on_stuck)
+        self._threads[number] = threading.Thread(target=worker.run, name=f"job-{number}", daemon=True)
+        self._threads[number].start()
+
+    def _replace(self, number: int) -> None:
+        stuck = self._threads.pop(number)
+        assert stuck.ident is not None
+        self._runtime.gate.forget(stuck.ident)
+        logger.error("another thread takes the place of %s; what that one holds it keeps until a restart", stuck.name)
+        self._start_one()
 
     def stop(self) -> None:
         """Take no more jobs and wait a while for those under way to be put back.
@@ -232,14 +284,16 @@ class Workers:
         One that does not report in time is left to its lease.
         """
         self.stopping.set()
-        self._runtime.job_came.release(max(1, len(self._threads)))  # wakes those that wait for work
+        self._runtime.job_came.release(max(1, self._count))  # wakes those that wait for work
         until = time.monotonic() + _GRACE_S
-        for thread in self._threads:
+        for thread in list(self._threads.values()):
             thread.join(max(0.0, until - time.monotonic()))
 
 
 def work(settings: Settings, kinds: Kinds, operations: Operations | None = None) -> None:
     """Work at the store's jobs, ``job_workers`` at a time, until SIGTERM or SIGINT; one under way is put back.
+
+    Where a job hangs the process ends by exit code 1, so that its supervisor starts it again: a thread cannot be ended.
 
     Raises
     ------
@@ -253,15 +307,25 @@ def work(settings: Settings, kinds: Kinds, operations: Operations | None = None)
     memory.limit()
     logs.set_up(settings)
     telemetry.set_up(settings, "heliotwin-worker")
+    stopping, stuck = threading.Event(), threading.Event()
+
+    def on_stuck() -> None:
+        stuck.set()
+        stopping.set()
+
     runtime = Runtime.from_settings(settings, operations)
     try:
         runtime.database.require_current()
-        workers, stopping = Workers(runtime, kinds, settings.job_workers), threading.Event()
+        workers = Workers(runtime, kinds, settings.job_workers, on_stuck)
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: stopping.set())
         with listening(settings, PROCESS):
             workers.start()
             stopping.wait()
             workers.stop()
+        if stuck.is_set():
+            logger.critical("a job hangs and cannot be ended: this process ends, start it again")
+            logging.shutdown()
+            os._exit(1)  # an ordinary end would wait for threads that the job may have started
     finally:
         runtime.close()

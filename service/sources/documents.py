@@ -20,6 +20,7 @@ from model.mount import LinearActuator, Mount
 from model.plant import Cylinder, Facet, Heliostat, Plant, TargetPlane
 from model.sunshape import SHAPES, SunShape
 from model.tracing import Optics
+from service.sources.files import require_regular
 from service.sources.photograph import Photograph
 
 Array = NDArray[np.float64]
@@ -115,13 +116,9 @@ def _number(data: Any, where: str, *keys: str | int) -> float:
 
 
 def read_json(path: Path) -> Any:
-    """Parsed JSON of a file; one that is missing, no regular file (a pipe is waited for) or not JSON is named."""
-    if path.exists() and not path.is_file():
-        raise InvalidInputError(f"{path}: no regular file")
+    """Parsed JSON of a file; one that is missing, no regular file, too large or not JSON is named."""
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InvalidInputError(f"{path}: no such file") from None
+        return json.loads(require_regular(path).read_text(encoding="utf-8"))
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise InvalidInputError(f"{path}: not valid JSON ({error})") from None
 

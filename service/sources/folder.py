@@ -19,6 +19,7 @@ from model.surface import control_points, fit_heights, heights
 from model.tracing import Optics
 from service.base.discovery import modules_of
 from service.sources.documents import Array, Measurement, get, parse_declared, read_json
+from service.sources.files import require_regular
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,8 +71,8 @@ def read_surface(root: Path, heliostat: Heliostat) -> tuple[Array, int] | None:
     """Control points (F, I, J, 3) [m] and spline degree from ``root/H/Deflectometry``, None where there are none."""
     folder = root / heliostat.name / "Deflectometry"
     spline = folder / f"{heliostat.name}-nurbs-surface.npz"
-    if spline.is_file():
-        with np.load(spline) as data:
+    if spline.exists():
+        with np.load(require_regular(spline)) as data:
             if "control_points" not in data:
                 raise InvalidInputError(f"{spline}: 'control_points' is missing")
             points = np.asarray(data["control_points"], dtype=np.float64)
@@ -90,7 +91,7 @@ def read_deflectometry(file: Path, heliostat: Heliostat) -> Array:
     """Heights z (F, 8, 8) [m] fitted to the (n, 3) points and normals of each facet, in mirror coordinates."""
     centers, axes, half_sizes = heliostat.facet_frames
     facets = []
-    with h5py.File(file, "r") as data:
+    with h5py.File(require_regular(file), "r") as data:
         for index, (center, frame, half_size) in enumerate(zip(centers, axes, half_sizes, strict=True), start=1):
             where = f"{file}, facet{index}"
             points, normals = (
@@ -154,4 +155,4 @@ def read_declared(path: Path) -> tuple[Optics, tuple[Effect, ...]]:
 
 def declared_json(path: Path) -> Any:
     """What ``twin.json`` declares; an empty object where there is no such file."""
-    return get(read_json(path), str(path), "declared") if path.is_file() else {}
+    return get(read_json(path), str(path), "declared") if path.exists() else {}

@@ -16,7 +16,7 @@ from datetime import datetime, timedelta
 from typing import Any
 
 from sqlalchemy import Select, and_, delete, func, or_, select
-from sqlalchemy.orm import Session, undefer
+from sqlalchemy.orm import Session, defer, undefer
 
 from model.errors import InvalidInputError
 from service.base.faults import ConflictError, NotFoundError, TooManyError
@@ -107,6 +107,10 @@ def _find_repeated(
     return row
 
 
+# What may be megabytes; whoever reads a job in short and asks for one of them made a mistake.
+_IN_SHORT = (defer(JobRow.payload, raiseload=True), defer(JobRow.result, raiseload=True))
+
+
 def get_job(session: Session, number: int, arrays: bool = False) -> JobRow:
     """A job, with its ``arrays`` where wanted; NotFoundError where there is none."""
     query = select(JobRow).where(JobRow.id == number)
@@ -116,11 +120,23 @@ def get_job(session: Session, number: int, arrays: bool = False) -> JobRow:
     return row
 
 
+def get_summaries(session: Session, numbers: Collection[int]) -> Sequence[JobRow]:
+    """Those of these jobs that there are, in short: without payload and result."""
+    return session.scalars(select(JobRow).options(*_IN_SHORT).where(JobRow.id.in_(numbers))).all()
+
+
+def get_summary(session: Session, number: int) -> JobRow:
+    """A job in short; NotFoundError where there is none."""
+    for row in get_summaries(session, [number]):
+        return row
+    raise NotFoundError(f"there is no job {number}")
+
+
 def list_jobs(
     session: Session, limit: int, after: int | None = None, state: str | None = None, kind: str | None = None
 ) -> Sequence[JobRow]:
-    """Up to ``limit`` jobs, newest first, those older than job ``after``."""
-    query = select(JobRow).order_by(JobRow.id.desc()).limit(limit)
+    """Up to ``limit`` jobs in short, newest first, those older than job ``after``."""
+    query = select(JobRow).options(*_IN_SHORT).order_by(JobRow.id.desc()).limit(limit)
     for column, wanted in ((JobRow.state, state), (JobRow.kind, kind)):
         query = query if wanted is None else query.where(column == wanted)
     return session.scalars(query.where(JobRow.id < after) if after else query).all()
@@ -200,7 +216,7 @@ def lease_of(row: JobRow) -> Lease:
 def _held(session: Session, lease: Lease) -> JobRow:
     """The job, locked, while it bears the lease's token; LeaseLostError otherwise."""
     query = select(JobRow).where(JobRow.id == lease.job_id, JobRow.lease_token == lease.token)
-    row = session.scalar(query.with_for_update())
+    row = session.scalar(query.options(*_IN_SHORT).with_for_update())
     if row is None:
         raise LeaseLostError(f"job {lease.job_id}")
     return row

@@ -1,4 +1,4 @@
-"""What is kept for a time only: forecasts and the audit trail. A few rows at a time, oldest first."""
+"""What is kept for a time only: jobs, forecasts and the audit trail. A few rows at a time, oldest first."""
 
 from datetime import timedelta
 
@@ -8,6 +8,14 @@ from sqlalchemy.orm import Session
 from service.store import audit, queue
 from service.store.keys import RESERVED
 from service.store.tables import AuditRow, ForecastRow
+
+
+def prune_jobs(session: Session, age: timedelta, most: int = 500) -> int:
+    """Delete up to ``most`` jobs that ended longer than ``age`` ago, note that, and say how many."""
+    count = queue.purge(session, age, most)
+    if count:
+        audit.record(session, RESERVED, "jobs.pruned", f"{count} jobs", older_than_days=age / timedelta(days=1))
+    return count
 
 
 def prune_forecasts(session: Session, age: timedelta, most: int = 500) -> int:

@@ -14,6 +14,7 @@ from service import store
 from service.base.faults import ConflictError, TooLargeError, UnsupportedImageError
 from service.base.progress import Progress, quiet
 from service.sources.documents import IMAGE_KINDS, Measurement
+from service.sources.files import require_regular
 from service.sources.folder import MeasurementFolder, declared_json, measured_heights
 from service.store import audit
 from service.store.keys import RESERVED
@@ -30,13 +31,17 @@ def import_folder(
 ) -> dict[str, Any]:
     """Store the plant, its targets, and every heliostat with its images and measured surface, on behalf of ``actor``.
 
-    Returns how many of each were new, changed or there already; measurements without an image, and images that cannot
-    be read, are listed with the reason.
+    Returns how many of each were new, changed or there already; measurements without an image, and images and
+    measured surfaces that cannot be read, are listed with the reason.
     """
     counts, skipped = _put_plant(runtime, folder, actor), dict[str, str]()
     for name in folder.plant.heliostats:
         progress(name)
-        counts.update(_put_heliostat(runtime, folder, name, actor))
+        try:
+            measured = folder.measured_surface(name)
+        except InvalidInputError as error:
+            measured, skipped[f"{name} surface"] = None, str(error)
+        counts.update(_put_heliostat(runtime, folder, name, measured, actor))
         for measurement in folder.measurements(name, with_images=False):
             if not measurement.images:
                 skipped[measurement.key] = "no image"
@@ -64,9 +69,10 @@ def _put_plant(runtime: Runtime, folder: MeasurementFolder, actor: str) -> Count
     return counts
 
 
-def _put_heliostat(runtime: Runtime, folder: MeasurementFolder, name: str, actor: str) -> list[str]:
+def _put_heliostat(
+    runtime: Runtime, folder: MeasurementFolder, name: str, measured: tuple[Any, int] | None, actor: str
+) -> list[str]:
     """A heliostat with its measured surface, where it has one: one deed."""
-    measured = folder.measured_surface(name)
     with runtime.database.writing() as session:
         row, change = geometry.set_heliostat(session, actor, name, folder.properties[name])
         outcomes = [f"heliostats {change}"]
@@ -86,8 +92,7 @@ def _measured(heliostat: Heliostat, measured: tuple[Any, int]) -> store.NewSurfa
 
 def _put_image(runtime: Runtime, folder: MeasurementFolder, measurement: Measurement, kind: ImageKind) -> str:
     photograph = measurement.photograph(kind, folder.plant)
-    row, is_new = ingest(
-        runtime, measurement.heliostat, photograph, measurement.images[kind].read_bytes(), is_live=False
-    )
+    content = require_regular(measurement.images[kind]).read_bytes()
+    row, is_new = ingest(runtime, measurement.heliostat, photograph, content, is_live=False)
     state = "new" if is_new else "unchanged"
     return f"images {state}" if row.accepted else f"images {state}, refused"

@@ -143,6 +143,8 @@ class Runtime:
                 held.enter_context(self.gate.turn(self.patience_s))
             with meters.timed(meters.MODEL_SECONDS.labels(operation), operation):
                 yield self.operations
+            # The sender was told to send it again: what the request's thread finds too late is not kept beside that.
+            self.gate.refuse_closed(self.patience_s)
 
     def for_requests(self) -> "Runtime":
         """The same for whoever does not wait long: `computing` raises BusyError then."""

@@ -20,11 +20,18 @@ from service.twin.accuracy import ComparisonBook
 from service.twin.field import FieldBook
 from service.twin.runtime import Operations, Runtime
 from service.web.answers import openapi, problems
+from service.web.answers.watching import Watchers
 from service.web.api import jobs
 from service.web.door import security
 from service.web.door.turns import Turns
 from service.web.metrics import registry
-from service.web.middleware import BodyLimitMiddleware, DoorMiddleware, RequestIdMiddleware, SecurityHeadersMiddleware
+from service.web.middleware import (
+    BodyLimitMiddleware,
+    DoorMiddleware,
+    RequestIdMiddleware,
+    SecurityHeadersMiddleware,
+    StoppingMiddleware,
+)
 
 _DESCRIPTION = (
     "Post the target photographs of a solar tower, read back each heliostat's flux and surface, and forecast the "
@@ -72,6 +79,7 @@ def create_app(settings: Settings, operations: Operations | None = None, kinds: 
             await to_thread.run_sync(require_fit, settings, runtime.database)
             app.state.runtime = runtime.for_requests()
             app.state.field = FieldBook(runtime)
+            app.state.watchers = Watchers(runtime)
             app.state.comparisons = ComparisonBook(runtime)
             workers = Workers(runtime, kinds, settings.job_workers)
             workers.start()
@@ -110,6 +118,7 @@ def create_app(settings: Settings, operations: Operations | None = None, kinds: 
     security.require_declared_roles(app)
     problems.install(app)
     openapi.install(app)
+    app.add_middleware(StoppingMiddleware)
     app.add_middleware(BodyLimitMiddleware, settings=settings)
     app.add_middleware(DoorMiddleware, settings=settings)
     app.add_middleware(SecurityHeadersMiddleware)

@@ -1,8 +1,10 @@
-"""What stands before every route: a request id, a log line, headers for browsers, the door, a bound on the body."""
+"""What stands before every route: a request id, a log line, headers for browsers, the door, bounds on body and end."""
 
+import asyncio
 import logging
 import math
 import re
+import threading
 import time
 import uuid
 from http import HTTPStatus
@@ -18,6 +20,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from service.base import logs
 from service.base.meters import REQUEST_SECONDS, REQUESTS
 from service.base.settings import Settings, is_loopback
+from service.twin.gate import STOPPING
 from service.web.answers import pages, problems
 from service.web.answers.problems import SECURITY_HEADERS, problem
 from service.web.door import security
@@ -36,6 +39,9 @@ _BYTES_A_TOKEN = 64 * 1024
 # Largest body where no key is needed [bytes], and its only media type: a form with a key.
 _PUBLIC_BYTES = 4096
 _FORM = "application/x-www-form-urlencoded"
+# Time that requests get to be done when the service is told to stop, and how often they look whether it was [s].
+_FINISH_S = 5.0
+_LOOK_EVERY_S = 0.25
 # Longest pause before the next part of a body [s].
 _BODY_PAUSE_S = 30.0
 # What multipart boundaries, part headers and the metadata may add to an image [bytes].
@@ -220,6 +226,49 @@ def _is_cross_site(headers: Headers) -> bool:
         return fetched not in ("same-origin", "none")
     origin = headers.get("origin")
     return origin is not None and origin.partition("://")[2] != headers.get("host")
+
+
+class StoppingMiddleware:
+    """Answers 503 where a route does not answer soon after the service was told to stop.
+
+    A thread at the model cannot be ended: it is left behind, what it finds is not kept, the process ends without it.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """One ASGI call."""
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
+        has_begun = False
+
+        async def noting(message: Message) -> None:
+            nonlocal has_begun
+            has_begun = True
+            await send(message)
+
+        work = asyncio.ensure_future(self.app(scope, receive, noting))
+        try:
+            await _until_done_or_late(work, scope["app"].state.stopping)
+            if work.done() or has_begun:
+                await work  # an answer that has begun is sent to its end, as long as the server waits
+                return
+        finally:
+            work.cancel()
+        scope["app"].state.runtime.gate.close()
+        logger.warning("%s %s is not done in time: the service stops", scope["method"], scope["path"])
+        await problem(scope, HTTPStatus.SERVICE_UNAVAILABLE, STOPPING, {"Retry-After": "10"})(scope, receive, send)
+
+
+async def _until_done_or_late(work: asyncio.Future[None], stopping: threading.Event) -> None:
+    """Until the work is done, or was not soon after ``stopping``."""
+    while not stopping.is_set():
+        done, _ = await asyncio.wait({work}, timeout=_LOOK_EVERY_S)
+        if done:
+            return
+    await asyncio.wait({work}, timeout=_FINISH_S)
 
 
 class BodyLimitMiddleware:

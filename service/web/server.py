@@ -1,7 +1,9 @@
 """Running the service: what the command line's ``serve`` and ``migrate`` call."""
 
 import asyncio
+import socket
 import threading
+from collections.abc import Callable
 from types import FrameType
 
 import h11
@@ -15,8 +17,9 @@ from service.base.settings import Settings
 from service.store.database import Database
 from service.web.app import create_app, require_fit
 
-# Seconds that requests under way get to finish when the service is told to stop.
-_GRACE_S = 30
+# Seconds that answers which have begun get to be sent when the service is told to stop; all others are answered before
+# (`service.web.middleware.StoppingMiddleware`). Jobs get 20 s after that, and supervisors usually wait 30 to 40.
+_GRACE_S = 10
 
 # Seconds that an idle connection stays open: longer than clients and proxies usually keep one for their next request.
 _KEEP_ALIVE_S = 75
@@ -63,11 +66,17 @@ class Protocol(H11Protocol):
 
 
 class _Server(uvicorn.Server):
-    """Ends streams without an end when it is told to stop, instead of waiting for their readers."""
+    """Says when it listens, and when it is told to stop, so that answers without an end end."""
 
-    def __init__(self, config: uvicorn.Config, stopping: threading.Event) -> None:
+    def __init__(self, config: uvicorn.Config, stopping: threading.Event, on_listening: Callable[[], None]) -> None:
         super().__init__(config)
         self._stopping = stopping
+        self._on_listening = on_listening
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """The application's start, then the port's."""
+        await super().startup(sockets)
+        self._on_listening()
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         """On SIGTERM or SIGINT."""
@@ -75,8 +84,10 @@ class _Server(uvicorn.Server):
         super().handle_exit(sig, frame)
 
 
-def serve(settings: Settings) -> None:
+def serve(settings: Settings, on_listening: Callable[[], None] = lambda: None) -> None:
     """Run the service until it is told to stop; an embedded SQLite store is migrated first.
+
+    ``on_listening`` is called once nothing keeps it from answering any more.
 
     Raises
     ------
@@ -91,7 +102,7 @@ def serve(settings: Settings) -> None:
     _require_fit(settings)
     app = create_app(settings)
     config = config_of(settings, app)
-    server = _Server(config, app.state.stopping)
+    server = _Server(config, app.state.stopping, on_listening)
     try:
         server.run()
     except SystemExit as refusal:  # uvicorn's way to say that the application or the port failed

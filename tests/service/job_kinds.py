@@ -2,6 +2,7 @@
 
 import os
 import signal
+import threading
 import time
 from types import SimpleNamespace
 from typing import cast
@@ -26,8 +27,13 @@ class SquareIn(Model):
     pause_s: float = Field(default=0.0, description="Time that each part takes [s].")
     fails: int = Field(default=0, description="Attempts that end by an error.")
     dies: int = Field(default=0, description="Attempts that kill their process.")
+    hangs: int = Field(default=0, description="Attempts that hang, having told of themselves once.")
     refuses: bool = False
     result: str | None = Field(default=None, description="What to give in place of the square.")
+
+
+WOKEN = threading.Event()
+"""Set where attempts that hang shall go on."""
 
 
 def square(context: Context, payload: SquareIn) -> Result:
@@ -37,6 +43,11 @@ def square(context: Context, payload: SquareIn) -> Result:
         os.kill(os.getpid(), signal.SIGKILL)
     if attempt <= payload.fails:
         raise OperationalError("SELECT 1", {}, Exception("the secret inside"))
+    if attempt <= payload.hangs:
+        with context.runtime.gate.turn():
+            context.report(0.1, "the last word")
+            WOKEN.wait()
+            context.report(0.2, "too late")
     if payload.refuses:
         raise InvalidInputError("value: it is refused")
     for index in range(payload.steps):

@@ -41,7 +41,7 @@ def import_(folder: Folder, as_json: AsJson = False) -> None:
 def serve(
     host: Annotated[str | None, typer.Option(help="Address to listen on; HELIOTWIN_HOST or 127.0.0.1.")] = None,
     port: Annotated[int | None, typer.Option(help="Port to listen on; HELIOTWIN_PORT or 8000.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print where it listens as JSON before it starts.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print where it listens as JSON, once it does.")] = False,
 ) -> None:
     """The REST service, on an embedded SQLite store unless HELIOTWIN_DATABASE_URL names another."""
     from service.base.settings import Settings
@@ -50,11 +50,14 @@ def serve(
     given: dict[str, Any] = {key: value for key, value in {"host": host, "port": port}.items() if value is not None}
     settings = Settings(**given)
     address = f"http://{settings.host}:{settings.port}"
-    if as_json:
-        typer.echo(json.dumps({"url": address, "docs": f"{address}/docs"}))
-    else:
-        console.print(f"heliotwin listens on {address}, its documentation on {address}/docs")
-    server.serve(settings)
+
+    def say() -> None:
+        if as_json:
+            typer.echo(json.dumps({"url": address, "docs": f"{address}/docs"}))
+        else:
+            console.print(f"heliotwin listens on {address}, its documentation on {address}/docs")
+
+    server.serve(settings, say)
 
 
 @app.command()

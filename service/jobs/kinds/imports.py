@@ -1,6 +1,5 @@
 """The job `imports`: a measurement folder into the store."""
 
-import stat
 from pathlib import Path
 
 from pydantic import Field
@@ -10,6 +9,7 @@ from service.base.faults import ConflictError
 from service.base.fields import Model
 from service.base.progress import Steps
 from service.jobs.kind import Context, Kind, Result
+from service.sources.files import require_regular
 from service.sources.folder import read_folder
 from service.twin.importing import import_folder
 
@@ -24,10 +24,6 @@ class ImportIn(Model):
         description="Path relative to the allowed folder; `.` is that folder itself.",
         examples=["stj"],
     )
-
-
-# The largest file of a measurement folder is deflectometry, some tens of megabytes.
-_MOST_BYTES = 2**30
 
 
 def allowed_folder(root: Path | None, folder: str) -> Path:
@@ -52,17 +48,8 @@ def allowed_folder(root: Path | None, folder: str) -> Path:
         if entry.is_symlink() and not entry.resolve().is_relative_to(top):
             raise InvalidInputError(f"folder: {entry.relative_to(top)} leads outside; copy what it links to")
         if not entry.is_dir():
-            _require_file(entry, str(entry.relative_to(top)))
+            require_regular(entry, f"folder: {entry.relative_to(top)}")
     return path
-
-
-def _require_file(path: Path, name: str) -> None:
-    """Refuse what is no regular file, or too large to be read into memory; nothing is opened for it."""
-    found = path.stat()
-    if not stat.S_ISREG(found.st_mode):
-        raise InvalidInputError(f"folder: {name} is no regular file")
-    if found.st_size > _MOST_BYTES:
-        raise InvalidInputError(f"folder: {name} has {found.st_size} bytes, {_MOST_BYTES} are the most")
 
 
 def import_allowed(context: Context, payload: ImportIn) -> Result:

@@ -1,18 +1,11 @@
 """Jobs: ask for them, follow them, cancel them."""
 
-import json
-import threading
-import time
-from collections.abc import AsyncIterator
-from datetime import datetime
 from functools import partial
+from threading import Event
 from typing import Annotated, Any
 
-import anyio
-from anyio import CapacityLimiter, to_thread
-from fastapi import APIRouter, Depends, Header, Path, Query, Response, status
-from fastapi.sse import EventSourceResponse, format_sse_event
-from pydantic import BaseModel, Field
+from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response, status
+from pydantic import Field
 
 from service.base.arrays import unpack
 from service.base.faults import NotFoundError
@@ -28,32 +21,37 @@ from service.web.answers.formats import MediaType, json_answer, maps_answer
 from service.web.answers.openapi import arrays, problems
 from service.web.answers.paging import Page, page
 from service.web.answers.representation import Maps
-from service.web.door.dependencies import OPERATE, READ, IdentityDep, Limit, RuntimeDep, StoppingDep, require_json
+from service.web.answers.watching import JobStream, JobSummary, Watcher, Watchers, job_summary
+from service.web.door.dependencies import (
+    OPERATE,
+    READ,
+    IdentityDep,
+    Limit,
+    PresentedDep,
+    RuntimeDep,
+    StoppingDep,
+    require_json,
+)
 
 
-class JobOut(BaseModel):
-    """A job as it stands."""
+async def _watchers(request: Request) -> Watchers:
+    watchers: Watchers = request.app.state.watchers
+    return watchers
 
-    id: int
-    kind: str
-    state: State = Field(description="queued, running, then for good done, failed or cancelled.")
+
+WatchersDep = Annotated[Watchers, Depends(_watchers)]
+
+
+class JobOut(JobSummary):
+    """A job as it stands, with what was asked and what came of it."""
+
     payload: dict[str, Any] = Field(description="What was asked.")
-    progress: float = Field(description="Share that is done, 0 to 1 [1].")
-    message: str = Field(description="What is being done.")
-    attempts: int = Field(description="How often it was begun.")
-    cancel_requested: bool = Field(description="It ends as soon as its worker sees this.")
-    reason: str | None = Field(description="Why it failed, or why it is tried again.")
     result: dict[str, Any] | None = Field(description="What a done job gave; by its kind.")
-    created_by: str = Field(description="Name of the key that asked for it.")
-    created_at: datetime
-    not_before: datetime = Field(description="When it is tried next at the earliest.")
-    started_at: datetime | None
-    finished_at: datetime | None
 
 
 def job_out(row: JobRow) -> JobOut:
     """A job as JSON."""
-    return JobOut.model_validate(row, from_attributes=True)
+    return JobOut(**dict(job_summary(row)), payload=row.payload, result=row.result)
 
 
 def job_flux(row: JobRow, media_type: str) -> Response:
@@ -69,57 +67,20 @@ def job_flux(row: JobRow, media_type: str) -> Response:
     return maps_answer(Maps(f"job-{row.id}-flux", title, {"flux": flux}, picture, row.arrays), media_type)
 
 
-# How often the store is asked for news [s], and after how much silence a comment keeps the connection open [s].
-_LOOK_EVERY_S = 0.5
-_COMMENT_EVERY_S = 15.0
-
-# Their own threads, so that many watchers do not keep the routes waiting.
-_watchers = CapacityLimiter(4)
-
-
-def _look(runtime: Runtime, number: int, seen: int) -> tuple[int, bool, str] | None:
-    """Revision, whether the job has ended, and its state as JSON; None where nothing is newer than ``seen``."""
-    with runtime.database.reading() as session:
-        row = queue.get_job(session, number)
-    if row.revision <= seen:
-        return None
-    return row.revision, row.state in queue.ENDED, json.dumps(job_out(row).model_dump(mode="json"))
-
-
-async def _events(runtime: Runtime, number: int, seen: int, stopping: threading.Event) -> AsyncIterator[bytes]:
-    """The job each time it has changed, numbered by its revision, until its end; comments in between."""
-    quiet_since = time.monotonic()
-    yield format_sse_event(retry=2000)
-    while not stopping.is_set():
-        news = await to_thread.run_sync(_look, runtime, number, seen, limiter=_watchers)
-        if news is not None:
-            seen, has_ended, document = news
-            yield format_sse_event(data_str=document, event="end" if has_ended else "progress", id=str(seen))
-            if has_ended:
-                return
-            quiet_since = time.monotonic()
-        elif time.monotonic() - quiet_since > _COMMENT_EVERY_S:
-            yield format_sse_event(comment="still here")
-            quiet_since = time.monotonic()
-        await anyio.sleep(_LOOK_EVERY_S)
-
-
-def stream(runtime: Runtime, number: int, last_event_id: str | None, stopping: threading.Event) -> Response:
-    """The events after ``last_event_id``; 204, which tells a browser not to come again, where the last was seen.
+def stream(watchers: Watchers, runtime: Runtime, watcher: Watcher, last: str | None, stopping: Event) -> Response:
+    """The events after ``last``; 204, which tells a browser not to come again, where that was the last of all.
 
     Raises
     ------
     NotFoundError
     """
-    is_number = last_event_id is not None and last_event_id.isascii() and last_event_id.isdecimal()
-    seen = int(last_event_id[:10]) if last_event_id is not None and is_number else 0
+    seen = int(last[:10]) if last is not None and last.isascii() and last.isdecimal() else 0
     with runtime.database.reading() as session:
-        row = queue.get_job(session, number)
+        row = queue.get_summary(session, watcher.number)
     if row.state in queue.ENDED and row.revision <= seen:
         return Response(status_code=204)
-    headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
     # FastAPI's own routes for generators could not answer 204.
-    return EventSourceResponse(_events(runtime, number, seen, stopping), headers=headers)
+    return JobStream(watchers, watcher, seen, stopping)
 
 
 Number = Annotated[Version, Path(description="Id of the job.")]
@@ -181,11 +142,11 @@ def list_jobs(
     after: Annotated[Version | None, Query(description="The last id of the page before.")] = None,
     state: Annotated[State | None, Query(description="Only jobs in this state.")] = None,
     kind: KindName = None,
-) -> Page[JobOut]:
-    """Jobs, newest first."""
+) -> Page[JobSummary]:
+    """Jobs in short, newest first; each one whole under its `href`."""
     with runtime.database.reading() as session:
         rows = queue.list_jobs(session, limit + 1, after, state, kind)
-    items = [job_out(row) for row in rows]
+    items = [job_summary(row) for row in rows]
     return page(items, limit)
 
 
@@ -221,11 +182,15 @@ def get_job_flux(number: Number, runtime: RuntimeDep, media_type: MediaType) -> 
 def get_job_events(
     number: Number,
     runtime: RuntimeDep,
+    watchers: WatchersDep,
+    identity: IdentityDep,
+    presented: PresentedDep,
     stopping: StoppingDep,
     last_event_id: Annotated[str | None, Header(alias="Last-Event-ID", description="Go on after this one.")] = None,
 ) -> Response:
-    """The job each time it changes, as server-sent events, until it ends."""
-    return stream(runtime, number, last_event_id, stopping)
+    """The job in short each time it changes, as server-sent events, until it ends."""
+    watcher = Watcher(number, identity.name, presented)
+    return stream(watchers, runtime, watcher, last_event_id, stopping)
 
 
 @router.post("/{number}/cancel", responses=problems(404, 409), dependencies=[OPERATE])

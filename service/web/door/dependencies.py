@@ -12,7 +12,7 @@ from fastapi import Depends, Path, Query, Request
 from service.base.faults import UnsupportedContentError
 from service.base.fields import MeasurementName, Name
 from service.twin.runtime import Runtime
-from service.web.door.security import Identity, Requires, Role
+from service.web.door.security import Identity, Requires, Role, presented_key
 
 
 async def get_runtime(request: Request) -> Runtime:
@@ -34,6 +34,14 @@ async def _identity(request: Request) -> Identity:
 
 IdentityDep = Annotated[Identity, Depends(_identity)]
 """Who asks; for routes that `requires` a role."""
+
+
+async def _presented(request: Request) -> str | None:
+    return presented_key(request.headers)
+
+
+PresentedDep = Annotated[str | None, Depends(_presented)]
+"""The key that was presented; for answers that go on for as long as it opens."""
 
 
 async def _stopping(request: Request) -> threading.Event:

@@ -22,6 +22,9 @@ Number = Annotated[Version, Path(description="Id of the job.")]
 
 _PAGE = 50
 
+# Most names that a job's page shows of a list: heliostats that were asked for, or that it was done for.
+_SHOWN = 200
+
 
 class PredictionForm(Model):
     """The form that asks for surfaces; without a heliostat of all of them."""
@@ -55,23 +58,38 @@ def _plain(value: Any) -> bool:
     return isinstance(value, str | int | float | bool)
 
 
+def _asked(payload: dict[str, Any]) -> dict[str, Any]:
+    """What was asked, long lists by their length."""
+    given = {name: value for name, value in payload.items() if value is not None}
+    long = {name: len(value) for name, value in given.items() if isinstance(value, list | dict) and len(value) > _SHOWN}
+    return given | {name: f"{count} entries" for name, count in long.items()}
+
+
 @router.get("/jobs/{number}", dependencies=[READ])
 def get_job_page(number: Number, request: Request, runtime: RuntimeDep) -> HTMLResponse:
-    """A job; the page follows it until it ends."""
+    """A job; the page follows it until it ends.
+
+    While it does, each change asks for what changes only: neither what was asked nor a result is read for that.
+    """
     with runtime.database.reading() as session:
-        row = queue.get_job(session, number, arrays=True)
-    result = row.result or {}
+        row = queue.get_summary(session, number)
+        is_live, asked, result, flux = row.state not in queue.ENDED, None, {}, None
+        if not is_live or "hx-request" not in request.headers:
+            session.expunge(row)
+            row = queue.get_job(session, number, arrays=True)
+            asked, result, flux = _asked(row.payload), row.result or {}, _flux(row)
     return render(
         request,
         "job.html",
         job=row,
-        is_live=row.state not in queue.ENDED,
-        asked={name: value for name, value in row.payload.items() if value is not None},
-        flux=_flux(row),
+        is_live=is_live,
+        asked=asked,
+        flux=flux,
         facts={name: value for name, value in result.items() if _plain(value)},
         counts=result.get("counts", {}),
         surfaces=result.get("surfaces", {}),
         skipped=result.get("skipped", {}),
+        shown=_SHOWN,
     )
 
 

@@ -2,12 +2,15 @@
 
 import json
 import os
+import signal
+import socket
 import sqlite3
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 
 from service.base.settings import Settings
@@ -15,6 +18,7 @@ from service.cli import folder as verbs
 from service.cli.demo_plant import write_plant
 from service.sources.folder import read_folder
 from service.store.database import migrate
+from tests.service.conftest import free_port
 
 ROOT = Path(__file__).parents[3]
 
@@ -102,3 +106,70 @@ def test_an_interrupted_prediction_leaves_what_was_done(tmp_path: Path, monkeypa
     report = json.loads((tmp_path / "out" / "predictions.json").read_text())
     assert list(report["heliostats"]) == [first]
     assert report["skipped"] == dict.fromkeys(others, "interrupted")
+
+
+def test_more_workers_than_the_connections_allow_are_one_line(tmp_path: Path):
+    """The option counts like the setting; both databases have their pool of these connections."""
+    few = {"HELIOTWIN_DATABASE_CONNECTIONS": "10"}
+    done = heliotwin(tmp_path / "data", "worker", "--count", "4", **few)
+    ends(
+        done, 2, "heliotwin: setting combination: database_connections: 10 are too few for job_workers 4; set at least"
+    )
+    assert not done.stdout
+    assert "schema is at None" in heliotwin(tmp_path / "data", "worker", "--count", "1", **few).stderr
+
+
+@pytest.mark.parametrize("form", [(), ("--json",)])
+def test_what_does_not_listen_says_nothing_of_it(tmp_path: Path, form: tuple[str, ...]):
+    refused = heliotwin(tmp_path / "data", "serve", "--host", "0.0.0.0", *form)
+    assert (refused.returncode, refused.stdout) == (1, "")
+    assert "listens" not in refused.stderr
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        refused = heliotwin(tmp_path / "data", "serve", "--port", taken.getsockname()[1], *form)
+    assert (refused.returncode, refused.stdout) == (1, "")
+    assert "listens" not in refused.stderr
+
+
+def test_what_listens_says_where_and_answers(tmp_path: Path):
+    port = free_port()
+    environment = os.environ | {"HELIOTWIN_DATA_DIR": str(tmp_path / "data"), "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-m", "service", "serve", "--port", str(port), "--json"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment) as process:
+        assert process.stdout is not None
+        try:
+            url = json.loads(process.stdout.readline())["url"]
+            assert httpx.get(f"{url}/livez").status_code == 200
+        finally:
+            process.terminate()
+
+
+_INTERRUPTED = """
+import sys, time
+from service.cli import folder
+from service.cli.main import main
+
+def long(*_):
+    print("begun", file=sys.stderr, flush=True)
+    time.sleep(60)
+
+folder.predict_heliostat = long
+sys.argv = ["heliotwin", *sys.argv[1:]]
+main()
+"""
+
+
+def test_an_interrupted_verb_ends_by_130(tmp_path: Path):
+    """Ctrl-C: what a shell expects of whoever was interrupted, and no traceback."""
+    command = [sys.executable, "-c", _INTERRUPTED, "predict", _plant(tmp_path), "--out", tmp_path / "out"]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, env=environment) as process:
+        assert process.stderr is not None
+        while b"begun" not in (line := process.stderr.readline()):
+            assert line, "it ended before it was interrupted"
+        process.send_signal(signal.SIGINT)
+        told = process.stderr.read()
+        assert process.wait(30) == 130, told
+    assert b"Traceback" not in told
+    assert (tmp_path / "out" / "predictions.json").is_file()

@@ -26,9 +26,10 @@ from service.jobs.worker import Worker, Workers, pause_s
 from service.store import queue
 from service.store.database import Database
 from service.store.tables import AuditRow, JobRow
+from service.twin.gate import Gate
 from service.twin.runtime import Runtime
 from tests.service.conftest import FakeOperations, until
-from tests.service.job_kinds import TEST_KINDS
+from tests.service.job_kinds import TEST_KINDS, WOKEN
 
 ROOT = Path(__file__).parents[3]
 KINDS = ("squares",)
@@ -323,6 +324,40 @@ def test_heartbeat_keeps_a_job_that_outlasts_its_lease(runtime: Runtime):
     assert (row.state, row.attempts) == ("done", 1)
 
 
+@pytest.fixture
+def impatient(runtime: Runtime) -> Iterator[Runtime]:
+    """Jobs that tell nothing of themselves for a second are given up; what hangs goes on at the end."""
+    changed = {"job_lease_s": 0.6, "job_silence_s": 1.0}
+    yield replace(runtime, settings=runtime.settings.model_copy(update=changed), gate=Gate(1))
+    WOKEN.set()
+    until(lambda: not [thread for thread in threading.enumerate() if thread.name.startswith("job-")])
+    WOKEN.clear()
+
+
+def test_job_that_hangs_is_given_up_and_its_worker_replaced(impatient: Runtime):
+    """The heart beats on, which is no sign of life; the place before the model is free again, and stays one."""
+    once, always, healthy = ask(impatient, value=3, hangs=1), ask(impatient, hangs=99), ask(impatient, value=2)
+    with working(impatient):
+        rows = [ended(impatient, number) for number in (once, healthy, always)]
+        WOKEN.set()
+    assert [(row.state, row.result, row.attempts) for row in rows] == [
+        ("done", {"square": 9}, 2),
+        ("done", {"square": 4}, 1),
+        ("failed", None, 3),
+    ]
+    assert (rows[2].reason or "").startswith("failed 3 times, the last time by no sign of life for 1 s;")
+    until(lambda: not [thread for thread in threading.enumerate() if thread.name.startswith("job-")])
+    assert impatient.gate._free == 1  # those that woke gave nothing back twice
+    assert look(impatient, always).state == "failed"
+
+
+def test_job_that_reports_is_not_given_up_however_long_it_takes(impatient: Runtime):
+    number = ask(impatient, value=5, steps=8, pause_s=0.4)
+    with working(impatient):
+        row = ended(impatient, number)
+    assert (row.state, row.attempts) == ("done", 1)
+
+
 def test_stopped_worker_puts_its_job_back(runtime: Runtime):
     number = ask(runtime, value=5, steps=4, pause_s=0.3)
     with working(runtime):
@@ -387,7 +422,7 @@ def test_end_is_stored_when_the_database_is_back(runtime: Runtime, monkeypatch: 
 
 
 @contextmanager
-def process(runtime: Runtime) -> Iterator[subprocess.Popen[bytes]]:
+def process(runtime: Runtime, **settings_of_it: str) -> Iterator[subprocess.Popen[bytes]]:
     """A worker as a process of its own."""
     settings = runtime.settings
     environment = os.environ | {
@@ -395,14 +430,15 @@ def process(runtime: Runtime) -> Iterator[subprocess.Popen[bytes]]:
         "HELIOTWIN_DATABASE_URL": str(settings.database_url),
         "HELIOTWIN_JOB_LEASE_S": "1",
         "HELIOTWIN_JOB_POLL_S": "0.05",
+        **settings_of_it,
     }
     command = [sys.executable, "-m", "tests.service.job_kinds"]
-    running = subprocess.Popen(command, cwd=ROOT, env=environment, stderr=subprocess.DEVNULL)
+    running = subprocess.Popen(command, cwd=ROOT, env=environment, stderr=subprocess.PIPE)
     try:
         yield running
     finally:
         running.kill()
-        running.wait()
+        running.communicate()
 
 
 def test_job_of_a_killed_process_is_finished_by_another(runtime: Runtime):
@@ -441,3 +477,21 @@ def test_process_that_is_told_to_stop_puts_its_job_back(runtime: Runtime):
         assert running.wait(30) == 0
     row = look(runtime, number)
     assert (row.state, row.attempts) == ("queued", 0)
+
+
+def test_process_whose_job_hangs_ends_with_a_clear_word(runtime: Runtime):
+    """What hangs cannot be ended but with its process; the other job is put back, and the next process does both."""
+    hanging, other = ask(runtime, value=3, hangs=1), ask(runtime, value=2, steps=1000, pause_s=0.1)
+    few = {"HELIOTWIN_JOB_SILENCE_S": "2", "HELIOTWIN_JOB_WORKERS": "2", "HELIOTWIN_JOB_RETRY_S": "0"}
+    with process(runtime, **few) as first:
+        _, log = first.communicate(timeout=60)
+        assert first.returncode == 1
+    assert b"hangs, no sign of life for 2 s in attempt 1" in log
+    assert b"this process ends, start it again" in log
+    row = look(runtime, hanging)
+    assert (row.state, row.attempts) == ("queued", 1)
+    assert "no sign of life for 2 s" in (row.reason or "")
+    assert (look(runtime, other).state, look(runtime, other).attempts) == ("queued", 0)
+    cancel(runtime, other)
+    with working(runtime):
+        assert ended(runtime, hanging).result == {"square": 9}

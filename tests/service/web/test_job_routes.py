@@ -7,6 +7,7 @@ import shutil
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +16,18 @@ import numpy as np
 import pytest
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
+from sqlalchemy import delete, update
 
 from service.base.settings import Settings
 from service.jobs.kind import Context
 from service.jobs.kinds import KINDS
 from service.jobs.kinds.predictions import PredictionsIn, predict_many
-from service.store import queue
+from service.store import keys, queue
 from service.store.tables import JobRow
 from service.web.app import create_app
 from tests.service.conftest import QUIET, FakeOperations, Post, client_of, png, serving, until
 from tests.service.job_kinds import TEST_KINDS
+from tests.service.store.test_statements import statements
 
 JSON = {"Content-Type": "application/json"}
 
@@ -292,7 +295,7 @@ def test_stream_follows_a_job_to_its_end(server: str):
     assert shares == sorted(shares)
     assert len(set(shares)) >= 4
     assert events[-1]["event"] == "end"
-    assert documents[-1]["result"] == {"square": 9}
+    assert httpx.get(server + documents[-1]["href"]).json()["result"] == {"square": 9}
     numbers = [int(event["id"]) for event in events]
     assert numbers == sorted(set(numbers))
 
@@ -311,7 +314,7 @@ def test_stream_goes_on_where_it_was_left(server: str):
 
 
 def test_silent_stream_is_kept_open_by_comments(server: str, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("service.web.api.jobs._COMMENT_EVERY_S", 0.2)
+    monkeypatch.setattr("service.web.answers.watching._COMMENT_EVERY_S", 0.2)
     job = httpx.post(f"{server}/v1/jobs/squares", json={"steps": 1, "pause_s": 2.0}).json()
     text = httpx.get(f"{server}/v1/jobs/{job['id']}/events", timeout=30).text
     assert "\n: still here\n\n" in text
@@ -332,3 +335,147 @@ def test_open_stream_does_not_keep_the_service_from_stopping(app: FastAPI, serve
     app.state.stopping.set()
     reader.join(10)
     assert not reader.is_alive()
+
+
+# --- large jobs, and many who follow them -----------------------------------------------------------------------------
+
+
+LARGE = [f"H{number:05}" for number in range(20_000)]
+
+
+def large(app: FastAPI, count: int = 1) -> list[int]:
+    """Jobs with all that 20,000 heliostats bring, at which nobody works."""
+    result = {"surfaces": dict.fromkeys(LARGE, 1), "skipped": {}}
+    with app.state.runtime.database.writing() as session:
+        rows = [JobRow(kind="k", payload={"heliostats": LARGE}, result=result, created_by="a") for _ in range(count)]
+        session.add_all(rows)
+        session.flush()
+        return [row.id for row in rows]
+
+
+def test_lists_and_events_hold_jobs_in_short_and_read_no_more(app: FastAPI, client: TestClient):
+    numbers = large(app, 3)
+    with statements(app.state.runtime.database) as sent:
+        page = client.get("/v1/jobs")
+    assert len(page.content) < 3000
+    assert [(item["id"], item["href"]) for item in page.json()["items"]] == [
+        (number, f"/v1/jobs/{number}") for number in reversed(numbers)
+    ]
+    assert not {"payload", "result"} & page.json()["items"][0].keys()
+    with app.state.runtime.database.writing() as session:
+        session.execute(update(JobRow).values(state="done", revision=2))
+    with statements(app.state.runtime.database) as sent_for_events:
+        events = client.get(f"/v1/jobs/{numbers[0]}/events")
+    assert len(events.content) < 1000
+    with statements(app.state.runtime.database) as sent_for_page:
+        assert "H00001" not in client.get("/jobs").text
+    read = [text for text in (*sent, *sent_for_events, *sent_for_page) if "FROM jobs" in text]
+    assert len(read) >= 3
+    assert not [text for text in read if "jobs.payload" in text or "jobs.result" in text]
+    whole = client.get(f"/v1/jobs/{numbers[0]}").json()
+    assert whole["payload"] == {"heliostats": LARGE}
+    assert len(whole["result"]["surfaces"]) == 20_000
+
+
+def test_page_of_a_large_job_shows_its_beginning_and_is_small_while_it_is_followed(app: FastAPI, client: TestClient):
+    (number,) = large(app)
+    with statements(app.state.runtime.database) as sent:
+        part = client.get(f"/jobs/{number}", headers={"HX-Request": "true"})
+    assert 'id="job"' in part.text
+    assert not [text for text in sent if "jobs.payload" in text or "jobs.result" in text]
+    assert "20000 entries" in client.get(f"/jobs/{number}").text
+    with app.state.runtime.database.writing() as session:
+        session.execute(update(JobRow).values(state="done"))
+    page = client.get(f"/jobs/{number}").text
+    assert len(page) < 60_000
+    assert "H00199, version 1" in page
+    assert "H00200" not in page
+
+
+@contextmanager
+def following(server: str, number: int, count: int, **options: Any) -> Iterator[list[httpx.Response]]:
+    """So many open streams of a job that nobody works at."""
+    with httpx.Client(timeout=30) as client, ExitStack() as held:
+        url = f"{server}/v1/jobs/{number}/events"
+        yield [held.enter_context(client.stream("GET", url, **options)) for _ in range(count)]
+
+
+def test_watchers_have_a_bound_together_and_for_each_key(app: FastAPI, settings: Settings):
+    bounded = settings.model_copy(update={"most_watchers": 3, "most_watchers_of_key": 2})
+    app = create_app(bounded, FakeOperations())
+    with serving(app) as server:
+        (number,) = large(app)
+        with app.state.runtime.database.writing() as session:
+            key, other = (
+                {"Authorization": f"Bearer {keys.create(session, name, 'read', 'tester')}"} for name in ("one", "other")
+            )
+        with following(server, number, 3, headers=key) as streams:
+            assert [stream.status_code for stream in streams] == [200, 200, 429]
+            assert streams[2].headers["Retry-After"]
+            assert "key one follows 2 jobs already" in json.loads(streams[2].read())["detail"]
+            with following(server, number, 2, headers=other) as others:
+                assert [stream.status_code for stream in others] == [200, 503]
+                assert others[1].headers["Retry-After"]
+                assert others[1].headers["Content-Type"] == "application/problem+json"
+        url = f"{server}/v1/jobs/{number}/events"
+
+        def is_free() -> bool:
+            with httpx.stream("GET", url, headers=key, timeout=30) as stream:
+                return stream.status_code == 200
+
+        until(is_free)  # a place is given back with its connection
+
+
+def test_many_watchers_are_one_look_at_the_database(app: FastAPI, server: str):
+    (number,) = large(app)
+    with following(server, number, 12):
+        time.sleep(1.0)
+        with statements(app.state.runtime.database) as sent:
+            time.sleep(2.0)
+    looks = [text for text in sent if "jobs.id IN" in text]
+    assert 2 <= len(looks) <= 5  # 48 if each looked for itself
+
+
+def test_stream_ends_when_its_key_is_withdrawn(app: FastAPI, server: str):
+    (number,) = large(app)
+    database = app.state.runtime.database
+    with database.writing() as session:
+        shown = [keys.create(session, name, "read", "tester") for name in ("leaving", "staying")]
+    leaving, staying = ({"Authorization": f"Bearer {key}"} for key in shown)
+    with (
+        following(server, number, 1, headers=leaving) as (ends,),
+        following(server, number, 1, headers=staying) as (on,),
+    ):
+        lines = on.iter_lines()
+        while "id: 1" not in next(lines):
+            pass
+        with database.writing() as session:
+            keys.withdraw(session, "leaving", "tester")
+        started = time.monotonic()
+        ends.read()  # to its end
+        assert time.monotonic() - started < 5
+        with database.writing() as session:
+            session.execute(update(JobRow).values(state="cancelled", revision=2))
+        assert "event: end" in list(lines)
+
+
+def test_stream_without_a_key_ends_when_the_first_is_made(app: FastAPI, server: str):
+    (number,) = large(app)
+    with following(server, number, 1) as (stream,):
+        lines = stream.iter_lines()
+        while "id: 1" not in next(lines):
+            pass
+        with app.state.runtime.database.writing() as session:
+            keys.create(session, "first", "admin", "tester")
+        assert "event: end" not in list(lines)
+
+
+def test_stream_of_a_job_that_is_deleted_ends(app: FastAPI, server: str):
+    (number,) = large(app)
+    with following(server, number, 1) as (stream,):
+        lines = stream.iter_lines()
+        while "id: 1" not in next(lines):
+            pass
+        with app.state.runtime.database.writing() as session:
+            session.execute(delete(JobRow))
+        assert "event: end" not in list(lines)

@@ -1,0 +1,91 @@
+"""A folder's files are regular ones, or are not opened: whoever opens a pipe waits without end."""
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+
+from model.errors import InvalidInputError
+from service.base.settings import Settings
+from service.cli.folder import read_image
+from service.sources.files import require_regular
+from service.sources.folder import read_declared, read_folder
+from service.twin.importing import import_folder
+from service.twin.runtime import Runtime
+from tests.service.conftest import FakeOperations, metadata, png, properties_document, tower_document
+
+pytestmark = pytest.mark.timeout(60)
+
+SURFACE = "AA39/Deflectometry/AA39-2024-deflectometry.h5"
+
+
+@pytest.fixture
+def plant(tmp_path: Path) -> Path:
+    """A folder of one heliostat."""
+    root = tmp_path / "plant"
+    for kind in ("Properties", "Calibration", "Deflectometry"):
+        (root / "AA39" / kind).mkdir(parents=True)
+    (root / "WRI1030197-tower-measurements.json").write_text(json.dumps(tower_document()))
+    (root / "AA39" / "Properties" / "AA39-heliostat-properties.json").write_text(json.dumps(properties_document()))
+    (root / "AA39" / "Calibration" / "1-calibration-properties.json").write_text(json.dumps(metadata()))
+    (root / "AA39" / "Calibration" / "1-flux.png").write_bytes(png())
+    return root
+
+
+@pytest.mark.parametrize("name", [SURFACE, "AA39/Deflectometry/AA39-nurbs-surface.npz"])
+def test_a_pipe_for_a_surface_costs_the_surface_and_nothing_else(plant: Path, tmp_path: Path, name: str):
+    os.mkfifo(plant / name)
+    runtime = Runtime.from_settings(Settings(data_dir=tmp_path / "data"), FakeOperations())
+    try:
+        runtime.database.upgrade()
+        report = import_folder(runtime, read_folder(plant))
+    finally:
+        runtime.close()
+    assert report["counts"]["heliostats new"] == report["counts"]["images new"] == 1
+    assert report["skipped"] == {"AA39 surface": f"{plant / name}: no regular file"}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "WRI1030197-tower-measurements.json",
+        "twin.json",
+        "AA39/Properties/AA39-heliostat-properties.json",
+        "AA39/Calibration/1-calibration-properties.json",
+        "AA39/Calibration/1-calibration-item-stac.json",
+        "AA39/Calibration/1-flux.png",
+        SURFACE,
+    ],
+)
+def test_no_pipe_of_a_folder_is_waited_for(plant: Path, name: str):
+    (plant / name).unlink(missing_ok=True)
+    os.mkfifo(plant / name)
+    try:
+        folder = read_folder(plant)
+        measurements = folder.measurements("AA39", with_images=False)
+        folder.measured_surface("AA39")
+    except InvalidInputError as error:
+        told = str(error)
+    else:
+        told = " ".join(folder.skipped.values())
+        taken = [(kind, item.taken_at) for item in measurements for kind in item.images]
+        assert told or taken in ([], [("flux", None)])  # PAINT's images and items are taken where they are files
+    assert not told or "no regular file" in told or "no heliostat with a readable" in told
+
+
+def test_only_regular_files_of_a_bearable_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "file").write_bytes(b"x" * 11)
+    (tmp_path / "link").symlink_to(tmp_path / "file")
+    os.mkfifo(tmp_path / "pipe")
+    assert require_regular(tmp_path / "link") == tmp_path / "link"
+    for name, told in (("pipe", "no regular file"), (".", "no regular file"), ("nothing", "no such file")):
+        with pytest.raises(InvalidInputError, match=told):
+            require_regular(tmp_path / name)
+    with pytest.raises(InvalidInputError, match="pipe: no regular file"):
+        read_image(tmp_path / "pipe")
+    with pytest.raises(InvalidInputError, match="pipe: no regular file"):
+        read_declared(tmp_path / "pipe")
+    monkeypatch.setattr("service.sources.files._MOST_BYTES", 10)
+    with pytest.raises(InvalidInputError, match="link: 11 bytes, 10 are the most"):
+        require_regular(tmp_path / "link")
