@@ -5,6 +5,7 @@ import math
 import re
 import time
 import uuid
+from functools import partial
 from http import HTTPStatus
 from urllib.parse import urlsplit
 
@@ -168,7 +169,10 @@ class DoorMiddleware:
 
     async def _identify(self, scope: Scope, headers: Headers) -> security.Identity | None:
         database, presented = scope["app"].state.runtime.database, security.presented_key(headers)
-        identity = await to_thread.run_sync(security.identify, database, self.settings, presented, limiter=self.threads)
+        # Proxies of the sort that adds no header often speak HTTP/1.0 to what stands behind them, which clients do not.
+        is_direct = not security.is_forwarded(headers) and scope.get("http_version") != "1.0"
+        asked = partial(security.identify, database, self.settings, presented, is_direct)
+        identity = await to_thread.run_sync(asked, limiter=self.threads)
         scope.setdefault("state", {})["identity"] = identity
         return identity
 
@@ -225,7 +229,8 @@ def _is_cross_site(headers: Headers) -> bool:
 class BodyLimitMiddleware:
     """Stops reading a body at its bound: at once where its length is announced, else when the bound is passed.
 
-    Who comes without a key may send a small form and nothing else. No part of a body may be long in coming.
+    Who comes without a key may send a small form and nothing else. No part of a body may be long in coming, and the
+    whole has that pause once and then as long as the settings' least rate gives what has come.
     """
 
     def __init__(self, app: ASGIApp, settings: Settings) -> None:
@@ -256,13 +261,17 @@ class BodyLimitMiddleware:
             refused = f"Content-Type: send {_FORM}"
             await problem(scope, HTTPStatus.UNSUPPORTED_MEDIA_TYPE, refused)(scope, receive, send)
             return
-        received, is_whole = 0, False
+        received, waited_s, is_whole = 0, 0.0, False
 
         async def bounded() -> Message:
-            nonlocal received, is_whole
+            nonlocal received, waited_s, is_whole
+            # What the service itself takes between two parts is not the sender's.
+            left_s = min(self.patience_s, self.patience_s + received / self.settings.least_bytes_per_s - waited_s)
+            began = time.monotonic()
             # After the body only the client's going is waited for, however long that takes.
-            with move_on_after(None if is_whole else self.patience_s) as waiting:
+            with move_on_after(None if is_whole else left_s) as waiting:
                 message = await receive()
+            waited_s += time.monotonic() - began
             if waiting.cancelled_caught:
                 raise HTTPException(HTTPStatus.REQUEST_TIMEOUT, "body: it did not come in time; send it again")
             is_whole = not message.get("more_body", False)

@@ -75,18 +75,26 @@ def presented_key(headers: Mapping[str, str]) -> str | None:
     return None if morsel is None else morsel.value
 
 
+_FORWARDED = ("forwarded", "via", "x-real-ip")
+
+
+def is_forwarded(headers: Mapping[str, str]) -> bool:
+    """Whether a proxy sent the request on, trusted or not: whoever stands behind it may be anywhere."""
+    return any(name.lower() in _FORWARDED or name.lower().startswith("x-forwarded-") for name in headers)
+
+
 def may_be_open(settings: Settings) -> bool:
     """Whether access without a key is allowed while no key was made: this machine only, or acknowledged."""
     return is_loopback(settings.host) or settings.allow_open_network
 
 
-def identify(database: Database, settings: Settings, presented: str | None) -> Identity | None:
-    """Who presented this key, or who may come without one; None for everybody else."""
+def identify(database: Database, settings: Settings, presented: str | None, is_direct: bool = True) -> Identity | None:
+    """Who presented this key, or who may come without one, directly and not by a proxy; None for everybody else."""
     with database.reading() as session:
         if presented is not None:
             row = keys.find(session, presented)
             return None if row is None else Identity(row.name, Role(row.role))
-        if may_be_open(settings) and not keys.any_made(session):
+        if is_direct and may_be_open(settings) and not keys.any_made(session):
             return LOCAL
     return None
 

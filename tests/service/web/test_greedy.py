@@ -1,7 +1,9 @@
 """Clients that take more than their share: they wait, and nobody else does."""
 
 import socket
+from contextlib import ExitStack
 from dataclasses import replace
+from pathlib import Path
 
 import anyio
 import httpx
@@ -15,10 +17,11 @@ from service.base.settings import Settings
 from service.twin.gate import Gate
 from service.twin.runtime import Runtime
 from service.web.app import create_app
+from service.web.door.connections import Protocol, _holder, protocol_of
 from service.web.door.limits import Buckets
 from service.web.door.turns import Turns
 from service.web.middleware import BodyLimitMiddleware
-from service.web.server import Protocol, config_of
+from service.web.server import config_of
 from tests.service.conftest import QUIET, FakeOperations, client_of, serving
 from tests.service.web.test_keys import bearer, make_key
 
@@ -108,7 +111,10 @@ def test_bad_keys_shut_out_neither_probes_nor_the_login_of_their_address(tmp_pat
 def test_server_bounds_connections_and_heads():
     settings = Settings(most_connections=77)
     config = config_of(settings, create_app(settings, FakeOperations()))
-    assert (config.limit_concurrency, config.h11_max_incomplete_event_size, config.http) == (77, 32768, Protocol)
+    assert (config.limit_concurrency, config.h11_max_incomplete_event_size) == (77, 32768)
+    assert isinstance(config.http, type)
+    assert issubclass(config.http, Protocol)
+    assert config.http.most_each == settings.most_connections_each
 
 
 def test_half_a_head_is_not_waited_for_for_ever(app: FastAPI):
@@ -132,6 +138,39 @@ def test_one_connection_too_many_is_answered_503(tmp_path):
         assert httpx.get(f"{address}/livez").status_code == 503
 
 
+def _connect(address: str, port: int) -> socket.socket:
+    """A connection from one of this machine's own addresses, silent."""
+    return socket.create_connection(("127.0.0.1", port), timeout=30, source_address=(address, 0))
+
+
+def _ask(connection: socket.socket) -> bytes:
+    connection.sendall(b"GET /livez HTTP/1.1\r\nHost: 127.0.0.1\r\nConnection: close\r\n\r\n")
+    return connection.recv(65536)[:12]
+
+
+def test_one_address_cannot_hold_all_connections(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Silent connections beyond its share are ended; who comes from elsewhere notices nothing."""
+    monkeypatch.setattr("service.web.door.connections.is_loopback", lambda address: address == "127.0.0.9")
+    settings = Settings(data_dir=tmp_path, most_connections_each=3, forwarded_allow_ips="127.0.0.7", **QUIET)
+    app = create_app(settings, FakeOperations())
+    with serving(app, http=protocol_of(settings)) as address, ExitStack() as held:
+        port = int(address.rsplit(":", 1)[1])
+        # Of this machine and of a trusted proxy any number, for many come through there.
+        for sender, most in (("127.0.0.2", 3), ("127.0.0.7", 6), ("127.0.0.9", 6)):
+            silent = [held.enter_context(_connect(sender, port)) for _ in range(6)]
+            for refused in silent[most:]:
+                assert refused.recv(100).startswith(b"HTTP/1.1 503 ")
+            assert _ask(silent[0]) == b"HTTP/1.1 200"
+        assert _ask(held.enter_context(_connect("127.0.0.3", port))) == b"HTTP/1.1 200"
+        # One of the three has gone.
+        assert _ask(held.enter_context(_connect("127.0.0.2", port))) == b"HTTP/1.1 200"
+
+
+def test_addresses_of_one_holder_count_together():
+    assert _holder("2001:db8::1") == _holder("2001:db8::2:1") != _holder("2001:db8:1::1")
+    assert _holder("::ffff:192.0.2.1") == _holder("192.0.2.1") != _holder("192.0.2.2")
+
+
 def test_public_paths_take_small_forms_only(bare: TestClient):
     for path in ("/login", "/session"):
         assert bare.post(path, data={"key": "x" * 5000}).status_code == 413
@@ -139,34 +178,43 @@ def test_public_paths_take_small_forms_only(bare: TestClient):
         assert bare.post(path, data={"key": "nonsense"}).status_code == 401
 
 
-def test_a_body_that_does_not_come_is_not_waited_for(settings: Settings):
+def _sent_slowly(settings: Settings, part: bytes, pause_s: float, patience_s: float) -> tuple[str, int]:
+    """What a sender of one part after the other is answered, and how many parts it got rid of."""
     answers: list[str] = []
+    taken = 0
 
     async def reads_its_body(scope: Scope, receive: Receive, send: Send) -> None:
+        nonlocal taken
         try:
             while (await receive()).get("more_body", False):
-                pass
+                taken += 1
         except HTTPException as error:
             answers.append(f"{error.status_code}")
 
-    async def ask() -> None:
-        parts = iter([{"type": "http.request", "body": b"{", "more_body": True}])
+    async def receive() -> Message:
+        await anyio.sleep(pause_s)
+        return {"type": "http.request", "body": part, "more_body": taken < 60}
 
-        async def receive() -> Message:
-            part = next(parts, None)
-            if part is None:
-                await anyio.sleep_forever()
-            return part
+    async def send(message: Message) -> None:
+        pass
 
-        async def send(message: Message) -> None:
-            pass
+    middleware = BodyLimitMiddleware(reads_its_body, settings)
+    middleware.patience_s = patience_s
+    anyio.run(middleware, {"type": "http", "path": "/v1/plant", "headers": []}, receive, send)
+    return "".join(answers), taken
 
-        middleware = BodyLimitMiddleware(reads_its_body, settings)
-        middleware.patience_s = 0.01
-        await middleware({"type": "http", "path": "/v1/plant", "headers": []}, receive, send)
 
-    anyio.run(ask)
-    assert answers == ["408"]
+def test_a_body_that_does_not_come_is_not_waited_for(settings: Settings):
+    assert _sent_slowly(settings, b"{", 60.0, 0.01) == ("408", 0)
+
+
+def test_a_body_that_drips_ends_as_a_whole(settings: Settings):
+    """No pause is long, and it would never end."""
+    slow = settings.model_copy(update={"least_bytes_per_s": 1000.0})
+    answer, taken = _sent_slowly(slow, b" ", 0.01, 0.2)
+    assert answer == "408"
+    assert taken < 40
+    assert _sent_slowly(slow, b" " * 100, 0.01, 0.2) == ("", 60)  # ten times the rate, and three times as long
 
 
 def test_a_busy_model_is_503_for_requests_and_nothing_for_the_light(client: TestClient, app: FastAPI):
