@@ -7,6 +7,9 @@ from contextlib import contextmanager
 
 from service.base.faults import BusyError
 
+MOST_WAITING = 8
+"""Requests that wait for the model, each on one of the web server's threads."""
+
 
 class Gate:
     """Lets ``slots`` callers in at a time, in the order in which they came.
@@ -16,7 +19,7 @@ class Gate:
     says.
     """
 
-    def __init__(self, slots: int, most_waiting: int = 8) -> None:
+    def __init__(self, slots: int, most_waiting: int = MOST_WAITING) -> None:
         self._free = slots
         self._most_waiting = most_waiting
         self._hurried = 0

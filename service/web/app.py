@@ -18,6 +18,7 @@ from service.jobs.worker import Workers
 from service.store.database import Database
 from service.twin.accuracy import ComparisonBook
 from service.twin.field import FieldBook
+from service.twin.gate import MOST_WAITING
 from service.twin.runtime import Operations, Runtime
 from service.web.answers import openapi, problems
 from service.web.api import jobs
@@ -97,6 +98,7 @@ def create_app(settings: Settings, operations: Operations | None = None, kinds: 
     )
     app.state.stopping = threading.Event()
     app.state.turns = Turns()
+    app.state.computing = Turns(settings.parallel_computations + MOST_WAITING)  # as many as the model's gate takes
     v1 = APIRouter(prefix="/v1")
     for resource in modules_of("service.web.api"):
         v1.include_router(resource.router)

@@ -22,7 +22,7 @@ from service.web.answers.openapi import arrays, problems
 from service.web.answers.paging import Page, page
 from service.web.answers.representation import Maps
 from service.web.api.jobs import IdempotencyKey, JobOut, job_out
-from service.web.door.dependencies import OPERATE, READ, IdentityDep, Limit, RuntimeDep, require_json
+from service.web.door.dependencies import COMPUTES, OPERATE, READ, IdentityDep, Limit, RuntimeDep, require_json
 
 
 class ForecastIn(Model):
@@ -170,7 +170,7 @@ Asked = Annotated[
         **problems(404, 409, 413, 415, 429),
         202: {"model": JobOut, "description": "Of many heliostats: the job that superposes them, under its Location."},
     },
-    dependencies=[OPERATE, Depends(require_json)],
+    dependencies=[OPERATE, Depends(require_json), COMPUTES],
 )
 def post_forecast(
     request: Asked, runtime: RuntimeDep, identity: IdentityDep, response: Response, key: IdempotencyKey = None

@@ -22,7 +22,16 @@ from service.web.answers.formats import MediaType, json_answer, maps_answer
 from service.web.answers.openapi import arrays, problems
 from service.web.answers.paging import Page, page
 from service.web.answers.representation import Maps
-from service.web.door.dependencies import INGEST, READ, Limit, MeasurementPath, NamePath, RuntimeDep, require_multipart
+from service.web.door.dependencies import (
+    COMPUTES,
+    INGEST,
+    READ,
+    Limit,
+    MeasurementPath,
+    NamePath,
+    RuntimeDep,
+    require_multipart,
+)
 
 Motors = Annotated[
     tuple[Annotated[float, Field(ge=-1e9, le=1e9)], Annotated[float, Field(ge=-1e9, le=1e9)]],
@@ -158,7 +167,7 @@ def _bytes(upload: UploadFile, limit: int) -> bytes:
         **problems(400, 404, 409, 413, 415),
         200: {"model": MeasurementOut, "description": "This image was there already; nothing changed."},
     },
-    dependencies=[INGEST, Depends(require_multipart)],
+    dependencies=[INGEST, Depends(require_multipart), COMPUTES],
 )
 def post_measurement(
     name: NamePath,

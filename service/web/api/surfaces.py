@@ -19,7 +19,16 @@ from service.web.answers.formats import MediaType, json_answer, maps_answer
 from service.web.answers.openapi import arrays, problems
 from service.web.answers.paging import Page, page
 from service.web.answers.representation import Maps
-from service.web.door.dependencies import OPERATE, READ, IdentityDep, Limit, NamePath, RuntimeDep, require_json
+from service.web.door.dependencies import (
+    COMPUTES,
+    OPERATE,
+    READ,
+    IdentityDep,
+    Limit,
+    NamePath,
+    RuntimeDep,
+    require_json,
+)
 
 
 class SurfaceIn(Model):
@@ -103,7 +112,7 @@ router = APIRouter(prefix="/heliostats/{name}/surfaces", tags=["surfaces"])
     "",
     status_code=status.HTTP_201_CREATED,
     responses=problems(404, 409, 413, 415),
-    dependencies=[OPERATE, Depends(require_json)],
+    dependencies=[OPERATE, Depends(require_json), COMPUTES],
 )
 def post_surface(
     name: NamePath,

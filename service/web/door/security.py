@@ -31,14 +31,14 @@ PUBLIC = ("/livez", "/readyz", "/openapi.json", "/docs", "/session", "/login", "
 class Role(StrEnum):
     """What a key may do; each role may also do what those before it may."""
 
-    READ = ROLES[0]
+    READ = "read"
     """Read everything but the audit trail: dashboards."""
-    INGEST = ROLES[1]
+    INGEST = "ingest"
     """Post photographs: the calibration system, which reads back flux, quality and surface."""
-    OPERATE = ROLES[2]
+    OPERATE = "operate"
     """Predict, forecast, study, adopt effects, run and cancel jobs, change plant, targets and heliostats: operators,
     aim-point software."""
-    ADMIN = ROLES[3]
+    ADMIN = "admin"
     """Read the audit trail: whoever answers for the plant."""
 
     def includes(self, other: "Role") -> bool:

@@ -14,7 +14,7 @@ from service.jobs.kinds.predictions import PredictionsIn
 from service.store import queue
 from service.store.tables import JobRow
 from service.web.answers.pages import go_to, render
-from service.web.door.dependencies import OPERATE, READ, IdentityDep, RuntimeDep
+from service.web.door.dependencies import DRAWS, OPERATE, READ, IdentityDep, RuntimeDep
 
 router = APIRouter(include_in_schema=False)
 
@@ -55,7 +55,7 @@ def _plain(value: Any) -> bool:
     return isinstance(value, str | int | float | bool)
 
 
-@router.get("/jobs/{number}", dependencies=[READ])
+@router.get("/jobs/{number}", dependencies=[READ, DRAWS])
 def get_job_page(number: Number, request: Request, runtime: RuntimeDep) -> HTMLResponse:
     """A job; the page follows it until it ends."""
     with runtime.database.reading() as session:

@@ -1,7 +1,8 @@
 """Clients that take more than their share: they wait, and nobody else does."""
 
 import socket
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,26 +23,52 @@ from service.web.door.limits import Buckets
 from service.web.door.turns import Turns
 from service.web.middleware import BodyLimitMiddleware
 from service.web.server import config_of
-from tests.service.conftest import QUIET, FakeOperations, client_of, serving
+from tests.service.conftest import QUIET, FakeOperations, Post, client_of, png, serving
 from tests.service.web.test_keys import bearer, make_key
 
 FORECAST = {"heliostat": "AA39", "target": "lower", "sun": {"azimuth_deg": 0.0, "elevation_deg": 45.0}}
 
 
-def _hold_all(client: TestClient, app: FastAPI) -> None:
-    app.state.turns = Turns(count=1, most_waiting=0)
+@contextmanager
+def _none_left(client: TestClient, app: FastAPI, what: str) -> Iterator[None]:
+    """While another key holds the only turn, and nobody may wait."""
+    turns = Turns(count=1, most_waiting=0)
+    setattr(app.state, what, turns)
+    held = turns.one("the test")
     assert client.portal is not None
-    client.portal.call(app.state.turns._limiter.acquire_on_behalf_of_nowait, "the test")
+    client.portal.call(held.__aenter__)
+    yield
+    client.portal.call(held.__aexit__, None, None, None)
 
 
 def test_maps_have_turns_of_their_own_and_light_requests_need_none(client: TestClient, app: FastAPI):
     made = client.post("/v1/forecasts", json={**FORECAST, "surface": "ideal"})
-    _hold_all(client, app)
-    refused = client.get(made.headers["Location"])
-    assert (refused.status_code, refused.headers["Retry-After"]) == (503, "5")
-    assert refused.headers["Content-Type"] == "application/problem+json"
-    for light in ("/v1/plant", "/v1/heliostats/AA39", "/v1/forecasts", "/readyz"):
-        assert client.get(light).status_code == 200, light
+    with _none_left(client, app, "turns"):
+        refused = client.get(made.headers["Location"])
+        assert (refused.status_code, refused.headers["Retry-After"]) == (503, "5")
+        assert refused.headers["Content-Type"] == "application/problem+json"
+        for light in ("/v1/plant", "/v1/heliostats/AA39", "/v1/forecasts", "/readyz", "/jobs", "/forecast"):
+            assert client.get(light).status_code == 200, light
+
+
+def test_pages_with_maps_have_the_same_turns(client: TestClient, app: FastAPI):
+    client.post("/v1/forecasts", json={**FORECAST, "surface": "ideal"})
+    client.post("/v1/jobs/predictions", json={})
+    drawn = ("/", "/heliostats/AA39", "/forecasts/1", "/jobs/1")
+    assert [client.get(page).status_code for page in drawn] == [200] * 4
+    with _none_left(client, app, "turns"):
+        assert [client.get(page).status_code for page in drawn] == [503] * 4
+
+
+def test_one_key_does_not_fill_the_line_before_the_model(client: TestClient, app: FastAPI, post: Post):
+    asked = {**FORECAST, "surface": "ideal"}
+    form = {"heliostat": "AA39", "target": "lower", "azimuth_deg": "0", "elevation_deg": "45"}
+    with _none_left(client, app, "computing"):
+        assert post().status_code == 503
+        assert client.post("/v1/forecasts", json=asked).status_code == 503
+        assert client.post("/v1/heliostats/AA39/surfaces", json={}).status_code == 503
+        assert client.post("/forecast", data=form).status_code == 503
+    assert [post(png(seed)).status_code for seed in (1, 2)] == [201, 201]  # each gives its turn back
 
 
 def test_a_turn_ends_with_its_request(client: TestClient, app: FastAPI):
@@ -55,21 +82,67 @@ def test_a_turn_ends_with_its_request(client: TestClient, app: FastAPI):
 def test_turns_are_bounded_in_number_and_time():
     async def ask() -> list[str]:
         turns, said = Turns(count=1, most_waiting=1, patience_s=0.05), []
-        async with turns.one():
+        async with turns.one("a"):
             with pytest.raises(BusyError) as late:
-                async with turns.one():
+                async with turns.one("a"):
                     pass
             said.append(str(late.value))
-        async with turns.one():  # the one that gave up holds nothing
+        async with turns.one("a"):  # the one that gave up holds nothing
             pass
         full = Turns(count=1, most_waiting=0)
-        async with full.one():
-            with pytest.raises(BusyError, match="too many"):
-                async with full.one():
+        async with full.one("a"):
+            with pytest.raises(BusyError, match="too much"):
+                async with full.one("a"):
                     pass
         return said
 
     assert "one after the other" in anyio.run(ask)[0]
+
+
+def test_one_key_has_half_of_the_turns_and_of_the_places_to_wait():
+    """However greedy it is, another has a turn at once, and two greedy ones are served by turns."""
+
+    async def ask() -> list[str]:
+        turns, order, leave = Turns(count=2, most_waiting=8), [], anyio.Event()
+
+        async def take(who: str) -> None:
+            try:
+                async with turns.one(who):
+                    order.append(who)
+                    await leave.wait()
+            except BusyError:
+                order.append(f"{who} refused")
+
+        async with anyio.create_task_group() as asking:
+            for who in ["greedy"] * 6 + ["victim"] + ["other"] * 3:
+                asking.start_soon(take, who)
+                await anyio.wait_all_tasks_blocked()
+            leave.set()
+        return order
+
+    assert anyio.run(ask) == [
+        *("greedy", "greedy refused", "victim"),
+        *("greedy", "other", "greedy", "other", "greedy", "other", "greedy"),
+    ]
+
+
+def test_who_goes_while_waiting_leaves_no_place_taken():
+    async def ask() -> None:
+        turns = Turns(count=2, most_waiting=2)
+
+        async def wait() -> None:
+            async with turns.one("a"):
+                pass
+
+        for _ in range(3):
+            async with turns.one("a"), anyio.create_task_group() as asking:
+                asking.start_soon(wait)
+                await anyio.wait_all_tasks_blocked()
+                asking.cancel_scope.cancel()
+        async with turns.one("a"), turns.one("b"):
+            pass
+
+    anyio.run(ask)
 
 
 def test_a_debt_is_paid_before_the_next_request():
