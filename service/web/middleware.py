@@ -9,7 +9,7 @@ from functools import partial
 from http import HTTPStatus
 from urllib.parse import urlsplit
 
-from anyio import CapacityLimiter, move_on_after, to_thread
+from anyio import CancelScope, CapacityLimiter, move_on_after, to_thread
 from fastapi import HTTPException, Response
 from sqlalchemy.exc import OperationalError
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
@@ -30,8 +30,6 @@ _REQUEST_ID = re.compile(r"[A-Za-z0-9_-]{8,64}")
 # Methods that are told apart in metrics, and paths that are asked for too often to log each time.
 _METHODS = ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS")
 _PROBES = ("/livez", "/readyz", "/metrics")
-# What supervisors ask without a key; it costs little, and `/readyz` has one thread of its own.
-_HEALTH = ("/livez", "/readyz")
 # Bytes of an answer that count as another request: a map of 1024 x 1024 as JSON counts as some three hundred.
 _BYTES_A_TOKEN = 64 * 1024
 # Largest body where no key is needed [bytes], and its only media type: a form with a key.
@@ -57,29 +55,29 @@ class RequestIdMiddleware:
         given = Headers(scope=scope).get("x-request-id", "")
         identity = given if _REQUEST_ID.fullmatch(given) else uuid.uuid4().hex
         scope.setdefault("state", {})["request_id"] = identity
-        started = time.perf_counter()
+        method, started = scope["method"], time.perf_counter()
 
         async def send_with_id(message: Message) -> None:
             if message["type"] == "http.response.start":
                 MutableHeaders(scope=message)["X-Request-ID"] = identity
-                _note(scope, message["status"], time.perf_counter() - started)
+                _note(scope, method, message["status"], time.perf_counter() - started)
             await send(message)
 
         with logs.bound(request_id=identity):
             await self.app(scope, receive, send_with_id)
 
 
-def _note(scope: Scope, status: int, took_s: float) -> None:
+def _note(scope: Scope, method: str, status: int, took_s: float) -> None:
     """Log a request and count it."""
     path, identity = scope["path"], scope["state"].get("identity")
     level = logging.DEBUG if path in _PROBES else logging.INFO
-    extra = {"method": scope["method"], "path": path, "status": status, "ms": round(took_s * 1e3, 1)}
+    extra = {"method": method, "path": path, "status": status, "ms": round(took_s * 1e3, 1)}
     extra["key"] = None if identity is None else identity.name
-    logger.log(level, "%s %s %d %.1f ms", scope["method"], path, status, took_s * 1e3, extra=extra)
-    method = scope["method"] if scope["method"] in _METHODS else "other"
+    logger.log(level, "%s %s %d %.1f ms", method, path, status, took_s * 1e3, extra=extra)
+    known = method if method in _METHODS else "other"
     route = _template(scope)
-    REQUESTS.labels(method, route, status).inc()
-    REQUEST_SECONDS.labels(method, route).observe(took_s)
+    REQUESTS.labels(known, route, status).inc()
+    REQUEST_SECONDS.labels(known, route).observe(took_s)
 
 
 def _template(scope: Scope) -> str:
@@ -89,6 +87,36 @@ def _template(scope: Scope) -> str:
         return "none"
     # A router that was included tells its own path only.
     return path if not scope["path"].startswith("/v1/") or path.startswith("/v1/") else f"/v1{path}"
+
+
+class HeadMiddleware:
+    """Answers HEAD as GET, without the body; what is made part by part, such as events, ends with its head."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """One ASGI call."""
+        if scope["type"] != "http" or scope["method"] != "HEAD":
+            await self.app(scope, receive, send)
+            return
+        making = CancelScope()
+
+        async def send_head(message: Message) -> None:
+            if message["type"] != "http.response.body":
+                await send(message)
+                return
+            await send({"type": "http.response.body", "body": b"", "more_body": False})
+            if message.get("more_body", False):
+                making.cancel()
+
+        # The scope itself, for the server and the log look into it; the server must know again what it answers.
+        scope["method"] = "GET"
+        try:
+            with making:
+                await self.app(scope, receive, send_head)
+        finally:
+            scope["method"] = "HEAD"
 
 
 class SecurityHeadersMiddleware:
@@ -177,7 +205,7 @@ class DoorMiddleware:
         return identity
 
     def _too_often(self, scope: Scope) -> Response | None:
-        if scope["path"] in _HEALTH:
+        if scope["path"] in security.HEALTH:
             return None
         wait_s = self.buckets.wait_s(_bucket(scope))
         if not wait_s:

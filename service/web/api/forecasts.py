@@ -10,7 +10,19 @@ from pydantic import BaseModel, Discriminator, Field, Tag, model_validator
 
 from service import store
 from service.base.arrays import pair
-from service.base.fields import Model, ModelVersion, Name, Plane, Position, Resolution, Sun, Version
+from service.base.fields import (
+    Flag,
+    Model,
+    ModelVersion,
+    Name,
+    Number,
+    Plane,
+    Position,
+    Resolution,
+    Sun,
+    Version,
+    VersionIn,
+)
 from service.drawing.pictures import flux_picture
 from service.jobs.asking import ask_for
 from service.jobs.kinds.field_forecasts import FleetForecastIn
@@ -35,18 +47,18 @@ class ForecastIn(Model):
     aim_point: Position | None = Field(
         default=None, description="Where the heliostat aims [m]; by default the plane's centre."
     )
-    surface: Literal["current", "ideal"] | Version = Field(
+    surface: Literal["current", "ideal"] | VersionIn = Field(
         default="current", description="The heliostat's current surface, the ideal one, or a version."
     )
-    dni_w_m2: float = Field(default=1000.0, gt=0, le=2000, description="Direct normal irradiance [W/m2].")
+    dni_w_m2: Number = Field(default=1000.0, gt=0, le=2000, description="Direct normal irradiance [W/m2].")
     resolution: Resolution = (256, 256)
-    window: float | None = Field(
+    window: Number | None = Field(
         default=None,
         ge=0.01,
         le=1e3,
         description="Side of a square about the centre of mass to map [m]; else the plane.",
     )
-    normalised: bool = Field(default=False, description="Scale the map to a sum of 100 instead of W/m2.")
+    normalised: Flag = Field(default=False, description="Scale the map to a sum of 100 instead of W/m2.")
     model_version: ModelVersion = None
 
     @model_validator(mode="after")

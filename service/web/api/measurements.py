@@ -10,7 +10,18 @@ from pydantic import BaseModel, BeforeValidator, Field, Json
 from service import store
 from service.base.arrays import pair, unpack
 from service.base.faults import NotFoundError, TooLargeError
-from service.base.fields import Azimuth, Elevation, Identifier, Kind, MeasurementName, Model, Moment, Name, Wgs84
+from service.base.fields import (
+    Azimuth,
+    Elevation,
+    Identifier,
+    Kind,
+    MeasurementName,
+    Model,
+    Moment,
+    Name,
+    Number,
+    Wgs84,
+)
 from service.drawing.pictures import flux_picture
 from service.sources.photograph import Photograph
 from service.sources.schema import paint_motors, paint_spot
@@ -34,11 +45,11 @@ from service.web.door.dependencies import (
 )
 
 Motors = Annotated[
-    tuple[Annotated[float, Field(ge=-1e9, le=1e9)], Annotated[float, Field(ge=-1e9, le=1e9)]],
+    tuple[Annotated[Number, Field(ge=-1e9, le=1e9)], Annotated[Number, Field(ge=-1e9, le=1e9)]],
     BeforeValidator(paint_motors),
 ]
 
-Pixel = tuple[Annotated[float, Field(ge=-1e5, le=1e5)], Annotated[float, Field(ge=-1e5, le=1e5)]]
+Pixel = tuple[Annotated[Number, Field(ge=-1e5, le=1e5)], Annotated[Number, Field(ge=-1e5, le=1e5)]]
 
 
 class MeasurementIn(Model):

@@ -9,7 +9,7 @@ from pydantic import BaseModel, Field
 
 from service import store
 from service.base.arrays import unpack
-from service.base.fields import MeasurementName, Method, Model, ModelVersion, Moment, Source, Version
+from service.base.fields import MeasurementName, Method, Model, ModelVersion, Moment, Source, Version, Whole
 from service.drawing.pictures import surface_picture
 from service.store.tables import SurfaceRow
 from service.twin.prediction import predict_surface
@@ -38,7 +38,7 @@ class SurfaceIn(Model):
     measurements: list[MeasurementName] | None = Field(
         default=None, min_length=1, max_length=8, description="Ids of 1 to 8 accepted measurements."
     )
-    images: int = Field(
+    images: Whole = Field(
         default=8,
         ge=1,
         le=8,

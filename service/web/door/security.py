@@ -28,6 +28,10 @@ PUBLIC = ("/livez", "/readyz", "/openapi.json", "/docs", "/session", "/login", "
 """Paths that need no key, with all that lies below them; none shows or changes anything of the plant."""
 
 
+HEALTH = ("/livez", "/readyz")
+"""What supervisors ask, as often as they like; it costs little, and `/readyz` has one thread of its own."""
+
+
 class Role(StrEnum):
     """What a key may do; each role may also do what those before it may."""
 

@@ -12,7 +12,7 @@ from sqlalchemy.orm import Session
 from model.ephemeris import sun_angles_at
 from model.errors import InvalidInputError
 from service import store
-from service.base.fields import Azimuth, Elevation, Model, Name, Sun, Version
+from service.base.fields import AZIMUTH, ELEVATION, Model, Name, Sun, Version
 from service.drawing import charts
 from service.jobs.asking import ask_for
 from service.jobs.kinds.field_forecasts import FleetForecastIn
@@ -40,8 +40,8 @@ class ForecastForm(Model):
     heliostat: Name | None = None
     target: Name
     sun_by: Literal["position", "time"] = "position"
-    azimuth_deg: Azimuth | None = None
-    elevation_deg: Elevation | None = None
+    azimuth_deg: Annotated[float, AZIMUTH] | None = None
+    elevation_deg: Annotated[float, ELEVATION] | None = None
     moment: Annotated[datetime | None, AfterValidator(lambda moment: None if moment is None else _in_utc(moment))] = (
         None
     )
