@@ -46,6 +46,7 @@ class SunShapeEffect(Effect):
     """
 
     name: ClassVar[str] = "sun_shape"
+    about: ClassVar[str] = "Sun shape: haze that spreads the sun's light into an aureole."
     stage: ClassVar[Stage] = "optics"
     scales_with: ClassVar[frozenset[Factor]] = frozenset({"distance", "weather"})
 
