@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 # Answers after which the same request may succeed later.
-AGAIN = (429, 500, 502, 503, 504, 507)
+AGAIN = (408, 429, 500, 502, 503, 504, 507)
 LONGEST_PAUSE_S = 60.0
 
 

@@ -43,6 +43,7 @@ class AxisTilt(Effect):
     """The foundation is turned about north by ``north_deg``, then about up by ``up_deg`` [deg], right-handed."""
 
     name: ClassVar[str] = "axis_tilt"
+    about: ClassVar[str] = "Axis tilt: the mount's foundation does not stand as surveyed."
     stage: ClassVar[Stage] = "geometry"
     scales_with: ClassVar[frozenset[Factor]] = frozenset({"roll"})
 

@@ -46,6 +46,7 @@ class Background(Effect):
     """
 
     name: ClassVar[str] = "background"
+    about: ClassVar[str] = "Background: light on the target, or counts in the camera, that the heliostat did not send."
     stage: ClassVar[Stage] = "image"
     scales_with: ClassVar[frozenset[Factor]] = frozenset({"weather", "camera"})
 

@@ -86,6 +86,8 @@ class Effect:
     ----------
     name : str
         As in DESIGN.md, section 5.
+    about : str
+        What it is, in one sentence for people.
     stage : {"geometry", "optics", "image"}
         What must be done anew when a parameter changes: the alignment of the mirrors, the tracing, or only the image.
     scales_with : frozenset of Factor
@@ -98,6 +100,7 @@ class Effect:
     """
 
     name: ClassVar[str]
+    about: ClassVar[str]
     stage: ClassVar[Stage]
     scales_with: ClassVar[frozenset[Factor]]
     guesses: ClassVar[tuple[dict[str, float], ...]] = ()

@@ -42,6 +42,7 @@ class Blocking(Effect):
     """The lowest ``lower_fraction`` of the mirror's height, counted along its y, sends no light to the target."""
 
     name: ClassVar[str] = "blocking"
+    about: ClassVar[str] = "Blocking: a neighbour in front hides the lower part of the mirror."
     stage: ClassVar[Stage] = "geometry"
     scales_with: ClassVar[frozenset[Factor]] = frozenset({"heliostat", "elevation"})
 

@@ -42,6 +42,7 @@ class CameraBlur(Effect):
     """The image is smeared by a Gaussian of standard deviation ``sigma_m`` [m on the target] per axis."""
 
     name: ClassVar[str] = "camera_blur"
+    about: ClassVar[str] = "Camera blur: a lens out of focus, air that shimmers."
     stage: ClassVar[Stage] = "image"
     scales_with: ClassVar[frozenset[Factor]] = frozenset({"camera"})
 

@@ -42,6 +42,7 @@ class CameraGhost(Effect):
     """A ``share`` of the light appears ``right_m`` and ``up_m`` [m on the target] beside its place."""
 
     name: ClassVar[str] = "camera_ghost"
+    about: ClassVar[str] = "Camera ghost: a second, faint and displaced image of the spot."
     stage: ClassVar[Stage] = "image"
     scales_with: ClassVar[frozenset[Factor]] = frozenset({"camera"})
     guesses: ClassVar[tuple[dict[str, float], ...]] = tuple(

@@ -47,6 +47,7 @@ class CameraResponse(Effect):
     """Light is cut at ``saturation`` of the peak, then raised to the power ``gamma``."""
 
     name: ClassVar[str] = "camera_response"
+    about: ClassVar[str] = "Camera response: counts that do not grow in proportion to the light."
     stage: ClassVar[Stage] = "image"
     scales_with: ClassVar[frozenset[Factor]] = frozenset({"camera"})
 

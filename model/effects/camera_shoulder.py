@@ -48,6 +48,9 @@ class CameraShoulder(Effect):
     """Light is compressed by 1 - exp(-``compression`` * light / peak), the peak kept."""
 
     name: ClassVar[str] = "camera_shoulder"
+    about: ClassVar[str] = (
+        "Camera shoulder: counts that grow ever less the more light there is, long before the sensor's end."
+    )
     stage: ClassVar[Stage] = "image"
     scales_with: ClassVar[frozenset[Factor]] = frozenset({"camera"})
 

@@ -43,6 +43,7 @@ class FacetCanting(Effect):
     """Each facet's slope grows by ``x_mrad`` along the mirror's x and by ``y_mrad`` along its y [mrad]."""
 
     name: ClassVar[str] = "facet_canting"
+    about: ClassVar[str] = "Canting error: facets that lean against the pose they are known in."
     stage: ClassVar[Stage] = "geometry"
     scales_with: ClassVar[frozenset[Factor]] = frozenset({"distance", "heliostat", "roll"})
     prior_std: ClassVar[float] = 0.1  # the mount takes back what a mirror's facets share, and no image shows it

@@ -57,6 +57,7 @@ class GravityBending(Effect):
     """Edges sink by ``amplitude_mm`` [mm] per unit of the sine of the normal's elevation."""
 
     name: ClassVar[str] = "gravity_bending"
+    about: ClassVar[str] = "Gravity bending: the mirror sags under its own weight, the more the flatter it lies."
     stage: ClassVar[Stage] = "geometry"
     scales_with: ClassVar[frozenset[Factor]] = frozenset({"distance", "elevation"})
 

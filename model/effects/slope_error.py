@@ -38,6 +38,7 @@ class SlopeError(Effect):
     """The mirror's normals scatter with a standard deviation of ``sigma_mrad`` [mrad] per axis."""
 
     name: ClassVar[str] = "slope_error"
+    about: ClassVar[str] = "Slope error: waviness of the mirror too fine for the surface's control points."
     stage: ClassVar[Stage] = "optics"
     scales_with: ClassVar[frozenset[Factor]] = frozenset({"distance", "heliostat"})
 

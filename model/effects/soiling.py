@@ -40,6 +40,7 @@ class Soiling(Effect):
     """Each facet reflects ``reflectivity_ratio`` of what a clean one does."""
 
     name: ClassVar[str] = "soiling"
+    about: ClassVar[str] = "Soiling: facets that reflect less than the best of their heliostat."
     stage: ClassVar[Stage] = "geometry"
     scales_with: ClassVar[frozenset[Factor]] = frozenset({"heliostat"})
 

@@ -42,6 +42,7 @@ class SunPosition(Effect):
     """The sun stood where it is ``minutes`` [min] after the recorded time, further west where positive."""
 
     name: ClassVar[str] = "sun_position"
+    about: ClassVar[str] = "Clock error: the sun stood elsewhere than the recorded time says."
     stage: ClassVar[Stage] = "geometry"
     scales_with: ClassVar[frozenset[Factor]] = frozenset({"roll", "side"})
 

@@ -43,6 +43,7 @@ class SunShapeEffect(Effect):
     """The declared sun behind haze; Buie's sun with 0.02, the default, becomes Buie's with ``circumsolar_ratio``."""
 
     name: ClassVar[str] = "sun_shape"
+    about: ClassVar[str] = "Sun shape: haze that spreads the sun's light into an aureole."
     stage: ClassVar[Stage] = "optics"
     scales_with: ClassVar[frozenset[Factor]] = frozenset({"distance", "weather"})
 

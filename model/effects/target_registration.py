@@ -49,6 +49,7 @@ class TargetRegistration(Effect):
     """
 
     name: ClassVar[str] = "target_registration"
+    about: ClassVar[str] = "Target registration: the target's corners were not found where they are."
     stage: ClassVar[Stage] = "image"
     scales_with: ClassVar[frozenset[Factor]] = frozenset({"camera"})
 

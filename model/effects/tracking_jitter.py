@@ -39,6 +39,9 @@ class TrackingJitter(Effect):
     """The mirror turns about the first mount axis with a standard deviation of ``sigma_mrad`` [mrad]."""
 
     name: ClassVar[str] = "tracking_jitter"
+    about: ClassVar[str] = (
+        "Tracking jitter: the mount oscillates about its first axis while the camera's shutter is open."
+    )
     stage: ClassVar[Stage] = "optics"
     scales_with: ClassVar[frozenset[Factor]] = frozenset({"distance", "roll", "weather"})
 

@@ -7,7 +7,16 @@ from datetime import UTC, datetime
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, AwareDatetime, BaseModel, BeforeValidator, ConfigDict, Field, StringConstraints
+from pydantic import (
+    AfterValidator,
+    AwareDatetime,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    Strict,
+    StringConstraints,
+)
 
 from model.plant import Cylinder, TargetPlane
 from service.base.choices import Method as Method  # one of these types, and a choice of the command line
@@ -35,24 +44,40 @@ Kind = Literal["raw", "cropped", "flux", "flux-centered"]
 Source = Literal["measured", "network", "refined", "imported"]
 Verdict = Literal["effect", "none", "unexplained"]
 State = Literal["queued", "running", "done", "failed", "cancelled"]
-Metres = Annotated[float, Field(ge=-1e6, le=1e6)]
+
+
+def _is_number(value: Any) -> Any:
+    if isinstance(value, bool | str):
+        raise ValueError("must be a number, and neither text nor a truth value")
+    return value
+
+
+# JSON has types: what only stands for a number there is a mistake. Forms and queries, which are all text, have float
+# and int themselves.
+Number = Annotated[float, BeforeValidator(_is_number)]
+Whole = Annotated[int, BeforeValidator(_is_number)]
+Flag = Annotated[bool, Strict()]
+
+Metres = Annotated[Number, Field(ge=-1e6, le=1e6)]
 Position = Annotated[tuple[Metres, Metres, Metres], Field(description="East, north, up of the tower base [m].")]
 
 Direction = tuple[
-    Annotated[float, Field(ge=-1e3, le=1e3)],
-    Annotated[float, Field(ge=-1e3, le=1e3)],
-    Annotated[float, Field(ge=-1e3, le=1e3)],
+    Annotated[Number, Field(ge=-1e3, le=1e3)],
+    Annotated[Number, Field(ge=-1e3, le=1e3)],
+    Annotated[Number, Field(ge=-1e3, le=1e3)],
 ]
 
 Wgs84 = tuple[
-    Annotated[float, Field(ge=-90, le=90)],
-    Annotated[float, Field(ge=-180, le=180)],
-    Annotated[float, Field(ge=-1e4, le=1e5)],
+    Annotated[Number, Field(ge=-90, le=90)],
+    Annotated[Number, Field(ge=-180, le=180)],
+    Annotated[Number, Field(ge=-1e4, le=1e5)],
 ]
 
-Azimuth = Annotated[float, Field(ge=-360, le=360, description="Sun azimuth from south, positive to the east [deg].")]
-Elevation = Annotated[float, Field(gt=0, le=90, description="Sun elevation above the horizon [deg].")]
-Extent = Annotated[float, Field(ge=0.01, le=1e3)]
+AZIMUTH = Field(ge=-360, le=360, description="Sun azimuth from south, positive to the east [deg].")
+ELEVATION = Field(gt=0, le=90, description="Sun elevation above the horizon [deg].")
+Azimuth = Annotated[Number, AZIMUTH]
+Elevation = Annotated[Number, ELEVATION]
+Extent = Annotated[Number, Field(ge=0.01, le=1e3)]
 
 Moment = Annotated[
     AwareDatetime,
@@ -61,9 +86,12 @@ Moment = Annotated[
 ]
 
 Version = Annotated[int, Field(ge=1, le=2**31 - 1)]
+"""In paths and queries."""
+VersionIn = Annotated[Whole, Field(ge=1, le=2**31 - 1)]
+"""In bodies."""
 
 ModelVersion = Annotated[
-    Version | None,
+    VersionIn | None,
     Field(description="Number of a version of the plant's model, see /v1/models; the current one without it."),
 ]
 
@@ -103,9 +131,9 @@ class ReceiverIn(Model):
     center: Position = Field(description="The middle of the lit surface: east, north, up of the tower base [m].")
     normal: Direction = Field(description="Normal there, away from the axis, east-north-up; of any length.")
     up: Direction = Field(default=(0.0, 0.0, 1.0), description="Along the axis, upwards in the map.")
-    radius: Annotated[float, Field(ge=0.01, lt=1e3)] = Field(description="[m]")
+    radius: Annotated[Number, Field(ge=0.01, lt=1e3)] = Field(description="[m]")
     height: Extent = Field(description="Along the axis [m].")
-    opening_deg: float = Field(
+    opening_deg: Number = Field(
         default=360.0, gt=0, le=360, description="Angle of the lit surface, half of it to each side of its middle."
     )
 
@@ -130,10 +158,10 @@ class Sun(Model):
 
 
 def _square(value: Any) -> Any:
-    return (value, value) if isinstance(value, int) and not isinstance(value, bool) else value
+    return (value, value) if isinstance(value, int | float) and not isinstance(value, bool) else value
 
 
-Side = Annotated[int, Field(ge=8, le=1024)]
+Side = Annotated[Whole, Field(ge=8, le=1024)]
 
 Resolution = Annotated[
     tuple[Side, Side],

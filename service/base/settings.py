@@ -1,6 +1,7 @@
 """Settings of the service, from the environment (prefix ``HELIOTWIN_``) or a ``.env`` file."""
 
 import ipaddress
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal, Self
 
@@ -8,6 +9,8 @@ from pydantic import Field, SecretStr, field_validator, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 from sqlalchemy import URL, make_url
 from sqlalchemy.exc import ArgumentError
+
+Network = ipaddress.IPv4Network | ipaddress.IPv6Network
 
 LogLevel = Literal["critical", "error", "warning", "info", "debug"]
 
@@ -31,6 +34,20 @@ def is_loopback(host: str) -> bool:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return False  # a name that may resolve anywhere
+
+
+def networks_of(text: str) -> tuple[Network, ...]:
+    """Addresses and networks with commas between; ValueError for anything else, and for `*`, which trusts everybody."""
+    return tuple(ipaddress.ip_network(part.strip()) for part in text.split(","))
+
+
+def is_within(host: str, networks: Iterable[Network]) -> bool:
+    """Whether an address lies in one of these networks; nothing else than an address does."""
+    try:
+        address = ipaddress.ip_address(host)
+    except ValueError:
+        return False
+    return any(address in network for network in networks)
 
 
 class Settings(BaseSettings):
@@ -65,6 +82,13 @@ class Settings(BaseSettings):
         default=False,
         description="Unsafe: while no key was made, whoever reaches a non-loopback host may read and write everything.",
     )
+    proxy_headers: bool = Field(
+        default=True, description="Believe X-Forwarded-For and X-Forwarded-Proto of the proxies in forwarded_allow_ips."
+    )
+    forwarded_allow_ips: str = Field(
+        default="127.0.0.1,::1",
+        description="Addresses and networks of trusted proxies, with commas between; never one that clients come from.",
+    )
     max_image_bytes: int = Field(default=32 * 2**20, ge=1024, description="Largest image accepted [bytes].")
     max_image_pixels: int = Field(
         default=50_000_000, ge=1024, description="Largest image accepted, width x height [pixels]."
@@ -87,6 +111,15 @@ class Settings(BaseSettings):
     )
     most_watchers_of_key: int = Field(
         default=50, ge=1, le=10_000, description="Those of one key, or of all without a key; 429 beyond."
+    )
+    most_connections_each: int = Field(
+        default=100,
+        ge=1,
+        le=100_000,
+        description="Those of one address, of a /64 with IPv6; this machine and trusted proxies have no such bound.",
+    )
+    least_bytes_per_s: float = Field(
+        default=4096.0, gt=0, le=1e9, description="Bytes of a body that must come each second, on the whole [bytes/s]."
     )
     parallel_computations: int = Field(
         default=2, ge=1, le=64, description="Measurements, predictions and tracings at a time."
@@ -156,6 +189,12 @@ class Settings(BaseSettings):
             raise ValueError(f"must be a sqlite or postgresql URL, not {backend}")
         return value
 
+    @field_validator("forwarded_allow_ips")
+    @classmethod
+    def _known_proxies(cls, value: str) -> str:
+        networks_of(value)
+        return value
+
     @model_validator(mode="after")
     def _enough_connections(self) -> Self:
         """With fewer, workers could hold all there are, and requests and heartbeats would wait for them."""
@@ -166,6 +205,11 @@ class Settings(BaseSettings):
                 f"set at least {least}"
             )
         return self
+
+    @property
+    def trusted_proxies(self) -> tuple[Network, ...]:
+        """Whose word on the sender of a request is believed."""
+        return networks_of(self.forwarded_allow_ips) if self.proxy_headers else ()
 
     @property
     def connections(self) -> int:

@@ -1,6 +1,5 @@
 """A study as one page that an operator reads: no request to anywhere, no script, its pictures within it."""
 
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -54,9 +53,8 @@ class Finding:
     def of(cls, found: Found) -> "Finding":
         """An effect as the page shows it."""
         kind = CATALOGUE[found.name]
-        about = (sys.modules[kind.__module__].__doc__ or "").partition("\n")[0]
         parameters = [row for p in kind.parameters() for row in _rows(p, found.parameters[p.name])]
-        return cls(found, about, parameters, {name: told_apart_by(found.name, name) for name in found.lookalikes})
+        return cls(found, kind.about, parameters, {name: told_apart_by(found.name, name) for name in found.lookalikes})
 
 
 def _rows(parameter: Parameter, fitted: Mapping[str, Any]) -> list[Fitted]:

@@ -97,12 +97,15 @@ def get(data: Any, where: str, *keys: str | int) -> Any:
     return data
 
 
+def _is_number(value: Any) -> bool:
+    """Neither text nor a truth value."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
 def _numbers(data: Any, where: str, *keys: str | int, count: int) -> Array:
     value = get(data, where, *keys)
-    try:
-        numbers = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        numbers = np.array([np.nan])
+    is_list = isinstance(value, list | tuple) and all(map(_is_number, value))
+    numbers = np.array(value if is_list else [np.nan], dtype=np.float64)
     if numbers.shape != (count,) or not np.isfinite(numbers).all():
         raise InvalidInputError(f"{where}: '{keys[-1]}' must be {count} finite numbers, got {str(value)[:80]}")
     return numbers
@@ -110,7 +113,7 @@ def _numbers(data: Any, where: str, *keys: str | int, count: int) -> Array:
 
 def _number(data: Any, where: str, *keys: str | int) -> float:
     value = get(data, where, *keys)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+    if not _is_number(value) or not np.isfinite(value):
         raise InvalidInputError(f"{where}: '{keys[-1]}' must be a finite number, got {str(value)[:80]}")
     return float(value)
 

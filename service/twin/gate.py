@@ -10,6 +10,9 @@ from service.base.faults import BusyError
 STOPPING = "the service is stopping; send the same again when it is back"
 """What requests are told that a stop ends."""
 
+MOST_WAITING = 8
+"""Requests that wait for the model, each on one of the web server's threads."""
+
 
 class Gate:
     """Lets ``slots`` callers in at a time, in the order in which they came.
@@ -19,7 +22,7 @@ class Gate:
     says.
     """
 
-    def __init__(self, slots: int, most_waiting: int = 8) -> None:
+    def __init__(self, slots: int, most_waiting: int = MOST_WAITING) -> None:
         self._free = slots
         self._most_waiting = most_waiting
         self._hurried = 0

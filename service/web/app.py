@@ -18,6 +18,7 @@ from service.jobs.worker import Workers
 from service.store.database import Database
 from service.twin.accuracy import ComparisonBook
 from service.twin.field import FieldBook
+from service.twin.gate import MOST_WAITING
 from service.twin.runtime import Operations, Runtime
 from service.web.answers import openapi, problems
 from service.web.answers.watching import Watchers
@@ -28,6 +29,7 @@ from service.web.metrics import registry
 from service.web.middleware import (
     BodyLimitMiddleware,
     DoorMiddleware,
+    HeadMiddleware,
     RequestIdMiddleware,
     SecurityHeadersMiddleware,
     StoppingMiddleware,
@@ -35,7 +37,8 @@ from service.web.middleware import (
 
 _DESCRIPTION = (
     "Post the target photographs of a solar tower, read back each heliostat's flux and surface, and forecast the "
-    "flux that it throws on any plane. Metres, degrees where a name says so, east-north-up from the tower base."
+    "flux that it throws on any plane. Metres, degrees where a name says so, east-north-up from the tower base. HEAD "
+    "is answered wherever GET is."
 )
 
 
@@ -105,10 +108,11 @@ def create_app(settings: Settings, operations: Operations | None = None, kinds: 
     )
     app.state.stopping = threading.Event()
     app.state.turns = Turns()
+    app.state.computing = Turns(settings.parallel_computations + MOST_WAITING)  # as many as the model's gate takes
     v1 = APIRouter(prefix="/v1")
+    v1.include_router(jobs.creators(kinds))  # before the routes of a job, which would take their names for numbers
     for resource in modules_of("service.web.api"):
         v1.include_router(resource.router)
-    v1.include_router(jobs.creators(kinds))
     app.include_router(v1)
     for place in (*modules_of("service.web.root"), *modules_of("service.web.pages")):
         if hasattr(place, "router"):
@@ -121,6 +125,7 @@ def create_app(settings: Settings, operations: Operations | None = None, kinds: 
     app.add_middleware(StoppingMiddleware)
     app.add_middleware(BodyLimitMiddleware, settings=settings)
     app.add_middleware(DoorMiddleware, settings=settings)
+    app.add_middleware(HeadMiddleware)
     app.add_middleware(SecurityHeadersMiddleware)
     app.add_middleware(RequestIdMiddleware)  # added last, it comes first
     return app

@@ -7,10 +7,11 @@ import re
 import threading
 import time
 import uuid
+from functools import partial
 from http import HTTPStatus
 from urllib.parse import urlsplit
 
-from anyio import CapacityLimiter, move_on_after, to_thread
+from anyio import CancelScope, CapacityLimiter, move_on_after, to_thread
 from fastapi import HTTPException, Response
 from sqlalchemy.exc import OperationalError
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
@@ -32,8 +33,6 @@ _REQUEST_ID = re.compile(r"[A-Za-z0-9_-]{8,64}")
 # Methods that are told apart in metrics, and paths that are asked for too often to log each time.
 _METHODS = ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS")
 _PROBES = ("/livez", "/readyz", "/metrics")
-# What supervisors ask without a key; it costs little, and `/readyz` has one thread of its own.
-_HEALTH = ("/livez", "/readyz")
 # Bytes of an answer that count as another request: a map of 1024 x 1024 as JSON counts as some three hundred.
 _BYTES_A_TOKEN = 64 * 1024
 # Largest body where no key is needed [bytes], and its only media type: a form with a key.
@@ -62,29 +61,29 @@ class RequestIdMiddleware:
         given = Headers(scope=scope).get("x-request-id", "")
         identity = given if _REQUEST_ID.fullmatch(given) else uuid.uuid4().hex
         scope.setdefault("state", {})["request_id"] = identity
-        started = time.perf_counter()
+        method, started = scope["method"], time.perf_counter()
 
         async def send_with_id(message: Message) -> None:
             if message["type"] == "http.response.start":
                 MutableHeaders(scope=message)["X-Request-ID"] = identity
-                _note(scope, message["status"], time.perf_counter() - started)
+                _note(scope, method, message["status"], time.perf_counter() - started)
             await send(message)
 
         with logs.bound(request_id=identity):
             await self.app(scope, receive, send_with_id)
 
 
-def _note(scope: Scope, status: int, took_s: float) -> None:
+def _note(scope: Scope, method: str, status: int, took_s: float) -> None:
     """Log a request and count it."""
     path, identity = scope["path"], scope["state"].get("identity")
     level = logging.DEBUG if path in _PROBES else logging.INFO
-    extra = {"method": scope["method"], "path": path, "status": status, "ms": round(took_s * 1e3, 1)}
+    extra = {"method": method, "path": path, "status": status, "ms": round(took_s * 1e3, 1)}
     extra["key"] = None if identity is None else identity.name
-    logger.log(level, "%s %s %d %.1f ms", scope["method"], path, status, took_s * 1e3, extra=extra)
-    method = scope["method"] if scope["method"] in _METHODS else "other"
+    logger.log(level, "%s %s %d %.1f ms", method, path, status, took_s * 1e3, extra=extra)
+    known = method if method in _METHODS else "other"
     route = _template(scope)
-    REQUESTS.labels(method, route, status).inc()
-    REQUEST_SECONDS.labels(method, route).observe(took_s)
+    REQUESTS.labels(known, route, status).inc()
+    REQUEST_SECONDS.labels(known, route).observe(took_s)
 
 
 def _template(scope: Scope) -> str:
@@ -94,6 +93,36 @@ def _template(scope: Scope) -> str:
         return "none"
     # A router that was included tells its own path only.
     return path if not scope["path"].startswith("/v1/") or path.startswith("/v1/") else f"/v1{path}"
+
+
+class HeadMiddleware:
+    """Answers HEAD as GET, without the body; what is made part by part, such as events, ends with its head."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """One ASGI call."""
+        if scope["type"] != "http" or scope["method"] != "HEAD":
+            await self.app(scope, receive, send)
+            return
+        making = CancelScope()
+
+        async def send_head(message: Message) -> None:
+            if message["type"] != "http.response.body":
+                await send(message)
+                return
+            await send({"type": "http.response.body", "body": b"", "more_body": False})
+            if message.get("more_body", False):
+                making.cancel()
+
+        # The scope itself, for the server and the log look into it; the server must know again what it answers.
+        scope["method"] = "GET"
+        try:
+            with making:
+                await self.app(scope, receive, send_head)
+        finally:
+            scope["method"] = "HEAD"
 
 
 class SecurityHeadersMiddleware:
@@ -174,12 +203,15 @@ class DoorMiddleware:
 
     async def _identify(self, scope: Scope, headers: Headers) -> security.Identity | None:
         database, presented = scope["app"].state.runtime.database, security.presented_key(headers)
-        identity = await to_thread.run_sync(security.identify, database, self.settings, presented, limiter=self.threads)
+        # Proxies of the sort that adds no header often speak HTTP/1.0 to what stands behind them, which clients do not.
+        is_direct = not security.is_forwarded(headers) and scope.get("http_version") != "1.0"
+        asked = partial(security.identify, database, self.settings, presented, is_direct)
+        identity = await to_thread.run_sync(asked, limiter=self.threads)
         scope.setdefault("state", {})["identity"] = identity
         return identity
 
     def _too_often(self, scope: Scope) -> Response | None:
-        if scope["path"] in _HEALTH:
+        if scope["path"] in security.HEALTH:
             return None
         wait_s = self.buckets.wait_s(_bucket(scope))
         if not wait_s:
@@ -274,7 +306,8 @@ async def _until_done_or_late(work: asyncio.Future[None], stopping: threading.Ev
 class BodyLimitMiddleware:
     """Stops reading a body at its bound: at once where its length is announced, else when the bound is passed.
 
-    Who comes without a key may send a small form and nothing else. No part of a body may be long in coming.
+    Who comes without a key may send a small form and nothing else. No part of a body may be long in coming, and the
+    whole has that pause once and then as long as the settings' least rate gives what has come.
     """
 
     def __init__(self, app: ASGIApp, settings: Settings) -> None:
@@ -305,13 +338,17 @@ class BodyLimitMiddleware:
             refused = f"Content-Type: send {_FORM}"
             await problem(scope, HTTPStatus.UNSUPPORTED_MEDIA_TYPE, refused)(scope, receive, send)
             return
-        received, is_whole = 0, False
+        received, waited_s, is_whole = 0, 0.0, False
 
         async def bounded() -> Message:
-            nonlocal received, is_whole
+            nonlocal received, waited_s, is_whole
+            # What the service itself takes between two parts is not the sender's.
+            left_s = min(self.patience_s, self.patience_s + received / self.settings.least_bytes_per_s - waited_s)
+            began = time.monotonic()
             # After the body only the client's going is waited for, however long that takes.
-            with move_on_after(None if is_whole else self.patience_s) as waiting:
+            with move_on_after(None if is_whole else left_s) as waiting:
                 message = await receive()
+            waited_s += time.monotonic() - began
             if waiting.cancelled_caught:
                 raise HTTPException(HTTPStatus.REQUEST_TIMEOUT, "body: it did not come in time; send it again")
             is_whole = not message.get("more_body", False)

@@ -1,21 +1,19 @@
 """Running the service: what the command line's ``serve`` and ``migrate`` call."""
 
-import asyncio
 import socket
 import threading
 from collections.abc import Callable
 from types import FrameType
 
-import h11
 import uvicorn
 from fastapi import FastAPI
-from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from service.base import logs, memory, telemetry
 from service.base.faults import NotStartedError
 from service.base.settings import Settings
 from service.store.database import Database
 from service.web.app import create_app, require_fit
+from service.web.door.connections import protocol_of
 
 # Seconds that answers which have begun get to be sent when the service is told to stop; all others are answered before
 # (`service.web.middleware.StoppingMiddleware`). Jobs get 20 s after that, and supervisors usually wait 30 to 40.
@@ -26,43 +24,6 @@ _KEEP_ALIVE_S = 75
 
 # Most bytes of a request's head.
 _MOST_HEAD_BYTES = 32 * 1024
-
-# Seconds that a client may take for it.
-_HEAD_S = 20.0
-
-
-class Protocol(H11Protocol):
-    """Ends connections whose request's head does not come in time, for which uvicorn has no option."""
-
-    head_s = _HEAD_S
-    _late: asyncio.TimerHandle | None = None
-
-    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as uvicorn has it
-        """Wait for the first head from now on."""
-        super().connection_made(transport)
-        self._await_head()
-
-    def data_received(self, data: bytes) -> None:
-        """Wait on where the head is not whole, and no more where it is."""
-        super().data_received(data)
-        if self.conn.their_state is h11.IDLE:
-            self._await_head()
-        else:
-            self._stop_waiting()
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        """There is nothing to wait for."""
-        self._stop_waiting()
-        super().connection_lost(exc)
-
-    def _await_head(self) -> None:
-        if self._late is None:
-            self._late = self.loop.call_later(self.head_s, self.transport.close)
-
-    def _stop_waiting(self) -> None:
-        if self._late is not None:
-            self._late.cancel()
-            self._late = None
 
 
 class _Server(uvicorn.Server):
@@ -113,11 +74,15 @@ def config_of(settings: Settings, app: FastAPI) -> uvicorn.Config:
     """How uvicorn serves.
 
     It answers 503 by itself beyond ``limit_concurrency`` connections or requests, and bounds a request's head by its
-    bytes; connections without a request count, too. It has no time-outs for heads, so `Protocol` has.
+    bytes; connections without a request count, too. What it has no options for `protocol_of` has. Who sends a request,
+    and whether it came encrypted, is what a proxy says in X-Forwarded-For and -Proto where the settings trust it, and
+    nobody else; the variable FORWARDED_ALLOW_IPS, which uvicorn would read by itself, means nothing here.
     """
     return uvicorn.Config(
         app,
-        http=Protocol,
+        http=protocol_of(settings),
+        proxy_headers=settings.proxy_headers,
+        forwarded_allow_ips=settings.forwarded_allow_ips,
         limit_concurrency=settings.most_connections,
         h11_max_incomplete_event_size=_MOST_HEAD_BYTES,
         host=settings.host,

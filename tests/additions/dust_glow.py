@@ -14,6 +14,7 @@ class DustGlow(Effect):
     """``share`` of the peak is added everywhere."""
 
     name: ClassVar[str] = "dust_glow"
+    about: ClassVar[str] = "Dust before the target that glows as bright as the spot's peak allows."
     stage: ClassVar[Stage] = "image"
     scales_with: ClassVar[frozenset[Factor]] = frozenset({"weather"})
 

@@ -160,7 +160,8 @@ def _cpu_s(number: int) -> float:
     return (int(fields[11]) + int(fields[12])) / 100
 
 
-def _import(store: Store) -> None:
+def import_two(store: Store) -> None:
+    """The plant and two of its mirrors."""
     with tempfile.TemporaryDirectory() as folder:
         for name in (*HELIOSTATS, "WRI1030197-tower-measurements.json"):
             (Path(folder) / name).symlink_to((data_folder() / name).resolve())
@@ -216,7 +217,7 @@ def main(arguments: list[str]) -> None:
         f"{options.database}, {options.clients} clients, {options.seconds:.0f} s, pause {options.pause} s, load {load}"
     )
     with tempfile.TemporaryDirectory() as folder, new_store(options.database, Path(folder)) as store:
-        _import(store)
+        import_two(store)
         extra = {"HELIOTWIN_JOB_WORKERS": "1", "HELIOTWIN_JOB_LEASE_S": "30", "HELIOTWIN_JOB_POLL_S": "0.5"}
         with Process(store, "serve", module="service", **extra) as service:
             asyncio.run(_warm_up(service.base))

@@ -1,6 +1,7 @@
 """Effects on sun, mount, mirror and optics, against geometry and the Monte Carlo tracer; and effects as data."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,6 +30,8 @@ from model.tracing.montecarlo import trace_montecarlo
 from tests.conftest import flat_heliostat, target
 
 SUN = sun_direction(25.0, 40.0)
+
+ROOT = Path(__file__).parents[2]
 
 
 def setup(sun=SUN, position=(20.0, 70.0, 1.8), focal_length=75.0, mount=None, z=None, **given) -> Setup:
@@ -367,3 +370,18 @@ def test_gradients_agree_with_finite_differences(make, value):
     with torch.no_grad():
         expected = float(total(start + 1e-5 * direction) - total(start - 1e-5 * direction)) / 2e-5
     assert float((start.grad * direction).sum()) == pytest.approx(expected, rel=2e-3)
+
+
+def test_every_effect_says_what_it_is():
+    """In a sentence of its own, also where Python was told to drop docstrings."""
+    for name, kind in CATALOGUE.items():
+        assert "about" in vars(kind), name
+        title, _, rest = kind.about.partition(": ")
+        assert title, name
+        assert rest.endswith("."), name
+
+
+def test_nothing_shown_to_people_is_taken_from_docstrings():
+    """`python -OO` drops them, and whoever rewords one for programmers would reword a report."""
+    sources = [path for package in ("model", "service") for path in (ROOT / package).rglob("*.py")]
+    assert [path for path in sources if "__doc__" in path.read_text(encoding="utf-8")] == []

@@ -10,7 +10,7 @@ from sqlalchemy.orm import Session
 from model.frames import sun_direction
 from model.plant import Receiver
 from service import store
-from service.base.fields import Model, ModelVersion, Name, Plane, Position, ReceiverIn, Resolution, Sun
+from service.base.fields import Flag, Model, ModelVersion, Name, Number, Plane, Position, ReceiverIn, Resolution, Sun
 from service.jobs.common import Heliostats, chosen_names, require_some
 from service.jobs.kind import Context, Kind, Result
 from service.twin import versions
@@ -37,13 +37,13 @@ class FleetForecastIn(Model):
     aim_points: dict[Name, Position] = Field(
         default_factory=dict, max_length=20_000, description="Where single heliostats aim instead [m], by name."
     )
-    neighbours: bool = Field(
+    neighbours: Flag = Field(
         default=True, description="Whether the mirrors of these heliostats shade and block each other."
     )
     surface: Literal["current", "ideal"] = Field(
         default="current", description="The heliostats' current surfaces, where one has none it is skipped; or ideal."
     )
-    dni_w_m2: float = Field(default=1000.0, gt=0, le=2000, description="Direct normal irradiance [W/m2].")
+    dni_w_m2: Number = Field(default=1000.0, gt=0, le=2000, description="Direct normal irradiance [W/m2].")
     resolution: Resolution = (256, 256)
     model_version: ModelVersion = None
 

@@ -3,7 +3,7 @@
 from pydantic import Field
 
 from service.base.faults import SKIPPED
-from service.base.fields import Method, Model, ModelVersion
+from service.base.fields import Method, Model, ModelVersion, Whole
 from service.jobs.common import Heliostats, chosen_names, require_some
 from service.jobs.kind import Context, Kind, Result
 from service.twin import versions
@@ -16,7 +16,7 @@ class PredictionsIn(Model):
 
     heliostats: Heliostats = None
     method: Method = Field(default="network", description="network: at once; refined: fitted through the ray tracer.")
-    images: int = Field(default=8, ge=1, le=8, description="How many measurements to take of each heliostat.")
+    images: Whole = Field(default=8, ge=1, le=8, description="How many measurements to take of each heliostat.")
     model_version: ModelVersion = None
 
 

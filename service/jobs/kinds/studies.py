@@ -4,7 +4,7 @@ from pydantic import Field, field_validator
 
 from model.effects import CATALOGUE
 from service import store
-from service.base.fields import Model, Moment, Name
+from service.base.fields import Model, Moment, Name, Whole
 from service.jobs.kind import Context, Kind, Result
 from service.twin.study import StudyRequest, Surfaces, study_row, study_store
 
@@ -15,7 +15,7 @@ class StudyIn(Model):
     heliostats: list[Name] | None = Field(
         default=None, min_length=1, max_length=200, description="Names of heliostats; else some of all over the field."
     )
-    most_heliostats: int = Field(
+    most_heliostats: Whole = Field(
         default=12, ge=1, le=200, description="How many heliostats to take where none is named, near ones and far ones."
     )
     surfaces: Surfaces = Field(
@@ -23,7 +23,7 @@ class StudyIn(Model):
         description="measured: only heliostats with a measured surface; current: where there is none, the newest "
         "prediction.",
     )
-    images: int = Field(
+    images: Whole = Field(
         default=12,
         ge=2,
         le=64,

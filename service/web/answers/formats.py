@@ -12,6 +12,7 @@ from pydantic import BaseModel
 
 from service.base.faults import NotAcceptableError
 from service.web.answers.representation import Maps, Representation
+from service.web.door.dependencies import turn
 
 JSON = "application/json"
 
@@ -98,7 +99,7 @@ async def _media_type(
     accept: Annotated[str | None, Header(description=f"One of {', '.join(ARRAYS)}; JSON by default.")] = None,
 ) -> AsyncIterator[str]:
     media_type = choose(accept)
-    async with request.app.state.turns.one():
+    async with turn(request):
         yield media_type
 
 

@@ -8,13 +8,16 @@ from fastapi.openapi.utils import get_openapi
 from service.web.answers import formats
 from service.web.answers.problem_schema import Problem
 from service.web.answers.problems import PROBLEM_MEDIA_TYPE
+from service.web.door import security
 
 _MEANINGS = {
     400: "The body could not be read.",
     401: "A key is needed, and none that is valid was presented.",
     403: "The key's role is not enough, or the request comes from another site's page.",
     404: "Something that the path or the body names is not stored.",
+    405: "This path takes other methods only; see Allow.",
     406: "None of the media types in Accept is offered.",
+    408: "The body did not come in time.",
     409: "The store is in no state to do this; the detail says what to do first.",
     413: "The body or the image is too large.",
     415: "The body or the image is of a format that is not taken.",
@@ -22,9 +25,9 @@ _MEANINGS = {
     429: "Too many requests, or too many jobs that wait; see Retry-After.",
     500: "The service failed.",
     503: "The database does not answer, or the service is busy; see Retry-After.",
+    507: "The store's disk is full; nothing was kept.",
 }
 
-_ANYWHERE = (401, 403, 422, 429, 500, 503)
 
 _TAGS = [
     {"name": "plant", "description": "The tower base, which everything is measured from, its targets and receivers."},
@@ -46,8 +49,8 @@ _BINARY = {"type": "string", "format": "binary"}
 
 
 def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """Documented error answers of a route; every route may also fail for other reasons of its own or the door's."""
-    return {status: {"model": Problem, "description": _MEANINGS[status]} for status in sorted({*statuses, *_ANYWHERE})}
+    """Documented error answers of a route; those that do not depend on what it does come by themselves."""
+    return {status: {"model": Problem, "description": _MEANINGS[status]} for status in sorted({500, *statuses})}
 
 
 def arrays(description: str) -> dict[int | str, dict[str, Any]]:
@@ -62,14 +65,37 @@ def _as_problem(response: dict[str, Any]) -> None:
         content[PROBLEM_MEDIA_TYPE] = content.pop("application/json")
 
 
+def _by_themselves(path: str, method: str, operation: dict[str, Any]) -> set[int]:
+    """Statuses that come of the door and of the request's form, whatever the route does."""
+    statuses, needs_key = {405, 500}, "security" in operation
+    if path not in security.HEALTH:
+        statuses |= {429, 503}
+    if needs_key:
+        statuses |= {401, 403}
+    if method != "get":
+        statuses |= {403, 413, 507} if needs_key else {403, 413}
+    if "parameters" in operation:
+        statuses |= {422}
+    if "requestBody" in operation:
+        statuses |= {400, 408, 413, 415, 422}
+    return statuses
+
+
 def _document(app: FastAPI) -> dict[str, Any]:
     document = get_openapi(
         title=app.title, version=app.version, description=app.description, routes=app.routes, tags=_TAGS
     )
-    for path in document["paths"].values():
-        for operation in path.values():
-            for status, response in operation["responses"].items():
-                if status.isdecimal() and int(status) >= 400 and "Problem" in str(response):
+    problem = {"application/json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
+    for path, operations in document["paths"].items():
+        for method, operation in operations.items():
+            responses = operation["responses"]
+            if "HTTPValidationError" in str(responses.get("422")):
+                del responses["422"]  # FastAPI's own form of it
+            for status in _by_themselves(path, method, operation):
+                responses.setdefault(str(status), {"description": _MEANINGS[status], "content": dict(problem)})
+            operation["responses"] = dict(sorted(responses.items()))
+            for status, response in responses.items():
+                if int(status) >= 400 and "Problem" in str(response):
                     _as_problem(response)
     for unused in ("HTTPValidationError", "ValidationError"):
         document["components"]["schemas"].pop(unused, None)

@@ -11,7 +11,19 @@ from pydantic import BaseModel, Discriminator, Field, Tag, model_validator
 
 from service import store
 from service.base.arrays import pair
-from service.base.fields import Model, ModelVersion, Name, Plane, Position, Resolution, Sun, Version
+from service.base.fields import (
+    Flag,
+    Model,
+    ModelVersion,
+    Name,
+    Number,
+    Plane,
+    Position,
+    Resolution,
+    Sun,
+    Version,
+    VersionIn,
+)
 from service.drawing.pictures import flux_picture
 from service.jobs.asking import ask_for
 from service.jobs.kinds.field_forecasts import FleetForecastIn
@@ -23,7 +35,7 @@ from service.web.answers.openapi import arrays, problems
 from service.web.answers.paging import Page, page
 from service.web.answers.representation import Maps
 from service.web.api.jobs import IdempotencyKey, JobOut, job_out
-from service.web.door.dependencies import OPERATE, READ, IdentityDep, Limit, RuntimeDep, require_json
+from service.web.door.dependencies import COMPUTES, OPERATE, READ, IdentityDep, Limit, RuntimeDep, require_json
 
 
 class ForecastIn(Model):
@@ -36,18 +48,18 @@ class ForecastIn(Model):
     aim_point: Position | None = Field(
         default=None, description="Where the heliostat aims [m]; by default the plane's centre."
     )
-    surface: Literal["current", "ideal"] | Version = Field(
+    surface: Literal["current", "ideal"] | VersionIn = Field(
         default="current", description="The heliostat's current surface, the ideal one, or a version."
     )
-    dni_w_m2: float = Field(default=1000.0, gt=0, le=2000, description="Direct normal irradiance [W/m2].")
+    dni_w_m2: Number = Field(default=1000.0, gt=0, le=2000, description="Direct normal irradiance [W/m2].")
     resolution: Resolution = (256, 256)
-    window: float | None = Field(
+    window: Number | None = Field(
         default=None,
         ge=0.01,
         le=1e3,
         description="Side of a square about the centre of mass to map [m]; else the plane.",
     )
-    normalised: bool = Field(default=False, description="Scale the map to a sum of 100 instead of W/m2.")
+    normalised: Flag = Field(default=False, description="Scale the map to a sum of 100 instead of W/m2.")
     model_version: ModelVersion = None
 
     @model_validator(mode="after")
@@ -171,7 +183,7 @@ Asked = Annotated[
         **problems(404, 409, 413, 415, 429),
         202: {"model": JobOut, "description": "Of many heliostats: the job that superposes them, under its Location."},
     },
-    dependencies=[OPERATE, Depends(require_json)],
+    dependencies=[OPERATE, Depends(require_json), COMPUTES],
 )
 def post_forecast(
     request: Asked, runtime: RuntimeDep, identity: IdentityDep, response: Response, key: IdempotencyKey = None

@@ -4,7 +4,7 @@ from functools import partial
 from threading import Event
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response, status
+from fastapi import APIRouter, Depends, Header, HTTPException, Path, Query, Request, Response, status
 from pydantic import Field
 
 from service.base.arrays import unpack
@@ -102,7 +102,13 @@ def creators(kinds: Kinds) -> APIRouter:
     asking = APIRouter(prefix="/jobs", tags=["jobs"])
     for kind in kinds.values():
         add_creator(asking, kind, f"/{kind.name}", f"post_{kind.name}_job")
+        asking.get(f"/{kind.name}", include_in_schema=False, dependencies=[READ])(_only_post)
     return asking
+
+
+async def _only_post() -> None:
+    """There is nothing to read where jobs are asked for."""
+    raise HTTPException(status.HTTP_405_METHOD_NOT_ALLOWED, headers={"Allow": "POST"})
 
 
 def add_creator(router: APIRouter, kind: Kind[Any], path: str, name: str) -> None:

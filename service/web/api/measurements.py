@@ -10,7 +10,18 @@ from pydantic import BaseModel, BeforeValidator, Field, Json
 from service import store
 from service.base.arrays import pair, unpack
 from service.base.faults import NotFoundError, TooLargeError
-from service.base.fields import Azimuth, Elevation, Identifier, Kind, MeasurementName, Model, Moment, Name, Wgs84
+from service.base.fields import (
+    Azimuth,
+    Elevation,
+    Identifier,
+    Kind,
+    MeasurementName,
+    Model,
+    Moment,
+    Name,
+    Number,
+    Wgs84,
+)
 from service.drawing.pictures import flux_picture
 from service.sources.photograph import Photograph
 from service.sources.schema import paint_motors, paint_spot
@@ -22,14 +33,23 @@ from service.web.answers.formats import MediaType, json_answer, maps_answer
 from service.web.answers.openapi import arrays, problems
 from service.web.answers.paging import Page, page
 from service.web.answers.representation import Maps
-from service.web.door.dependencies import INGEST, READ, Limit, MeasurementPath, NamePath, RuntimeDep, require_multipart
+from service.web.door.dependencies import (
+    COMPUTES,
+    INGEST,
+    READ,
+    Limit,
+    MeasurementPath,
+    NamePath,
+    RuntimeDep,
+    require_multipart,
+)
 
 Motors = Annotated[
-    tuple[Annotated[float, Field(ge=-1e9, le=1e9)], Annotated[float, Field(ge=-1e9, le=1e9)]],
+    tuple[Annotated[Number, Field(ge=-1e9, le=1e9)], Annotated[Number, Field(ge=-1e9, le=1e9)]],
     BeforeValidator(paint_motors),
 ]
 
-Pixel = tuple[Annotated[float, Field(ge=-1e5, le=1e5)], Annotated[float, Field(ge=-1e5, le=1e5)]]
+Pixel = tuple[Annotated[Number, Field(ge=-1e5, le=1e5)], Annotated[Number, Field(ge=-1e5, le=1e5)]]
 
 
 class MeasurementIn(Model):
@@ -158,7 +178,7 @@ def _bytes(upload: UploadFile, limit: int) -> bytes:
         **problems(400, 404, 409, 413, 415),
         200: {"model": MeasurementOut, "description": "This image was there already; nothing changed."},
     },
-    dependencies=[INGEST, Depends(require_multipart)],
+    dependencies=[INGEST, Depends(require_multipart), COMPUTES],
 )
 def post_measurement(
     name: NamePath,

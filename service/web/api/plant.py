@@ -204,7 +204,11 @@ def put_target(
 
 
 @router.delete(
-    "/targets/{name}", status_code=status.HTTP_204_NO_CONTENT, responses=problems(404, 409), dependencies=[OPERATE]
+    "/targets/{name}",
+    status_code=status.HTTP_204_NO_CONTENT,
+    response_class=Response,
+    responses=problems(404, 409),
+    dependencies=[OPERATE],
 )
 def delete_target(name: NamePath, runtime: RuntimeDep, identity: IdentityDep) -> None:
     """Delete a target plane that was made by mistake; not where photographs, forecasts or waiting jobs name it."""
@@ -248,7 +252,11 @@ def put_receiver(
 
 
 @router.delete(
-    "/receivers/{name}", status_code=status.HTTP_204_NO_CONTENT, responses=problems(404, 409), dependencies=[OPERATE]
+    "/receivers/{name}",
+    status_code=status.HTTP_204_NO_CONTENT,
+    response_class=Response,
+    responses=problems(404, 409),
+    dependencies=[OPERATE],
 )
 def delete_receiver(name: NamePath, runtime: RuntimeDep, identity: IdentityDep) -> None:
     """Delete a receiver that was made by mistake; not where waiting jobs name it."""

@@ -10,7 +10,7 @@ from sqlalchemy.orm import Session
 
 from service import store
 from service.base.faults import NotFoundError
-from service.base.fields import Model, StudyReport, Verdict, Version
+from service.base.fields import Flag, Model, StudyReport, Verdict, Version
 from service.jobs.kinds import KINDS
 from service.store.tables import StudyRow
 from service.twin import versions
@@ -44,7 +44,7 @@ class StudyOut(StudySummary, StudyReport):
 class AdoptIn(Model):
     """How to adopt what a study found."""
 
-    force: bool = Field(
+    force: Flag = Field(
         default=False,
         description="Also where its verdict is not `effect`, or another version of the model is current by now, which "
         "it then takes the place of.",

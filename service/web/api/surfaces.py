@@ -9,7 +9,7 @@ from pydantic import BaseModel, Field
 
 from service import store
 from service.base.arrays import unpack
-from service.base.fields import MeasurementName, Method, Model, ModelVersion, Moment, Source, Version
+from service.base.fields import MeasurementName, Method, Model, ModelVersion, Moment, Source, Version, Whole
 from service.drawing.pictures import surface_picture
 from service.store.tables import SurfaceRow
 from service.twin.prediction import predict_surface
@@ -19,7 +19,16 @@ from service.web.answers.formats import MediaType, json_answer, maps_answer
 from service.web.answers.openapi import arrays, problems
 from service.web.answers.paging import Page, page
 from service.web.answers.representation import Maps
-from service.web.door.dependencies import OPERATE, READ, IdentityDep, Limit, NamePath, RuntimeDep, require_json
+from service.web.door.dependencies import (
+    COMPUTES,
+    OPERATE,
+    READ,
+    IdentityDep,
+    Limit,
+    NamePath,
+    RuntimeDep,
+    require_json,
+)
 
 
 class SurfaceIn(Model):
@@ -29,7 +38,7 @@ class SurfaceIn(Model):
     measurements: list[MeasurementName] | None = Field(
         default=None, min_length=1, max_length=8, description="Ids of 1 to 8 accepted measurements."
     )
-    images: int = Field(
+    images: Whole = Field(
         default=8,
         ge=1,
         le=8,
@@ -103,7 +112,7 @@ router = APIRouter(prefix="/heliostats/{name}/surfaces", tags=["surfaces"])
     "",
     status_code=status.HTTP_201_CREATED,
     responses=problems(404, 409, 413, 415),
-    dependencies=[OPERATE, Depends(require_json)],
+    dependencies=[OPERATE, Depends(require_json), COMPUTES],
 )
 def post_surface(
     name: NamePath,

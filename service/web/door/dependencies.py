@@ -5,6 +5,8 @@ from a dependency would keep its connection while the request waits for a thread
 """
 
 import threading
+from collections.abc import AsyncIterator
+from contextlib import AbstractAsyncContextManager
 from typing import Annotated
 
 from fastapi import Depends, Path, Query, Request
@@ -13,6 +15,7 @@ from service.base.faults import UnsupportedContentError
 from service.base.fields import MeasurementName, Name
 from service.twin.runtime import Runtime
 from service.web.door.security import Identity, Requires, Role, presented_key
+from service.web.door.turns import Turns
 
 
 async def get_runtime(request: Request) -> Runtime:
@@ -24,7 +27,10 @@ async def get_runtime(request: Request) -> Runtime:
 RuntimeDep = Annotated[Runtime, Depends(get_runtime)]
 
 # For a route's ``dependencies``: whoever has at least this role is let in.
-READ, INGEST, OPERATE, ADMIN = (Depends(Requires(role)) for role in Role)
+READ = Depends(Requires(Role.READ))
+INGEST = Depends(Requires(Role.INGEST))
+OPERATE = Depends(Requires(Role.OPERATE))
+ADMIN = Depends(Requires(Role.ADMIN))
 
 
 async def _identity(request: Request) -> Identity:
@@ -51,6 +57,34 @@ async def _stopping(request: Request) -> threading.Event:
 
 StoppingDep = Annotated[threading.Event, Depends(_stopping)]
 """Set when the service is told to stop, so that answers without an end end."""
+
+
+def turn(request: Request) -> AbstractAsyncContextManager[None]:
+    """A turn at what is heavy to write or to draw, for the key that asks."""
+    turns: Turns = request.app.state.turns
+    identity: Identity = request.state.identity
+    return turns.one(identity.name)
+
+
+async def _turn(request: Request) -> AsyncIterator[None]:
+    async with turn(request):
+        yield
+
+
+async def _computing(request: Request) -> AsyncIterator[None]:
+    turns: Turns = request.app.state.computing
+    identity: Identity = request.state.identity
+    async with turns.one(identity.name):
+        yield
+
+
+# For a route's ``dependencies``. A turn ends before the answer is sent, so that a slow reader keeps nobody waiting.
+DRAWS = Depends(_turn, scope="function")
+"""A turn at drawing maps."""
+Turn = Annotated[None, DRAWS]
+"""The same in a signature, for what comes after other dependencies."""
+COMPUTES = Depends(_computing, scope="function")
+"""A turn at waiting for the model, so that one key does not fill the line before it."""
 
 
 NamePath = Annotated[Name, Path(description="Name of the heliostat or target.")]

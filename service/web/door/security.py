@@ -28,17 +28,21 @@ PUBLIC = ("/livez", "/readyz", "/openapi.json", "/docs", "/session", "/login", "
 """Paths that need no key, with all that lies below them; none shows or changes anything of the plant."""
 
 
+HEALTH = ("/livez", "/readyz")
+"""What supervisors ask, as often as they like; it costs little, and `/readyz` has one thread of its own."""
+
+
 class Role(StrEnum):
     """What a key may do; each role may also do what those before it may."""
 
-    READ = ROLES[0]
+    READ = "read"
     """Read everything but the audit trail: dashboards."""
-    INGEST = ROLES[1]
+    INGEST = "ingest"
     """Post photographs: the calibration system, which reads back flux, quality and surface."""
-    OPERATE = ROLES[2]
+    OPERATE = "operate"
     """Predict, forecast, study, adopt effects, run and cancel jobs, change plant, targets and heliostats: operators,
     aim-point software."""
-    ADMIN = ROLES[3]
+    ADMIN = "admin"
     """Read the audit trail: whoever answers for the plant."""
 
     def includes(self, other: "Role") -> bool:
@@ -75,18 +79,26 @@ def presented_key(headers: Mapping[str, str]) -> str | None:
     return None if morsel is None else morsel.value
 
 
+_FORWARDED = ("forwarded", "via", "x-real-ip")
+
+
+def is_forwarded(headers: Mapping[str, str]) -> bool:
+    """Whether a proxy sent the request on, trusted or not: whoever stands behind it may be anywhere."""
+    return any(name.lower() in _FORWARDED or name.lower().startswith("x-forwarded-") for name in headers)
+
+
 def may_be_open(settings: Settings) -> bool:
     """Whether access without a key is allowed while no key was made: this machine only, or acknowledged."""
     return is_loopback(settings.host) or settings.allow_open_network
 
 
-def identify(database: Database, settings: Settings, presented: str | None) -> Identity | None:
-    """Who presented this key, or who may come without one; None for everybody else."""
+def identify(database: Database, settings: Settings, presented: str | None, is_direct: bool = True) -> Identity | None:
+    """Who presented this key, or who may come without one, directly and not by a proxy; None for everybody else."""
     with database.reading() as session:
         if presented is not None:
             row = keys.find(session, presented)
             return None if row is None else Identity(row.name, Role(row.role))
-        if may_be_open(settings) and not keys.any_made(session):
+        if is_direct and may_be_open(settings) and not keys.any_made(session):
             return LOCAL
     return None
 

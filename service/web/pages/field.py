@@ -16,7 +16,7 @@ from service.store.tables import JobRow, PlantRow, TargetRow
 from service.twin.accuracy import RECENT
 from service.twin.field import FieldBook, Line
 from service.web.answers.pages import render
-from service.web.door.dependencies import READ, RuntimeDep
+from service.web.door.dependencies import DRAWS, READ, RuntimeDep
 
 router = APIRouter(include_in_schema=False, dependencies=[READ])
 
@@ -184,7 +184,7 @@ def _totals(session: Session) -> dict[str, Any]:
     }
 
 
-@router.get("/")
+@router.get("/", dependencies=[DRAWS])
 def get_field(
     request: Request,
     runtime: RuntimeDep,

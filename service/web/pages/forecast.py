@@ -12,7 +12,7 @@ from sqlalchemy.orm import Session
 from model.ephemeris import sun_angles_at
 from model.errors import InvalidInputError
 from service import store
-from service.base.fields import Azimuth, Elevation, Model, Name, Sun, Version
+from service.base.fields import AZIMUTH, ELEVATION, Model, Name, Sun, Version
 from service.drawing import charts
 from service.jobs.asking import ask_for
 from service.jobs.kinds.field_forecasts import FleetForecastIn
@@ -21,7 +21,7 @@ from service.store.tables import HeliostatRow, PlantRow, ReceiverRow, TargetRow
 from service.twin.forecast import ForecastRequest, flux_of, make_forecast
 from service.twin.runtime import Runtime
 from service.web.answers.pages import go_to, leave_for, render
-from service.web.door.dependencies import OPERATE, READ, IdentityDep, RuntimeDep
+from service.web.door.dependencies import COMPUTES, DRAWS, OPERATE, READ, IdentityDep, RuntimeDep
 from service.web.door.security import Identity
 
 router = APIRouter(include_in_schema=False)
@@ -40,8 +40,8 @@ class ForecastForm(Model):
     heliostat: Name | None = None
     target: Name
     sun_by: Literal["position", "time"] = "position"
-    azimuth_deg: Azimuth | None = None
-    elevation_deg: Elevation | None = None
+    azimuth_deg: Annotated[float, AZIMUTH] | None = None
+    elevation_deg: Annotated[float, ELEVATION] | None = None
     moment: Annotated[datetime | None, AfterValidator(lambda moment: None if moment is None else _in_utc(moment))] = (
         None
     )
@@ -109,7 +109,7 @@ def _ask_for_all(runtime: Runtime, form: ForecastForm, sun: Sun, identity: Ident
     return f"/jobs/{row.id}"
 
 
-@router.post("/forecast", dependencies=[OPERATE])
+@router.post("/forecast", dependencies=[OPERATE, COMPUTES])
 def post_forecast_form(
     form: Annotated[ForecastForm, Form()], request: Request, runtime: RuntimeDep, identity: IdentityDep
 ) -> Response:
@@ -128,7 +128,7 @@ def post_forecast_form(
     return go_to(f"/forecasts/{make_forecast(runtime, asked).id}")
 
 
-@router.get("/forecasts/{number}", dependencies=[READ])
+@router.get("/forecasts/{number}", dependencies=[READ, DRAWS])
 def get_forecast_page(
     number: Annotated[Version, Path(description="Id of the forecast.")], request: Request, runtime: RuntimeDep
 ) -> HTMLResponse:

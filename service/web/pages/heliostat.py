@@ -24,7 +24,7 @@ from service.store.tables import HeliostatRow, MeasurementRow, SurfaceRow
 from service.twin.accuracy import RECENT, Compared, Comparison, ComparisonBook
 from service.twin.field import Figures, figures_of
 from service.web.answers.pages import render
-from service.web.door.dependencies import READ, NamePath, RuntimeDep
+from service.web.door.dependencies import READ, NamePath, RuntimeDep, Turn
 
 router = APIRouter(include_in_schema=False, dependencies=[READ])
 
@@ -141,38 +141,54 @@ def _size(row: HeliostatRow) -> tuple[float, float]:
     return float(row.properties["width"]), float(row.properties["height"])
 
 
-@router.get("/heliostats/{name}")
-def get_heliostat_page(
+@dataclass(frozen=True)
+class _Read:
+    """What the page shows, before it is drawn."""
+
+    row: HeliostatRow
+    today: SurfaceRow | None
+    surface: SurfaceRow | None
+    surfaces: list[SurfaceRow]
+    photographs: Sequence[MeasurementRow]
+    compared: Compared
+
+
+def _read(
     name: NamePath,
-    request: Request,
     runtime: RuntimeDep,
     book: ComparisonBookDep,
     version: Annotated[Version | None, Query()] = None,
-) -> HTMLResponse:
-    """A heliostat with its current surface, or an earlier ``version``."""
+) -> _Read:
+    """A heliostat with its current surface, or an earlier ``version``; waits for what is compared elsewhere."""
     with runtime.database.reading() as session:
         row = store.get_heliostat(session, name)
         today = store.find_surface_at(session, row)
         surface = today if version is None else store.get_surface(session, row, version)
-        listed = versions(_newest_surfaces(session, row))
+        surfaces = _newest_surfaces(session, row)
         photographs = _newest_photographs(session, row)
         shown = book.read(session, row, surface)
     # The rest of the page does not depend on them.
     compared = Compared() if shown is None else book.wait_for(shown) or _UNDER_WAY
-    comparisons = compared.comparisons
+    return _Read(row, today, surface, surfaces, photographs, compared)
+
+
+@router.get("/heliostats/{name}")
+def get_heliostat_page(request: Request, read: Annotated[_Read, Depends(_read)], _turn: Turn) -> HTMLResponse:
+    """A heliostat with its current surface, or an earlier ``version``; nobody waits in his turn for comparisons."""
+    listed, comparisons = versions(read.surfaces), read.compared.comparisons
     return render(
         request,
         "heliostat.html",
-        heliostat=row,
-        size=_size(row),
-        surface=surface,
-        today=today,
+        heliostat=read.row,
+        size=_size(read.row),
+        surface=read.surface,
+        today=read.today,
         versions=listed,
         histories=_histories(listed) if listed else [],
         comparisons=[_comparison_figure(comparison) for comparison in comparisons],
-        trouble=compared.trouble,
+        trouble=read.compared.trouble,
         recent=RECENT,
-        photographs=photographs,
+        photographs=read.photographs,
         **_means(comparisons),
-        **(_surface_context(surface, _size(row)) if surface is not None else {}),
+        **(_surface_context(read.surface, _size(read.row)) if read.surface is not None else {}),
     )

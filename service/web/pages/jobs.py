@@ -14,7 +14,7 @@ from service.jobs.kinds.predictions import PredictionsIn
 from service.store import queue
 from service.store.tables import JobRow
 from service.web.answers.pages import go_to, render
-from service.web.door.dependencies import OPERATE, READ, IdentityDep, RuntimeDep
+from service.web.door.dependencies import DRAWS, OPERATE, READ, IdentityDep, RuntimeDep
 
 router = APIRouter(include_in_schema=False)
 
@@ -65,7 +65,7 @@ def _asked(payload: dict[str, Any]) -> dict[str, Any]:
     return given | {name: f"{count} entries" for name, count in long.items()}
 
 
-@router.get("/jobs/{number}", dependencies=[READ])
+@router.get("/jobs/{number}", dependencies=[READ, DRAWS])
 def get_job_page(number: Number, request: Request, runtime: RuntimeDep) -> HTMLResponse:
     """A job; the page follows it until it ends.
 

@@ -32,7 +32,7 @@ def forget_key(response: Response) -> None:
     response.delete_cookie(security.COOKIE, httponly=True, samesite="strict")
 
 
-@router.post("/session", status_code=status.HTTP_204_NO_CONTENT, responses=problems(413))
+@router.post("/session", status_code=status.HTTP_204_NO_CONTENT, response_class=Response, responses=problems(401))
 def post_session(
     key: Annotated[str, Form(max_length=200, description="A key made by `heliotwin keys create`.")],
     request: Request,
@@ -44,7 +44,7 @@ def post_session(
     keep_key(response, request, key)
 
 
-@router.delete("/session", status_code=status.HTTP_204_NO_CONTENT, responses=problems())
+@router.delete("/session", status_code=status.HTTP_204_NO_CONTENT, response_class=Response, responses=problems())
 def delete_session(response: Response) -> None:
     """Forget the key."""
     forget_key(response)

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
-from service.base.settings import Settings, is_loopback
+from service.base.settings import Settings, is_loopback, is_within
 
 
 @pytest.fixture(autouse=True)
@@ -62,3 +62,17 @@ def test_workers_have_connections_of_their_own():
     assert Settings(job_workers=64, database_connections=136).connections == 136
     with pytest.raises(ValidationError, match="too few for job_workers 64; set at least 136"):
         Settings(job_workers=64, database_connections=100)
+
+
+@pytest.mark.parametrize("proxies", ["*", "proxy.example", "10.0.0.1/8", "127.0.0.1,", "10.0.0.0/33"])
+def test_proxies_are_named_by_addresses(proxies: str):
+    with pytest.raises(ValidationError, match="forwarded_allow_ips"):
+        Settings(forwarded_allow_ips=proxies)
+
+
+def test_proxies_are_believed_where_they_are_named():
+    settings = Settings(forwarded_allow_ips="10.1.0.0/16, ::1")
+    assert is_within("10.1.2.3", settings.trusted_proxies)
+    assert is_within("::1", settings.trusted_proxies)
+    assert not any(is_within(host, settings.trusted_proxies) for host in ("10.2.0.1", "127.0.0.1", "", "localhost"))
+    assert Settings(proxy_headers=False).trusted_proxies == ()

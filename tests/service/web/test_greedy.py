@@ -1,7 +1,10 @@
 """Clients that take more than their share: they wait, and nobody else does."""
 
 import socket
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
+from pathlib import Path
 
 import anyio
 import httpx
@@ -15,30 +18,57 @@ from service.base.settings import Settings
 from service.twin.gate import Gate
 from service.twin.runtime import Runtime
 from service.web.app import create_app
+from service.web.door.connections import Protocol, _holder, protocol_of
 from service.web.door.limits import Buckets
 from service.web.door.turns import Turns
 from service.web.middleware import BodyLimitMiddleware
-from service.web.server import Protocol, config_of
-from tests.service.conftest import QUIET, FakeOperations, client_of, serving
+from service.web.server import config_of
+from tests.service.conftest import QUIET, FakeOperations, Post, client_of, png, serving
 from tests.service.web.test_keys import bearer, make_key
 
 FORECAST = {"heliostat": "AA39", "target": "lower", "sun": {"azimuth_deg": 0.0, "elevation_deg": 45.0}}
 
 
-def _hold_all(client: TestClient, app: FastAPI) -> None:
-    app.state.turns = Turns(count=1, most_waiting=0)
+@contextmanager
+def _none_left(client: TestClient, app: FastAPI, what: str) -> Iterator[None]:
+    """While another key holds the only turn, and nobody may wait."""
+    turns = Turns(count=1, most_waiting=0)
+    setattr(app.state, what, turns)
+    held = turns.one("the test")
     assert client.portal is not None
-    client.portal.call(app.state.turns._limiter.acquire_on_behalf_of_nowait, "the test")
+    client.portal.call(held.__aenter__)
+    yield
+    client.portal.call(held.__aexit__, None, None, None)
 
 
 def test_maps_have_turns_of_their_own_and_light_requests_need_none(client: TestClient, app: FastAPI):
     made = client.post("/v1/forecasts", json={**FORECAST, "surface": "ideal"})
-    _hold_all(client, app)
-    refused = client.get(made.headers["Location"])
-    assert (refused.status_code, refused.headers["Retry-After"]) == (503, "5")
-    assert refused.headers["Content-Type"] == "application/problem+json"
-    for light in ("/v1/plant", "/v1/heliostats/AA39", "/v1/forecasts", "/readyz"):
-        assert client.get(light).status_code == 200, light
+    with _none_left(client, app, "turns"):
+        refused = client.get(made.headers["Location"])
+        assert (refused.status_code, refused.headers["Retry-After"]) == (503, "5")
+        assert refused.headers["Content-Type"] == "application/problem+json"
+        for light in ("/v1/plant", "/v1/heliostats/AA39", "/v1/forecasts", "/readyz", "/jobs", "/forecast"):
+            assert client.get(light).status_code == 200, light
+
+
+def test_pages_with_maps_have_the_same_turns(client: TestClient, app: FastAPI):
+    client.post("/v1/forecasts", json={**FORECAST, "surface": "ideal"})
+    client.post("/v1/jobs/predictions", json={})
+    drawn = ("/", "/heliostats/AA39", "/forecasts/1", "/jobs/1")
+    assert [client.get(page).status_code for page in drawn] == [200] * 4
+    with _none_left(client, app, "turns"):
+        assert [client.get(page).status_code for page in drawn] == [503] * 4
+
+
+def test_one_key_does_not_fill_the_line_before_the_model(client: TestClient, app: FastAPI, post: Post):
+    asked = {**FORECAST, "surface": "ideal"}
+    form = {"heliostat": "AA39", "target": "lower", "azimuth_deg": "0", "elevation_deg": "45"}
+    with _none_left(client, app, "computing"):
+        assert post().status_code == 503
+        assert client.post("/v1/forecasts", json=asked).status_code == 503
+        assert client.post("/v1/heliostats/AA39/surfaces", json={}).status_code == 503
+        assert client.post("/forecast", data=form).status_code == 503
+    assert [post(png(seed)).status_code for seed in (1, 2)] == [201, 201]  # each gives its turn back
 
 
 def test_a_turn_ends_with_its_request(client: TestClient, app: FastAPI):
@@ -52,21 +82,67 @@ def test_a_turn_ends_with_its_request(client: TestClient, app: FastAPI):
 def test_turns_are_bounded_in_number_and_time():
     async def ask() -> list[str]:
         turns, said = Turns(count=1, most_waiting=1, patience_s=0.05), []
-        async with turns.one():
+        async with turns.one("a"):
             with pytest.raises(BusyError) as late:
-                async with turns.one():
+                async with turns.one("a"):
                     pass
             said.append(str(late.value))
-        async with turns.one():  # the one that gave up holds nothing
+        async with turns.one("a"):  # the one that gave up holds nothing
             pass
         full = Turns(count=1, most_waiting=0)
-        async with full.one():
-            with pytest.raises(BusyError, match="too many"):
-                async with full.one():
+        async with full.one("a"):
+            with pytest.raises(BusyError, match="too much"):
+                async with full.one("a"):
                     pass
         return said
 
     assert "one after the other" in anyio.run(ask)[0]
+
+
+def test_one_key_has_half_of_the_turns_and_of_the_places_to_wait():
+    """However greedy it is, another has a turn at once, and two greedy ones are served by turns."""
+
+    async def ask() -> list[str]:
+        turns, order, leave = Turns(count=2, most_waiting=8), [], anyio.Event()
+
+        async def take(who: str) -> None:
+            try:
+                async with turns.one(who):
+                    order.append(who)
+                    await leave.wait()
+            except BusyError:
+                order.append(f"{who} refused")
+
+        async with anyio.create_task_group() as asking:
+            for who in ["greedy"] * 6 + ["victim"] + ["other"] * 3:
+                asking.start_soon(take, who)
+                await anyio.wait_all_tasks_blocked()
+            leave.set()
+        return order
+
+    assert anyio.run(ask) == [
+        *("greedy", "greedy refused", "victim"),
+        *("greedy", "other", "greedy", "other", "greedy", "other", "greedy"),
+    ]
+
+
+def test_who_goes_while_waiting_leaves_no_place_taken():
+    async def ask() -> None:
+        turns = Turns(count=2, most_waiting=2)
+
+        async def wait() -> None:
+            async with turns.one("a"):
+                pass
+
+        for _ in range(3):
+            async with turns.one("a"), anyio.create_task_group() as asking:
+                asking.start_soon(wait)
+                await anyio.wait_all_tasks_blocked()
+                asking.cancel_scope.cancel()
+        async with turns.one("a"), turns.one("b"):
+            pass
+
+    anyio.run(ask)
 
 
 def test_a_debt_is_paid_before_the_next_request():
@@ -108,7 +184,10 @@ def test_bad_keys_shut_out_neither_probes_nor_the_login_of_their_address(tmp_pat
 def test_server_bounds_connections_and_heads():
     settings = Settings(most_connections=77)
     config = config_of(settings, create_app(settings, FakeOperations()))
-    assert (config.limit_concurrency, config.h11_max_incomplete_event_size, config.http) == (77, 32768, Protocol)
+    assert (config.limit_concurrency, config.h11_max_incomplete_event_size) == (77, 32768)
+    assert isinstance(config.http, type)
+    assert issubclass(config.http, Protocol)
+    assert config.http.most_each == settings.most_connections_each
 
 
 def test_half_a_head_is_not_waited_for_for_ever(app: FastAPI):
@@ -132,6 +211,39 @@ def test_one_connection_too_many_is_answered_503(tmp_path):
         assert httpx.get(f"{address}/livez").status_code == 503
 
 
+def _connect(address: str, port: int) -> socket.socket:
+    """A connection from one of this machine's own addresses, silent."""
+    return socket.create_connection(("127.0.0.1", port), timeout=30, source_address=(address, 0))
+
+
+def _ask(connection: socket.socket) -> bytes:
+    connection.sendall(b"GET /livez HTTP/1.1\r\nHost: 127.0.0.1\r\nConnection: close\r\n\r\n")
+    return connection.recv(65536)[:12]
+
+
+def test_one_address_cannot_hold_all_connections(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Silent connections beyond its share are ended; who comes from elsewhere notices nothing."""
+    monkeypatch.setattr("service.web.door.connections.is_loopback", lambda address: address == "127.0.0.9")
+    settings = Settings(data_dir=tmp_path, most_connections_each=3, forwarded_allow_ips="127.0.0.7", **QUIET)
+    app = create_app(settings, FakeOperations())
+    with serving(app, http=protocol_of(settings)) as address, ExitStack() as held:
+        port = int(address.rsplit(":", 1)[1])
+        # Of this machine and of a trusted proxy any number, for many come through there.
+        for sender, most in (("127.0.0.2", 3), ("127.0.0.7", 6), ("127.0.0.9", 6)):
+            silent = [held.enter_context(_connect(sender, port)) for _ in range(6)]
+            for refused in silent[most:]:
+                assert refused.recv(100).startswith(b"HTTP/1.1 503 ")
+            assert _ask(silent[0]) == b"HTTP/1.1 200"
+        assert _ask(held.enter_context(_connect("127.0.0.3", port))) == b"HTTP/1.1 200"
+        # One of the three has gone.
+        assert _ask(held.enter_context(_connect("127.0.0.2", port))) == b"HTTP/1.1 200"
+
+
+def test_addresses_of_one_holder_count_together():
+    assert _holder("2001:db8::1") == _holder("2001:db8::2:1") != _holder("2001:db8:1::1")
+    assert _holder("::ffff:192.0.2.1") == _holder("192.0.2.1") != _holder("192.0.2.2")
+
+
 def test_public_paths_take_small_forms_only(bare: TestClient):
     for path in ("/login", "/session"):
         assert bare.post(path, data={"key": "x" * 5000}).status_code == 413
@@ -139,34 +251,43 @@ def test_public_paths_take_small_forms_only(bare: TestClient):
         assert bare.post(path, data={"key": "nonsense"}).status_code == 401
 
 
-def test_a_body_that_does_not_come_is_not_waited_for(settings: Settings):
+def _sent_slowly(settings: Settings, part: bytes, pause_s: float, patience_s: float) -> tuple[str, int]:
+    """What a sender of one part after the other is answered, and how many parts it got rid of."""
     answers: list[str] = []
+    taken = 0
 
     async def reads_its_body(scope: Scope, receive: Receive, send: Send) -> None:
+        nonlocal taken
         try:
             while (await receive()).get("more_body", False):
-                pass
+                taken += 1
         except HTTPException as error:
             answers.append(f"{error.status_code}")
 
-    async def ask() -> None:
-        parts = iter([{"type": "http.request", "body": b"{", "more_body": True}])
+    async def receive() -> Message:
+        await anyio.sleep(pause_s)
+        return {"type": "http.request", "body": part, "more_body": taken < 60}
 
-        async def receive() -> Message:
-            part = next(parts, None)
-            if part is None:
-                await anyio.sleep_forever()
-            return part
+    async def send(message: Message) -> None:
+        pass
 
-        async def send(message: Message) -> None:
-            pass
+    middleware = BodyLimitMiddleware(reads_its_body, settings)
+    middleware.patience_s = patience_s
+    anyio.run(middleware, {"type": "http", "path": "/v1/plant", "headers": []}, receive, send)
+    return "".join(answers), taken
 
-        middleware = BodyLimitMiddleware(reads_its_body, settings)
-        middleware.patience_s = 0.01
-        await middleware({"type": "http", "path": "/v1/plant", "headers": []}, receive, send)
 
-    anyio.run(ask)
-    assert answers == ["408"]
+def test_a_body_that_does_not_come_is_not_waited_for(settings: Settings):
+    assert _sent_slowly(settings, b"{", 60.0, 0.01) == ("408", 0)
+
+
+def test_a_body_that_drips_ends_as_a_whole(settings: Settings):
+    """No pause is long, and it would never end."""
+    slow = settings.model_copy(update={"least_bytes_per_s": 1000.0})
+    answer, taken = _sent_slowly(slow, b" ", 0.01, 0.2)
+    assert answer == "408"
+    assert taken < 40
+    assert _sent_slowly(slow, b" " * 100, 0.01, 0.2) == ("", 60)  # ten times the rate, and three times as long
 
 
 def test_a_busy_model_is_503_for_requests_and_nothing_for_the_light(client: TestClient, app: FastAPI):

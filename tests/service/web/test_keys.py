@@ -16,11 +16,11 @@ from model.errors import InvalidInputError
 from service.base.faults import ConflictError, NotFoundError, OpenDoorError
 from service.base.settings import Settings
 from service.cli.main import main
-from service.store import keys
+from service.store import keys, tables
 from service.store.database import Database
 from service.store.tables import AuditRow, KeyRow
 from service.web.app import create_app
-from service.web.door import security
+from service.web.door import dependencies, security
 from service.web.door.limits import Buckets
 from service.web.door.security import Role
 from tests.service.conftest import QUIET, FakeOperations, client_of, free_port, properties_document, tower_document
@@ -165,6 +165,20 @@ def test_roles_of_routes_are_those_documented(guarded: Any):
             assert role == Role.READ
         else:
             assert role == (Role.INGEST if path.endswith("/measurements") else Role.OPERATE), path
+
+
+def test_roles_are_those_of_the_keys():
+    """By their names, in whatever order they are written down; each may do what those before it may."""
+    assert {role.value for role in Role} == set(tables.ROLES)
+    steps = [Role.READ, Role.INGEST, Role.OPERATE, Role.ADMIN]
+    assert [[one.includes(other) for other in steps] for one in steps] == [
+        [True, False, False, False],
+        [True, True, False, False],
+        [True, True, True, False],
+        [True, True, True, True],
+    ]
+    asked = (dependencies.READ, dependencies.INGEST, dependencies.OPERATE, dependencies.ADMIN)
+    assert [found.dependency.role for found in asked] == steps
 
 
 def test_route_without_a_role_keeps_the_service_from_starting():

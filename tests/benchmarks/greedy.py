@@ -1,0 +1,151 @@
+"""A victim beside a greedy key: ``python -m tests.benchmarks.greedy [--database postgres]``.
+
+On the service with the real model, which knows two mirrors of the Solar Tower Juelich, sixteen connections ask with one
+key, each as soon as it has its answer: for a forecast of 1024 x 1024 as JSON, for pages with it, for predictions, or
+with photographs. Meanwhile another key reads plain routes and /readyz. Prints its times, alone and beside each, and
+what the greedy one was answered. All clients run on the same machine as the service.
+"""
+
+import argparse
+import asyncio
+import itertools
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+
+import httpx
+import numpy as np
+
+from service.store import keys
+from service.store.database import Database
+from tests.benchmarks import data_folder
+from tests.benchmarks.load import HELIOSTATS, SUN, Tally, Visitor, import_two
+from tests.faults.harness import Process, Store, new_store
+
+CONNECTIONS = 16
+PLAIN = ("/v1/heliostats", "/v1/heliostats/AA39", "/v1/forecasts?limit=20", "/v1/jobs", "/v1/targets", "/readyz")
+FORECAST = {"heliostat": "AA39", "target": "multi_focus_tower", "sun": SUN, "surface": "ideal", "resolution": 1024}
+
+Ask = Callable[[Visitor], Awaitable[httpx.Response]]
+
+
+async def _map(visitor: Visitor) -> httpx.Response:
+    return await visitor.http.get("/v1/forecasts/1")
+
+
+async def _page(visitor: Visitor) -> httpx.Response:
+    path = visitor.random.choice(["/forecasts/1", "/heliostats/AA39", "/"])
+    return await visitor.http.get(path, headers={"Accept": "text/html"})
+
+
+GREEDY: dict[str, tuple[str, Ask]] = {
+    "maps": ("read", _map),
+    "pages": ("read", _page),
+    "predictions": ("operate", Visitor.surface),
+    "photographs": ("ingest", Visitor.photograph),
+}
+"""What a greedy key asks for, and its role."""
+
+
+def _client(base: str, key: str) -> httpx.AsyncClient:
+    return httpx.AsyncClient(base_url=base, headers={"Authorization": f"Bearer {key}"}, timeout=60)
+
+
+async def _greedy(base: str, key: str, ask: Ask, seed: int, answers: Counter[str]) -> None:
+    async with _client(base, key) as http:
+        visitor = Visitor(http, Tally(), seed)
+        while True:
+            try:
+                answers[str((await ask(visitor)).status_code)] += 1
+            except httpx.TransportError as error:
+                answers[type(error).__name__] += 1
+
+
+async def _victim(base: str, key: str, seconds: float, pause_s: float) -> tuple[list[float], Counter[str]]:
+    """Its times [s] and what it was answered."""
+    times, answers, until_s = [], Counter[str](), time.monotonic() + seconds
+    async with _client(base, key) as http:
+        for path in itertools.cycle(PLAIN):
+            if time.monotonic() > until_s:
+                return times, answers
+            began = time.perf_counter()
+            answers[str((await http.get(path)).status_code)] += 1
+            times.append(time.perf_counter() - began)
+            await asyncio.sleep(pause_s)
+    raise AssertionError
+
+
+async def _beside(base: str, made: dict[str, str], name: str | None, options: argparse.Namespace) -> str:
+    """A row: the victim alone, or beside the greedy key that asks for ``name``."""
+    met: Counter[str] = Counter()
+    crowd = []
+    if name is not None:
+        role, ask = GREEDY[name]
+        crowd = [asyncio.create_task(_greedy(base, made[role], ask, seed, met)) for seed in range(CONNECTIONS)]
+        await asyncio.sleep(2)  # its burst is over
+    times, answers = await _victim(base, made["victim"], options.seconds, options.pause)
+    for one in crowd:
+        one.cancel()
+    await asyncio.gather(*crowd, return_exceptions=True)
+    p50, p99 = np.percentile(times, [50, 99]) * 1e3
+    told = [", ".join(f"{count} x {kind}" for kind, count in sorted(some.items())) or "-" for some in (answers, met)]
+    return f"| {name or 'alone'} | {told[0]} | {p50:.0f} | {p99:.0f} | {max(times) * 1e3:.0f} | {told[1]} |"
+
+
+def _keys(store: Store) -> dict[str, str]:
+    """A key of each role, and the victim's."""
+    database = Database(store.settings.database)
+    with database.writing() as session:
+        made = {role: keys.create(session, role, role, "bench") for role in ("read", "ingest", "operate")}
+        made["victim"] = keys.create(session, "victim", "read", "bench")
+    database.close()
+    return made
+
+
+async def _fill(base: str, made: dict[str, str]) -> None:
+    """A large forecast, and photographs and a surface to predict and draw from."""
+    async with _client(base, made["operate"]) as http:
+        visitor = Visitor(http, Tally(), 10**6)
+        (await http.post("/v1/forecasts", json=FORECAST)).raise_for_status()
+        for _ in range(2 * len(HELIOSTATS)):
+            (await visitor.photograph()).raise_for_status()
+            (await visitor.surface()).raise_for_status()
+        for page in ("/", "/forecasts/1", "/heliostats/AA39"):
+            (await http.get(page, headers={"Accept": "text/html"})).raise_for_status()
+
+
+async def _run(base: str, made: dict[str, str], options: argparse.Namespace) -> None:
+    await _fill(base, made)
+    print("| beside | victim's answers | p50 [ms] | p99 [ms] | longest [ms] | greedy one's answers |")
+    print("| --- | --- | --- | --- | --- | --- |")
+    for name in (None, *options.greedy):
+        print(await _beside(base, made, name, options), flush=True)
+
+
+def main(arguments: list[str]) -> None:
+    """Run each and print what the victim met."""
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.benchmarks.greedy", description="A victim's times beside a greedy key."
+    )
+    parser.add_argument("--database", choices=("sqlite", "postgres"), default="sqlite")
+    parser.add_argument("--seconds", type=float, default=20.0, help="of each")
+    parser.add_argument("--pause", type=float, default=0.05, help="of the victim between two requests [s]")
+    parser.add_argument("--greedy", nargs="+", choices=tuple(GREEDY), default=list(GREEDY))
+    parser.add_argument("--unlimited", action="store_true", help="let each key ask as often as it likes")
+    options = parser.parse_args(arguments)
+    if not data_folder().is_dir():
+        parser.error(f"no real measurements at {data_folder()}; set HELIOTWIN_STJ")
+    limits = {} if options.unlimited else {"HELIOTWIN_REQUESTS_PER_S": "200", "HELIOTWIN_REQUESTS_BURST": "400"}
+    load = Path("/proc/loadavg").read_text().split()[0]
+    print(f"{options.database}, {options.seconds:.0f} s each, load {load}{', unlimited' * options.unlimited}")
+    with tempfile.TemporaryDirectory() as folder, new_store(options.database, Path(folder)) as store:
+        import_two(store)
+        with Process(store, "serve", module="service", **limits) as service:
+            asyncio.run(_run(service.base, _keys(store), options))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
