@@ -23,6 +23,9 @@ Number = Annotated[Version, Path(description="Id of the job.")]
 
 _PAGE = 50
 
+# Heliostats of a job that its page names; all of them stand in its JSON.
+_LISTED = 100
+
 
 class PredictionForm(Model):
     """The form that asks for surfaces; without a heliostat of all of them."""
@@ -68,6 +71,13 @@ def _flux(row: JobRow) -> HeatMap | None:
     return charts.flux_map("Flux of all heliostats together", flux, (plane["width"], plane["height"]), "W/m²")
 
 
+def _asked(value: Any) -> Any:
+    """What a job was asked, in a line; of long lists the beginning."""
+    if not isinstance(value, list) or len(value) <= _LISTED:
+        return value
+    return f"{', '.join(map(str, value[:_LISTED]))} and {len(value) - _LISTED} more"
+
+
 def _plain(value: Any) -> bool:
     return isinstance(value, str | int | float | bool)
 
@@ -83,7 +93,8 @@ def get_job_page(number: Number, request: Request, runtime: RuntimeDep) -> HTMLR
         "job.html",
         job=row,
         is_live=row.state not in queue.ENDED,
-        asked={name: value for name, value in row.payload.items() if value is not None},
+        asked={name: _asked(value) for name, value in row.payload.items() if value is not None},
+        listed=_LISTED,
         flux=_flux(row),
         facts={name: value for name, value in result.items() if _plain(value)},
         counts=result.get("counts", {}),
