@@ -4,7 +4,7 @@ from typing import Any
 
 from service.jobs.kind import Kinds
 from service.store import audit
-from service.store.keys import RESERVED
+from service.store.keys import ITSELF
 from service.store.queue import add_job, cancel
 from service.store.tables import JobRow
 from service.twin.runtime import Runtime
@@ -32,9 +32,9 @@ def begin_due(runtime: Runtime, kinds: Kinds) -> None:
             key = kind.due(session, runtime.settings)
         if key is not None:
             with runtime.database.writing() as session:
-                row, is_new = add_job(session, kind.name, {}, RESERVED, key)
+                row, is_new = add_job(session, kind.name, {}, ITSELF, key)
                 if is_new:
-                    audit.record(session, RESERVED, "job.created", f"job {row.id}", kind=kind.name)
+                    audit.record(session, ITSELF, "job.created", f"job {row.id}", kind=kind.name)
 
 
 def cancel_for(runtime: Runtime, number: int, actor: str) -> JobRow:

@@ -23,6 +23,7 @@ from service.store.check import inspect_store, is_sound
 from service.store.columns import now
 from service.store.database import Database
 from service.store.images import ImageStore, digest
+from service.store.keys import RESERVED
 from service.store.tables import ImageRow, JobRow, MeasurementRow
 from service.twin.ingest import Photograph, ingest
 from service.twin.prediction import predict_surface
@@ -260,6 +261,8 @@ def test_workers_begin_a_pruning_when_it_is_due_and_once(runtime: Runtime):
     aged = with_(runtime, image_retention_days=90.0)
     begin_due(aged, KINDS)
     assert jobs() == []
+    with runtime.database.writing() as session:  # somebody else's key of the same text is no matter
+        queue.add_job(session, "forecasts", {}, RESERVED, f"prunings-{now():%Y-%m-%d}")
     age(runtime, 100, 9)
     for _ in range(2):
         Worker(aged, KINDS, "one", threading.Event())._purge()
