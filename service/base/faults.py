@@ -15,6 +15,14 @@ class ConflictError(ServiceError):
     """The request is well-formed but the store is in no state to fulfil it; the message says what to do first."""
 
 
+class GoneError(ServiceError):
+    """A named thing was in the store and is kept no longer."""
+
+
+class StoreFullError(ServiceError):
+    """The store may keep no more, and has nothing that it may give up."""
+
+
 class TooLargeError(ServiceError):
     """A body or an image exceeds its bound."""
 

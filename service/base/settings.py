@@ -157,6 +157,23 @@ class Settings(BaseSettings):
     forecast_retention_days: float = Field(
         default=365.0, ge=0, le=36500, description="Forecasts made so long ago [days] are deleted; 0 keeps all."
     )
+    refused_image_retention_days: float = Field(
+        default=90.0, ge=0, le=36500, description="Refused photographs so old [days] lose their image; 0 keeps all."
+    )
+    image_retention_days: float = Field(
+        default=730.0,
+        ge=0,
+        le=36500,
+        description="Accepted photographs so old [days] lose their image, unless today's surface was made from them; 0 "
+        "keeps all.",
+    )
+    image_quota_gb: float = Field(
+        default=2000.0,
+        ge=0,
+        le=1e6,
+        description="Most that images may take [GB]; beyond it the oldest go, refused ones first, but never what "
+        "today's surfaces were made from. 0 sets no bound.",
+    )
     audit_retention_days: float = Field(
         default=1825.0, ge=0, le=36500, description="Audit entries so old [days] are deleted; 0 keeps all."
     )

@@ -46,6 +46,14 @@ def irradiance(watts_m2: float) -> str:
     return figure(watts_m2 / 1e3, 2, "kW/m²") if abs(watts_m2) >= 1000 else figure(watts_m2, 0, "W/m²")
 
 
+def storage(size_bytes: float) -> str:
+    """A size on the disk, in the unit that reads best."""
+    for unit, size in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if size_bytes >= size:
+            return figure(size_bytes / size, 1, unit)
+    return figure(size_bytes, 0, "B")
+
+
 def environment(*packages: str) -> Environment:
     """Templates of these packages, the first one's first, with the filters above."""
     made = Environment(
@@ -61,6 +69,7 @@ def environment(*packages: str) -> Environment:
         moment=moment,
         power=power,
         irradiance=irradiance,
+        storage=storage,
         path=lambda value: quote(value, ""),
         words=lambda name: name.replace("_", " "),
     )

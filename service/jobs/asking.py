@@ -1,8 +1,10 @@
-"""Asking for a job and cancelling one, on somebody's behalf."""
+"""Asking for a job and cancelling one, on somebody's behalf or on the service's own."""
 
 from typing import Any
 
+from service.jobs.kind import Kinds
 from service.store import audit
+from service.store.keys import ITSELF
 from service.store.queue import add_job, cancel
 from service.store.tables import JobRow
 from service.twin.runtime import Runtime
@@ -19,6 +21,20 @@ def ask_for(
             audit.record(session, actor, "job.created", f"job {row.id}", kind=kind)
     runtime.job_came.release()
     return row
+
+
+def begin_due(runtime: Runtime, kinds: Kinds) -> None:
+    """Queue the jobs that are due by themselves, each once, however many workers ask and however many others wait."""
+    for kind in kinds.values():
+        if kind.due is None:
+            continue
+        with runtime.database.reading() as session:
+            key = kind.due(session, runtime.settings)
+        if key is not None:
+            with runtime.database.writing() as session:
+                row, is_new = add_job(session, kind.name, {}, ITSELF, key)
+                if is_new:
+                    audit.record(session, ITSELF, "job.created", f"job {row.id}", kind=kind.name)
 
 
 def cancel_for(runtime: Runtime, number: int, actor: str) -> JobRow:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 from sqlalchemy.orm import Session
 
+from service.base.settings import Settings
 from service.store import queue
 from service.twin.runtime import Runtime
 
@@ -93,12 +94,17 @@ class Context:
 
 @dataclass(frozen=True)
 class Kind(Generic[Payload]):
-    """A kind of job: what it takes, and the function that does it."""
+    """A kind of job: what it takes, and the function that does it.
+
+    Where it has ``due``, workers ask that every hour: it gives None, or the Idempotency-Key of a job that is due, which
+    is begun once, with nothing in its payload.
+    """
 
     name: str
     payload: type[Payload]
     handler: Callable[[Context, Payload], Result]
     summary: str
+    due: Callable[[Session, Settings], str | None] | None = None
 
 
 Kinds = Mapping[str, Kind[Any]]

@@ -25,6 +25,7 @@ from service.base.arrays import pack
 from service.base.faults import ServiceError
 from service.base.meters import JOB_ATTEMPTS, JOB_SECONDS, PROCESS, listening, timed
 from service.base.settings import Settings
+from service.jobs.asking import begin_due
 from service.jobs.kind import CancelRequestedError, Context, Kinds, WorkerStoppingError
 from service.store import queue, retention
 from service.store.tables import JobRow
@@ -90,7 +91,7 @@ class Worker:
                 self.runtime.job_came.acquire(timeout=self.runtime.settings.job_poll_s)
 
     def _purge(self) -> None:
-        """Delete what is kept for a time only, now and then, a few rows of each table at a time."""
+        """Delete what is kept for a time only, now and then, a few rows at a time, and begin jobs that are due."""
         if time.monotonic() - self._purged_s < _PURGE_EVERY_S:
             return
         settings, deleted = self.runtime.settings, 0
@@ -105,6 +106,7 @@ class Worker:
                 if count:
                     logger.info("%s: %d %s deleted that were older than %g days", self.name, count, what, days)
                 deleted += count
+        begin_due(self.runtime, self.kinds)
         if not deleted:  # else there may be more
             self._purged_s = time.monotonic()
 

@@ -1,7 +1,8 @@
 """Back-ups: a folder with the database as it was at one moment, all images that it knows, and their hashes.
 
 It is taken while the service runs. The database is read in one snapshot; the images after it, which suffices because
-an image lies in the store before its row does, and is never changed or removed. SQLite is copied by its own back-up
+an image lies in the store before its row does, is never changed, and is not removed meanwhile
+(`service.store.photographs`): pruning waits. SQLite is copied by its own back-up
 call; PostgreSQL table by table by COPY, so that no tool of the right version must be at hand. A restore verifies all
 hashes before it writes anything, and writes only into a store that holds nothing.
 """
@@ -19,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from psycopg import sql
-from sqlalchemy import Connection, inspect, select
+from sqlalchemy import Connection, inspect, text
 
 from model.errors import InvalidInputError
 from service.base.faults import ConflictError, StoreDamagedError
@@ -27,7 +28,6 @@ from service.base.progress import Progress, quiet
 from service.base.settings import Settings
 from service.store.database import Database
 from service.store.images import ImageStore
-from service.store.tables import ImageRow
 
 _FORMAT = 1
 _MANIFEST, _SQLITE, _IMAGES, _LIST = "manifest.json", "database.sqlite", "images", "images.txt"
@@ -69,7 +69,9 @@ def back_up(settings: Settings, out: Path, step: Progress = quiet) -> dict[str, 
             raise ConflictError("there is no store to back up: the database holds no schema")
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir(parents=True)
-        manifest = _write(database, images_of(settings), partial, step)
+        images = images_of(settings)
+        with images.held():  # from before the snapshot: what it names is there until all is copied
+            manifest = _write(database, images, partial, step)
     finally:
         database.close()
     os.sync()
@@ -108,6 +110,11 @@ def _place(images: ImageStore, sha256: str, data: bytes) -> None:
     path.write_bytes(data)
 
 
+def _kept_images(columns: Iterable[str]) -> str:
+    """The statement that lists images whose files are kept; before schema 0007 all were."""
+    return f"SELECT sha256 FROM images {'WHERE pruned_at IS NULL ' if 'pruned_at' in columns else ''}ORDER BY sha256"
+
+
 def _list_images(folder: Path, digests: Iterable[str]) -> None:
     (folder / _LIST).write_text("".join(f"{sha256}\n" for sha256 in digests), encoding="ascii")
 
@@ -117,7 +124,8 @@ def _copy_sqlite(database: Database, folder: Path) -> dict[str, Any]:
     with closing(sqlite3.connect(str(database.url.database))) as source, closing(sqlite3.connect(path)) as copy:
         source.backup(copy)
         copy.execute("PRAGMA journal_mode=DELETE")  # all of it in the one file
-        _list_images(folder, (row[0] for row in copy.execute("SELECT sha256 FROM images ORDER BY sha256")))
+        columns = [row[1] for row in copy.execute("PRAGMA table_info(images)")]
+        _list_images(folder, (row[0] for row in copy.execute(_kept_images(columns))))
         return {"revision": copy.execute("SELECT version_num FROM alembic_version").fetchone()[0]}
 
 
@@ -128,7 +136,7 @@ def _copy_postgres(database: Database, folder: Path) -> dict[str, Any]:
         tables = _tables(connection)
         for name, columns in tables.items():
             _copy_out(connection, name, columns, folder / f"{name}.copy.gz")
-        _list_images(folder, connection.scalars(select(ImageRow.sha256).order_by(ImageRow.sha256)))
+        _list_images(folder, connection.scalars(text(_kept_images(tables["images"]))))
     return {"revision": revision, "tables": tables}
 
 

@@ -4,7 +4,7 @@ import re
 from collections.abc import Sequence
 from typing import Any
 
-from sqlalchemy import select
+from sqlalchemy import func, not_, select
 from sqlalchemy.orm import Session
 
 from service.base.faults import StoreDamagedError
@@ -16,6 +16,8 @@ from service.store.tables import HeliostatRow, ImageRow, MeasurementRow
 # Images that are asked for in one statement.
 _CHUNK = 500
 
+_KEPT = ImageRow.pruned_at.is_(None)
+
 _IMAGE = re.compile(r"[0-9a-f]{2}/[0-9a-f]{62}")
 
 
@@ -25,22 +27,27 @@ def inspect_store(database: Database, images: ImageStore, step: Progress) -> dic
     Returns
     -------
     dict
-        ``images``: how many were read. ``bad``: for each that is missing or damaged its reason and the measurements
-        (H/ID) that it belongs to. ``database``: what SQLite finds wrong; PostgreSQL looks after itself. ``unused`` and
-        ``leftovers``: files that no row names and cut-off ones, which a fault left and which harm nothing.
+        ``images``: how many were read. ``pruned``: how many were given up, and are not looked for. ``bad``: for each
+        that is missing or damaged its reason and the measurements (H/ID) that it belongs to. ``database``: what SQLite
+        finds wrong; PostgreSQL looks after itself. ``unused`` and ``leftovers``: files that no row names and cut-off
+        ones, which a fault left and which harm nothing.
     """
     with database.reading() as session:
-        known = list(session.scalars(select(ImageRow.sha256).order_by(ImageRow.sha256)))
+        known = list(session.scalars(select(ImageRow.sha256).where(_KEPT).order_by(ImageRow.sha256)))
+        pruned = session.scalars(select(func.count()).select_from(ImageRow).where(not_(_KEPT))).one()
+        waiting = list(session.scalars(select(ImageRow.sha256).where(not_(_KEPT), ImageRow.removed_at.is_(None))))
         faults = _database_faults(session)
     # Terabytes take hours to read: no transaction waits for that.
     bad = {sha256: reason for sha256 in known if (reason := _reason(images, sha256, step)) is not None}
+    bad = _still_kept(database, bad)
     owners = _owners(database, list(bad))
     listed = {sha256: {"reason": reason, "measurements": owners[sha256]} for sha256, reason in bad.items()}
-    names = set(known)
+    names = {*known, *waiting}
     files = [path.relative_to(images.root).as_posix() for path in images.root.rglob("*") if path.is_file()]
     stored = [name for name in files if _IMAGE.fullmatch(name)]
     return {
         "images": len(known),
+        "pruned": pruned,
         "bad": listed,
         "database": faults,
         "unused": sum(name.replace("/", "") not in names for name in stored),
@@ -62,6 +69,16 @@ def _reason(images: ImageStore, sha256: str, step: Progress) -> str | None:
     except OSError as error:
         return f"unreadable: {error.strerror}"
     return None
+
+
+def _still_kept(database: Database, bad: dict[str, str]) -> dict[str, str]:
+    """Without images that were given up since they were listed: reading all takes hours."""
+    digests, kept = list(bad), set[str]()
+    with database.reading() as session:
+        for start in range(0, len(digests), _CHUNK):
+            some = select(ImageRow.sha256).where(_KEPT, ImageRow.sha256.in_(digests[start : start + _CHUNK]))
+            kept.update(session.scalars(some))
+    return {sha256: reason for sha256, reason in bad.items() if sha256 in kept}
 
 
 def _owners(database: Database, images: Sequence[str]) -> dict[str, list[str]]:

@@ -1,8 +1,11 @@
 """The image files: each kept once under the SHA-256 of its bytes, written whole or not at all."""
 
+import fcntl
 import hashlib
 import os
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from io import BufferedReader
 from pathlib import Path
 
@@ -112,6 +115,38 @@ class ImageStore:
         with self._opened(sha256) as file:
             _require_same(sha256, hashlib.file_digest(file, "sha256").hexdigest())
         return self.path(sha256)
+
+    def remove(self, sha256: str) -> None:
+        """Take the image away, where it is there; `service.store.photographs` says when that may be."""
+        self.path(sha256).unlink(missing_ok=True)
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Nothing is removed while the block runs, by any process of this store: for who reads all that rows name."""
+        with self._lock_file() as descriptor:
+            fcntl.flock(descriptor, fcntl.LOCK_SH)
+            yield
+
+    @contextmanager
+    def removing(self) -> Iterator[bool]:
+        """Whether images may be removed while the block runs: False where somebody has them `held`."""
+        with self._lock_file() as descriptor:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                yield False
+            else:
+                yield True
+
+    @contextmanager
+    def _lock_file(self) -> Iterator[int]:
+        """Beside the folder, in which everything is an image; its lock goes with whoever took it, even if killed."""
+        self.root.parent.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(self.root.with_name(f"{self.root.name}.lock"), os.O_CREAT | os.O_RDWR, 0o644)
+        try:
+            yield descriptor
+        finally:
+            os.close(descriptor)
 
     def _opened(self, sha256: str) -> BufferedReader:
         try:

@@ -25,6 +25,9 @@ from service.store.tables import ROLES, KeyRow
 RESERVED = "local"
 """Who acts where no key is demanded; no key may bear this name."""
 
+ITSELF = "the service"
+"""Who acts where nobody asked; no key can bear this name, which holds a space, and so none can take its job's key."""
+
 _KEY = re.compile(r"htw_([0-9a-f]{12})_([A-Za-z0-9_-]{43})")
 
 

@@ -8,6 +8,8 @@ from sqlalchemy.orm import Session, undefer
 
 from service.base import names
 from service.base.faults import ConflictError, NotFoundError
+from service.store import sizes
+from service.store.columns import now
 from service.store.rows import ROUNDS, hold, insert
 from service.store.tables import HeliostatRow, ImageRow, MeasurementRow, TargetRow
 
@@ -102,6 +104,32 @@ def _free_identifier(session: Session, heliostat: HeliostatRow, row: Measurement
     raise ConflictError(f"id: measurement {wanted} of heliostat {heliostat.name} has another {row.kind} image already")
 
 
+def _use(session: Session, image: ImageRow, accepted: bool, is_new: bool) -> None:
+    """Keep an image's row in step with a new measurement of it, and the totals with the row."""
+    if is_new:
+        sizes.count(session, accepted, 1, image.size_bytes)
+    elif image.pruned_at is not None:  # it came again, and with something new; whoever brought it has the file
+        image.accepted |= accepted
+        image.pruned_at = image.pruned_for = image.removed_at = None
+        image.created_at = now()
+        sizes.count(session, image.accepted, 1, image.size_bytes)
+    elif accepted and not image.accepted:
+        image.accepted = True
+        sizes.count(session, False, -1, -image.size_bytes)
+        sizes.count(session, True, 1, image.size_bytes)
+
+
+def _keep_image(session: Session, image: ImageRow, accepted: bool) -> tuple[ImageRow, bool]:
+    """The image's row, locked against its file's removal until the transaction ends, and whether it is new."""
+    held = session.get(ImageRow, image.sha256, with_for_update=True)
+    if held is not None:
+        return held, False
+    image.accepted = accepted
+    if insert(session, image):
+        return image, True
+    return session.get_one(ImageRow, image.sha256, with_for_update=True), False
+
+
 def add_measurement(
     session: Session, heliostat: HeliostatRow, image: ImageRow, row: MeasurementRow
 ) -> tuple[MeasurementRow, bool]:
@@ -122,8 +150,7 @@ def add_measurement(
         names.require(names.IDENTIFIER, row.external_id, "id")
     hold(session, HeliostatRow, heliostat.id, f"heliostat {heliostat.name}")
     hold(session, TargetRow, row.target_id, "its target")
-    if session.get(ImageRow, image.sha256) is None:
-        insert(session, image)
+    image, is_new = _keep_image(session, image, row.accepted)
     row.heliostat_id, row.image_sha256 = heliostat.id, image.sha256
     for _ in range(ROUNDS):
         existing = find_measurement_of_image(session, heliostat, image.sha256, row.kind)
@@ -131,6 +158,7 @@ def add_measurement(
             return existing, False
         row.identifier = _free_identifier(session, heliostat, row)
         if insert(session, row):
+            _use(session, image, row.accepted, is_new)
             session.refresh(row, ["target", "image"])
             return row, True
     raise ConflictError("too many writers on the same measurement; try again")

@@ -77,9 +77,16 @@ def get_heliostats(session: Session, wanted: Sequence[str]) -> dict[str, Heliost
     return {row.name: row for row in rows}
 
 
-def list_heliostats(session: Session, limit: int, after: str | None = None) -> Sequence[HeliostatRow]:
-    """Up to ``limit`` heliostats in the order of their names, those after the name ``after``."""
+def list_heliostats(
+    session: Session, limit: int, after: str | None = None, prefix: str | None = None
+) -> Sequence[HeliostatRow]:
+    """Up to ``limit`` heliostats in the order of their names, those after ``after`` that begin by ``prefix``.
+
+    Whether the prefix is written in capitals does not matter.
+    """
     query = select(HeliostatRow).options(defer(HeliostatRow.properties)).order_by(HeliostatRow.name).limit(limit)
+    if prefix:
+        query = query.where(HeliostatRow.name.istartswith(prefix, autoescape=True))
     return session.scalars(query.where(HeliostatRow.name > after) if after else query).all()
 
 

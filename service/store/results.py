@@ -68,6 +68,12 @@ def get_study(session: Session, number: int, page: bool = False) -> StudyRow:
     return row
 
 
+def has_study_page(session: Session, number: int) -> bool:
+    """Whether a study came with a page, told without its megabytes."""
+    query = select(StudyRow.id).where(StudyRow.id == number, StudyRow.html.is_not(None))
+    return session.scalar(query) is not None
+
+
 def list_studies(session: Session, limit: int, after: int | None = None) -> Sequence[StudyRow]:
     """Up to ``limit`` studies without their reports, newest first, those older than study ``after``."""
     query = select(StudyRow).order_by(StudyRow.id.desc()).limit(limit)

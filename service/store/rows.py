@@ -15,7 +15,7 @@ from service.base.faults import NotFoundError
 from service.store.columns import Base
 from service.store.tables import HeliostatRow, ReceiverRow, TargetRow
 
-# The statement that knows ON CONFLICT DO NOTHING, by dialect.
+# The statement that knows ON CONFLICT, by dialect.
 _INSERTS: dict[str, Callable[..., Any]] = {"postgresql": postgresql.insert, "sqlite": sqlite.insert}
 
 # Rounds that a writer takes against others who write the same thing before it gives up.
@@ -59,6 +59,11 @@ def hold(session: Session, table: type[Base], number: int, what: str) -> None:
         raise NotFoundError(f"{what} was deleted in the meantime")
 
 
+def inserting(session: Session, table: type[Base]) -> Any:
+    """The INSERT of the session's database, which knows ON CONFLICT."""
+    return _INSERTS[session.get_bind().dialect.name](table)
+
+
 def insert(session: Session, row: Base) -> bool:
     """Insert ``row`` unless a unique constraint forbids it; False where another writer was first.
 
@@ -74,7 +79,7 @@ def insert(session: Session, row: Base) -> bool:
     assert not state.mapper.relationships.keys() & state.dict.keys(), "set relationships after the insert"
     given = {column.name: state.dict[column.name] for column in table.columns if column.name in state.dict}
     made = [column for column in table.columns if column.primary_key or column.name not in given]
-    begun = _INSERTS[session.get_bind().dialect.name](table).values(given)
+    begun = inserting(session, type(row)).values(given)
     written = session.execute(begun.on_conflict_do_nothing().returning(*made)).one_or_none()
     if written is None:
         return False

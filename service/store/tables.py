@@ -7,7 +7,19 @@ and are referred to by their SHA-256.
 from datetime import datetime
 from typing import Any, get_args
 
-from sqlalchemy import CheckConstraint, Column, ForeignKey, Index, LargeBinary, String, Table, Text, UniqueConstraint
+from sqlalchemy import (
+    BigInteger,
+    CheckConstraint,
+    Column,
+    ForeignKey,
+    Index,
+    LargeBinary,
+    String,
+    Table,
+    Text,
+    UniqueConstraint,
+    false,
+)
 from sqlalchemy.orm import Mapped, mapped_column, relationship
 
 from service.base.choices import RoleName
@@ -94,9 +106,14 @@ class ReceiverRow(Base):
 
 
 class ImageRow(Base):
-    """An image file in the store, by its content."""
+    """An image file in the store, by its content; ``accepted`` where a measurement of it was.
+
+    ``pruned_at`` says since when the file is given up (`service.store.photographs`), ``pruned_for`` why, ``removed_at``
+    since when it is gone. ``created_at`` is when it came, or came anew after it was given up.
+    """
 
     __tablename__ = "images"
+    __table_args__ = (Index(None, "pruned_at", "accepted", "created_at"),)
 
     sha256: Mapped[str] = mapped_column(String(64), primary_key=True)
     media_type: Mapped[str] = mapped_column(String(32))
@@ -104,6 +121,20 @@ class ImageRow(Base):
     width_px: Mapped[int]
     height_px: Mapped[int]
     created_at: Mapped[datetime] = mapped_column(default=now)
+    accepted: Mapped[bool] = mapped_column(server_default=false())
+    pruned_at: Mapped[datetime | None]
+    pruned_for: Mapped[str | None] = mapped_column(String(8))
+    removed_at: Mapped[datetime | None]
+
+
+class ImageTotalRow(Base):
+    """How many images the store keeps, of one verdict, and their size: every write of `ImageRow` keeps it up."""
+
+    __tablename__ = "image_totals"
+
+    accepted: Mapped[bool] = mapped_column(primary_key=True)
+    images: Mapped[int]
+    size_bytes: Mapped[int] = mapped_column(BigInteger)
 
 
 class MeasurementRow(Base):

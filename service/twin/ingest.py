@@ -9,6 +9,7 @@ from datetime import datetime, timedelta
 
 import numpy as np
 from numpy.typing import NDArray
+from sqlalchemy.orm import Session
 
 from model.errors import ImageRefusedError, InvalidInputError
 from model.imaging import MeasuredFlux
@@ -16,10 +17,12 @@ from model.imaging.quality import refused
 from model.plant import TargetPlane
 from service import store
 from service.base.arrays import pack, plain
-from service.base.faults import TooLargeError
+from service.base.faults import StoreFullError, TooLargeError
 from service.base.meters import ACCURACY, PHOTOGRAPHS, REFUSALS
+from service.base.settings import Settings
 from service.sources.decode import decode_image
 from service.sources.photograph import Photograph
+from service.store import photographs
 from service.store.columns import now
 from service.store.images import digest, media_type
 from service.store.tables import ImageRow, MeasurementRow, SurfaceRow
@@ -58,12 +61,14 @@ def ingest(
         Where the file is no image that can be decoded safely, or was taken in the future; it is not kept.
     ConflictError
         Where the external id belongs to another image of the same kind.
+    StoreFullError
+        Where the images' quota is reached and nothing may be given up.
     """
     kind_of_file = media_type(data)
     _require_past(photograph.taken_at)
-    known = _read(runtime, heliostat, photograph, digest(data))
+    known = _read(runtime, heliostat, photograph, data)
     if known.measurement is not None:
-        runtime.images.put(data)  # mends a file that the store has lost
+        _mend(runtime, data)
         PHOTOGRAPHS.labels("known").inc()
         return known.measurement, False
     pixels, measured = _measure(runtime, photograph, data, known.plane)
@@ -74,6 +79,8 @@ def ingest(
     image.width_px, image.height_px = width, height
     with runtime.database.writing() as session:
         row, is_new = store.add_measurement(session, known.twin.row, image, row)
+        if is_new and not runtime.images.path(image.sha256).is_file():
+            runtime.images.put(data)  # it was given up before, and removed before its row was locked
         if is_new and judged is not None and known.surface is not None:
             accuracy.note(session, row, known.surface, judged)
     _count(row, is_new, judged)
@@ -89,8 +96,28 @@ def _require_past(taken_at: datetime | None) -> None:
         )
 
 
-def _read(runtime: Runtime, heliostat: str, photograph: Photograph, sha256: str) -> _Known:
+def _mend(runtime: Runtime, data: bytes) -> None:
+    """Write a file that the store has lost; one that it gave up stays away, or senders who repeat would fill it."""
+    with runtime.database.writing() as session:
+        if session.get_one(ImageRow, digest(data), with_for_update=True).pruned_at is None:
+            runtime.images.put(data)
+
+
+def _require_room(session: Session, settings: Settings, sha256: str, size: int) -> None:
+    """StoreFullError where the quota is reached for good; else the job `prunings` makes room soon."""
+    if photographs.excess_bytes(session, settings, size) and session.get(ImageRow, sha256) is None:
+        quota = [rule for rule in photographs.rules(session, settings) if rule.reason == "quota"]
+        if not photographs.has_some(session, quota):
+            raise StoreFullError(
+                f"the store's images have reached their quota of {settings.image_quota_gb:g} GB, and today's surfaces "
+                "were made from all of them; nothing was kept: its operator must raise HELIOTWIN_IMAGE_QUOTA_GB"
+            )
+
+
+def _read(runtime: Runtime, heliostat: str, photograph: Photograph, data: bytes) -> _Known:
+    sha256 = digest(data)
     with runtime.database.reading() as session:
+        _require_room(session, runtime.settings, sha256, len(data))
         twin = load_twin(session, heliostat)
         target = store.get_target(session, photograph.target_name)
         return _Known(

@@ -15,7 +15,8 @@ from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
 from service.base.meters import PROCESS
-from service.store import queue
+from service.base.settings import Settings
+from service.store import queue, sizes
 from service.store.tables import DriftRow, HeliostatRow, JobRow
 from service.twin.runtime import Runtime
 
@@ -36,7 +37,8 @@ class StoreCollector(Collector):
         """The figures, read in one transaction."""
         try:
             with self._runtime.database.reading() as session:
-                found = [*_queue(session), _drift(session, self._runtime.settings.metrics_heliostats)]
+                found = [*_queue(session), *_sizes(session, self._runtime.settings)]
+                found.append(_drift(session, self._runtime.settings.metrics_heliostats))
         except SQLAlchemyError as error:
             logger.warning("metrics of the store are missing: %s", error)
             found = []
@@ -53,6 +55,22 @@ def _queue(session: Session) -> Iterator[Metric]:
     oldest = session.scalar(select(func.min(JobRow.created_at)).where(JobRow.state == "queued"))
     waited_s = 0.0 if oldest is None else max(0.0, (queue.clock(session) - oldest).total_seconds())
     yield GaugeMetricFamily("heliotwin_jobs_oldest_seconds", "How long the oldest waiting job waits [s].", waited_s)
+
+
+def _sizes(session: Session, settings: Settings) -> Iterator[Metric]:
+    held = sizes.sizes(session)
+    images = GaugeMetricFamily("heliotwin_images", "Images that are kept.", labels=["verdict"])
+    size = GaugeMetricFamily("heliotwin_image_bytes", "Size of the images that are kept [B].", labels=["verdict"])
+    age = GaugeMetricFamily("heliotwin_image_oldest_seconds", "Age of the oldest of them [s].", labels=["verdict"])
+    at = queue.clock(session)
+    for verdict, kept in (("accepted", held.accepted), ("refused", held.refused)):
+        images.add_metric([verdict], kept.images)
+        size.add_metric([verdict], kept.size_bytes)
+        age.add_metric([verdict], 0.0 if kept.oldest is None else max(0.0, (at - kept.oldest).total_seconds()))
+    yield from (images, size, age)
+    quota = "Most that images may take [B]; 0 without a bound."
+    yield GaugeMetricFamily("heliotwin_image_quota_bytes", quota, settings.image_quota_gb * 1e9)
+    yield GaugeMetricFamily("heliotwin_database_bytes", "Size of the database [B].", held.database_bytes)
 
 
 def _drift(session: Session, most: int) -> Metric:

@@ -141,7 +141,7 @@ def test_alerts_ask_for_metrics_that_exist(tmp_path: Path):
     names |= {f"{name}_total" for name in names}
     rules = yaml.safe_load((DOCKER / "prometheus-rules.yml").read_text(encoding="utf-8"))["groups"][0]["rules"]
     asked = {name for rule in rules for name in re.findall(r"heliotwin_\w+", rule["expr"])}
-    assert len(rules) == 6
+    assert len(rules) == 7
     assert asked <= names
     told = set(re.findall(r"heliotwin_\w+", (DOCKER / "OPERATING.md").read_text(encoding="utf-8")))
     assert told <= names

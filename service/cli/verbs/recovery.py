@@ -70,8 +70,8 @@ def check(as_json: AsJson = False) -> None:
         typer.echo(f"image {sha256} is {found['reason']}; measurements {', '.join(found['measurements'])}", err=True)
     for fault in report["database"]:
         typer.echo(f"database: {fault}", err=True)
-    counts = f"{report['images']} images, {len(report['bad'])} bad, {report['unused']} unused"
-    _tell(report, f"{counts}, {report['leftovers']} leftovers", as_json)
+    counts = f"{report['images']} images, {len(report['bad'])} bad, {report['pruned']} pruned"
+    _tell(report, f"{counts}, {report['unused']} unused, {report['leftovers']} leftovers", as_json)
     if not is_sound(report):
         raise typer.Exit(1)
 

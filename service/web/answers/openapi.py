@@ -19,13 +19,14 @@ _MEANINGS = {
     406: "None of the media types in Accept is offered.",
     408: "The body did not come in time.",
     409: "The store is in no state to do this; the detail says what to do first.",
+    410: "It was kept, and no longer is; the detail says why.",
     413: "The body or the image is too large.",
     415: "The body or the image is of a format that is not taken.",
     422: "A field is wrong; the detail names it.",
     429: "Too many requests, or too many jobs that wait; see Retry-After.",
     500: "The service failed.",
+    507: "The store has no room left, and nothing was kept.",
     503: "The database does not answer, or the service is busy; see Retry-After.",
-    507: "The store's disk is full; nothing was kept.",
 }
 
 

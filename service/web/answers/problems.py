@@ -46,6 +46,8 @@ STATUS: dict[type[Exception], HTTPStatus] = {
     ModelError: HTTPStatus.UNPROCESSABLE_ENTITY,
     faults.NotFoundError: HTTPStatus.NOT_FOUND,
     faults.ConflictError: HTTPStatus.CONFLICT,
+    faults.GoneError: HTTPStatus.GONE,
+    faults.StoreFullError: HTTPStatus.INSUFFICIENT_STORAGE,
     faults.NotAcceptableError: HTTPStatus.NOT_ACCEPTABLE,
     faults.TooLargeError: HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
     faults.TooManyError: HTTPStatus.TOO_MANY_REQUESTS,
@@ -53,6 +55,13 @@ STATUS: dict[type[Exception], HTTPStatus] = {
     faults.UnsupportedImageError: HTTPStatus.UNSUPPORTED_MEDIA_TYPE,
     faults.UnsupportedContentError: HTTPStatus.UNSUPPORTED_MEDIA_TYPE,
     faults.StoreDamagedError: HTTPStatus.INTERNAL_SERVER_ERROR,
+}
+
+# Where the same request may succeed later, after so many seconds.
+_RETRY_AFTER_S: dict[type[Exception], str] = {
+    faults.TooManyError: "30",
+    faults.BusyError: "5",
+    faults.StoreFullError: "3600",
 }
 
 # PostgreSQL's code for a disk without room.
@@ -105,13 +114,10 @@ def _on_known(request: Request, error: Exception) -> Response:
     status = next(STATUS[kind] for kind in type(error).__mro__ if kind in STATUS)
     if isinstance(error, faults.StoreDamagedError):
         logger.error("%s, request %s", error, request_id(request.scope))
-    if isinstance(error, faults.TooManyError):
-        return problem(request.scope, status, str(error), {"Retry-After": "30"})
-    if isinstance(error, faults.BusyError):
-        return problem(request.scope, status, str(error), {"Retry-After": "5"})
     if isinstance(error, faults.NotAcceptableError):
         return problem(request.scope, status, str(error), offered=list(error.offered))
-    return problem(request.scope, status, str(error))
+    wait_s = _RETRY_AFTER_S.get(type(error))
+    return problem(request.scope, status, str(error), {} if wait_s is None else {"Retry-After": wait_s})
 
 
 def _on_validation(request: Request, error: Exception) -> Response:

@@ -56,10 +56,11 @@ def list_heliostats(
     runtime: RuntimeDep,
     limit: Limit = 100,
     after: Annotated[Name | None, Query(description="The last name of the page before.")] = None,
+    prefix: Annotated[Name | None, Query(description="Only names that begin so, in capitals or not.")] = None,
 ) -> Page[HeliostatSummary]:
     """Heliostats in the order of their names."""
     with runtime.database.reading() as session:
-        rows = store.list_heliostats(session, limit + 1, after)
+        rows = store.list_heliostats(session, limit + 1, after, prefix)
     items = [heliostat_summary(row) for row in rows]
     return page(items, limit, "name")
 

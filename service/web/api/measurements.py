@@ -9,7 +9,7 @@ from pydantic import BaseModel, BeforeValidator, Field, Json
 
 from service import store
 from service.base.arrays import pair, unpack
-from service.base.faults import NotFoundError, TooLargeError
+from service.base.faults import GoneError, NotFoundError, StoreDamagedError, TooLargeError
 from service.base.fields import (
     Azimuth,
     Elevation,
@@ -27,6 +27,7 @@ from service.sources.photograph import Photograph
 from service.sources.schema import paint_motors, paint_spot
 from service.store.tables import MeasurementRow
 from service.twin.ingest import ingest
+from service.twin.runtime import Runtime
 from service.web.answers import formats
 from service.web.answers.files import WholeFile, is_held
 from service.web.answers.formats import MediaType, json_answer, maps_answer
@@ -100,6 +101,9 @@ class MeasurementOut(BaseModel):
     center_of_mass: tuple[float, float] | None = Field(description="Right and up of the target's centre [m].")
     image_sha256: str
     image_media_type: str
+    image_pruned_at: datetime | None = Field(
+        description="Since when the image is kept no longer; everything else of the measurement is."
+    )
     created_at: datetime
 
 
@@ -123,9 +127,22 @@ def measurement_out(heliostat_name: str, row: MeasurementRow) -> MeasurementOut:
             "center_of_mass": pair(row.center_right_m, row.center_up_m),
             "image_sha256": row.image_sha256,
             "image_media_type": row.image.media_type,
+            "image_pruned_at": row.image.pruned_at,
             "created_at": row.created_at,
         }
     )
+
+
+_PRUNED = {"age": "it was as old as the store's settings allow", "quota": "the store's images had reached their quota"}
+
+
+def require_image(row: MeasurementRow) -> None:
+    """GoneError, which says why, where the image of a measurement is kept no longer."""
+    if row.image.pruned_at is not None:
+        raise GoneError(
+            f"the image of measurement {row.identifier} was given up on {row.image.pruned_at:%Y-%m-%d}: "
+            f"{_PRUNED[row.image.pruned_for or 'age']}; its figures are kept"
+        )
 
 
 def flux_answer(heliostat_name: str, row: MeasurementRow, media_type: str) -> Response:
@@ -164,6 +181,12 @@ def _photograph(metadata: MeasurementIn) -> Photograph:
     )
 
 
+def get_row(name: str, measurement: str, runtime: Runtime) -> MeasurementRow:
+    """A heliostat's measurement; NotFoundError where there is none."""
+    with runtime.database.reading() as session:
+        return store.get_measurement(session, store.get_heliostat(session, name), measurement)
+
+
 def _bytes(upload: UploadFile, limit: int) -> bytes:
     data = upload.file.read(limit + 1)
     if len(data) > limit:
@@ -175,7 +198,7 @@ def _bytes(upload: UploadFile, limit: int) -> bytes:
     "",
     status_code=status.HTTP_201_CREATED,
     responses={
-        **problems(400, 404, 409, 413, 415),
+        **problems(400, 404, 409, 413, 415, 507),
         200: {"model": MeasurementOut, "description": "This image was there already; nothing changed."},
     },
     dependencies=[INGEST, Depends(require_multipart), COMPUTES],
@@ -218,16 +241,14 @@ def list_measurements(
 @router.get("/{measurement}", responses=problems(404), dependencies=[READ])
 def get_measurement(name: NamePath, measurement: MeasurementPath, runtime: RuntimeDep) -> MeasurementOut:
     """A measurement with its quality record."""
-    with runtime.database.reading() as session:
-        row = store.get_measurement(session, store.get_heliostat(session, name), measurement)
-    return measurement_out(name, row)
+    return measurement_out(name, get_row(name, measurement, runtime))
 
 
 @router.get(
     "/{measurement}/image",
     response_class=Response,
     responses={
-        **problems(404),
+        **problems(404, 410),
         200: {"description": "The file as it was sent.", "content": {"image/*": {}}},
         304: {"description": "If-None-Match names the file, which the client holds already."},
     },
@@ -240,14 +261,19 @@ def get_image(
     if_none_match: Annotated[str | None, Header(description="The ETag of a file that is held already.")] = None,
 ) -> Response:
     """The image as it was sent; every byte of it is checked before the first one leaves."""
-    with runtime.database.reading() as session:
-        row = store.get_measurement(session, store.get_heliostat(session, name), measurement)
+    row = get_row(name, measurement, runtime)
+    require_image(row)
     # It may be kept, but every use asks again, and shows its key again.
     headers = {"ETag": f'"{row.image_sha256}"', "Cache-Control": "private, no-cache"}
     if is_held(headers["ETag"], if_none_match):
         return Response(status_code=status.HTTP_304_NOT_MODIFIED, headers=headers)
     headers["X-Content-Type-Options"] = "nosniff"
-    return WholeFile(runtime.images.checked(row.image_sha256), media_type=row.image.media_type, headers=headers)
+    try:
+        path = runtime.images.checked(row.image_sha256)
+    except StoreDamagedError:
+        require_image(get_row(name, measurement, runtime))  # it may have been given up since its row was read
+        raise
+    return WholeFile(path, media_type=row.image.media_type, headers=headers)
 
 
 @router.get(

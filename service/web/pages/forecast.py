@@ -17,7 +17,7 @@ from service.drawing import charts
 from service.jobs.asking import ask_for
 from service.jobs.kinds.field_forecasts import FleetForecastIn
 from service.store.columns import now
-from service.store.tables import HeliostatRow, PlantRow, ReceiverRow, TargetRow
+from service.store.tables import PlantRow, ReceiverRow, TargetRow
 from service.twin.forecast import ForecastRequest, flux_of, make_forecast
 from service.twin.runtime import Runtime
 from service.web.answers.pages import go_to, leave_for, render
@@ -27,6 +27,9 @@ from service.web.door.security import Identity
 router = APIRouter(include_in_schema=False)
 
 _RECENT = 10
+
+# Heliostats that the form offers at a time: those whose names begin as what is typed does.
+_OFFERED = 20
 
 
 def _in_utc(moment: datetime) -> datetime:
@@ -82,12 +85,25 @@ def _sun_now(plant: PlantRow | None) -> tuple[float, float]:
 
 def _choices(session: Session) -> dict[str, Any]:
     return {
-        "heliostats": session.scalars(select(HeliostatRow.name).order_by(HeliostatRow.name)).all(),
+        "heliostats": store.list_heliostats(session, _OFFERED),
         "targets": session.scalars(select(TargetRow.name).order_by(TargetRow.name)).all(),
         "receivers": session.scalars(select(ReceiverRow.name).order_by(ReceiverRow.name)).all(),
         "recent": store.recent_forecasts(session, _RECENT),
         "moment": now().strftime("%Y-%m-%dT%H:%M"),
     }
+
+
+@router.get("/forecast/heliostats", dependencies=[READ])
+def get_offered_heliostats(
+    request: Request,
+    runtime: RuntimeDep,
+    heliostat: Annotated[str, Query(max_length=32)] = "",
+    after: Annotated[Name | None, Query(description="The last name of the list before.")] = None,
+) -> HTMLResponse:
+    """The first names that begin as ``heliostat`` does, as the form offers them."""
+    with runtime.database.reading() as session:
+        rows = store.list_heliostats(session, _OFFERED, after, heliostat)
+    return render(request, "offered.html", heliostats=rows)
 
 
 @router.get("/forecast", dependencies=[READ])
@@ -98,7 +114,8 @@ def get_forecast_form(
     with runtime.database.reading() as session:
         choices = _choices(session)
         azimuth, elevation = _sun_now(session.get(PlantRow, 1))
-    filled = {"heliostat": heliostat, "target": None, "azimuth_deg": azimuth, "elevation_deg": elevation}
+    first = next((row.name for row in choices["heliostats"]), "")
+    filled = {"heliostat": heliostat or first, "target": None, "azimuth_deg": azimuth, "elevation_deg": elevation}
     return render(request, "forecast.html", **choices, filled=filled, forecast=None)
 
 

@@ -12,6 +12,7 @@ from service.drawing.charts import HeatMap
 from service.jobs.asking import ask_for, cancel_for
 from service.jobs.kinds.predictions import PredictionsIn
 from service.store import queue
+from service.store.sizes import sizes
 from service.store.tables import JobRow
 from service.web.answers.pages import go_to, render
 from service.web.door.dependencies import DRAWS, OPERATE, READ, IdentityDep, RuntimeDep
@@ -40,9 +41,25 @@ def get_jobs_page(
     """Jobs, newest first."""
     with runtime.database.reading() as session:
         rows = queue.list_jobs(session, _PAGE + 1, after)
+        held = sizes(session)
     is_live = any(row.state not in queue.ENDED for row in rows)
     more = rows[_PAGE - 1].id if len(rows) > _PAGE else None
-    return render(request, "jobs.html", jobs=rows[:_PAGE], more=more, after=after, is_live=is_live, ended=queue.ENDED)
+    settings = runtime.settings
+    return render(
+        request,
+        "jobs.html",
+        jobs=rows[:_PAGE],
+        more=more,
+        after=after,
+        is_live=is_live,
+        ended=queue.ENDED,
+        held=held,
+        kept=(
+            ("accepted", held.accepted, settings.image_retention_days),
+            ("refused", held.refused, settings.refused_image_retention_days),
+        ),
+        quota_bytes=settings.image_quota_gb * 1e9,
+    )
 
 
 def _flux(row: JobRow) -> HeatMap | None:

@@ -63,9 +63,9 @@ def get_studies_page(
 def get_study_page(number: Number, request: Request, runtime: RuntimeDep) -> HTMLResponse:
     """A study with its report, and the button that makes the plant's model out of it."""
     with runtime.database.reading() as session:
-        row = store.get_study(session, number, page=True)
+        row, has_page = store.get_study(session, number), store.has_study_page(session, number)
         adopted, current = versions.find_adopted(session, number), versions.current_number(session)
-    return render(request, "studied.html", study=row, adopted=adopted, current=current)
+    return render(request, "studied.html", study=row, has_page=has_page, adopted=adopted, current=current)
 
 
 @router.get("/studies/{number}/report", dependencies=[READ])

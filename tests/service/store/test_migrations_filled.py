@@ -21,6 +21,7 @@ _CHOSEN: dict[str, Any] = {
     "role": "read",
     "verdict": "effect",
     "model_version": "1:none",
+    "pruned_for": "age",
 }
 _TYPES = (
     (JSON, {"a": [1.5, None, "é"]}),
@@ -81,6 +82,27 @@ def test_rows_survive_the_way_up_and_down(empty_url: URL, revision: str):
     database.downgrade(revision)
     assert _columns(database) == columns
     assert _rows(database, columns) == before
+    database.close()
+
+
+def test_images_of_older_stores_get_verdict_and_totals(empty_url: URL):
+    database = Database(empty_url)
+    database.upgrade("0006")
+    _fill(database)
+    tables = {table.name: table for table in _tables(database)}
+    with database.engine.execution_options(writes=True).begin() as connection:
+        image = {c.name: _value(c) for c in tables["images"].columns} | {"sha256": "y", "size_bytes": 5}
+        connection.execute(insert(tables["images"]).values(image))  # of no measurement, as a refused one
+    database.upgrade()
+    assert _rows(database, {"image_totals": ["accepted", "images", "size_bytes"]})["image_totals"] == [
+        (False, 1, 5),
+        (True, 1, 1),
+    ]
+    assert _rows(database, {"images": ["sha256", "accepted", "pruned_at"]})["images"] == [
+        ("x", True, None),
+        ("y", False, None),
+    ]
+    database.downgrade("base")
     database.close()
 
 

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -26,12 +27,14 @@ from service.cli.demo_plant import ORIGIN, TARGET, properties
 from service.jobs.kinds import KINDS
 from service.jobs.worker import Worker
 from service.store.database import Database
+from service.store.images import ImageStore
 from service.store.surfaces import NewSurface
 from service.store.tables import ImageRow, MeasurementRow, SurfaceRow
-from service.twin.runtime import Runtime
-from service.twin.study import StudyRequest, gather
+from service.twin.gate import Gate
+from service.twin.runtime import Operations, Runtime
+from service.twin.study import StudyRequest, gather, study_store
 from service.web.app import create_app
-from tests.service.conftest import QUIET, client_of
+from tests.service.conftest import QUIET, client_of, until
 
 GAMMA = 0.6
 FIELD = {"AB12": (-44.0, 62.0, 1.7), "AK08": (-32.0, 138.0, 1.8)}
@@ -216,6 +219,32 @@ def test_photograph_shows_its_heliostat_with_the_stored_surface(filled: Database
     np.testing.assert_allclose(photograph.setup.control_points, points, atol=1e-9)
     center = center_of_mass(photograph.image, (TARGET.width, TARGET.height))
     np.testing.assert_allclose(photograph.setup.spot, TARGET.to_enu(center), atol=1e-6)
+
+
+def test_study_lets_others_at_the_model_between_its_steps(filled: Database, tmp_path: Path):
+    """A request that comes during the first step is done before the second begins, and the slot is free at the end."""
+    order: list[str] = []
+
+    def ask() -> None:
+        with runtime.for_requests().computing("forecast"):
+            order.append("a request")
+
+    def study(photographs: Any, optics: Any, effects: Any, options: Any, step: Any, *, latitude_deg: float) -> None:
+        request = threading.Thread(target=ask)
+        step("one")
+        request.start()
+        until(lambda: len(runtime.gate._line) == 1)
+        order.append("step one")
+        step("two")
+        order.append("step two")
+        request.join(30)
+
+    operations = cast(Operations, SimpleNamespace(study=study))
+    runtime = Runtime(Settings(data_dir=tmp_path), filled, ImageStore(tmp_path), operations, gate=Gate(1))
+    study_store(runtime, StudyRequest(surfaces="measured"))
+    assert order == ["step one", "a request", "step two"]
+    with runtime.gate.turn(0.0):
+        pass
 
 
 def test_time_and_number_of_photographs_are_bounded(filled: Database):

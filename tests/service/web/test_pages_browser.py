@@ -173,6 +173,18 @@ def test_operator_asks_for_a_forecast(page: Any):
     assert "/forecasts/" in page.url
 
 
+def test_form_offers_heliostats_as_they_are_typed(page: Any):
+    page.goto("/forecast")
+    expect(page.locator("#offered option")).to_have_count(2)
+    page.locator("[name=heliostat]").press_sequentially("x")  # behind the name that stands there
+    expect(page.locator("#offered option")).to_have_count(0)
+    page.fill("[name=heliostat]", "")
+    page.locator("[name=heliostat]").press_sequentially("ab")
+    expect(page.locator("#offered option")).to_have_count(1)
+    assert page.locator("#offered option").get_attribute("value") == "AB01"
+    assert page.url.endswith("/forecast")
+
+
 def test_operator_follows_and_cancels_a_job(page: Any, served: Served):
     served.operations.gate.clear()
     page.goto("/heliostats/AA39")
