@@ -24,7 +24,7 @@ Number = Annotated[Version, Path(description="Id of the job.")]
 _PAGE = 50
 
 # Most names that a job's page shows of a list: heliostats that were asked for, or that it was done for.
-_SHOWN = 200
+_SHOWN = 100
 
 
 class PredictionForm(Model):

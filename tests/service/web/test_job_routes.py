@@ -388,8 +388,8 @@ def test_page_of_a_large_job_shows_its_beginning_and_is_small_while_it_is_follow
         session.execute(update(JobRow).values(state="done"))
     page = client.get(f"/jobs/{number}").text
     assert len(page) < 60_000
-    assert "H00199, version 1" in page
-    assert "H00200" not in page
+    assert "H00099, version 1" in page
+    assert "H00100" not in page
 
 
 @contextmanager

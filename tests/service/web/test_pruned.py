@@ -68,7 +68,8 @@ def test_image_that_was_given_up_is_gone_and_the_measurement_is_not(pruned: Test
 
 
 def test_job_and_audit_trail_say_what_went(pruned: TestClient):
-    (job,) = pruned.get("/v1/jobs").json()["items"]
+    (listed,) = pruned.get("/v1/jobs").json()["items"]
+    job = pruned.get(listed["href"]).json()
     assert (job["kind"], job["state"], job["result"]["images"]) == ("prunings", "done", 1)
     assert job["result"]["counts"] == {"refused, age": 1}
     (entry,) = [e for e in pruned.get("/v1/audit").json()["items"] if e["action"] == "images.pruned"]
