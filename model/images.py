@@ -35,6 +35,19 @@ def normalized(images: Images) -> Images:
     return scaled
 
 
+def clipped_alike(forecast: Images, measured: Images, clipped: Images) -> Images:
+    """Forecasts (..., R, C) as a camera shows them whose range cut off ``measured`` by the shares ``clipped`` [1].
+
+    Of such a pixel only this is known: that the light was at least so much. Forecasts are brought to the scale of what
+    was not cut off, and cut off where they are brighter; what lies above is no error.
+    """
+    free = 1 - clipped
+    scale = (measured * free).sum((-2, -1)) / (forecast * free).sum((-2, -1)).clip(1e-9)
+    seen = forecast * scale[..., None, None]
+    cut: Images = seen - clipped * (seen - measured).clip(0)
+    return cut
+
+
 def binned(images: Images, resolution: int) -> Images:
     """Images (..., n R, n R) in R = ``resolution`` pixels a side, their sums kept."""
     size = images.shape[-1] // resolution

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from model.effects import Effect
 from model.errors import InvalidInputError
 from model.forecast import Aligned, Setup, align
-from model.images import FLUX_SHAPE
+from model.images import FLUX_SHAPE, FLUX_SIZE, binned, clipped_alike, normalized
 from model.metrics import flux_accuracy
 from model.plant import Heliostat, TargetPlane
 from model.surface import control_points
@@ -43,6 +44,8 @@ class Observation:
         The spot in ENU; the target's centre is a fair guess where it is not known.
     identifier : str
     motor_position : (2,) [steps] or None
+    clipped : (64, 64) [1] or None
+        Share of each pixel that the camera's range cut off, where it did: there was at least so much light.
     """
 
     flux: NDArray[np.float32]
@@ -51,8 +54,18 @@ class Observation:
     center_of_mass: NDArray[np.float64]
     identifier: str
     motor_position: NDArray[np.float64] | None = None
+    clipped: NDArray[np.float32] | None = None
+
+    @property
+    def clipped_share(self) -> float:
+        """Share [1] of the spot's brighter half that the camera's range cut off."""
+        if self.clipped is None:
+            return 0.0
+        return float(self.clipped[self.flux > 0.5 * self.flux.max()].mean())
 
     def __post_init__(self) -> None:
+        if self.clipped is not None and self.clipped.shape != FLUX_SHAPE:
+            raise InvalidInputError(f"clipped of {self.identifier} must be {FLUX_SHAPE}, got {self.clipped.shape}")
         if self.flux.shape != FLUX_SHAPE:
             raise InvalidInputError(f"flux of {self.identifier} must be {FLUX_SHAPE}, got {self.flux.shape}")
         if not np.isfinite(self.flux).all() or not self.flux.sum() > 0:
@@ -150,6 +163,28 @@ def align_observations(
     return align(setups, effects, latitude_deg=latitude_deg, start=start)
 
 
+class Ranges:
+    """Where the camera's range cut off M observations; forecasts of them are cut off there, too.
+
+    ``size`` is that of the forecasts' pixels along a side.
+    """
+
+    def __init__(self, observations: Sequence[Observation], size: int = FLUX_SIZE) -> None:
+        nothing = np.zeros(FLUX_SHAPE)
+        clipped = np.array([nothing if o.clipped is None else o.clipped for o in observations], dtype=np.float64)
+        self._cut_off = bool(clipped.any())
+        flux = np.array([o.flux for o in observations], dtype=np.float64)
+        self._measured, self._clipped = (
+            torch.as_tensor(binned(image, size)) for image in (flux, clipped * (size / FLUX_SIZE) ** 2)
+        )
+
+    def seen(self, images: Tensor) -> Tensor:
+        """Forecasts (..., M, R, R) as the camera shows them, sum 100."""
+        if not self._cut_off:
+            return images
+        return normalized(clipped_alike(images, self._measured.to(images), self._clipped.to(images)))
+
+
 def render_observations(
     heliostat: Heliostat,
     observations: Sequence[Observation],
@@ -160,10 +195,10 @@ def render_observations(
     latitude_deg: float,
     samples: int = 24,
 ) -> NDArray[np.float64]:
-    """What a surface ``z`` (4, 8, 8) [m] would have thrown where M fluxes were observed: (M, 64, 64), sum 100."""
+    """What the M photographs would show of a surface ``z`` (4, 8, 8) [m]: (M, 64, 64), sum 100."""
     with torch.no_grad():
         aligned = align_observations(heliostat, observations, z, effects, latitude_deg=latitude_deg)
-        return aligned.flux_images(optics, effects, samples=samples).double().numpy()
+        return Ranges(observations).seen(aligned.flux_images(optics, effects, samples=samples)).double().numpy()
 
 
 def spread_suns(suns: NDArray[np.float64], count: int) -> list[int]:

@@ -25,7 +25,7 @@ from model.forecast import Aligned
 from model.images import COARSE_SIZE, FLUX_WINDOW, binned
 from model.least_squares import Descent, minimize
 from model.network.inputs import STEP_HEIGHT
-from model.observation import Observation, SurfacePrediction, align_observations, misfits
+from model.observation import Observation, Ranges, SurfacePrediction, align_observations, misfits
 from model.plant import Heliostat
 from model.prior import SurfacePrior, default_prior
 from model.surface import control_points, require_own_grid
@@ -130,6 +130,7 @@ class _Posterior:
         self.heliostat, self.observations = heliostat, observations
         self.prior, self.options = prior, options
         (self.optics, self.effects), self.latitude_deg = model, latitude_deg
+        self.ranges = Ranges(observations, options.resolution)
         self.measured = binned(np.array([o.flux for o in observations], dtype=np.float64), options.resolution)
         # The same height for each direction: small enough for images to be linear in it, large enough to stand out from
         # their last digits.
@@ -140,10 +141,11 @@ class _Posterior:
         self.changes = torch.as_tensor(changes, dtype=torch.float32)
 
     def _rendered(self, aligned: Aligned, samples: int) -> Array:
-        """Images (B, R, R), sum 100, of aligned mirrors."""
+        """Images (B, R, R), sum 100, of aligned mirrors, the M observations over and over, as the cameras show them."""
         with torch.no_grad():
             images = aligned.flux_images(self.optics, self.effects, size=self.options.resolution, samples=samples)
-        return images.double().numpy()
+            each = images.double().view(-1, *self.measured.shape)
+        return np.asarray(self.ranges.seen(each).flatten(0, 1).numpy())
 
     def state(self, c: Array) -> _State:
         """The mirror of coefficients (K,), aligned under each sun."""

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 Kind = Literal["L", "T"]
 Points = NDArray[np.float64]
+Gray = NDArray[np.uint8] | NDArray[np.float32]
 Line = tuple[Points, Points]  # a point and a unit direction
 
 _WORK_SIZE = 1500  # longest side [px] of the image that is searched
@@ -108,8 +109,11 @@ def _template_matrix() -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     return matrix, matrix.sum(axis=1)
 
 
-def find_marks(gray: NDArray[np.uint8]) -> list[Mark]:
-    """All marks of a gray image (rows, columns), the best first, with sub-pixel reference points."""
+def find_marks(gray: NDArray[np.uint8], light: Gray | None = None) -> list[Mark]:
+    """All marks of a gray image (rows, columns), the best first, with sub-pixel reference points.
+
+    Those are measured in ``light`` (rows, columns) where it is given.
+    """
     scale = min(1.0, _WORK_SIZE / max(gray.shape))
     small = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else gray
     found: list[Mark] = []
@@ -120,7 +124,7 @@ def find_marks(gray: NDArray[np.uint8]) -> list[Mark]:
     for mark in sorted(found, key=lambda mark: -mark.score):
         if all(np.linalg.norm(mark.point - other.point) > 0.5 * other.size for other in kept):
             kept.append(mark)
-    return [_refined(gray, _scaled(mark, 1 / scale)) for mark in kept]
+    return [_refined(gray if light is None else light, _scaled(mark, 1 / scale)) for mark in kept]
 
 
 def _darkness(gray: NDArray[np.uint8]) -> list[NDArray[np.float32]]:
@@ -170,7 +174,7 @@ def _scaled(mark: Mark, factor: float) -> Mark:
     return Mark(mark.kind, mark.quarter, (mark.point + 0.5) * factor - 0.5, mark.arms * factor, mark.score)
 
 
-def _refined(gray: NDArray[np.uint8], mark: Mark) -> Mark:
+def _refined(gray: Gray, mark: Mark) -> Mark:
     """The mark with its reference point measured on its edges; unchanged where they are not clear."""
     for reach in _REACHES:
         measure = _edge_corner if mark.kind == "L" else _edge_tee
@@ -192,14 +196,14 @@ def _moved(mark: Mark, first: Line | None, second: Line | None) -> Mark | None:
     return Mark(mark.kind, mark.quarter, point, np.stack([first[1], second[1]]) * lengths, mark.score)
 
 
-def _edge_corner(gray: NDArray[np.uint8], mark: Mark, reach: float) -> Mark | None:
+def _edge_corner(gray: Gray, mark: Mark, reach: float) -> Mark | None:
     """An L's outer corner: where the outer edges of its two arms meet."""
     first = _edge_line(gray, mark.point + 0.15 * mark.arms[0], 0.7 * mark.arms[0], mark.arms[1], reach)
     second = _edge_line(gray, mark.point + 0.15 * mark.arms[1], 0.7 * mark.arms[1], mark.arms[0], reach)
     return _moved(mark, first, second)
 
 
-def _edge_tee(gray: NDArray[np.uint8], mark: Mark, reach: float) -> Mark | None:
+def _edge_tee(gray: Gray, mark: Mark, reach: float) -> Mark | None:
     """A T's reference point: where the axis of its stem meets the outer edge of its bar."""
     half, stem = mark.arms
     bar = _edge_line(gray, mark.point - 0.85 * half, 1.7 * half, stem, reach)
@@ -212,7 +216,7 @@ def _edge_tee(gray: NDArray[np.uint8], mark: Mark, reach: float) -> Mark | None:
     return _moved(mark, bar, ((left[0] + right[0]) / 2, along))
 
 
-def _edge_line(gray: NDArray[np.uint8], start: Points, run: Points, inward: Points, reach: float) -> Line | None:
+def _edge_line(gray: Gray, start: Points, run: Points, inward: Points, reach: float) -> Line | None:
     """The line along which brightness falls towards ``inward``, near ``start`` to ``start + run``, within ``reach``."""
     across = np.array([-run[1], run[0]]) / np.linalg.norm(run)
     across *= np.sign(across @ inward)
@@ -230,7 +234,7 @@ def _edge_line(gray: NDArray[np.uint8], start: Points, run: Points, inward: Poin
     return _line_through(along[usable] + shift[:, None] * across, shift, run)
 
 
-def _fall(gray: NDArray[np.uint8], places: Points) -> Points:
+def _fall(gray: Gray, places: Points) -> Points:
     """Fall of brightness (profiles, steps - 1) from step to step along profiles at places (profiles, steps, 2)."""
     x, y = np.moveaxis(places.astype(np.float32), -1, 0)
     profiles = cv2.remap(gray, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

@@ -1,8 +1,8 @@
-"""From a photograph to a measured flux: find, rectify, separate, centre, crop, normalise, judge."""
+"""From a photograph to a measured flux: find, turn into light, rectify, separate, centre, crop, normalise, judge."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal, TypeVar, get_args
 
 import cv2
 import numpy as np
@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from model.errors import ImageRefusedError, InvalidInputError
 from model.images import FLUX_WINDOW, normalized
+from model.imaging.light import Camera
 from model.imaging.quality import SATURATED_GRAY, Quality, judge, judge_flux, refused
 from model.imaging.rectify import BRACKETS, CROP_SIZE, Layout, check_corners, find_corners, rectify
 from model.imaging.separate import find_spots, separate
@@ -17,6 +18,8 @@ from model.imaging.window import center_of_mass, flux_window
 from model.plant import TargetPlane
 
 ImageKind = Literal["raw", "cropped", "flux", "flux-centered"]
+Image = NDArray[np.uint8] | NDArray[np.uint16]
+Counts = TypeVar("Counts", np.uint8, np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +45,8 @@ class MeasuredFlux:
         The rectified photograph, of the kinds ``raw`` and ``cropped``.
     corners : float64 (4, 2) or None [px]
         Where the target's corners lie in a ``raw`` image: upper left, upper right, lower left, lower right.
+    clipped : bool (256, 256) or None
+        Where on the target the camera's range cut the light off, where it did: there was at least so much.
     """
 
     quality: Quality
@@ -51,23 +56,27 @@ class MeasuredFlux:
     window: float = FLUX_WINDOW
     crop: NDArray[np.uint8] | None = None
     corners: NDArray[np.float64] | None = None
+    clipped: NDArray[np.bool_] | None = None
 
 
 def measure(
-    image: NDArray[np.uint8],
+    image: Image,
     kind: ImageKind,
     plane: TargetPlane,
     *,
     layouts: Sequence[Layout] = (BRACKETS,),
     side: float | None = None,
     corners: ArrayLike | None = None,
-    empty: NDArray[np.uint8] | None = None,
+    empty: Image | None = None,
+    camera: Camera | None = None,
 ) -> MeasuredFlux:
     """The flux on a target, from any kind of image.
 
+    Photographs (``raw``, ``cropped``) are turned into light before anything is taken off them.
+
     Parameters
     ----------
-    image : uint8 (rows, columns) or (rows, columns, 3) in RGB
+    image : uint8 or uint16 (rows, columns) or (rows, columns, 3) in RGB
     kind : {"raw", "cropped", "flux", "flux-centered"}
         A camera frame; the target seen straight on; that with its background removed; a square of that about the
         centre of mass.
@@ -80,8 +89,11 @@ def measure(
     corners : array_like (4, 2) [px], optional
         The target's corners in a raw image, used instead of its marks: upper left, upper right, lower left, lower
         right.
-    empty : uint8 (256, 256), optional
+    empty : uint8 or uint16 (256, 256), optional
         A rectified image of the same target without light.
+    camera : Camera, optional
+        How it turns light into counts. Photographs are sRGB without one (16 bits are linear anyway); images whose
+        background is off already are then taken as light.
 
     Returns
     -------
@@ -97,62 +109,91 @@ def measure(
     if kind == "flux-centered":
         if side is None or not side > 0:
             raise InvalidInputError(f"side of a centred flux must be positive metres, got {side}")
-        return _measure_centered(_gray(image), side)
+        return _measure_centered(_spot_light(image, camera), side)
     if kind == "flux":
-        return _measure_flux(_gray(image), plane)
+        return _measure_flux(_spot_light(image, camera), plane)
+    camera = camera or Camera()
+    dark = None if empty is None else _square(_light(empty, camera))
+    light, crop, brightest = _light(image, camera), _gray(image), _brightest(image)
     if kind == "cropped":
-        return _measure_crop(_square(_gray(image)), _square(_brightest(image)), plane, empty)
+        return _measure_crop(_square(light), _square(crop), _square(brightest), plane, dark)
     try:
-        found = find_corners(_gray(image), plane, layouts) if corners is None else check_corners(corners)
+        found = find_corners(crop, plane, layouts, light) if corners is None else check_corners(corners)
     except ImageRefusedError as refusal:
         return MeasuredFlux(refused(refusal.reason, refusal.detail))
-    return _measure_crop(rectify(_gray(image), found), rectify(_brightest(image), found), plane, empty, found)
+    return _measure_crop(rectify(light, found), rectify(crop, found), rectify(brightest, found), plane, dark, found)
 
 
-def _check(image: NDArray[np.uint8], kind: str) -> None:
+def _check(image: Image, kind: str) -> None:
     if kind not in get_args(ImageKind):
         raise InvalidInputError(f"kind must be one of {', '.join(get_args(ImageKind))}, got {kind!r}")
     shape_fits = image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)
-    if image.dtype != np.uint8 or not shape_fits or min(image.shape[:2]) < 16:
+    if image.dtype not in (np.uint8, np.uint16) or not shape_fits or min(image.shape[:2]) < 16:
         raise InvalidInputError(
-            f"image must be uint8, (rows, columns) or (rows, columns, 3), at least 16 pixels wide and high; "
+            f"image must be uint8 or uint16, (rows, columns) or (rows, columns, 3), at least 16 pixels wide and high; "
             f"got {image.dtype} {image.shape}"
         )
 
 
-def _gray(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    return np.asarray(image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+def _light(image: Image, camera: Camera) -> NDArray[np.float32]:
+    """Light (rows, columns) of a photograph: 255 where all counts are at their largest, as of a linear 8-bit camera."""
+    light = np.asarray(255 * camera.light_of(image), dtype=np.float32)
+    return light if light.ndim == 2 else np.asarray(cv2.cvtColor(light, cv2.COLOR_RGB2GRAY), dtype=np.float32)
 
 
-def _brightest(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def _spot_light(image: Image, camera: Camera | None) -> NDArray[np.float32]:
+    """Light (rows, columns), in any unit, of an image whose background was taken off."""
+    if camera is None or image.dtype != np.uint8:
+        return _gray(image).astype(np.float32)
+    return np.asarray(255 * camera.light_of_difference(_gray(image) / 255), dtype=np.float32)
+
+
+def _gray(image: Image) -> NDArray[np.uint8]:
+    """Counts (rows, columns) in 8 bits: what people see, and where marks are looked for."""
+    counts = image if image.dtype == np.uint8 else np.asarray(image // 257, dtype=np.uint8)
+    return np.asarray(counts if counts.ndim == 2 else cv2.cvtColor(counts, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+
+
+def _brightest(image: Image) -> NDArray[np.uint8]:
     """The brightest channel: the first that the camera's range cuts off."""
-    return image if image.ndim == 2 else np.asarray(image.max(axis=2), dtype=np.uint8)
+    return _gray(image if image.ndim == 2 else image.max(axis=2))
 
 
-def _square(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def _square(image: NDArray[Counts]) -> NDArray[Counts]:
     if image.shape == (CROP_SIZE, CROP_SIZE):
         return image
-    return np.asarray(cv2.resize(image, (CROP_SIZE, CROP_SIZE), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    return np.asarray(cv2.resize(image, (CROP_SIZE, CROP_SIZE), interpolation=cv2.INTER_AREA), dtype=image.dtype)
 
 
 def _measure_crop(
+    light: NDArray[np.float32],
     crop: NDArray[np.uint8],
     brightest: NDArray[np.uint8],
     plane: TargetPlane,
-    empty: NDArray[np.uint8] | None,
+    empty: NDArray[np.float32] | None,
     corners: NDArray[np.float64] | None = None,
 ) -> MeasuredFlux:
-    parts = separate(crop, None if empty is None else _square(_gray(empty)))
+    parts = separate(light, empty)
     if not parts.flux.any():
         return MeasuredFlux(refused("no_spot"), crop=crop, corners=corners)
     center, centered, outside = _centered(parts.flux, (plane.width, plane.height))
-    quality = judge(parts, crop >= SATURATED_GRAY, brightest >= SATURATED_GRAY, outside)
+    clipped = brightest >= SATURATED_GRAY
+    quality = judge(parts, crop >= SATURATED_GRAY, clipped, outside)
     if not quality.accepted:
         return MeasuredFlux(quality, crop=crop, corners=corners)
-    return MeasuredFlux(quality, _normalised(parts.flux), centered, center, crop=crop, corners=corners)
+    clipped &= parts.main
+    return MeasuredFlux(
+        quality,
+        _normalised(parts.flux),
+        centered,
+        center,
+        crop=crop,
+        corners=corners,
+        clipped=clipped if clipped.any() else None,
+    )
 
 
-def _measure_flux(image: NDArray[np.uint8], plane: TargetPlane) -> MeasuredFlux:
+def _measure_flux(image: NDArray[np.float32], plane: TargetPlane) -> MeasuredFlux:
     size = plane.width, plane.height
     # Area weights keep the energy whatever the image's size.
     flux = flux_window(image.astype(np.float64), size, window=size, resolution=CROP_SIZE)
@@ -167,7 +208,7 @@ def _measure_flux(image: NDArray[np.uint8], plane: TargetPlane) -> MeasuredFlux:
     return MeasuredFlux(quality, _normalised(flux), centered, center)
 
 
-def _measure_centered(image: NDArray[np.uint8], side: float) -> MeasuredFlux:
+def _measure_centered(image: NDArray[np.float32], side: float) -> MeasuredFlux:
     flux = image.astype(np.float64)
     if not flux.any():
         return MeasuredFlux(refused("no_spot"))

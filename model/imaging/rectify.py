@@ -8,6 +8,7 @@ where marks serve several targets that share an edge. Four marks give a homograp
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations, product
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -18,6 +19,8 @@ from model.imaging.marks import Kind, Mark, Points, find_marks, intersection
 from model.plant import TargetPlane
 
 CROP_SIZE = 256
+
+Pixel = TypeVar("Pixel", np.uint8, np.float32)
 
 _CANDIDATES = 4  # marks of one kind and attitude that are tried for one place
 _ASPECT_TOLERANCE = 0.35  # of the natural logarithm; a view from the side shortens the width
@@ -45,16 +48,24 @@ BRACKETS: Layout = (MarkPlace("L", 0, 0, 0), MarkPlace("L", 1, 1, 0), MarkPlace(
 _SQUARE = np.array([[place.x, place.y] for place in BRACKETS], dtype=np.float64)
 
 
-def find_corners(gray: NDArray[np.uint8], plane: TargetPlane, layouts: Sequence[Layout] = (BRACKETS,)) -> Points:
+def find_corners(
+    gray: NDArray[np.uint8],
+    plane: TargetPlane,
+    layouts: Sequence[Layout] = (BRACKETS,),
+    light: NDArray[np.float32] | None = None,
+) -> Points:
     """The target's corners in a camera frame, by its marks.
 
     Parameters
     ----------
     gray : uint8 (rows, columns)
+        Counts, in which marks are told from what is no mark.
     plane : TargetPlane
         Its aspect tells it from other targets in the frame.
     layouts : sequence of Layout
         Those to try, in order.
+    light : float32 (rows, columns), optional
+        The same in light, in which edges lie where they are: a lens blurs light, and a curve moves the middle of that.
 
     Returns
     -------
@@ -66,7 +77,7 @@ def find_corners(gray: NDArray[np.uint8], plane: TargetPlane, layouts: Sequence[
     ImageRefusedError
         With reason ``target_not_found``.
     """
-    marks = find_marks(gray)
+    marks = find_marks(gray, light)
     for layout in layouts:
         corners = _fit_layout(marks, layout, plane)
         if corners is not None:
@@ -94,12 +105,12 @@ def check_corners(corners: ArrayLike) -> Points:
     return points
 
 
-def rectify(image: NDArray[np.uint8], corners: Points, size: int = CROP_SIZE) -> NDArray[np.uint8]:
+def rectify(image: NDArray[Pixel], corners: Points, size: int = CROP_SIZE) -> NDArray[Pixel]:
     """The target seen straight on.
 
     Parameters
     ----------
-    image : uint8 (rows, columns) or (rows, columns, 3)
+    image : uint8 or float32 (rows, columns) or (rows, columns, 3)
     corners : (4, 2) [px]
         See `find_corners`.
     size : int
@@ -107,7 +118,7 @@ def rectify(image: NDArray[np.uint8], corners: Points, size: int = CROP_SIZE) ->
 
     Returns
     -------
-    ndarray uint8 (size, size) or (size, size, 3)
+    ndarray (size, size) or (size, size, 3)
         Each pixel the mean over the area that it covers: it is sampled finely and averaged.
     """
     longest = max(np.linalg.norm(corners[a] - corners[b]) for a, b in ((0, 1), (2, 3), (0, 2), (1, 3)))
@@ -116,7 +127,7 @@ def rectify(image: NDArray[np.uint8], corners: Points, size: int = CROP_SIZE) ->
     edge = np.array([[0, 0], [fine, 0], [0, fine], [fine, fine]], dtype=np.float64) - 0.5
     transform = cv2.getPerspectiveTransform(corners.astype(np.float32), edge.astype(np.float32))
     warped = cv2.warpPerspective(image, transform, (fine, fine), flags=cv2.INTER_LINEAR)
-    return np.asarray(cv2.resize(warped, (size, size), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    return np.asarray(cv2.resize(warped, (size, size), interpolation=cv2.INTER_AREA), dtype=image.dtype)
 
 
 def _fit_layout(marks: list[Mark], layout: Layout, plane: TargetPlane) -> Points | None:

@@ -1,9 +1,8 @@
-"""Separating the heliostat's spot from the target that it falls on.
+"""Separating the heliostat's spot from the target that it falls on, in light (`model.imaging.light`).
 
-Gray value = sheet's brightness + flux, both linear in light: on real images of the Juelich tower PAINT's flux is
-proportional to the gray value less a smooth background over its whole range. The sheet's brightness is therefore fitted
-as a smooth surface to the pixels off the spot, after dark lines, rivets and marks were bridged, and subtracted. What
-remains is kept where it belongs to the main spot; its faint wings fade out softly, for a hard mask would cut them.
+Light = that of the sheet by day + flux. The sheet's is fitted as a smooth surface to the pixels off the spot, after
+dark lines, rivets and marks were bridged, and subtracted. What remains is kept where it belongs to the main spot; its
+faint wings fade out softly, for a hard mask would cut them.
 """
 
 from dataclasses import dataclass
@@ -39,14 +38,14 @@ class Separation:
 
     Attributes
     ----------
-    flux : float32 (rows, columns) [gray]
+    flux : float32 (rows, columns) [light]
         The main spot's flux, zero elsewhere.
-    background : float32 (rows, columns) [gray]
-    smooth : float32 (rows, columns) [gray]
+    background : float32 (rows, columns) [light]
+    smooth : float32 (rows, columns) [light]
         The whole signal, smoothed: all spots.
     main, foreign : bool (rows, columns)
         Where the main spot lies, and where others lie.
-    noise : float [gray]
+    noise : float [light]
         Deviation of ``smooth`` off the spots.
     """
 
@@ -58,8 +57,10 @@ class Separation:
     noise: float
 
 
-def separate(crop: NDArray[np.uint8], empty: NDArray[np.uint8] | None = None) -> Separation:
-    """The spot on a rectified gray image (rows, columns), given optionally the same target without light.
+def separate(crop: Image, empty: Image | None = None) -> Separation:
+    """The spot on a rectified image (rows, columns), given optionally the same target without light.
+
+    Both in light, 255 the largest that the camera can tell.
 
     An empty reference carries the sheet's own pattern; it is scaled by a smooth surface to the image's illumination.
     """
@@ -91,7 +92,7 @@ def _blurred(image: NDArray[np.floating], sigma: float) -> Image:
     return np.asarray(cv2.GaussianBlur(image.astype(np.float32), (0, 0), sigma), dtype=np.float32)
 
 
-def bridge_dark_features(crop: NDArray[np.uint8]) -> tuple[Image, Mask]:
+def bridge_dark_features(crop: Image) -> tuple[Image, Mask]:
     """The image with dark lines, rivets and marks filled from their surroundings, and the mask of the marks."""
     gray = crop.astype(np.float32)
     # Marks are darker than the sheet itself; a gap between two spots, or a spot and the edge, is only darker than they.
@@ -125,7 +126,7 @@ def _fill(gray: Image, holes: Mask) -> Image:
     return filled
 
 
-def _pattern(empty: NDArray[np.uint8]) -> Image:
+def _pattern(empty: Image) -> Image:
     """The sheet's reflectance relative to its smooth brightness, which is that day's light."""
     filled, hidden = bridge_dark_features(empty)
     return np.clip(filled / np.maximum(_polynomial(filled, ~hidden), 1.0), 0.5, 2.0).astype(np.float32)

@@ -71,6 +71,20 @@ def flux_window(
     return np.asarray(row_weights @ image @ column_weights.T)
 
 
+def share_window(
+    mask: NDArray[np.bool_],
+    plane_size: tuple[float, float],
+    center: ArrayLike = (0.0, 0.0),
+    window: float = FLUX_WINDOW,
+    resolution: int = FLUX_SIZE,
+) -> NDArray[np.float32]:
+    """Share [1] of each pixel of a window, as of `flux_window`, that a mask (rows, columns) over the plane covers."""
+    covered, all_of_it = (
+        flux_window(part, plane_size, center, window, resolution) for part in (mask.astype(float), np.ones(mask.shape))
+    )
+    return np.asarray(covered / np.maximum(all_of_it, 1e-12), dtype=np.float32)
+
+
 def center_of_mass(flux: NDArray[np.floating], plane_size: tuple[float, float]) -> NDArray[np.float64]:
     """Centre of mass (2,) [m] right and up of the plane's centre, of an image (rows, columns) with row 0 at the top.
 

@@ -25,7 +25,7 @@ from model.network.inputs import (
     conditions,
     descents,
 )
-from model.observation import Observation, SurfacePrediction, align_observations, misfits
+from model.observation import Observation, Ranges, SurfacePrediction, align_observations, misfits
 from model.plant import Heliostat
 from model.prior import default_prior
 from model.surface import control_points, mirrored, require_own_grid
@@ -146,6 +146,7 @@ class _NetworkInputs:
         self.ideal = torch.as_tensor(control_points(heliostat), dtype=torch.float32).movedim(-1, -3)
         self.normals = torch.as_tensor(heliostat.facet_normals, dtype=torch.float32)
         self.basis = torch.as_tensor(default_prior().basis, dtype=torch.float32)
+        self.ranges = {size: Ranges(observations, size) for size in (FLUX_SIZE, COARSE_SIZE)}
         self.aligned: Aligned | None = None
 
     def inputs(self, z: Array) -> dict[str, NDArray[Any]]:
@@ -168,8 +169,9 @@ class _NetworkInputs:
         }
 
     def _images(self, aligned: Aligned, size: int, samples: int) -> Tensor:
-        """Images (M, size, size), sum 100, of aligned mirrors."""
-        return aligned.flux_images(self.optics, self.effects, size=size, samples=samples)
+        """Images (M, size, size), sum 100, of aligned mirrors, as the cameras show them."""
+        images = aligned.flux_images(self.optics, self.effects, size=size, samples=samples)
+        return self.ranges[size].seen(images)
 
     def _changed(self, aligned: Aligned, changes: Tensor) -> Tensor:
         """Images (1, M, R, R), sum 100, of aligned mirrors, deformed by heights (1, M, 4, 8, 8) [m]."""

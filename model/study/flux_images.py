@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from model.effects import Effect, effect_to_json
 from model.errors import InvalidInputError
 from model.forecast import Aligned, Setup, View, align
-from model.images import FLUX_SIZE
+from model.images import FLUX_SIZE, clipped_alike
 from model.imaging.window import overlap_matrix
 from model.metrics import accuracy_window
 from model.plant import TargetPlane
@@ -37,12 +37,15 @@ class FluxImage:
         Whether the mirror's surface was predicted from it: such a surface flatters its own photographs.
     taken_at : datetime or None
         When it was taken, with time zone, where that was recorded.
+    clipped : bool (rows, columns) or None
+        Where the camera's range cut the light off, where it did.
     """
 
     setup: Setup
     image: NDArray[np.floating]
     seen: bool = False
     taken_at: datetime | None = None
+    clipped: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
         if self.image.ndim != 2 or not np.isfinite(self.image).all() or not self.image.sum() > 0:
@@ -212,8 +215,21 @@ class Forecaster:
         for camera in np.unique(self.cameras, axis=0):
             rows = np.flatnonzero((self.cameras == camera).all(axis=1))
             planes = [self.planes[row] for row in rows]
-            cuts[rows] = cut(in_pixels(images[rows], *camera), planes, self.window, resolution)
+            shown = in_pixels(images[rows], *camera)
+            for place, row in enumerate(rows.tolist()):
+                shown[place] = self._within_range(self.flux_images[row], shown[place])
+            cuts[rows] = cut(shown, planes, self.window, resolution)
         return cuts
+
+    @staticmethod
+    def _within_range(taken: FluxImage, forecast: Array) -> Array:
+        """A forecast (R, C), cut off where the camera's range cut off the photograph."""
+        if taken.clipped is None:
+            return forecast
+        size = forecast.shape
+        measured = in_pixels(np.asarray(taken.image, dtype=np.float64)[None], *size)
+        share = in_pixels(taken.clipped[None].astype(np.float64), *size) * (forecast.size / taken.clipped.size)
+        return np.asarray(clipped_alike(forecast[None], measured, share)[0])
 
     def _traced(self, model: Sequence[Effect]) -> tuple[Aligned, torch.Tensor]:
         """Aligned setups and their flux; both are kept while only later stages change."""

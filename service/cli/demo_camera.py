@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.errors import InvalidInputError
+from model.imaging.light import Srgb
 from model.plant import TargetPlane
 
 _SHEET_HEIGHT = 1024  # [px] of the raster on which the sheet is drawn
@@ -53,8 +54,8 @@ class CameraOptions:
     """
 
     size: tuple[int, int] = (1080, 1440)
-    daylight: float = 0.5
-    peak: float = 0.35
+    daylight: float = 0.25
+    peak: float = 0.6
     gradient: tuple[float, float] = (0.08, 0.12)
     perspective: float = 0.06
     fill: float = 0.75
@@ -101,7 +102,7 @@ def photograph(
     Returns
     -------
     ndarray uint8 (rows, columns, 3)
-        RGB; linear in light.
+        RGB, encoded as cameras do (sRGB).
 
     Raises
     ------
@@ -113,7 +114,8 @@ def photograph(
         raise InvalidInputError("flux must be a finite, non-negative image (rows, columns)")
     light = _sheet(plane, options)[..., None] * _light(flux, plane, options)
     frame = _seen(light, plane, options)
-    frame = 255 * cv2.GaussianBlur(frame, (0, 0), options.blur_px) + rng.normal(0, options.noise, frame.shape)
+    counts = 255 * Srgb().counts(cv2.GaussianBlur(frame, (0, 0), options.blur_px))
+    frame = counts + rng.normal(0, options.noise, frame.shape)
     image = np.clip(np.round(frame), 0, 255).astype(np.uint8)
     return _stamped(image, options.time_stamp)
 

@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 
 from model.effects import Effect, effect_to_json, model_version
 from model.errors import InvalidInputError, ModelError
-from model.imaging import ImageKind, MeasuredFlux
+from model.images import clipped_alike
+from model.imaging import Camera, ImageKind, MeasuredFlux
+from model.imaging.light import camera_at
 from model.metrics import accuracy_window, compare_on_target, surface_error
 from model.network.architecture import MAX_IMAGES
 from model.observation import Observation, SurfacePrediction
@@ -25,7 +27,7 @@ from model.plant import Heliostat, TargetPlane
 from model.surface import split_canting
 from service.base.choices import Method
 from service.base.progress import Progress, quiet
-from service.sources.decode import decode_image
+from service.sources.decode import Pixels, decode_image
 from service.sources.documents import IMAGE_KINDS, Measurement, optics_to_json
 from service.sources.files import require_regular
 from service.sources.folder import MeasurementFolder, measured_heights, read_surface
@@ -49,7 +51,7 @@ def write_json(path: Path, content: Any) -> None:
     path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
-def read_image(path: Path) -> NDArray[np.uint8]:
+def read_image(path: Path) -> Pixels:
     """Decode an image file; a file that is no image is named."""
     try:
         return decode_image(require_regular(path).read_bytes())
@@ -58,15 +60,16 @@ def read_image(path: Path) -> NDArray[np.uint8]:
 
 
 @lru_cache(maxsize=512)
-def _measure(path: Path, kind: ImageKind, plane: TargetPlane) -> MeasuredFlux:
-    return compute.measure(read_image(path), kind, plane)
+def _measure(path: Path, kind: ImageKind, plane: TargetPlane, camera: Camera | None) -> MeasuredFlux:
+    return compute.measure(read_image(path), kind, plane, camera=camera)
 
 
 def measure(folder: MeasurementFolder, measurement: Measurement, kind: ImageKind | None = None) -> MeasuredFlux:
     """Flux of a measurement's most worked-out image, or of its image of one kind."""
     chosen = next(k for k in IMAGE_KINDS if k in measurement.images) if kind is None else kind
     plane = folder.plant.targets[measurement.target]
-    return _measure(measurement.images[chosen], chosen, plane)
+    camera = camera_at(folder.cameras, measurement.target, measurement.taken_at)
+    return _measure(measurement.images[chosen], chosen, plane, camera)
 
 
 def _write_report(folder: MeasurementFolder, report: dict[str, Any], path: Path) -> None:
@@ -154,6 +157,7 @@ def evidence_of(folder: MeasurementFolder, measurement: Measurement) -> Evidence
         spot=measurement.spot if center is None else target.to_enu(center),
         motor_position=measurement.motor_position,
         taken_at=measurement.taken_at,
+        clipped=measured.clipped,
     )
 
 
@@ -311,15 +315,19 @@ def forecast_measurement(
 def compare(
     folder: MeasurementFolder, measurement: Measurement, traced: compute.Forecast, window: float | None
 ) -> dict[str, Any] | None:
-    """Accuracy of a forecast against the measurement's ``flux.png``, None where there is none."""
-    if "flux" not in measurement.images:
+    """Accuracy of a forecast against the measurement's flux; None without an image of its target, or a refused one."""
+    if not any(kind in measurement.images for kind in ROUGHEST_FIRST[:-1]):
         return None
-    measured = read_image(measurement.images["flux"]).astype(np.float64)
-    gray = measured.mean(axis=2) if measured.ndim == 3 else measured
+    measured = measure(folder, measurement)
+    if measured.flux is None:
+        return None
+    flux, forecast = measured.flux.astype(np.float64), traced.camera_view.astype(np.float64)
+    if measured.clipped is not None:
+        forecast = clipped_alike(forecast, flux, measured.clipped.astype(np.float64))
     plane = folder.plant.targets[measurement.target]
     size = (plane.width, plane.height)
-    window = window or accuracy_window([gray], [size], spill=SPILL, widest=WIDEST)
-    return asdict(compare_on_target(gray, traced.camera_view, size, window))
+    window = window or accuracy_window([flux], [size], spill=SPILL, widest=WIDEST)
+    return asdict(compare_on_target(flux, forecast, size, window))
 
 
 def forecast_folder(

@@ -16,6 +16,8 @@ from model.errors import InvalidInputError
 
 MAX_PIXELS = 32_000_000
 
+Pixels = NDArray[np.uint8] | NDArray[np.uint16]
+
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _PNG_NEEDED = {b"IHDR", b"PLTE", b"IDAT", b"IEND"}
 # Start-of-frame markers of JPEG: C0 to CF without DHT (C4), JPG (C8) and DAC (CC).
@@ -30,7 +32,7 @@ _TIFF_TILE_WIDTH, _TIFF_TILE_HEIGHT = 322, 323
 _TIFF_PLACES = ((273, 279), (324, 325))  # (offsets, byte counts) of strips and of tiles
 
 
-def decode_image(data: bytes, *, max_pixels: int = MAX_PIXELS) -> NDArray[np.uint8]:
+def decode_image(data: bytes, *, max_pixels: int = MAX_PIXELS) -> Pixels:
     """The pixels of a PNG, JPEG, TIFF or BMP file.
 
     Parameters
@@ -42,9 +44,9 @@ def decode_image(data: bytes, *, max_pixels: int = MAX_PIXELS) -> NDArray[np.uin
 
     Returns
     -------
-    ndarray uint8, (rows, columns) for a gray file and (rows, columns, 3) in RGB order for a colour file
-        Deeper samples are scaled to 8 bits, transparency is dropped, and an EXIF orientation is ignored: marks and
-        configured corner pixels refer to the sensor.
+    ndarray uint8 or uint16, (rows, columns) for a gray file and (rows, columns, 3) in RGB order for a colour file
+        As deep as the file's samples, up to 16 bits; transparency is dropped, and an EXIF orientation is ignored: marks
+        and configured corner pixels refer to the sensor.
 
     Raises
     ------
@@ -80,15 +82,15 @@ def _trailing() -> InvalidInputError:
     return InvalidInputError("image: there is other data behind the image; send the image alone")
 
 
-def _pixels(data: bytes, shape: tuple[int, int]) -> NDArray[np.uint8]:
-    flags = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
+def _pixels(data: bytes, shape: tuple[int, int]) -> Pixels:
+    flags = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
     except cv2.error:
         image = None
     if image is None or image.shape[:2] != shape:
         raise _truncated()
-    return np.asarray(image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+    return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)  # type: ignore[return-value]
 
 
 def _read_png(data: bytes) -> tuple[bytes, tuple[int, int]]:

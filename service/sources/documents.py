@@ -7,7 +7,7 @@ import json
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from model.effects import Effect, effects_from_json
 from model.errors import InvalidInputError
 from model.frames import sun_direction
-from model.imaging import ImageKind
+from model.imaging import Camera, ImageKind
+from model.imaging.light import cameras_from_json
 from model.mount import LinearActuator, Mount
 from model.plant import Cylinder, Facet, Heliostat, Plant, TargetPlane
 from model.sunshape import SHAPES, SunShape
@@ -28,7 +29,7 @@ Array = NDArray[np.float64]
 # Coefficients that an attenuation may have: published ones have four.
 _MAX_COEFFICIENTS = 8
 
-IMAGE_KINDS: tuple[ImageKind, ...] = ("flux", "cropped", "raw", "flux-centered")
+IMAGE_KINDS: tuple[ImageKind, ...] = ("cropped", "raw", "flux", "flux-centered")
 """Kinds of image that a measurement may hold, the most worked-out one with a known place on the target first."""
 
 
@@ -328,15 +329,27 @@ def optics_to_json(optics: Optics) -> dict[str, Any]:
     return {"reflectivity": optics.reflectivity, "attenuation": list(optics.attenuation)}
 
 
-def parse_declared(declared: Any, where: str) -> tuple[Optics, tuple[Effect, ...]]:
-    """Optics and effects of a declared model, which ``where`` holds; each part has the model's default."""
+class Declared(NamedTuple):
+    """A declared model."""
+
+    optics: Optics
+    effects: tuple[Effect, ...]
+    cameras: tuple[Camera, ...]
+
+
+def parse_declared(declared: Any, where: str) -> Declared:
+    """A declared model, which ``where`` holds; each part has the model's default."""
     if not isinstance(declared, dict):
         raise InvalidInputError(f"{where}: 'declared' must be a JSON object")
     sun = declared.get("sun")
     optics = _optics(declared.get("optics", {}), where)
     if sun is not None:
         optics = replace(optics, sun_shape=_sun_shape(sun, where))
-    return optics, _effects(declared.get("effects", []), where)
+    try:
+        cameras = cameras_from_json(declared.get("cameras", []))
+    except InvalidInputError as error:
+        raise InvalidInputError(f"{where}: {error}") from None
+    return Declared(optics, _effects(declared.get("effects", []), where), cameras)
 
 
 def read_effects(path: Path) -> tuple[Effect, ...]:

@@ -14,11 +14,12 @@ import numpy as np
 
 from model.effects import Effect
 from model.errors import InvalidInputError
+from model.imaging import Camera
 from model.plant import Heliostat, Plant
 from model.surface import control_points, fit_heights, heights
 from model.tracing import Optics
 from service.base.discovery import modules_of
-from service.sources.documents import Array, Measurement, get, parse_declared, read_json
+from service.sources.documents import Array, Declared, Measurement, get, parse_declared, read_json
 from service.sources.files import require_regular
 
 
@@ -34,6 +35,7 @@ class MeasurementFolder(ABC):
     optics : Optics
         The declared model (``twin.json``), Buie's sun with 0.02 without one.
     effects : tuple of Effect
+    cameras : tuple of Camera
         Those of the declared model.
     skipped : dict
         Heliostats and measurements that are there but could not be read, with the reason.
@@ -45,6 +47,7 @@ class MeasurementFolder(ABC):
     plant: Plant
     optics: Optics
     effects: tuple[Effect, ...]
+    cameras: tuple[Camera, ...]
     skipped: dict[str, str]
     properties: dict[str, Any] = field(default_factory=dict)
 
@@ -148,8 +151,8 @@ def read_folder(root: Path, heliostats: list[str] | None = None) -> MeasurementF
     raise InvalidInputError(f"{root}: {'; '.join(importer.otherwise for importer in importers)}")
 
 
-def read_declared(path: Path) -> tuple[Optics, tuple[Effect, ...]]:
-    """The optics and the effects that ``twin.json`` declares; the defaults where there is no such file."""
+def read_declared(path: Path) -> Declared:
+    """What ``twin.json`` declares; the defaults where there is no such file."""
     return parse_declared(declared_json(path), str(path))
 
 

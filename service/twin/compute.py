@@ -12,7 +12,7 @@ from model.errors import InvalidInputError
 from model.fleet import Engine, FleetFlux, Superposition, Tile
 from model.fleet import superpose as superpose_tiles
 from model.forecast import Setup, View, align
-from model.imaging import ImageKind, MeasuredFlux
+from model.imaging import Camera, ImageKind, MeasuredFlux
 from model.imaging import measure as measure_image
 from model.network.predictor import default_predictor
 from model.observation import Observation, SurfacePrediction, render_observations
@@ -38,10 +38,16 @@ MODEL_VERSION = model_version(())
 
 
 def measure(
-    image: NDArray[np.uint8], kind: ImageKind, plane: TargetPlane, *, corners: Array | None = None
+    image: NDArray[np.uint8] | NDArray[np.uint16],
+    kind: ImageKind,
+    plane: TargetPlane,
+    *,
+    corners: Array | None = None,
+    camera: Camera | None = None,
 ) -> MeasuredFlux:
     """Flux and quality of one photograph of a target; see `model.imaging.measure`."""
-    return measure_image(image, kind, plane, layouts=mark_layouts(plane.name), side=CENTERED_WINDOW, corners=corners)
+    layouts = mark_layouts(plane.name)
+    return measure_image(image, kind, plane, layouts=layouts, side=CENTERED_WINDOW, corners=corners, camera=camera)
 
 
 def predict(

@@ -18,6 +18,7 @@ from model.errors import InvalidInputError
 from model.forecast import Setup
 from model.frames import sun_direction, wgs84_to_enu
 from model.images import FLUX_WINDOW
+from model.imaging.window import share_window
 from model.observation import Observation, spread_suns
 from model.plant import Heliostat, TargetPlane
 from model.study import FluxImage
@@ -36,6 +37,9 @@ Item = TypeVar("Item")
 # The newest measurements, this many times as many as are wanted, stand for the mirror's present state; those that
 # are used are chosen among them for variety of the sun's position.
 _RECENT = 4
+
+# Share of a spot that the camera's range may cut off before others are rather chosen.
+_WHOLE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +60,8 @@ class Evidence:
         Where the centre of mass lies, in ENU: as measured, else as the sender knew it.
     motor_position : (2,) [steps] or None
     taken_at : datetime or None
+    clipped : bool (rows, columns) or None
+        Where on the target the camera's range cut the light off.
     """
 
     identifier: str
@@ -66,6 +72,7 @@ class Evidence:
     spot: Array | None
     motor_position: Array | None = None
     taken_at: datetime | None = None
+    clipped: NDArray[np.bool_] | None = None
 
     def observation(self) -> Observation:
         """What it shows of the mirror."""
@@ -76,7 +83,13 @@ class Evidence:
             target=self.target,
             motor_position=self.motor_position,
             identifier=self.identifier,
+            clipped=self._clipped_about_spot(),
         )
+
+    def _clipped_about_spot(self) -> NDArray[np.float32] | None:
+        if self.clipped is None or self.spot is None:
+            return None
+        return share_window(self.clipped, (self.target.width, self.target.height), self.target.to_plane(self.spot))
 
     def photograph(self, heliostat: Heliostat, points: Array, degree: int = DEGREE, seen: bool = False) -> FluxImage:
         """It as a study compares it with the mirror of control points (F, I, J, 3) [m].
@@ -93,16 +106,26 @@ class Evidence:
             raise InvalidInputError(f"{key}: a centred flux without 'focal_spot' has no place on the target")
         if not self.target.holds(self.spot):
             raise InvalidInputError(f"{key}: 'focal_spot' lies off its target {self.target.name}")
-        image, plane = self.flux, self.target
+        image, plane, clipped = self.flux, self.target, self.clipped
         if image is None:  # the part about the spot is all there is
             image, plane = self.centered, replace(plane, center=self.spot, width=FLUX_WINDOW, height=FLUX_WINDOW)
         shot = Setup(heliostat, points, self.sun, plane, spot=self.spot, degree=degree, identifier=key)
-        return FluxImage(shot, np.asarray(image, dtype=np.float64), taken_at=self.taken_at, seen=seen)
+        return FluxImage(shot, np.asarray(image, dtype=np.float64), taken_at=self.taken_at, seen=seen, clipped=clipped)
 
 
-def choose(items: Sequence[Item], count: int, sun_of: Callable[[Item], Array] = attrgetter("sun")) -> list[Item]:
-    """Up to ``count`` of what was seen under some sun, the suns far apart."""
-    return [items[index] for index in spread_suns(np.array([sun_of(item) for item in items]), count)]
+def choose(
+    items: Sequence[Item],
+    count: int,
+    sun_of: Callable[[Item], Array] = attrgetter("sun"),
+    clipped_of: Callable[[Item], float] = attrgetter("clipped_share"),
+) -> list[Item]:
+    """Up to ``count`` of what was seen under some sun, the suns far apart.
+
+    What the camera's range cut off tells less: such photographs come in where there are not enough others.
+    """
+    whole = [item for item in items if clipped_of(item) <= _WHOLE]
+    kept = items if len(whole) < count else whole
+    return [kept[index] for index in spread_suns(np.array([sun_of(item) for item in kept]), count)]
 
 
 # --- out of the store -------------------------------------------------------------------------------------------------
@@ -141,7 +164,7 @@ def heights_of(surface: SurfaceRow | None) -> Array | None:
 def evidence_of(row: MeasurementRow, origin: tuple[float, float, float], target: TargetPlane | None = None) -> Evidence:
     """An accepted measurement, loaded with its arrays; ``target`` where the row is not in the store yet."""
     plane, arrays = target or store.target_plane(row.target), unpack(row.arrays or b"")
-    motors = (row.motor_axis_1, row.motor_axis_2)
+    motors, clipped = (row.motor_axis_1, row.motor_axis_2), arrays.get("clipped")
     return Evidence(
         identifier=row.identifier,
         sun=sun_direction(row.sun_azimuth_deg, row.sun_elevation_deg),
@@ -151,6 +174,7 @@ def evidence_of(row: MeasurementRow, origin: tuple[float, float, float], target:
         spot=_spot_of(row, plane, origin),
         motor_position=None if None in motors else np.array(motors),
         taken_at=row.taken_at,
+        clipped=None if clipped is None else np.asarray(clipped, dtype=bool),
     )
 
 
@@ -179,7 +203,12 @@ def choose_measurements(
         raise ConflictError(f"heliostat {heliostat.name} has no accepted measurement of this time")
     if not recent:
         raise ConflictError(f"heliostat {heliostat.name} has no accepted measurement; post target images of it first")
-    return choose(recent, count, lambda row: sun_direction(row.sun_azimuth_deg, row.sun_elevation_deg))
+    return choose(
+        recent,
+        count,
+        lambda row: sun_direction(row.sun_azimuth_deg, row.sun_elevation_deg),
+        lambda row: float(row.quality.get("clipped_share") or 0),
+    )
 
 
 def named_measurements(session: Session, heliostat: HeliostatRow, names: Sequence[str]) -> list[MeasurementRow]:

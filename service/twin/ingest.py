@@ -6,6 +6,7 @@ transaction: the image's row, the measurement and what it says of the heliostat'
 
 from dataclasses import asdict, dataclass
 from datetime import datetime, timedelta
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from sqlalchemy.orm import Session
 
 from model.errors import ImageRefusedError, InvalidInputError
 from model.imaging import MeasuredFlux
+from model.imaging.light import camera_at
 from model.imaging.quality import refused
 from model.plant import TargetPlane
 from service import store
@@ -20,7 +22,7 @@ from service.base.arrays import pack, plain
 from service.base.faults import StoreFullError, TooLargeError
 from service.base.meters import ACCURACY, PHOTOGRAPHS, REFUSALS
 from service.base.settings import Settings
-from service.sources.decode import decode_image
+from service.sources.decode import Pixels, decode_image
 from service.sources.photograph import Photograph
 from service.store import photographs
 from service.store.columns import now
@@ -71,7 +73,7 @@ def ingest(
         _mend(runtime, data)
         PHOTOGRAPHS.labels("known").inc()
         return known.measurement, False
-    pixels, measured = _measure(runtime, photograph, data, known.plane)
+    pixels, measured = _measure(runtime, photograph, data, known)
     row = _row(photograph, measured, known.target_id)
     judged = _judge(runtime, known, row) if is_live else None
     height, width = pixels.shape[:2]
@@ -129,17 +131,16 @@ def _read(runtime: Runtime, heliostat: str, photograph: Photograph, data: bytes)
         )
 
 
-def _measure(
-    runtime: Runtime, photograph: Photograph, data: bytes, plane: TargetPlane
-) -> tuple[NDArray[np.uint8], MeasuredFlux]:
+def _measure(runtime: Runtime, photograph: Photograph, data: bytes, known: _Known) -> tuple[Pixels, MeasuredFlux]:
     limit = runtime.settings.max_image_bytes
     if len(data) > limit:
         raise TooLargeError(f"image: {len(data)} bytes is more than the {limit} allowed; crop or compress it")
     corners = None if photograph.corners is None else np.array(photograph.corners)
+    camera = camera_at(known.twin.model.cameras, known.plane.name, photograph.taken_at)
     with runtime.computing("measure") as operations:
         pixels = decode_image(data, max_pixels=runtime.settings.max_image_pixels)
         try:
-            return pixels, operations.measure(pixels, photograph.kind, plane, corners=corners)
+            return pixels, operations.measure(pixels, photograph.kind, known.plane, corners=corners, camera=camera)
         except ImageRefusedError as refusal:
             return pixels, MeasuredFlux(refused(refusal.reason, refusal.detail))
 
@@ -147,7 +148,11 @@ def _measure(
 def _row(photograph: Photograph, measured: MeasuredFlux, target_id: int) -> MeasurementRow:
     """The measurement as it is kept, but for its heliostat, image and identifier."""
     arrays = {"flux": measured.flux, "centered": measured.centered}
-    kept = {name: np.asarray(array, np.float32) for name, array in arrays.items() if array is not None}
+    kept: dict[str, NDArray[Any]] = {
+        n: np.asarray(array, np.float32) for n, array in arrays.items() if array is not None
+    }
+    if measured.clipped is not None:
+        kept["clipped"] = measured.clipped
     motors = photograph.motor_position or (None, None)
     right, up = (None, None) if measured.center_of_mass is None else measured.center_of_mass.tolist()
     return MeasurementRow(

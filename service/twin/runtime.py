@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from model.effects import Effect
 from model.fleet import Engine, FleetFlux, Tile
-from model.imaging import ImageKind, MeasuredFlux
+from model.imaging import Camera, ImageKind, MeasuredFlux
 from model.observation import Observation, SurfacePrediction
 from model.plant import Heliostat, Receiver, TargetPlane
 from model.study import FluxImage, Study, StudyOptions
@@ -33,7 +33,13 @@ class Operations(Protocol):
     """The model as the service uses it: the interface of the module `service.twin.compute`."""
 
     def measure(
-        self, image: NDArray[Any], kind: ImageKind, plane: TargetPlane, *, corners: NDArray[Any] | None = None
+        self,
+        image: NDArray[Any],
+        kind: ImageKind,
+        plane: TargetPlane,
+        *,
+        corners: NDArray[Any] | None = None,
+        camera: Camera | None = None,
     ) -> MeasuredFlux:
         """Flux, centre of mass and quality of a photograph."""
 

@@ -13,6 +13,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from model.effects import Effect, effect_to_json, effects_from_json, in_light_order
+from model.imaging import Camera
 from model.tracing import Optics
 from service import store
 from service.base.faults import ConflictError, NotFoundError
@@ -40,12 +41,13 @@ __all__ = [
 
 @dataclass(frozen=True, eq=False)
 class PlantModel:
-    """The plant's model as it is computed with: declared optics, declared and adopted effects."""
+    """The plant's model as it is computed with: declared optics and cameras, declared and adopted effects."""
 
     number: int
     version: str
     optics: Optics
     effects: tuple[Effect, ...]
+    cameras: tuple[Camera, ...] = ()
 
 
 # --- reading ----------------------------------------------------------------------------------------------------------
@@ -87,8 +89,9 @@ def _row(session: Session, number: int) -> ModelRow | None:
 
 def _plant_model(session: Session, row: ModelRow | None) -> PlantModel:
     number, adopted = (DECLARED, ()) if row is None else (row.number, _effects(row.effects))
-    optics, declared = parse_declared(declared_of(session, row) or {}, "the plant")
-    return PlantModel(number, version_name(number, adopted), optics, (*declared, *adopted))
+    declared = parse_declared(declared_of(session, row) or {}, "the plant")
+    effects = (*declared.effects, *adopted)
+    return PlantModel(number, version_name(number, adopted), declared.optics, effects, declared.cameras)
 
 
 def find_model(session: Session, effects: Sequence[Effect]) -> PlantModel | None:

@@ -17,7 +17,8 @@ import matplotlib as mpl
 import numpy as np
 from numpy.typing import NDArray
 
-from model.imaging import MeasuredFlux, center_of_mass, measure
+from model.imaging import Camera, MeasuredFlux, center_of_mass, measure
+from model.imaging.light import LINEAR
 from model.plant import Plant, TargetPlane
 from service.sources.decode import decode_image
 from service.sources.documents import read_json, read_targets
@@ -64,7 +65,8 @@ def read_case(properties: Path, plant: Plant) -> Case:
 
     raw = image("raw") if (properties.parent / f"{stem}-raw.png").exists() else None
     start = perf_counter()
-    from_raw = None if raw is None else measure(raw, "raw", plane, layouts=mark_layouts(plane.name))
+    linear = Camera(LINEAR)  # PAINT's fluxes are differences of counts
+    from_raw = None if raw is None else measure(raw, "raw", plane, layouts=mark_layouts(plane.name), camera=linear)
     return Case(
         name=stem,
         target=plane.name,
@@ -73,7 +75,7 @@ def read_case(properties: Path, plant: Plant) -> Case:
         paint_flux=image("flux").astype(np.float64),
         focal_spot=plane.to_plane(plant.to_enu(record["focal_spot"]["UTIS"])),
         from_raw=from_raw,
-        from_crop=measure(image("cropped"), "cropped", plane),
+        from_crop=measure(image("cropped"), "cropped", plane, camera=linear),
         seconds=perf_counter() - start,
     )
 

@@ -60,7 +60,7 @@ def test_configured_corners_replace_the_marks(plane, spot):
     frame = taken(spot, plane, gradient=(0.0, 0.0))
     corners = target_corners(plane, options)
     for corner in corners:
-        cv2.circle(frame, tuple(np.round(corner).astype(int).tolist()), 110, (128, 128, 128), -1)
+        cv2.circle(frame, tuple(np.round(corner).astype(int).tolist()), 110, (137, 137, 137), -1)
     assert measure(frame, "raw", plane).quality.reason == "target_not_found"
     result = measure(frame, "raw", plane, corners=corners)
     check_measured(result)
@@ -70,7 +70,7 @@ def test_configured_corners_replace_the_marks(plane, spot):
 @pytest.mark.parametrize(
     ("reason", "flux", "options"),
     [
-        ("saturated", (0.0, 0.0, 0.6, 0.6), {"peak": 0.9}),
+        ("saturated", (0.0, 0.0, 0.6, 0.6), {"peak": 3.0}),
         ("cut", (2.6, 0.0, 0.6, 0.6), {}),
         ("cut", (0.0, 3.0, 0.6, 0.9), {}),
         ("no_spot", (0.0, 0.0, 0.6, 0.6), {"peak": 0.0}),

@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 
 from model.errors import ImageRefusedError, InvalidInputError
+from model.imaging import Camera
 from model.imaging.marks import find_marks
 from model.imaging.rectify import check_corners, find_corners, rectify
 from model.plant import TargetPlane
@@ -14,6 +15,10 @@ ARM, STROKE = 0.74, 0.16  # [m]
 
 def gray(image):
     return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+
+
+def light(image):
+    return (255 * Camera().light_of(gray(image))).astype(np.float32)
 
 
 @pytest.mark.parametrize(
@@ -34,7 +39,7 @@ def gray(image):
 )
 def test_corners_are_found_within_a_pixel(plane, spot, options):
     frame = photograph(spot, plane, np.random.default_rng(2), options)
-    found = find_corners(gray(frame), plane)
+    found = find_corners(gray(frame), plane, light=light(frame))
     assert np.abs(found - target_corners(plane, options)).max() < 1.0
 
 
@@ -112,7 +117,7 @@ def test_a_target_of_another_shape_is_not_taken(spot, plane):
 
 def test_rectifying_puts_the_corners_into_the_corners(plane, spot):
     options = CameraOptions(noise=0.0, grid_step=0.0, gradient=(0.0, 0.0), daylight=0.3, peak=0.5, blur_px=0.3)
-    crop = rectify(gray(photograph(spot, plane, np.random.default_rng(0), options)), target_corners(plane, options))
+    crop = rectify(light(photograph(spot, plane, np.random.default_rng(0), options)), target_corners(plane, options))
     assert crop.shape == (256, 256)
     inner = crop[40:-40, 40:-40].astype(float)
     expected = 255 * (0.3 + 0.5 * spot[40:-40, 40:-40] * 0.94)

@@ -158,7 +158,9 @@ class FakeOperations:
     measured: int = 0
     rendered: int = 0
 
-    def measure(self, image: Any, kind: str, plane: TargetPlane, *, corners: Any = None) -> MeasuredFlux:
+    def measure(
+        self, image: Any, kind: str, plane: TargetPlane, *, corners: Any = None, camera: Any = None
+    ) -> MeasuredFlux:
         self.measured += 1
         if np.ravel(image)[0] == 0:
             return MeasuredFlux(Quality(accepted=False, reason="no_spot", detail="no spot stands out"))

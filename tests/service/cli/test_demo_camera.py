@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from model.errors import InvalidInputError
+from model.imaging.light import Srgb
 from model.plant import TargetPlane
 from service.cli.demo_camera import CameraOptions, photograph, target_corners
 from tests.imaging import gaussian
@@ -37,8 +38,8 @@ def test_brightness_is_daylight_plus_flux(plane, spot):
     options = CameraOptions(noise=0.0, gradient=(0.0, 0.0), grid_step=0.0, time_stamp="", perspective=0.0)
     frame = photograph(spot, plane, np.random.default_rng(0), options)
     red = frame[..., 0].astype(float)
-    assert red.max() == pytest.approx(255 * 0.85, abs=2)
-    assert np.median(frame[300:340, 900:930, 1]) == pytest.approx(127.5, abs=2)
+    assert red.max() == pytest.approx(255 * Srgb().counts(0.85), abs=2)
+    assert np.median(frame[300:340, 900:930, 1]) == pytest.approx(255 * Srgb().counts(0.25), abs=2)
 
 
 @pytest.mark.parametrize("bad", [np.full((4, 4), np.nan), -np.ones((4, 4)), np.ones(4)])

@@ -64,7 +64,7 @@ def test_lists_take_no_lock_and_migrate_nothing(tmp_path: Path):
 
 
 def _plant(folder: Path) -> Path:
-    write_plant(folder / "plant", images=1, rays=1000)
+    write_plant(folder / "plant", images=1, rays=30_000)
     return folder / "plant"
 
 

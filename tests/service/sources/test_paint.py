@@ -78,7 +78,7 @@ def test_deflectometry_h5_is_fitted(tmp_path):
 )
 def test_declared_sun(tmp_path, sun, shape):
     (tmp_path / "twin.json").write_text(json.dumps({"declared": {"sun": sun, "effects": []}}))
-    optics, effects = read_declared(tmp_path / "twin.json")
+    optics, effects, _ = read_declared(tmp_path / "twin.json")
     assert optics.sun_shape == shape
     assert effects == ()
 
@@ -88,11 +88,11 @@ def test_undeclared_sun_is_buies(tmp_path):
 
 
 def test_declared_optics_and_their_defaults(tmp_path):
-    plain, _ = read_declared(tmp_path / "twin.json")
+    plain, *_ = read_declared(tmp_path / "twin.json")
     assert optics_to_json(plain) == {"reflectivity": 1.0, "attenuation": []}
     declared = {"reflectivity": 0.9, "attenuation": [0.01, 0.1]}
     (tmp_path / "twin.json").write_text(json.dumps({"declared": {"optics": declared}}))
-    optics, _ = read_declared(tmp_path / "twin.json")
+    optics, *_ = read_declared(tmp_path / "twin.json")
     assert optics_to_json(optics) == declared
     assert optics.sun_shape == Buie(0.02)
 
@@ -100,7 +100,7 @@ def test_declared_optics_and_their_defaults(tmp_path):
 def test_declared_effects(tmp_path):
     effects = [{"name": "soiling", "parameters": {"reflectivity_ratio": {"AA39": [1.0, 0.8, 1.0, 0.9]}}}]
     (tmp_path / "twin.json").write_text(json.dumps({"declared": {"effects": effects}}))
-    _, declared = read_declared(tmp_path / "twin.json")
+    _, declared, _ = read_declared(tmp_path / "twin.json")
     assert [effect_to_json(effect) for effect in declared] == effects
 
 

@@ -141,7 +141,9 @@ def forecast(client: TestClient, **changes: Any) -> tuple[str, np.ndarray]:
     """Model version of a forecast, and what the camera shows of it."""
     answer = client.post("/v1/forecasts", json=FORECAST | changes)
     assert answer.status_code == 201, answer.text
-    return answer.json()["model_version"], np.array(client.get(f"{answer.headers['Location']}?view=camera").json()["flux"])
+    return answer.json()["model_version"], np.array(
+        client.get(f"{answer.headers['Location']}?view=camera").json()["flux"]
+    )
 
 
 def test_effect_is_found_adopted_used_and_withdrawn(looped: TestClient):
