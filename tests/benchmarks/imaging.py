@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.imaging import Camera, MeasuredFlux, center_of_mass, measure
-from model.imaging.light import LINEAR
+from model.imaging.light import LINEAR, Srgb
 from model.plant import Plant, TargetPlane
 from service.sources.decode import decode_image
 from service.sources.documents import read_json, read_targets
@@ -186,8 +186,11 @@ def measure_folder(folder: Path, plane: TargetPlane) -> Counter[str]:
 def composite(
     rng: np.random.Generator, empties: list[Path], fluxes: list[Path], *, foreign: bool
 ) -> tuple[Image, Image]:
-    """A real empty target with a real flux somewhere on it, beside a foreign spot of half the size; and that flux."""
-    empty = decode_image(empties[rng.integers(len(empties))].read_bytes()).astype(np.float32)
+    """A real empty target with a real flux somewhere on it, beside a foreign spot of half the size; and that flux.
+
+    Light is added to light, and encoded as the camera does it.
+    """
+    empty = Srgb().light(decode_image(empties[rng.integers(len(empties))].read_bytes()) / 255)
     reflectance = empty / np.median(empty)
 
     def placed(scale: float) -> Image:
@@ -201,8 +204,9 @@ def composite(
     spot, other = placed(1.0), np.zeros((256, 256), np.float32)
     while foreign and (not other.any() or np.minimum(spot, other).sum() > 0.02 * spot.sum()):
         spot, other = placed(1.0), placed(0.5) * np.float32(rng.uniform(0.3, 1.0))
-    light = empty + reflectance * rng.uniform(40, 90) * (spot + other) + rng.normal(0, 1, empty.shape)
-    return np.clip(light, 0, 255).astype(np.uint8), spot
+    light = empty + reflectance * rng.uniform(0.3, 0.7) * (spot + other)
+    counts = 255 * Srgb().counts(light) + rng.normal(0, 1, empty.shape)
+    return np.clip(counts, 0, 255).astype(np.uint8), spot
 
 
 def composites(folder: Path, plane: TargetPlane, count: int, *, foreign: bool) -> str:
