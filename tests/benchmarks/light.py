@@ -4,13 +4,19 @@ Every crop of AA39 in ``../shared/stj-years`` is measured twice, its values take
 light (sRGB), and held against the forecast by the measured surface, without any fitted number: Buie's sun with 0.02, a
 window of 4 m. Of each photograph it also tells which circumsolar ratio suits it best, which the photograph itself has
 chosen. Prints means and medians, and draws accuracy by date and brightness against forecast.
+
+Of the photographs under low suns it asks whether neighbours shaded the mirror: all within 40 m
+(``field-positions.json``) are taken for mirrors like this one that send the sun to the receiver, which nobody recorded.
 """
 
 import argparse
+import json
 import sys
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -22,8 +28,11 @@ from model.images import clipped_alike
 from model.imaging import Camera, MeasuredFlux, measure
 from model.imaging.light import LINEAR
 from model.metrics import compare_on_target
+from model.neighbours import Neighbours, outlines
 from model.sunshape import Buie
-from model.tracing import Optics
+from model.tracing import Optics, Scene, Window, trace
+from model.tracing.alignment import align_scene
+from model.tracing.convolution import central_rays
 from service.sources.decode import decode_image
 from service.sources.documents import Measurement
 from service.sources.folder import MeasurementFolder, read_folder
@@ -96,6 +105,43 @@ def table(cases: list[Case]) -> None:
     print(f"below 0.85 in light: {low}")
 
 
+def shadows(folder: MeasurementFolder, heliostat: str, cases: list[Case]) -> None:
+    """Accuracies of the photographs whose mirror neighbours would shade or block, without them and with them."""
+    surface = folder.measured_surface(heliostat)
+    assert surface is not None
+    (points, degree), mirror = surface, folder.plant.heliostats[heliostat]
+    positions = json.loads((data_folder() / "field-positions.json").read_text())
+    places = {name: np.array(entry["position_enu"]) for name, entry in positions.items()}
+    near = [replace(mirror, name=n, position=p) for n, p in places.items() if _is_near(p - mirror.position)]
+    aims = np.tile(next(iter(folder.plant.receivers.values())).center, (len(near) + 1, 1))
+    print("| photograph | sun's elevation [deg] | light that neighbours leave | accuracy without them | with them |")
+    print("| --- | --- | --- | --- | --- |")
+    for case, one in zip(cases, (m for m in folder.measurements(heliostat) if "cropped" in m.images), strict=True):
+        standing = outlines([mirror, *near], one.sun, aims)
+        field = Neighbours.from_outlines([([m.name for m in (mirror, *near)], standing, aims)], one.sun)
+        obstacles = torch.as_tensor(field.obstacles([heliostat]))
+        plane = folder.plant.targets[one.target]
+        goals: tuple[Any, ...] = ([mirror], [points], one.sun[None], [plane], [one.spot])
+        free, shaded = (align_scene(*goals, degree=degree, alter=alter).scene for alter in (None, _before(obstacles)))
+        shaded = _before(obstacles)(shaded)
+        left = float(central_rays(_before(obstacles)(free), 24).power.sum() / central_rays(free, 24).power.sum())
+        if left > 0.99 or case.measured["light"].flux is None:
+            continue
+        image = trace(shaded, Window.of(plane), Optics(), samples=48).irradiance[0].clamp(min=0).numpy()
+        with_them = replace(case, forecasts={0.02: image}).accuracy("light", 0.02)
+        figures = f"{one.elevation_deg:.0f} | {left:.2f} | {case.accuracy('light', 0.02):.3f} | {with_them:.3f}"
+        print(f"| {one.identifier} | {figures} |")
+
+
+def _is_near(apart: Array) -> bool:
+    return 0.5 < float(np.linalg.norm(apart)) < 40
+
+
+def _before(obstacles: torch.Tensor) -> Callable[[Scene], Scene]:
+    """Puts rectangles before a scene's mirrors."""
+    return lambda scene: scene.with_(obstacles=obstacles.to(scene.sun))
+
+
 def draw(cases: list[Case], path: Path) -> None:
     """Accuracy by date under both laws, and of one bright photograph brightness against forecast, pixel by pixel."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(13, 5), layout="constrained")
@@ -125,8 +171,10 @@ def main(arguments: list[str]) -> None:
     root = data_folder().parent / "stj-years"
     if not root.is_dir():
         parser.error(f"no photographs at {root}; set HELIOTWIN_STJ to its neighbour stj")
-    cases = read_cases(read_folder(root), "AA39")
+    folder = read_folder(root)
+    cases = read_cases(folder, "AA39")
     table(cases)
+    shadows(folder, "AA39", cases)
     draw(cases, options.out / "light.png")
 
 
