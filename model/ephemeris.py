@@ -1,11 +1,12 @@
 """Where the sun stands at a time and place."""
 
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 
 import numpy as np
+from numpy.typing import NDArray
 
 from model.errors import InvalidInputError
-from model.frames import sun_angles, sun_direction_at
+from model.frames import sun_angles, sun_direction, sun_direction_at
 
 _NOON_OF_2000 = datetime(2000, 1, 1, 12, tzinfo=UTC)
 
@@ -34,3 +35,27 @@ def sun_angles_at(moment: datetime, latitude_deg: float, longitude_deg: float) -
     hour_angle = sidereal + longitude_deg - right_ascension
     azimuth, elevation = sun_angles(sun_direction_at(declination, hour_angle, latitude_deg))
     return float(azimuth), float(elevation)
+
+
+TOLERANCE_DEG = 1.0
+"""Angle [deg] that a recorded sun may lie from where it stood at the recorded time: four minutes of a clock."""
+
+
+def clock_fault(sun: NDArray[np.float64], moment: datetime, latitude_deg: float, longitude_deg: float) -> str | None:
+    """What is wrong with a recorded time, by the sun (3,) that was recorded with it; None where both agree.
+
+    A clock in another time zone is off by whole or half hours: the likeliest is named where one explains the sun.
+    """
+
+    def apart_deg(hours: float) -> float:
+        stood = sun_angles_at(moment - timedelta(hours=hours), latitude_deg, longitude_deg)
+        return float(np.degrees(np.arccos(np.clip(sun @ sun_direction(*stood), -1, 1))))
+
+    apart = apart_deg(0.0)
+    if apart <= TOLERANCE_DEG:
+        return None
+    said = f"the sun was recorded {apart:.1f} degrees from where it stood at {moment.isoformat(timespec='minutes')}"
+    hours = min((half / 2 for half in range(-28, 29)), key=apart_deg)
+    if hours == 0 or apart_deg(hours) > TOLERANCE_DEG:
+        return f"{said}; check time, sun and place"
+    return f"{said}; a clock {abs(hours):g} h {'ahead' if hours > 0 else 'behind'} explains it: check its time zone"

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.effects import Effect, effect_to_json, model_version
+from model.ephemeris import clock_fault
 from model.errors import InvalidInputError, ModelError
 from model.images import clipped_alike
 from model.imaging import Camera, ImageKind, MeasuredFlux
@@ -72,6 +73,14 @@ def measure(folder: MeasurementFolder, measurement: Measurement, kind: ImageKind
     return _measure(measurement.images[chosen], chosen, plane, camera)
 
 
+def clock_fault_of(folder: MeasurementFolder, measurement: Measurement) -> str | None:
+    """Where a measurement's time and sun disagree, and the likely reason; None where they agree, or it has no time."""
+    if measurement.taken_at is None:
+        return None
+    latitude_deg, longitude_deg, _ = folder.plant.origin
+    return clock_fault(measurement.sun, measurement.taken_at, latitude_deg, longitude_deg)
+
+
 def _write_report(folder: MeasurementFolder, report: dict[str, Any], path: Path) -> None:
     report["skipped"] = {**folder.skipped, **report["skipped"]}
     write_json(path, report)
@@ -104,7 +113,7 @@ def flux_folder(folder: MeasurementFolder, out: Path, progress: Progress = quiet
             except ModelError as error:
                 report["skipped"][measurement.key] = str(error)
                 continue
-            entry = {"kind": kind, **asdict(measured.quality)}
+            entry = {"kind": kind, **asdict(measured.quality), "clock": clock_fault_of(folder, measurement)}
             if measured.flux is not None and measured.center_of_mass is not None:
                 spot = folder.plant.targets[measurement.target].to_enu(measured.center_of_mass)
                 entry["center_of_mass_m"] = [float(v) for v in measured.center_of_mass]

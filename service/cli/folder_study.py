@@ -1,7 +1,7 @@
 """The study of a measurement folder: ``heliotwin study``."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -10,18 +10,22 @@ from model.errors import InvalidInputError, ModelError
 from model.study import FluxImage, Study, StudyOptions, study
 from model.surface import DEGREE, control_points
 from service.base.progress import Progress, quiet
-from service.cli.folder import check_surfaces, evidence_of, surface_of
+from service.cli.folder import check_surfaces, clock_fault_of, evidence_of, surface_of
 from service.sources.documents import Measurement, read_json
 from service.sources.folder import MeasurementFolder
 
 
 @dataclass(frozen=True, eq=False)
 class FolderStudy:
-    """A study, what of the folder it left out, with the reasons, and the effects that it took for known."""
+    """A study, what of the folder it left out, with the reasons, and the effects that it took for known.
+
+    ``clocks``: measurements whose time and sun disagree, with the likely reason.
+    """
 
     study: Study
     skipped: dict[str, str]
     known: Sequence[Effect] = ()
+    clocks: dict[str, str] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
         """The study's report, the model it was made with, and what was skipped where something was."""
@@ -29,6 +33,7 @@ class FolderStudy:
             **self.study.to_json(),
             "model": {"effects": [effect_to_json(effect) for effect in self.known]},
             **({"skipped": self.skipped} if self.skipped else {}),
+            **({"clocks": self.clocks} if self.clocks else {}),
         }
 
 
@@ -94,4 +99,6 @@ def study_folder(
     except InvalidInputError as error:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in list(skipped.items())[:5])
         raise InvalidInputError(f"{error}" + (f" ({reasons})" if reasons else "")) from None
-    return FolderStudy(found, skipped, known)
+    every = [one for name in folder.plant.heliostats for one in folder.measurements(name)]
+    faults = {one.key: clock_fault_of(folder, one) for one in every}
+    return FolderStudy(found, skipped, known, {key: fault for key, fault in faults.items() if fault is not None})

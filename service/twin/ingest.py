@@ -12,7 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy.orm import Session
 
+from model.ephemeris import clock_fault
 from model.errors import ImageRefusedError, InvalidInputError
+from model.frames import sun_direction
 from model.imaging import MeasuredFlux
 from model.imaging.light import camera_at
 from model.imaging.quality import refused
@@ -74,7 +76,7 @@ def ingest(
         PHOTOGRAPHS.labels("known").inc()
         return known.measurement, False
     pixels, measured = _measure(runtime, photograph, data, known)
-    row = _row(photograph, measured, known.target_id)
+    row = _row(photograph, measured, known.target_id, _clock_fault(photograph, known))
     judged = _judge(runtime, known, row) if is_live else None
     height, width = pixels.shape[:2]
     image = ImageRow(sha256=runtime.images.put(data), media_type=kind_of_file, size_bytes=len(data))
@@ -145,7 +147,15 @@ def _measure(runtime: Runtime, photograph: Photograph, data: bytes, known: _Know
             return pixels, MeasuredFlux(refused(refusal.reason, refusal.detail))
 
 
-def _row(photograph: Photograph, measured: MeasuredFlux, target_id: int) -> MeasurementRow:
+def _clock_fault(photograph: Photograph, known: _Known) -> str | None:
+    """What is wrong with the time that the sender gave, by the sun; it is told, and refuses nothing."""
+    if photograph.taken_at is None:
+        return None
+    sun = sun_direction(photograph.sun_azimuth_deg, photograph.sun_elevation_deg)
+    return clock_fault(sun, photograph.taken_at, *known.twin.origin[:2])
+
+
+def _row(photograph: Photograph, measured: MeasuredFlux, target_id: int, clock: str | None) -> MeasurementRow:
     """The measurement as it is kept, but for its heliostat, image and identifier."""
     arrays = {"flux": measured.flux, "centered": measured.centered}
     kept: dict[str, NDArray[Any]] = {
@@ -168,7 +178,7 @@ def _row(photograph: Photograph, measured: MeasuredFlux, target_id: int) -> Meas
         corners_px=None if photograph.corners is None else {"corners": plain(photograph.corners)},
         accepted=bool(measured.quality.accepted),
         reason=measured.quality.reason or None,
-        quality=plain(asdict(measured.quality)),
+        quality=plain(asdict(measured.quality)) | {"clock": clock},
         center_right_m=right,
         center_up_m=up,
         arrays=pack(kept) if kept else None,

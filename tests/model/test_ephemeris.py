@@ -4,8 +4,9 @@ from datetime import UTC, datetime, timedelta, timezone
 
 import pytest
 
-from model.ephemeris import sun_angles_at
+from model.ephemeris import clock_fault, sun_angles_at
 from model.errors import InvalidInputError
+from model.frames import sun_direction
 
 
 def test_position_of_the_published_example():
@@ -35,3 +36,14 @@ def test_morning_sun_stands_in_the_east():
 def test_moment_needs_a_zone():
     with pytest.raises(InvalidInputError, match="time zone"):
         sun_angles_at(datetime(2026, 3, 20), 50.9, 6.4)
+
+
+@pytest.mark.parametrize(
+    ("hours", "says"),
+    [(0.0, None), (0.05, None), (2.0, "2 h ahead"), (-5.5, "5.5 h behind"), (0.2, "check time, sun and place")],
+)
+def test_a_clock_is_held_against_the_sun(hours, says):
+    moment = datetime(2024, 6, 21, 10, 30, tzinfo=UTC)
+    sun = sun_direction(*sun_angles_at(moment, 50.91, 6.39))
+    fault = clock_fault(sun, moment + timedelta(hours=hours), 50.91, 6.39)
+    assert fault is None if says is None else says in (fault or "")

@@ -97,7 +97,9 @@ class MeasurementOut(BaseModel):
     )
     accepted: bool = Field(description="Whether the image can be used; a refused one is kept with its reason.")
     reason: str | None = Field(description="Why it was refused.")
-    quality: dict[str, Any] = Field(description="The quality record of the image.")
+    quality: dict[str, Any] = Field(
+        description="The quality record of the image; `clock` says where time and sun disagree by more than a degree."
+    )
     center_of_mass: tuple[float, float] | None = Field(description="Right and up of the target's centre [m].")
     image_sha256: str
     image_media_type: str

@@ -4,6 +4,7 @@ import io
 import json
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,10 @@ import pytest
 from fastapi.testclient import TestClient
 from sqlalchemy import URL
 
+from model.ephemeris import sun_angles_at
 from service.base.settings import Settings
 from service.web.app import create_app
-from tests.service.conftest import FakeOperations, Post, client_of, metadata, png
+from tests.service.conftest import ORIGIN, FakeOperations, Post, client_of, metadata, png
 
 BASE = "/v1/heliostats/AA39/measurements"
 
@@ -288,3 +290,14 @@ def test_same_image_from_many_clients_is_one_measurement(
         assert sorted(answer.status_code for answer in answers) == [200] * (clients - 1) + [201]
         assert len({answer.text for answer in answers}) == 1
         assert len(client.get(BASE).json()["items"]) == 1
+
+
+@pytest.mark.parametrize(("hours", "says"), [(0, None), (2, "2 h ahead")])
+def test_a_time_that_disagrees_with_the_sun_is_told(post: Post, hours: int, says: str | None):
+    moment = datetime(2024, 6, 21, 10, 0, tzinfo=UTC)
+    azimuth, elevation = sun_angles_at(moment, *ORIGIN[:2])
+    taken_at = (moment + timedelta(hours=hours)).isoformat()
+    answer = post(png(1), sun_azimuth=azimuth, sun_elevation=elevation, taken_at=taken_at)
+    clock = answer.json()["quality"]["clock"]
+    assert answer.status_code == 201
+    assert clock is None if says is None else says in clock
