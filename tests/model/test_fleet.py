@@ -15,7 +15,7 @@ from model.forecast import Setup
 from model.frames import sun_direction
 from model.neighbours import clear
 from model.plant import JUELICH_LATITUDE, Cylinder, Facet, Heliostat
-from model.sunshape import Pillbox
+from model.sunshape import Buie, Pillbox
 from model.surface import control_points
 from model.tracing import Optics, Scene, Window, trace
 from model.tracing.montecarlo import trace_montecarlo
@@ -60,6 +60,21 @@ def test_fleet_is_the_sum_of_its_mirrors_however_it_is_tiled():
     for size in (1, 2):
         again = superpose(task, tiles(some, size=size))
         np.testing.assert_allclose(again.irradiance, whole.irradiance, atol=1e-6 * whole.irradiance.max())
+
+
+@pytest.mark.parametrize("distance", [150.0, 600.0])
+def test_the_aureole_lands_where_it_lands_and_no_more_than_that(distance):
+    """Under haze a fifth of the light lies beyond the sun's disc: on the receiver, or beside it."""
+    plane, hazy = target(10.0), Optics(sun_shape=Buie(0.3))
+    (one,) = setups([Heliostat.juelich("far", np.array([20.0, distance, 1.8]), distance)])
+    total = superpose(Superposition(plane, (32, 32), hazy, latitude_deg=JUELICH_LATITUDE), tiles([one]))
+    angles = one.heliostat.mount.align(one.heliostat.position, SUN, plane.center)
+    scene = Scene.build([one.heliostat], [one.control_points], [angles], [SUN], [plane])
+    window = Window.of(plane, 32, 32)
+    rays, _ = trace_montecarlo(scene, window, hazy, rays=400_000)
+    landed, by_rays = (image.sum() * np.prod(window.pixel) / total.power for image in (total.irradiance, rays))
+    assert landed == pytest.approx(by_rays, abs=0.004)
+    assert landed < 1
 
 
 def test_heliostat_that_cannot_send_light_there_is_skipped_by_name():
