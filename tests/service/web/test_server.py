@@ -60,6 +60,7 @@ def test_migrate_makes_the_embedded_store(tmp_path: Path):
 
 
 _SLOW = """
+import os
 import time
 from service.base.settings import Settings
 from service.twin import runtime
@@ -68,7 +69,7 @@ from tests.service.conftest import FakeOperations
 
 class Slow(FakeOperations):
     def predict(self, *arguments, **options):
-        print("begun", flush=True)
+        os.write(1, b"begun\\n")  # at once: print writes the line's end by itself, and two threads print
         time.sleep(20)
         return super().predict(*arguments, **options)
 
