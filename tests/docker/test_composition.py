@@ -95,14 +95,12 @@ def kept(client: Client) -> dict[str, Any]:
     """All that must come through an upgrade and a restoration."""
     names = [item["name"] for item in client.get("/v1/heliostats")["items"]]
     jobs = [item["id"] for item in client.get("/v1/jobs")["items"]]  # in short, since revision 0007
-    return {
+    heliostats = {
         name: {what: client.get(f"/v1/heliostats/{name}/{what}") for what in ("measurements", "surfaces")}
         for name in names
-    } | {
-        "jobs": [client.get(f"/v1/jobs/{number}") for number in jobs],
-        "targets": client.get("/v1/targets"),
-        "models": client.get("/v1/models"),
     }
+    whole = [client.get(f"/v1/jobs/{number}") for number in jobs]
+    return heliostats | {"jobs": whole, "targets": client.get("/v1/targets"), "models": client.get("/v1/models")}
 
 
 def versions(client: Client) -> dict[str, int]:
