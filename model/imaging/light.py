@@ -142,10 +142,11 @@ class Camera:
         if not 0 <= self.ambient < 1:
             raise InvalidInputError(f"a camera's 'ambient' must lie in [0, 1) of its counts, got {self.ambient}")
 
-    def light_of(self, image: NDArray[np.integer[Any]]) -> Array:
+    def light_of(self, image: NDArray[np.integer[Any]]) -> NDArray[np.float32]:
         """Light (...) [1] of an image's counts; 16 bits are a linear camera's, whatever the curve of its 8 bits."""
-        transfer = self.transfer if image.dtype == np.uint8 else LINEAR
-        return transfer.light(image / np.iinfo(image.dtype).max)
+        transfer, most = self.transfer if image.dtype == np.uint8 else LINEAR, np.iinfo(image.dtype).max
+        levels = transfer.light(np.arange(most + 1) / most)
+        return np.asarray(levels.astype(np.float32)[image])
 
     def light_of_difference(self, counts: ArrayLike) -> Array:
         """Light (...) [1] of a spot of which ``counts`` (...) [1] over the sheet are known: PAINT's ``flux``.

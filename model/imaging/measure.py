@@ -137,14 +137,17 @@ def _check(image: Image, kind: str) -> None:
 
 def _light(image: Image, camera: Camera) -> NDArray[np.float32]:
     """Light (rows, columns) of a photograph: 255 where all counts are at their largest, as of a linear 8-bit camera."""
-    light = np.asarray(255 * camera.light_of(image), dtype=np.float32)
-    return light if light.ndim == 2 else np.asarray(cv2.cvtColor(light, cv2.COLOR_RGB2GRAY), dtype=np.float32)
+    return _luma(255 * camera.light_of(image))
+
+
+def _luma(image: NDArray[np.float32]) -> NDArray[np.float32]:
+    return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.float32)
 
 
 def _spot_light(image: Image, camera: Camera | None) -> NDArray[np.float32]:
     """Light (rows, columns), in any unit, of an image whose background was taken off."""
     if camera is None or image.dtype != np.uint8:
-        return _gray(image).astype(np.float32)
+        return _luma(image.astype(np.float32))
     return np.asarray(255 * camera.light_of_difference(_gray(image) / 255), dtype=np.float32)
 
 
