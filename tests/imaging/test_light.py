@@ -106,6 +106,8 @@ def test_cameras_are_declared():
         ({"transfer": {"counts": [0, 0.5, 1], "light": [0, 1]}}, "of one length"),
         ({"transfer": {"gamma": 9}}, "gamma must lie in"),
         ({"transfer": {"gamma": "two"}}, "must hold numbers"),
+        ({"transfer": {"gamma": [2.0, 2.2]}}, "'gamma' is one number"),
+        ({"transfer": {"counts": 0.5, "light": 0.5}}, "are lists"),
         ({"transfer": "log"}, "'transfer' must be"),
         ({"ambient": 1.0}, "'ambient' must lie in"),
         ({"ambient": True}, "'ambient' must be a number"),

@@ -459,12 +459,18 @@ def test_stream_ends_when_its_key_is_withdrawn(app: FastAPI, server: str):
         assert "event: end" in list(lines)
 
 
+def begun(stream: httpx.Response) -> Iterator[str]:
+    """Lines of a stream after its first event."""
+    lines = stream.iter_lines()
+    while "id: 1" not in next(lines):
+        pass
+    return lines
+
+
 def test_stream_without_a_key_ends_when_the_first_is_made(app: FastAPI, server: str):
     (number,) = large(app)
     with following(server, number, 1) as (stream,):
-        lines = stream.iter_lines()
-        while "id: 1" not in next(lines):
-            pass
+        lines = begun(stream)
         with app.state.runtime.database.writing() as session:
             keys.create(session, "first", "admin", "tester")
         assert "event: end" not in list(lines)
@@ -473,9 +479,7 @@ def test_stream_without_a_key_ends_when_the_first_is_made(app: FastAPI, server: 
 def test_stream_of_a_job_that_is_deleted_ends(app: FastAPI, server: str):
     (number,) = large(app)
     with following(server, number, 1) as (stream,):
-        lines = stream.iter_lines()
-        while "id: 1" not in next(lines):
-            pass
+        lines = begun(stream)
         with app.state.runtime.database.writing() as session:
             session.execute(delete(JobRow))
         assert "event: end" not in list(lines)

@@ -31,14 +31,19 @@ def _wait(url: str, process: subprocess.Popen[bytes]) -> httpx.Response:
     pytest.fail("the service does not answer")
 
 
-def test_process_starts_answers_and_stops(tmp_path: Path):
-    port = free_port()
+def _environment(tmp_path: Path, port: int) -> dict[str, str]:
+    """Of a process with a store of its own that finds this checkout."""
     root = str(Path(__file__).parents[3])
-    environment = os.environ | {
+    return os.environ | {
         "HELIOTWIN_PORT": str(port),
         "HELIOTWIN_DATA_DIR": str(tmp_path / "data"),
         "PYTHONPATH": os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")])),
     }
+
+
+def test_process_starts_answers_and_stops(tmp_path: Path):
+    port = free_port()
+    environment = _environment(tmp_path, port)
     process = subprocess.Popen([sys.executable, "-c", _SERVE], cwd=tmp_path, env=environment, stderr=subprocess.PIPE)
     try:
         base = f"http://127.0.0.1:{port}"
@@ -82,12 +87,7 @@ serve(Settings())
 def test_requests_at_the_model_are_told_to_come_again_when_the_service_stops(tmp_path: Path, told: signal.Signals):
     """Two at the model and one that waits for it: 503 with Retry-After within seconds, and nothing of them is kept."""
     port = free_port()
-    root = str(Path(__file__).parents[3])
-    environment = os.environ | {
-        "HELIOTWIN_PORT": str(port),
-        "HELIOTWIN_DATA_DIR": str(tmp_path / "data"),
-        "PYTHONPATH": os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")])),
-    }
+    environment = _environment(tmp_path, port)
     command = [sys.executable, "-c", _SLOW]
     with ExitStack() as held:
         pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
