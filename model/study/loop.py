@@ -7,7 +7,7 @@ from datetime import date
 import numpy as np
 from numpy.typing import NDArray
 
-from model.effects import CATALOGUE, Effect
+from model.effects import CATALOGUE, Effect, Since
 from model.errors import InvalidInputError
 from model.forecast import View
 from model.images import FLUX_SIZE
@@ -354,7 +354,8 @@ def study(
     if len({p.key for p in flux_images}) < len(flux_images):
         raise InvalidInputError("photographs of a study must have identifiers of their own")
     loop = _Loop(flux_images, optics, effects, options, latitude_deg)
-    declared = {effect.name for effect in effects}
+    # What has changed once may change again.
+    declared = {effect.name for effect in effects if not isinstance(effect.scope, Since)}
     before = current = loop.trial([])
     found: dict[Term, Found] = {}
     candidates: list[Candidate] = []
