@@ -27,7 +27,7 @@ READ_NOISE = 0.3
 WELL = 2e4
 """Electrons that make the largest count."""
 
-DAYLIGHT, EXPOSURE = (0.18, 0.34), (0.5, 0.95)
+DAYLIGHT, EXPOSURE = (0.2, 0.34), (0.5, 0.95)
 """Light of the sheet by day, and of the spot's peak over it, in shares of what the camera can tell."""
 
 
@@ -52,7 +52,7 @@ def counts(light: Array, rng: np.random.Generator) -> Array:
 
 def photograph(light: Array, target: Target, world: World, rng: np.random.Generator) -> Photograph:
     """An 8-bit photograph (256, 256) of light on the sheet by day."""
-    across, down = rng.uniform(-0.15, 0.15, 2)
+    across, down = rng.uniform(-0.2, 0.2, 2)
     x = np.linspace(-1, 1, PIXELS)
     day = rng.uniform(*DAYLIGHT) * (1 + across * x + down * x[:, None] - 0.05 * (x**2 + x[:, None] ** 2))
     sensed = sheet(target.name) * (day + rng.uniform(*EXPOSURE) * light)
@@ -116,21 +116,22 @@ def _encoded(light: Array) -> Array:
 def sheet(target: str) -> Array:
     """Reflectance (256, 256) of a target's sheet: panels, seams with rivets, stains, grain, marks at the corners.
 
-    As strong as on 300 photographs of the empty targets of Juelich: grain 1 %, seams 5 to 15 %, panels 5 to 10 %.
+    As strong as on 300 photographs of the empty targets of Juelich: grain and stains 1 to 2 %, seams 5 to 30 %.
     """
     rng = np.random.default_rng(crc32(target.encode()))
-    paint = 1 + 0.01 * rng.standard_normal((PIXELS, PIXELS))
-    stains = gaussian_filter(rng.standard_normal((PIXELS, PIXELS)), 14.0)
-    paint *= 1 + 0.012 * stains / stains.std()
+    paint = 1 + 0.015 * rng.standard_normal((PIXELS, PIXELS))
+    for size, strength in ((2.5, 0.006), (14.0, 0.007)):
+        stains = gaussian_filter(rng.standard_normal((PIXELS, PIXELS)), size)
+        paint *= 1 + strength * stains / stains.std()
     rows, columns = (np.round(np.linspace(0, PIXELS, n) + rng.uniform(-4, 4, n)).astype(int)[1:-1] for n in (5, 9))
     paint[rows[-1] :] *= 0.94
     paint[rows[-1] :, :14] *= 0.9
-    paint[rows] *= 1 - rng.uniform(0.05, 0.15, (len(rows), 1))
-    paint[:, columns] *= 1 - rng.uniform(0.02, 0.06, len(columns))
-    paint[np.ix_(np.arange(5, PIXELS, 11), columns)] *= 0.9
-    ends = [slice(0, 5), slice(0, 22)], [slice(PIXELS - 5, PIXELS), slice(PIXELS - 22, PIXELS)]
+    paint[rows] *= 1 - rng.uniform(0.15, 0.35, (len(rows), 1))
+    paint[:, columns] *= 1 - rng.uniform(0.05, 0.12, len(columns))
+    paint[np.ix_(np.arange(5, PIXELS, 11), columns)] *= 0.8
+    ends = [slice(0, 4), slice(0, 22)], [slice(PIXELS - 4, PIXELS), slice(PIXELS - 22, PIXELS)]
     for down, along_down in ends:
         for across, along_across in ends:
             paint[down, along_across] = paint[along_down, across] = 0.12
-    paint[-26:, 126:130] = paint[-5:, 117:139] = 0.12
-    return gaussian_filter(paint, 0.7)
+    paint[-26:, 127:130] = paint[-4:, 117:139] = 0.12
+    return gaussian_filter(paint, 0.6)

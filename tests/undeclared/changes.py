@@ -91,7 +91,7 @@ CHANGES: dict[str, Change] = {
         "sun_shape", "circumsolar_ratio", 0.02, (0.1, 0.2, 0.35), lambda v: {"circumsolar_ratio": v}
     ),
     "jitter_by_day": by_day("tracking_jitter", "sigma_mrad", 0.0, (1.0, 1.5, 2.2), lambda v: {"first_axis_mrad": v}),
-    "background_by_day": by_day("background", "level", 0.0, (0.003, 0.006, 0.012), lambda v: {"stray": (v, 0.0, 0.0)}),
+    "background_by_day": by_day("background", "level", 0.0, (0.0015, 0.003, 0.006), lambda v: {"stray": (v, 0.0, 0.0)}),
     "response_since": since("camera_response"),
     "shoulder_since": since("camera_shoulder"),
     "law_since": law_since,
