@@ -56,6 +56,8 @@ class Quality:
         The spot's peak over the deviation of the smoothed background.
     spot_area_share : float [1]
         Area of the spot with its wings over the target's area.
+    sheet_share : float [1]
+        Share of the flux that the sheet's own pattern, as it is seen off the spot, moves about within it.
     """
 
     accepted: bool
@@ -69,6 +71,7 @@ class Quality:
     second_spot_share: float = 0.0
     signal_to_noise: float = 0.0
     spot_area_share: float = 0.0
+    sheet_share: float = 0.0
 
 
 def judge(
@@ -98,6 +101,7 @@ def judge(
         second_spot_share=_second_share(parts),
         signal_to_noise=certainty,
         spot_area_share=area,
+        sheet_share=_sheet_share(parts),
     )
     if contrast < _LEAST_CONTRAST or certainty < _LEAST_CERTAINTY or area < _LEAST_AREA:
         return _refuse(quality, "low_signal" if certainty > _CERTAIN and area > _LEAST_AREA else "no_spot")
@@ -150,6 +154,19 @@ def _second_share(parts: Separation) -> float:
     signal = np.maximum(parts.smooth, 0)
     others = float(signal[parts.foreign].sum())
     return others / max(others + float(signal[parts.main].sum()), 1e-9)
+
+
+def _sheet_share(parts: Separation) -> float:
+    """Mean error of the flux over its mean, of a sheet that is as uneven under the spot as it is elsewhere.
+
+    Stains and seams reflect the spot's light as they do the daylight; unevenness is taken for normally distributed.
+    """
+    off = ~(parts.main | parts.foreign)
+    if not off.any():
+        return 0.0
+    uneven = 1.4826 * float(np.median(np.abs(parts.smooth[off] / np.maximum(parts.background[off], 1.0))))
+    light = float((parts.flux + parts.background)[parts.main].sum(dtype=np.float64))
+    return float((2 / np.pi) ** 0.5) * uneven * light / max(float(parts.flux.sum(dtype=np.float64)), 1e-9)
 
 
 def _bright_share(

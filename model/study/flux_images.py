@@ -37,12 +37,15 @@ class FluxImage:
         Whether the mirror's surface was predicted from it: such a surface flatters its own photographs.
     clipped : bool (rows, columns) or None
         Where the camera's range cut the light off, where it did.
+    sheet_share : float [1]
+        Share of the light that the pattern of the sheet behind the spot moves about (`model.imaging.Quality`).
     """
 
     setup: Setup
     image: NDArray[np.floating]
     seen: bool = False
     clipped: NDArray[np.bool_] | None = None
+    sheet_share: float = 0.0
 
     def __post_init__(self) -> None:
         if self.image.ndim != 2 or not np.isfinite(self.image).all() or not self.image.sum() > 0:

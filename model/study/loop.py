@@ -141,10 +141,19 @@ class _Loop:
         if start is not None:
             values, spread = (start.unknowns.put(v, whole) for v in (start.values, start.spread))
             trial, known = replace(trial, values=values, spread=spread), set(start.unknowns.terms)
-        for rows, unknowns in ((self.split.fit, whole), (self.split.own, whole.own)):
+        for rows, unknowns in self._parts(whole):
             moving = unknowns if joint else unknowns.without(known)
             trial = self._fitted(trial, self.touched(rows, moving.terms), moving, known)
         return self.judged(trial)
+
+    def _parts(self, whole: Unknowns) -> list[tuple[Rows, Unknowns]]:
+        """What is fitted to which images: to those of the heliostat that is kept apart only what is its own.
+
+        A day has its haze for all heliostats; where an effect comes by day, none is kept apart.
+        """
+        if any(term.days for term in whole.terms):
+            return [(np.sort(np.concatenate([self.split.fit, self.split.own])), whole)]
+        return [(self.split.fit, whole), (self.split.own, whole.own)]
 
     def judged(self, trial: Trial) -> Trial:
         """The trial with its forecasts of the held-out images."""

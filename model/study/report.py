@@ -171,8 +171,8 @@ class Study:
 
     @cached_property
     def noise_floor(self) -> float:
-        """Mean error that the images' noise alone makes."""
-        return float(np.mean([p.noise_share(self.window) for p in self.images]))
+        """Mean error that the images' noise and the sheets behind the spots make alone."""
+        return float(np.mean([np.hypot(p.noise_share(self.window), p.sheet_share) for p in self.images]))
 
     @property
     def unexplained_share(self) -> float:

@@ -167,6 +167,7 @@ def evidence_of(folder: MeasurementFolder, measurement: Measurement) -> Evidence
         motor_position=measurement.motor_position,
         taken_at=measurement.taken_at,
         clipped=measured.clipped,
+        sheet_share=measured.quality.sheet_share,
     )
 
 

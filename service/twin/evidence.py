@@ -62,6 +62,8 @@ class Evidence:
     taken_at : datetime or None
     clipped : bool (rows, columns) or None
         Where on the target the camera's range cut the light off.
+    sheet_share : float [1]
+        As `model.imaging.Quality` has it.
     """
 
     identifier: str
@@ -73,6 +75,7 @@ class Evidence:
     motor_position: Array | None = None
     taken_at: datetime | None = None
     clipped: NDArray[np.bool_] | None = None
+    sheet_share: float = 0.0
 
     def observation(self) -> Observation:
         """What it shows of the mirror."""
@@ -113,7 +116,9 @@ class Evidence:
         shot = Setup(
             heliostat, points, self.sun, plane, self.spot, degree=degree, identifier=key, taken_at=self.taken_at
         )
-        return FluxImage(shot, np.asarray(image, dtype=np.float64), seen=seen, clipped=clipped)
+        return FluxImage(
+            shot, np.asarray(image, dtype=np.float64), seen=seen, clipped=clipped, sheet_share=self.sheet_share
+        )
 
 
 def choose(
@@ -178,6 +183,7 @@ def evidence_of(row: MeasurementRow, origin: tuple[float, float, float], target:
         motor_position=None if None in motors else np.array(motors),
         taken_at=row.taken_at,
         clipped=None if clipped is None else np.asarray(clipped, dtype=bool),
+        sheet_share=float(row.quality.get("sheet_share") or 0),
     )
 
 
