@@ -13,7 +13,7 @@ from model.plant import JUELICH_LATITUDE
 from model.study import StudyOptions, study
 from model.tracing import Optics
 from tests.undeclared import world
-from tests.undeclared.adapter import effects_at, flux_images, setups_of
+from tests.undeclared.adapter import effects_of, flux_images, setups_of
 from tests.undeclared.generator import MeasurementSet, generate
 
 STRONG = 2
@@ -44,7 +44,7 @@ def test_the_generator_has_every_effect_of_the_catalogue():
 def test_the_model_with_the_truth_explains_what_the_generator_throws(case):
     """Generator and model share no code, so that each is a test of the other."""
     made = generate(case, STRONG, 3, heliostats=2, setups=1, side=128, fan=16)
-    setups, effects = setups_of(made), effects_at(made, made.plans[0])
+    setups, effects = setups_of(made), effects_of(made)
     forecasts = forecast_setups(setups, None, effects, View(96, 96), latitude_deg=JUELICH_LATITUDE).numpy()
     for setup, image, forecast in zip(setups, made.images, forecasts, strict=True):
         size = (setup.plane.width, setup.plane.height)
