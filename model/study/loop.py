@@ -7,7 +7,7 @@ from datetime import date
 import numpy as np
 from numpy.typing import NDArray
 
-from model.effects import CATALOGUE, Effect
+from model.effects import CATALOGUE, Effect, Since
 from model.errors import InvalidInputError
 from model.forecast import View
 from model.images import FLUX_SIZE
@@ -179,12 +179,11 @@ class _Loop:
 
     def scoped(self, trials: dict[Term, Trial], current: Trial) -> dict[Term, Trial]:
         """Effects that are not always there, fitted: those of the most promising scopes."""
-        assert self.days is not None
-        rows = np.sort(np.concatenate([self.split.fit, self.split.own]))
+        rows, days = self._dated(np.sort(np.concatenate([self.split.fit, self.split.own])))
         found: list[Promise] = []
         for term, trial in trials.items():
             saved = self._saved(trial, current, term, rows, STRENGTHS)
-            found += promises(term.kind, saved, [self.days[row] for row in rows], self.all_heliostats[rows])
+            found += promises(term.kind, saved, days, self.all_heliostats[rows])
         found.sort(key=lambda promise: -promise.saved)
         fitted = [self._settled(promise.term, current, rows) for promise in found[:SCREENED]]
         return dict(fitted)
@@ -214,10 +213,15 @@ class _Loop:
 
     def _changed(self, term: Term, trial: Trial, current: Trial, rows: Rows) -> date | None:
         """The day from which on photographs among some save most by an effect as it was fitted."""
-        assert self.days is not None
-        rows = self.touched(rows, [replace(term, since=None)])
-        found = change(self._saved(trial, current, term, rows, (1.0,)), [self.days[row] for row in rows])
+        rows, days = self._dated(self.touched(rows, [replace(term, since=None)]))
+        found = change(self._saved(trial, current, term, rows, (1.0,)), days)
         return None if found is None else found[0]
+
+    def _dated(self, rows: Rows) -> tuple[Rows, list[date]]:
+        """Those of some images whose day is known, and the days."""
+        days = self.days or []
+        known = [(row, day) for row in rows.tolist() if (day := days[row]) is not None]
+        return np.array([row for row, _ in known], dtype=np.int64), [day for _, day in known]
 
     def dated(self, term: Term, trial: Trial, current: Trial) -> tuple[Term, Trial]:
         """An effect that was judged since the day that all photographs name, also those that judged it."""
@@ -350,7 +354,8 @@ def study(
     if len({p.key for p in flux_images}) < len(flux_images):
         raise InvalidInputError("photographs of a study must have identifiers of their own")
     loop = _Loop(flux_images, optics, effects, options, latitude_deg)
-    declared = {effect.name for effect in effects}
+    # What has changed once may change again.
+    declared = {effect.name for effect in effects if not isinstance(effect.scope, Since)}
     before = current = loop.trial([])
     found: dict[Term, Found] = {}
     candidates: list[Candidate] = []

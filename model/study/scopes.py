@@ -39,10 +39,11 @@ class Promise:
     saved: float
 
 
-def days_of(flux_images: Sequence[FluxImage]) -> list[date] | None:
-    """The day of each photograph; None unless all are known and there are several."""
-    days = [p.taken_at.date() for p in flux_images if p.taken_at is not None]
-    return days if len(days) == len(flux_images) and len(set(days)) >= LEAST_DAYS else None
+def days_of(flux_images: Sequence[FluxImage]) -> list[date | None] | None:
+    """The day of each photograph, where it is known; None unless most are, and there are several."""
+    days = [None if p.taken_at is None else p.taken_at.date() for p in flux_images]
+    known = [day for day in days if day is not None]
+    return days if len(known) > len(days) / 2 and len(set(known)) >= LEAST_DAYS else None
 
 
 def promises(kind: type[Effect], saved: Array, days: Sequence[date], heliostats: NDArray[np.str_]) -> Iterator[Promise]:

@@ -49,8 +49,9 @@ class Term:
             return False
         if self.since is None and not self.days:
             return True
-        day = None if taken_at is None else taken_at.date()
-        return day is not None and (day in self.days if self.since is None else day >= self.since)
+        if taken_at is None:  # of today, as `Since` has it
+            return self.since is not None
+        return taken_at.date() in self.days if self.since is None else taken_at.date() >= self.since
 
 
 @dataclass(frozen=True)
