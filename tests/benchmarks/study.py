@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -84,8 +85,8 @@ def answer(case: Case) -> Record:
         "found": [effect["name"] for effect in report["effects"]],
         "before": report["before"]["accuracy_mean"],
         "after": report["after"]["accuracy_mean"],
-        "true": true,
-        "change": change,
+        "true": round(float(true.mean()), 5),
+        "change": round(float(change.mean()), 5),
         "noise": report["noise_floor"],
         "unexplained": report["unexplained_share"],
         "incomplete": found.incomplete,
@@ -98,14 +99,13 @@ def answer(case: Case) -> Record:
     }
 
 
-def upper_bound(made: MeasurementSet, found: Study) -> tuple[float, float]:
-    """Accuracy on the held-out images with the true effects, and by how much those change the forecast."""
+def upper_bound(made: MeasurementSet, found: Study) -> tuple[Array, Array]:
+    """Accuracies (H,) of the held-out images with the true effects, and by how much those change the forecast (H,)."""
     forecaster = Forecaster(
         found.images, Optics(), [], found.window, StudyOptions().view, latitude_deg=JUELICH_LATITUDE
     )
     with_truth = forecaster.cuts(effects_of(made))
-    true, same = flux_accuracies(found.measured, with_truth).mean(), flux_accuracies(found.before, with_truth).mean()
-    return round(float(true), 5), round(float(1 - same), 5)
+    return flux_accuracies(found.measured, with_truth), 1 - flux_accuracies(found.before, with_truth)
 
 
 def errors(effect: Record, truth: Sequence[Record]) -> Iterator[Record]:
@@ -290,19 +290,23 @@ def confusion(records: Sequence[Record]) -> tuple[list[str], list[str], Array]:
     return rows, columns, shares / shares.sum(axis=1, keepdims=True)
 
 
+def draw(axes: Axes, rows: Sequence[str], columns: Sequence[str], shares: Array) -> None:
+    """A confusion matrix, in percent."""
+    axes.imshow(shares, cmap="Blues", vmin=0, vmax=1)
+    for (row, place), share in np.ndenumerate(shares):
+        if share > 0:
+            axes.text(place, row, f"{100 * share:.0f}", ha="center", va="center", color="w" if share > 0.5 else "k")
+    axes.set_xticks(range(len(columns)), columns, rotation=60, ha="right")
+    axes.set_yticks(range(len(rows)), rows)
+
+
 def matrix(records: Sequence[Record]) -> Figure:
     """The confusion matrix of all strengths, beside that of the sets with more change than twice the noise."""
     known = [r for r in records if r["name"] not in CATALOGUE or r["change"] > 2 * r["noise"]]
     figure = Figure(figsize=(18, 9), layout="constrained")
     titles = "all strengths", "effects that change the forecast by more than twice the noise"
     for axes, some, title in zip(figure.subplots(1, 2), (records, known), titles, strict=True):
-        rows, columns, shares = confusion(some)
-        axes.imshow(shares, cmap="Blues", vmin=0, vmax=1)
-        for (row, place), share in np.ndenumerate(shares):
-            if share > 0:
-                axes.text(place, row, f"{100 * share:.0f}", ha="center", va="center", color="w" if share > 0.5 else "k")
-        axes.set_xticks(range(len(columns)), columns, rotation=60, ha="right")
-        axes.set_yticks(range(len(rows)), rows)
+        draw(axes, *confusion(some))
         axes.set(title=f"{title} [%]", xlabel="verdict, or the effect found first", ylabel="undeclared")
     return figure
 
