@@ -29,6 +29,7 @@ from tests.benchmarks.study import (
     cases,
     code,
     decimal,
+    draw,
     mean,
     percent,
     read,
