@@ -19,7 +19,6 @@ from model.plant import Facet, Heliostat, TargetPlane
 from model.study import FluxImage
 from model.surface import control_points, fit_heights
 from tests.undeclared import plant, sky
-from tests.undeclared.changes import in_force
 from tests.undeclared.generator import MeasurementSet
 from tests.undeclared.plan import Plan
 
@@ -52,10 +51,9 @@ def surface_of(heliostat: plant.Heliostat) -> Array:
     return control_points(heliostat_of(heliostat), heights)
 
 
-def effects_at(made: MeasurementSet, plan: Plan) -> list[Effect]:
-    """The truth as the model states it of one photograph."""
-    acting = [in_force(effect, plan) for effect in made.truth]
-    return effects_from_json([effect for effect in acting if effect is not None])
+def effects_of(made: MeasurementSet) -> list[Effect]:
+    """The truth as the model states it."""
+    return effects_from_json(made.truth)
 
 
 def setups_of(made: MeasurementSet) -> list[Setup]:

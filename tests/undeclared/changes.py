@@ -1,7 +1,7 @@
 """Worlds that change while a season's photographs are taken: days of haze and wind, new cantings, new cameras.
 
 As in `tests.undeclared.world`, at three strengths. The truth of a change is as a study ought to report it (DESIGN.md,
-section 7): an effect of the catalogue, its ``scope``, and ``by_day`` where it differs from day to day.
+section 7): an effect of the catalogue with its ``scope``, and values ``by_day`` where it differs from day to day.
 """
 
 from collections.abc import Callable, Sequence
@@ -76,11 +76,10 @@ def by_day(name: str, parameter: str, neutral: float, sizes: Sequence[float], fi
     def change(level: int, plans: Sequence[Plan], rng: np.random.Generator) -> Changing:
         days = sorted({plan.day for plan in plans})
         bad = rng.choice(len(days), round(HAZY * len(days)), replace=False)
-        values = dict.fromkeys(days, neutral)
-        values |= {days[i]: round(sizes[level] * rng.uniform(0.7, 1.3), 4) for i in bad}
-        found = {"by_day": {parameter: {day.isoformat(): value for day, value in values.items()}}}
-        truth = _truth(name, {parameter: float(np.mean(list(values.values())))}, {"kind": "day"}) | found
-        return [World(**fields(values[plan.day])) for plan in plans], [truth]
+        values = dict.fromkeys(days, neutral) | {days[i]: round(sizes[level] * rng.uniform(0.7, 1.3), 4) for i in bad}
+        each = {"value": neutral, "by_day": {day.isoformat(): value for day, value in values.items()}}
+        truth = [_truth(name, {parameter: each}, {"kind": "day"})]
+        return [World(**fields(values[plan.day])) for plan in plans], truth
 
     return change
 
@@ -107,18 +106,6 @@ WITHOUT_SHEET = ("background_by_day",)
 def changing(case: str, level: int, plans: Sequence[Plan], rng: np.random.Generator) -> Changing:
     """The worlds of a season's photographs, and the truth."""
     return CHANGES[case](level, plans, rng)
-
-
-def in_force(effect: dict[str, Any], plan: Plan) -> dict[str, Any] | None:
-    """An effect of the truth as one without a scope, as it acts on one photograph; None where it does not."""
-    scope, parameters = effect.get("scope", {"kind": "set"}), dict(effect["parameters"])
-    if scope["kind"] == "since":
-        concerned = scope["heliostats"] is None or plan.heliostat.name in scope["heliostats"]
-        if not concerned or plan.day.isoformat() < scope["since"]:
-            return None
-    if scope["kind"] == "day":
-        parameters |= {name: values[plan.day.isoformat()] for name, values in effect["by_day"].items()}
-    return {"name": effect["name"], "parameters": parameters}
 
 
 def _names(plans: Sequence[Plan]) -> list[str]:

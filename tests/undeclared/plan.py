@@ -62,13 +62,14 @@ def scattered(heliostats: int, each: int, rng: np.random.Generator) -> list[Plan
 
 
 def season(days: tuple[int, int], rng: np.random.Generator) -> list[Plan]:
-    """Photographs of 3 to 5 heliostats, 3 to 6 a day on so many days over weeks to months, in the order of time."""
+    """Photographs of 3 to 5 heliostats in the order of time, about one a day each, on so many days over weeks."""
     heliostats = field(int(rng.integers(3, 6)), RANGES, rng)
-    day, plans = date(2023, 3, 15) + timedelta(days=int(rng.integers(500))), list[Plan]()
-    pace, turns = rng.uniform(1, 6), list[int]()
+    day, pace = date(2023, 3, 15) + timedelta(days=int(rng.integers(500))), rng.uniform(1, 6)
+    plans: list[Plan] = []
+    turns: list[int] = []
     for _ in range(rng.integers(*days, endpoint=True)):
         day += timedelta(days=1 + int(rng.exponential(pace)))
-        for _ in range(rng.integers(3, 7)):
+        for _ in range(len(heliostats) + rng.integers(3)):
             turns = turns or rng.permutation(len(heliostats)).tolist()
             index = turns.pop()
             plans.append(_plan(index, heliostats[index], day, rng))

@@ -1,8 +1,8 @@
 """A generated plant: targets on a tower, heliostats before them, and mirrors as smooth or as rough as real ones.
 
 A mirror is no spline: each facet's deviation from its place in the plans is a sum of tilts, bending, a roll of the
-edges, and waves. Sizes follow what deflectometry shows of 47 heliostats of the Solar Tower Juelich (median: heights
-0.5 mm rms, tilts 0.9 mrad, slopes of waves 0.7 mrad) and of the roughest, AA39 (1.15 mm).
+edges, and waves. Sizes follow what deflectometry shows of 47 heliostats of the Solar Tower Juelich (in the median 0.5
+mm rms of height, 0.25 mm without the tilts, and slopes of 0.75 mrad) and of a rough one, AA39 (1.15 mm, 0.4 mm).
 """
 
 from collections.abc import Sequence

@@ -12,9 +12,11 @@ from model.metrics import compare_on_target
 from model.plant import JUELICH_LATITUDE
 from model.study import StudyOptions, study
 from model.tracing import Optics
+from service.cli.folder_study import study_folder
+from service.sources.folder import read_folder
 from tests.undeclared import world
-from tests.undeclared.adapter import effects_at, flux_images, setups_of
-from tests.undeclared.generator import MeasurementSet, generate
+from tests.undeclared.adapter import effects_of, flux_images, setups_of, write_folder
+from tests.undeclared.generator import MeasurementSet, generate, generate_season
 
 STRONG = 2
 
@@ -44,7 +46,7 @@ def test_the_generator_has_every_effect_of_the_catalogue():
 def test_the_model_with_the_truth_explains_what_the_generator_throws(case):
     """Generator and model share no code, so that each is a test of the other."""
     made = generate(case, STRONG, 3, heliostats=2, setups=1, side=128, fan=16)
-    setups, effects = setups_of(made), effects_at(made, made.plans[0])
+    setups, effects = setups_of(made), effects_of(made)
     forecasts = forecast_setups(setups, None, effects, View(96, 96), latitude_deg=JUELICH_LATITUDE).numpy()
     for setup, image, forecast in zip(setups, made.images, forecasts, strict=True):
         size = (setup.plane.width, setup.plane.height)
@@ -84,3 +86,13 @@ def test_canting_is_found_facet_by_facet():
 
 def test_what_no_effect_describes_is_not_taken_for_nothing():
     assert report("facet_focus")["verdict"] != "none"
+
+
+def test_a_change_is_found_with_its_day(tmp_path):
+    """A camera set anew, in photographs of a sunlit sheet, as a user gives them."""
+    made = generate_season("response_since", STRONG, 2, days=(5, 5), side=128, fan=16)
+    folder = read_folder(write_folder(made, tmp_path))
+    options = StudyOptions(candidates=("camera_response", "sun_shape"), most=1)
+    (found,), (truth,) = study_folder(folder, options=options).to_json()["effects"], made.truth
+    assert (found["name"], found["scope"]) == (truth["name"], truth["scope"])
+    assert found["parameters"]["gamma"]["value"] == pytest.approx(truth["parameters"]["gamma"], abs=0.05)

@@ -23,7 +23,8 @@ class World:
     """Disturbances of sky, mount, mirror and camera; the defaults are the declared world, in which there are none.
 
     Those of mirrors are one value for all, or arrays (heliostat,), (heliostat, facet) or, for ``canting_mrad``,
-    (heliostat, facet, 2). The last block is in no catalogue.
+    (heliostat, facet, 2). ``gamma``, ``saturation`` and ``compression`` bend the mirror's light alone, ``law`` that of
+    sheet and mirror together, on photographs. The last block is in no catalogue.
     """
 
     circumsolar_ratio: float = 0.02

@@ -1,0 +1,133 @@
+"""The generator by itself: it shares nothing with the product, keeps energy, and the truth explains what it makes."""
+
+import ast
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from model.ephemeris import sun_angles_at
+from model.forecast import View, forecast_setups
+from model.frames import sun_direction
+from model.images import clipped_alike
+from model.metrics import compare_on_target
+from model.plant import JUELICH_LATITUDE
+from model.study import FluxImage
+from service.cli.folder import clock_fault_of
+from service.cli.folder_study import photographs_of
+from service.sources.folder import MeasurementFolder, read_folder
+from tests.undeclared import changes, sky
+from tests.undeclared.adapter import effects_of, write_folder
+from tests.undeclared.camera import sheet
+from tests.undeclared.generator import MeasurementSet, generate_season
+from tests.undeclared.plan import Plan, season
+from tests.undeclared.rays import Sun, throw
+from tests.undeclared.world import World
+
+STRONG = 2
+
+Season = tuple[MeasurementSet, MeasurementFolder]
+
+
+@cache
+def plans() -> list[Plan]:
+    return season((4, 4), np.random.default_rng(1))
+
+
+@pytest.fixture(scope="module")
+def a_season(tmp_path_factory) -> Callable[[str], Season]:
+    """A short season of a case, and the folder that was written of it."""
+
+    @cache
+    def made(case: str) -> Season:
+        photographed = generate_season(case, STRONG, 2, days=(3, 3), side=128, fan=16)
+        return photographed, read_folder(write_folder(photographed, tmp_path_factory.mktemp(case)))
+
+    return made
+
+
+def test_only_the_adapter_knows_the_product():
+    for path in Path(__file__).parent.glob("*.py"):
+        if path.stem == "adapter" or path.stem.startswith("test_"):
+            continue
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            assert not {name.split(".")[0] for name in names} & {"model", "service", "training"}, path.name
+
+
+def test_its_almanac_agrees_with_the_products():
+    for plan in plans():
+        stood = sun_direction(*sun_angles_at(plan.moment, *sky.PLACE[:2]))
+        assert np.degrees(np.arccos(plan.sun() @ stood)) < 0.2
+
+
+def test_rays_carry_what_the_mirror_collects():
+    """1000 W/m2, say, times area and cosine: four facets of 1.605 m x 1.275 m."""
+    rng, fan = np.random.default_rng(1), 8
+    sun = Sun.of(0.02, 0.0, rng)
+    for plan in plans()[:3]:
+        exposure = plan.exposure(World())
+        cosine = float(exposure.stand().attitude[:, 2] @ plan.sun())
+        light = sum(float(light.sum()) for _, light in throw(exposure, sun, 64, fan, rng)) / fan
+        assert light == pytest.approx(4 * 1.605 * 1.275 * cosine, rel=0.008)
+
+
+def test_a_sheet_is_white_but_for_its_marks():
+    paint = sheet("lower")
+    assert np.median(paint) == pytest.approx(1, abs=0.05)
+    assert paint.min() > 0.05
+    assert 0.005 < (paint < 0.5).mean() < 0.03
+
+
+def test_times_agree_with_the_sun(a_season):
+    made, folder = a_season("calm")
+    measurements = [one for name in folder.plant.heliostats for one in folder.measurements(name)]
+    assert len(measurements) == len(made.plans)
+    assert {clock_fault_of(folder, one) for one in measurements} == {None}
+
+
+def test_photographs_are_measured_back_to_the_light_that_was_on_the_sheet(a_season):
+    made, folder = a_season("calm")
+    photographs, skipped = photographs_of(folder)
+    light = {
+        f"{plan.heliostat.name}/{identifier}": image
+        for plan, identifier, image in zip(made.plans, made.identifiers, made.light, strict=True)
+    }
+    assert not skipped
+    assert any(p.clipped is not None for p in photographs)
+    assert np.mean([_accuracy(p, light[p.key]) for p in photographs]) > 0.94
+
+
+@pytest.mark.parametrize("case", [name for name in changes.CHANGES if not name.endswith("always")])
+def test_the_model_with_the_truth_explains_a_season(a_season, case):
+    """At each time by what is in force then; neither a law of sheet and spot together nor two cameras are in words."""
+    made, folder = a_season(case)
+    photographs, _ = photographs_of(folder)
+    setups = [p.setup for p in photographs]
+    view = View(256, 256)
+    with_truth, without = (
+        forecast_setups(setups, None, effects, view, latitude_deg=JUELICH_LATITUDE).double().clamp(min=0).numpy()
+        for effects in (effects_of(made), [])
+    )
+    after, before = (
+        np.array([_accuracy(p, image) for p, image in zip(photographs, images, strict=True)])
+        for images in (with_truth, without)
+    )
+    if case in ("law_since", "two_cameras"):
+        assert 0.88 < after.mean() < 0.95
+    else:
+        changed = np.abs(after - before) > 1e-4
+        assert after.mean() > 0.93
+        assert changed.any() == (case != "calm")
+        assert case == "calm" or (after - before)[changed].mean() > 0.005
+
+
+def _accuracy(photograph: FluxImage, light: np.ndarray) -> float:
+    """Of light (256, 256) over the whole target, cut off where the photograph is."""
+    plane, clipped = photograph.setup.plane, photograph.clipped
+    if clipped is not None:
+        light = clipped_alike(light, photograph.image, clipped.astype(float))
+    return compare_on_target(photograph.image, light, (plane.width, plane.height), 6.0, 32).accuracy
