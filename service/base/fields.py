@@ -13,9 +13,11 @@ from pydantic import (
     BaseModel,
     BeforeValidator,
     ConfigDict,
+    Discriminator,
     Field,
     Strict,
     StringConstraints,
+    Tag,
 )
 
 from model.plant import Cylinder, TargetPlane
@@ -155,6 +157,25 @@ class Sun(Model):
 
     azimuth_deg: Azimuth
     elevation_deg: Elevation
+
+
+class SunAt(Model):
+    """Where the sun stands over the plant at a time."""
+
+    at: Moment = Field(description="Time with zone; by day.")
+
+
+def _way_to_say(sun: Any) -> str:
+    """Which of the two ways somebody says where the sun stands by."""
+    by_time = "at" in sun if isinstance(sun, dict) else isinstance(sun, SunAt)
+    return "(time)" if by_time else "(position)"
+
+
+AnySun = Annotated[
+    Annotated[Sun, Tag("(position)")] | Annotated[SunAt, Tag("(time)")],
+    Discriminator(_way_to_say),
+    Field(description='Where the sun stands: its position, or the time, `{"at": ..}`.'),
+]
 
 
 def _square(value: Any) -> Any:

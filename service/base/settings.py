@@ -4,6 +4,7 @@ import ipaddress
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal, Self
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 from pydantic import Field, SecretStr, field_validator, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
@@ -179,6 +180,9 @@ class Settings(BaseSettings):
     )
     log_level: LogLevel = "info"
     log_format: Literal["text", "json"] = Field(default="text", description="json: one object a line.")
+    time_zone: str | None = Field(
+        default=None, description="The plant's zone, as `Europe/Berlin`: pages tell times in it beside UTC."
+    )
     metrics_port: int | None = Field(
         default=None,
         ge=1,
@@ -205,6 +209,14 @@ class Settings(BaseSettings):
         if backend not in _DRIVERS:
             raise ValueError(f"must be a sqlite or postgresql URL, not {backend}")
         return value
+
+    @field_validator("time_zone")
+    @classmethod
+    def _known_zone(cls, value: str | None) -> str | None:
+        try:
+            return None if value is None else ZoneInfo(value).key
+        except (ZoneInfoNotFoundError, ValueError, OSError) as error:
+            raise ValueError(f"must be a zone of the tz database such as Europe/Berlin, not {value!r}") from error
 
     @field_validator("forwarded_allow_ips")
     @classmethod

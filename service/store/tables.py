@@ -231,7 +231,10 @@ class DriftRow(Base):
 
 
 class ForecastRow(Base):
-    """A computed flux map: its inputs, its npz ``flux`` (rows, columns) float32 [W/m2] and its figures."""
+    """A computed flux map: its inputs, its npz ``flux`` (rows, columns) float32 [W/m2] and its figures.
+
+    ``sun_at`` is the time that was asked for, where the sun was not asked for by its position.
+    """
 
     __tablename__ = "forecasts"
 
@@ -242,6 +245,7 @@ class ForecastRow(Base):
     plane: Mapped[dict[str, Any]]
     sun_azimuth_deg: Mapped[float]
     sun_elevation_deg: Mapped[float]
+    sun_at: Mapped[datetime | None]
     aim_point_m: Mapped[list[float] | None]
     dni_w_m2: Mapped[float]
     window_m: Mapped[float | None]

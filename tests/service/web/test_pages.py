@@ -3,6 +3,7 @@
 import re
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -250,9 +251,43 @@ def test_forecast_form_takes_a_time(pages: TestClient, operations: FakeOperation
     assert up == pytest.approx(0.887, abs=0.002)
 
 
+def field_of(page: str, name: str) -> str:
+    """The value that stands in a field of a form."""
+    found = re.search(rf'name="{name}"[^>]* value="([^"]*)"', page)
+    assert found is not None
+    return found[1]
+
+
+def test_forecast_page_keeps_what_was_asked(pages: TestClient):
+    """Made anew from its own page, a forecast is the same forecast."""
+    asked = form(sun_by="time", moment="2026-06-21T11:36", surface="ideal", dni_w_m2="850")
+    page = text_of(pages, pages.post("/forecast", data=asked, follow_redirects=False).headers["Location"])
+    assert 'value="time" checked' in page
+    assert 'value="position" checked' not in page
+    assert (field_of(page, "moment"), field_of(page, "dni_w_m2")) == ("2026-06-21T11:36", "850")
+    assert 'value="ideal" selected' in page
+    assert "2026-06-21 11:36 UTC" in page
+    by_position = text_of(pages, "/forecasts/1")
+    assert 'value="position" checked' in by_position
+    assert (field_of(by_position, "azimuth_deg"), field_of(by_position, "elevation_deg")) == ("-20.0", "45.0")
+
+
+def test_times_are_told_by_the_plants_clocks_too(tmp_path: Path, operations: FakeOperations):
+    app = create_app(Settings(data_dir=tmp_path, time_zone="Europe/Berlin", **QUIET), operations)
+    with client_of(app) as client:
+        client.put("/v1/plant", json=tower_document())
+        client.put("/v1/heliostats/AA39", json=properties_document())
+        fill(client)
+        asked = form(sun_by="time", moment="2026-06-21T11:36")
+        page = text_of(client, client.post("/forecast", data=asked, follow_redirects=False).headers["Location"])
+    assert page.count("2026-06-21 13:36 CEST") == 2
+
+
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
+        ({"sun_by": "time", "moment": "0001-01-01T12:00"}, "moment"),
+        ({"sun_by": "time", "moment": "0001-01-01T12:00+14:00"}, "moment"),
         ({"sun_by": "time", "moment": "2026-06-21T00:00"}, "below the horizon"),
         ({"sun_by": "time"}, "say when"),
         ({"azimuth_deg": "", "elevation_deg": ""}, "say where the sun stands"),
