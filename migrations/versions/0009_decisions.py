@@ -1,4 +1,4 @@
-"""Forecasts keep the time that they were asked for."""
+"""Which surface is today's is decided, and decisions are kept; forecasts keep the time that they were asked for."""
 
 import sqlalchemy as sa
 from alembic import op
@@ -11,7 +11,32 @@ depends_on = None
 
 def upgrade() -> None:
     op.add_column("forecasts", sa.Column("sun_at", sa.DateTime(timezone=True), nullable=True))
+    op.add_column("surfaces", sa.Column("set_aside", sa.Boolean(), server_default=sa.false(), nullable=False))
+    op.create_table(
+        "surface_decisions",
+        sa.Column("id", sa.Integer(), nullable=False),
+        sa.Column("heliostat_id", sa.Integer(), nullable=False),
+        sa.Column("surface_id", sa.Integer(), nullable=False),
+        sa.Column("previous", sa.Integer(), nullable=True),
+        sa.Column("taken", sa.Boolean(), nullable=False),
+        sa.Column("made_at", sa.DateTime(timezone=True), nullable=False),
+        sa.Column("made_by", sa.String(64), nullable=False),
+        sa.Column("reason", sa.String(200), nullable=False),
+        sa.Column("accuracy_before", sa.Double(), nullable=True),
+        sa.Column("accuracy_after", sa.Double(), nullable=True),
+        sa.Column("photographs", sa.Integer(), nullable=False),
+        sa.Column("set_aside_before", sa.JSON(none_as_null=True), nullable=False),
+        sa.ForeignKeyConstraint(
+            ["heliostat_id"], ["heliostats.id"], name=op.f("fk_surface_decisions_heliostat_id_heliostats")
+        ),
+        sa.ForeignKeyConstraint(["surface_id"], ["surfaces.id"], name=op.f("fk_surface_decisions_surface_id_surfaces")),
+        sa.PrimaryKeyConstraint("id", name=op.f("pk_surface_decisions")),
+    )
+    op.create_index(op.f("ix_surface_decisions_heliostat_id"), "surface_decisions", ["heliostat_id"])
 
 
 def downgrade() -> None:
+    # Older versions know nothing of what is set aside: there the newest surface is today's again.
+    op.drop_table("surface_decisions")
+    op.drop_column("surfaces", "set_aside")
     op.drop_column("forecasts", "sun_at")

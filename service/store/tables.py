@@ -190,7 +190,8 @@ class SurfaceRow(Base):
     """One version of a heliostat's surface; npz ``z``, ``z_std`` (4, 8, 8) and ``control_points`` (4, 8, 8, 3) [m].
 
     ``content_sha256`` is set where the same content must not be stored twice (imports); predictions leave it empty.
-    ``model`` names the weights, ``model_version`` the plant's model with its effects that a prediction was made by.
+    What is ``set_aside`` is never current (`service.store.decisions`). ``model`` names the weights, ``model_version``
+    the plant's model with its effects that a prediction was made by.
     """
 
     __tablename__ = "surfaces"
@@ -211,11 +212,37 @@ class SurfaceRow(Base):
     model_version: Mapped[str | None] = mapped_column(String(MODEL_VERSION))
     misfit: Mapped[float | None]
     content_sha256: Mapped[str | None] = mapped_column(String(64))
+    set_aside: Mapped[bool] = mapped_column(server_default=false())
     arrays: Mapped[bytes] = mapped_column(LargeBinary, deferred=True)
 
     measurements: Mapped[list[MeasurementRow]] = relationship(
         secondary=surface_measurements, order_by=MeasurementRow.id, lazy="selectin"
     )
+
+
+class DecisionRow(Base):
+    """That a version became a heliostat's surface of today, or did not, and on what grounds.
+
+    ``previous`` is the version that was today's; ``set_aside_before`` are those that were set aside until then, which
+    is what taking the decision back restores. Accuracies [1] are those of the former surface and of this one.
+    """
+
+    __tablename__ = "surface_decisions"
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    heliostat_id: Mapped[int] = mapped_column(ForeignKey("heliostats.id"), index=True)
+    surface_id: Mapped[int] = mapped_column(ForeignKey("surfaces.id"))
+    previous: Mapped[int | None]
+    taken: Mapped[bool]
+    made_at: Mapped[datetime] = mapped_column(default=now)
+    made_by: Mapped[str] = mapped_column(String(64))
+    reason: Mapped[str] = mapped_column(String(200))
+    accuracy_before: Mapped[float | None]
+    accuracy_after: Mapped[float | None]
+    photographs: Mapped[int]
+    set_aside_before: Mapped[list[int]]
+
+    surface: Mapped[SurfaceRow] = relationship(lazy="joined", innerjoin=True)
 
 
 class DriftRow(Base):

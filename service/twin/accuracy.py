@@ -6,7 +6,7 @@ model another version.
 """
 
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from statistics import fmean
 from typing import Any
@@ -22,7 +22,7 @@ from service.base.faults import ServiceError
 from service.store.tables import DriftRow, HeliostatRow, MeasurementRow, SurfaceRow
 from service.twin import versions
 from service.twin.book import Book
-from service.twin.evidence import Evidence, Twin, evidence_of, heights_of, load_twin
+from service.twin.evidence import Array, Evidence, Twin, evidence_of, heights_of, load_twin
 from service.twin.runtime import Runtime
 
 logger = logging.getLogger("heliotwin.service")
@@ -58,9 +58,27 @@ class Comparison:
     was_used: bool
 
 
-def _newest(session: Session, heliostat: HeliostatRow) -> list[MeasurementRow]:
-    recent = store.recent_measurements(session, heliostat, RECENT)
-    return store.get_measurements(session, heliostat, [row.identifier for row in recent], arrays=True)
+# The newest photographs, this many times as many as are held against a forecast, are looked through for unseen ones.
+_LOOKED_THROUGH = 4
+
+
+def name_of(row: MeasurementRow) -> str:
+    """Of the photograph that an image shows: one photograph may be stored in several kinds."""
+    return row.external_id or row.identifier
+
+
+def seen_by(surface: SurfaceRow | None) -> set[str]:
+    """Names of the photographs that a surface was made from."""
+    return set() if surface is None else {name_of(row) for row in surface.measurements}
+
+
+def unseen_first(session: Session, heliostat: HeliostatRow, seen: Collection[str]) -> tuple[list[MeasurementRow], int]:
+    """A heliostat's newest photographs, with arrays, first those not ``seen``; and how many of them are not."""
+    recent = store.recent_measurements(session, heliostat, _LOOKED_THROUGH * RECENT)
+    unseen = [row for row in recent if name_of(row) not in seen]
+    chosen = (unseen + [row for row in recent if name_of(row) in seen])[:RECENT]
+    rows = store.get_measurements(session, heliostat, [row.identifier for row in chosen], arrays=True)
+    return rows, min(len(unseen), RECENT)
 
 
 def compare(runtime: Runtime, name: str, surface: SurfaceRow | None) -> list[Comparison]:
@@ -75,25 +93,25 @@ def compare(runtime: Runtime, name: str, surface: SurfaceRow | None) -> list[Com
     """
     with runtime.database.reading() as session:
         twin = load_twin(session, name)
-        rows = _newest(session, twin.row)
+        rows, _ = unseen_first(session, twin.row, seen_by(surface))
     if not rows:
         return []
     shown = [evidence_of(row, twin.origin) for row in rows]
-    used = set() if surface is None else {measurement.id for measurement in surface.measurements}
+    used, forecasts = seen_by(surface), forecasts_of(runtime, twin, shown, heights_of(surface))
     return [
-        Comparison(row, evidence.centered, forecast, flux_accuracy(evidence.centered, forecast), row.id in used)
-        for row, evidence, forecast in zip(rows, shown, forecasts_of(runtime, twin, shown, surface), strict=True)
+        Comparison(row, evidence.centered, forecast, flux_accuracy(evidence.centered, forecast), name_of(row) in used)
+        for row, evidence, forecast in zip(rows, shown, forecasts, strict=True)
     ]
 
 
-def forecasts_of(runtime: Runtime, twin: Twin, shown: Sequence[Evidence], surface: SurfaceRow | None) -> NDArray[Any]:
-    """What a stored surface, or the ideal one, throws where each photograph shows its spot: (n, 64, 64), sum 100."""
+def forecasts_of(runtime: Runtime, twin: Twin, shown: Sequence[Evidence], z: Array | None) -> NDArray[Any]:
+    """What heights (4, 8, 8) [m], None the ideal ones, throw where photographs show spots: (n, 64, 64), sum 100."""
     observations, model = [evidence.observation() for evidence in shown], twin.model
     with runtime.computing("compare") as operations:
         return operations.render(
             twin.heliostat,
             observations,
-            heights_of(surface),
+            z,
             model.optics,
             model.effects,
             latitude_deg=twin.origin[0],
@@ -207,7 +225,7 @@ def judge(runtime: Runtime, twin: Twin, surface: SurfaceRow | None, shown: Evide
     if surface is None:
         return None
     try:
-        (forecast,) = forecasts_of(runtime, twin, [shown], surface)
+        (forecast,) = forecasts_of(runtime, twin, [shown], heights_of(surface))
         return float(flux_accuracy(shown.centered, forecast))
     except ModelError as error:
         logger.warning("the drift of heliostat %s cannot be told: %s", twin.row.name, error)

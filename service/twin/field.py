@@ -76,7 +76,7 @@ def _current_surfaces(session: Session) -> dict[int, Current]:
     place = func.row_number().over(
         partition_by=SurfaceRow.heliostat_id, order_by=(SurfaceRow.valid_from.desc(), SurfaceRow.version.desc())
     )
-    ranked = select(SurfaceRow.id, place.label("place")).subquery()
+    ranked = select(SurfaceRow.id, place.label("place")).where(~SurfaceRow.set_aside).subquery()
     query = select(
         SurfaceRow.heliostat_id,
         SurfaceRow.id,

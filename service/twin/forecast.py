@@ -32,8 +32,9 @@ class ForecastRequest:
     """What to forecast; ``target`` names a stored plane, else ``plane`` is one.
 
     ``sun_azimuth_deg`` counts from south, positive to the east; ``sun_at`` is the time that was asked for, if one was.
-    ``aim`` (3,) [m] is by default the plane's centre. ``surface``: "current", "ideal" or a version. ``window`` [m]: the side of a square about the centre of mass that is
-    mapped; the whole plane without it. ``model_version`` is the plant's model, by default the current one.
+    ``aim`` (3,) [m] is by default the plane's centre. ``surface``: "current", "ideal" or a version. ``window`` [m]: the
+    side of a square about the centre of mass that is mapped; the whole plane without it. ``model_version`` is the
+    plant's model, by default the current one.
     """
 
     heliostat: str

@@ -20,7 +20,8 @@ from service.base.fields import Version
 from service.drawing import charts
 from service.drawing.charts import HeatMap, History, Scale
 from service.drawing.pictures import mirror_heights
-from service.store.tables import HeliostatRow, MeasurementRow, SurfaceRow
+from service.store import decisions
+from service.store.tables import DecisionRow, HeliostatRow, MeasurementRow, SurfaceRow
 from service.twin.accuracy import RECENT, Compared, Comparison, ComparisonBook
 from service.twin.field import Figures, figures_of
 from service.web.answers.pages import render
@@ -31,6 +32,8 @@ router = APIRouter(include_in_schema=False, dependencies=[READ])
 # Newest surfaces and photographs that the page lists.
 _MOST_SURFACES = 40
 _MOST_PHOTOGRAPHS = 60
+# Last decisions on which surface is today's that the page tells.
+_MOST_DECISIONS = 5
 # Points along each side of a facet in the view in space.
 _SPACE_SAMPLES = 14
 # Side of the window of measured fluxes [m].
@@ -149,6 +152,7 @@ class _Read:
     today: SurfaceRow | None
     surface: SurfaceRow | None
     surfaces: list[SurfaceRow]
+    decided: Sequence[DecisionRow]
     photographs: Sequence[MeasurementRow]
     compared: Compared
 
@@ -165,11 +169,12 @@ def _read(
         today = store.find_surface_at(session, row)
         surface = today if version is None else store.get_surface(session, row, version)
         surfaces = _newest_surfaces(session, row)
+        decided = decisions.list_decisions(session, row, _MOST_DECISIONS)
         photographs = _newest_photographs(session, row)
         shown = book.read(session, row, surface)
     # The rest of the page does not depend on them.
     compared = Compared() if shown is None else book.wait_for(shown) or _UNDER_WAY
-    return _Read(row, today, surface, surfaces, photographs, compared)
+    return _Read(row, today, surface, surfaces, decided, photographs, compared)
 
 
 @router.get("/heliostats/{name}")
@@ -184,6 +189,7 @@ def get_heliostat_page(request: Request, read: Annotated[_Read, Depends(_read)],
         surface=read.surface,
         today=read.today,
         versions=listed,
+        decided=read.decided,
         histories=_histories(listed) if listed else [],
         comparisons=[_comparison_figure(comparison) for comparison in comparisons],
         trouble=read.compared.trouble,

@@ -10,12 +10,13 @@ from service.base.fields import Method, Model, Name, Version
 from service.drawing import charts
 from service.drawing.charts import HeatMap
 from service.jobs.asking import ask_for, cancel_for
+from service.jobs.kind import result_of
 from service.jobs.kinds.predictions import PredictionsIn
 from service.store import queue
 from service.store.sizes import sizes
 from service.store.tables import JobRow
 from service.web.answers.pages import go_to, render
-from service.web.door.dependencies import DRAWS, OPERATE, READ, IdentityDep, RuntimeDep
+from service.web.door.dependencies import DRAWS, OPERATE, READ, IdentityDep, KindsDep, RuntimeDep
 
 router = APIRouter(include_in_schema=False)
 
@@ -31,7 +32,7 @@ class PredictionForm(Model):
     """The form that asks for surfaces; without a heliostat of all of them."""
 
     heliostat: Name | None = None
-    method: Method = "network"
+    method: Method = "refined"
 
 
 @router.get("/jobs", dependencies=[READ])
@@ -83,7 +84,7 @@ def _asked(payload: dict[str, Any]) -> dict[str, Any]:
 
 
 @router.get("/jobs/{number}", dependencies=[READ, DRAWS])
-def get_job_page(number: Number, request: Request, runtime: RuntimeDep) -> HTMLResponse:
+def get_job_page(number: Number, request: Request, runtime: RuntimeDep, kinds: KindsDep) -> HTMLResponse:
     """A job; the page follows it until it ends.
 
     While it does, each change asks for what changes only: neither what was asked nor a result is read for that.
@@ -94,7 +95,7 @@ def get_job_page(number: Number, request: Request, runtime: RuntimeDep) -> HTMLR
         if not is_live or "hx-request" not in request.headers:
             session.expunge(row)
             row = queue.get_job(session, number, arrays=True)
-            asked, result, flux = _asked(row.payload), row.result or {}, _flux(row)
+            asked, result, flux = _asked(row.payload), result_of(kinds, session, row) or {}, _flux(row)
     return render(
         request,
         "job.html",
@@ -105,6 +106,8 @@ def get_job_page(number: Number, request: Request, runtime: RuntimeDep) -> HTMLR
         facts={name: value for name, value in result.items() if _plain(value)},
         counts=result.get("counts", {}),
         surfaces=result.get("surfaces", {}),
+        unchanged=result.get("unchanged", {}),
+        judged=result.get("judged", {}),
         skipped=result.get("skipped", {}),
         shown=_SHOWN,
     )

@@ -34,8 +34,8 @@ def fill(client: TestClient) -> None:
     assert post(png(1), id="101").status_code == 201
     assert post(png(2), id="102", sun_azimuth=-30.0).status_code == 201
     assert post(png(3, refused=True), id="103").status_code == 201
-    for _ in range(2):
-        assert client.post("/v1/heliostats/AA39/surfaces", json={}).status_code == 201
+    for method in ("network", "refined"):
+        assert client.post("/v1/heliostats/AA39/surfaces", json={"method": method}).status_code == 201
     sun = {"azimuth_deg": -20, "elevation_deg": 45}
     assert client.post("/v1/forecasts", json={"heliostat": "AA39", "target": "lower", "sun": sun}).status_code == 201
     assert client.post("/v1/jobs/imports", json={"folder": "<script>alert(1)</script>"}).status_code == 202
@@ -196,9 +196,9 @@ def test_accuracy_is_worked_out_once_for_each_surface(pages: TestClient, operati
     assert rendered > 0
     settled(pages)
     assert operations.rendered == rendered
-    assert pages.post("/v1/heliostats/AA39/surfaces", json={}).status_code == 201
+    assert pages.post("/v1/heliostats/AA39/surfaces", json={"images": 1}).status_code == 201
     settled(pages)
-    assert operations.rendered == rendered + 1
+    assert operations.rendered == rendered + 3  # both surfaces to judge the new one, then today's
 
 
 def test_heliostat_without_anything_is_drawn_hollow(pages: TestClient, properties: dict[str, Any]):
