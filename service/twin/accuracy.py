@@ -119,6 +119,20 @@ def forecasts_of(runtime: Runtime, twin: Twin, shown: Sequence[Evidence], z: Arr
 
 
 @dataclass(frozen=True)
+class Rank:
+    """Mean accuracy [1] on photographs that the surface was not made from, and how many there are; None without any."""
+
+    accuracy: float | None
+    photographs: int
+
+
+def rank_of(comparisons: Sequence[Comparison]) -> Rank:
+    """What comparisons prove of a surface: those that it was made from prove nothing."""
+    unseen = [comparison.accuracy for comparison in comparisons if not comparison.was_used]
+    return Rank(fmean(unseen) if unseen else None, len(unseen))
+
+
+@dataclass(frozen=True)
 class State:
     """What a heliostat's accuracy depends on.
 
@@ -132,31 +146,30 @@ class State:
 
 
 class AccuracyBook:
-    """Mean accuracies [1] by `State`; those that are missing are worked out in the background."""
+    """How well heliostats are forecast, by `State`; what is missing is worked out in the background."""
 
     def __init__(self, runtime: Runtime) -> None:
         self._runtime = runtime
-        self._book: Book[State, float | None] = Book(self._accuracy, None, "accuracy", _MOST)
+        self._book: Book[State, Rank] = Book(self._rank, Rank(None, 0), "accuracy", _MOST)
 
-    def look_up(self, states: Iterable[State]) -> tuple[dict[str, float | None], int]:
-        """What is known, by heliostat (None: it could not be told), and how many are still being worked out."""
+    def look_up(self, states: Iterable[State]) -> tuple[dict[str, Rank], int]:
+        """What is known, by heliostat, and how many are still being worked out."""
         known, missing = self._book.look_up(states)
-        return {state.heliostat: accuracy for state, accuracy in known.items()}, missing
+        return {state.heliostat: rank for state, rank in known.items()}, missing
 
     def close(self) -> None:
         """Stop working, and wait for what is under way."""
         self._book.close()
 
-    def _accuracy(self, state: State) -> float | None:
-        """Of the surface that is current by now; None where it cannot be told, which the log explains."""
+    def _rank(self, state: State) -> Rank:
+        """Of the surface that is current by now; where it cannot be told the log explains why."""
         try:
             with self._runtime.database.reading() as session:
                 surface = store.get_surface_at(session, store.get_heliostat(session, state.heliostat))
-            compared = compare(self._runtime, state.heliostat, surface)
-            return fmean(comparison.accuracy for comparison in compared) if compared else None
+            return rank_of(compare(self._runtime, state.heliostat, surface))
         except (ModelError, ServiceError) as error:
             logger.warning("the accuracy of heliostat %s cannot be told: %s", state.heliostat, error)
-        return None
+        return Rank(None, 0)
 
 
 @dataclass(frozen=True)

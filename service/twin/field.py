@@ -12,7 +12,7 @@ from service.base.arrays import unpack
 from service.store.columns import now
 from service.store.tables import HeliostatRow, MeasurementRow, SurfaceRow
 from service.twin import versions
-from service.twin.accuracy import AccuracyBook, State
+from service.twin.accuracy import AccuracyBook, Rank, State
 from service.twin.runtime import Runtime
 
 # Surfaces that are read at a time, to bound memory.
@@ -53,7 +53,10 @@ class Current:
 
 @dataclass(frozen=True)
 class Line:
-    """A heliostat in the field; what is None is not known (yet)."""
+    """A heliostat in the field; what is None is not known (yet).
+
+    Where it has a ``rank`` without an accuracy, no photograph can judge its surface: it was made from all of them.
+    """
 
     name: str
     east_m: float
@@ -63,7 +66,7 @@ class Line:
     newest: int | None = None
     surface: Current | None = None
     figures: Figures | None = None
-    accuracy: float | None = None
+    rank: Rank | None = None
 
     def state(self, model: int) -> State | None:
         """What its accuracy by this version of the model depends on; None where there is nothing to compare."""
@@ -141,12 +144,12 @@ class FieldBook:
         figures = self._figures_of(session, [line.surface.id for line in lines if line.surface is not None])
         model = versions.current_number(session)
         states = (line.state(model) for line in lines)
-        accuracies, pending = self._accuracies.look_up(state for state in states if state is not None)
+        ranks, pending = self._accuracies.look_up(state for state in states if state is not None)
         return [
             replace(
                 line,
                 figures=None if line.surface is None else figures.get(line.surface.id),
-                accuracy=accuracies.get(line.name),
+                rank=ranks.get(line.name),
             )
             for line in lines
         ], pending

@@ -12,6 +12,7 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from service.drawing.charts import Scale, scale_of
+from service.drawing.templates import figure
 from service.store.tables import JobRow, PlantRow, TargetRow
 from service.twin.accuracy import RECENT
 from service.twin.field import FieldBook, Line
@@ -54,7 +55,7 @@ def _age(line: Line) -> float | None:
 
 
 def _accuracy(line: Line) -> float | None:
-    return None if line.accuracy is None else line.accuracy * 100
+    return None if line.rank is None or line.rank.accuracy is None else line.rank.accuracy * 100
 
 
 MetricName = Literal["deviation", "uncertainty", "misfit", "age", "accuracy"]
@@ -68,7 +69,8 @@ METRICS: dict[str, Metric] = {
             "%",
             1,
             "viridis",
-            f"Mean agreement of forecast and measured flux on up to {RECENT} newest photographs, with today's surface.",
+            f"Mean agreement of forecast and measured flux, with today's surface, on the {RECENT} newest photographs "
+            "that it was not made from; not yet judged where there are none.",
             _accuracy,
         ),
         Metric(
@@ -113,12 +115,15 @@ FieldBookDep = Annotated[FieldBook, Depends(_book)]
 
 @dataclass(frozen=True)
 class Dot:
-    """A heliostat on the drawn map, in the drawing's units; without a colour where its value is not known."""
+    """A heliostat on the drawn map, in the drawing's units; without a colour where its value is not known.
+
+    ``told`` is its value in words.
+    """
 
     line: Line
     x: float
     y: float
-    value: float | None
+    told: str
     colour: str | None
 
 
@@ -134,6 +139,13 @@ class Drawing:
     bar_m: float
     bar: float
     has_names: bool
+
+
+def _told(line: Line, metric: Metric) -> str:
+    if metric.name == "accuracy" and line.rank is not None and not line.rank.photographs:
+        return "not yet judged"
+    value = metric.value(line)
+    return "not known" if value is None else figure(value, metric.digits, metric.unit)
 
 
 _WIDTH = 720.0
@@ -158,7 +170,7 @@ def draw(lines: Sequence[Line], metric: Metric, scale: Scale) -> Drawing:
     values = [metric.value(line) for line in lines]
     colours = scale.names([math.nan if value is None else value for value in values])
     dots = [
-        Dot(line, float(x[i]), float(y[i]), value, None if value is None else colour)
+        Dot(line, float(x[i]), float(y[i]), _told(line, metric), None if value is None else colour)
         for i, (line, value, colour) in enumerate(zip(lines, values, colours, strict=True))
     ]
     bar_m = _round_length(width / 4 / per_metre)

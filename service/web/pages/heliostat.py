@@ -22,7 +22,7 @@ from service.drawing.charts import HeatMap, History, Scale
 from service.drawing.pictures import mirror_heights
 from service.store import decisions
 from service.store.tables import DecisionRow, HeliostatRow, MeasurementRow, SurfaceRow
-from service.twin.accuracy import RECENT, Compared, Comparison, ComparisonBook
+from service.twin.accuracy import RECENT, Compared, Comparison, ComparisonBook, rank_of
 from service.twin.field import Figures, figures_of
 from service.web.answers.pages import render
 from service.web.door.dependencies import READ, NamePath, RuntimeDep, Turn
@@ -118,14 +118,6 @@ ComparisonBookDep = Annotated[ComparisonBook, Depends(_book)]
 _UNDER_WAY = Compared(trouble="The forecasts of its photographs are being worked out; look again in a moment.")
 
 
-def _means(comparisons: Sequence[Comparison]) -> dict[str, float | None]:
-    groups = {
-        "accuracy": [c.accuracy for c in comparisons],
-        "accuracy_new": [c.accuracy for c in comparisons if not c.was_used],
-    }
-    return {name: fmean(group) if group else None for name, group in groups.items()}
-
-
 def _surface_context(surface: SurfaceRow, size: tuple[float, float]) -> dict[str, Any]:
     arrays = unpack(surface.arrays)
     shown = figures_of(surface.arrays)
@@ -195,6 +187,7 @@ def get_heliostat_page(request: Request, read: Annotated[_Read, Depends(_read)],
         trouble=read.compared.trouble,
         recent=RECENT,
         photographs=read.photographs,
-        **_means(comparisons),
+        rank=rank_of(comparisons),
+        accuracy_seen=fmean(seen) if (seen := [c.accuracy for c in comparisons if c.was_used]) else None,
         **(_surface_context(read.surface, _size(read.row)) if read.surface is not None else {}),
     )

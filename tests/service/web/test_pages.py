@@ -35,7 +35,10 @@ def fill(client: TestClient) -> None:
     assert post(png(2), id="102", sun_azimuth=-30.0).status_code == 201
     assert post(png(3, refused=True), id="103").status_code == 201
     for method in ("network", "refined"):
-        assert client.post("/v1/heliostats/AA39/surfaces", json={"method": method}).status_code == 201
+        assert (
+            client.post("/v1/heliostats/AA39/surfaces", json={"method": method, "measurements": ["101"]}).status_code
+            == 201
+        )
     sun = {"azimuth_deg": -20, "elevation_deg": 45}
     assert client.post("/v1/forecasts", json={"heliostat": "AA39", "target": "lower", "sun": sun}).status_code == 201
     assert client.post("/v1/jobs/imports", json={"folder": "<script>alert(1)</script>"}).status_code == 202
@@ -185,8 +188,20 @@ def test_field_shows_every_figure_as_colour_and_as_number(shown: TestClient, met
     label = re.search(r'aria-label="AA39: ([^"]+)"', page)
     assert label is not None
     number = label[1].split("\N{NO-BREAK SPACE}")[0]
-    assert f'<td class="number">{number}</td>' in page
+    assert f'<td class="number">{number}' in page
     assert re.search(r'<circle [^>]*fill="#[0-9a-f]{6}"', page)
+
+
+def test_surface_made_from_all_photographs_is_not_yet_judged(pages: TestClient):
+    """What it was made from proves nothing of it."""
+    assert "not yet judged" not in settled(pages)
+    pages.post("/v1/heliostats/AA39/surfaces", json={"images": 2})
+    page = settled(pages)
+    assert 'aria-label="AA39: not yet judged"' in page
+    assert '<small class="short">not yet judged</small>' in page
+    page = text_of(pages, "/heliostats/AA39")
+    assert "not yet judged" in page
+    assert "100.0\N{NO-BREAK SPACE}% on photographs that it was made from, which flatters it" in page
 
 
 def test_accuracy_is_worked_out_once_for_each_surface(pages: TestClient, operations: FakeOperations):
@@ -196,7 +211,7 @@ def test_accuracy_is_worked_out_once_for_each_surface(pages: TestClient, operati
     assert rendered > 0
     settled(pages)
     assert operations.rendered == rendered
-    assert pages.post("/v1/heliostats/AA39/surfaces", json={"images": 1}).status_code == 201
+    assert pages.post("/v1/heliostats/AA39/surfaces", json={"measurements": ["102"]}).status_code == 201
     settled(pages)
     assert operations.rendered == rendered + 3  # both surfaces to judge the new one, then today's
 

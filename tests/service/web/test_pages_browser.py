@@ -81,7 +81,7 @@ def fill(app: FastAPI) -> None:
         send = poster(client)
         for seed, azimuth in enumerate((20.0, -30.0)):
             assert send(png(seed), id=f"10{seed}", sun_azimuth=azimuth).status_code == 201
-        assert client.post("/v1/heliostats/AA39/surfaces", json={}).status_code == 201
+        assert client.post("/v1/heliostats/AA39/surfaces", json={"measurements": ["100"]}).status_code == 201
         sun = {"azimuth_deg": -20, "elevation_deg": 45}
         body = {"heliostat": "AA39", "target": "lower", "sun": sun}
         assert client.post("/v1/forecasts", json=body).status_code == 201
