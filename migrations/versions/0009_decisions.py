@@ -1,4 +1,4 @@
-"""Which surface is today's is decided, and decisions are kept; forecasts keep the time that they were asked for."""
+"""Surfaces keep whether they are trusted; what is today's is decided, and decisions are kept; a forecast's time, too."""
 
 import sqlalchemy as sa
 from alembic import op
@@ -9,9 +9,23 @@ branch_labels = None
 depends_on = None
 
 
+_TRUST = (
+    sa.Column("trusted", sa.Boolean(), nullable=True),
+    sa.Column("doubts", sa.JSON(none_as_null=True), nullable=True),
+    sa.Column("doubted_since", sa.DateTime(timezone=True), nullable=True),
+    sa.Column("suspicious", sa.JSON(none_as_null=True), nullable=True),
+    sa.Column("strangeness", sa.Double(), nullable=True),
+    sa.Column("sun_span_deg", sa.Double(), nullable=True),
+    sa.Column("seen_at", sa.DateTime(timezone=True), nullable=True),
+    sa.Column("seen_by", sa.String(64), nullable=True),
+)
+
+
 def upgrade() -> None:
     op.add_column("forecasts", sa.Column("sun_at", sa.DateTime(timezone=True), nullable=True))
     op.add_column("surfaces", sa.Column("set_aside", sa.Boolean(), server_default=sa.false(), nullable=False))
+    for column in _TRUST:
+        op.add_column("surfaces", column)
     op.create_table(
         "surface_decisions",
         sa.Column("id", sa.Integer(), nullable=False),
@@ -38,5 +52,6 @@ def upgrade() -> None:
 def downgrade() -> None:
     # Older versions know nothing of what is set aside: there the newest surface is today's again.
     op.drop_table("surface_decisions")
-    op.drop_column("surfaces", "set_aside")
+    for column in (*(column.name for column in _TRUST), "set_aside"):
+        op.drop_column("surfaces", column)
     op.drop_column("forecasts", "sun_at")

@@ -46,6 +46,7 @@ from service.store.results import (
 from service.store.rows import Change, insert, one_at_a_time
 from service.store.surfaces import (
     NewSurface,
+    Trust,
     add_surface,
     current_surfaces,
     find_alike,
@@ -54,11 +55,13 @@ from service.store.surfaces import (
     get_surface,
     get_surface_at,
     list_surfaces,
+    newest_prediction,
 )
 
 __all__ = [
     "Change",
     "NewSurface",
+    "Trust",
     "add_forecast",
     "add_heliostat",
     "add_measurement",
@@ -93,6 +96,7 @@ __all__ = [
     "list_studies",
     "list_surfaces",
     "list_targets",
+    "newest_prediction",
     "one_at_a_time",
     "put_heliostat",
     "put_plant",

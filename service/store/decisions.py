@@ -8,6 +8,7 @@ from sqlalchemy.orm import Session
 
 from service.base.faults import ConflictError
 from service.store import audit
+from service.store.columns import now
 from service.store.rows import hold
 from service.store.surfaces import find_surface_at
 from service.store.tables import DecisionRow, HeliostatRow, SurfaceRow
@@ -100,6 +101,21 @@ def undo(session: Session, heliostat: HeliostatRow, actor: str) -> DecisionRow:
             row.set_aside = version in last.set_aside_before
     session.flush()
     return back
+
+
+def see(session: Session, heliostat: HeliostatRow, surface: SurfaceRow, actor: str) -> None:
+    """Note that somebody has seen that a surface is not trusted; the first who did stays.
+
+    Raises
+    ------
+    ConflictError
+        Where there is no doubt in it.
+    """
+    if not surface.doubts:
+        raise ConflictError(f"heliostat {heliostat.name}: nothing is doubted of surface {surface.version}")
+    if surface.seen_by is None:
+        surface.seen_at, surface.seen_by = now(), actor
+        audit.record(session, actor, "surface.seen", f"heliostat {heliostat.name}", version=surface.version)
 
 
 def list_decisions(session: Session, heliostat: HeliostatRow, limit: int) -> Sequence[DecisionRow]:

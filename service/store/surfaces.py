@@ -21,6 +21,20 @@ from service.store.tables import HeliostatRow, MeasurementRow, SurfaceRow
 _ALIKE_M = 1e-7
 
 
+@dataclass(frozen=True)
+class Trust:
+    """What a prediction says of itself.
+
+    ``doubts`` are sentences, none where it is trusted; ``suspicious`` the measurements that it does not explain;
+    ``strangeness`` its Mahalanobis distance; ``sun_span_deg`` the largest angle between the suns of its photographs.
+    """
+
+    doubts: tuple[str, ...]
+    suspicious: tuple[str, ...]
+    strangeness: float
+    sun_span_deg: float
+
+
 @dataclass(frozen=True, eq=False)
 class NewSurface:
     """A surface to be stored as the next version.
@@ -40,6 +54,8 @@ class NewSurface:
         Version of the plant's model that it was made with.
     measurements : the rows that it was made from
     misfit : float
+    trust : Trust
+        Of a prediction.
     """
 
     source: str
@@ -51,6 +67,7 @@ class NewSurface:
     model_version: str | None = None
     measurements: Sequence[MeasurementRow] = field(default=())
     misfit: float | None = None
+    trust: Trust | None = None
 
     @property
     def content(self) -> str:
@@ -64,9 +81,22 @@ def _surfaces(heliostat: HeliostatRow) -> Select[SurfaceRow]:
 
 
 def _surface_row(heliostat: HeliostatRow, version: int, new: NewSurface, content: str | None) -> SurfaceRow:
-    created = now()
+    created, trust = now(), new.trust
     arrays = {"z": new.z, "z_std": new.z_std, "control_points": new.control_points}
+    told = (
+        {}
+        if trust is None
+        else {
+            "trusted": not trust.doubts,
+            "doubts": list(trust.doubts),
+            "doubted_since": created if trust.doubts else None,
+            "suspicious": list(trust.suspicious),
+            "strangeness": trust.strangeness,
+            "sun_span_deg": trust.sun_span_deg,
+        }
+    )
     return SurfaceRow(
+        **told,
         heliostat_id=heliostat.id,
         version=version,
         created_at=created,
@@ -109,6 +139,12 @@ def list_surfaces(
     """Up to ``limit`` versions, oldest first, those after version ``after``."""
     query = _surfaces(heliostat).order_by(SurfaceRow.version).limit(limit)
     return session.scalars(query.where(SurfaceRow.version > after) if after else query).all()
+
+
+def newest_prediction(session: Session, heliostat: HeliostatRow) -> SurfaceRow | None:
+    """The version that was predicted last, or None."""
+    query = _surfaces(heliostat).where(SurfaceRow.trusted.is_not(None))
+    return session.scalar(query.order_by(SurfaceRow.version.desc()).limit(1))
 
 
 def find_alike(session: Session, heliostat: HeliostatRow, new: NewSurface) -> SurfaceRow | None:

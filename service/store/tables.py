@@ -191,7 +191,10 @@ class SurfaceRow(Base):
 
     ``content_sha256`` is set where the same content must not be stored twice (imports); predictions leave it empty.
     What is ``set_aside`` is never current (`service.store.decisions`). ``model`` names the weights, ``model_version``
-    the plant's model with its effects that a prediction was made by.
+    the plant's model with its effects that a prediction was made by. Whether a prediction is ``trusted``
+    (`model.observation.SurfacePrediction`) stands with its ``doubts`` in words, since when the heliostat has had any,
+    and who has seen that; of a measured surface all of it is empty. ``sun_span_deg`` is the largest angle between the
+    suns of its photographs.
     """
 
     __tablename__ = "surfaces"
@@ -213,6 +216,14 @@ class SurfaceRow(Base):
     misfit: Mapped[float | None]
     content_sha256: Mapped[str | None] = mapped_column(String(64))
     set_aside: Mapped[bool] = mapped_column(server_default=false())
+    trusted: Mapped[bool | None]
+    doubts: Mapped[list[str] | None]
+    doubted_since: Mapped[datetime | None]
+    suspicious: Mapped[list[str] | None]
+    strangeness: Mapped[float | None]
+    sun_span_deg: Mapped[float | None]
+    seen_at: Mapped[datetime | None]
+    seen_by: Mapped[str | None] = mapped_column(String(64))
     arrays: Mapped[bytes] = mapped_column(LargeBinary, deferred=True)
 
     measurements: Mapped[list[MeasurementRow]] = relationship(

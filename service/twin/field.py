@@ -44,6 +44,10 @@ class Current:
     source: str
     valid_from: datetime
     misfit: float | None
+    trusted: bool | None = None
+    doubts: Sequence[str] | None = None
+    doubted_since: datetime | None = None
+    seen_by: str | None = None
 
     @property
     def age_days(self) -> float | None:
@@ -87,10 +91,14 @@ def _current_surfaces(session: Session) -> dict[int, Current]:
         SurfaceRow.source,
         SurfaceRow.valid_from,
         SurfaceRow.misfit,
+        SurfaceRow.trusted,
+        SurfaceRow.doubts,
+        SurfaceRow.doubted_since,
+        SurfaceRow.seen_by,
     )
     # The database picks them: a plant has many versions, and this is read at every refresh.
     query = query.join(ranked, ranked.c.id == SurfaceRow.id).where(ranked.c.place == 1)
-    return {row.heliostat_id: Current(*row[1:]) for row in session.execute(query)}
+    return {row.heliostat_id: Current(*tuple(row)[1:]) for row in session.execute(query)}
 
 
 def _photographs(session: Session) -> dict[tuple[int, bool], tuple[int, int]]:

@@ -3,9 +3,11 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 from sqlalchemy.orm import Session
 
-from model.observation import SurfacePrediction
+from model.frames import sun_direction
+from model.observation import TRUSTED_MAHALANOBIS, SurfacePrediction
 from service import store
 from service.base.choices import Method
 from service.store import audit, decisions
@@ -86,7 +88,24 @@ def _new_surface(
         model_version=twin.model.version,
         measurements=used,
         misfit=surface.misfit,
+        trust=_trust(surface, used),
     )
+
+
+def _trust(surface: SurfacePrediction, used: Sequence[MeasurementRow]) -> store.Trust:
+    """What a prediction says of itself, in words."""
+    misfits = dict(zip(surface.used, surface.misfits, strict=True))
+    doubts = [f"photograph {name} is not explained: {misfits[name]:.0%} of it is missed" for name in surface.suspicious]
+    if surface.mahalanobis > TRUSTED_MAHALANOBIS:
+        doubts.append(
+            f"the mirror is unlike those known: {surface.mahalanobis:.1f} standard deviations from them, "
+            f"{TRUSTED_MAHALANOBIS} are usual at most"
+        )
+    if not surface.trusted and not doubts:
+        doubts.append("the prediction does not trust itself")
+    suns = np.array([sun_direction(row.sun_azimuth_deg, row.sun_elevation_deg) for row in used])
+    span = float(np.degrees(np.arccos(np.clip(suns @ suns.T, -1, 1)).max()))
+    return store.Trust(tuple(doubts), surface.suspicious, float(surface.mahalanobis), span)
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,10 +126,12 @@ def keep_surface(session: Session, predicted: Predicted, actor: str) -> Kept:
     if predicted.known is not None:
         return Kept(store.get_surface(session, heliostat, predicted.known.version), is_new=False)
     today = store.find_surface_at(session, heliostat)
+    last = store.newest_prediction(session, heliostat)
     used = store.get_measurements(session, heliostat, [row.identifier for row in new.measurements])
     row, _ = store.add_surface(session, heliostat, replace(new, measurements=used))
     about = {"version": row.version, "model": new.model_version}
     audit.record(session, actor, "surface.predicted", f"heliostat {heliostat.name}", **about)
+    _carry_doubts(row, last)
     judgement = predicted.judgement
     if judgement is None or today is None:
         return Kept(row)
@@ -121,6 +142,15 @@ def keep_surface(session: Session, predicted: Predicted, actor: str) -> Kept:
         return Kept(row, decision=decisions.keep_aside(session, heliostat, row, actor, Grounds(reason)))
     decide = decisions.take if judgement.taken else decisions.keep_aside
     return Kept(row, decision=decide(session, heliostat, row, actor, judgement.grounds))
+
+
+def _carry_doubts(row: SurfaceRow, last: SurfaceRow | None) -> None:
+    """Doubts go on since the version before had any; who has seen the same ones need not see them again."""
+    if row.doubted_since is None or last is None or last.doubted_since is None:
+        return
+    row.doubted_since = last.doubted_since
+    if row.suspicious == last.suspicious:
+        row.seen_at, row.seen_by = last.seen_at, last.seen_by
 
 
 def predict_surface(

@@ -63,6 +63,20 @@ class SurfaceSummary(BaseModel):
     valid_from: datetime = Field(description="The mirror is taken to have this surface from then on.")
     measurements: list[str] = Field(description="Ids of the measurements that it was made from.")
     misfit: float | None = Field(description="What the refinement left unexplained of the flux.")
+    trusted: bool | None = Field(
+        description="Whether it explains all its photographs by a mirror like those known; null: it was not predicted."
+    )
+    doubts: list[str] | None = Field(description="Why it is not trusted, in sentences.")
+    doubted_since: datetime | None = Field(description="Since when the heliostat's predictions have not been trusted.")
+    suspicious: list[str] | None = Field(description="Ids of the measurements that it does not explain.")
+    strangeness: float | None = Field(
+        description="Distance from the mirrors known, in standard deviations per root degree of freedom; about 1."
+    )
+    sun_span_deg: float | None = Field(
+        description="What its photographs cover: the largest angle between their suns [deg]; 0 for a single sun."
+    )
+    seen_at: datetime | None = Field(description="Since when somebody has seen the doubts.")
+    seen_by: str | None = Field(description="Who.")
     set_aside: bool = Field(description="Whether it is never current, because another version was judged or chosen.")
 
 
@@ -103,6 +117,18 @@ class SurfaceOut(SurfaceSummary):
     control_points: list[Any] = Field(description="(4, 8, 8, 3) [m] in heliostat coordinates.")
 
 
+_TOLD = (
+    "trusted",
+    "doubts",
+    "doubted_since",
+    "suspicious",
+    "strangeness",
+    "sun_span_deg",
+    "seen_at",
+    "seen_by",
+)
+
+
 def surface_summary(heliostat_name: str, row: SurfaceRow) -> SurfaceSummary:
     """A surface without its arrays."""
     return SurfaceSummary.model_validate(
@@ -116,6 +142,7 @@ def surface_summary(heliostat_name: str, row: SurfaceRow) -> SurfaceSummary:
             "valid_from": row.valid_from,
             "measurements": [measurement_out.identifier for measurement_out in row.measurements],
             "misfit": row.misfit,
+            **{name: getattr(row, name) for name in _TOLD},
             "set_aside": row.set_aside,
         }
     )
@@ -253,3 +280,18 @@ def get_surface(
     with runtime.database.reading() as session:
         row = store.get_surface(session, store.get_heliostat(session, name), version)
     return surface_answer(name, row, media_type)
+
+
+@router.post("/{version}/seen", responses=problems(404, 409), dependencies=[OPERATE])
+def see_surface(
+    name: NamePath,
+    version: Annotated[Version, Path(description="Number of the version, from 1.")],
+    runtime: RuntimeDep,
+    identity: IdentityDep,
+) -> SurfaceSummary:
+    """Note that somebody has seen that a surface is not trusted, and why; 409 where it is."""
+    with runtime.database.writing() as session:
+        heliostat = store.get_heliostat(session, name)
+        row = store.get_surface(session, heliostat, version)
+        decisions.see(session, heliostat, row, identity.name)
+        return surface_summary(name, row)

@@ -1,4 +1,4 @@
-"""Which surface is today's: the buttons that decide it, and that take it back."""
+"""Which surface is today's: the buttons that decide it and take it back, and who has seen its doubts."""
 
 from typing import Annotated
 
@@ -35,6 +35,20 @@ def post_take_form(
         reason = form.reason[:200] or f"{identity.name} chose it"
         decisions.take(session, heliostat, surface, identity.name, Grounds(reason))
     return go_to(f"/heliostats/{name}#history-title")
+
+
+@router.post("/heliostats/{name}/surfaces/{version}/seen", dependencies=[OPERATE])
+def post_seen_form(
+    name: NamePath,
+    version: Annotated[Version, Path(description="Number of the version.")],
+    runtime: RuntimeDep,
+    identity: IdentityDep,
+) -> Response:
+    """Note that somebody has seen that a surface is not trusted."""
+    with runtime.database.writing() as session:
+        heliostat = store.get_heliostat(session, name)
+        decisions.see(session, heliostat, store.get_surface(session, heliostat, version), identity.name)
+    return go_to(f"/heliostats/{name}")
 
 
 @router.post("/heliostats/{name}/surfaces/undo", dependencies=[OPERATE])

@@ -194,7 +194,7 @@ def test_field_shows_every_figure_as_colour_and_as_number(shown: TestClient, met
 
 def test_surface_made_from_all_photographs_is_not_yet_judged(pages: TestClient):
     """What it was made from proves nothing of it."""
-    assert "not yet judged" not in settled(pages)
+    assert "AA39: not yet judged" not in settled(pages)
     pages.post("/v1/heliostats/AA39/surfaces", json={"images": 2})
     page = settled(pages)
     assert 'aria-label="AA39: not yet judged"' in page
