@@ -1,4 +1,4 @@
-"""Surfaces keep whether they are trusted; what is today's is decided, and decisions are kept; a forecast's time, too."""
+"""Surfaces keep trust and decisions on what is today's, photographs their corrections, forecasts the time asked for."""
 
 import sqlalchemy as sa
 from alembic import op
@@ -47,11 +47,29 @@ def upgrade() -> None:
         sa.PrimaryKeyConstraint("id", name=op.f("pk_surface_decisions")),
     )
     op.create_index(op.f("ix_surface_decisions_heliostat_id"), "surface_decisions", ["heliostat_id"])
+    op.add_column("measurements", sa.Column("corrected_at", sa.DateTime(timezone=True), nullable=True))
+    op.create_table(
+        "corrections",
+        sa.Column("id", sa.Integer(), nullable=False),
+        sa.Column("measurement_id", sa.Integer(), nullable=False),
+        sa.Column("made_at", sa.DateTime(timezone=True), nullable=False),
+        sa.Column("made_by", sa.String(64), nullable=False),
+        sa.Column("reason", sa.String(200), nullable=False),
+        sa.Column("before", sa.JSON(none_as_null=True), nullable=False),
+        sa.Column("after", sa.JSON(none_as_null=True), nullable=False),
+        sa.ForeignKeyConstraint(
+            ["measurement_id"], ["measurements.id"], name=op.f("fk_corrections_measurement_id_measurements")
+        ),
+        sa.PrimaryKeyConstraint("id", name=op.f("pk_corrections")),
+    )
+    op.create_index(op.f("ix_corrections_measurement_id"), "corrections", ["measurement_id"])
 
 
 def downgrade() -> None:
     # Older versions know nothing of what is set aside: there the newest surface is today's again.
     op.drop_table("surface_decisions")
+    op.drop_table("corrections")
+    op.drop_column("measurements", "corrected_at")
     for column in (*(column.name for column in _TRUST), "set_aside"):
         op.drop_column("surfaces", column)
     op.drop_column("forecasts", "sun_at")

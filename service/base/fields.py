@@ -87,6 +87,14 @@ Moment = Annotated[
     AfterValidator(lambda moment: moment.astimezone(UTC)),
 ]
 
+FormMoment = Annotated[
+    datetime,
+    AfterValidator(lambda moment: moment.replace(tzinfo=UTC) if moment.tzinfo is None else moment),
+    Field(ge=datetime(1970, 1, 1, tzinfo=UTC), lt=datetime(9000, 1, 1, tzinfo=UTC)),
+    AfterValidator(lambda moment: moment.astimezone(UTC)),
+]
+"""In forms: what a browser's field for a moment gives bears no zone; the pages say that it means UTC."""
+
 Version = Annotated[int, Field(ge=1, le=2**31 - 1)]
 """In paths and queries."""
 VersionIn = Annotated[Whole, Field(ge=1, le=2**31 - 1)]

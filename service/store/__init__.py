@@ -10,6 +10,7 @@ from service.store.measurements import (
     get_measurements,
     list_measurements,
     recent_measurements,
+    use_image,
 )
 from service.store.plant import (
     add_heliostat,
@@ -109,4 +110,5 @@ __all__ = [
     "remove_target",
     "require_same_properties",
     "target_plane",
+    "use_image",
 ]

@@ -141,7 +141,8 @@ class MeasurementRow(Base):
     """One photograph of one heliostat's spot and what was measured in it.
 
     ``arrays`` holds npz ``flux`` and ``centered``; a refused image has neither and keeps its ``reason``.
-    ``center_right_m``, ``center_up_m``: centre of mass from the target's centre.
+    ``center_right_m``, ``center_up_m``: centre of mass from the target's centre. ``corrected_at``: since when it stands
+    as it does, where it was corrected (`CorrectionRow`); an excluded one is not accepted for the reason `excluded`.
     """
 
     __tablename__ = "measurements"
@@ -173,9 +174,24 @@ class MeasurementRow(Base):
     center_up_m: Mapped[float | None]
     arrays: Mapped[bytes | None] = mapped_column(LargeBinary, deferred=True)
     created_at: Mapped[datetime] = mapped_column(default=now)
+    corrected_at: Mapped[datetime | None]
 
     target: Mapped[TargetRow] = relationship(lazy="joined", innerjoin=True)
     image: Mapped[ImageRow] = relationship(lazy="joined", innerjoin=True)
+
+
+class CorrectionRow(Base):
+    """What somebody corrected of a photograph, or that it was excluded: what stood there ``before``, and ``after``."""
+
+    __tablename__ = "corrections"
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    measurement_id: Mapped[int] = mapped_column(ForeignKey("measurements.id"), index=True)
+    made_at: Mapped[datetime] = mapped_column(default=now)
+    made_by: Mapped[str] = mapped_column(String(64))
+    reason: Mapped[str] = mapped_column(String(200))
+    before: Mapped[dict[str, Any]]
+    after: Mapped[dict[str, Any]]
 
 
 surface_measurements = Table(
@@ -229,6 +245,11 @@ class SurfaceRow(Base):
     measurements: Mapped[list[MeasurementRow]] = relationship(
         secondary=surface_measurements, order_by=MeasurementRow.id, lazy="selectin"
     )
+
+    @property
+    def outdated(self) -> list[MeasurementRow]:
+        """Photographs that it was made from, and that were corrected or excluded since."""
+        return [row for row in self.measurements if row.corrected_at is not None and row.corrected_at > self.created_at]
 
 
 class DecisionRow(Base):

@@ -8,6 +8,7 @@ model another version.
 import logging
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from statistics import fmean
 from typing import Any
 
@@ -136,12 +137,14 @@ def rank_of(comparisons: Sequence[Comparison]) -> Rank:
 class State:
     """What a heliostat's accuracy depends on.
 
-    Its surface and its newest photograph, by their rows' ids, and the version of the plant's model.
+    Its surface and its newest photograph, by their rows' ids, when one was last corrected, and the version of the
+    plant's model.
     """
 
     heliostat: str
     surface: int
     newest: int
+    corrected: datetime | None
     model: int
 
 
@@ -179,6 +182,7 @@ class Shown:
     heliostat: str
     surface: int | None
     newest: int
+    corrected: datetime | None
     model: int
 
 
@@ -204,8 +208,9 @@ class ComparisonBook:
         newest = session.scalar(photographs.where(MeasurementRow.accepted))
         if newest is None:
             return None
-        model = versions.current_number(session)
-        return Shown(heliostat.name, None if surface is None else surface.version, newest, model)
+        corrections = select(func.max(MeasurementRow.corrected_at)).where(MeasurementRow.heliostat_id == heliostat.id)
+        corrected, model = session.scalar(corrections), versions.current_number(session)
+        return Shown(heliostat.name, None if surface is None else surface.version, newest, corrected, model)
 
     def wait_for(self, shown: Shown, seconds: float = 5.0) -> Compared | None:
         """Them; None where they are still being worked out after so many seconds."""

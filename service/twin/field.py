@@ -68,6 +68,7 @@ class Line:
     photographs: int = 0
     refused: int = 0
     newest: int | None = None
+    corrected: datetime | None = None
     surface: Current | None = None
     figures: Figures | None = None
     rank: Rank | None = None
@@ -76,7 +77,7 @@ class Line:
         """What its accuracy by this version of the model depends on; None where there is nothing to compare."""
         if self.surface is None or self.newest is None:
             return None
-        return State(self.name, self.surface.id, self.newest, model)
+        return State(self.name, self.surface.id, self.newest, self.corrected, model)
 
 
 def _current_surfaces(session: Session) -> dict[int, Current]:
@@ -101,13 +102,12 @@ def _current_surfaces(session: Session) -> dict[int, Current]:
     return {row.heliostat_id: Current(*tuple(row)[1:]) for row in session.execute(query)}
 
 
-def _photographs(session: Session) -> dict[tuple[int, bool], tuple[int, int]]:
-    """How many photographs each heliostat has, accepted or not, and the id of the newest."""
+def _photographs(session: Session) -> dict[tuple[int, bool], tuple[int, int | None, datetime | None]]:
+    """Of each heliostat's photographs, accepted or not: how many, the id of the newest, and the last correction."""
     row = MeasurementRow
-    query = select(row.heliostat_id, row.accepted, func.count(), func.max(row.id)).group_by(
-        row.heliostat_id, row.accepted
-    )
-    return {(heliostat, accepted): (count, newest) for heliostat, accepted, count, newest in session.execute(query)}
+    query = select(row.heliostat_id, row.accepted, func.count(), func.max(row.id), func.max(row.corrected_at))
+    found = session.execute(query.group_by(row.heliostat_id, row.accepted))
+    return {(heliostat, accepted): (count, newest, at) for heliostat, accepted, count, newest, at in found}
 
 
 def read_lines(session: Session) -> list[Line]:
@@ -116,9 +116,10 @@ def read_lines(session: Session) -> list[Line]:
     columns = select(HeliostatRow.id, HeliostatRow.name, HeliostatRow.east_m, HeliostatRow.north_m)
     lines = []
     for number, name, east, north in session.execute(columns.order_by(HeliostatRow.name)):
-        accepted, newest = photographs.get((number, True), (0, None))
-        refused, _ = photographs.get((number, False), (0, None))
-        lines.append(Line(name, east, north, accepted + refused, refused, newest, surfaces.get(number)))
+        accepted, newest, *kept = photographs.get((number, True), (0, None, None))
+        refused, _, *others = photographs.get((number, False), (0, None, None))
+        corrected = max((moment for moment in (*kept, *others) if moment is not None), default=None)
+        lines.append(Line(name, east, north, accepted + refused, refused, newest, corrected, surfaces.get(number)))
     return lines
 
 

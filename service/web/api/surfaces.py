@@ -62,6 +62,7 @@ class SurfaceSummary(BaseModel):
     created_at: datetime
     valid_from: datetime = Field(description="The mirror is taken to have this surface from then on.")
     measurements: list[str] = Field(description="Ids of the measurements that it was made from.")
+    outdated: list[str] = Field(description="Ids of those of them that were corrected or excluded since.")
     misfit: float | None = Field(description="What the refinement left unexplained of the flux.")
     trusted: bool | None = Field(
         description="Whether it explains all its photographs by a mirror like those known; null: it was not predicted."
@@ -141,6 +142,7 @@ def surface_summary(heliostat_name: str, row: SurfaceRow) -> SurfaceSummary:
             "created_at": row.created_at,
             "valid_from": row.valid_from,
             "measurements": [measurement_out.identifier for measurement_out in row.measurements],
+            "outdated": [measurement_out.identifier for measurement_out in row.outdated],
             "misfit": row.misfit,
             **{name: getattr(row, name) for name in _TOLD},
             "set_aside": row.set_aside,

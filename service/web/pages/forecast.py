@@ -1,17 +1,16 @@
 """Forecasts: a form, and the flux map that comes of it."""
 
-from datetime import UTC, datetime
 from typing import Annotated, Any, Literal, Self
 
 from fastapi import APIRouter, Form, Path, Query, Request, Response
 from fastapi.responses import HTMLResponse
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from model.ephemeris import sun_angles_at
 from service import store
-from service.base.fields import AZIMUTH, ELEVATION, Model, Name, Sun, SunAt, Version
+from service.base.fields import AZIMUTH, ELEVATION, FormMoment, Model, Name, Sun, SunAt, Version
 from service.drawing import charts
 from service.drawing.templates import in_zone
 from service.jobs.asking import ask_for
@@ -32,15 +31,6 @@ _RECENT = 10
 _OFFERED = 20
 
 
-# What a browser's field for a moment gives bears no zone; the page says that it means UTC.
-Moment = Annotated[
-    datetime,
-    AfterValidator(lambda moment: moment.replace(tzinfo=UTC) if moment.tzinfo is None else moment),
-    Field(ge=datetime(1970, 1, 1, tzinfo=UTC), lt=datetime(9000, 1, 1, tzinfo=UTC)),
-    AfterValidator(lambda moment: moment.astimezone(UTC)),
-]
-
-
 class ForecastForm(Model):
     """The form; without a heliostat it means all of them."""
 
@@ -49,7 +39,7 @@ class ForecastForm(Model):
     sun_by: Literal["position", "time"] = "position"
     azimuth_deg: Annotated[float, AZIMUTH] | None = None
     elevation_deg: Annotated[float, ELEVATION] | None = None
-    moment: Moment | None = None
+    moment: FormMoment | None = None
     surface: Literal["current", "ideal"] = "current"
     dni_w_m2: float = Field(default=1000.0, gt=0, le=2000)
 

@@ -77,6 +77,7 @@ PATHS = (
     "/?metric=age",
     "/heliostats/AA39",
     "/heliostats/AA39?version=1",
+    "/heliostats/AA39/photographs/101",
     "/forecast",
     "/forecast?heliostat=AA39",
     "/forecasts/1",

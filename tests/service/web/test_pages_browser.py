@@ -46,7 +46,17 @@ FLAGS = [
     "--disable-sync",
 ]
 DESK, PHONE = {"width": 1280, "height": 900}, {"width": 390, "height": 844}
-PATHS = ("/", "/heliostats/AA39", "/heliostats/AB01", "/forecast", "/forecasts/1", "/studies", "/jobs", "/jobs/1")
+PATHS = (
+    "/",
+    "/heliostats/AA39",
+    "/heliostats/AA39/photographs/100",
+    "/heliostats/AB01",
+    "/forecast",
+    "/forecasts/1",
+    "/studies",
+    "/jobs",
+    "/jobs/1",
+)
 
 
 class GatedOperations(FakeOperations):
