@@ -11,7 +11,8 @@ from fastapi.responses import HTMLResponse
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
-from service.drawing.charts import Scale, scale_of
+from service.base.settings import Settings
+from service.drawing.charts import Scale
 from service.drawing.templates import figure
 from service.store.tables import JobRow, PlantRow, TargetRow
 from service.twin.accuracy import RECENT
@@ -33,7 +34,6 @@ class Metric:
     label: str
     unit: str
     digits: int
-    colours: str
     about: str
     value: Callable[[Line], float | None]
 
@@ -68,17 +68,15 @@ METRICS: dict[str, Metric] = {
             "Forecast accuracy",
             "%",
             1,
-            "viridis",
             f"Mean agreement of forecast and measured flux, with today's surface, on the {RECENT} newest photographs "
             "that it was not made from; not yet judged where there are none.",
             _accuracy,
         ),
         Metric(
             "deviation",
-            "Surface error",
+            "Deviation from ideal",
             "mm",
             3,
-            "viridis_r",
             "How far the mirror is from its ideal shape: root mean square of the heights.",
             _deviation,
         ),
@@ -87,7 +85,6 @@ METRICS: dict[str, Metric] = {
             "Surface uncertainty",
             "mm",
             3,
-            "viridis_r",
             "How well the surface is known: root mean square of the heights' standard deviations.",
             _uncertainty,
         ),
@@ -96,11 +93,10 @@ METRICS: dict[str, Metric] = {
             "Surface misfit",
             "%",
             1,
-            "viridis_r",
             "What the surface leaves unexplained of the photographs that it was made from.",
             _misfit,
         ),
-        Metric("age", "Age of the surface", "days", 0, "viridis_r", "Since the surface describes the mirror.", _age),
+        Metric("age", "Age of the surface", "days", 0, "Since the surface describes the mirror.", _age),
     )
 }
 
@@ -146,6 +142,13 @@ def _told(line: Line, metric: Metric) -> str:
         return "not yet judged"
     value = metric.value(line)
     return "not known" if value is None else figure(value, metric.digits, metric.unit)
+
+
+def scale_for(metric: Metric, settings: Settings) -> Scale:
+    """The colours of a figure, from what is fine, light, to what is poor, dark: the same whatever the field."""
+    fine, poor = settings.map_scales[metric.name]
+    label = f"{metric.label} [{metric.unit}]"
+    return Scale("viridis" if poor < fine else "viridis_r", min(fine, poor), max(fine, poor), label)
 
 
 _WIDTH = 720.0
@@ -212,7 +215,7 @@ def get_field(
     values = [value for line in lines if (value := chosen.value(line)) is not None]
     # A large field takes its time and its page is long: it is asked for again the less often the more is left.
     again_ms = min(max(1500, 30 * pending), 15_000)
-    scale = scale_of(values, chosen.colours, f"{chosen.label} [{chosen.unit}]", 5 * 10.0**-chosen.digits)
+    scale = scale_for(chosen, runtime.settings)
     return render(
         request,
         "field.html",
@@ -224,6 +227,8 @@ def get_field(
         metric=chosen,
         values=values,
         scale=scale,
+        fine=runtime.settings.map_scales[metric][0],
+        poor=runtime.settings.map_scales[metric][1],
         drawing=draw(lines, chosen, scale) if lines else None,
         pending=pending,
         again_ms=again_ms,

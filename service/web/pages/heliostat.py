@@ -36,6 +36,7 @@ _MOST_PHOTOGRAPHS = 60
 _MOST_DECISIONS = 5
 # Points along each side of a facet in the view in space.
 _SPACE_SAMPLES = 14
+_OF_PEAK = "of the measured peak"
 # Side of the window of measured fluxes [m].
 _WINDOW = (4.0, 4.0)
 
@@ -84,7 +85,7 @@ def _histories(listed: Sequence[Revision]) -> list[History]:
     oldest_first = list(reversed(listed))
     deviation = [(f"version {v.row.version}", v.figures.deviation_mm) for v in oldest_first]
     changes = [(f"version {v.row.version}", v.change_mm) for v in oldest_first if v.change_mm is not None]
-    drawn = [charts.history("Surface error by version", "mm", deviation, 3)]
+    drawn = [charts.history("Deviation from ideal by version", "mm", deviation, 3)]
     return [*drawn, charts.history("Change from the version before", "mm", changes, 3)] if changes else drawn
 
 
@@ -95,17 +96,32 @@ def space_view(z: NDArray[Any], size: tuple[float, float]) -> str:
     return json.dumps({"size": size, "facets": np.round(heights, 4).tolist(), "colours": colours})
 
 
-def _comparison_figure(comparison: Comparison) -> ComparisonFigure:
-    # Both have the sum 100 on the same pixels: shares of the mean are a scale that all pictures have in common.
-    measured, forecast = (image * (image.size / 100) for image in (comparison.measured, comparison.forecast))
-    top = float(max(measured.max(), forecast.max()))
-    name = comparison.measurement.identifier
-    return ComparisonFigure(
-        comparison,
-        charts.flux_map(f"measured flux of {name}", measured, _WINDOW, "of the mean", top),
-        charts.flux_map(f"forecast flux of {name}", forecast, _WINDOW, "of the mean", top),
-        charts.difference_map(f"forecast minus measured flux of {name}", forecast - measured, _WINDOW, "of the mean"),
-    )
+@dataclass(frozen=True)
+class ComparisonFigures:
+    """All comparisons, and the two scales that they share."""
+
+    figures: list[ComparisonFigure]
+    flux: Scale
+    difference: Scale
+
+
+def _comparison_figures(comparisons: Sequence[Comparison]) -> ComparisonFigures:
+    """In shares of each photograph's measured peak, as in the report of a study."""
+    pairs = [(c.measured / c.measured.max(), c.forecast / c.measured.max()) for c in comparisons]
+    top = max((float(image.max()) for pair in pairs for image in pair), default=1.0)
+    bound = max((float(np.abs(forecast - measured).max()) for measured, forecast in pairs), default=0.0)
+    flux, difference = charts.flux_scale(top, _OF_PEAK), charts.difference_scale(bound, _OF_PEAK)
+    figures = []
+    for comparison, (measured, forecast) in zip(comparisons, pairs, strict=True):
+        shown = (
+            ("measured", measured, flux),
+            ("forecast", forecast, flux),
+            ("forecast minus measured", forecast - measured, difference),
+        )
+        name = comparison.measurement.identifier
+        maps = [charts.heat_map(f"{what} flux of {name}", image, _WINDOW, scale) for what, image, scale in shown]
+        figures.append(ComparisonFigure(comparison, *maps))
+    return ComparisonFigures(figures, flux, difference)
 
 
 async def _book(request: Request) -> ComparisonBook:
@@ -183,7 +199,7 @@ def get_heliostat_page(request: Request, read: Annotated[_Read, Depends(_read)],
         versions=listed,
         decided=read.decided,
         histories=_histories(listed) if listed else [],
-        comparisons=[_comparison_figure(comparison) for comparison in comparisons],
+        comparisons=_comparison_figures(comparisons),
         trouble=read.compared.trouble,
         recent=RECENT,
         photographs=read.photographs,

@@ -205,6 +205,21 @@ def test_surface_made_from_all_photographs_is_not_yet_judged(pages: TestClient):
     assert "100.0\N{NO-BREAK SPACE}% on photographs that it was made from, which flatters it" in page
 
 
+def test_colours_mean_the_same_in_every_field(tmp_path: Path):
+    """What is fine is light though it be the worst there is; the ends are settings."""
+    colours = {}
+    for name, scales in (("usual", {}), ("strict", {"accuracy": (100.0, 99.0)}), ("lax", {"accuracy": (200.0, 100.0)})):
+        app = create_app(Settings(data_dir=tmp_path / name, map_scales=scales, **QUIET), FakeOperations())
+        with client_of(app) as client:
+            client.put("/v1/plant", json=tower_document())
+            client.put("/v1/heliostats/AA39", json=properties_document())
+            fill(client)
+            found = re.search(r'<circle [^>]*fill="(#[0-9a-f]{6})"', settled(client))
+            assert found is not None
+            colours[name] = found[1]
+    assert colours == {"usual": "#fde724", "strict": "#fde724", "lax": "#440154"}
+
+
 def test_accuracy_is_worked_out_once_for_each_surface(pages: TestClient, operations: FakeOperations):
     # The stand-in forecasts what was measured.
     assert "AA39: 100.0" in settled(pages)

@@ -150,7 +150,7 @@ def test_operator_looks_at_the_field_and_at_a_heliostat(page: Any):
     expect(page.locator("#map-title")).to_have_text("Forecast accuracy")
     expect(page.locator('[data-map] a[aria-label^="AA39: 100.0"]')).to_be_attached()
     page.select_option("#metric", "deviation")
-    expect(page.locator("#map-title")).to_have_text("Surface error")
+    expect(page.locator("#map-title")).to_have_text("Deviation from ideal")
     assert page.url.endswith("/?metric=deviation")
     # By keyboard: one tab stop for the map, arrows to the neighbour, Enter to its page.
     expect(page.locator('[data-map] a[tabindex="0"]')).to_have_count(1)
