@@ -42,6 +42,7 @@ from service.store.results import (
     has_study_page,
     list_forecasts,
     list_studies,
+    recent_field_forecasts,
     recent_forecasts,
 )
 from service.store.rows import Change, insert, one_at_a_time
@@ -103,6 +104,7 @@ __all__ = [
     "put_plant",
     "put_receiver",
     "put_target",
+    "recent_field_forecasts",
     "recent_forecasts",
     "recent_measurements",
     "remove_heliostat",

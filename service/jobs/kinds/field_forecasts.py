@@ -84,6 +84,7 @@ def forecast_field(context: Context, payload: FleetForecastIn) -> Result:
     made = forecast_fleet(context.runtime, fleet, payload.resolution, payload.neighbours, context.report)
     require_some(made.heliostats, made.skipped)
     figures = _figures(made.irradiance, receiver) | {"model_version": model.version, "reflected_w": made.power}
+    figures |= {"sun": sun.model_dump(), "dni_w_m2": payload.dni_w_m2}
     counts = {"heliostats": made.heliostats, "skipped": made.skipped}
     return Result(figures | counts, {"flux": made.irradiance.astype(np.float32)})
 

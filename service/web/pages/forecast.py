@@ -1,5 +1,7 @@
 """Forecasts: a form, and the flux map that comes of it."""
 
+from dataclasses import dataclass
+from datetime import datetime
 from typing import Annotated, Any, Literal, Self
 
 from fastapi import APIRouter, Form, Path, Query, Request, Response
@@ -10,13 +12,15 @@ from sqlalchemy.orm import Session
 
 from model.ephemeris import sun_angles_at
 from service import store
+from service.base.faults import NotFoundError
 from service.base.fields import AZIMUTH, ELEVATION, FormMoment, Model, Name, Sun, SunAt, Version
 from service.drawing import charts
 from service.drawing.templates import in_zone
 from service.jobs.asking import ask_for
 from service.jobs.kinds.field_forecasts import FleetForecastIn
+from service.store import queue
 from service.store.columns import now
-from service.store.tables import PlantRow, ReceiverRow, TargetRow
+from service.store.tables import JobRow, PlantRow, ReceiverRow, TargetRow
 from service.twin.forecast import ForecastRequest, flux_of, make_forecast, position_of
 from service.twin.runtime import Runtime
 from service.web.answers.pages import go_to, leave_for, render
@@ -29,6 +33,19 @@ _RECENT = 10
 
 # Heliostats that the form offers at a time: those whose names begin as what is typed does.
 _OFFERED = 20
+
+
+@dataclass(frozen=True)
+class Made:
+    """A line of the list of forecasts: where it is, and what is in it."""
+
+    path: str
+    name: str
+    of: str
+    target: str | None
+    sun_deg: tuple[float | None, float | None]
+    peak_w_m2: float
+    created_at: datetime
 
 
 class ForecastForm(Model):
@@ -75,8 +92,37 @@ def _choices(session: Session) -> dict[str, Any]:
         "heliostats": store.list_heliostats(session, _OFFERED),
         "targets": session.scalars(select(TargetRow.name).order_by(TargetRow.name)).all(),
         "receivers": session.scalars(select(ReceiverRow.name).order_by(ReceiverRow.name)).all(),
-        "recent": store.recent_forecasts(session, _RECENT),
+        "recent": _recent(session),
     }
+
+
+def _recent(session: Session) -> list[Made]:
+    """The newest forecasts, of one heliostat and of many, the newest first."""
+    of_one = [
+        Made(
+            f"/forecasts/{row.id}",
+            str(row.id),
+            row.heliostat.name,
+            row.target_name,
+            (row.sun_azimuth_deg, row.sun_elevation_deg),
+            row.peak_w_m2,
+            row.created_at,
+        )
+        for row in store.recent_forecasts(session, _RECENT)
+    ]
+    of_many = [
+        Made(
+            f"/jobs/{row.job}",
+            f"job {row.job}",
+            f"{row.heliostats} together",
+            row.target,
+            (row.sun_azimuth_deg, row.sun_elevation_deg),
+            row.peak_w_m2,
+            row.created_at,
+        )
+        for row in store.recent_field_forecasts(session, _RECENT)
+    ]
+    return sorted([*of_one, *of_many], key=lambda made: made.created_at, reverse=True)[:_RECENT]
 
 
 def _filled(**known: Any) -> dict[str, Any]:
@@ -100,15 +146,38 @@ def get_offered_heliostats(
 
 @router.get("/forecast", dependencies=[READ])
 def get_forecast_form(
-    request: Request, runtime: RuntimeDep, heliostat: Annotated[Name | None, Query()] = None
+    request: Request,
+    runtime: RuntimeDep,
+    heliostat: Annotated[Name | None, Query()] = None,
+    job: Annotated[Version | None, Query()] = None,
 ) -> HTMLResponse:
-    """The form, empty but for what is likely."""
+    """The form, empty but for what is likely, or as a ``job`` was asked for by it."""
     with runtime.database.reading() as session:
         choices = _choices(session)
+        if job is not None:
+            filled = _filled_as(session, queue.get_job(session, job))
+            return _page(request, runtime, choices, filled, forecast=None)
         azimuth, elevation = _sun_now(session.get(PlantRow, 1))
     first = next((row.name for row in choices["heliostats"]), "")
     filled = _filled(heliostat=heliostat or first, azimuth_deg=azimuth, elevation_deg=elevation)
     return _page(request, runtime, choices, filled, forecast=None)
+
+
+def _filled_as(session: Session, job: JobRow) -> dict[str, Any]:
+    """What the form of a forecast of all heliostats held."""
+    if job.kind != "forecasts":
+        raise NotFoundError(f"job {job.id} is no forecast")
+    asked = FleetForecastIn.model_validate(job.payload)
+    sun = position_of(session, asked.sun)
+    return _filled(
+        heliostat="",
+        target=asked.target,
+        azimuth_deg=round(sun.azimuth_deg, 3),
+        elevation_deg=round(sun.elevation_deg, 3),
+        surface=asked.surface,
+        dni_w_m2=asked.dni_w_m2,
+        **({"sun_by": "time", "moment": asked.sun.at} if isinstance(asked.sun, SunAt) else {}),
+    )
 
 
 def _page(

@@ -69,7 +69,8 @@ def _flux(row: JobRow) -> HeatMap | None:
         return None
     plane = row.result["plane"]
     flux = unpack(row.arrays)["flux"]
-    return charts.flux_map("Flux of all heliostats together", flux, (plane["width"], plane["height"]), "W/m²")
+    title = f"Flux of {row.result['heliostats']} heliostats together"
+    return charts.flux_map(title, flux, (plane["width"], plane["height"]), "W/m²")
 
 
 def _plain(value: Any) -> bool:
@@ -78,9 +79,19 @@ def _plain(value: Any) -> bool:
 
 def _asked(payload: dict[str, Any]) -> dict[str, Any]:
     """What was asked, long lists by their length."""
-    given = {name: value for name, value in payload.items() if value is not None}
+    given = {name: value for name, value in payload.items() if value not in (None, {}, [])}
     long = {name: len(value) for name, value in given.items() if isinstance(value, list | dict) and len(value) > _SHOWN}
-    return given | {name: f"{count} entries" for name, count in long.items()}
+    short = {name: _in_words(value) for name, value in given.items() if name not in long}
+    return short | {name: f"{count} entries" for name, count in long.items()}
+
+
+def _in_words(value: Any) -> str:
+    """A value as a sentence has it: no braces, no quotes."""
+    if isinstance(value, dict):
+        return ", ".join(f"{name.replace('_', ' ')} {_in_words(inner)}" for name, inner in value.items())
+    if isinstance(value, list):
+        return ", ".join(_in_words(inner) for inner in value)
+    return {True: "yes", False: "no"}[value] if isinstance(value, bool) else str(value)
 
 
 @router.get("/jobs/{number}", dependencies=[READ, DRAWS])
@@ -103,6 +114,8 @@ def get_job_page(number: Number, request: Request, runtime: RuntimeDep, kinds: K
         is_live=is_live,
         asked=asked,
         flux=flux,
+        light=result if row.kind == "forecasts" and "peak_w_m2" in result else None,
+        target=asked.get("target") if asked else None,
         facts={name: value for name, value in result.items() if _plain(value)},
         counts=result.get("counts", {}),
         surfaces=result.get("surfaces", {}),

@@ -1,6 +1,7 @@
 """The pages as a client without a browser sees them: each answers, escapes what it shows, and asks nobody else."""
 
 import re
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,6 +13,8 @@ from fastapi.testclient import TestClient
 
 from service import store
 from service.base.settings import Settings
+from service.jobs.kinds import KINDS
+from service.jobs.worker import Worker
 from service.store import keys
 from service.web.answers.pages import ASSETS
 from service.web.app import create_app
@@ -341,6 +344,26 @@ def test_forecast_of_all_heliostats_is_a_job(pages: TestClient):
     answer = pages.post("/forecast", data=form(heliostat=""), follow_redirects=False)
     assert (answer.status_code, answer.headers["Location"]) == (303, "/jobs/2")
     assert pages.post("/forecast", data=form(heliostat=""), headers=HTMX).headers["HX-Redirect"] == "/jobs/3"
+
+
+def test_forecast_of_all_heliostats_shows_its_light(app: FastAPI, pages: TestClient):
+    asked = form(heliostat="", sun_by="time", moment="2026-06-21T11:36", dni_w_m2="900")
+    path = pages.post("/forecast", data=asked, follow_redirects=False).headers["Location"]
+    worker = Worker(app.state.runtime, KINDS, "tester", threading.Event())
+    while worker.work():
+        pass
+    page = text_of(pages, path)
+    for told in ("Power on lower", "Reflected by the mirrors", "62.5° high", "Flux of 1 heliostats together"):
+        assert told in page
+    assert 'href="data:image/png' in page
+    assert "{" not in page.partition("<main")[2]  # nothing as Python writes it
+    listed = text_of(pages, "/forecast")
+    assert f'<a href="{path}">job' in listed
+    assert "1 together" in listed
+    again = text_of(pages, f"/forecast?job={path.rpartition('/')[2]}")
+    assert (field_of(again, "heliostat"), field_of(again, "dni_w_m2")) == ("", "900")
+    assert field_of(again, "moment") == "2026-06-21T11:36"
+    assert pages.get("/forecast?job=1").status_code == 404
 
 
 def test_jobs_are_asked_for_followed_and_cancelled(pages: TestClient):
