@@ -24,7 +24,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from model.effects import Effect, light_effects
+from model.effects import Effect, acting, light_effects
 from model.effects.blocking import Blocking
 from model.errors import ModelError, UnreachableError
 from model.forecast import Setup, align, altered, optics_under
@@ -148,13 +148,13 @@ class Superposition:
         return total
 
     def _trace(self, tile: Tile) -> FleetFlux:
-        acting = light_effects(self.effects)
+        there: Sequence[Effect] = light_effects(acting(self.effects, None))
         if tile.obstacles is not None:
-            acting = [effect for effect in acting if not isinstance(effect, Blocking)]
-        optics = optics_under(acting, self.optics)
+            there = [effect for effect in there if not isinstance(effect, Blocking)]
+        optics = optics_under(there, self.optics)
         flux, power = torch.zeros(self.resolution, dtype=torch.float64), 0.0
         with torch.no_grad():
-            for group in align(tile.setups, acting, latitude_deg=self.latitude_deg).groups:
+            for group in align(tile.setups, there, latitude_deg=self.latitude_deg).groups:
                 scene = group.scene
                 if tile.obstacles is not None:
                     scene = scene.with_(obstacles=torch.as_tensor(tile.obstacles[group.rows]).to(scene.sun))
@@ -268,14 +268,14 @@ def aligned_field(
 
     Those whose mounts cannot turn there are left out.
     """
-    acting = list(effects)
+    there = acting(effects, None)
     true_sun = np.asarray(sun, dtype=np.float64)[None]
-    for effect in acting:
+    for effect in there:
         true_sun = effect.on_sun(true_sun, latitude_deg)
 
     def outlined(part: Sequence[tuple[Heliostat, ArrayLike]]) -> tuple[list[str], Array, Array]:
         heliostats, aims = [one for one, _ in part], np.array([aim for _, aim in part], dtype=np.float64)
-        return [one.name for one in heliostats], outlines(altered(heliostats, acting), true_sun[0], aims), aims
+        return [one.name for one in heliostats], outlines(altered(heliostats, there), true_sun[0], aims), aims
 
     remaining, found = iter(field), []
     while some := list(islice(remaining, TILE)):

@@ -13,6 +13,7 @@ or, in one step, `forecast_setups`. Gradients with respect to an effect's parame
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime
 from typing import Literal
 
 import numpy as np
@@ -20,7 +21,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from model.effects import Effect, in_light_order
+from model.effects import Effect, Stage, acting, in_light_order
 from model.images import FLUX_SIZE, FLUX_WINDOW, normalized
 from model.mount import Mount
 from model.plant import Heliostat, TargetPlane
@@ -54,6 +55,8 @@ class Setup:
     degree : int
         Of the surface's splines.
     identifier : str
+    taken_at : datetime or None
+        When, with time zone, where that is known: effects may come and go.
     """
 
     heliostat: Heliostat
@@ -65,6 +68,7 @@ class Setup:
     aim: Array | None = None
     degree: int = DEGREE
     identifier: str = ""
+    taken_at: datetime | None = None
 
     @property
     def goal(self) -> Array:
@@ -110,6 +114,11 @@ class View:
         return flux.irradiance
 
 
+def of_stage(effects: Iterable[Effect], *stages: Stage) -> list[Effect]:
+    """Effects of some stages."""
+    return [effect for effect in effects if effect.stage in stages]
+
+
 def optics_under(effects: Iterable[Effect], optics: Optics) -> Optics:
     """The declared optics to what the light really meets under effects."""
     for effect in in_light_order(effects):
@@ -153,6 +162,8 @@ class Group:
     rows : list of int
         Their places among all setups.
     planes : list of TargetPlane
+    moments : list of datetime or None
+        When they were photographed.
     scene : Scene
     angles : (B, 2) [rad]
     aims : (B, 3) [m]
@@ -161,16 +172,18 @@ class Group:
 
     rows: list[int]
     planes: list[TargetPlane]
+    moments: list[datetime | None]
     scene: Scene
     angles: Array
     aims: Array
 
-    def windows(self, view: View) -> Iterator[tuple[Window, list[int]]]:
-        """Each window that the view has on their targets, with the places in this group of the setups that share it."""
-        places: dict[Window, list[int]] = {}
-        for place, plane in enumerate(self.planes):
-            places.setdefault(view.of(plane), []).append(place)
-        yield from places.items()
+    def parts(self, view: View, effects: Sequence[Effect]) -> Iterator[tuple[Window, tuple[Effect, ...], list[int]]]:
+        """The windows that the view has on their targets and the effects that act, with the places of those alike."""
+        places: dict[tuple[Window, tuple[Effect, ...]], list[int]] = {}
+        for place, (plane, moment) in enumerate(zip(self.planes, self.moments, strict=True)):
+            places.setdefault((view.of(plane), acting(effects, moment)), []).append(place)
+        for (window, there), alike in places.items():
+            yield window, there, alike
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,20 +227,21 @@ class Aligned:
 
         ``tracer`` takes the place of the convolution tracer.
         """
-        view, effective = view or View(), optics_under(effects, optics or Optics())
+        view, declared = view or View(), optics or Optics()
         by_tracer = tracer or view.trace
-        return self._each_window(
-            view, lambda group, window, rows: by_tracer(group.scene.subset(rows), window, effective)
-        )
+
+        def traced(group: Group, window: Window, there: Sequence[Effect], rows: list[int]) -> Tensor:
+            return by_tracer(group.scene.subset(rows), window, optics_under(there, declared))
+
+        return self._each_part(view, of_stage(effects, "optics"), traced)
 
     def camera_images(self, flux: Tensor, effects: Iterable[Effect], view: View | None = None) -> Tensor:
         """What the effects of the camera make of ``flux`` (B, rows, columns), which was traced in the same view."""
-        acting = list(effects)
 
-        def imaged(group: Group, window: Window, rows: list[int]) -> Tensor:
-            return images_under(acting, flux[[group.rows[row] for row in rows]], window)
+        def imaged(group: Group, window: Window, there: Sequence[Effect], rows: list[int]) -> Tensor:
+            return images_under(there, flux[[group.rows[row] for row in rows]], window)
 
-        return self._each_window(view or View(), imaged)
+        return self._each_part(view or View(), of_stage(effects, "image"), imaged)
 
     def images(
         self,
@@ -252,20 +266,25 @@ class Aligned:
             return normalized(self.flux(optics, effects, View(size, size, window=FLUX_WINDOW, samples=samples)))
         planes = [plane for group in self.groups for plane in group.planes]
         rows, columns = (math.ceil(max(getattr(p, side) for p in planes) / pixel) for side in ("height", "width"))
-        view, effective = View(rows, columns, samples=samples), optics_under(effects, optics or Optics())
+        view, declared = View(rows, columns, samples=samples), optics or Optics()
 
-        def measured(group: Group, window: Window, rows: list[int]) -> Tensor:
-            flux = view.trace(group.scene.subset(rows), window, effective)
-            return centered(images_under(effects, flux, window).clamp(min=0), window, size)
+        def measured(group: Group, window: Window, there: Sequence[Effect], rows: list[int]) -> Tensor:
+            flux = view.trace(group.scene.subset(rows), window, optics_under(there, declared))
+            return centered(images_under(there, flux, window).clamp(min=0), window, size)
 
-        return normalized(self._each_window(view, measured))
+        return normalized(self._each_part(view, of_stage(effects, "optics", "image"), measured))
 
-    def _each_window(self, view: View, act: Callable[[Group, Window, list[int]], Tensor]) -> Tensor:
-        """What ``act`` makes (b, ...) of the setups in each window of each group, in the setups' order (B, ...)."""
+    def _each_part(
+        self,
+        view: View,
+        effects: Sequence[Effect],
+        act: Callable[[Group, Window, Sequence[Effect], list[int]], Tensor],
+    ) -> Tensor:
+        """What ``act`` makes (b, ...) of the setups alike in window and effects, in the setups' order (B, ...)."""
         parts, places = [], []
         for group in self.groups:
-            for window, rows in group.windows(view):
-                parts.append(act(group, window, rows))
+            for window, there, rows in group.parts(view, effects):
+                parts.append(act(group, window, there, rows))
                 places += [group.rows[row] for row in rows]
         return torch.cat(parts)[torch.as_tensor(places).argsort()]
 
@@ -303,13 +322,13 @@ def align(
     UnreachableError
         Where no attitude reflects the sun to the spot.
     """
-    ordered = in_light_order(effects)
-    kinds: dict[tuple[object, ...], list[int]] = {}
+    ordered = in_light_order(of_stage(effects, "geometry"))
+    kinds: dict[tuple[tuple[object, ...], tuple[Effect, ...]], list[int]] = {}
     for row, setup in enumerate(setups):
-        kinds.setdefault(setup.kind, []).append(row)
+        kinds.setdefault((setup.kind, acting(ordered, setup.taken_at)), []).append(row)
     aims = np.array([setup.goal for setup in setups]) if start is None else start.aims
     return Aligned(
-        tuple(_align_group(setups, rows, ordered, latitude_deg, dtype, aims[rows]) for rows in kinds.values())
+        tuple(_align_group(setups, rows, there, latitude_deg, dtype, aims[rows]) for (_, there), rows in kinds.items())
     )
 
 
@@ -346,7 +365,7 @@ def _align_group(
         angles, aims, scene = align_scene(
             heliostats, points, suns, planes, goals, degree=degree, start=aims, alter=alter
         )
-    return Group(rows, planes, alter(scene.to(dtype)), angles, aims)
+    return Group(rows, planes, [setup.taken_at for setup in group], alter(scene.to(dtype)), angles, aims)
 
 
 def altered(heliostats: Sequence[Heliostat], effects: Sequence[Effect]) -> list[Heliostat]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import datetime
 
 import numpy as np
 import torch
@@ -46,6 +47,8 @@ class Observation:
     motor_position : (2,) [steps] or None
     clipped : (64, 64) [1] or None
         Share of each pixel that the camera's range cut off, where it did: there was at least so much light.
+    taken_at : datetime or None
+        When, where that is known.
     """
 
     flux: NDArray[np.float32]
@@ -55,6 +58,7 @@ class Observation:
     identifier: str
     motor_position: NDArray[np.float64] | None = None
     clipped: NDArray[np.float32] | None = None
+    taken_at: datetime | None = None
 
     @property
     def clipped_share(self) -> float:
@@ -159,7 +163,7 @@ def align_observations(
     that differs little, and saves rounds. ``latitude_deg`` [deg] is the plant's, along which the sun's clock runs.
     """
     points = control_points(heliostat, z)
-    setups = [Setup(heliostat, points, o.sun, o.target, spot=o.center_of_mass) for o in observations]
+    setups = [Setup(heliostat, points, o.sun, o.target, o.center_of_mass, taken_at=o.taken_at) for o in observations]
     return align(setups, effects, latitude_deg=latitude_deg, start=start)
 
 

@@ -34,7 +34,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from model.effects.base import Effect, Factor, Scalar, Stage, parameter
+from model.effects.base import Arrival, Effect, Factor, Scalar, Stage, parameter
 from model.tracing.scene import Window
 
 
@@ -49,6 +49,7 @@ class Background(Effect):
     about: ClassVar[str] = "Background: light on the target, or counts in the camera, that the heliostat did not send."
     stage: ClassVar[Stage] = "image"
     scales_with: ClassVar[frozenset[Factor]] = frozenset({"weather", "camera"})
+    comes: ClassVar[frozenset[Arrival]] = frozenset({"since", "day"})
 
     level: Scalar = parameter(0.0, -0.2, 0.5, "1", "camera")
     gradient_x: Scalar = parameter(0.0, -0.1, 0.1, "1/m", "camera")

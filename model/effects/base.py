@@ -7,8 +7,10 @@ in torch, where parameters that are tensors carry gradients.
 """
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from datetime import date, datetime
+from functools import cached_property
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -16,6 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from model.effects.scope import Always, ByDay, Scope
 from model.errors import InvalidInputError
 from model.mount import Mount
 from model.plant import Heliostat
@@ -24,10 +27,11 @@ from model.tracing.scene import Optics, Scene, Window
 Array = NDArray[np.float64]
 Scalar = float | Tensor
 ByHeliostat = Mapping[str, Any]
-"""Heliostat name to a number, an array or a tensor: (facets,) or a scalar, as the parameter's scope says."""
+"""Heliostat name to a number, an array or a tensor: (facets,) or a scalar, as the parameter's owner says."""
 
-Scope = Literal["set", "camera", "heliostat", "facet"]
+Owner = Literal["set", "camera", "heliostat", "facet"]
 Stage = Literal["geometry", "optics", "image"]
+Arrival = Literal["since", "day"]
 Factor = Literal["distance", "heliostat", "elevation", "side", "roll", "weather", "camera"]
 """What may vary between photographs; `model.study.advice` says which photographs vary it."""
 
@@ -43,7 +47,7 @@ class Parameter:
         Bounds.
     neutral : float
         The value at which the effect changes nothing.
-    scope : {"set", "camera", "heliostat", "facet"}
+    owner : {"set", "camera", "heliostat", "facet"}
         Whom one value belongs to: all measurements, a camera's, one heliostat, or each facet of one heliostat.
     """
 
@@ -52,7 +56,12 @@ class Parameter:
     low: float
     high: float
     neutral: float
-    scope: Scope
+    owner: Owner
+
+    @property
+    def shared(self) -> bool:
+        """Whether all heliostats have one value in common."""
+        return self.owner in ("set", "camera")
 
     def check(self, effect: str, value: object) -> None:
         """Raise `InvalidInputError` unless ``value``, a number or an array, is finite and within the bounds."""
@@ -60,9 +69,9 @@ class Parameter:
             numbers = np.asarray(value.detach().cpu() if isinstance(value, Tensor) else value)
         except ValueError:  # rows of different lengths
             numbers = np.array("")
-        fits = numbers.dtype.kind in "iuf" and numbers.ndim == (self.scope == "facet")
+        fits = numbers.dtype.kind in "iuf" and numbers.ndim == (self.owner == "facet")
         if not fits or not ((numbers >= self.low) & (numbers <= self.high)).all():
-            kind = "numbers, one a facet," if self.scope == "facet" else "a number"
+            kind = "numbers, one a facet," if self.owner == "facet" else "a number"
             unit = "" if self.unit == "1" else f" {self.unit}"
             raise InvalidInputError(
                 f"effect {effect}: '{self.name}' must be {kind} in [{self.low:g}, {self.high:g}]{unit}, "
@@ -70,10 +79,10 @@ class Parameter:
             )
 
 
-def parameter(neutral: float, low: float, high: float, unit: str, scope: Scope = "set") -> Any:
+def parameter(neutral: float, low: float, high: float, unit: str, owner: Owner = "set") -> Any:
     """A dataclass field of an effect; one that belongs to heliostats is a mapping, empty where none is named."""
-    about = {"neutral": neutral, "low": low, "high": high, "unit": unit, "scope": scope}
-    if scope in ("heliostat", "facet"):
+    about = {"neutral": neutral, "low": low, "high": high, "unit": unit, "owner": owner}
+    if owner in ("heliostat", "facet"):
         return field(default_factory=dict, metadata=about)
     return field(default=neutral, metadata=about)
 
@@ -97,6 +106,10 @@ class Effect:
     prior_std : float
         Prior standard deviation of a parameter about neutral, in shares of its range. It should matter only for what
         images cannot tell.
+    comes : frozenset of {"since", "day"}
+        How it may come, if it is not always there: at a date, to stay, or with each day anew.
+    scope : Scope
+        When this one acts.
     """
 
     name: ClassVar[str]
@@ -105,11 +118,16 @@ class Effect:
     scales_with: ClassVar[frozenset[Factor]]
     guesses: ClassVar[tuple[dict[str, float], ...]] = ()
     prior_std: ClassVar[float] = 1.0
+    comes: ClassVar[frozenset[Arrival]] = frozenset({"since"})
+
+    scope: Scope = field(default=Always(), kw_only=True)
 
     def __post_init__(self) -> None:
+        if isinstance(self.scope, ByDay) and not all(p.shared for p in self.parameters()):
+            raise InvalidInputError(f"effect {self.name}: what belongs to heliostats has no values by day")
         for p in self.parameters():
             value = getattr(self, p.name)
-            if p.scope in ("set", "camera"):
+            if p.shared:
                 p.check(self.name, value)
             elif not isinstance(value, Mapping):
                 raise InvalidInputError(f"effect {self.name}: '{p.name}' must map heliostat names to values")
@@ -120,7 +138,27 @@ class Effect:
     @classmethod
     def parameters(cls) -> tuple[Parameter, ...]:
         """The effect's parameters in their order."""
-        return tuple(Parameter(name=f.name, **f.metadata) for f in fields(cls))
+        return tuple(Parameter(name=f.name, **f.metadata) for f in fields(cls) if f.metadata)
+
+    @property
+    def heliostats(self) -> list[str] | None:
+        """Those that it names; None for what all have in common."""
+        named = [getattr(self, p.name) for p in self.parameters() if not p.shared]
+        return sorted({name for by_heliostat in named for name in by_heliostat}) if named else None
+
+    def at(self, taken_at: datetime | None) -> "Effect | None":
+        """What it is at a time, None where it does not act; of one day it is always the same object.
+
+        What is of no known time is of today: what has changed stays so, and the day is as days usually are.
+        """
+        phase = self.scope.phase(taken_at)
+        return self._days[phase] if isinstance(phase, date) else self if phase else None
+
+    @cached_property
+    def _days(self) -> dict[date, "Effect"]:
+        """The effect of each day that has values of its own."""
+        by_day = self.scope.by_day if isinstance(self.scope, ByDay) else {}
+        return {day: replace(self, **values, scope=Always()) for day, values in by_day.items()}
 
     def on_sun(self, suns: Array, latitude_deg: float) -> Array:
         """Unit vectors (B, 3) towards the sun, as they were recorded, to where it really stood."""
@@ -141,6 +179,11 @@ class Effect:
     def on_image(self, images: Tensor, window: Window) -> Tensor:
         """Irradiance (B, rows, columns) over ``window`` to what the camera shows of it."""
         return images
+
+
+def acting(effects: Iterable[Effect], taken_at: datetime | None) -> tuple[Effect, ...]:
+    """The effects that act at a time, as they are then; the same objects wherever the same act."""
+    return tuple(there for effect in effects if (there := effect.at(taken_at)) is not None)
 
 
 def quadrature(first: Scalar, second: Scalar) -> Scalar:

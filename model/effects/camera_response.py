@@ -38,7 +38,7 @@ from typing import ClassVar
 
 from torch import Tensor
 
-from model.effects.base import Effect, Factor, Scalar, Stage, parameter
+from model.effects.base import Arrival, Effect, Factor, Scalar, Stage, parameter
 from model.tracing.scene import Window
 
 
@@ -50,6 +50,7 @@ class CameraResponse(Effect):
     about: ClassVar[str] = "Camera response: counts that do not grow in proportion to the light."
     stage: ClassVar[Stage] = "image"
     scales_with: ClassVar[frozenset[Factor]] = frozenset({"camera"})
+    comes: ClassVar[frozenset[Arrival]] = frozenset({"since", "day"})
 
     gamma: Scalar = parameter(1.0, 0.3, 3.0, "1", "camera")
     saturation: Scalar = parameter(1.0, 0.3, 1.0, "1", "camera")

@@ -36,7 +36,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from model.effects.base import Effect, Factor, Scalar, Stage, parameter
+from model.effects.base import Arrival, Effect, Factor, Scalar, Stage, parameter
 from model.tracing.scene import Window
 
 LEAST = 1e-3
@@ -53,6 +53,7 @@ class CameraShoulder(Effect):
     )
     stage: ClassVar[Stage] = "image"
     scales_with: ClassVar[frozenset[Factor]] = frozenset({"camera"})
+    comes: ClassVar[frozenset[Arrival]] = frozenset({"since", "day"})
 
     compression: Scalar = parameter(0.0, 0.0, 5.0, "1", "camera")
 

@@ -1,6 +1,7 @@
-"""The catalogue of effects, and effects as JSON: ``{"name": .., "parameters": {..}}`` (DESIGN.md, section 5)."""
+"""The catalogue of effects, and effects as JSON: ``{"name": .., "parameters": {..}, "scope": {..}}`` (DESIGN.md, 7)."""
 
 from collections.abc import Iterable, Mapping
+from datetime import date
 from importlib import import_module
 from typing import Any
 
@@ -8,6 +9,7 @@ import numpy as np
 from torch import Tensor
 
 from model.effects.base import Effect, Parameter
+from model.effects.scope import Always, ByDay, day_from_json, scope_from_json
 from model.errors import InvalidInputError
 
 ORDER = (
@@ -77,7 +79,7 @@ def effect_from_json(data: object) -> Effect:
     Raises
     ------
     InvalidInputError
-        For an unknown effect or parameter, and for a value out of its bounds.
+        For an unknown effect, parameter or scope, and for a value out of its bounds.
     """
     if not isinstance(data, Mapping) or not isinstance(data.get("name"), str):
         raise InvalidInputError(f"an effect must be an object with a 'name', got {str(data)[:80]}")
@@ -90,13 +92,30 @@ def effect_from_json(data: object) -> Effect:
     for key in given:
         if key not in known:
             raise InvalidInputError(f"effect {name}: no parameter '{key}'; it has {', '.join(known)}")
-    return CATALOGUE[name](**{key: _read(name, known[key], value) for key, value in given.items()})
+    values = {key: _read(name, known[key], value) for key, value in given.items()}
+    scope = scope_from_json(data.get("scope"), name)
+    if isinstance(scope, ByDay):
+        scope = ByDay(_by_day(name, known, given))
+    return CATALOGUE[name](**values, scope=scope)
+
+
+def _by_day(effect: str, known: Mapping[str, Parameter], given: Mapping[str, Any]) -> dict[date, dict[str, float]]:
+    """Values of the parameters on each day that some are given for; what is not, is as on other days."""
+    days: dict[date, dict[str, float]] = {}
+    for key, data in given.items():
+        by_day = data.get("by_day", {}) if isinstance(data, Mapping) else {}
+        if not isinstance(by_day, Mapping):
+            raise InvalidInputError(f"effect {effect}: 'by_day' of '{key}' must map days to numbers")
+        for day, value in by_day.items():
+            known[key].check(effect, value)
+            days.setdefault(day_from_json(day, effect), {})[key] = float(value)
+    return days
 
 
 def _read(effect: str, parameter: Parameter, data: Any) -> Any:
     """A parameter's value, checked before numbers become arrays."""
     value = _bare(data)
-    if parameter.scope in ("set", "camera") or not isinstance(value, Mapping):
+    if parameter.shared or not isinstance(value, Mapping):
         return value  # what is no mapping where one is wanted, the effect itself refuses
     by_heliostat = {name: _bare(one) for name, one in value.items()}
     for one in by_heliostat.values():
@@ -111,10 +130,16 @@ def _bare(data: Any) -> Any:
 
 def effect_to_json(effect: Effect) -> dict[str, Any]:
     """An effect as JSON; `effect_from_json` reads it back."""
-    return {
-        "name": effect.name,
-        "parameters": {p.name: _plain(getattr(effect, p.name)) for p in effect.parameters()},
-    }
+    plain = {p.name: _plain(getattr(effect, p.name)) for p in effect.parameters()}
+    if isinstance(effect.scope, Always):
+        return {"name": effect.name, "parameters": plain}
+    if isinstance(effect.scope, ByDay):
+        days = {day.isoformat(): values for day, values in sorted(effect.scope.by_day.items())}
+        plain = {
+            name: {"value": value, "by_day": {day: values[name] for day, values in days.items() if name in values}}
+            for name, value in plain.items()
+        }
+    return {"name": effect.name, "parameters": plain, "scope": effect.scope.to_json()}
 
 
 def _plain(value: Any) -> Any:

@@ -33,7 +33,7 @@ Neutral at 0.02, a clear sky's, which any declared sun is taken to have: what co
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
-from model.effects.base import Effect, Factor, Scalar, Stage, parameter
+from model.effects.base import Arrival, Effect, Factor, Scalar, Stage, parameter
 from model.sunshape import CLEAR_SKY, Buie, Hazy
 from model.tracing.scene import Optics
 
@@ -46,6 +46,7 @@ class SunShapeEffect(Effect):
     about: ClassVar[str] = "Sun shape: haze that spreads the sun's light into an aureole."
     stage: ClassVar[Stage] = "optics"
     scales_with: ClassVar[frozenset[Factor]] = frozenset({"distance", "weather"})
+    comes: ClassVar[frozenset[Arrival]] = frozenset({"day"})
 
     circumsolar_ratio: Scalar = parameter(CLEAR_SKY, 0.0, 0.5, "1")
 

@@ -30,7 +30,7 @@ What it is confused with
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
-from model.effects.base import Effect, Factor, Scalar, Stage, parameter, quadrature
+from model.effects.base import Arrival, Effect, Factor, Scalar, Stage, parameter, quadrature
 from model.tracing.scene import Optics
 
 
@@ -44,6 +44,7 @@ class TrackingJitter(Effect):
     )
     stage: ClassVar[Stage] = "optics"
     scales_with: ClassVar[frozenset[Factor]] = frozenset({"distance", "roll", "weather"})
+    comes: ClassVar[frozenset[Arrival]] = frozenset({"day"})
 
     sigma_mrad: Scalar = parameter(0.0, 0.0, 4.0, "mrad")
 

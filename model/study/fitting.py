@@ -77,7 +77,7 @@ class Fitter:
 
     def residuals_of(self, unknowns: Unknowns, trials: Array) -> Array:
         """Residuals (M, N, COARSE_SIZE**2) of many trials (M, P), traced at once where only mirrors differ in them."""
-        shared = np.array([unknown.shared for unknown in unknowns.all])
+        shared = np.array([unknown.shared for unknown in unknowns.all], dtype=bool)
         _, group = np.unique(trials[:, shared], axis=0, return_inverse=True)
         residuals = np.empty((len(trials), len(self.measured), COARSE_SIZE**2))
         for one in np.unique(group):
@@ -135,8 +135,8 @@ class Fitter:
 
     def _affected(self, unknowns: Unknowns, place: int) -> NDArray[np.bool_]:
         """Which images (N,) an unknown changes."""
-        heliostat = unknowns.all[place].heliostat
-        return np.full(len(self.heliostats), True) if heliostat is None else self.heliostats == heliostat
+        unknown = unknowns.all[place]
+        return np.array([unknown.touches(p.heliostat, p.taken_at) for p in self.forecaster.flux_images])
 
     def starts(self, unknowns: Unknowns, begin: Array, free: NDArray[np.bool_]) -> tuple[list[Array], list[float]]:
         """Values to begin with and their costs, the best first: ``begin``, and its ``free`` unknowns elsewhere.
@@ -169,11 +169,11 @@ class Fitter:
     def _guesses(self, unknowns: Unknowns, begin: Array, free: NDArray[np.bool_]) -> list[Array]:
         """``begin`` with each of the free effects' own guesses."""
         guessed = []
-        for kind in unknowns.kinds:
-            for guess in kind.guesses:
+        for term in unknowns.terms:
+            for guess in term.kind.guesses:
                 values = begin.copy()
                 for place, unknown in enumerate(unknowns.all):
-                    if free[place] and unknown.effect is kind:
+                    if free[place] and unknown.term == term:
                         values[place] = guess.get(unknown.parameter.name, values[place])
                 guessed.append(values)
         return guessed

@@ -35,8 +35,6 @@ class FluxImage:
         Over the whole target, row 0 at the top, in any unit.
     seen : bool
         Whether the mirror's surface was predicted from it: such a surface flatters its own photographs.
-    taken_at : datetime or None
-        When it was taken, with time zone, where that was recorded.
     clipped : bool (rows, columns) or None
         Where the camera's range cut the light off, where it did.
     """
@@ -44,7 +42,6 @@ class FluxImage:
     setup: Setup
     image: NDArray[np.floating]
     seen: bool = False
-    taken_at: datetime | None = None
     clipped: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
@@ -60,6 +57,11 @@ class FluxImage:
     def heliostat(self) -> str:
         """Name of the heliostat."""
         return self.setup.heliostat.name
+
+    @property
+    def taken_at(self) -> datetime | None:
+        """When it was taken, with time zone, where that was recorded."""
+        return self.setup.taken_at
 
     @property
     def elevation_deg(self) -> float:

@@ -5,8 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import t
 
 from model.study.flux_images import FluxImage
+from model.study.scopes import days_of
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
@@ -42,26 +44,35 @@ FRESH = 2
 
 
 def split(flux_images: Sequence[FluxImage]) -> Split:
-    """Every second image of each heliostat, by the sun's elevation, judges; and one heliostat of several is kept apart.
+    """Every second image of each heliostat judges; and one heliostat of several is kept apart.
+
+    They are counted by the day, where all have one, and by the sun's elevation: what comes and goes shall be seen by
+    fits and by judges alike.
 
     The one that is kept apart is at the median distance: the others span it. Images that surfaces were predicted from
     do not judge; where fewer than `FRESH` others are left they have to, which the report says.
     """
-    seen = [p.seen for p in flux_images]
+    seen, dated = [p.seen for p in flux_images], days_of(flux_images) is not None
     judged_apart = any(seen) and seen.count(False) >= FRESH
     names = sorted({p.heliostat for p in flux_images})
     distance = {name: np.mean([p.slant_range for p in flux_images if p.heliostat == name]) for name in names}
     kept = sorted(names, key=lambda name: distance[name])[len(names) // 2] if len(names) >= SEVERAL else None
     parts: dict[str, list[int]] = {"fit": [], "own": [], "held_out": []}
-    for name in names:
+    for number, name in enumerate(sorted(names, key=lambda name: name == kept)):
         rows = [row for row, p in enumerate(flux_images) if p.heliostat == name]
-        rows.sort(key=lambda row: (flux_images[row].elevation_deg, flux_images[row].key))
-        fitted = [row for row in rows if seen[row]] if judged_apart else rows[::2]
+        rows.sort(key=lambda row: _turn(flux_images[row], dated))
+        # Of a day on which every heliostat was photographed once, some judge and some are fitted.
+        fitted = [row for row in rows if seen[row]] if judged_apart else rows[number % 2 if dated else 0 :: 2]
         if not fitted:  # a heliostat none of whose images is seen, beside others
             fitted = rows[::2]
         parts["own" if name == kept else "fit"] += fitted
         parts["held_out"] += [row for row in rows if row not in fitted]
     return Split(*(np.array(sorted(parts[part]), dtype=np.int64) for part in ("fit", "own", "held_out")))
+
+
+def _turn(flux_image: FluxImage, dated: bool) -> tuple[str, float, str]:
+    day = flux_image.taken_at.date().isoformat() if dated and flux_image.taken_at is not None else ""
+    return day, flux_image.elevation_deg, flux_image.key
 
 
 @dataclass(frozen=True)
@@ -93,6 +104,28 @@ def paired_gain(differences: Array, heliostats: NDArray[np.str_], rounds: int = 
     low, high = np.quantile(means, [0.025, 0.975])
     mean = float(differences.mean())
     return Gain(mean, float(low), float(high), mean / max(float(means.std()), 1e-9))
+
+
+USUAL, USUAL_SCATTER = 2, 0.01
+"""What is known beforehand of the standard deviation of gains from image to image, and from how many, as it were."""
+
+
+def few_gain(differences: Array) -> Gain:
+    """The mean of a few differences (N,) with its 95 % interval by a moderated t; fewer than two gain nothing.
+
+    How much few images scatter is hardly known from themselves, and counts as if `USUAL` images had shown their usual
+    scatter besides.
+
+    Source: Smyth, *Linear models and empirical Bayes methods*, Stat. Appl. Genet. Mol. Biol. 3 (2004), section 4.
+    """
+    count = len(differences)
+    if count < 2:
+        return Gain(0.0, 0.0, 0.0, 0.0)
+    mean, freedom = float(differences.mean()), count - 1 + USUAL
+    variance = (((differences - mean) ** 2).sum() + USUAL * USUAL_SCATTER**2) / freedom
+    error = float(variance / count) ** 0.5
+    reach = float(t.ppf(0.975, freedom)) * error
+    return Gain(mean, mean - reach, mean + reach, mean / error)
 
 
 def rank_correlation(a: Array, b: Array) -> float:

@@ -1,21 +1,23 @@
 """The loop: fit every candidate, keep the one that images it never saw gain from, and go on from there."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from datetime import date
 
 import numpy as np
 from numpy.typing import NDArray
 
-from model.effects import CATALOGUE, Effect
+from model.effects import CATALOGUE, Effect, Since
 from model.errors import InvalidInputError
 from model.forecast import View
 from model.images import FLUX_SIZE
 from model.metrics import flux_accuracies
 from model.study.fitting import Fitter
 from model.study.flux_images import FluxImage, Forecaster, spot_window
-from model.study.judging import Gain, Split, paired_gain, split
+from model.study.judging import Gain, Rows, Split, few_gain, paired_gain, split
 from model.study.report import Candidate, Found, Study
-from model.study.unknowns import Unknowns
+from model.study.scopes import SCREENED, STRENGTHS, Promise, change, days_of, promises
+from model.study.unknowns import Term, Unknowns
 from model.tracing import Optics
 
 Array = NDArray[np.float64]
@@ -25,6 +27,12 @@ LEAST_IMAGES = 4
 REFITTED = 3
 """How many of the best candidates are fitted once more, jointly with the effects found before."""
 
+
+SETTLING = 3
+"""How often a change's date and what changed are sought in turn."""
+
+CHANGED = 0.002
+"""Share of the light that an effect must move in a forecast for its photograph to say something of it."""
 
 LEAST_DIFFERENCE = 0.001
 """Accuracy that one effect must gain more than another on the same images to be told from it."""
@@ -48,17 +56,35 @@ class StudyOptions:
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """A model with some kinds of effect, fitted: values (P,), their spread (P,), accuracy (H,) of held-out images."""
+    """A model with some effects, fitted.
+
+    Attributes
+    ----------
+    unknowns : Unknowns
+    values, spread : (P,)
+        Of the unknowns, and their standard deviations.
+    cuts : (H, 64, 64)
+        Forecasts of the held-out images.
+    accuracy : (H,)
+        Of those.
+    """
 
     unknowns: Unknowns
     values: Array
     spread: Array
+    cuts: Array
     accuracy: Array
 
     @property
     def effects(self) -> list[Effect]:
         """The fitted effects."""
         return self.unknowns.effects(self.values)
+
+    def redated(self, term: Term, since: date) -> "Trial":
+        """The same with one effect since another day."""
+        later = replace(term, since=since)
+        terms = tuple(later if one == term else one for one in self.unknowns.terms)
+        return replace(self, unknowns=Unknowns(terms, self.unknowns.facets))
 
 
 class _Loop:
@@ -73,75 +99,169 @@ class _Loop:
         latitude_deg: float,
     ) -> None:
         self.flux_images, self.options = flux_images, options
+        self.optics, self.declared, self.latitude_deg = optics, declared, latitude_deg
         self.window = options.window or spot_window(flux_images)
         self.split: Split = split(flux_images)
         self.facets = tuple(sorted({(p.heliostat, len(p.setup.control_points)) for p in flux_images}))
-
-        def forecaster(rows: NDArray[np.int64], view: View) -> Forecaster:
-            chosen = [flux_images[row] for row in rows]
-            return Forecaster(chosen, optics, declared, self.window, view, latitude_deg=latitude_deg)
-
-        self.fit, self.own = (
-            (forecaster(rows, options.fit_view), forecaster(rows, options.view)) if len(rows) else None
-            for rows in (self.split.fit, self.split.own)
-        )
-        self.judge = forecaster(self.split.held_out, options.view)
+        self.days = days_of(flux_images)
+        self.all_heliostats = np.array([p.heliostat for p in flux_images])
+        self.judge = self._forecaster(self.split.held_out, options.view)
         self.measured = self.judge.measured(FLUX_SIZE)
-        self.heliostats = np.array([flux_images[row].heliostat for row in self.split.held_out])
+        self.heliostats = self.all_heliostats[self.split.held_out]
         self.noise = float(np.mean([flux_images[row].noise_share(self.window) for row in self.split.held_out]))
+        self._pairs: dict[bytes, tuple[Forecaster, Forecaster]] = {}
 
-    def trial(self, kinds: Sequence[type[Effect]], start: Trial | None = None, joint: bool = True) -> Trial:
-        """Fit kinds of effect, from where ``start`` has fitted some of them, and judge them.
+    def _forecaster(self, rows: Rows, view: View) -> Forecaster:
+        chosen = [self.flux_images[row] for row in rows]
+        return Forecaster(chosen, self.optics, self.declared, self.window, view, latitude_deg=self.latitude_deg)
+
+    def _pair(self, rows: Rows) -> tuple[Forecaster, Forecaster]:
+        """A coarse and a fine forecaster of some images."""
+        key = rows.tobytes()
+        if key not in self._pairs:
+            views = self.options.fit_view, self.options.view
+            self._pairs[key] = self._forecaster(rows, views[0]), self._forecaster(rows, views[1])
+        return self._pairs[key]
+
+    def touched(self, rows: Rows, terms: Iterable[Term]) -> Rows:
+        """Those of some images that one of the terms may change."""
+        known, some = [self.flux_images[row] for row in rows], list(terms)
+        return rows[[any(term.touches(p.heliostat, p.taken_at) for term in some) for p in known]]
+
+    # --- fits ---------------------------------------------------------------------------------------------------------
+
+    def trial(self, terms: Sequence[Term], start: Trial | None = None, joint: bool = True) -> Trial:
+        """Fit effects, from where ``start`` has fitted some of them, and judge them.
 
         All of them, unless ``joint`` is false: then those that ``start`` knows stay as they are.
         """
-        whole = Unknowns(tuple(kinds), self.facets)
-        trial = Trial(whole, whole.neutral, np.zeros(len(whole.all)), np.empty(0))
-        known: set[type[Effect]] = set()
+        whole = Unknowns(tuple(terms), self.facets)
+        trial = Trial(whole, whole.neutral, np.zeros(len(whole.all)), np.empty(0), np.empty(0))
+        known: set[Term] = set()
         if start is not None:
             values, spread = (start.unknowns.put(v, whole) for v in (start.values, start.spread))
-            trial, known = replace(trial, values=values, spread=spread), set(start.unknowns.kinds)
-        for pair, unknowns in ((self.fit, whole), (self.own, whole.own)):
+            trial, known = replace(trial, values=values, spread=spread), set(start.unknowns.terms)
+        for rows, unknowns in ((self.split.fit, whole), (self.split.own, whole.own)):
             moving = unknowns if joint else unknowns.without(known)
-            if pair is not None and moving.kinds:
-                trial = self._fitted(trial, pair, moving, known)
-        return replace(trial, accuracy=self.accuracy(trial.effects))
+            trial = self._fitted(trial, self.touched(rows, moving.terms), moving, known)
+        return self.judged(trial)
 
-    @staticmethod
-    def _fitted(
-        trial: Trial, pair: tuple[Forecaster, Forecaster], unknowns: Unknowns, known: set[type[Effect]]
-    ) -> Trial:
-        """The trial with those unknowns fitted that the photographs of a pair can tell of."""
-        fixed = [effect for effect in trial.effects if type(effect) not in unknowns.kinds]
-        fitter = Fitter(*pair, fixed=fixed)
-        local = unknowns.of(sorted(set(fitter.heliostats.tolist())))
-        free = np.array([u.effect not in known for u in local.all], dtype=bool)
+    def judged(self, trial: Trial) -> Trial:
+        """The trial with its forecasts of the held-out images."""
+        cuts = self.judge.cuts(trial.effects)
+        return replace(trial, cuts=cuts, accuracy=flux_accuracies(self.measured, cuts))
+
+    def _fitted(self, trial: Trial, rows: Rows, unknowns: Unknowns, known: set[Term]) -> Trial:
+        """The trial with those unknowns fitted that some photographs can tell of."""
+        local = unknowns.of(sorted(set(self.all_heliostats[rows].tolist())))
+        if not local.all or not len(rows):
+            return trial
+        fixed = trial.unknowns.without(unknowns.terms)
+        fitter = Fitter(*self._pair(rows), fixed=fixed.effects(trial.unknowns.put(trial.values, fixed)))
+        free = np.array([u.term not in known for u in local.all], dtype=bool)
         fit = fitter.fit(local, trial.unknowns.put(trial.values, local), free)
         values, spread = trial.values.copy(), trial.spread.copy()
         places = [trial.unknowns.all.index(u) for u in local.all]
         values[places], spread[places] = fit.values, fit.spread
         return replace(trial, values=values, spread=spread)
 
-    def added(self, name: str, current: Trial) -> Trial:
+    def added(self, term: Term, current: Trial) -> Trial:
         """The current model with one more effect, fitted beside what is known."""
-        return self.trial([*current.unknowns.kinds, CATALOGUE[name]], current, joint=False)
+        return self.trial([*current.unknowns.terms, term], current, joint=False)
 
-    def refitted(self, trials: dict[str, Trial]) -> dict[str, Trial]:
+    def refitted(self, trials: dict[Term, Trial]) -> dict[Term, Trial]:
         """Trials, the best of them fitted once more from where they are, jointly with what was known before."""
-        best = sorted(trials, key=lambda name: -trials[name].accuracy.mean())[:REFITTED]
-        return trials | {name: self.trial(trials[name].unknowns.kinds, trials[name]) for name in best}
+        best = sorted(trials, key=lambda term: -trials[term].accuracy.mean())[:REFITTED]
+        joint = {term: self.trial(trials[term].unknowns.terms, trials[term]) for term in best}
+        return trials | joint
+
+    # --- scopes -------------------------------------------------------------------------------------------------------
+
+    def scoped(self, trials: dict[Term, Trial], current: Trial) -> dict[Term, Trial]:
+        """Effects that are not always there, fitted: those of the most promising scopes."""
+        rows, days = self._dated(np.sort(np.concatenate([self.split.fit, self.split.own])))
+        found: list[Promise] = []
+        for term, trial in trials.items():
+            saved = self._saved(trial, current, term, rows, STRENGTHS)
+            found += promises(term.kind, saved, days, self.all_heliostats[rows])
+        found.sort(key=lambda promise: -promise.saved)
+        fitted = [self._settled(promise.term, current, rows) for promise in found[:SCREENED]]
+        return dict(fitted)
+
+    def _saved(self, trial: Trial, current: Trial, term: Term, rows: Rows, strengths: Sequence[float]) -> Array:
+        """Cost (strengths, n) that some images save by an effect that is always there, over the current model."""
+        fitter = Fitter(*self._pair(rows))
+        always = replace(term, since=None)
+        terms = tuple(always if one == term else one for one in trial.unknowns.terms)
+        unknowns, moved = Unknowns(terms, self.facets), np.array([u.term == term for u in trial.unknowns.all])
+        away = np.where(moved, trial.values - trial.unknowns.neutral, 0.0)
+        tried = [np.clip(trial.values + (s - 1) * away, *unknowns.bounds) for s in strengths]
+        before = (fitter.residuals(current.unknowns, current.values) ** 2).sum(axis=1)
+        after = np.array([(one**2).sum(axis=1) for one in fitter.residuals_of(unknowns, np.array(tried))])
+        return np.asarray((before - after) / 2)
+
+    def _settled(self, term: Term, current: Trial, rows: Rows) -> tuple[Term, Trial]:
+        """An effect in its scope, fitted; one since a day since that from which on its fit saves most."""
+        trial = self.added(term, current)
+        for _ in range(SETTLING if term.since is not None else 0):
+            day = self._changed(term, trial, current, rows)
+            if day is None or day == term.since:
+                break
+            term = replace(term, since=day)
+            trial = self.added(term, current)
+        return term, trial
+
+    def _changed(self, term: Term, trial: Trial, current: Trial, rows: Rows) -> date | None:
+        """The day from which on photographs among some save most by an effect as it was fitted."""
+        rows, days = self._dated(self.touched(rows, [replace(term, since=None)]))
+        found = change(self._saved(trial, current, term, rows, (1.0,)), days)
+        return None if found is None else found[0]
+
+    def _dated(self, rows: Rows) -> tuple[Rows, list[date]]:
+        """Those of some images whose day is known, and the days."""
+        days = self.days or []
+        known = [(row, day) for row in rows.tolist() if (day := days[row]) is not None]
+        return np.array([row for row, _ in known], dtype=np.int64), [day for _, day in known]
+
+    def dated(self, term: Term, trial: Trial, current: Trial) -> tuple[Term, Trial]:
+        """An effect that was judged since the day that all photographs name, also those that judged it."""
+        day = None if term.since is None else self._changed(term, trial, current, np.arange(len(self.flux_images)))
+        if day is None or day == term.since:
+            return term, trial
+        return replace(term, since=day), trial.redated(term, day)
+
+    # --- judgement ----------------------------------------------------------------------------------------------------
 
     def worth_adding_to(self, current: Trial) -> bool:
         """Whether even the truth, which leaves the images' noise, could bring the gain that an effect must bring."""
         return 1 - float(current.accuracy.mean()) - self.noise >= self.options.least_gain
 
-    def accuracy(self, effects: Sequence[Effect]) -> Array:
-        """Accuracy (H,) of the held-out images under effects."""
-        return flux_accuracies(self.measured, self.judge.cuts(effects))
-
     def gain(self, after: Trial, before: Trial) -> Gain:
         """What ``after`` is better by on held-out images."""
         return paired_gain(after.accuracy - before.accuracy, self.heliostats)
+
+    def own_gain(self, term: Term, after: Trial, before: Trial) -> Gain:
+        """What an effect gains where it acts: on the held-out images whose forecast it changes.
+
+        One that is not always there acts on few of them. So it is fitted once more to those, and judged by the images
+        that it was fitted to first: every image that it changes judges once, by a fit that did not see it.
+        """
+        if term.whole:
+            return self.gain(after, before)
+        fitted = np.sort(np.concatenate([self.split.fit, self.split.own]))
+        crossed = self._crossed(term, after, before, fitted)
+        return few_gain(np.concatenate([_changes(self.measured, before.cuts, after.cuts), crossed]))
+
+    def _crossed(self, term: Term, after: Trial, before: Trial, rows: Rows) -> Array:
+        """Changes of accuracy (n,) of images that were fitted, by an effect fitted to those held out."""
+        crossed = replace(after, values=before.unknowns.put(before.values, after.unknowns))
+        moving = Unknowns((term,), self.facets)
+        crossed = self._fitted(crossed, self.touched(self.split.held_out, [term]), moving, set())
+        rows = self.touched(rows, [term])
+        if not len(rows):
+            return np.empty(0)
+        judge = self._pair(rows)[1]
+        return _changes(judge.measured(FLUX_SIZE), judge.cuts(before.effects), judge.cuts(crossed.effects))
 
     def counts(self, gain: Gain) -> bool:
         """Whether a gain is both significant and worth having."""
@@ -152,27 +272,50 @@ class _Loop:
         """Whether a gain of one effect over another is significant, and more than what fits may differ by."""
         return gain.low > 0 and gain.mean >= LEAST_DIFFERENCE
 
-    def choose(self, trials: dict[str, Trial], current: Trial) -> tuple[str, list[str]] | None:
-        """The candidate to add and its look-alikes, or None.
+    def choose(self, trials: dict[Term, Trial], current: Trial) -> tuple[Term, Gain, list[Term]] | None:
+        """The candidate to add, its gain and its look-alikes, or None.
 
         Of those that no held-out image tells from the best one the simplest is taken.
         """
-        significant = {name: t for name, t in trials.items() if self.counts(self.gain(t, current))}
+        gains = {term: self.own_gain(term, trial, current) for term, trial in trials.items()}
+        significant = {term: t for term, t in trials.items() if self.counts(gains[term])}
         if not significant:
             return None
         best = max(significant.values(), key=lambda t: t.accuracy.mean())
-        alike = [name for name, t in significant.items() if t is best or not self.distinguishes(self.gain(best, t))]
-        alike.sort(key=lambda name: (len(significant[name].values), -significant[name].accuracy.mean()))
-        return alike[0], alike[1:]
+        alike = [term for term, t in significant.items() if t is best or not self.distinguishes(self.gain(best, t))]
+        alike.sort(key=lambda term: (_complexity(term, significant[term]), -significant[term].accuracy.mean()))
+        chosen, *others = alike
+        gain = gains[chosen] if not chosen.whole else self._nested_gain(significant, current)
+        return (chosen, gain, others) if self.counts(gain) else None
+
+    def _nested_gain(self, trials: dict[Term, Trial], current: Trial) -> Gain:
+        """What the best of some trials gains on images that did not choose it: each half judges the other's choice."""
+        second = np.arange(len(self.heliostats)) % 2 == 1
+        differences = np.empty(len(second))
+        for half in (second, ~second):
+            best = max(trials.values(), key=lambda t: t.accuracy[~half].mean() if (~half).any() else 0.0)
+            differences[half] = (best.accuracy - current.accuracy)[half]
+        return paired_gain(differences, self.heliostats)
 
     def without_idle(self, current: Trial) -> Trial:
         """The trial without effects that a later one has made idle."""
-        for kind in current.unknowns.kinds[:-1]:
-            rest = [k for k in current.unknowns.kinds if k is not kind]
+        for term in current.unknowns.terms[:-1]:
+            rest = [one for one in current.unknowns.terms if one != term]
             less = self.trial(rest, current)
-            if not self.counts(self.gain(current, less)):
+            if not self.counts(self.own_gain(term, current, less)):
                 current = less
         return current
+
+
+def _changes(measured: Array, before: Array, after: Array) -> Array:
+    """Changes of accuracy (n,) of the images whose forecasts differ."""
+    differ = 1 - flux_accuracies(before, after) > CHANGED
+    return np.asarray((flux_accuracies(measured, after) - flux_accuracies(measured, before))[differ])
+
+
+def _complexity(term: Term, trial: Trial) -> int:
+    """How many numbers a term takes, a date among them."""
+    return sum(u.term == term for u in trial.unknowns.all) + (term.since is not None)
 
 
 def study(
@@ -184,12 +327,13 @@ def study(
     *,
     latitude_deg: float,
 ) -> Study:
-    """Which effects photographs demand that a model with these optics and effects lacks, and what they buy.
+    """Which effects photographs demand that a model with these optics and effects lacks, when, and what they buy.
 
     Parameters
     ----------
     flux_images : sequence of FluxImage
-        With surfaces that are believed; at least four, better several heliostats under many suns.
+        With surfaces that are believed; at least four, better several heliostats under many suns. Where all have their
+        times, effects that come at a date or by day are found as such.
     optics, effects
         The declared model.
     progress : callable
@@ -210,30 +354,37 @@ def study(
     if len({p.key for p in flux_images}) < len(flux_images):
         raise InvalidInputError("photographs of a study must have identifiers of their own")
     loop = _Loop(flux_images, optics, effects, options, latitude_deg)
-    declared = {effect.name for effect in effects}
+    # What has changed once may change again.
+    declared = {effect.name for effect in effects if not isinstance(effect.scope, Since)}
     before = current = loop.trial([])
-    found: list[Found] = []
+    found: dict[Term, Found] = {}
     candidates: list[Candidate] = []
-    left = [name for name in options.candidates if name not in declared]
+    left = [Term(CATALOGUE[name]) for name in options.candidates if name not in declared]
     for _ in range(options.most):
         if found and not loop.worth_adding_to(current):
             break
         trials = {}
-        for name in left:
-            progress(name)
-            trials[name] = loop.added(name, current)
+        for term in left:
+            progress(term.kind.name)
+            trials[term] = loop.added(term, current)
+        if loop.days is not None:
+            progress("changes and days")
+            trials |= loop.scoped(trials, current)
         trials = loop.refitted(trials)
         candidates = candidates or [
-            Candidate(n, float(t.accuracy.mean()), loop.gain(t, before)) for n, t in trials.items()
+            Candidate(term.kind.name, float(t.accuracy.mean()), loop.gain(t, before))
+            for term, t in trials.items()
+            if term.whole
         ]
         chosen = loop.choose(trials, current)
         if chosen is None:
             break
-        name, others = chosen
-        found.append(Found(name, loop.gain(trials[name], current), others))
-        current = loop.without_idle(trials[name])
-        found = [f for f in found if CATALOGUE[f.name] in current.unknowns.kinds]
-        left.remove(name)
+        term, gain, others = chosen
+        dated, trial = loop.dated(term, trials[term], current)
+        found[dated] = Found(term.kind.name, gain, _names(term, others))
+        current = loop.without_idle(loop.judged(trial) if dated != term else trial)
+        found = {known: one for known, one in found.items() if known in current.unknowns.terms}
+        left = [one for one in left if one.kind is not term.kind or term.heliostats is not None]
     held_out = [flux_images[row] for row in loop.split.held_out]
     return Study(
         images=held_out,
@@ -242,8 +393,13 @@ def study(
         measured=loop.measured,
         before=loop.judge.cuts([]),
         after=loop.judge.cuts(current.effects),
-        found=[f.fitted(current.unknowns, current.values, current.spread) for f in found],
+        found=[one.fitted(term, current.unknowns, current.values, current.spread) for term, one in found.items()],
         candidates=sorted(candidates, key=lambda c: -c.accuracy_after),
         effects=current.effects,
         latitude_deg=latitude_deg,
     )
+
+
+def _names(term: Term, others: Sequence[Term]) -> list[str]:
+    """The kinds of look-alikes, each once, but for the term's own in another scope."""
+    return list(dict.fromkeys(other.kind.name for other in others if other.kind is not term.kind))

@@ -2,19 +2,20 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from datetime import date
 from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from model.effects import CATALOGUE, Effect
+from model.effects import Always, ByDay, Effect, Since
 from model.metrics import flux_accuracies
 from model.study.advice import told_apart_by
 from model.study.covariates import covariates_of
 from model.study.flux_images import FluxImage
 from model.study.judging import Gain, rank_correlation
-from model.study.unknowns import Unknowns
+from model.study.unknowns import Term, Unknowns
 
 Array = NDArray[np.float64]
 Verdict = Literal["effect", "none", "unexplained"]
@@ -34,6 +35,10 @@ known effects (`tests.benchmarks.study`), where the median error of most paramet
 """
 
 
+LISTED = 4
+"""How many days or heliostats a conclusion names."""
+
+
 @dataclass(frozen=True)
 class Candidate:
     """One effect of the catalogue, fitted alone: mean accuracy of held-out images and its gain."""
@@ -47,25 +52,77 @@ class Candidate:
 class Found:
     """An effect that was found, what it gained when it was added, and what could not be told from it.
 
-    ``parameters`` are nested as in the report: name, then heliostat where it belongs to one, then a list over facets.
+    Attributes
+    ----------
+    name : str
+    gain : Gain
+    lookalikes : list of str
+    parameters : dict
+        Nested as in the report: name, then heliostat where it belongs to one, then a list over facets.
+    scope : dict
+        When it acts, as in the report.
+    days : list of date
+        Those on which an effect that comes and goes by day differs most from what changes nothing.
     """
 
     name: str
     gain: Gain
     lookalikes: list[str]
     parameters: dict[str, Any] = field(default_factory=dict)
+    scope: dict[str, Any] = field(default_factory=lambda: Always().to_json())
+    days: list[date] = field(default_factory=list)
 
-    def fitted(self, unknowns: Unknowns, values: Array, spread: Array) -> "Found":
+    def fitted(self, term: Term, unknowns: Unknowns, values: Array, spread: Array) -> "Found":
         """With its final parameters and their 95 % intervals, cut to their bounds."""
-        kind = CATALOGUE[self.name]
         low, high = unknowns.bounds
         spread = np.hypot(spread, SHARED * (values - unknowns.neutral))
         intervals = np.stack([values - 1.96 * spread, values + 1.96 * spread], axis=-1)
         intervals = np.clip(intervals, low[:, None], high[:, None])
-        value = unknowns.nested(kind, [round(float(v), 6) for v in values])
-        ci95 = unknowns.nested(kind, [[round(float(v), 6) for v in interval] for interval in intervals])
-        parameters = {p.name: {"value": value[p.name], "ci95": ci95[p.name], "unit": p.unit} for p in kind.parameters()}
-        return replace(self, parameters=parameters)
+        value = unknowns.nested(term, [round(float(v), 6) for v in values])
+        ci95 = unknowns.nested(term, [[round(float(v), 6) for v in interval] for interval in intervals])
+        parameters = {p.name: _fitted(value[p.name], ci95[p.name], p.unit, term) for p in term.kind.parameters()}
+        away = dict.fromkeys(term.days, 0.0)
+        for place, unknown in enumerate(unknowns.all):
+            if unknown.term == term and unknown.day is not None:
+                away[unknown.day] += abs(values[place] - unknown.parameter.neutral) / (high - low)[place]
+        most = sorted(day for day in away if away[day] > max(away.values()) / 2)
+        return replace(self, parameters=parameters, scope=_scope(term, unknowns), days=most)
+
+    @property
+    def described(self) -> str:
+        """What it is and when, in a few words."""
+        name, scope = _plain(self.name), self.scope
+        if scope["kind"] == "day":
+            return f"{name} by day (most on {_listed([day.isoformat() for day in self.days])})"
+        if scope["kind"] == "since":
+            of = f" of {_listed(scope['heliostats'])}" if scope["heliostats"] else ""
+            return f"{name}{of} since {scope['since']}"
+        return name
+
+
+def _fitted(value: Any, ci95: Any, unit: str, term: Term) -> dict[str, Any]:
+    """A parameter in the report; one by day has the median of its days for all others."""
+    if not term.days:
+        return {"value": value, "ci95": ci95, "unit": unit}
+    usual = round(float(np.median(list(value.values()))), 6)
+    spread = [round(float(v), 6) for v in np.median(list(ci95.values()), axis=0)]
+    return {"value": usual, "ci95": spread, "unit": unit, "by_day": value, "ci95_by_day": ci95}
+
+
+def _scope(term: Term, unknowns: Unknowns) -> dict[str, Any]:
+    """When an effect acts, as DESIGN.md, section 7, has it."""
+    if term.days:
+        return ByDay().to_json()
+    if term.since is None:
+        return Always().to_json()
+    alone = [name for name, _ in unknowns.facets] if term.own and len(unknowns.facets) == 1 else None
+    named = alone if term.heliostats is None else list(term.heliostats)
+    return {**Since(term.since).to_json(), "heliostats": named}
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Some names, the first few where they are many."""
+    return ", ".join(names[:LISTED]) + (f" and {len(names) - LISTED} more" if len(names) > LISTED else "")
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,7 +224,7 @@ class Study:
 
     def _conclusion(self) -> str:
         before, after = float(self.accuracy_before.mean()), float(self.accuracy_after.mean())
-        names = " and ".join(_plain(f.name) for f in self.found)
+        names = " and ".join(f.described for f in self.found)
         if self.verdict == "effect":
             doubts = [
                 f"{_plain(f.name)} from {', '.join(map(_plain, f.lookalikes))}" for f in self.found if f.lookalikes
@@ -237,6 +294,7 @@ def _gain(gain: Gain) -> dict[str, Any]:
 def _effect(found: Found) -> dict[str, Any]:
     return {
         "name": found.name,
+        "scope": found.scope,
         "parameters": found.parameters,
         "accuracy_gain": _gain(found.gain),
         "lookalikes": found.lookalikes,

@@ -2,24 +2,67 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import date, datetime
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from model.effects import Effect, Parameter
+from model.effects import Always, ByDay, Effect, Parameter, Since
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Unknown:
-    """One number: a parameter of an effect, of one heliostat and one of its facets where it belongs to those."""
+class Term:
+    """A kind of effect and the scope that it is sought in: always, since a day, or by the values of some days.
 
-    effect: type[Effect]
+    Attributes
+    ----------
+    kind : Effect class
+    since : date or None
+    days : tuple of date
+        Those that have values of their own; empty for the other scopes.
+    heliostats : tuple of str or None
+        Those that it is sought at, of a kind whose parameters belong to heliostats; None for all.
+    """
+
+    kind: type[Effect]
+    since: date | None = None
+    days: tuple[date, ...] = ()
+    heliostats: tuple[str, ...] | None = None
+
+    @property
+    def whole(self) -> bool:
+        """Whether it acts always and everywhere."""
+        return self.since is None and not self.days and self.heliostats is None
+
+    @property
+    def own(self) -> bool:
+        """Whether all its parameters belong to heliostats."""
+        return not any(p.shared for p in self.kind.parameters())
+
+    def touches(self, heliostat: str, taken_at: datetime | None) -> bool:
+        """Whether a photograph may change with it."""
+        if self.heliostats is not None and heliostat not in self.heliostats:
+            return False
+        if self.since is None and not self.days:
+            return True
+        if taken_at is None:  # of today, as `Since` has it
+            return self.since is not None
+        return taken_at.date() in self.days if self.since is None else taken_at.date() >= self.since
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """One number: a parameter of an effect, of one heliostat and one of its facets, or of a day, where it is theirs."""
+
+    term: Term
     parameter: Parameter
     heliostat: str | None = None
     facet: int | None = None
+    day: date | None = None
 
     @property
     def shared(self) -> bool:
@@ -27,39 +70,46 @@ class Unknown:
         return self.heliostat is None
 
     @property
-    def group(self) -> tuple[str, str, int | None]:
-        """Unknowns of one group belong to different heliostats: no image depends on two of them.
+    def group(self) -> tuple[Term, str, int | None]:
+        """Unknowns of one group belong to different heliostats or days: no image depends on two of them.
 
         Their columns of a Jacobian are estimated at once (Curtis, Powell and Reid 1974, doi:10.1093/imamat/13.1.117).
         """
-        return self.effect.name, self.parameter.name, self.facet
+        return self.term, self.parameter.name, self.facet
+
+    def touches(self, heliostat: str, taken_at: datetime | None) -> bool:
+        """Whether a photograph may change with it."""
+        theirs = self.heliostat is None or self.heliostat == heliostat
+        days = self.day is None or (taken_at is not None and taken_at.date() == self.day)
+        return theirs and days and self.term.touches(heliostat, taken_at)
 
 
 @dataclass(frozen=True)
 class Unknowns:
-    """All numbers of some kinds of effect for some heliostats.
+    """All numbers of some effects for some heliostats.
 
     Attributes
     ----------
-    kinds : tuple of Effect classes
+    terms : tuple of Term
     facets : tuple of (str, int)
         Heliostats with their number of facets.
     """
 
-    kinds: tuple[type[Effect], ...]
+    terms: tuple[Term, ...]
     facets: tuple[tuple[str, int], ...]
 
     @cached_property
     def all(self) -> tuple[Unknown, ...]:
         """In the order of the vectors."""
-        return tuple(u for kind in self.kinds for p in kind.parameters() for u in self._of(kind, p))
+        return tuple(u for term in self.terms for p in term.kind.parameters() for u in self._of(term, p))
 
-    def _of(self, kind: type[Effect], parameter: Parameter) -> list[Unknown]:
-        if parameter.scope in ("set", "camera"):
-            return [Unknown(kind, parameter)]
-        if parameter.scope == "heliostat":
-            return [Unknown(kind, parameter, name) for name, _ in self.facets]
-        return [Unknown(kind, parameter, name, facet) for name, count in self.facets for facet in range(count)]
+    def _of(self, term: Term, parameter: Parameter) -> list[Unknown]:
+        if parameter.shared:
+            return [Unknown(term, parameter, day=day) for day in term.days or (None,)]
+        facets = [(name, count) for name, count in self.facets if term.heliostats is None or name in term.heliostats]
+        if parameter.owner == "heliostat":
+            return [Unknown(term, parameter, name) for name, _ in facets]
+        return [Unknown(term, parameter, name, facet) for name, count in facets for facet in range(count)]
 
     @property
     def neutral(self) -> Array:
@@ -75,40 +125,50 @@ class Unknowns:
     def prior_std(self) -> Array:
         """Prior standard deviations (P,) about neutral."""
         low, high = self.bounds
-        return np.array([u.effect.prior_std for u in self.all]) * (high - low)
+        return np.array([u.term.kind.prior_std for u in self.all]) * (high - low)
 
     @property
-    def groups(self) -> dict[tuple[str, str, int | None], list[int]]:
+    def groups(self) -> dict[tuple[Term, str, int | None], list[int]]:
         """Places of the unknowns that may be changed at once, by group."""
-        places: dict[tuple[str, str, int | None], list[int]] = {}
+        places: dict[tuple[Term, str, int | None], list[int]] = {}
         for place, unknown in enumerate(self.all):
             places.setdefault(unknown.group, []).append(place)
         return places
 
-    def nested(self, kind: type[Effect], values: Sequence[object]) -> dict[str, object]:
-        """Parameters of one kind of effect as its constructor and the report have them: plain or by heliostat.
+    def nested(self, term: Term, values: Sequence[object]) -> dict[str, object]:
+        """Parameters of one term as its effect's constructor and the report have them: plain, by heliostat, or by day.
 
         ``values`` are any P objects, one for each unknown.
         """
         parameters: dict[str, object] = {}
         for unknown, value in zip(self.all, values, strict=True):
-            if unknown.effect is not kind:
+            if unknown.term != term:
                 continue
-            name = unknown.parameter.name
-            if unknown.heliostat is None:
+            name, key = unknown.parameter.name, unknown.heliostat if unknown.day is None else unknown.day.isoformat()
+            if key is None:
                 parameters[name] = value
                 continue
-            by_heliostat = parameters.setdefault(name, {})
-            assert isinstance(by_heliostat, dict)
+            owned = parameters.setdefault(name, {})
+            assert isinstance(owned, dict)
             if unknown.facet is None:
-                by_heliostat[unknown.heliostat] = value
+                owned[key] = value
             else:
-                by_heliostat.setdefault(unknown.heliostat, []).append(value)
+                owned.setdefault(key, []).append(value)
         return parameters
 
     def effects(self, values: Array) -> list[Effect]:
         """Effects with parameters ``values`` (P,)."""
-        return [kind(**_arrays(self.nested(kind, [float(v) for v in values]))) for kind in self.kinds]
+        return [self._effect(term, [float(v) for v in values]) for term in self.terms]
+
+    def _effect(self, term: Term, values: Sequence[float]) -> Effect:
+        parameters: dict[str, Any] = _arrays(self.nested(term, values))
+        if not term.days:
+            return term.kind(**parameters, scope=Always() if term.since is None else Since(term.since))
+        by_day = {
+            day: {name: float(of_days[day.isoformat()]) for name, of_days in parameters.items()} for day in term.days
+        }
+        usual = {name: float(np.median(list(of_days.values()))) for name, of_days in parameters.items()}
+        return term.kind(**usual, scope=ByDay(by_day))
 
     def put(self, values: Array, into: "Unknowns") -> Array:
         """Values of the unknowns of ``into``: these where it has them too, neutral elsewhere."""
@@ -120,9 +180,17 @@ class Unknowns:
 
         The trials must have what heliostats share in common.
         """
-        copies = Unknowns(self.kinds, tuple((copy_name(h, m), n) for m in range(len(trials)) for h, n in self.facets))
+        numbers = range(len(trials))
+        copies = Unknowns(
+            tuple(_copied_term(term, len(trials)) for term in self.terms),
+            tuple((copy_name(h, m), n) for m in numbers for h, n in self.facets),
+        )
         known = {
-            replace(u, heliostat=None if u.heliostat is None else copy_name(u.heliostat, m)): value
+            replace(
+                u,
+                term=_copied_term(u.term, len(trials)),
+                heliostat=None if u.heliostat is None else copy_name(u.heliostat, m),
+            ): value
             for m, values in enumerate(trials)
             for u, value in zip(self.all, values, strict=True)
         }
@@ -131,16 +199,15 @@ class Unknowns:
     @property
     def own(self) -> "Unknowns":
         """Those that belong to heliostats."""
-        kinds = [k for k in self.kinds if all(p.scope in ("heliostat", "facet") for p in k.parameters())]
-        return Unknowns(tuple(kinds), self.facets)
+        return Unknowns(tuple(term for term in self.terms if term.own), self.facets)
 
-    def without(self, kinds: Iterable[type[Effect]]) -> "Unknowns":
-        """Those of other kinds."""
-        return Unknowns(tuple(k for k in self.kinds if k not in set(kinds)), self.facets)
+    def without(self, terms: Iterable[Term]) -> "Unknowns":
+        """Those of other terms."""
+        return Unknowns(tuple(term for term in self.terms if term not in set(terms)), self.facets)
 
     def of(self, heliostats: Sequence[str]) -> "Unknowns":
-        """The same kinds for fewer heliostats."""
-        return Unknowns(self.kinds, tuple((name, count) for name, count in self.facets if name in heliostats))
+        """The same terms for fewer heliostats."""
+        return Unknowns(self.terms, tuple((name, count) for name, count in self.facets if name in heliostats))
 
 
 def copy_name(heliostat: str, number: int) -> str:
@@ -148,17 +215,24 @@ def copy_name(heliostat: str, number: int) -> str:
     return f"{heliostat}#{number}"
 
 
+def _copied_term(term: Term, count: int) -> Term:
+    """A term at copies of its heliostats."""
+    if term.heliostats is None:
+        return term
+    return replace(term, heliostats=tuple(copy_name(h, m) for m in range(count) for h in term.heliostats))
+
+
 def copied(effect: Effect, count: int) -> Effect:
     """An effect whose heliostats are there ``count`` times."""
-    changes = {
+    changes: dict[str, Any] = {
         p.name: {copy_name(h, m): v for m in range(count) for h, v in getattr(effect, p.name).items()}
         for p in effect.parameters()
-        if p.scope in ("heliostat", "facet")
+        if not p.shared
     }
     return replace(effect, **changes)
 
 
-def _arrays(parameters: Mapping[str, object]) -> dict[str, object]:
+def _arrays(parameters: Mapping[str, object]) -> dict[str, Any]:
     """Lists by heliostat as arrays, the rest as it is."""
     return {
         name: {h: np.asarray(v) for h, v in value.items()} if isinstance(value, dict) else value

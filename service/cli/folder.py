@@ -318,6 +318,7 @@ def forecast_measurement(
         surface=surface,
         effects=[*folder.effects, *effects],
         latitude_deg=float(folder.plant.origin[0]),
+        taken_at=measurement.taken_at,
     )
 
 

@@ -32,7 +32,7 @@ class Value:
 
 @dataclass(frozen=True)
 class Fitted:
-    """A parameter for all images or one heliostat: one value, or one a facet."""
+    """A parameter for all images, a day or one heliostat: one value, or one a facet."""
 
     name: str
     unit: str
@@ -60,9 +60,14 @@ class Finding:
 def _rows(parameter: Parameter, fitted: Mapping[str, Any]) -> list[Fitted]:
     """A line for each owner of a parameter's values."""
     value, ci95 = fitted["value"], fitted["ci95"]
-    if parameter.scope in ("set", "camera"):
+    if "by_day" in fitted:
+        value, ci95 = (
+            {"other days": usual} | by_day
+            for usual, by_day in ((value, fitted["by_day"]), (ci95, fitted["ci95_by_day"]))
+        )
+    elif parameter.shared:
         value, ci95 = {"all images": value}, {"all images": ci95}
-    if parameter.scope != "facet":
+    if parameter.owner != "facet":
         value, ci95 = ({owner: [one] for owner, one in given.items()} for given in (value, ci95))
     values = {
         owner: [_value(parameter, one, interval) for one, interval in zip(ones, ci95[owner], strict=True)]

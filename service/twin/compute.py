@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime
 
 import numpy as np
 import torch
@@ -138,6 +139,7 @@ def forecast(
     surface: tuple[ArrayLike, int] | None = None,
     effects: Sequence[Effect] = (),
     latitude_deg: float,
+    taken_at: datetime | None = None,
 ) -> Forecast:
     """Trace the flux of a heliostat on a plane by its model, with its effects.
 
@@ -161,6 +163,8 @@ def forecast(
     effects : sequence of Effect
     latitude_deg : float [deg]
         Of the plant.
+    taken_at : datetime, optional
+        When, for effects that come and go; the plant of today without it.
 
     Raises
     ------
@@ -177,6 +181,7 @@ def forecast(
         angles=None if angles is None else np.asarray(angles, dtype=np.float64),
         aim=None if aim is None else np.asarray(aim, dtype=np.float64),
         degree=degree,
+        taken_at=taken_at,
     )
     view = View(*resolution, window=window, samples=SAMPLES, padding=0.5, cones="facet")
     aligned = align([shot], effects, latitude_deg=latitude_deg, dtype=torch.float64)

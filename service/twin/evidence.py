@@ -84,6 +84,7 @@ class Evidence:
             motor_position=self.motor_position,
             identifier=self.identifier,
             clipped=self._clipped_about_spot(),
+            taken_at=self.taken_at,
         )
 
     def _clipped_about_spot(self) -> NDArray[np.float32] | None:
@@ -109,8 +110,10 @@ class Evidence:
         image, plane, clipped = self.flux, self.target, self.clipped
         if image is None:  # the part about the spot is all there is
             image, plane = self.centered, replace(plane, center=self.spot, width=FLUX_WINDOW, height=FLUX_WINDOW)
-        shot = Setup(heliostat, points, self.sun, plane, spot=self.spot, degree=degree, identifier=key)
-        return FluxImage(shot, np.asarray(image, dtype=np.float64), taken_at=self.taken_at, seen=seen, clipped=clipped)
+        shot = Setup(
+            heliostat, points, self.sun, plane, self.spot, degree=degree, identifier=key, taken_at=self.taken_at
+        )
+        return FluxImage(shot, np.asarray(image, dtype=np.float64), seen=seen, clipped=clipped)
 
 
 def choose(

@@ -9,9 +9,10 @@ import torch
 from numpy.typing import NDArray
 from sqlalchemy.orm import Session
 
+from model.effects import acting
 from model.ephemeris import sun_angles_at
 from model.errors import InvalidInputError
-from model.forecast import images_under
+from model.forecast import images_under, of_stage
 from model.frames import sun_direction
 from model.images import FLUX_SUM
 from model.plant import Receiver, TargetPlane
@@ -192,9 +193,9 @@ def camera_view(session: Session, row: ForecastRow) -> NDArray[np.float32]:
         raise ConflictError("view: a camera looks at stored targets; of any other plane there is only the light")
     light = torch.as_tensor(unpack(row.flux)["flux"])
     size = row.window_m or row.plane["width"], row.window_m or row.plane["height"]
-    effects = [e for e in get_model(session, int(row.model_version.partition(":")[0])).effects if e.stage == "image"]
+    effects = of_stage(get_model(session, int(row.model_version.partition(":")[0])).effects, "image")
     with torch.no_grad():
-        return images_under(effects, light[None], Window(*size, *light.shape))[0].clamp(min=0).numpy()
+        return images_under(acting(effects, None), light[None], Window(*size, *light.shape))[0].clamp(min=0).numpy()
 
 
 def flux_of(row: ForecastRow, flux: NDArray[np.float32] | None = None) -> NDArray[np.float32]:

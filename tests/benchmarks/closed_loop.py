@@ -24,7 +24,7 @@ from model.refinement import refine
 from model.study import FluxImage, Study, StudyOptions
 from model.study.fitting import Fitter
 from model.study.flux_images import Forecaster
-from model.study.unknowns import Unknowns
+from model.study.unknowns import Term, Unknowns
 from service.cli.folder import observations_of, predict_folder, surface_errors
 from service.cli.folder_study import photographs_of, study_folder
 from service.sources.folder import measured_heights, read_folder
@@ -118,7 +118,7 @@ def picture(study: Study) -> Figure:
 def left_out(photographs: Sequence[FluxImage], kinds: tuple[str, ...], window: float) -> np.ndarray:
     """Accuracy (N,) of each photograph under effects that were fitted to all others."""
     folder_facets = tuple(sorted({(p.heliostat, len(p.setup.control_points)) for p in photographs}))
-    unknowns = Unknowns(tuple(CATALOGUE[kind] for kind in kinds), folder_facets)
+    unknowns = Unknowns(tuple(Term(CATALOGUE[kind]) for kind in kinds), folder_facets)
     optics = read_folder(data_folder(), HELIOSTATS).optics
     accuracy = np.empty(len(photographs))
     for index, photograph in enumerate(photographs):

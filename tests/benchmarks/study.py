@@ -27,13 +27,14 @@ from numpy.typing import NDArray
 from model.effects import CATALOGUE as KINDS
 from model.metrics import flux_accuracies
 from model.plant import JUELICH_LATITUDE
-from model.study import FluxImage, Study, StudyOptions, study
+from model.study import Study, StudyOptions, study
 from model.study.flux_images import Forecaster
 from model.tracing import Optics
 from service.cli.folder_study import study_folder
 from service.sources.folder import read_folder
 from tests.benchmarks import data_folder
-from tests.undeclared.generator import MeasurementSet, generate, mirrors
+from tests.undeclared.adapter import effects_at, flux_images
+from tests.undeclared.generator import MeasurementSet, generate
 from tests.undeclared.world import CATALOGUE, OUTSIDE
 
 Record = dict[str, Any]
@@ -67,13 +68,9 @@ class Case:
 def answer(case: Case) -> Record:
     """The study's answer to a case, with the truth beside it."""
     torch.set_num_threads(1)
-    made = generate(case.name, case.level, case.seed, mirrors(data_folder()))
+    made = generate(case.name, case.level, case.seed)
     start = process_time()
-    found = study(
-        [FluxImage(setup, image) for setup, image in zip(made.setups, made.images, strict=True)],
-        Optics(),
-        latitude_deg=JUELICH_LATITUDE,
-    )
+    found = study(flux_images(made), Optics(), latitude_deg=JUELICH_LATITUDE)
     seconds = process_time() - start
     report = found.to_json()
     true, change = upper_bound(made, found)
@@ -103,7 +100,7 @@ def upper_bound(made: MeasurementSet, found: Study) -> tuple[float, float]:
     forecaster = Forecaster(
         found.images, Optics(), [], found.window, StudyOptions().view, latitude_deg=JUELICH_LATITUDE
     )
-    with_truth = forecaster.cuts(made.effects)
+    with_truth = forecaster.cuts(effects_at(made, made.plans[0]))
     true, same = flux_accuracies(found.measured, with_truth).mean(), flux_accuracies(found.before, with_truth).mean()
     return round(float(true), 5), round(float(1 - same), 5)
 

@@ -55,7 +55,7 @@ def scene_of(one: Setup, *effects) -> Scene:
 def test_the_catalogue_is_the_contract():
     """DESIGN.md, section 5; the closed loop added `camera_ghost` and `camera_shoulder`."""
     bounds = {
-        name: {p.name: (p.low, p.high, p.unit, p.scope) for p in effect.parameters()}
+        name: {p.name: (p.low, p.high, p.unit, p.owner) for p in effect.parameters()}
         for name, effect in CATALOGUE.items()
     }
     assert len(bounds) == 15

@@ -27,7 +27,7 @@ from model.study.fitting import Fitter
 from model.study.flux_images import Forecaster, cut, in_pixels, spot_window
 from model.study.judging import paired_gain, rank_correlation, split
 from model.study.noise import grain_variance
-from model.study.unknowns import Unknowns
+from model.study.unknowns import Term, Unknowns
 from model.surface import control_points
 from model.tracing import Optics
 from tests.conftest import target
@@ -76,9 +76,13 @@ def hazy() -> list[FluxImage]:
 # --- unknowns ---------------------------------------------------------------------------------------------------------
 
 
+def unknowns_of(kinds: Sequence[type[Effect]], facets: tuple[tuple[str, int], ...]) -> Unknowns:
+    """Of effects that are always there."""
+    return Unknowns(tuple(Term(kind) for kind in kinds), facets)
+
+
 def test_unknowns_become_effects_and_nested_parameters():
-    kinds = (FacetCanting, Blocking, SlopeError)
-    unknowns = Unknowns(kinds, (("A", 4), ("B", 2)))
+    unknowns = unknowns_of((FacetCanting, Blocking, SlopeError), (("A", 4), ("B", 2)))
     assert len(unknowns.all) == 2 * (4 + 2) + 2 + 1
     low, high = unknowns.bounds
     values = low + (high - low) * np.linspace(0.1, 0.9, len(low))
@@ -87,21 +91,21 @@ def test_unknowns_become_effects_and_nested_parameters():
     np.testing.assert_array_equal(canting.y_mrad["B"], values[10:12])
     assert blocking.lower_fraction == {"A": values[12], "B": values[13]}
     assert slope.sigma_mrad == values[14]
-    assert unknowns.nested(FacetCanting, range(15))["x_mrad"] == {"A": [0, 1, 2, 3], "B": [4, 5]}
+    assert unknowns.nested(Term(FacetCanting), range(15))["x_mrad"] == {"A": [0, 1, 2, 3], "B": [4, 5]}
 
 
 def test_unknowns_go_into_others_by_what_they_are():
-    both = Unknowns((SlopeError, Blocking), (("A", 4), ("B", 4)))
-    one = Unknowns((Blocking, CameraBlur), (("B", 4),))
+    both = unknowns_of((SlopeError, Blocking), (("A", 4), ("B", 4)))
+    one = unknowns_of((Blocking, CameraBlur), (("B", 4),))
     values = both.put(np.array([1.5, 0.2, 0.3]), one)
     np.testing.assert_array_equal(values, [0.3, 0.0])
     np.testing.assert_array_equal(one.put(values, both), [0.0, 0.0, 0.3])
-    assert both.own.kinds == (Blocking,)
+    assert both.own.terms == (Term(Blocking),)
     assert [u.heliostat for u in both.of(["A"]).all] == [None, "A"]
 
 
 def test_unknowns_of_one_colour_belong_to_different_heliostats():
-    unknowns = Unknowns((FacetCanting, SlopeError), (("A", 4), ("B", 4)))
+    unknowns = unknowns_of((FacetCanting, SlopeError), (("A", 4), ("B", 4)))
     groups = list(unknowns.groups.values())
     assert sorted(place for group in groups for place in group) == list(range(len(unknowns.all)))
     for group in groups:
@@ -247,7 +251,7 @@ def test_a_forecaster_repeats_itself_whatever_it_has_kept(clean):
 def fitted(truth: Effect) -> tuple[Unknowns, np.ndarray, np.ndarray]:
     """Unknowns of a kind, their fit to forecasts that hold ``truth``, and the spread of it."""
     forecaster = Forecaster(flux_images([truth], view=SMALL), Optics(), [], 6.0, SMALL, latitude_deg=JUELICH_LATITUDE)
-    unknowns = Unknowns((type(truth),), (("far", 4), ("near", 4)))
+    unknowns = unknowns_of((type(truth),), (("far", 4), ("near", 4)))
     fit = Fitter(forecaster).fit(unknowns, unknowns.neutral)
     return unknowns, fit.values, fit.spread
 
@@ -272,7 +276,7 @@ def test_a_fit_recovers_the_canting_of_every_facet():
 def test_where_the_model_fails_the_residual_is_infinite(clean):
     """All light blocked, or the sun below the horizon: as wrong as can be, and no reason to stop."""
     fitter = Fitter(Forecaster(clean, Optics(), [], 4.0, SMALL, latitude_deg=JUELICH_LATITUDE))
-    unknowns = Unknowns((CATALOGUE["soiling"],), (("far", 4), ("near", 4)))
+    unknowns = unknowns_of((CATALOGUE["soiling"],), (("far", 4), ("near", 4)))
     dark = np.zeros(len(unknowns.all))
     assert np.isinf(fitter.residuals(unknowns, dark)).all()
     assert np.isnan(fitter.descend(unknowns, dark).spread).all()
@@ -325,7 +329,7 @@ def test_what_no_candidate_explains_is_said(hazy):
 
 def test_an_error_that_grows_with_time_is_seen_where_times_were_recorded(hazy):
     first = datetime(2026, 6, 1, 12, tzinfo=UTC)
-    dated = [replace(p, taken_at=first + timedelta(days=day)) for day, p in enumerate(hazy)]
+    dated = [replace(p, setup=replace(p.setup, taken_at=first + timedelta(days=day))) for day, p in enumerate(hazy)]
     found = study(dated, Optics(), options=replace(QUICK, candidates=("axis_tilt",)), latitude_deg=JUELICH_LATITUDE)
     days = covariates_of(found.images, found.latitude_deg)[RECORDED_TIME]
     assert days.min() == 0

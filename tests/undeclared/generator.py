@@ -1,146 +1,85 @@
-"""Measurement sets with effects that the model does not declare: random mirrors, places and suns, one world for all."""
+"""Measurement sets with effects that the model does not declare: random mirrors, places and suns, known worlds.
 
+Nothing here is the product's; `tests.undeclared.adapter` hands a set to it.
+"""
+
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from functools import lru_cache
 from typing import Any
 from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
 
-from model.effects import Effect, effects_from_json
-from model.forecast import Setup
-from model.plant import Heliostat, TargetPlane
-from model.prior import default_prior
-from model.surface import control_points
-from tests.undeclared.camera import photograph
-from tests.undeclared.rays import Exposure, Sun, throw
+from tests.undeclared import camera
+from tests.undeclared.changes import WITHOUT_SHEET, changing
+from tests.undeclared.plan import Plan, scattered, season
+from tests.undeclared.rays import Sun, throw
 from tests.undeclared.world import World, disturb
-from training.surfaces import Augmentation, load_surfaces
-
-Array = NDArray[np.float64]
-
-LATITUDE = np.radians(50.913)
-
-TARGETS = (
-    TargetPlane("lower", np.array([0.0, -3.23, 35.88]), np.array([0.005, 1, 0.001]), np.array([0.0, 0, 1]), 8.63, 7.22),
-    TargetPlane("upper", np.array([0.0, -3.24, 43.10]), np.array([0.003, 1, 0.0]), np.array([0.0, 0, 1]), 8.63, 7.21),
-)
-"""The two calibration targets of the Solar Tower Juelich."""
-
-RANGES = (40.0, 250.0)
-"""Slant ranges [m]; a set spreads its heliostats evenly, in the logarithm, between them."""
-
-MIN_ELEVATION = np.radians(12.0)
-
-
-@dataclass(frozen=True, eq=False)
-class Plan:
-    """What is planned for one photograph; angles [rad], ``goal`` (3,) [m], ``warmth`` in standard deviations."""
-
-    index: int
-    heliostat: Heliostat
-    heights: Array
-    declination: float
-    hour_angle: float
-    plane: TargetPlane
-    goal: Array
-    warmth: float
-
-    def sun(self, late_minutes: float = 0.0) -> Array:
-        """Direction (3,) of the sun, ``late_minutes`` after the planned time."""
-        hour = self.hour_angle + np.radians(late_minutes / 4)
-        # East, and in the plane of the meridian towards the equator and towards the pole.
-        east, equator = -np.cos(self.declination) * np.sin(hour), np.cos(self.declination) * np.cos(hour)
-        pole = np.sin(self.declination)
-        north = pole * np.cos(LATITUDE) - equator * np.sin(LATITUDE)
-        return np.array([east, north, pole * np.sin(LATITUDE) + equator * np.cos(LATITUDE)])
-
-    def exposure(self, world: World) -> Exposure:
-        """What really happens."""
-        sun = self.sun(world.clock_minutes)
-        return Exposure(world, self.index, self.heliostat, self.heights, sun, self.plane, self.goal, self.warmth)
-
-    def setup(self, identifier: str) -> Setup:
-        """What is recorded."""
-        points = control_points(self.heliostat, self.heights)
-        return Setup(self.heliostat, points, self.sun(), self.plane, self.goal, identifier=identifier)
 
 
 @dataclass(frozen=True, eq=False)
 class MeasurementSet:
-    """Photographs (256, 256) of setups in a world, whose effects of the catalogue are ``truth``, as JSON."""
+    """Images (256, 256) of plans, each in its world; ``truth`` are the worlds' effects of the catalogue, as JSON.
 
-    world: World
+    ``light`` is what the images are of, of each one's brightest place. Images are photographs where ``on_sheet``, and
+    else counts of the light alone.
+    """
+
+    plans: Sequence[Plan]
+    worlds: Sequence[World]
     truth: list[dict[str, Any]]
-    setups: list[Setup]
-    images: list[Array]
+    light: list[NDArray[np.float64]]
+    images: list[NDArray[Any]]
+    on_sheet: bool
 
     @property
-    def effects(self) -> list[Effect]:
-        """The truth as the model states it."""
-        return effects_from_json(self.truth)
+    def identifiers(self) -> list[str]:
+        """What names the photographs."""
+        return [str(number) for number in range(100, 100 + len(self.plans))]
 
 
 def generate(
-    case: str,
-    level: int,
-    seed: int,
-    surfaces: Array,
-    *,
-    heliostats: int = 4,
-    setups: int = 6,
-    side: int = 192,
-    fan: int = 24,
+    case: str, level: int, seed: int, *, heliostats: int = 4, setups: int = 6, side: int = 192, fan: int = 24
 ) -> MeasurementSet:
-    """A set of one case at strength ``level`` (0 to 2); a seed has the same plant, suns and aims in every case.
+    """A set of one case of `tests.undeclared.world`, one world for all its images, which are of light alone.
 
-    ``surfaces`` (N, 4, 8, 8) [m] are mirrors to draw from; an image has 4 * side**2 * fan rays.
+    Strengths are 0 to 2. A seed has the same plant, suns and aims in every case; an image has 4 * side**2 * fan rays.
     """
-    plans = _plans(heliostats, setups, surfaces, np.random.default_rng(seed))
-    rng = np.random.default_rng((seed, crc32(case.encode())))
+    plans, rng = scattered(heliostats, setups, np.random.default_rng(seed)), _chances(case, seed)
     world, truth = disturb(case, level, list(dict.fromkeys(plan.heliostat.name for plan in plans)), rng)
-    sun = Sun.of(world, rng)
-    images = [photograph(throw(plan.exposure(world), sun, side, fan, rng), plan.plane, world, rng) for plan in plans]
-    recorded = [plan.setup(f"{plan.heliostat.name}/{number}") for number, plan in enumerate(plans, start=100)]
-    return MeasurementSet(world, truth, recorded, images)
+    return _taken(plans, [world] * len(plans), truth, False, rng, side, fan)
 
 
-def mirrors(data: Path | None = None, count: int = 200, seed: int = 1) -> Array:
-    """Surfaces (count, 4, 8, 8) [m]: mixtures of the measured ones, samples of the shipped prior without such data."""
-    rng = np.random.default_rng(seed)
-    if data is not None and (data / "surfaces.npz").is_file():
-        return Augmentation().sample(load_surfaces(data)[0], count, rng)
-    prior = default_prior()
-    return np.array([prior.surface(rng.normal(size=len(prior.basis))) for _ in range(count)])
+def generate_season(
+    case: str, level: int, seed: int, *, days: tuple[int, int] = (8, 14), side: int = 192, fan: int = 24
+) -> MeasurementSet:
+    """A season's photographs in one case of `tests.undeclared.changes`, on as many ``days`` as lie within."""
+    plans, rng = season(days, np.random.default_rng(seed)), _chances(case, seed)
+    worlds, truth = changing(case, level, plans, rng)
+    return _taken(plans, worlds, truth, case not in WITHOUT_SHEET, rng, side, fan)
 
 
-def _plans(heliostats: int, setups: int, surfaces: Array, rng: np.random.Generator) -> list[Plan]:
-    """Heliostats spread over the slant ranges, evenly in their logarithm, each with a random mirror."""
-    plans = []
-    for index, heights in enumerate(surfaces[rng.choice(len(surfaces), heliostats, replace=False)]):
-        share = (index + rng.random()) / heliostats
-        distance = RANGES[0] * (RANGES[1] / RANGES[0]) ** share
-        heliostat = _heliostat(f"A{chr(65 + index)}{rng.integers(10, 60)}", distance, rng)
-        plans += [_plan(index, heliostat, heights, rng) for _ in range(setups)]
-    return plans
+def _chances(case: str, seed: int) -> np.random.Generator:
+    return np.random.default_rng((seed, crc32(case.encode())))
 
 
-def _heliostat(name: str, distance: float, rng: np.random.Generator) -> Heliostat:
-    """A heliostat in the northern field, canted for the targets."""
-    aim, height, bearing = np.array([0.0, -3.2, 39.5]), 1.75, rng.uniform(-0.75, 0.75)
-    level = np.sqrt(distance**2 - (aim[2] - height) ** 2) if distance > aim[2] else 10.0
-    position = np.array([level * np.sin(bearing), aim[1] + level * np.cos(bearing), height])
-    return Heliostat.juelich(name, position, float(np.linalg.norm(aim - position)))
-
-
-def _plan(index: int, heliostat: Heliostat, heights: Array, rng: np.random.Generator) -> Plan:
-    """A photograph on a random day at a random hour with the sun well up."""
-    plane = TARGETS[rng.integers(len(TARGETS))]
-    right, up = rng.normal(0, 0.25, 2)
-    goal = plane.center + right * np.cross(plane.up, plane.normal) + up * plane.up
-    while True:
-        declination, hour = np.radians(23.45) * np.sin(rng.uniform(0, 2 * np.pi)), rng.uniform(-1.8, 1.8)
-        plan = Plan(index, heliostat, heights, declination, hour, plane, goal, rng.standard_normal())
-        if np.arcsin(min(plan.sun(late)[2] for late in (-60.0, 0.0, 60.0))) > MIN_ELEVATION:
-            return plan
+def _taken(
+    plans: Sequence[Plan],
+    worlds: Sequence[World],
+    truth: list[dict[str, Any]],
+    on_sheet: bool,
+    rng: np.random.Generator,
+    side: int,
+    fan: int,
+) -> MeasurementSet:
+    """The set of its images."""
+    suns = lru_cache(lambda ratio, clouded: Sun.of(ratio, clouded, rng))
+    lights, images = [], []
+    for plan, world in zip(plans, worlds, strict=True):
+        rays = throw(plan.exposure(world), suns(world.circumsolar_ratio, world.clouded), side, fan, rng)
+        light = camera.light(rays, plan.target, world, rng)
+        lights.append(light)
+        images.append(camera.photograph(light, plan.target, world, rng) if on_sheet else camera.counts(light, rng))
+    return MeasurementSet(plans, worlds, truth, lights, images, on_sheet)

@@ -10,10 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation
 
-from model.plant import Facet, Heliostat, TargetPlane
+from tests.undeclared.plant import Facet, Heliostat, Target, unit
 from tests.undeclared.world import Values, World
 
 Array = NDArray[np.float64]
@@ -25,8 +24,6 @@ DISC, AUREOLE = 4.65e-3, 43.6e-3
 PIVOT = 0.175
 """From the mount's pivot to the mirror's centre [m]."""
 
-KNOTS = np.concatenate([np.zeros(3), np.linspace(0, 1, 6), np.ones(3)])
-
 MEASURED_AT = np.radians(30.0)
 """Elevation of the normal at which mirrors were measured, under their own weight."""
 
@@ -35,11 +32,6 @@ TUBE = 0.4
 
 CHUNK = 1024
 """Mirror points whose rays are traced at a time: what fits into a core's cache."""
-
-
-def unit(vectors: Array) -> Array:
-    """Vectors (3,) or (3, n) of length one."""
-    return np.asarray(vectors / np.linalg.norm(vectors, axis=0))
 
 
 # --- sun --------------------------------------------------------------------------------------------------------------
@@ -56,16 +48,16 @@ class Sun:
     light: Rays
 
     @classmethod
-    def of(cls, world: World, rng: np.random.Generator, count: int = 1 << 20) -> "Sun":
-        """Buie's sun (Buie, Monger, Dey, Solar Energy 74 (2003), eqs. 6 to 9), perhaps behind the edge of a cloud."""
+    def of(cls, ratio: float, clouded: float, rng: np.random.Generator, count: int = 1 << 20) -> "Sun":
+        """Buie's sun (Buie, Monger, Dey, Solar Energy 74 (2003), eqs. 6 to 9), half of it ``clouded`` by a share."""
         shares = np.array([3 * count // 4, count // 4])
         rings = np.linspace(0, DISC, 2001), np.geomspace(DISC, AUREOLE, 4001)
-        thrown = [_ring(edges, world.circumsolar_ratio, share, rng) for edges, share in zip(rings, shares, strict=True)]
+        thrown = [_ring(edges, ratio, share, rng) for edges, share in zip(rings, shares, strict=True)]
         energy = np.array([ring[0] for ring in thrown])
         light = np.repeat(energy / energy.sum() * count / shares, shares)
         angle, turn = np.concatenate([ring[1] for ring in thrown]), rng.uniform(0, 2 * np.pi, count)
         directions = np.array([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.cos(angle)])
-        light *= 1 - world.clouded * (directions[0] > 0)
+        light *= 1 - clouded * (directions[0] > 0)
         order = rng.permutation(count)
         return cls(directions[:, order].astype(np.float32), light[order].astype(np.float32))
 
@@ -105,25 +97,14 @@ def _bent(places: Array, areas: Array, hessian: Array) -> tuple[Array, Array]:
     return np.vstack([places[:2], places[2] + rise]), np.vstack([areas[:2] - areas[2] * slopes, areas[2]])
 
 
-def _splines(places: Array) -> tuple[Array, Array]:
-    """Cubic B-splines of eight control points and their slopes, each (n, 8), at ``places`` (n,) in [0, 1]."""
-    splines = BSpline(KNOTS, np.eye(8), 3)
-    return splines(places), splines.derivative()(places)
-
-
-def _facet(facet: Facet, heights: Array, tilt: Array, curvature: float, u: Array, v: Array) -> tuple[Array, Array]:
+def _facet(facet: Facet, tilt: Array, curvature: float, u: Array, v: Array) -> tuple[Array, Array]:
     """Points and area vectors of a facet in mirror coordinates at the grid ``u`` by ``v``; ``tilt`` (2,) [rad]."""
-    half = np.array([np.linalg.norm(facet.canting_x), np.linalg.norm(facet.canting_y)])
-    (value_u, slope_u), (value_v, slope_v) = _splines(u), _splines(v)
-    x, y = (axis.ravel() for axis in np.meshgrid((2 * u - 1) * half[0], (2 * v - 1) * half[1], indexing="ij"))
-    by_x = (slope_u @ heights @ value_v.T).ravel() / (2 * half[0])
-    by_y = (value_u @ heights @ slope_v.T).ravel() / (2 * half[1])
-    cell = 4 * half.prod() / (len(u) * len(v))
-    places = np.array([x, y, (value_u @ heights @ value_v.T).ravel()])
-    places, areas = _bent(places, cell * np.array([-by_x, -by_y, np.ones_like(x)]), curvature * np.eye(2))
-    along, normal = unit(facet.canting_x), unit(np.cross(facet.canting_x, facet.canting_y))
-    frame = np.column_stack([along, np.cross(normal, along), normal])
-    turn = frame @ Rotation.from_rotvec([tilt[1], -tilt[0], 0.0]).as_matrix()
+    heights, by_x, by_y = (values.ravel() for values in facet.surface(u, v))
+    x, y = (axis.ravel() for axis in np.meshgrid(u * facet.half[0], v * facet.half[1], indexing="ij"))
+    cell = 4 * facet.half.prod() / (len(u) * len(v))
+    areas = cell * np.array([-by_x, -by_y, np.ones_like(x)])
+    places, areas = _bent(np.array([x, y, heights]), areas, curvature * np.eye(2))
+    turn = facet.frame @ Rotation.from_rotvec([tilt[1], -tilt[0], 0.0]).as_matrix()
     return turn @ places + facet.position[:, None], turn @ areas
 
 
@@ -134,16 +115,14 @@ def _facet(facet: Facet, heights: Array, tilt: Array, curvature: float, u: Array
 class Exposure:
     """One heliostat of a world, its ``index`` there, as it throws its light onto ``goal`` (3,) [m] on a target.
 
-    ``heights`` (4, 8, 8) [m] are what was measured of the mirror over its canted facets; ``sun`` (3,) is the true one;
-    ``warmth`` says by how many standard deviations the day is warmer than usual.
+    ``sun`` (3,) is the true one; ``warmth`` says by how many standard deviations the day is warmer than usual.
     """
 
     world: World
     index: int
     heliostat: Heliostat
-    heights: Array
     sun: Array
-    plane: TargetPlane
+    target: Target
     goal: Array
     warmth: float = 0.0
 
@@ -152,8 +131,8 @@ class Exposure:
         tilts = 1e-3 * self._own(self.world.canting_mrad, 4, 2)
         curvatures = self._own(self.world.curvature, 4)
         parts = []
-        for part in zip(self.heliostat.facets, self.heights, tilts, curvatures, strict=True):
-            u, v = ((np.arange(side) + (0.5 if rng is None else rng.random(side))) / side for _ in "uv")
+        for part in zip(self.heliostat.facets, tilts, curvatures, strict=True):
+            u, v = (2 * (np.arange(side) + (0.5 if rng is None else rng.random(side))) / side - 1 for _ in "uv")
             parts.append(_facet(*part, u, v))
         places, areas = (np.concatenate(arrays, axis=1) for arrays in zip(*parts, strict=True))
         twist = 1e-3 * self.world.twist_mrad_m * self.warmth
@@ -174,11 +153,6 @@ class Exposure:
         """Where the first axis, east by the plans, really points: the ground is turned about north, then about up."""
         return Rotation.from_euler("yz", self.world.tilt_deg, degrees=True).apply([1.0, 0.0, 0.0])
 
-    @property
-    def target_axes(self) -> Array:
-        """Rows right, up and normal (3, 3) of the target as it is seen from the field."""
-        return np.array([np.cross(self.plane.up, self.plane.normal), self.plane.up, self.plane.normal])
-
     def facing(self, aim: Array) -> "Pose":
         """The mirror turned so that its centre sends the sun to ``aim`` (3,) [m]."""
         center = self.heliostat.position
@@ -197,17 +171,17 @@ class Exposure:
 
     def stand(self) -> "Pose":
         """The pose in which the centre of mass of the light lies at the goal."""
-        points, aim = self.mirror(16), self.goal
+        points, aim, axes = self.mirror(16), self.goal, self.target.axes
         light = self.light(points)
         for _ in range(6):
             pose = self.facing(aim)
             bent = self.sagging(points, pose)
-            places, areas = (self.target_axes @ a for a in pose.in_sight(bent, self.plane))
-            sun = (self.target_axes @ self.sun)[:, None]
+            places, areas = (axes @ a for a in pose.in_sight(bent, self.target))
+            sun = (axes @ self.sun)[:, None]
             weight = light * (areas * sun).sum(axis=0)
             right, up = land(places, reflected(unit(areas), sun)) @ weight / weight.sum()
-            miss = self.target_axes @ (self.goal - self.plane.center) - [right, up, 0.0]
-            aim = aim + miss[:2] @ self.target_axes[:2]
+            miss = axes @ (self.goal - self.target.center) - [right, up, 0.0]
+            aim = aim + miss[:2] @ axes[:2]
         return pose
 
 
@@ -218,9 +192,9 @@ class Pose:
     attitude: Array
     center: Array
 
-    def in_sight(self, points: Points, plane: TargetPlane) -> tuple[Array, Array]:
+    def in_sight(self, points: Points, target: Target) -> tuple[Array, Array]:
         """Points [m] from the target's centre and area vectors, each (3, n), in east-north-up."""
-        return self.attitude @ points.places + (self.center - plane.center)[:, None], self.attitude @ points.areas
+        return self.attitude @ points.places + (self.center - target.center)[:, None], self.attitude @ points.areas
 
 
 def reflected(normals: Array, suns: Array) -> Array:
@@ -239,7 +213,7 @@ def throw(exposure: Exposure, sun: Sun, side: int, fan: int, rng: np.random.Gene
     ``side`` squared points a facet send on ``fan`` rays each.
     """
     places, normals, weight = _swung(exposure, side, rng)
-    toward = exposure.target_axes @ exposure.sun
+    toward = exposure.target.axes @ exposure.sun
     across = unit(np.cross(toward, [1.0, 0.0, 0.0]))
     frame = np.column_stack([across, np.cross(toward, across), toward])
     # Reflection of directions about the sun, point by point: 2 n n^T - 1.
@@ -258,14 +232,14 @@ def throw(exposure: Exposure, sun: Sun, side: int, fan: int, rng: np.random.Gene
 
 def _swung(exposure: Exposure, side: int, rng: np.random.Generator) -> tuple[Array, Array, Array]:
     """Places (3, n) [m], normals (3, n) and collected light (n,) of mirror points in the target's frame."""
-    world, pose, axes = exposure.world, exposure.stand(), exposure.target_axes
+    world, pose, axes = exposure.world, exposure.stand(), exposure.target.axes
     points = exposure.sagging(exposure.mirror(side, rng), pose)
-    places, areas = (axes @ a for a in pose.in_sight(points, exposure.plane))
+    places, areas = (axes @ a for a in pose.in_sight(points, exposure.target))
     weight = exposure.light(points) * (areas * (axes @ exposure.sun)[:, None]).sum(axis=0).clip(min=0)
     count = weight.size
     swings = [(exposure.first_axis, world.first_axis_mrad), (pose.attitude[:, 1], world.second_axis_mrad)]
     swing = 1e-3 * sum(np.outer(axes @ axis, sigma * rng.standard_normal(count)) for axis, sigma in swings)
-    center = (axes @ (pose.center - exposure.plane.center))[:, None]
+    center = (axes @ (pose.center - exposure.target.center))[:, None]
     normals = unit(areas)
     normals = unit(
         normals + np.cross(swing, normals, axis=0) + 1e-3 * world.roughness_mrad * rng.standard_normal((3, count))

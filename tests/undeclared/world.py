@@ -48,6 +48,7 @@ class World:
     twist_mrad_m: float = 0.0
     clouded: float = 0.0
     barrel: float = 0.0
+    law: float = 1.0
 
 
 def _sign(rng: np.random.Generator) -> float:

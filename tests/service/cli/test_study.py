@@ -6,6 +6,7 @@ import shutil
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from datetime import date
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -14,11 +15,12 @@ import pytest
 
 from model.effects import CATALOGUE
 from model.effects.facet_canting import FacetCanting
+from model.effects.sun_shape import SunShapeEffect
 from model.errors import InvalidInputError
 from model.study import StudyOptions
 from model.study.judging import Gain
 from model.study.report import Found
-from model.study.unknowns import Unknowns
+from model.study.unknowns import Term, Unknowns
 from service.cli.folder_study import FolderStudy, study_folder
 from service.cli.main import main
 from service.drawing.study_report import study_page
@@ -241,14 +243,26 @@ def test_look_alikes_come_with_the_photographs_that_decide(hazy):
 
 
 def test_parameters_of_facets_stand_in_columns(hazy):
-    unknowns = Unknowns((FacetCanting,), (("AD34", 4), ("AR18", 4)))
+    term = Term(FacetCanting)
+    unknowns = Unknowns((term,), (("AD34", 4), ("AR18", 4)))
     values = np.linspace(-1, 1, 16)
-    found = Found("facet_canting", Gain(0.02, 0.01, 0.03, 4.0), []).fitted(unknowns, values, np.full(16, 0.1))
+    found = Found("facet_canting", Gain(0.02, 0.01, 0.03, 4.0), []).fitted(term, unknowns, values, np.full(16, 0.1))
     page = study_page(replace(hazy.study, found=[found]), "few")
     assert "Facet 4" in text(page)
     assert page.count("<code>x_mrad</code>") == page.count("<code>y_mrad</code>") == 2
     telling = [abs(v) > 0.196 for v in values]
     assert len(re.findall(r"<strong>[−0-9.]+</strong><small>", page)) == sum(telling)
+
+
+def test_what_comes_and_goes_is_shown_by_day(hazy):
+    days = date(2024, 6, 7), date(2024, 6, 9)
+    term = Term(SunShapeEffect, days=days)
+    found = Found("sun_shape", Gain(0.02, 0.01, 0.03, 4.0), []).fitted(
+        term, Unknowns((term,), (("AD34", 4),)), np.array([0.02, 0.2]), np.full(2, 0.01)
+    )
+    words = text(study_page(replace(hazy.study, found=[found]), "few"))
+    assert "Sun shape by day (most on 2024-06-09)" in words
+    assert all(row in words for row in ("other days", "2024-06-07", "2024-06-09"))
 
 
 def test_names_are_text_wherever_they_come_from(hazy):

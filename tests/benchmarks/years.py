@@ -1,0 +1,100 @@
+"""The closed loop on two years of photographs, by date: ``python -m tests.benchmarks.years [--out REPORT.json]``.
+
+AA39 in ``../shared/stj-years`` and, with AC43, in ``../shared/stj``, with the surfaces that deflectometry measured. The
+days are dealt out to two halves. A study sees one half only: it chooses effects, fits them, and the photographs of the
+other half's days, which had no say in anything, judge them; then the halves change places. Intervals are over days:
+photographs of a day err together. What comes by day cannot be carried to other days: it is judged by photographs of the
+same days, as the study itself does it, and its usual value by the others.
+"""
+
+import argparse
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.effects import Effect, effect_to_json
+from model.metrics import flux_accuracies
+from model.plant import JUELICH_LATITUDE
+from model.study import FluxImage, Study, StudyOptions, study
+from model.study.flux_images import Forecaster
+from model.tracing import Optics
+from service.cli.folder_study import photographs_of
+from service.sources.folder import read_folder
+from tests.benchmarks import data_folder
+
+Array = NDArray[np.float64]
+
+WINDOW = 4.0
+
+
+def photographs() -> list[FluxImage]:
+    """Those of both folders, each once: as a crop where there is one."""
+    root = data_folder()
+    crops, _ = photographs_of(read_folder(root.parent / "stj-years"))
+    known = {p.key for p in crops}
+    others, _ = photographs_of(read_folder(root, ["AA39", "AC43"]))
+    return [*crops, *(p for p in others if p.key not in known)]
+
+
+def day_of(photograph: FluxImage) -> str:
+    """The day of a photograph; those of no known time have one for each."""
+    return photograph.key if photograph.taken_at is None else photograph.taken_at.date().isoformat()
+
+
+def accuracies(taken: Sequence[FluxImage], effects: Sequence[Effect]) -> Array:
+    """Of photographs (N,) in a window of 4 m."""
+    judge = Forecaster(taken, Optics(), [], WINDOW, StudyOptions().view, latitude_deg=JUELICH_LATITUDE)
+    return flux_accuracies(judge.measured(), judge.cuts(effects))
+
+
+def interval(values: Array, days: Sequence[str], rounds: int = 2000) -> tuple[float, float]:
+    """The 95 % interval of the mean of ``values`` (N,), days drawn anew."""
+    rng, names = np.random.default_rng(0), sorted(set(days))
+    sums = np.array([[values[[d == name for d in days]].sum(), sum(d == name for d in days)] for name in names])
+    drawn = sums[rng.integers(len(names), size=(rounds, len(names)))].sum(axis=1)
+    low, high = np.quantile(drawn[:, 0] / drawn[:, 1], [0.025, 0.975])
+    return float(low), float(high)
+
+
+def halves(taken: Sequence[FluxImage]) -> list[list[FluxImage]]:
+    """Every second day in each."""
+    days = sorted({day_of(p) for p in taken})
+    return [[p for p in taken if days.index(day_of(p)) % 2 == half] for half in (0, 1)]
+
+
+def described(found: Study) -> str:
+    """The effects of a study in one line."""
+    names = [f"{f.described} ({f.gain.mean:.3f} [{f.gain.low:.3f}, {f.gain.high:.3f}])" for f in found.found]
+    return "; ".join(names) or "none"
+
+
+def main() -> None:
+    """Print what the whole says, and what each half of the days finds for the other."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, help="write the report of the whole there")
+    options = parser.parse_args()
+    taken, asked = photographs(), StudyOptions(window=WINDOW)
+    whole = study(taken, Optics(), options=asked, latitude_deg=JUELICH_LATITUDE)
+    print(f"{len(taken)} photographs on {len({day_of(p) for p in taken})} days: {whole.conclusion()}")
+    before, after = whole.accuracy_before.mean(), whole.accuracy_after.mean()
+    print(f"found: {described(whole)}; without effects {before:.4f}, with {after:.4f}")
+    print("alone: " + ", ".join(f"{c.name} {c.gain.mean:+.4f}" for c in whole.candidates[:6]), flush=True)
+    if options.out:
+        options.out.write_text(json.dumps(whole.to_json(), indent=1), encoding="utf-8")
+    print("| a study of | finds | photographs of the other days | before | after | gain, 95 % over days |")
+    print("| --- | --- | --- | --- | --- | --- |")
+    both = halves(taken)
+    for name, seen, unseen in (("even days", *both), ("odd days", *reversed(both))):
+        found = study(seen, Optics(), options=asked, latitude_deg=JUELICH_LATITUDE)
+        before, after = accuracies(unseen, []), accuracies(unseen, found.effects)
+        low, high = interval(after - before, [day_of(p) for p in unseen])
+        gain = f"{(after - before).mean():+.4f} [{low:+.4f}, {high:+.4f}]"
+        print(f"| {name} | {described(found)} | {len(unseen)} | {before.mean():.4f} | {after.mean():.4f} | {gain} |")
+        print(f"  {json.dumps([effect_to_json(e) for e in found.effects])[:400]}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

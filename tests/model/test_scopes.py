@@ -1,0 +1,210 @@
+"""Effects that come and go: they act when they should, and studies find when."""
+
+from collections.abc import Sequence
+from datetime import UTC, date, datetime, timedelta
+
+import numpy as np
+import pytest
+
+from model.effects import Always, ByDay, Effect, Since, acting, effect_from_json, effect_to_json
+from model.effects.blocking import Blocking
+from model.effects.camera_response import CameraResponse
+from model.effects.facet_canting import FacetCanting
+from model.effects.sun_shape import SunShapeEffect
+from model.errors import InvalidInputError
+from model.forecast import Setup, View, forecast_setups
+from model.frames import sun_direction
+from model.plant import JUELICH_LATITUDE, Heliostat
+from model.study import FluxImage, Study, StudyOptions, study
+from model.study.judging import few_gain, split
+from model.study.scopes import change, promises
+from model.study.unknowns import Term, Unknowns, copied
+from model.surface import control_points
+from model.tracing import Optics
+from tests.conftest import target
+
+FIRST = datetime(2024, 6, 1, 12, tzinfo=UTC)
+CHANGE = date(2024, 6, 16)
+HAZY = {date(2024, 6, 7): {"circumsolar_ratio": 0.15}, date(2024, 6, 16): {"circumsolar_ratio": 0.2}}
+PLACES = {"near": (-8.0, 45.0, 1.8), "far": (35.0, 110.0, 1.8), "middle": (-40.0, 75.0, 1.8)}
+CANTED = FacetCanting(
+    {"far": np.array([0.5, -0.3, 0.0, -0.2])}, {"far": np.array([-0.4, 0.4, 0.2, -0.2])}, scope=Since(CHANGE)
+)
+
+
+def photographs(effects: Sequence[Effect] = (), days: int = 8) -> list[FluxImage]:
+    """What the forecaster expects of three mirrors, once every third day each, with some noise."""
+    rng, plane, made = np.random.default_rng(3), target(), []
+    for name, place in PLACES.items():
+        mirror = Heliostat.juelich(name, place, float(np.linalg.norm(np.array(place) - plane.center)), facet_depth=0.0)
+        points = control_points(mirror, rng.normal(0, 2e-4, (4, 8, 8)))
+        for day in range(days):
+            azimuth, spot = rng.uniform(-60, 60), plane.to_enu(rng.uniform(-0.3, 0.3, 2))
+            sun, moment = sun_direction(azimuth, 50 - abs(azimuth) / 2), FIRST + timedelta(days=3 * day)
+            made.append(Setup(mirror, points, sun, plane, spot, identifier=f"{name}/{day}", taken_at=moment))
+    images = forecast_setups(made, Optics(), effects, View(256, 256, samples=12), latitude_deg=JUELICH_LATITUDE).numpy()
+    images = images + 0.003 * images.max(axis=(1, 2), keepdims=True) * rng.standard_normal(images.shape)
+    return [FluxImage(setup, image) for setup, image in zip(made, images, strict=True)]
+
+
+def found_in(effects: Sequence[Effect], *candidates: str) -> Study:
+    return study(photographs(effects), Optics(), options=StudyOptions(candidates), latitude_deg=JUELICH_LATITUDE)
+
+
+# --- when effects act -------------------------------------------------------------------------------------------------
+
+
+def test_an_effect_acts_since_its_day_and_in_the_plant_of_today():
+    since = SunShapeEffect(0.1, scope=Since(date(2024, 6, 2)))
+    assert acting([since], datetime(2024, 6, 1, 23, tzinfo=UTC)) == ()
+    assert acting([since], datetime(2024, 6, 2, 0, tzinfo=UTC)) == (since,)
+    assert acting([since], None) == (since,)
+
+
+def test_an_effect_by_day_has_values_of_its_own_on_some_days():
+    hazy = SunShapeEffect(0.03, scope=ByDay(HAZY))
+    (there,) = acting([hazy], datetime(2024, 6, 7, 9, tzinfo=UTC))
+    assert isinstance(there, SunShapeEffect)
+    assert there.circumsolar_ratio == 0.15
+    assert acting([hazy], datetime(2024, 6, 7, 15, tzinfo=UTC)) == (there,)
+    assert acting([hazy], datetime(2024, 6, 8, 9, tzinfo=UTC)) == acting([hazy], None) == (hazy,)
+
+
+@pytest.mark.parametrize("effect", [CANTED, SunShapeEffect(0.03, scope=ByDay(HAZY)), CameraResponse(1.1)])
+def test_forecasts_hold_each_effect_when_it_acts(effect: Effect):
+    """All photographs at once are what each is with the effects of its time."""
+    setups = [p.setup for p in photographs(days=6)]
+    view = View(24, 24, samples=8)
+    together = forecast_setups(setups, None, [effect], view, latitude_deg=JUELICH_LATITUDE)
+    for setup, image in zip(setups, together, strict=True):
+        (alone,) = forecast_setups([setup], None, acting([effect], setup.taken_at), view, latitude_deg=JUELICH_LATITUDE)
+        np.testing.assert_allclose(image, alone, rtol=1e-3, atol=1e-3 * float(alone.max()))
+
+
+def test_scopes_survive_json():
+    assert effect_from_json(effect_to_json(CANTED)).scope == Since(CHANGE)
+    hazy = effect_from_json(effect_to_json(SunShapeEffect(0.03, scope=ByDay(HAZY))))
+    assert hazy.scope == ByDay(HAZY)
+    assert isinstance(effect_from_json(effect_to_json(CameraResponse(1.1))).scope, Always)
+
+
+@pytest.mark.parametrize(
+    ("scope", "says"),
+    [
+        ("set", "'scope' must be"),
+        ({"kind": "sometimes"}, "'scope' must be"),
+        ({"kind": "since", "since": "June"}, "a day must be a date such as 2024-06-02, got June"),
+        ({"kind": "since"}, "a day must be a date"),
+    ],
+)
+def test_a_malformed_scope_is_refused(scope: object, says: str):
+    with pytest.raises(InvalidInputError, match=says):
+        effect_from_json({"name": "sun_shape", "parameters": {}, "scope": scope})
+
+
+@pytest.mark.parametrize("by_day", [{"June": 0.1}, {"2024-06-02": 7}, 3, {"2024-06-02": "x"}])
+def test_malformed_values_by_day_are_refused(by_day: object):
+    parameters = {"circumsolar_ratio": {"value": 0.1, "by_day": by_day}}
+    with pytest.raises(InvalidInputError, match="sun_shape"):
+        effect_from_json({"name": "sun_shape", "parameters": parameters, "scope": {"kind": "day"}})
+
+
+def test_what_belongs_to_heliostats_has_no_values_by_day():
+    with pytest.raises(InvalidInputError, match="no values by day"):
+        Blocking(scope=ByDay({}))
+
+
+def test_copies_keep_the_scope():
+    both = copied(CANTED, 2)
+    assert both.heliostats == ["far#0", "far#1"]
+    assert both.scope == CANTED.scope
+
+
+# --- unknowns with a scope --------------------------------------------------------------------------------------------
+
+
+def test_unknowns_of_days_are_moved_at_once_and_become_one_effect():
+    days = tuple(sorted(HAZY))
+    unknowns = Unknowns((Term(SunShapeEffect, days=days),), (("near", 4), ("far", 4)))
+    assert list(unknowns.groups.values()) == [[0, 1]]
+    (effect,) = unknowns.effects(np.array([0.1, 0.2]))
+    assert effect_to_json(effect)["parameters"]["circumsolar_ratio"]["value"] == pytest.approx(0.15)
+    (there,) = acting([effect], datetime(2024, 6, 16, 9, tzinfo=UTC))
+    assert isinstance(there, SunShapeEffect)
+    assert there.circumsolar_ratio == 0.2
+
+
+def test_unknowns_of_one_heliostat_touch_its_later_photographs():
+    term = Term(FacetCanting, since=CHANGE, heliostats=("far",))
+    unknowns = Unknowns((term,), (("near", 4), ("far", 4)))
+    assert len(unknowns.all) == 8
+    (effect,) = unknowns.effects(np.zeros(8))
+    assert effect.heliostats == ["far"]
+    touched = {p.key for p in photographs() if term.touches(p.heliostat, p.taken_at)}
+    assert touched == {"far/5", "far/6", "far/7"}
+
+
+def test_the_day_of_a_change_is_the_one_after_which_most_is_saved():
+    days = [date(2024, 6, 1 + n) for n in range(8)]
+    saved = np.array([[-1.0, 0.5, -1, -1, 3, 2, -0.5, 3], [-4.0, 0, -4, -4, 2, 1, -2, 2]])
+    assert change(saved, days) == (date(2024, 6, 5), 7.5)
+    assert change(saved[:, :1], days[:1]) is None
+    since, by_day = promises(CameraResponse, saved, [days[0]] * 4 + [days[1]] * 4, np.array(["a"] * 8))
+    assert since.term == Term(CameraResponse, since=days[1])
+    assert by_day.term == Term(CameraResponse, days=tuple(days[:2]))
+
+
+def test_few_gains_are_worth_less():
+    assert few_gain(np.array([0.05])).low <= 0
+    assert few_gain(np.array([0.05, 0.01])).low < 0
+    assert few_gain(np.array([0.05, 0.04])).low > 0
+    assert few_gain(np.array([0.05, 0.01, 0.03])).low > 0
+
+
+def test_of_every_day_some_photographs_are_fitted_and_some_judge():
+    taken = photographs(days=4)
+    parts = split(taken)
+    fitted, judging = ({taken[row].taken_at for row in rows} for rows in (parts.fit, parts.held_out))
+    assert fitted == judging == {p.taken_at for p in taken}
+
+
+# --- what studies find ------------------------------------------------------------------------------------------------
+
+
+def test_nothing_comes_or_goes_in_calm_photographs():
+    calm = found_in([], "sun_shape", "camera_response", "facet_canting").to_json()
+    assert calm["verdict"] == "none"
+    assert calm["effects"] == []
+
+
+def test_a_mirror_that_was_canted_anew_is_found_with_its_date():
+    report = found_in([CANTED], "facet_canting", "slope_error").to_json()
+    (found,) = report["effects"]
+    assert found["scope"] == {"kind": "since", "since": "2024-06-16", "heliostats": ["far"]}
+    assert "facet canting of far since 2024-06-16" in report["conclusion"]
+    assert report["verdict"] == "effect"
+    tilts = np.array(found["parameters"]["y_mrad"]["value"]["far"])
+    np.testing.assert_allclose(tilts - tilts.mean(), CANTED.y_mrad["far"], atol=0.15)
+    assert effect_from_json(found).scope == Since(CHANGE)
+
+
+def test_a_camera_that_was_set_anew_is_found_with_its_date():
+    report = found_in([CameraResponse(1.1, scope=Since(CHANGE))], "camera_response", "camera_blur").to_json()
+    (found,) = report["effects"]
+    assert found["scope"] == {"kind": "since", "since": "2024-06-16", "heliostats": None}
+    assert found["parameters"]["gamma"]["value"] == pytest.approx(1.1, abs=0.02)
+
+
+def test_hazy_days_are_found_and_named():
+    report = found_in([SunShapeEffect(0.02, scope=ByDay(HAZY))], "sun_shape", "slope_error").to_json()
+    (found,) = report["effects"]
+    assert found["scope"] == {"kind": "day"}
+    assert "sun shape by day (most on 2024-06-07, 2024-06-16)" in report["conclusion"]
+    for day, truth in HAZY.items():
+        by_day = found["parameters"]["circumsolar_ratio"]["by_day"]
+        assert by_day[day.isoformat()] == pytest.approx(truth["circumsolar_ratio"], abs=0.03)
+
+
+def test_what_is_always_there_is_not_dated():
+    (found,) = found_in([SunShapeEffect(0.12)], "sun_shape", "camera_response").to_json()["effects"]
+    assert found["scope"] == {"kind": "set"}
