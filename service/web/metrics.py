@@ -22,7 +22,7 @@ from service.store.tables import DriftRow, HeliostatRow, JobRow
 from service.twin.field import read_lines
 from service.twin.runtime import Runtime
 
-_VERDICTS = {True: "yes", False: "no", None: "not predicted"}
+_VERDICTS = {True: "yes", False: "no", None: "unknown"}
 
 logger = logging.getLogger("heliotwin.service")
 
