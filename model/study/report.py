@@ -15,6 +15,7 @@ from model.study.advice import told_apart_by
 from model.study.covariates import covariates_of
 from model.study.flux_images import FluxImage
 from model.study.judging import Gain, rank_correlation
+from model.study.pattern import Pattern, pattern_of
 from model.study.unknowns import Term, Unknowns
 
 Array = NDArray[np.float64]
@@ -189,7 +190,21 @@ class Study:
         """Whether an effect explains the residual, there is none to explain, or none does."""
         if self.found and self.unexplained_share <= 1 - SHARE:
             return "effect"
-        return "unexplained" if self.incomplete else "none"
+        return "unexplained" if self.incomplete and not self.is_pattern else "none"
+
+    @cached_property
+    def pattern(self) -> Pattern:
+        """What the photographs' residuals have in common, place by place."""
+        return pattern_of(self.images, self.measured, self.after, self.window)
+
+    @property
+    def is_pattern(self) -> bool:
+        """Whether most of what is left is the target's own pattern, which no model of the light can explain.
+
+        Of deviations of standard deviation ``depth`` the mean magnitude is 0.8 of that.
+        """
+        left = self._excess(self.accuracy_after)
+        return left > 0 and self.pattern.is_targets and 0.8 * self.pattern.depth >= left / 2
 
     @property
     def flattered(self) -> int:
@@ -214,11 +229,17 @@ class Study:
         return np.asarray(((self.measured - self.after) / peaks).mean(axis=0))
 
     def conclusion(self) -> str:
-        """One plain sentence, and a second one where the images that judge are not independent of the surfaces."""
+        """One plain sentence, and others where a pattern is left, or the images that judge are not independent."""
+        said = self._conclusion()
+        if self.incomplete and self.is_pattern:
+            said += (
+                f" What is left is the target's own pattern, its marks and grid lines: {self.pattern.depth:.1%} of the "
+                "light, at the same places of the target in all photographs."
+            )
         if not self.flattered:
-            return self._conclusion()
+            return said
         return (
-            f"{self._conclusion()} {self.flattered} of the {len(self.images)} images that judge are among those "
+            f"{said} {self.flattered} of the {len(self.images)} images that judge are among those "
             "that the surfaces were predicted from, which flatters both accuracies: predict from fewer, or take more."
         )
 
@@ -271,6 +292,12 @@ class Study:
             ],
             "residual": {
                 "covariates": self.covariates(),
+                "pattern": {
+                    "is_targets": bool(self.is_pattern),
+                    "on_target": round(float(self.pattern.on_target), 4),
+                    "on_spot": round(float(self.pattern.on_spot), 4),
+                    "depth": round(float(self.pattern.depth), 5),
+                },
                 "mean_map_8x8": self.residual_map().reshape(8, 8, 8, 8).mean(axis=(1, 3)).round(4).tolist(),
             },
         }

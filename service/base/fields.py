@@ -13,9 +13,11 @@ from pydantic import (
     BaseModel,
     BeforeValidator,
     ConfigDict,
+    Discriminator,
     Field,
     Strict,
     StringConstraints,
+    Tag,
 )
 
 from model.plant import Cylinder, TargetPlane
@@ -84,6 +86,14 @@ Moment = Annotated[
     Field(ge=datetime(1970, 1, 1, tzinfo=UTC), lt=datetime(9000, 1, 1, tzinfo=UTC)),
     AfterValidator(lambda moment: moment.astimezone(UTC)),
 ]
+
+FormMoment = Annotated[
+    datetime,
+    AfterValidator(lambda moment: moment.replace(tzinfo=UTC) if moment.tzinfo is None else moment),
+    Field(ge=datetime(1970, 1, 1, tzinfo=UTC), lt=datetime(9000, 1, 1, tzinfo=UTC)),
+    AfterValidator(lambda moment: moment.astimezone(UTC)),
+]
+"""In forms: what a browser's field for a moment gives bears no zone; the pages say that it means UTC."""
 
 Version = Annotated[int, Field(ge=1, le=2**31 - 1)]
 """In paths and queries."""
@@ -155,6 +165,25 @@ class Sun(Model):
 
     azimuth_deg: Azimuth
     elevation_deg: Elevation
+
+
+class SunAt(Model):
+    """Where the sun stands over the plant at a time."""
+
+    at: Moment = Field(description="Time with zone; by day.")
+
+
+def _way_to_say(sun: Any) -> str:
+    """Which of the two ways somebody says where the sun stands by."""
+    by_time = "at" in sun if isinstance(sun, dict) else isinstance(sun, SunAt)
+    return "(time)" if by_time else "(position)"
+
+
+AnySun = Annotated[
+    Annotated[Sun, Tag("(position)")] | Annotated[SunAt, Tag("(time)")],
+    Discriminator(_way_to_say),
+    Field(description='Where the sun stands: its position, or the time, `{"at": ..}`.'),
+]
 
 
 def _square(value: Any) -> Any:

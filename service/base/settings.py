@@ -1,9 +1,11 @@
 """Settings of the service, from the environment (prefix ``HELIOTWIN_``) or a ``.env`` file."""
 
 import ipaddress
+import math
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal, Self
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 from pydantic import Field, SecretStr, field_validator, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
@@ -24,6 +26,15 @@ WORKER_CONNECTIONS = 2
 """Those of a worker: for its work and for its heartbeat."""
 
 _LEAST_WEB_CONNECTIONS = 8
+
+MAP_SCALES: dict[str, tuple[float, float]] = {
+    "accuracy": (95.0, 75.0),
+    "deviation": (0.0, 2.0),
+    "uncertainty": (0.0, 0.5),
+    "misfit": (5.0, 30.0),
+    "age": (0.0, 365.0),
+}
+"""What is fine and what is poor of the figures that the field's map shows, unless the settings say otherwise."""
 
 
 def is_loopback(host: str) -> bool:
@@ -179,6 +190,15 @@ class Settings(BaseSettings):
     )
     log_level: LogLevel = "info"
     log_format: Literal["text", "json"] = Field(default="text", description="json: one object a line.")
+    time_zone: str | None = Field(
+        default=None, description="The plant's zone, as `Europe/Berlin`: pages tell times in it beside UTC."
+    )
+    map_scales: dict[str, tuple[float, float]] = Field(
+        default_factory=dict,
+        validate_default=True,
+        description="JSON: what is fine and what is poor, which is where the map's colours begin and end, of accuracy "
+        '[%], deviation, uncertainty [mm], misfit [%] and age [days], such as {"accuracy": [95, 80]}.',
+    )
     metrics_port: int | None = Field(
         default=None,
         ge=1,
@@ -205,6 +225,26 @@ class Settings(BaseSettings):
         if backend not in _DRIVERS:
             raise ValueError(f"must be a sqlite or postgresql URL, not {backend}")
         return value
+
+    @field_validator("map_scales")
+    @classmethod
+    def _all_scales(cls, value: dict[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
+        unknown = sorted(set(value) - set(MAP_SCALES))
+        if unknown:
+            raise ValueError(f"there is no figure {', '.join(unknown)}; name {', '.join(MAP_SCALES)}")
+        for name, (fine, poor) in value.items():
+            rises = poor < fine if name == "accuracy" else fine < poor
+            if not rises or not math.isfinite(fine - poor):
+                raise ValueError(f"{name}: give what is fine, then what is poor, not {fine:g}, {poor:g}")
+        return MAP_SCALES | value
+
+    @field_validator("time_zone")
+    @classmethod
+    def _known_zone(cls, value: str | None) -> str | None:
+        try:
+            return None if value is None else ZoneInfo(value).key
+        except (ZoneInfoNotFoundError, ValueError, OSError) as error:
+            raise ValueError(f"must be a zone of the tz database such as Europe/Berlin, not {value!r}") from error
 
     @field_validator("forwarded_allow_ips")
     @classmethod

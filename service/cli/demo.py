@@ -134,7 +134,7 @@ def _split(observations: list[Observation]) -> tuple[list[Observation], list[Obs
 
 def _stored(runtime: Runtime, name: str, method: Method, used: Sequence[Observation]) -> Array:
     """Predict from stored measurements, store the version, and give back its heights (4, 8, 8) [m]."""
-    row = predict_surface(runtime, name, method, [o.identifier for o in used])
+    row = predict_surface(runtime, name, method, [o.identifier for o in used]).row
     return unpack(row.arrays)["z"].astype(np.float64)
 
 

@@ -61,15 +61,6 @@ class Scale:
         return ticks(self.low, self.high)
 
 
-def scale_of(values: Sequence[float], colours: str, label: str, least: float) -> Scale:
-    """A scale over all ``values``, which are not negative; it spans at least ``least``, lest noise be coloured."""
-    low, high = (min(values), max(values)) if values else (0.0, least)
-    if high - low < least:
-        low = max((low + high - least) / 2, 0.0)
-        high = low + least
-    return Scale(colours, low, high, label)
-
-
 @dataclass(frozen=True)
 class HeatMap:
     """A coloured map over a rectangle.
@@ -112,16 +103,25 @@ def heat_map(title: str, values: Array, size: tuple[float, float], scale: Scale)
     return HeatMap(title, _data_url(scale.pixels(values)), *size, scale)
 
 
+def flux_scale(top: float, unit: str) -> Scale:
+    """Of flux: dark where there is none."""
+    return Scale("inferno", 0.0, max(top, 1e-9), unit)
+
+
+def difference_scale(bound: float, unit: str) -> Scale:
+    """Of differences, forecast minus photograph: white where there is none, red where the forecast is brighter."""
+    bound = max(bound, 1e-9)
+    return Scale("RdBu_r", -bound, bound, unit)
+
+
 def flux_map(title: str, flux: Array, size: tuple[float, float], unit: str, top: float | None = None) -> HeatMap:
     """A flux map, dark where there is none; ``top`` ends its scale, else its own peak."""
-    peak = float(flux.max()) if top is None else top
-    return heat_map(title, flux, size, Scale("inferno", 0.0, max(peak, 1e-9), unit))
+    return heat_map(title, flux, size, flux_scale(float(flux.max()) if top is None else top, unit))
 
 
 def difference_map(title: str, difference: Array, size: tuple[float, float], unit: str) -> HeatMap:
     """A map of differences, white where there is none."""
-    bound = max(float(np.abs(difference).max()), 1e-9)
-    return heat_map(title, difference, size, Scale("RdBu_r", -bound, bound, unit))
+    return heat_map(title, difference, size, difference_scale(float(np.abs(difference).max()), unit))
 
 
 def mirror_image(heights: Array) -> Array:

@@ -56,7 +56,8 @@ def comparison_picture(
     measured: NDArray[np.floating], forecast: NDArray[np.floating], side: float, title: str
 ) -> bytes:
     """Measured and forecast flux (n, n) over ``side`` [m], scaled to one sum, and their difference."""
-    a, b = (image / image.sum() * image.size for image in (np.asarray(measured), np.asarray(forecast)))
+    a, b = (image / image.sum() for image in (np.asarray(measured), np.asarray(forecast)))
+    a, b = a / a.max(), b / a.max()
     figure = Figure(figsize=(10, 3.4), layout="constrained")
     panes = figure.subplots(1, 3)
     extent = (-side / 2, side / 2, -side / 2, side / 2)
@@ -64,9 +65,9 @@ def comparison_picture(
     for pane, image, name in zip(panes, (a, b), ("measured", "forecast"), strict=False):
         shown = pane.imshow(image, cmap="inferno", vmin=0, vmax=top, extent=extent)
         pane.set(title=name, xlabel="right [m]")
-    figure.colorbar(shown, ax=panes[:2].tolist(), label="of the mean")
+    figure.colorbar(shown, ax=panes[:2].tolist(), label="of the measured peak")
     shown = panes[2].imshow(b - a, cmap="RdBu_r", vmin=-bound, vmax=bound, extent=extent)
     panes[2].set(title="forecast - measured", xlabel="right [m]")
-    figure.colorbar(shown, ax=panes[2], label="of the mean")
+    figure.colorbar(shown, ax=panes[2], label="of the measured peak")
     figure.suptitle(title)
     return _png(figure)

@@ -92,9 +92,9 @@ def pictures(study: Study, images: Sequence[Image]) -> Pictures:
         shown = {"measured": (measured, flux_scale), "forecast before": (before, flux_scale)}
         if study.found:
             shown["forecast after"] = (after, flux_scale)
-        shown["residual before"] = (measured - before, residual_scale)
+        shown["difference before"] = (before - measured, residual_scale)
         if study.found:
-            shown["residual after"] = (measured - after, residual_scale)
+            shown["difference after"] = (after - measured, residual_scale)
         name = image.photograph.key
         squares = {what: heat_map(f"{name}, {what}", v, (study.window,) * 2, s) for what, (v, s) in shown.items()}
         return Row(rank, image, squares)

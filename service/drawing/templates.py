@@ -1,8 +1,10 @@
 """The templates of pages and reports, and how both write numbers and moments."""
 
+from collections.abc import Callable
 from datetime import UTC, datetime
 from importlib.resources import files
 from urllib.parse import quote
+from zoneinfo import ZoneInfo
 
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
@@ -34,6 +36,11 @@ def moment(value: datetime | None) -> str | Markup:
         return "–"
     utc = value.astimezone(UTC)
     return Markup('<time datetime="{}">{}</time>').format(utc.isoformat(), utc.strftime("%Y-%m-%d %H:%M UTC"))
+
+
+def in_zone(zone: str | None) -> Callable[[datetime], str]:
+    """How a moment is told by the clocks of a zone of the tz database; nothing without one."""
+    return lambda value: "" if zone is None else f"{value.astimezone(ZoneInfo(zone)):%Y-%m-%d %H:%M %Z}"
 
 
 def power(watts: float) -> str:

@@ -14,6 +14,7 @@ from sqlalchemy.orm import Session
 
 from service.base.settings import Settings
 from service.store import queue
+from service.store.tables import JobRow
 from service.twin.runtime import Runtime
 
 # Seconds between two writes of a job's progress: what a person can follow, and little for the database.
@@ -97,7 +98,8 @@ class Kind(Generic[Payload]):
     """A kind of job: what it takes, and the function that does it.
 
     Where it has ``due``, workers ask that every hour: it gives None, or the Idempotency-Key of a job that is due, which
-    is begun once, with nothing in its payload.
+    is begun once, with nothing in its payload. Where it has ``so_far``, that makes a result of the steps that are done,
+    for a job that did not come to its end.
     """
 
     name: str
@@ -105,6 +107,15 @@ class Kind(Generic[Payload]):
     handler: Callable[[Context, Payload], Result]
     summary: str
     due: Callable[[Session, Settings], str | None] | None = None
+    so_far: Callable[[Mapping[str, Mapping[str, Any]]], dict[str, Any]] | None = None
 
 
 Kinds = Mapping[str, Kind[Any]]
+
+
+def result_of(kinds: Kinds, session: Session, job: JobRow) -> dict[str, Any] | None:
+    """What a job gave; where it was cancelled or failed, what it had changed until then."""
+    kind = kinds.get(job.kind)
+    if job.result is not None or kind is None or kind.so_far is None or job.state not in ("cancelled", "failed"):
+        return job.result
+    return kind.so_far(queue.steps(session, job.id))

@@ -10,6 +10,7 @@ from service.store.measurements import (
     get_measurements,
     list_measurements,
     recent_measurements,
+    use_image,
 )
 from service.store.plant import (
     add_heliostat,
@@ -41,23 +42,28 @@ from service.store.results import (
     has_study_page,
     list_forecasts,
     list_studies,
+    recent_field_forecasts,
     recent_forecasts,
 )
 from service.store.rows import Change, insert, one_at_a_time
 from service.store.surfaces import (
     NewSurface,
+    Trust,
     add_surface,
     current_surfaces,
+    find_alike,
     find_measured_surface,
     find_surface_at,
     get_surface,
     get_surface_at,
     list_surfaces,
+    newest_prediction,
 )
 
 __all__ = [
     "Change",
     "NewSurface",
+    "Trust",
     "add_forecast",
     "add_heliostat",
     "add_measurement",
@@ -65,6 +71,7 @@ __all__ = [
     "add_surface",
     "counts",
     "current_surfaces",
+    "find_alike",
     "find_heliostat",
     "find_measured_surface",
     "find_measurement_of_image",
@@ -91,11 +98,13 @@ __all__ = [
     "list_studies",
     "list_surfaces",
     "list_targets",
+    "newest_prediction",
     "one_at_a_time",
     "put_heliostat",
     "put_plant",
     "put_receiver",
     "put_target",
+    "recent_field_forecasts",
     "recent_forecasts",
     "recent_measurements",
     "remove_heliostat",
@@ -103,4 +112,5 @@ __all__ = [
     "remove_target",
     "require_same_properties",
     "target_plane",
+    "use_image",
 ]

@@ -58,5 +58,6 @@ class Base(DeclarativeBase):
         dict[str, Any]: _Json,
         list[dict[str, Any]]: _Json,
         list[float]: _Json,
+        list[int]: _Json,
         list[str]: _Json,
     }

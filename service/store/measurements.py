@@ -104,7 +104,7 @@ def _free_identifier(session: Session, heliostat: HeliostatRow, row: Measurement
     raise ConflictError(f"id: measurement {wanted} of heliostat {heliostat.name} has another {row.kind} image already")
 
 
-def _use(session: Session, image: ImageRow, accepted: bool, is_new: bool) -> None:
+def use_image(session: Session, image: ImageRow, accepted: bool, is_new: bool) -> None:
     """Keep an image's row in step with a new measurement of it, and the totals with the row."""
     if is_new:
         sizes.count(session, accepted, 1, image.size_bytes)
@@ -158,7 +158,7 @@ def add_measurement(
             return existing, False
         row.identifier = _free_identifier(session, heliostat, row)
         if insert(session, row):
-            _use(session, image, row.accepted, is_new)
+            use_image(session, image, row.accepted, is_new)
             session.refresh(row, ["target", "image"])
             return row, True
     raise ConflictError("too many writers on the same measurement; try again")

@@ -35,7 +35,8 @@ def _is_todays() -> ColumnElement[bool]:
     """Whether no other version of the surface is current in its place; see `find_surface_at`."""
     other = aliased(SurfaceRow)
     is_newer = tuple_(other.valid_from, other.version) > tuple_(SurfaceRow.valid_from, SurfaceRow.version)
-    return not_(exists(select(other.id).where(other.heliostat_id == SurfaceRow.heliostat_id, is_newer)))
+    newer = select(other.id).where(other.heliostat_id == SurfaceRow.heliostat_id, is_newer, not_(other.set_aside))
+    return and_(not_(SurfaceRow.set_aside), not_(exists(newer)))
 
 
 _REFUSED = not_(ImageRow.accepted)

@@ -9,6 +9,7 @@ from service.store.plant import get_heliostat, get_receiver, get_target
 from service.store.queue import ENDED
 from service.store.rows import one_at_a_time
 from service.store.tables import (
+    DecisionRow,
     DriftRow,
     ForecastRow,
     HeliostatRow,
@@ -55,7 +56,7 @@ def remove_heliostat(session: Session, name: str) -> None:
     _lock(session, HeliostatRow, row.id)
     users = {
         table.__tablename__: _count(session, table, table.heliostat_id == row.id)
-        for table in (MeasurementRow, SurfaceRow, ForecastRow, DriftRow)
+        for table in (MeasurementRow, SurfaceRow, DecisionRow, ForecastRow, DriftRow)
     }
     # A study keeps names, for its photographs may be gone before it.
     studied = sum(name in heliostats for heliostats in session.scalars(select(StudyRow.heliostats)))

@@ -1,6 +1,8 @@
 """Forecasts and studies, as they are kept and found again, and how many of everything there are."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
 from typing import cast
 
 from sqlalchemy import func, select
@@ -9,7 +11,16 @@ from sqlalchemy.orm import Session, joinedload, lazyload, load_only, undefer
 from service.base.faults import NotFoundError
 from service.store.columns import Base
 from service.store.rows import hold
-from service.store.tables import ForecastRow, HeliostatRow, ImageRow, MeasurementRow, StudyRow, SurfaceRow, TargetRow
+from service.store.tables import (
+    ForecastRow,
+    HeliostatRow,
+    ImageRow,
+    JobRow,
+    MeasurementRow,
+    StudyRow,
+    SurfaceRow,
+    TargetRow,
+)
 
 # What a forecast tells of its heliostat and surface is a name and a number; the rest would be megabytes in a list.
 _NAMES = (
@@ -50,6 +61,34 @@ def list_forecasts(
 def recent_forecasts(session: Session, limit: int) -> Sequence[ForecastRow]:
     """The newest ``limit`` forecasts, the newest first."""
     return session.scalars(select(ForecastRow).options(*_NAMES).order_by(ForecastRow.id.desc()).limit(limit)).all()
+
+
+@dataclass(frozen=True)
+class FieldForecast:
+    """A forecast of many heliostats in short: a job's, without its map."""
+
+    job: int
+    created_at: datetime
+    heliostats: int
+    target: str | None
+    sun_azimuth_deg: float | None
+    sun_elevation_deg: float | None
+    peak_w_m2: float
+
+
+def recent_field_forecasts(session: Session, limit: int) -> list[FieldForecast]:
+    """The newest ``limit`` forecasts of many heliostats, the newest first; the database picks them out of results."""
+    result, payload = JobRow.result, JobRow.payload
+    query = select(
+        JobRow.id,
+        JobRow.created_at,
+        result["heliostats"].as_integer(),
+        payload["target"].as_string(),
+        result["sun"]["azimuth_deg"].as_float(),
+        result["sun"]["elevation_deg"].as_float(),
+        result["peak_w_m2"].as_float(),
+    ).where(JobRow.kind == "forecasts", JobRow.state == "done")
+    return [FieldForecast(*row) for row in session.execute(query.order_by(JobRow.id.desc()).limit(limit))]
 
 
 def add_study(session: Session, row: StudyRow) -> StudyRow:

@@ -11,11 +11,28 @@ from numpy.typing import NDArray
 from sqlalchemy import Select, func, select
 from sqlalchemy.orm import Session, undefer
 
-from service.base.arrays import pack
+from service.base.arrays import pack, unpack
 from service.base.faults import ConflictError, NotFoundError
 from service.store.columns import now
 from service.store.rows import ROUNDS, hold, insert
 from service.store.tables import HeliostatRow, MeasurementRow, SurfaceRow
+
+# Heights that differ less [m] are the same: what threads that add up in another order make of them.
+_ALIKE_M = 1e-7
+
+
+@dataclass(frozen=True)
+class Trust:
+    """What a prediction says of itself.
+
+    ``doubts`` are sentences, none where it is trusted; ``suspicious`` the measurements that it does not explain;
+    ``strangeness`` its Mahalanobis distance; ``sun_span_deg`` the largest angle between the suns of its photographs.
+    """
+
+    doubts: tuple[str, ...]
+    suspicious: tuple[str, ...]
+    strangeness: float
+    sun_span_deg: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +54,8 @@ class NewSurface:
         Version of the plant's model that it was made with.
     measurements : the rows that it was made from
     misfit : float
+    trust : Trust
+        Of a prediction.
     """
 
     source: str
@@ -48,6 +67,7 @@ class NewSurface:
     model_version: str | None = None
     measurements: Sequence[MeasurementRow] = field(default=())
     misfit: float | None = None
+    trust: Trust | None = None
 
     @property
     def content(self) -> str:
@@ -61,9 +81,22 @@ def _surfaces(heliostat: HeliostatRow) -> Select[SurfaceRow]:
 
 
 def _surface_row(heliostat: HeliostatRow, version: int, new: NewSurface, content: str | None) -> SurfaceRow:
-    created = now()
+    created, trust = now(), new.trust
     arrays = {"z": new.z, "z_std": new.z_std, "control_points": new.control_points}
+    told = (
+        {}
+        if trust is None
+        else {
+            "trusted": not trust.doubts,
+            "doubts": list(trust.doubts),
+            "doubted_since": created if trust.doubts else None,
+            "suspicious": list(trust.suspicious),
+            "strangeness": trust.strangeness,
+            "sun_span_deg": trust.sun_span_deg,
+        }
+    )
     return SurfaceRow(
+        **told,
         heliostat_id=heliostat.id,
         version=version,
         created_at=created,
@@ -108,6 +141,26 @@ def list_surfaces(
     return session.scalars(query.where(SurfaceRow.version > after) if after else query).all()
 
 
+def newest_prediction(session: Session, heliostat: HeliostatRow) -> SurfaceRow | None:
+    """The version that was predicted last, or None."""
+    query = _surfaces(heliostat).where(SurfaceRow.trusted.is_not(None))
+    return session.scalar(query.order_by(SurfaceRow.version.desc()).limit(1))
+
+
+def find_alike(session: Session, heliostat: HeliostatRow, new: NewSurface) -> SurfaceRow | None:
+    """A version that was made in the same way from the same photographs and differs by less than 0.1 um, or None."""
+    query = _surfaces(heliostat).where(
+        SurfaceRow.source == new.source, SurfaceRow.model == new.model, SurfaceRow.model_version == new.model_version
+    )
+    made_from = {row.id for row in new.measurements}
+    for row in session.scalars(query.order_by(SurfaceRow.version.desc())):
+        if made_from == {measurement.id for measurement in row.measurements}:
+            found = get_surface(session, heliostat, row.version)
+            if np.allclose(unpack(found.arrays)["z"], new.z, rtol=0, atol=_ALIKE_M):
+                return found
+    return None
+
+
 def get_surface(session: Session, heliostat: HeliostatRow, version: int) -> SurfaceRow:
     """A version with its arrays; NotFoundError where there is none."""
     row = session.scalar(_surfaces(heliostat).where(SurfaceRow.version == version).options(undefer(SurfaceRow.arrays)))
@@ -125,10 +178,11 @@ def find_measured_surface(session: Session, heliostat: HeliostatRow) -> SurfaceR
 def find_surface_at(session: Session, heliostat: HeliostatRow, moment: datetime | None = None) -> SurfaceRow | None:
     """The version, with its arrays, that was valid at ``moment``: the last to begin before it, or None.
 
+    What is set aside does not count.
     Without a moment the last of all: what begins a little ahead, because a camera's clock is ahead of ours or ours was
     set back, is current too.
     """
-    query = _surfaces(heliostat)
+    query = _surfaces(heliostat).where(~SurfaceRow.set_aside)
     if moment is not None:
         query = query.where(SurfaceRow.valid_from <= moment)
     query = query.order_by(SurfaceRow.valid_from.desc(), SurfaceRow.version.desc()).limit(1)
@@ -140,7 +194,8 @@ def current_surfaces(session: Session, heliostats: Sequence[int]) -> dict[int, b
     newest = func.row_number().over(
         partition_by=SurfaceRow.heliostat_id, order_by=(SurfaceRow.valid_from.desc(), SurfaceRow.version.desc())
     )
-    ranked = select(SurfaceRow.id, newest.label("place")).where(SurfaceRow.heliostat_id.in_(heliostats)).subquery()
+    candidates = select(SurfaceRow.id, newest.label("place")).where(SurfaceRow.heliostat_id.in_(heliostats))
+    ranked = candidates.where(~SurfaceRow.set_aside).subquery()
     first = select(ranked.c.id).where(ranked.c.place == 1)
     rows = session.execute(select(SurfaceRow.heliostat_id, SurfaceRow.arrays).where(SurfaceRow.id.in_(first)))
     return {row.heliostat_id: row.arrays for row in rows}

@@ -141,7 +141,8 @@ class MeasurementRow(Base):
     """One photograph of one heliostat's spot and what was measured in it.
 
     ``arrays`` holds npz ``flux`` and ``centered``; a refused image has neither and keeps its ``reason``.
-    ``center_right_m``, ``center_up_m``: centre of mass from the target's centre.
+    ``center_right_m``, ``center_up_m``: centre of mass from the target's centre. ``corrected_at``: since when it stands
+    as it does, where it was corrected (`CorrectionRow`); an excluded one is not accepted for the reason `excluded`.
     """
 
     __tablename__ = "measurements"
@@ -173,9 +174,24 @@ class MeasurementRow(Base):
     center_up_m: Mapped[float | None]
     arrays: Mapped[bytes | None] = mapped_column(LargeBinary, deferred=True)
     created_at: Mapped[datetime] = mapped_column(default=now)
+    corrected_at: Mapped[datetime | None]
 
     target: Mapped[TargetRow] = relationship(lazy="joined", innerjoin=True)
     image: Mapped[ImageRow] = relationship(lazy="joined", innerjoin=True)
+
+
+class CorrectionRow(Base):
+    """What somebody corrected of a photograph, or that it was excluded: what stood there ``before``, and ``after``."""
+
+    __tablename__ = "corrections"
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    measurement_id: Mapped[int] = mapped_column(ForeignKey("measurements.id"), index=True)
+    made_at: Mapped[datetime] = mapped_column(default=now)
+    made_by: Mapped[str] = mapped_column(String(64))
+    reason: Mapped[str] = mapped_column(String(200))
+    before: Mapped[dict[str, Any]]
+    after: Mapped[dict[str, Any]]
 
 
 surface_measurements = Table(
@@ -190,7 +206,11 @@ class SurfaceRow(Base):
     """One version of a heliostat's surface; npz ``z``, ``z_std`` (4, 8, 8) and ``control_points`` (4, 8, 8, 3) [m].
 
     ``content_sha256`` is set where the same content must not be stored twice (imports); predictions leave it empty.
-    ``model`` names the weights, ``model_version`` the plant's model with its effects that a prediction was made by.
+    What is ``set_aside`` is never current (`service.store.decisions`). ``model`` names the weights, ``model_version``
+    the plant's model with its effects that a prediction was made by. Whether a prediction is ``trusted``
+    (`model.observation.SurfacePrediction`) stands with its ``doubts`` in words, since when the heliostat has had any,
+    and who has seen that; of a measured surface all of it is empty. ``sun_span_deg`` is the largest angle between the
+    suns of its photographs.
     """
 
     __tablename__ = "surfaces"
@@ -211,11 +231,50 @@ class SurfaceRow(Base):
     model_version: Mapped[str | None] = mapped_column(String(MODEL_VERSION))
     misfit: Mapped[float | None]
     content_sha256: Mapped[str | None] = mapped_column(String(64))
+    set_aside: Mapped[bool] = mapped_column(server_default=false())
+    trusted: Mapped[bool | None]
+    doubts: Mapped[list[str] | None]
+    doubted_since: Mapped[datetime | None]
+    suspicious: Mapped[list[str] | None]
+    strangeness: Mapped[float | None]
+    sun_span_deg: Mapped[float | None]
+    seen_at: Mapped[datetime | None]
+    seen_by: Mapped[str | None] = mapped_column(String(64))
     arrays: Mapped[bytes] = mapped_column(LargeBinary, deferred=True)
 
     measurements: Mapped[list[MeasurementRow]] = relationship(
         secondary=surface_measurements, order_by=MeasurementRow.id, lazy="selectin"
     )
+
+    @property
+    def outdated(self) -> list[MeasurementRow]:
+        """Photographs that it was made from, and that were corrected or excluded since."""
+        return [row for row in self.measurements if row.corrected_at is not None and row.corrected_at > self.created_at]
+
+
+class DecisionRow(Base):
+    """That a version became a heliostat's surface of today, or did not, and on what grounds.
+
+    ``previous`` is the version that was today's; ``set_aside_before`` are those that were set aside until then, which
+    is what taking the decision back restores. Accuracies [1] are those of the former surface and of this one.
+    """
+
+    __tablename__ = "surface_decisions"
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    heliostat_id: Mapped[int] = mapped_column(ForeignKey("heliostats.id"), index=True)
+    surface_id: Mapped[int] = mapped_column(ForeignKey("surfaces.id"))
+    previous: Mapped[int | None]
+    taken: Mapped[bool]
+    made_at: Mapped[datetime] = mapped_column(default=now)
+    made_by: Mapped[str] = mapped_column(String(64))
+    reason: Mapped[str] = mapped_column(String(200))
+    accuracy_before: Mapped[float | None]
+    accuracy_after: Mapped[float | None]
+    photographs: Mapped[int]
+    set_aside_before: Mapped[list[int]]
+
+    surface: Mapped[SurfaceRow] = relationship(lazy="joined", innerjoin=True)
 
 
 class DriftRow(Base):
@@ -231,7 +290,10 @@ class DriftRow(Base):
 
 
 class ForecastRow(Base):
-    """A computed flux map: its inputs, its npz ``flux`` (rows, columns) float32 [W/m2] and its figures."""
+    """A computed flux map: its inputs, its npz ``flux`` (rows, columns) float32 [W/m2] and its figures.
+
+    ``sun_at`` is the time that was asked for, where the sun was not asked for by its position.
+    """
 
     __tablename__ = "forecasts"
 
@@ -242,6 +304,7 @@ class ForecastRow(Base):
     plane: Mapped[dict[str, Any]]
     sun_azimuth_deg: Mapped[float]
     sun_elevation_deg: Mapped[float]
+    sun_at: Mapped[datetime | None]
     aim_point_m: Mapped[list[float] | None]
     dni_w_m2: Mapped[float]
     window_m: Mapped[float | None]

@@ -6,8 +6,9 @@ model another version.
 """
 
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from statistics import fmean
 from typing import Any
 
@@ -22,7 +23,7 @@ from service.base.faults import ServiceError
 from service.store.tables import DriftRow, HeliostatRow, MeasurementRow, SurfaceRow
 from service.twin import versions
 from service.twin.book import Book
-from service.twin.evidence import Evidence, Twin, evidence_of, heights_of, load_twin
+from service.twin.evidence import Array, Evidence, Twin, evidence_of, heights_of, load_twin
 from service.twin.runtime import Runtime
 
 logger = logging.getLogger("heliotwin.service")
@@ -58,9 +59,27 @@ class Comparison:
     was_used: bool
 
 
-def _newest(session: Session, heliostat: HeliostatRow) -> list[MeasurementRow]:
-    recent = store.recent_measurements(session, heliostat, RECENT)
-    return store.get_measurements(session, heliostat, [row.identifier for row in recent], arrays=True)
+# The newest photographs, this many times as many as are held against a forecast, are looked through for unseen ones.
+_LOOKED_THROUGH = 4
+
+
+def name_of(row: MeasurementRow) -> str:
+    """Of the photograph that an image shows: one photograph may be stored in several kinds."""
+    return row.external_id or row.identifier
+
+
+def seen_by(surface: SurfaceRow | None) -> set[str]:
+    """Names of the photographs that a surface was made from."""
+    return set() if surface is None else {name_of(row) for row in surface.measurements}
+
+
+def unseen_first(session: Session, heliostat: HeliostatRow, seen: Collection[str]) -> tuple[list[MeasurementRow], int]:
+    """A heliostat's newest photographs, with arrays, first those not ``seen``; and how many of them are not."""
+    recent = store.recent_measurements(session, heliostat, _LOOKED_THROUGH * RECENT)
+    unseen = [row for row in recent if name_of(row) not in seen]
+    chosen = (unseen + [row for row in recent if name_of(row) in seen])[:RECENT]
+    rows = store.get_measurements(session, heliostat, [row.identifier for row in chosen], arrays=True)
+    return rows, min(len(unseen), RECENT)
 
 
 def compare(runtime: Runtime, name: str, surface: SurfaceRow | None) -> list[Comparison]:
@@ -75,25 +94,25 @@ def compare(runtime: Runtime, name: str, surface: SurfaceRow | None) -> list[Com
     """
     with runtime.database.reading() as session:
         twin = load_twin(session, name)
-        rows = _newest(session, twin.row)
+        rows, _ = unseen_first(session, twin.row, seen_by(surface))
     if not rows:
         return []
     shown = [evidence_of(row, twin.origin) for row in rows]
-    used = set() if surface is None else {measurement.id for measurement in surface.measurements}
+    used, forecasts = seen_by(surface), forecasts_of(runtime, twin, shown, heights_of(surface))
     return [
-        Comparison(row, evidence.centered, forecast, flux_accuracy(evidence.centered, forecast), row.id in used)
-        for row, evidence, forecast in zip(rows, shown, forecasts_of(runtime, twin, shown, surface), strict=True)
+        Comparison(row, evidence.centered, forecast, flux_accuracy(evidence.centered, forecast), name_of(row) in used)
+        for row, evidence, forecast in zip(rows, shown, forecasts, strict=True)
     ]
 
 
-def forecasts_of(runtime: Runtime, twin: Twin, shown: Sequence[Evidence], surface: SurfaceRow | None) -> NDArray[Any]:
-    """What a stored surface, or the ideal one, throws where each photograph shows its spot: (n, 64, 64), sum 100."""
+def forecasts_of(runtime: Runtime, twin: Twin, shown: Sequence[Evidence], z: Array | None) -> NDArray[Any]:
+    """What heights (4, 8, 8) [m], None the ideal ones, throw where photographs show spots: (n, 64, 64), sum 100."""
     observations, model = [evidence.observation() for evidence in shown], twin.model
     with runtime.computing("compare") as operations:
         return operations.render(
             twin.heliostat,
             observations,
-            heights_of(surface),
+            z,
             model.optics,
             model.effects,
             latitude_deg=twin.origin[0],
@@ -101,44 +120,59 @@ def forecasts_of(runtime: Runtime, twin: Twin, shown: Sequence[Evidence], surfac
 
 
 @dataclass(frozen=True)
+class Rank:
+    """Mean accuracy [1] on photographs that the surface was not made from, and how many there are; None without any."""
+
+    accuracy: float | None
+    photographs: int
+
+
+def rank_of(comparisons: Sequence[Comparison]) -> Rank:
+    """What comparisons prove of a surface: those that it was made from prove nothing."""
+    unseen = [comparison.accuracy for comparison in comparisons if not comparison.was_used]
+    return Rank(fmean(unseen) if unseen else None, len(unseen))
+
+
+@dataclass(frozen=True)
 class State:
     """What a heliostat's accuracy depends on.
 
-    Its surface and its newest photograph, by their rows' ids, and the version of the plant's model.
+    Its surface and its newest photograph, by their rows' ids, when one was last corrected, and the version of the
+    plant's model.
     """
 
     heliostat: str
     surface: int
     newest: int
+    corrected: datetime | None
     model: int
 
 
 class AccuracyBook:
-    """Mean accuracies [1] by `State`; those that are missing are worked out in the background."""
+    """How well heliostats are forecast, by `State`; what is missing is worked out in the background."""
 
     def __init__(self, runtime: Runtime) -> None:
         self._runtime = runtime
-        self._book: Book[State, float | None] = Book(self._accuracy, None, "accuracy", _MOST)
+        self._book: Book[State, Rank] = Book(self._rank, Rank(None, 0), "accuracy", _MOST)
 
-    def look_up(self, states: Iterable[State]) -> tuple[dict[str, float | None], int]:
-        """What is known, by heliostat (None: it could not be told), and how many are still being worked out."""
+    def look_up(self, states: Iterable[State]) -> tuple[dict[str, Rank], int]:
+        """What is known, by heliostat, and how many are still being worked out."""
         known, missing = self._book.look_up(states)
-        return {state.heliostat: accuracy for state, accuracy in known.items()}, missing
+        return {state.heliostat: rank for state, rank in known.items()}, missing
 
     def close(self) -> None:
         """Stop working, and wait for what is under way."""
         self._book.close()
 
-    def _accuracy(self, state: State) -> float | None:
-        """Of the surface that is current by now; None where it cannot be told, which the log explains."""
+    def _rank(self, state: State) -> Rank:
+        """Of the surface that is current by now; where it cannot be told the log explains why."""
         try:
             with self._runtime.database.reading() as session:
                 surface = store.get_surface_at(session, store.get_heliostat(session, state.heliostat))
-            compared = compare(self._runtime, state.heliostat, surface)
-            return fmean(comparison.accuracy for comparison in compared) if compared else None
+            return rank_of(compare(self._runtime, state.heliostat, surface))
         except (ModelError, ServiceError) as error:
             logger.warning("the accuracy of heliostat %s cannot be told: %s", state.heliostat, error)
-        return None
+        return Rank(None, 0)
 
 
 @dataclass(frozen=True)
@@ -148,6 +182,7 @@ class Shown:
     heliostat: str
     surface: int | None
     newest: int
+    corrected: datetime | None
     model: int
 
 
@@ -173,8 +208,9 @@ class ComparisonBook:
         newest = session.scalar(photographs.where(MeasurementRow.accepted))
         if newest is None:
             return None
-        model = versions.current_number(session)
-        return Shown(heliostat.name, None if surface is None else surface.version, newest, model)
+        corrections = select(func.max(MeasurementRow.corrected_at)).where(MeasurementRow.heliostat_id == heliostat.id)
+        corrected, model = session.scalar(corrections), versions.current_number(session)
+        return Shown(heliostat.name, None if surface is None else surface.version, newest, corrected, model)
 
     def wait_for(self, shown: Shown, seconds: float = 5.0) -> Compared | None:
         """Them; None where they are still being worked out after so many seconds."""
@@ -207,7 +243,7 @@ def judge(runtime: Runtime, twin: Twin, surface: SurfaceRow | None, shown: Evide
     if surface is None:
         return None
     try:
-        (forecast,) = forecasts_of(runtime, twin, [shown], surface)
+        (forecast,) = forecasts_of(runtime, twin, [shown], heights_of(surface))
         return float(flux_accuracy(shown.centered, forecast))
     except ModelError as error:
         logger.warning("the drift of heliostat %s cannot be told: %s", twin.row.name, error)

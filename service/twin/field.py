@@ -12,7 +12,7 @@ from service.base.arrays import unpack
 from service.store.columns import now
 from service.store.tables import HeliostatRow, MeasurementRow, SurfaceRow
 from service.twin import versions
-from service.twin.accuracy import AccuracyBook, State
+from service.twin.accuracy import AccuracyBook, Rank, State
 from service.twin.runtime import Runtime
 
 # Surfaces that are read at a time, to bound memory.
@@ -44,6 +44,10 @@ class Current:
     source: str
     valid_from: datetime
     misfit: float | None
+    trusted: bool | None = None
+    doubts: Sequence[str] | None = None
+    doubted_since: datetime | None = None
+    seen_by: str | None = None
 
     @property
     def age_days(self) -> float | None:
@@ -53,7 +57,10 @@ class Current:
 
 @dataclass(frozen=True)
 class Line:
-    """A heliostat in the field; what is None is not known (yet)."""
+    """A heliostat in the field; what is None is not known (yet).
+
+    Where it has a ``rank`` without an accuracy, no photograph can judge its surface: it was made from all of them.
+    """
 
     name: str
     east_m: float
@@ -61,22 +68,23 @@ class Line:
     photographs: int = 0
     refused: int = 0
     newest: int | None = None
+    corrected: datetime | None = None
     surface: Current | None = None
     figures: Figures | None = None
-    accuracy: float | None = None
+    rank: Rank | None = None
 
     def state(self, model: int) -> State | None:
         """What its accuracy by this version of the model depends on; None where there is nothing to compare."""
         if self.surface is None or self.newest is None:
             return None
-        return State(self.name, self.surface.id, self.newest, model)
+        return State(self.name, self.surface.id, self.newest, self.corrected, model)
 
 
 def _current_surfaces(session: Session) -> dict[int, Current]:
     place = func.row_number().over(
         partition_by=SurfaceRow.heliostat_id, order_by=(SurfaceRow.valid_from.desc(), SurfaceRow.version.desc())
     )
-    ranked = select(SurfaceRow.id, place.label("place")).subquery()
+    ranked = select(SurfaceRow.id, place.label("place")).where(~SurfaceRow.set_aside).subquery()
     query = select(
         SurfaceRow.heliostat_id,
         SurfaceRow.id,
@@ -84,19 +92,22 @@ def _current_surfaces(session: Session) -> dict[int, Current]:
         SurfaceRow.source,
         SurfaceRow.valid_from,
         SurfaceRow.misfit,
+        SurfaceRow.trusted,
+        SurfaceRow.doubts,
+        SurfaceRow.doubted_since,
+        SurfaceRow.seen_by,
     )
     # The database picks them: a plant has many versions, and this is read at every refresh.
     query = query.join(ranked, ranked.c.id == SurfaceRow.id).where(ranked.c.place == 1)
-    return {row.heliostat_id: Current(*row[1:]) for row in session.execute(query)}
+    return {row.heliostat_id: Current(*tuple(row)[1:]) for row in session.execute(query)}
 
 
-def _photographs(session: Session) -> dict[tuple[int, bool], tuple[int, int]]:
-    """How many photographs each heliostat has, accepted or not, and the id of the newest."""
+def _photographs(session: Session) -> dict[tuple[int, bool], tuple[int, int | None, datetime | None]]:
+    """Of each heliostat's photographs, accepted or not: how many, the id of the newest, and the last correction."""
     row = MeasurementRow
-    query = select(row.heliostat_id, row.accepted, func.count(), func.max(row.id)).group_by(
-        row.heliostat_id, row.accepted
-    )
-    return {(heliostat, accepted): (count, newest) for heliostat, accepted, count, newest in session.execute(query)}
+    query = select(row.heliostat_id, row.accepted, func.count(), func.max(row.id), func.max(row.corrected_at))
+    found = session.execute(query.group_by(row.heliostat_id, row.accepted))
+    return {(heliostat, accepted): (count, newest, at) for heliostat, accepted, count, newest, at in found}
 
 
 def read_lines(session: Session) -> list[Line]:
@@ -105,9 +116,10 @@ def read_lines(session: Session) -> list[Line]:
     columns = select(HeliostatRow.id, HeliostatRow.name, HeliostatRow.east_m, HeliostatRow.north_m)
     lines = []
     for number, name, east, north in session.execute(columns.order_by(HeliostatRow.name)):
-        accepted, newest = photographs.get((number, True), (0, None))
-        refused, _ = photographs.get((number, False), (0, None))
-        lines.append(Line(name, east, north, accepted + refused, refused, newest, surfaces.get(number)))
+        accepted, newest, *kept = photographs.get((number, True), (0, None, None))
+        refused, _, *others = photographs.get((number, False), (0, None, None))
+        corrected = max((moment for moment in (*kept, *others) if moment is not None), default=None)
+        lines.append(Line(name, east, north, accepted + refused, refused, newest, corrected, surfaces.get(number)))
     return lines
 
 
@@ -141,12 +153,12 @@ class FieldBook:
         figures = self._figures_of(session, [line.surface.id for line in lines if line.surface is not None])
         model = versions.current_number(session)
         states = (line.state(model) for line in lines)
-        accuracies, pending = self._accuracies.look_up(state for state in states if state is not None)
+        ranks, pending = self._accuracies.look_up(state for state in states if state is not None)
         return [
             replace(
                 line,
                 figures=None if line.surface is None else figures.get(line.surface.id),
-                accuracy=accuracies.get(line.name),
+                rank=ranks.get(line.name),
             )
             for line in lines
         ], pending

@@ -1,6 +1,7 @@
 """Flux forecasts of one heliostat from stored surfaces."""
 
 from dataclasses import dataclass, replace
+from datetime import datetime
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 from sqlalchemy.orm import Session
 
 from model.effects import acting
+from model.ephemeris import sun_angles_at
 from model.errors import InvalidInputError
 from model.forecast import images_under, of_stage
 from model.frames import sun_direction
@@ -18,6 +20,7 @@ from model.tracing import Window
 from service import store
 from service.base.arrays import pack, plain, unpack
 from service.base.faults import ConflictError, NotFoundError
+from service.base.fields import Sun, SunAt
 from service.store.tables import ForecastRow, HeliostatRow, SurfaceRow
 from service.twin.compute import Forecast
 from service.twin.evidence import Twin, heights_of, load_twin
@@ -29,14 +32,16 @@ from service.twin.versions import PlantModel, get_model
 class ForecastRequest:
     """What to forecast; ``target`` names a stored plane, else ``plane`` is one.
 
-    ``sun_azimuth_deg`` counts from south, positive to the east. ``aim`` (3,) [m] is by default the plane's centre.
-    ``surface``: "current", "ideal" or a version. ``window`` [m]: the side of a square about the centre of mass that is
-    mapped; the whole plane without it. ``model_version`` is the plant's model, by default the current one.
+    ``sun_azimuth_deg`` counts from south, positive to the east; ``sun_at`` is the time that was asked for, if one was.
+    ``aim`` (3,) [m] is by default the plane's centre. ``surface``: "current", "ideal" or a version. ``window`` [m]: the
+    side of a square about the centre of mass that is mapped; the whole plane without it. ``model_version`` is the
+    plant's model, by default the current one.
     """
 
     heliostat: str
     sun_azimuth_deg: float
     sun_elevation_deg: float
+    sun_at: datetime | None = None
     target: str | None = None
     plane: TargetPlane | None = None
     aim: tuple[float, float, float] | None = None
@@ -46,6 +51,26 @@ class ForecastRequest:
     window: float | None = None
     normalised: bool = False
     model_version: int | None = None
+
+
+def position_of(session: Session, sun: Sun | SunAt) -> Sun:
+    """Where the sun stands over the plant.
+
+    Raises
+    ------
+    InvalidInputError
+        Where it is night there at that time.
+    """
+    if isinstance(sun, Sun):
+        return sun
+    latitude, longitude, _ = store.get_plant(session).origin
+    azimuth, elevation = sun_angles_at(sun.at, latitude, longitude)
+    if elevation <= 0:
+        raise InvalidInputError(
+            f"at: the sun is {-elevation:.1f}° below the horizon on {sun.at:%Y-%m-%d at %H:%M} UTC; "
+            "choose a time of the day"
+        )
+    return Sun(azimuth_deg=azimuth, elevation_deg=elevation)
 
 
 def _chosen_surface(session: Session, heliostat: HeliostatRow, choice: str | int) -> SurfaceRow | None:
@@ -114,6 +139,7 @@ def _forecast_row(request: ForecastRequest, traced: Traced) -> ForecastRow:
         plane=receiver_as_json(traced.plane),
         sun_azimuth_deg=request.sun_azimuth_deg,
         sun_elevation_deg=request.sun_elevation_deg,
+        sun_at=request.sun_at,
         aim_point_m=None if request.aim is None else list(request.aim),
         dni_w_m2=request.dni,
         window_m=request.window,

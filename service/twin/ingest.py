@@ -21,17 +21,19 @@ from model.imaging.quality import refused
 from model.plant import TargetPlane
 from service import store
 from service.base.arrays import pack, plain
-from service.base.faults import StoreFullError, TooLargeError
+from service.base.faults import ConflictError, StoreFullError, TooLargeError
 from service.base.meters import ACCURACY, PHOTOGRAPHS, REFUSALS
 from service.base.settings import Settings
 from service.sources.decode import Pixels, decode_image
 from service.sources.photograph import Photograph
 from service.store import photographs
 from service.store.columns import now
+from service.store.corrections import list_corrections
 from service.store.images import digest, media_type
 from service.store.tables import ImageRow, MeasurementRow, SurfaceRow
 from service.twin import accuracy
 from service.twin.evidence import Twin, evidence_of, load_twin
+from service.twin.photographs import told_of, values_of
 from service.twin.runtime import Runtime
 
 # How far a camera's clock may be ahead of ours.
@@ -64,7 +66,8 @@ def ingest(
     InvalidInputError, UnsupportedImageError, TooLargeError
         Where the file is no image that can be decoded safely, or was taken in the future; it is not kept.
     ConflictError
-        Where the external id belongs to another image of the same kind.
+        Where the external id belongs to another image of the same kind, or the image is known with another sun, target
+        or time.
     StoreFullError
         Where the images' quota is reached and nothing may be given up.
     """
@@ -72,11 +75,12 @@ def ingest(
     _require_past(photograph.taken_at)
     known = _read(runtime, heliostat, photograph, data)
     if known.measurement is not None:
+        _require_same(runtime, heliostat, known.measurement, photograph)
         _mend(runtime, data)
         PHOTOGRAPHS.labels("known").inc()
         return known.measurement, False
-    pixels, measured = _measure(runtime, photograph, data, known)
-    row = _row(photograph, measured, known.target_id, _clock_fault(photograph, known))
+    pixels, measured = measure_photograph(runtime, photograph, data, known.twin, known.plane)
+    row = row_of(photograph, measured, known.target_id, clock_of(photograph, known.twin))
     judged = _judge(runtime, known, row) if is_live else None
     height, width = pixels.shape[:2]
     image = ImageRow(sha256=runtime.images.put(data), media_type=kind_of_file, size_bytes=len(data))
@@ -89,6 +93,24 @@ def ingest(
             accuracy.note(session, row, known.surface, judged)
     _count(row, is_new, judged)
     return row, is_new
+
+
+def _require_same(runtime: Runtime, heliostat: str, row: MeasurementRow, photograph: Photograph) -> None:
+    """ConflictError where an image that is known came with other values; those that were corrected may come again."""
+    with runtime.database.reading() as session:
+        corrections = list_corrections(session, row)
+    sent, stored = told_of(photograph), values_of(row)
+    first = {name: value for correction in reversed(corrections) for name, value in correction.before.items()}
+    apart = [
+        f"{name}: {stored[name]} is stored, {value} was sent"
+        for name, value in sent.items()
+        if None not in (value, stored[name]) and value != stored[name] and value != first.get(name)
+    ]
+    if apart:
+        raise ConflictError(
+            f"{'; '.join(apart)}. The image is known already; to correct what is known of it, "
+            f"PATCH /v1/heliostats/{heliostat}/measurements/{row.identifier}"
+        )
 
 
 def _require_past(taken_at: datetime | None) -> None:
@@ -133,29 +155,32 @@ def _read(runtime: Runtime, heliostat: str, photograph: Photograph, data: bytes)
         )
 
 
-def _measure(runtime: Runtime, photograph: Photograph, data: bytes, known: _Known) -> tuple[Pixels, MeasuredFlux]:
+def measure_photograph(
+    runtime: Runtime, photograph: Photograph, data: bytes, twin: Twin, plane: TargetPlane
+) -> tuple[Pixels, MeasuredFlux]:
+    """The pixels of an image file, and the flux on ``plane`` in them; raises what `ingest` raises of the file."""
     limit = runtime.settings.max_image_bytes
     if len(data) > limit:
         raise TooLargeError(f"image: {len(data)} bytes is more than the {limit} allowed; crop or compress it")
     corners = None if photograph.corners is None else np.array(photograph.corners)
-    camera = camera_at(known.twin.model.cameras, known.plane.name, photograph.taken_at)
+    camera = camera_at(twin.model.cameras, plane.name, photograph.taken_at)
     with runtime.computing("measure") as operations:
         pixels = decode_image(data, max_pixels=runtime.settings.max_image_pixels)
         try:
-            return pixels, operations.measure(pixels, photograph.kind, known.plane, corners=corners, camera=camera)
+            return pixels, operations.measure(pixels, photograph.kind, plane, corners=corners, camera=camera)
         except ImageRefusedError as refusal:
             return pixels, MeasuredFlux(refused(refusal.reason, refusal.detail))
 
 
-def _clock_fault(photograph: Photograph, known: _Known) -> str | None:
+def clock_of(photograph: Photograph, twin: Twin) -> str | None:
     """What is wrong with the time that the sender gave, by the sun; it is told, and refuses nothing."""
     if photograph.taken_at is None:
         return None
     sun = sun_direction(photograph.sun_azimuth_deg, photograph.sun_elevation_deg)
-    return clock_fault(sun, photograph.taken_at, *known.twin.origin[:2])
+    return clock_fault(sun, photograph.taken_at, *twin.origin[:2])
 
 
-def _row(photograph: Photograph, measured: MeasuredFlux, target_id: int, clock: str | None) -> MeasurementRow:
+def row_of(photograph: Photograph, measured: MeasuredFlux, target_id: int, clock: str | None) -> MeasurementRow:
     """The measurement as it is kept, but for its heliostat, image and identifier."""
     arrays = {"flux": measured.flux, "centered": measured.centered}
     kept: dict[str, NDArray[Any]] = {

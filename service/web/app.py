@@ -108,6 +108,7 @@ def create_app(settings: Settings, operations: Operations | None = None, kinds: 
     )
     app.state.stopping = threading.Event()
     app.state.turns = Turns()
+    app.state.kinds = kinds
     app.state.computing = Turns(settings.parallel_computations + MOST_WAITING)  # as many as the model's gate takes
     v1 = APIRouter(prefix="/v1")
     v1.include_router(jobs.creators(kinds))  # before the routes of a job, which would take their names for numbers

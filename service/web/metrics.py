@@ -5,6 +5,7 @@ as the queue, is told by `serve` alone, lest it be counted twice.
 """
 
 import logging
+from collections import Counter
 from collections.abc import Iterator
 
 from prometheus_client import CollectorRegistry
@@ -18,7 +19,10 @@ from service.base.meters import PROCESS
 from service.base.settings import Settings
 from service.store import queue, sizes
 from service.store.tables import DriftRow, HeliostatRow, JobRow
+from service.twin.field import read_lines
 from service.twin.runtime import Runtime
+
+_VERDICTS = {True: "yes", False: "no", None: "unknown"}
 
 logger = logging.getLogger("heliotwin.service")
 
@@ -38,6 +42,7 @@ class StoreCollector(Collector):
         try:
             with self._runtime.database.reading() as session:
                 found = [*_queue(session), *_sizes(session, self._runtime.settings)]
+                found += _trust(session, self._runtime.settings.metrics_heliostats)
                 found.append(_drift(session, self._runtime.settings.metrics_heliostats))
         except SQLAlchemyError as error:
             logger.warning("metrics of the store are missing: %s", error)
@@ -71,6 +76,29 @@ def _sizes(session: Session, settings: Settings) -> Iterator[Metric]:
     quota = "Most that images may take [B]; 0 without a bound."
     yield GaugeMetricFamily("heliotwin_image_quota_bytes", quota, settings.image_quota_gb * 1e9)
     yield GaugeMetricFamily("heliotwin_database_bytes", "Size of the database [B].", held.database_bytes)
+
+
+def _trust(session: Session, most: int) -> Iterator[Metric]:
+    """Which surfaces of today are trusted; of those that are not, since when, those of longest standing first."""
+    lines = [line for line in read_lines(session) if line.surface is not None]
+    trusted = Counter(_VERDICTS[line.surface.trusted] for line in lines if line.surface is not None)
+    counts = GaugeMetricFamily("heliotwin_surfaces", "Surfaces of today by trust in them.", labels=["trusted"])
+    for verdict in _VERDICTS.values():
+        counts.add_metric([verdict], trusted[verdict])
+    yield counts
+    since = GaugeMetricFamily(
+        "heliotwin_heliostat_doubted_since_seconds",
+        "Since when the heliostat's surface is not trusted [s since 1970], and whether anybody has seen that.",
+        labels=["heliostat", "seen"],
+    )
+    doubted = [
+        (line.surface.doubted_since.timestamp(), line.name, "yes" if line.surface.seen_by else "no")
+        for line in lines
+        if line.surface is not None and line.surface.doubted_since is not None
+    ]
+    for moment, name, seen in sorted(doubted)[:most]:
+        since.add_metric([name, seen], moment)
+    yield since
 
 
 def _drift(session: Session, most: int) -> Metric:

@@ -103,11 +103,11 @@ def picture(study: Study) -> Figure:
             study.images[index].key: measured,
             f"before: {study.accuracy_before[index]:.3f}": before,
             f"after: {study.accuracy_after[index]:.3f}": after,
-            "residual before": measured - before,
-            "residual after": measured - after,
+            "difference before": before - measured,
+            "difference after": after - measured,
         }
         for ax, (title, image) in zip(axes, shown.items(), strict=True):
-            signed = title.startswith("residual")
+            signed = title.startswith("difference")
             low, high = (-0.3, 0.3) if signed else (0.0, 1.0)
             ax.imshow(image, cmap="RdBu_r" if signed else "inferno", vmin=low, vmax=high)
             ax.set_title(title, fontsize=9)

@@ -10,12 +10,12 @@ from sqlalchemy.orm import Session
 from model.frames import sun_direction
 from model.plant import Receiver
 from service import store
-from service.base.fields import Flag, Model, ModelVersion, Name, Number, Plane, Position, ReceiverIn, Resolution, Sun
+from service.base.fields import AnySun, Flag, Model, ModelVersion, Name, Number, Plane, Position, ReceiverIn, Resolution
 from service.jobs.common import Heliostats, chosen_names, require_some
 from service.jobs.kind import Context, Kind, Result
 from service.twin import versions
 from service.twin.field_light import Fleet, forecast_fleet
-from service.twin.forecast import receiver_as_json
+from service.twin.forecast import position_of, receiver_as_json
 
 
 class FleetForecastIn(Model):
@@ -30,7 +30,7 @@ class FleetForecastIn(Model):
     )
     plane: Plane | None = Field(default=None, description="Any plane; either this, `target` or `receiver`.")
     receiver: ReceiverIn | None = Field(default=None, description="Any cylinder; either this, `target` or `plane`.")
-    sun: Sun
+    sun: AnySun
     aim_point: Position | None = Field(
         default=None, description="Where all heliostats aim [m]; by default the receiver's middle."
     )
@@ -68,11 +68,12 @@ def forecast_field(context: Context, payload: FleetForecastIn) -> Result:
     names = chosen_names(context.runtime, payload.heliostats)
     with context.runtime.database.reading() as session:
         receiver, origin = payload.on(session), store.get_plant(session).origin
+        sun = position_of(session, payload.sun)
         model = versions.get_model(session, payload.model_version)
     fleet = Fleet(
         names=names,
         receiver=receiver,
-        sun=sun_direction(payload.sun.azimuth_deg, payload.sun.elevation_deg),
+        sun=sun_direction(sun.azimuth_deg, sun.elevation_deg),
         optics=replace(model.optics, dni=payload.dni_w_m2),
         model=model,
         origin=origin,
@@ -83,6 +84,7 @@ def forecast_field(context: Context, payload: FleetForecastIn) -> Result:
     made = forecast_fleet(context.runtime, fleet, payload.resolution, payload.neighbours, context.report)
     require_some(made.heliostats, made.skipped)
     figures = _figures(made.irradiance, receiver) | {"model_version": model.version, "reflected_w": made.power}
+    figures |= {"sun": sun.model_dump(), "dni_w_m2": payload.dni_w_m2}
     counts = {"heliostats": made.heliostats, "skipped": made.skipped}
     return Result(figures | counts, {"flux": made.irradiance.astype(np.float32)})
 

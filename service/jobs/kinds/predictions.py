@@ -1,5 +1,8 @@
 """The job `predictions`: surfaces of many heliostats."""
 
+from collections.abc import Mapping
+from typing import Any
+
 from pydantic import Field
 
 from service.base.faults import SKIPPED
@@ -7,12 +10,15 @@ from service.base.fields import Method, Model, ModelVersion, Whole
 from service.jobs.common import Heliostats, chosen_names, require_some
 from service.jobs.kind import Context, Kind, Result
 from service.twin import versions
-from service.twin.prediction import compute_surface, keep_surface
+from service.twin.prediction import Kept, compute_surface, keep_surface
 from service.twin.runtime import Runtime
 
 
 class PredictionsIn(Model):
-    """Predict the surfaces of many heliostats, each from its newest accepted measurements."""
+    """Predict the surfaces of many heliostats, each from its newest accepted measurements.
+
+    A new surface becomes today's where it forecasts photographs no worse than the one that is.
+    """
 
     heliostats: Heliostats = None
     method: Method = Field(default="network", description="network: at once; refined: fitted through the ray tracer.")
@@ -28,11 +34,18 @@ def predict_many(context: Context, payload: PredictionsIn) -> Result:
         context.report(index / len(names), name)
         if name not in done:
             _predict_step(context, payload, name, version)
-    steps = context.steps()
-    skipped = {name: step["skipped"] for name, step in steps.items() if "skipped" in step}
-    versions = {name: step["version"] for name, step in steps.items() if "version" in step}
-    require_some(len(versions), skipped)
-    return Result({"surfaces": versions, "skipped": skipped})
+    made = changes(context.steps())
+    require_some(len(made["surfaces"]) + len(made["unchanged"]), made["skipped"])
+    return Result(made)
+
+
+def changes(steps: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """What was done for each heliostat, by name: new versions, how they compare with today's, and what stays."""
+    kinds = {"surfaces": "version", "unchanged": "unchanged", "judged": "judged", "skipped": "skipped"}
+    return {
+        kind: {name: step[key] for name, step in steps.items() if step.get(key) is not None}
+        for kind, key in kinds.items()
+    }
 
 
 def _model_number(runtime: Runtime, wanted: int | None) -> int:
@@ -47,11 +60,30 @@ def _predict_step(context: Context, payload: PredictionsIn, name: str, model_ver
             context.runtime, name, payload.method, images=payload.images, model_version=model_version
         )
         with context.runtime.database.writing() as session:
-            row = keep_surface(session, predicted, context.created_by)
-            context.keep(session, name, {"version": row.version})
+            context.keep(session, name, _step(keep_surface(session, predicted, context.created_by)))
     except SKIPPED as error:
         with context.runtime.database.writing() as session:
             context.keep(session, name, {"skipped": str(error)})
 
 
-KIND = Kind("predictions", PredictionsIn, predict_many, "Predict the surfaces of many heliostats.")
+def _step(kept: Kept) -> dict[str, Any]:
+    """What was done for a heliostat."""
+    if not kept.is_new:
+        return {"unchanged": kept.row.version}
+    decision = kept.decision
+    judged = (
+        None
+        if decision is None
+        else {
+            "taken": decision.taken,
+            "against": decision.previous,
+            "before": decision.accuracy_before,
+            "after": decision.accuracy_after,
+            "photographs": decision.photographs,
+            "reason": decision.reason,
+        }
+    )
+    return {"version": kept.row.version, "judged": judged}
+
+
+KIND = Kind("predictions", PredictionsIn, predict_many, "Predict the surfaces of many heliostats.", so_far=changes)

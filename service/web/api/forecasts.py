@@ -12,6 +12,7 @@ from pydantic import BaseModel, Discriminator, Field, Tag, model_validator
 from service import store
 from service.base.arrays import pair
 from service.base.fields import (
+    AnySun,
     Flag,
     Model,
     ModelVersion,
@@ -21,6 +22,7 @@ from service.base.fields import (
     Position,
     Resolution,
     Sun,
+    SunAt,
     Version,
     VersionIn,
 )
@@ -28,7 +30,8 @@ from service.drawing.pictures import flux_picture
 from service.jobs.asking import ask_for
 from service.jobs.kinds.field_forecasts import FleetForecastIn
 from service.store.tables import ForecastRow
-from service.twin.forecast import ForecastRequest, camera_view, flux_of, make_forecast
+from service.twin.forecast import ForecastRequest, camera_view, flux_of, make_forecast, position_of
+from service.twin.runtime import Runtime
 from service.web.answers import formats
 from service.web.answers.formats import MediaType, json_answer, maps_answer
 from service.web.answers.openapi import arrays, problems
@@ -44,7 +47,7 @@ class ForecastIn(Model):
     heliostat: Name
     target: Name | None = Field(default=None, description="A stored target; either this or `plane`.")
     plane: Plane | None = Field(default=None, description="Any plane; either this or `target`.")
-    sun: Sun
+    sun: AnySun
     aim_point: Position | None = Field(
         default=None, description="Where the heliostat aims [m]; by default the plane's centre."
     )
@@ -78,6 +81,7 @@ class ForecastSummary(BaseModel):
     target: str | None
     plane: Plane = Field(description="The plane that the light falls on [m].")
     sun: Sun
+    sun_at: datetime | None = Field(description="The time that was asked for; null: the sun's position was.")
     aim_point: tuple[float, float, float] | None = Field(description="[m], as given.")
     dni_w_m2: float = Field(description="[W/m2]")
     window: float | None = Field(description="Side of the mapped square about the centre of mass [m]; null: the plane.")
@@ -104,6 +108,7 @@ def forecast_summary(row: ForecastRow) -> ForecastSummary:
             "target": row.target_name,
             "plane": row.plane,
             "sun": {"azimuth_deg": row.sun_azimuth_deg, "elevation_deg": row.sun_elevation_deg},
+            "sun_at": row.sun_at,
             "aim_point": row.aim_point_m,
             "dni_w_m2": row.dni_w_m2,
             "window": row.window_m,
@@ -140,13 +145,16 @@ _EXAMPLE: dict[str, Any] = {
 }
 
 
-def _request(body: ForecastIn) -> ForecastRequest:
+def _request(runtime: Runtime, body: ForecastIn) -> ForecastRequest:
+    with runtime.database.reading() as session:
+        sun = position_of(session, body.sun)
     return ForecastRequest(
         heliostat=body.heliostat,
         target=body.target,
         plane=None if body.plane is None else body.plane.named("plane"),
-        sun_azimuth_deg=body.sun.azimuth_deg,
-        sun_elevation_deg=body.sun.elevation_deg,
+        sun_azimuth_deg=sun.azimuth_deg,
+        sun_elevation_deg=sun.elevation_deg,
+        sun_at=body.sun.at if isinstance(body.sun, SunAt) else None,
         aim=body.aim_point,
         surface=body.surface,
         dni=body.dni_w_m2,
@@ -197,7 +205,7 @@ def post_forecast(
         job = ask_for(runtime, "forecasts", request.model_dump(mode="json"), identity.name, key)
         document = job_out(job).model_dump(mode="json")
         return JSONResponse(document, status.HTTP_202_ACCEPTED, {"Location": f"/v1/jobs/{job.id}"})
-    row = make_forecast(runtime, _request(request))
+    row = make_forecast(runtime, _request(runtime, request))
     response.headers["Location"] = f"/v1/forecasts/{row.id}"
     return forecast_summary(row)
 

@@ -12,7 +12,7 @@ from service.base.faults import NotFoundError
 from service.base.fields import State, Version
 from service.drawing.pictures import flux_picture
 from service.jobs.asking import ask_for, cancel_for
-from service.jobs.kind import Kind, Kinds
+from service.jobs.kind import Kind, Kinds, result_of
 from service.store import queue
 from service.store.tables import JobRow
 from service.twin.runtime import Runtime
@@ -26,6 +26,7 @@ from service.web.door.dependencies import (
     OPERATE,
     READ,
     IdentityDep,
+    KindsDep,
     Limit,
     PresentedDep,
     RuntimeDep,
@@ -46,7 +47,9 @@ class JobOut(JobSummary):
     """A job as it stands, with what was asked and what came of it."""
 
     payload: dict[str, Any] = Field(description="What was asked.")
-    result: dict[str, Any] | None = Field(description="What a done job gave; by its kind.")
+    result: dict[str, Any] | None = Field(
+        description="What a done job gave, by its kind; of a cancelled or failed one what it had changed until then."
+    )
 
 
 def job_out(row: JobRow) -> JobOut:
@@ -157,10 +160,11 @@ def list_jobs(
 
 
 @router.get("/{number}", responses=problems(404), dependencies=[READ])
-def get_job(number: Number, runtime: RuntimeDep) -> JobOut:
-    """A job with its progress, and its result when it is done."""
+def get_job(number: Number, runtime: RuntimeDep, kinds: KindsDep) -> JobOut:
+    """A job with its progress, and its result when it has ended."""
     with runtime.database.reading() as session:
-        return job_out(queue.get_job(session, number))
+        row = queue.get_job(session, number)
+        return job_out(row).model_copy(update={"result": result_of(kinds, session, row)})
 
 
 @router.get(

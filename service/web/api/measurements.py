@@ -96,7 +96,7 @@ class MeasurementOut(BaseModel):
         description="As given: latitude [deg], longitude [deg], altitude [m]."
     )
     accepted: bool = Field(description="Whether the image can be used; a refused one is kept with its reason.")
-    reason: str | None = Field(description="Why it was refused.")
+    reason: str | None = Field(description="Why it was refused; `excluded`: somebody did.")
     quality: dict[str, Any] = Field(
         description="The quality record of the image; `clock` says where time and sun disagree by more than a degree."
     )
@@ -106,6 +106,7 @@ class MeasurementOut(BaseModel):
     image_pruned_at: datetime | None = Field(
         description="Since when the image is kept no longer; everything else of the measurement is."
     )
+    corrected_at: datetime | None = Field(description="Since when it stands so, where it was corrected or excluded.")
     created_at: datetime
 
 
@@ -130,6 +131,7 @@ def measurement_out(heliostat_name: str, row: MeasurementRow) -> MeasurementOut:
             "image_sha256": row.image_sha256,
             "image_media_type": row.image.media_type,
             "image_pruned_at": row.image.pruned_at,
+            "corrected_at": row.corrected_at,
             "created_at": row.created_at,
         }
     )
@@ -214,7 +216,8 @@ def post_measurement(
 ) -> MeasurementOut:
     """Measure and keep a photograph of a heliostat's spot.
 
-    The same image posted again is the same measurement (200 instead of 201). An image that cannot be used is kept
+    The same image posted again is the same measurement (200 instead of 201); with another sun, target or time it is
+    refused (409), and `PATCH` corrects what is known of it. An image that cannot be used is kept
     with `accepted: false` and its `reason`.
     """
     data = _bytes(image, runtime.settings.max_image_bytes)

@@ -13,6 +13,7 @@ from fastapi import Depends, Path, Query, Request
 
 from service.base.faults import UnsupportedContentError
 from service.base.fields import MeasurementName, Name
+from service.jobs.kind import Kinds
 from service.twin.runtime import Runtime
 from service.web.door.security import Identity, Requires, Role, presented_key
 from service.web.door.turns import Turns
@@ -57,6 +58,15 @@ async def _stopping(request: Request) -> threading.Event:
 
 StoppingDep = Annotated[threading.Event, Depends(_stopping)]
 """Set when the service is told to stop, so that answers without an end end."""
+
+
+async def _kinds(request: Request) -> Kinds:
+    kinds: Kinds = request.app.state.kinds
+    return kinds
+
+
+KindsDep = Annotated[Kinds, Depends(_kinds)]
+"""The kinds of jobs that this service takes."""
 
 
 def turn(request: Request) -> AbstractAsyncContextManager[None]:

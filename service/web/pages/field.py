@@ -11,7 +11,9 @@ from fastapi.responses import HTMLResponse
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
-from service.drawing.charts import Scale, scale_of
+from service.base.settings import Settings
+from service.drawing.charts import Scale
+from service.drawing.templates import figure
 from service.store.tables import JobRow, PlantRow, TargetRow
 from service.twin.accuracy import RECENT
 from service.twin.field import FieldBook, Line
@@ -32,7 +34,6 @@ class Metric:
     label: str
     unit: str
     digits: int
-    colours: str
     about: str
     value: Callable[[Line], float | None]
 
@@ -54,7 +55,7 @@ def _age(line: Line) -> float | None:
 
 
 def _accuracy(line: Line) -> float | None:
-    return None if line.accuracy is None else line.accuracy * 100
+    return None if line.rank is None or line.rank.accuracy is None else line.rank.accuracy * 100
 
 
 MetricName = Literal["deviation", "uncertainty", "misfit", "age", "accuracy"]
@@ -67,16 +68,15 @@ METRICS: dict[str, Metric] = {
             "Forecast accuracy",
             "%",
             1,
-            "viridis",
-            f"Mean agreement of forecast and measured flux on up to {RECENT} newest photographs, with today's surface.",
+            f"Mean agreement of forecast and measured flux, with today's surface, on the {RECENT} newest photographs "
+            "that it was not made from; not yet judged where there are none.",
             _accuracy,
         ),
         Metric(
             "deviation",
-            "Surface error",
+            "Deviation from ideal",
             "mm",
             3,
-            "viridis_r",
             "How far the mirror is from its ideal shape: root mean square of the heights.",
             _deviation,
         ),
@@ -85,7 +85,6 @@ METRICS: dict[str, Metric] = {
             "Surface uncertainty",
             "mm",
             3,
-            "viridis_r",
             "How well the surface is known: root mean square of the heights' standard deviations.",
             _uncertainty,
         ),
@@ -94,11 +93,10 @@ METRICS: dict[str, Metric] = {
             "Surface misfit",
             "%",
             1,
-            "viridis_r",
             "What the surface leaves unexplained of the photographs that it was made from.",
             _misfit,
         ),
-        Metric("age", "Age of the surface", "days", 0, "viridis_r", "Since the surface describes the mirror.", _age),
+        Metric("age", "Age of the surface", "days", 0, "Since the surface describes the mirror.", _age),
     )
 }
 
@@ -113,12 +111,15 @@ FieldBookDep = Annotated[FieldBook, Depends(_book)]
 
 @dataclass(frozen=True)
 class Dot:
-    """A heliostat on the drawn map, in the drawing's units; without a colour where its value is not known."""
+    """A heliostat on the drawn map, in the drawing's units; without a colour where its value is not known.
+
+    ``told`` is its value in words.
+    """
 
     line: Line
     x: float
     y: float
-    value: float | None
+    told: str
     colour: str | None
 
 
@@ -134,6 +135,20 @@ class Drawing:
     bar_m: float
     bar: float
     has_names: bool
+
+
+def _told(line: Line, metric: Metric) -> str:
+    if metric.name == "accuracy" and line.rank is not None and not line.rank.photographs:
+        return "not yet judged"
+    value = metric.value(line)
+    return "not known" if value is None else figure(value, metric.digits, metric.unit)
+
+
+def scale_for(metric: Metric, settings: Settings) -> Scale:
+    """The colours of a figure, from what is fine, light, to what is poor, dark: the same whatever the field."""
+    fine, poor = settings.map_scales[metric.name]
+    label = f"{metric.label} [{metric.unit}]"
+    return Scale("viridis" if poor < fine else "viridis_r", min(fine, poor), max(fine, poor), label)
 
 
 _WIDTH = 720.0
@@ -158,7 +173,7 @@ def draw(lines: Sequence[Line], metric: Metric, scale: Scale) -> Drawing:
     values = [metric.value(line) for line in lines]
     colours = scale.names([math.nan if value is None else value for value in values])
     dots = [
-        Dot(line, float(x[i]), float(y[i]), value, None if value is None else colour)
+        Dot(line, float(x[i]), float(y[i]), _told(line, metric), None if value is None else colour)
         for i, (line, value, colour) in enumerate(zip(lines, values, colours, strict=True))
     ]
     bar_m = _round_length(width / 4 / per_metre)
@@ -200,7 +215,7 @@ def get_field(
     values = [value for line in lines if (value := chosen.value(line)) is not None]
     # A large field takes its time and its page is long: it is asked for again the less often the more is left.
     again_ms = min(max(1500, 30 * pending), 15_000)
-    scale = scale_of(values, chosen.colours, f"{chosen.label} [{chosen.unit}]", 5 * 10.0**-chosen.digits)
+    scale = scale_for(chosen, runtime.settings)
     return render(
         request,
         "field.html",
@@ -212,6 +227,8 @@ def get_field(
         metric=chosen,
         values=values,
         scale=scale,
+        fine=runtime.settings.map_scales[metric][0],
+        poor=runtime.settings.map_scales[metric][1],
         drawing=draw(lines, chosen, scale) if lines else None,
         pending=pending,
         again_ms=again_ms,

@@ -20,8 +20,9 @@ from service.base.fields import Version
 from service.drawing import charts
 from service.drawing.charts import HeatMap, History, Scale
 from service.drawing.pictures import mirror_heights
-from service.store.tables import HeliostatRow, MeasurementRow, SurfaceRow
-from service.twin.accuracy import RECENT, Compared, Comparison, ComparisonBook
+from service.store import decisions
+from service.store.tables import DecisionRow, HeliostatRow, MeasurementRow, SurfaceRow
+from service.twin.accuracy import RECENT, Compared, Comparison, ComparisonBook, rank_of
 from service.twin.field import Figures, figures_of
 from service.web.answers.pages import render
 from service.web.door.dependencies import READ, NamePath, RuntimeDep, Turn
@@ -31,8 +32,11 @@ router = APIRouter(include_in_schema=False, dependencies=[READ])
 # Newest surfaces and photographs that the page lists.
 _MOST_SURFACES = 40
 _MOST_PHOTOGRAPHS = 60
+# Last decisions on which surface is today's that the page tells.
+_MOST_DECISIONS = 5
 # Points along each side of a facet in the view in space.
 _SPACE_SAMPLES = 14
+_OF_PEAK = "of the measured peak"
 # Side of the window of measured fluxes [m].
 _WINDOW = (4.0, 4.0)
 
@@ -81,7 +85,7 @@ def _histories(listed: Sequence[Revision]) -> list[History]:
     oldest_first = list(reversed(listed))
     deviation = [(f"version {v.row.version}", v.figures.deviation_mm) for v in oldest_first]
     changes = [(f"version {v.row.version}", v.change_mm) for v in oldest_first if v.change_mm is not None]
-    drawn = [charts.history("Surface error by version", "mm", deviation, 3)]
+    drawn = [charts.history("Deviation from ideal by version", "mm", deviation, 3)]
     return [*drawn, charts.history("Change from the version before", "mm", changes, 3)] if changes else drawn
 
 
@@ -92,17 +96,32 @@ def space_view(z: NDArray[Any], size: tuple[float, float]) -> str:
     return json.dumps({"size": size, "facets": np.round(heights, 4).tolist(), "colours": colours})
 
 
-def _comparison_figure(comparison: Comparison) -> ComparisonFigure:
-    # Both have the sum 100 on the same pixels: shares of the mean are a scale that all pictures have in common.
-    measured, forecast = (image * (image.size / 100) for image in (comparison.measured, comparison.forecast))
-    top = float(max(measured.max(), forecast.max()))
-    name = comparison.measurement.identifier
-    return ComparisonFigure(
-        comparison,
-        charts.flux_map(f"measured flux of {name}", measured, _WINDOW, "of the mean", top),
-        charts.flux_map(f"forecast flux of {name}", forecast, _WINDOW, "of the mean", top),
-        charts.difference_map(f"forecast minus measured flux of {name}", forecast - measured, _WINDOW, "of the mean"),
-    )
+@dataclass(frozen=True)
+class ComparisonFigures:
+    """All comparisons, and the two scales that they share."""
+
+    figures: list[ComparisonFigure]
+    flux: Scale
+    difference: Scale
+
+
+def _comparison_figures(comparisons: Sequence[Comparison]) -> ComparisonFigures:
+    """In shares of each photograph's measured peak, as in the report of a study."""
+    pairs = [(c.measured / c.measured.max(), c.forecast / c.measured.max()) for c in comparisons]
+    top = max((float(image.max()) for pair in pairs for image in pair), default=1.0)
+    bound = max((float(np.abs(forecast - measured).max()) for measured, forecast in pairs), default=0.0)
+    flux, difference = charts.flux_scale(top, _OF_PEAK), charts.difference_scale(bound, _OF_PEAK)
+    figures = []
+    for comparison, (measured, forecast) in zip(comparisons, pairs, strict=True):
+        shown = (
+            ("measured", measured, flux),
+            ("forecast", forecast, flux),
+            ("forecast minus measured", forecast - measured, difference),
+        )
+        name = comparison.measurement.identifier
+        maps = [charts.heat_map(f"{what} flux of {name}", image, _WINDOW, scale) for what, image, scale in shown]
+        figures.append(ComparisonFigure(comparison, *maps))
+    return ComparisonFigures(figures, flux, difference)
 
 
 async def _book(request: Request) -> ComparisonBook:
@@ -113,14 +132,6 @@ async def _book(request: Request) -> ComparisonBook:
 ComparisonBookDep = Annotated[ComparisonBook, Depends(_book)]
 
 _UNDER_WAY = Compared(trouble="The forecasts of its photographs are being worked out; look again in a moment.")
-
-
-def _means(comparisons: Sequence[Comparison]) -> dict[str, float | None]:
-    groups = {
-        "accuracy": [c.accuracy for c in comparisons],
-        "accuracy_new": [c.accuracy for c in comparisons if not c.was_used],
-    }
-    return {name: fmean(group) if group else None for name, group in groups.items()}
 
 
 def _surface_context(surface: SurfaceRow, size: tuple[float, float]) -> dict[str, Any]:
@@ -149,6 +160,7 @@ class _Read:
     today: SurfaceRow | None
     surface: SurfaceRow | None
     surfaces: list[SurfaceRow]
+    decided: Sequence[DecisionRow]
     photographs: Sequence[MeasurementRow]
     compared: Compared
 
@@ -165,11 +177,12 @@ def _read(
         today = store.find_surface_at(session, row)
         surface = today if version is None else store.get_surface(session, row, version)
         surfaces = _newest_surfaces(session, row)
+        decided = decisions.list_decisions(session, row, _MOST_DECISIONS)
         photographs = _newest_photographs(session, row)
         shown = book.read(session, row, surface)
     # The rest of the page does not depend on them.
     compared = Compared() if shown is None else book.wait_for(shown) or _UNDER_WAY
-    return _Read(row, today, surface, surfaces, photographs, compared)
+    return _Read(row, today, surface, surfaces, decided, photographs, compared)
 
 
 @router.get("/heliostats/{name}")
@@ -184,11 +197,13 @@ def get_heliostat_page(request: Request, read: Annotated[_Read, Depends(_read)],
         surface=read.surface,
         today=read.today,
         versions=listed,
+        decided=read.decided,
         histories=_histories(listed) if listed else [],
-        comparisons=[_comparison_figure(comparison) for comparison in comparisons],
+        comparisons=_comparison_figures(comparisons),
         trouble=read.compared.trouble,
         recent=RECENT,
         photographs=read.photographs,
-        **_means(comparisons),
+        rank=rank_of(comparisons),
+        accuracy_seen=fmean(seen) if (seen := [c.accuracy for c in comparisons if c.was_used]) else None,
         **(_surface_context(read.surface, _size(read.row)) if read.surface is not None else {}),
     )

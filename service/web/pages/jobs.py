@@ -10,12 +10,13 @@ from service.base.fields import Method, Model, Name, Version
 from service.drawing import charts
 from service.drawing.charts import HeatMap
 from service.jobs.asking import ask_for, cancel_for
+from service.jobs.kind import result_of
 from service.jobs.kinds.predictions import PredictionsIn
 from service.store import queue
 from service.store.sizes import sizes
 from service.store.tables import JobRow
 from service.web.answers.pages import go_to, render
-from service.web.door.dependencies import DRAWS, OPERATE, READ, IdentityDep, RuntimeDep
+from service.web.door.dependencies import DRAWS, OPERATE, READ, IdentityDep, KindsDep, RuntimeDep
 
 router = APIRouter(include_in_schema=False)
 
@@ -31,7 +32,7 @@ class PredictionForm(Model):
     """The form that asks for surfaces; without a heliostat of all of them."""
 
     heliostat: Name | None = None
-    method: Method = "network"
+    method: Method = "refined"
 
 
 @router.get("/jobs", dependencies=[READ])
@@ -68,7 +69,8 @@ def _flux(row: JobRow) -> HeatMap | None:
         return None
     plane = row.result["plane"]
     flux = unpack(row.arrays)["flux"]
-    return charts.flux_map("Flux of all heliostats together", flux, (plane["width"], plane["height"]), "W/m²")
+    title = f"Flux of {row.result['heliostats']} heliostats together"
+    return charts.flux_map(title, flux, (plane["width"], plane["height"]), "W/m²")
 
 
 def _plain(value: Any) -> bool:
@@ -77,13 +79,23 @@ def _plain(value: Any) -> bool:
 
 def _asked(payload: dict[str, Any]) -> dict[str, Any]:
     """What was asked, long lists by their length."""
-    given = {name: value for name, value in payload.items() if value is not None}
+    given = {name: value for name, value in payload.items() if value not in (None, {}, [])}
     long = {name: len(value) for name, value in given.items() if isinstance(value, list | dict) and len(value) > _SHOWN}
-    return given | {name: f"{count} entries" for name, count in long.items()}
+    short = {name: _in_words(value) for name, value in given.items() if name not in long}
+    return short | {name: f"{count} entries" for name, count in long.items()}
+
+
+def _in_words(value: Any) -> str:
+    """A value as a sentence has it: no braces, no quotes."""
+    if isinstance(value, dict):
+        return ", ".join(f"{name.replace('_', ' ')} {_in_words(inner)}" for name, inner in value.items())
+    if isinstance(value, list):
+        return ", ".join(_in_words(inner) for inner in value)
+    return {True: "yes", False: "no"}[value] if isinstance(value, bool) else str(value)
 
 
 @router.get("/jobs/{number}", dependencies=[READ, DRAWS])
-def get_job_page(number: Number, request: Request, runtime: RuntimeDep) -> HTMLResponse:
+def get_job_page(number: Number, request: Request, runtime: RuntimeDep, kinds: KindsDep) -> HTMLResponse:
     """A job; the page follows it until it ends.
 
     While it does, each change asks for what changes only: neither what was asked nor a result is read for that.
@@ -94,7 +106,7 @@ def get_job_page(number: Number, request: Request, runtime: RuntimeDep) -> HTMLR
         if not is_live or "hx-request" not in request.headers:
             session.expunge(row)
             row = queue.get_job(session, number, arrays=True)
-            asked, result, flux = _asked(row.payload), row.result or {}, _flux(row)
+            asked, result, flux = _asked(row.payload), result_of(kinds, session, row) or {}, _flux(row)
     return render(
         request,
         "job.html",
@@ -102,9 +114,13 @@ def get_job_page(number: Number, request: Request, runtime: RuntimeDep) -> HTMLR
         is_live=is_live,
         asked=asked,
         flux=flux,
+        light=result if row.kind == "forecasts" and "peak_w_m2" in result else None,
+        target=asked.get("target") if asked else None,
         facts={name: value for name, value in result.items() if _plain(value)},
         counts=result.get("counts", {}),
         surfaces=result.get("surfaces", {}),
+        unchanged=result.get("unchanged", {}),
+        judged=result.get("judged", {}),
         skipped=result.get("skipped", {}),
         shown=_SHOWN,
     )

@@ -76,3 +76,18 @@ def test_proxies_are_believed_where_they_are_named():
     assert is_within("::1", settings.trusted_proxies)
     assert not any(is_within(host, settings.trusted_proxies) for host in ("10.2.0.1", "127.0.0.1", "", "localhost"))
     assert Settings(proxy_headers=False).trusted_proxies == ()
+
+
+def test_map_scales_are_named_and_run_from_fine_to_poor():
+    made = Settings(map_scales={"accuracy": (98, 90)})
+    assert (made.map_scales["accuracy"], made.map_scales["age"]) == ((98, 90), (0, 365))
+    for wrong in ({"accuracy": (80, 95)}, {"age": (10, 10)}, {"age": (30, 10)}, {"beauty": (0, 1)}):
+        with pytest.raises(ValidationError, match="map_scales"):
+            Settings(map_scales=wrong)
+
+
+def test_zone_is_one_of_the_tz_database():
+    assert Settings(time_zone="Europe/Berlin").time_zone == "Europe/Berlin"
+    for wrong in ("Juelich", "../etc/passwd", ""):
+        with pytest.raises(ValidationError, match="tz database"):
+            Settings(time_zone=wrong)

@@ -16,7 +16,7 @@ from service.store.images import ImageStore
 from service.store.surfaces import NewSurface
 from service.store.tables import ForecastRow, HeliostatRow, SurfaceRow
 from service.twin import versions
-from service.twin.accuracy import _newest
+from service.twin.accuracy import unseen_first
 from service.twin.evidence import named_measurements
 from service.twin.study import StudyRequest, gather
 from tests.service.conftest import ORIGIN, properties_document
@@ -95,7 +95,7 @@ def test_measurements_come_in_one_statement(database: Database, count: int):
             assert [row.identifier for row in named_measurements(session, heliostat, names)] == names
         assert len(sent) == 1
         with statements(database) as sent:
-            assert len(_newest(session, heliostat)) == min(count, 8)
+            assert len(unseen_first(session, heliostat, ())[0]) == min(count, 8)
         assert len(sent) == 2
 
 

@@ -57,7 +57,7 @@ def test_accuracy_that_is_being_worked_out_is_not_begun_again(client: TestClient
 
     monkeypatch.setattr(AccuracyBook, "_accuracy", work)
     app: Any = client.app
-    book, state = AccuracyBook(app.state.runtime), State("AA39", 1, 1, 1)
+    book, state = AccuracyBook(app.state.runtime), State("AA39", 1, 1, None, 1)
     try:
         book.look_up([state])
         until(lambda: bool(begun))

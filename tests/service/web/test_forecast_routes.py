@@ -37,6 +37,22 @@ def test_forecast_on_a_target(client: TestClient, operations: FakeOperations):
     assert listed["items"] == [body]
 
 
+def test_forecast_for_a_time(client: TestClient, operations: FakeOperations):
+    body = ask(client, target="lower", sun={"at": "2026-06-21T13:36:00+02:00"}).json()
+    assert body["sun_at"] == "2026-06-21T11:36:00Z"
+    assert body["sun"]["elevation_deg"] == pytest.approx(62.5, abs=0.1)
+    np.testing.assert_allclose(operations.forecasts[0]["sun"][2], 0.887, atol=0.002)
+    for sun, field in (
+        ({"at": "2026-06-21T00:00:00Z"}, "at"),
+        ({"at": "2026-06-21T11:36:00"}, "sun.at"),
+        ({"at": "0001-01-01T12:00:00Z"}, "sun.at"),
+        ({"azimuth_deg": 0}, "sun.elevation_deg"),
+    ):
+        answer = ask(client, target="lower", sun=sun)
+        assert answer.status_code == 422
+        assert answer.json()["detail"].startswith(f"{field}: ")
+
+
 def test_forecast_on_any_plane(client: TestClient, operations: FakeOperations):
     body = ask(
         client, plane=PLANE, aim_point=[0, -3, 37], dni_w_m2=850, resolution=[16, 32], window=4, normalised=True

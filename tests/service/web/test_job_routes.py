@@ -69,7 +69,7 @@ def test_predictions_make_one_version_each_and_name_what_they_skip(client: TestC
     assert job["progress"] == 1
     assert client.get("/v1/heliostats/AA39/surfaces/1").status_code == 200
     again = finish(client, client.post("/v1/jobs/predictions", json={"heliostats": ["AA39", "AA39"]}))
-    assert again["result"] == {"surfaces": {"AA39": 2}, "skipped": {}}
+    assert again["result"] == {"surfaces": {}, "unchanged": {"AA39": 1}, "judged": {}, "skipped": {}}
 
 
 def test_surfaces_of_a_job_that_is_begun_again_are_not_made_again(

@@ -1,8 +1,10 @@
 """The pages as a client without a browser sees them: each answers, escapes what it shows, and asks nobody else."""
 
 import re
+import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -11,6 +13,8 @@ from fastapi.testclient import TestClient
 
 from service import store
 from service.base.settings import Settings
+from service.jobs.kinds import KINDS
+from service.jobs.worker import Worker
 from service.store import keys
 from service.web.answers.pages import ASSETS
 from service.web.app import create_app
@@ -33,8 +37,11 @@ def fill(client: TestClient) -> None:
     assert post(png(1), id="101").status_code == 201
     assert post(png(2), id="102", sun_azimuth=-30.0).status_code == 201
     assert post(png(3, refused=True), id="103").status_code == 201
-    for _ in range(2):
-        assert client.post("/v1/heliostats/AA39/surfaces", json={}).status_code == 201
+    for method in ("network", "refined"):
+        assert (
+            client.post("/v1/heliostats/AA39/surfaces", json={"method": method, "measurements": ["101"]}).status_code
+            == 201
+        )
     sun = {"azimuth_deg": -20, "elevation_deg": 45}
     assert client.post("/v1/forecasts", json={"heliostat": "AA39", "target": "lower", "sun": sun}).status_code == 201
     assert client.post("/v1/jobs/imports", json={"folder": "<script>alert(1)</script>"}).status_code == 202
@@ -73,6 +80,7 @@ PATHS = (
     "/?metric=age",
     "/heliostats/AA39",
     "/heliostats/AA39?version=1",
+    "/heliostats/AA39/photographs/101",
     "/forecast",
     "/forecast?heliostat=AA39",
     "/forecasts/1",
@@ -184,8 +192,35 @@ def test_field_shows_every_figure_as_colour_and_as_number(shown: TestClient, met
     label = re.search(r'aria-label="AA39: ([^"]+)"', page)
     assert label is not None
     number = label[1].split("\N{NO-BREAK SPACE}")[0]
-    assert f'<td class="number">{number}</td>' in page
+    assert f'<td class="number">{number}' in page
     assert re.search(r'<circle [^>]*fill="#[0-9a-f]{6}"', page)
+
+
+def test_surface_made_from_all_photographs_is_not_yet_judged(pages: TestClient):
+    """What it was made from proves nothing of it."""
+    assert "AA39: not yet judged" not in settled(pages)
+    pages.post("/v1/heliostats/AA39/surfaces", json={"images": 2})
+    page = settled(pages)
+    assert 'aria-label="AA39: not yet judged"' in page
+    assert '<small class="short">not yet judged</small>' in page
+    page = text_of(pages, "/heliostats/AA39")
+    assert "not yet judged" in page
+    assert "100.0\N{NO-BREAK SPACE}% on photographs that it was made from, which flatters it" in page
+
+
+def test_colours_mean_the_same_in_every_field(tmp_path: Path):
+    """What is fine is light though it be the worst there is; the ends are settings."""
+    colours = {}
+    for name, scales in (("usual", {}), ("strict", {"accuracy": (100.0, 99.0)}), ("lax", {"accuracy": (200.0, 100.0)})):
+        app = create_app(Settings(data_dir=tmp_path / name, map_scales=scales, **QUIET), FakeOperations())
+        with client_of(app) as client:
+            client.put("/v1/plant", json=tower_document())
+            client.put("/v1/heliostats/AA39", json=properties_document())
+            fill(client)
+            found = re.search(r'<circle [^>]*fill="(#[0-9a-f]{6})"', settled(client))
+            assert found is not None
+            colours[name] = found[1]
+    assert colours == {"usual": "#fde724", "strict": "#fde724", "lax": "#440154"}
 
 
 def test_accuracy_is_worked_out_once_for_each_surface(pages: TestClient, operations: FakeOperations):
@@ -195,9 +230,9 @@ def test_accuracy_is_worked_out_once_for_each_surface(pages: TestClient, operati
     assert rendered > 0
     settled(pages)
     assert operations.rendered == rendered
-    assert pages.post("/v1/heliostats/AA39/surfaces", json={}).status_code == 201
+    assert pages.post("/v1/heliostats/AA39/surfaces", json={"measurements": ["102"]}).status_code == 201
     settled(pages)
-    assert operations.rendered == rendered + 1
+    assert operations.rendered == rendered + 3  # both surfaces to judge the new one, then today's
 
 
 def test_heliostat_without_anything_is_drawn_hollow(pages: TestClient, properties: dict[str, Any]):
@@ -250,9 +285,43 @@ def test_forecast_form_takes_a_time(pages: TestClient, operations: FakeOperation
     assert up == pytest.approx(0.887, abs=0.002)
 
 
+def field_of(page: str, name: str) -> str:
+    """The value that stands in a field of a form."""
+    found = re.search(rf'name="{name}"[^>]* value="([^"]*)"', page)
+    assert found is not None
+    return found[1]
+
+
+def test_forecast_page_keeps_what_was_asked(pages: TestClient):
+    """Made anew from its own page, a forecast is the same forecast."""
+    asked = form(sun_by="time", moment="2026-06-21T11:36", surface="ideal", dni_w_m2="850")
+    page = text_of(pages, pages.post("/forecast", data=asked, follow_redirects=False).headers["Location"])
+    assert 'value="time" checked' in page
+    assert 'value="position" checked' not in page
+    assert (field_of(page, "moment"), field_of(page, "dni_w_m2")) == ("2026-06-21T11:36", "850")
+    assert 'value="ideal" selected' in page
+    assert "2026-06-21 11:36 UTC" in page
+    by_position = text_of(pages, "/forecasts/1")
+    assert 'value="position" checked' in by_position
+    assert (field_of(by_position, "azimuth_deg"), field_of(by_position, "elevation_deg")) == ("-20.0", "45.0")
+
+
+def test_times_are_told_by_the_plants_clocks_too(tmp_path: Path, operations: FakeOperations):
+    app = create_app(Settings(data_dir=tmp_path, time_zone="Europe/Berlin", **QUIET), operations)
+    with client_of(app) as client:
+        client.put("/v1/plant", json=tower_document())
+        client.put("/v1/heliostats/AA39", json=properties_document())
+        fill(client)
+        asked = form(sun_by="time", moment="2026-06-21T11:36")
+        page = text_of(client, client.post("/forecast", data=asked, follow_redirects=False).headers["Location"])
+    assert page.count("2026-06-21 13:36 CEST") == 2
+
+
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
+        ({"sun_by": "time", "moment": "0001-01-01T12:00"}, "moment"),
+        ({"sun_by": "time", "moment": "0001-01-01T12:00+14:00"}, "moment"),
         ({"sun_by": "time", "moment": "2026-06-21T00:00"}, "below the horizon"),
         ({"sun_by": "time"}, "say when"),
         ({"azimuth_deg": "", "elevation_deg": ""}, "say where the sun stands"),
@@ -275,6 +344,26 @@ def test_forecast_of_all_heliostats_is_a_job(pages: TestClient):
     answer = pages.post("/forecast", data=form(heliostat=""), follow_redirects=False)
     assert (answer.status_code, answer.headers["Location"]) == (303, "/jobs/2")
     assert pages.post("/forecast", data=form(heliostat=""), headers=HTMX).headers["HX-Redirect"] == "/jobs/3"
+
+
+def test_forecast_of_all_heliostats_shows_its_light(app: FastAPI, pages: TestClient):
+    asked = form(heliostat="", sun_by="time", moment="2026-06-21T11:36", dni_w_m2="900")
+    path = pages.post("/forecast", data=asked, follow_redirects=False).headers["Location"]
+    worker = Worker(app.state.runtime, KINDS, "tester", threading.Event())
+    while worker.work():
+        pass
+    page = text_of(pages, path)
+    for told in ("Power on lower", "Reflected by the mirrors", "62.5° high", "Flux of 1 heliostats together"):
+        assert told in page
+    assert 'href="data:image/png' in page
+    assert "{" not in page.partition("<main")[2]  # nothing as Python writes it
+    listed = text_of(pages, "/forecast")
+    assert f'<a href="{path}">job' in listed
+    assert "1 together" in listed
+    again = text_of(pages, f"/forecast?job={path.rpartition('/')[2]}")
+    assert (field_of(again, "heliostat"), field_of(again, "dni_w_m2")) == ("", "900")
+    assert field_of(again, "moment") == "2026-06-21T11:36"
+    assert pages.get("/forecast?job=1").status_code == 404
 
 
 def test_jobs_are_asked_for_followed_and_cancelled(pages: TestClient):

@@ -46,7 +46,17 @@ FLAGS = [
     "--disable-sync",
 ]
 DESK, PHONE = {"width": 1280, "height": 900}, {"width": 390, "height": 844}
-PATHS = ("/", "/heliostats/AA39", "/heliostats/AB01", "/forecast", "/forecasts/1", "/studies", "/jobs", "/jobs/1")
+PATHS = (
+    "/",
+    "/heliostats/AA39",
+    "/heliostats/AA39/photographs/100",
+    "/heliostats/AB01",
+    "/forecast",
+    "/forecasts/1",
+    "/studies",
+    "/jobs",
+    "/jobs/1",
+)
 
 
 class GatedOperations(FakeOperations):
@@ -81,7 +91,7 @@ def fill(app: FastAPI) -> None:
         send = poster(client)
         for seed, azimuth in enumerate((20.0, -30.0)):
             assert send(png(seed), id=f"10{seed}", sun_azimuth=azimuth).status_code == 201
-        assert client.post("/v1/heliostats/AA39/surfaces", json={}).status_code == 201
+        assert client.post("/v1/heliostats/AA39/surfaces", json={"measurements": ["100"]}).status_code == 201
         sun = {"azimuth_deg": -20, "elevation_deg": 45}
         body = {"heliostat": "AA39", "target": "lower", "sun": sun}
         assert client.post("/v1/forecasts", json=body).status_code == 201
@@ -91,7 +101,8 @@ def fill(app: FastAPI) -> None:
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     """A service on a port of this machine, with one worker."""
     folder = tmp_path_factory.mktemp("served")
-    settings = Settings(data_dir=folder, port=free_port(), job_poll_s=0.05, **QUIET | {"job_workers": 1})
+    options = QUIET | {"job_workers": 1, "time_zone": "Europe/Berlin"}
+    settings = Settings(data_dir=folder, port=free_port(), job_poll_s=0.05, **options)
     fill(create_app(settings, FakeOperations()))
     operations = GatedOperations()
     app = create_app(settings, operations)
@@ -139,7 +150,7 @@ def test_operator_looks_at_the_field_and_at_a_heliostat(page: Any):
     expect(page.locator("#map-title")).to_have_text("Forecast accuracy")
     expect(page.locator('[data-map] a[aria-label^="AA39: 100.0"]')).to_be_attached()
     page.select_option("#metric", "deviation")
-    expect(page.locator("#map-title")).to_have_text("Surface error")
+    expect(page.locator("#map-title")).to_have_text("Deviation from ideal")
     assert page.url.endswith("/?metric=deviation")
     # By keyboard: one tab stop for the map, arrows to the neighbour, Enter to its page.
     expect(page.locator('[data-map] a[tabindex="0"]')).to_have_count(1)
@@ -159,18 +170,26 @@ def test_operator_looks_at_the_field_and_at_a_heliostat(page: Any):
 
 def test_operator_asks_for_a_forecast(page: Any):
     page.goto("/forecast")
-    page.fill("[name=azimuth_deg]", "-20")
-    page.fill("[name=elevation_deg]", "45")
-    page.check("[value=time]")
-    page.fill("[name=moment]", "2026-06-21T00:00")
+    page.fill("[name=moment]", "2026-06-21T00:00")  # what is typed is what is asked for
+    expect(page.locator("[value=time]")).to_be_checked()
+    expect(page.locator("[data-zone]")).to_have_text("2026-06-21 02:00 CEST")
     page.click("form.stack button")
     expect(page.locator("#notice [role=alert]")).to_contain_text("below the horizon")
-    page.check("[value=position]")
+    page.fill("[name=azimuth_deg]", "-20")
+    page.fill("[name=elevation_deg]", "45")
+    expect(page.locator("[value=position]")).to_be_checked()
     page.click("form.stack button")
     expect(page.locator("#result h2").first).to_have_text("AA39 on lower")
     expect(page.locator("#result svg image")).to_be_visible()
     expect(page.locator("#notice")).to_be_empty()
     assert "/forecasts/" in page.url
+    # By a time of the day, and opened again, it is asked for by that time.
+    page.fill("[name=moment]", "2026-06-21T11:36")
+    page.click("form.stack button")
+    expect(page.locator("#result .tiles")).to_contain_text("2026-06-21 11:36 UTC")
+    page.reload()
+    expect(page.locator("[value=time]")).to_be_checked()
+    expect(page.locator("[name=moment]")).to_have_value("2026-06-21T11:36")
 
 
 def test_form_offers_heliostats_as_they_are_typed(page: Any):

@@ -1,0 +1,23 @@
+// The forecast form: what is typed is what is asked for, and a time is told by the plant's clocks, too.
+"use strict";
+(() => {
+  const ways = { azimuth_deg: "position", elevation_deg: "position", moment: "time" };
+
+  const tell = (form) => {
+    const output = form.querySelector("[data-zone]"), moment = form.querySelector("[name=moment]").value;
+    if (!output) return;
+    const at = new Date(`${moment}Z`);
+    if (isNaN(at)) { output.textContent = "–"; return; }
+    const parts = { year: "numeric", month: "2-digit", day: "2-digit", hour: "2-digit", minute: "2-digit" };
+    const clock = new Intl.DateTimeFormat("sv-SE", { ...parts, timeZone: output.dataset.zone }).format(at);
+    const name = new Intl.DateTimeFormat("en-GB", { timeZone: output.dataset.zone, timeZoneName: "short" }).formatToParts(at);
+    output.textContent = `${clock} ${name.find((part) => part.type === "timeZoneName").value}`;
+  };
+
+  document.addEventListener("input", (event) => {
+    const form = event.target.form, way = ways[event.target.name];
+    if (!form || !way) return;
+    form.querySelector(`[name=sun_by][value=${way}]`).checked = true;
+    if (way === "time") tell(form);
+  });
+})();

@@ -1,0 +1,131 @@
+"""Correcting what is known of a photograph, or excluding it: with a reason, its history kept."""
+
+from dataclasses import dataclass, replace
+from datetime import datetime
+from typing import Any, cast
+
+from model.imaging import ImageKind
+from model.imaging.light import camera_at
+from service import store
+from service.base.faults import ConflictError, GoneError
+from service.sources.photograph import Photograph
+from service.store import audit
+from service.store.columns import now
+from service.store.corrections import EXCLUDED, forget_drift
+from service.store.tables import CorrectionRow, MeasurementRow, TargetRow
+from service.twin.evidence import Twin, load_twin
+from service.twin.ingest import clock_of, measure_photograph, row_of
+from service.twin.photographs import values_of
+from service.twin.runtime import Runtime
+
+# What another sun, time or pair of motor positions changes, and what is measured anew with another target or camera.
+_TOLD = ("sun_azimuth_deg", "sun_elevation_deg", "taken_at", "motor_axis_1", "motor_axis_2", "quality")
+_MEASURED = ("target_id", "accepted", "reason", "center_right_m", "center_up_m", "arrays")
+
+
+@dataclass(frozen=True)
+class Changes:
+    """What shall be known of a photograph instead; None leaves it. ``excluded``: whether nothing is made from it."""
+
+    reason: str
+    target_name: str | None = None
+    sun_azimuth_deg: float | None = None
+    sun_elevation_deg: float | None = None
+    taken_at: datetime | None = None
+    motor_position: tuple[float, float] | None = None
+    excluded: bool | None = None
+
+    def of(self, row: MeasurementRow) -> Photograph:
+        """The photograph as it shall be known."""
+        motors = (row.motor_axis_1, row.motor_axis_2)
+        known = Photograph(
+            target_name=row.target.name,
+            kind=cast(ImageKind, row.kind),
+            sun_azimuth_deg=row.sun_azimuth_deg,
+            sun_elevation_deg=row.sun_elevation_deg,
+            external_id=row.external_id,
+            taken_at=row.taken_at,
+            motor_position=None if None in motors else cast(tuple[float, float], motors),
+            focal_spot_wgs84=cast(Any, row.focal_spot_wgs84),
+            corners=None if row.corners_px is None else row.corners_px["corners"],
+        )
+        names = ("target_name", "sun_azimuth_deg", "sun_elevation_deg", "taken_at", "motor_position")
+        return replace(known, **{name: value for name in names if (value := getattr(self, name)) is not None})
+
+
+def correct(runtime: Runtime, heliostat: str, identifier: str, changes: Changes, actor: str) -> MeasurementRow:
+    """Correct or exclude a photograph; where it is another target, or another camera's, it is measured anew.
+
+    Raises
+    ------
+    NotFoundError
+        Where heliostat, measurement or target are not stored.
+    ConflictError
+        Where nothing would change.
+    GoneError
+        Where it must be measured anew, and its image is kept no longer.
+    """
+    with runtime.database.reading() as session:
+        twin = load_twin(session, heliostat)
+        row = store.get_measurement(session, twin.row, identifier)
+        target = row.target if changes.target_name is None else store.get_target(session, changes.target_name)
+    fresh = _fresh(runtime, twin, row, changes.of(row), target)
+    with runtime.database.writing() as session:
+        row = store.get_measurement(session, store.get_heliostat(session, heliostat), identifier, arrays=True)
+        before = _state(row)
+        _write(row, fresh, changes.excluded)
+        session.flush()
+        session.refresh(row, ["target"])
+        after = _state(row)
+        apart = [name for name, value in after.items() if value != before[name]]
+        if not apart:
+            raise ConflictError(f"measurement {identifier} stands so already; nothing was changed")
+        row.corrected_at = now()
+        old, new = ({name: state[name] for name in apart} for state in (before, after))
+        session.add(CorrectionRow(measurement_id=row.id, made_by=actor, reason=changes.reason, before=old, after=new))
+        forget_drift(session, row)
+        store.use_image(session, row.image, row.accepted, False)
+        about = {"reason": changes.reason, "before": old, "after": new}
+        audit.record(session, actor, "measurement.corrected", f"heliostat {heliostat} {identifier}", **about)
+    return row
+
+
+def _state(row: MeasurementRow) -> dict[str, Any]:
+    return values_of(row) | {"excluded": row.reason == EXCLUDED}
+
+
+def _fresh(
+    runtime: Runtime, twin: Twin, row: MeasurementRow, photograph: Photograph, target: TargetRow
+) -> dict[str, Any]:
+    """The columns that change."""
+    cameras = twin.model.cameras
+    before = camera_at(cameras, row.target.name, row.taken_at)
+    if target.id == row.target_id and camera_at(cameras, target.name, photograph.taken_at) == before:
+        motors = photograph.motor_position or (None, None)
+        return {
+            "sun_azimuth_deg": photograph.sun_azimuth_deg,
+            "sun_elevation_deg": photograph.sun_elevation_deg,
+            "taken_at": photograph.taken_at,
+            "motor_axis_1": motors[0],
+            "motor_axis_2": motors[1],
+            "quality": {**row.quality, "clock": clock_of(photograph, twin)},
+        }
+    if row.image.pruned_at is not None:
+        raise GoneError(
+            f"measurement {row.identifier} must be measured anew, and its image was given up on "
+            f"{row.image.pruned_at:%Y-%m-%d}; exclude it instead"
+        )
+    data = runtime.images.read(row.image_sha256)
+    _, measured = measure_photograph(runtime, photograph, data, twin, store.target_plane(target))
+    made = row_of(photograph, measured, target.id, clock_of(photograph, twin))
+    return {name: getattr(made, name) for name in (*_TOLD, *_MEASURED)}
+
+
+def _write(row: MeasurementRow, fresh: dict[str, Any], excluded: bool | None) -> None:
+    was_excluded = row.reason == EXCLUDED
+    for name, value in fresh.items():
+        setattr(row, name, value)
+    if excluded if excluded is not None else was_excluded:
+        row.accepted, row.reason = False, EXCLUDED
+    else:
+        row.accepted, row.reason = bool(row.quality["accepted"]), row.quality.get("reason") or None

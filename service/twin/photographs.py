@@ -1,0 +1,30 @@
+"""What is known of a photograph beside its image: as it was sent, as it is stored, and what of it may be corrected."""
+
+from typing import Any
+
+from service.sources.photograph import Photograph
+from service.store.tables import MeasurementRow
+
+
+def told_of(photograph: Photograph) -> dict[str, Any]:
+    """What was sent with an image, by REST's names, as JSON has it."""
+    taken, motors = photograph.taken_at, photograph.motor_position
+    return {
+        "target_name": photograph.target_name,
+        "sun_azimuth": photograph.sun_azimuth_deg,
+        "sun_elevation": photograph.sun_elevation_deg,
+        "taken_at": None if taken is None else taken.isoformat(),
+        "motor_position": None if motors is None else [float(motor) for motor in motors],
+    }
+
+
+def values_of(row: MeasurementRow) -> dict[str, Any]:
+    """The same of a stored measurement."""
+    motors = (row.motor_axis_1, row.motor_axis_2)
+    return {
+        "target_name": row.target.name,
+        "sun_azimuth": row.sun_azimuth_deg,
+        "sun_elevation": row.sun_elevation_deg,
+        "taken_at": None if row.taken_at is None else row.taken_at.isoformat(),
+        "motor_position": None if None in motors else list(motors),
+    }

@@ -1,0 +1,124 @@
+"""Photographs that were known wrongly: refused when they differ, corrected or excluded with a reason, history kept."""
+
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+
+from service.store.columns import now
+from service.store.images import digest
+from service.store.tables import ImageRow
+from tests.service.conftest import FakeOperations, Post, png
+
+BASE = "/v1/heliostats/AA39/measurements"
+HTML = {"Accept": "text/html"}
+
+
+@pytest.fixture
+def known(client: TestClient, post: Post) -> TestClient:
+    """A photograph under a wrong sun, and a surface that was made from it."""
+    assert post(id="1", sun_azimuth=20.0, taken_at="2024-05-01T10:00:00Z").status_code == 201
+    assert post(png(2), id="2", sun_azimuth=-20.0).status_code == 201
+    assert client.post("/v1/heliostats/AA39/surfaces", json={"measurements": ["1"]}).status_code == 201
+    return client
+
+
+def patch(client: TestClient, **changes: Any) -> Any:
+    return client.patch(f"{BASE}/1", json={"reason": "the clock was wrong", **changes})
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"sun_azimuth": 30.0}, "sun_azimuth: 20.0 is stored, 30.0 was sent"),
+        ({"target_name": "upper"}, "target_name: lower is stored, upper was sent"),
+        ({"taken_at": "2024-05-01T11:00:00Z"}, "taken_at: 2024-05-01T10:00:00+00:00 is stored"),
+    ],
+)
+def test_same_image_with_other_values_is_a_conflict(known: TestClient, post: Post, changes: dict[str, Any], said: str):
+    answer = post(**{"id": "1", "sun_azimuth": 20.0, **changes})
+    assert answer.status_code == 409
+    assert said in answer.json()["detail"]
+    assert f"PATCH {BASE}/1" in answer.json()["detail"]
+    assert known.get(f"{BASE}/1").json()["sun_azimuth"] == 20.0
+
+
+def test_photograph_is_corrected_and_its_history_kept(known: TestClient, post: Post, operations: FakeOperations):
+    measured = operations.measured
+    answer = patch(known, sun_azimuth=30.0)
+    assert answer.status_code == 200
+    body = answer.json()
+    assert (body["measurement"]["sun_azimuth"], body["surfaces"], body["job"]) == (30.0, [1], None)
+    assert body["measurement"]["corrected_at"] is not None
+    assert operations.measured == measured  # its light is the same
+    (kept,) = known.get(f"{BASE}/1/corrections").json()
+    assert (kept["before"], kept["after"]) == ({"sun_azimuth": 20.0}, {"sun_azimuth": 30.0})
+    assert (kept["made_by"], kept["reason"]) == ("local", "the clock was wrong")
+    assert known.get("/v1/audit").json()["items"][0]["action"] == "measurement.corrected"
+    assert known.get("/v1/heliostats/AA39/surfaces/1").json()["outdated"] == ["1"]
+    # Whoever repeats what was sent first, or sends what stands there now, is told that it is known.
+    for azimuth in (20.0, 30.0):
+        assert post(id="1", sun_azimuth=azimuth, taken_at="2024-05-01T10:00:00Z").status_code == 200
+    assert patch(known, sun_azimuth=30.0).status_code == 409
+
+
+def test_another_target_is_measured_anew(known: TestClient, operations: FakeOperations):
+    measured = operations.measured
+    assert patch(known, target_name="upper").json()["measurement"]["target_name"] == "upper"
+    assert operations.measured == measured + 1
+    assert patch(known, target_name="nowhere").status_code == 404
+
+
+def test_excluded_photograph_is_not_used(known: TestClient):
+    body = patch(known, excluded=True, reason="a bird").json()["measurement"]
+    assert (body["accepted"], body["reason"]) == (False, "excluded")
+    made = known.post("/v1/heliostats/AA39/surfaces", json={}).json()
+    assert made["measurements"] == ["2"]
+    refused = known.post("/v1/heliostats/AA39/surfaces", json={"measurements": ["1"]})
+    assert (refused.status_code, "excluded" in refused.json()["detail"]) == (409, True)
+    back = patch(known, excluded=False, reason="it was no bird").json()["measurement"]
+    assert (back["accepted"], back["reason"]) == (True, None)
+    assert known.get(f"{BASE}/1/flux").status_code == 200
+
+
+def test_what_was_made_from_it_is_made_anew_on_request(known: TestClient):
+    job = patch(known, sun_azimuth=30.0, remake=True).json()["job"]
+    asked = known.get(f"/v1/jobs/{job}").json()
+    assert (asked["kind"], asked["payload"]["heliostats"], asked["payload"]["method"]) == (
+        "predictions",
+        ["AA39"],
+        "network",
+    )
+
+
+@pytest.mark.parametrize("body", [{}, {"reason": "x"}, {"sun_azimuth": 1.0}, {"reason": "x", "sun_azimuth": "1"}])
+def test_correction_says_what_and_why(known: TestClient, body: dict[str, Any]):
+    assert known.patch(f"{BASE}/1", json=body).status_code == 422
+
+
+def test_photograph_without_its_image_keeps_its_target(known: TestClient):
+    app: Any = known.app
+    with app.state.runtime.database.writing() as session:
+        image = session.get_one(ImageRow, digest(png()))
+        image.pruned_at, image.pruned_for = now(), "age"
+    answer = patch(known, target_name="upper")
+    assert (answer.status_code, "exclude it instead" in answer.json()["detail"]) == (410, True)
+    assert patch(known, sun_azimuth=1.0).status_code == 200
+
+
+def test_page_corrects_and_excludes(known: TestClient):
+    path = "/heliostats/AA39/photographs/1"
+    page = known.get(path, headers=HTML).text
+    assert "Surface version" in page
+    assert "It stands as it came" in page
+    form = {"target_name": "lower", "sun_azimuth": "30.0", "sun_elevation": "45.0", "reason": "<b>clock</b>"}
+    answer = known.post(path, data=form, headers=HTML, follow_redirects=False)
+    assert (answer.status_code, answer.headers["Location"]) == (303, path)
+    page = known.get(path, headers=HTML).text
+    assert "sun azimuth: 20.0 → 30.0" in page
+    assert "&lt;b&gt;clock&lt;/b&gt;" in page
+    assert "corrected since" in known.get("/heliostats/AA39", headers=HTML).text
+    form |= {"excluded": "true", "remake": "true"}
+    answer = known.post(path, data=form, headers=HTML, follow_redirects=False)
+    assert answer.headers["Location"] == "/jobs/1"
+    assert "excluded" in known.get("/heliostats/AA39", headers=HTML).text

@@ -1,0 +1,206 @@
+"""Which surface is today's: the better one stays it, unless somebody decides otherwise, and takes that back."""
+
+import threading
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from fastapi import FastAPI
+from fastapi.testclient import TestClient
+
+from model.observation import Observation, SurfacePrediction
+from model.plant import Heliostat
+from service import store
+from service.base.settings import Settings
+from service.jobs.kinds import KINDS
+from service.jobs.worker import Worker
+from service.web.app import create_app
+from tests.service.conftest import QUIET, FakeOperations, client_of, png, poster, properties_document, tower_document
+
+BASE = "/v1/heliostats/AA39/surfaces"
+
+
+class Mirrors(FakeOperations):
+    """Predicts a mirror that bends by ``bends`` of the method [mm], and forecasts the worse the more a mirror bends."""
+
+    bends: dict[str, float]
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.bends = {"network": 2.0, "refined": 1.0}
+
+    def predict(self, heliostat: Heliostat, *rest: Any, **more: Any) -> SurfacePrediction:
+        made = super().predict(heliostat, *rest, **more)
+        return replace(made, z=np.full((4, 8, 8), self.bends[made.method] / 1e3))
+
+    def render(self, heliostat: Heliostat, observations: list[Observation], z: Any, *rest: Any, **more: Any) -> Any:
+        right = super().render(heliostat, observations, z, *rest, **more)
+        wrong = np.zeros_like(right)
+        wrong[:, 0, 0] = 100
+        share = np.clip(np.abs(z).max() * 50, 0, 1)
+        return (1 - share) * right + share * wrong
+
+
+@pytest.fixture
+def mirrors() -> Mirrors:
+    return Mirrors()
+
+
+@pytest.fixture
+def client(tmp_path: Path, mirrors: Mirrors) -> Iterator[TestClient]:
+    with client_of(create_app(Settings(data_dir=tmp_path, **QUIET), mirrors)) as client:
+        client.put("/v1/plant", json=tower_document())
+        client.put("/v1/heliostats/AA39", json=properties_document())
+        post = poster(client)
+        for number in range(3):
+            post(png(number), id=str(number), sun_azimuth=10.0 * number, taken_at=f"2024-05-0{number + 1}T10:00:00Z")
+        yield client
+
+
+def predict(client: TestClient, method: str, *measurements: str) -> Any:
+    answer = client.post(BASE, json={"method": method, "measurements": measurements or ("0", "1", "2")})
+    assert answer.status_code == 201, answer.text
+    return answer.json()
+
+
+def current(client: TestClient) -> int:
+    return int(client.get(f"{BASE}/current").json()["version"])
+
+
+def test_worse_surface_waits_aside(client: TestClient):
+    assert predict(client, "refined")["set_aside"] is False
+    assert predict(client, "network")["set_aside"] is True
+    assert current(client) == 1
+    (decision,) = client.get(f"{BASE}/decisions").json()
+    assert (decision["version"], decision["taken"], decision["previous"]) == (2, False, 1)
+    assert decision["accuracy_before"] == pytest.approx(0.9, abs=0.01)
+    assert decision["accuracy_after"] == pytest.approx(0.8, abs=0.01)
+    assert "forecasts worse than version 1" in decision["reason"]
+
+
+def test_better_surface_becomes_todays_and_is_taken_back(client: TestClient):
+    predict(client, "network")
+    assert predict(client, "refined")["set_aside"] is False
+    assert current(client) == 2
+    undone = client.post(f"{BASE}/undo")
+    assert (undone.status_code, undone.json()["version"], current(client)) == (200, 1, 1)
+    assert client.get(f"{BASE}/2").json()["set_aside"] is True
+    assert client.post(f"{BASE}/undo").status_code == 200  # undone again it is as it was
+    assert current(client) == 2
+    assert client.get(f"{BASE}/2").json()["set_aside"] is False
+
+
+def test_somebody_decides_otherwise(client: TestClient):
+    predict(client, "refined")
+    predict(client, "network")
+    chosen = client.put(f"{BASE}/current", json={"version": 2, "reason": "the mirror was cleaned"})
+    assert (chosen.status_code, current(client)) == (200, 2)
+    assert client.put(f"{BASE}/current", json={"version": 1, "reason": "no"}).json()["previous"] == 2
+    assert (current(client), client.get(f"{BASE}/2").json()["set_aside"]) == (1, True)
+    client.post(f"{BASE}/undo")
+    assert current(client) == 2
+    assert client.put(f"{BASE}/current", json={"version": 9, "reason": "x"}).status_code == 404
+    assert client.put(f"{BASE}/current", json={"version": 1}).status_code == 422
+    actions = [entry["action"] for entry in client.get("/v1/audit").json()["items"]]
+    assert actions[:4] == ["surface.taken", "surface.taken", "surface.taken", "surface.set_aside"]
+
+
+def test_nothing_to_undo(client: TestClient):
+    predict(client, "refined")
+    answer = client.post(f"{BASE}/undo")
+    assert answer.status_code == 409
+    assert "choose a version" in answer.json()["detail"]
+
+
+def test_photographs_that_neither_has_seen_judge(client: TestClient):
+    predict(client, "network", "0", "2")
+    predict(client, "refined", "2")
+    (decision,) = client.get(f"{BASE}/decisions").json()
+    assert (decision["photographs"], decision["taken"]) == (1, True)
+    assert "that neither has seen" in decision["reason"]
+
+
+def test_measured_surface_stays_unless_an_unseen_photograph_speaks(client: TestClient):
+    app: Any = client.app
+    with app.state.runtime.database.writing() as session:
+        z = np.full((4, 8, 8), 5e-3)
+        heliostat = store.get_heliostat(session, "AA39")
+        store.add_surface(session, heliostat, store.NewSurface("measured", z, 0 * z, np.stack([z] * 3, -1)))
+    with app.state.runtime.database.writing() as session:
+        measured = store.find_surface_at(session, store.get_heliostat(session, "AA39"))
+        measured.valid_from = measured.valid_from.replace(year=1970)
+    assert predict(client, "refined")["set_aside"] is True  # it has seen all
+    assert "was measured" in client.get(f"{BASE}/decisions").json()[0]["reason"]
+    assert predict(client, "refined", "2")["set_aside"] is False
+    assert current(client) == 3
+
+
+def test_nothing_new_makes_no_version(client: TestClient):
+    first = predict(client, "refined")
+    again = client.post(BASE, json={"method": "refined", "measurements": ["0", "1", "2"]})
+    assert (again.status_code, again.json()) == (200, first)
+    assert again.headers["Location"] == f"{BASE}/1"
+    assert len(client.get(BASE).json()["items"]) == 1
+
+
+def test_surface_of_earlier_photographs_is_history(client: TestClient):
+    """It replaces nothing, so nothing is judged."""
+    predict(client, "network", "2")
+    assert predict(client, "refined", "0")["set_aside"] is False
+    assert current(client) == 1
+    assert client.get(f"{BASE}/decisions").json() == []
+
+
+def page_of(client: TestClient, path: str) -> str:
+    return str(client.get(path, headers={"Accept": "text/html"}).text)
+
+
+def work(app: FastAPI) -> None:
+    worker = Worker(app.state.runtime, KINDS, "tester", threading.Event())
+    while worker.work():
+        pass
+
+
+def test_cancelled_job_says_what_it_changed(client: TestClient, mirrors: Mirrors, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("service.jobs.kind._REPORT_EVERY_S", 0.0)
+    app: Any = client.app
+    client.put("/v1/heliostats/AB01", json=properties_document())
+    poster(client)(png(7), heliostat="AB01")
+    predict(client, "refined")
+    asked = client.post("/v1/jobs/predictions", json={"method": "network"}).json()["id"]
+    predicted = mirrors.predict
+
+    def cancelling(heliostat: Heliostat, *rest: Any, **more: Any) -> Any:
+        if heliostat.name == "AB01":
+            client.post(f"/v1/jobs/{asked}/cancel")
+        return predicted(heliostat, *rest, **more)
+
+    mirrors.predict = cancelling  # type: ignore[method-assign]
+    for name in ("AB02", "AB03"):
+        client.put(f"/v1/heliostats/{name}", json=properties_document())
+    work(app)
+    job = client.get(f"/v1/jobs/{asked}").json()
+    assert job["state"] == "cancelled"
+    assert job["result"]["surfaces"]["AA39"] == 2
+    assert job["result"]["judged"]["AA39"]["taken"] is False
+    page = page_of(client, f"/jobs/{asked}")
+    assert "What it had changed until then" in page
+    assert "AA39, version 2" in page
+    assert "set aside" in page
+
+
+def test_page_decides_and_takes_back(client: TestClient):
+    predict(client, "network")
+    predict(client, "refined")
+    page = page_of(client, "/heliostats/AA39")
+    assert "80.0\N{NO-BREAK SPACE}% before, <strong>90.0" in page
+    assert "Undo: back to version 1" in page
+    assert client.post("/heliostats/AA39/surfaces/undo", follow_redirects=False).status_code == 303
+    assert current(client) == 1
+    page = page_of(client, "/heliostats/AA39")
+    assert 'action="/heliostats/AA39/surfaces/2/take"' in page
+    client.post("/heliostats/AA39/surfaces/2/take", data={}, follow_redirects=False)
+    assert current(client) == 2
