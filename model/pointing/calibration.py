@@ -65,23 +65,25 @@ class Calibrated:
 
     chain: Chain
     field: Field
+    noise: Noise
     believed: Believed
     residuals: Array
 
 
-def start_chain(chain: Chain) -> tuple[Chain, NDArray[np.bool_]]:
-    """A chain to start from, and which heliostats' (H,) drives were replaced by the field's median.
+def start_chain(chain: Chain) -> Chain:
+    """A chain to start from: drives of another kind than the field's are replaced by the field's median.
 
     Some property files hold a default stroke, with a zero that goes with it, a radian from the others.
     """
-    stroke = np.median(chain.stroke, axis=0)
-    odd = (np.abs(chain.stroke - stroke) > _ANOTHER_KIND_M).any(axis=1)
-    if 2 * odd.sum() >= len(odd):  # no majority, so no kind
-        return chain, np.zeros_like(odd)
-    typical = {name: np.median(getattr(chain, name)[~odd], axis=0) for name in ("stroke", "zero")}
-    return replace(
-        chain, **{name: np.where(odd[:, None], value, getattr(chain, name)) for name, value in typical.items()}
-    ), odd
+    odd = of_another_kind(chain)
+    median = {name: np.median(getattr(chain, name)[~odd], axis=0) for name in ("stroke", "zero")}
+    return replace(chain, **{name: np.where(odd[:, None], value, getattr(chain, name)) for name, value in median.items()})
+
+
+def of_another_kind(chain: Chain) -> NDArray[np.bool_]:
+    """Heliostats (H,) whose spindles are not as long at their references as those of most of the field."""
+    odd = np.abs(chain.stroke - np.median(chain.stroke, axis=0)) > _ANOTHER_KIND_M
+    return np.asarray(odd.any(axis=1)) if 2 * odd.any(axis=1).sum() < len(odd) else np.zeros(len(odd), dtype=bool)
 
 
 def calibrate(chain: Chain, readings: Readings, noise: Noise | None = None, field: Field | None = None) -> Calibrated:
@@ -89,7 +91,7 @@ def calibrate(chain: Chain, readings: Readings, noise: Noise | None = None, fiel
 
     The readings of a heliostat are in order of time. Heliostats without any get what the prior has.
     """
-    noise = noise or Noise()
+    noise, chain = noise or Noise(), start_chain(chain)
     prior = field or Field.unseen()
     parameters = robust(chain, readings, prior, noise)
     zeros = np.zeros(readings.steps.shape)
@@ -99,7 +101,7 @@ def calibrate(chain: Chain, readings: Readings, noise: Noise | None = None, fiel
         prior = field or Field.of(believed)
     believed = _posterior(chain, readings, prior, noise, parameters, zeros)
     left = residuals(chain, readings, believed.parameters, believed.zeros)[0]
-    return Calibrated(chain, prior, believed, left)
+    return Calibrated(chain, prior, noise, believed, left)
 
 
 def robust(chain: Chain, readings: Readings, prior: Field, noise: Noise) -> Array:

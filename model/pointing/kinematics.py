@@ -65,6 +65,8 @@ NAMES = tuple(parameter.name for parameter in PARAMETERS)
 SPREAD: Array = np.array([parameter.spread for parameter in PARAMETERS])
 ZEROS = slice(NAMES.index("first_zero"), NAMES.index("second_zero") + 1)
 """Where the drives' zeros stand among the parameters: what lost steps and drift move."""
+STROKES = slice(NAMES.index("first_stroke"), NAMES.index("second_stroke") + 1)
+"""Where the spindles' lengths at their references stand."""
 
 _X, _Y, _Z = np.eye(3)
 
