@@ -39,29 +39,54 @@ _ANOTHER_KIND_M = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Field:
-    """What heliostats of one kind share: means (P,) and covariance (P, P) of their parameters."""
+    """What heliostats of one kind share.
+
+    Attributes
+    ----------
+    mean, covariance : (P,), (P, P)
+        Of their parameters.
+    stroke, zero : (2,) [m, rad]
+        Of their drives at the reference, as most property files have them.
+    """
 
     mean: Array
     covariance: Array
+    stroke: Array
+    zero: Array
 
     @classmethod
-    def unseen(cls) -> "Field":
-        """Before any heliostat was seen."""
-        return cls(np.zeros(len(PARAMETERS)), np.diag(SPREAD**2))
+    def unseen(cls, chain: Chain) -> "Field":
+        """Before any of its spots was seen."""
+        count = len(PARAMETERS)
+        return cls(np.zeros(count), np.diag(SPREAD**2), np.median(chain.stroke, axis=0), np.median(chain.zero, axis=0))
 
-    @classmethod
-    def of(cls, believed: Believed) -> "Field":
-        """By what is believed of its heliostats, each as far as its data tell."""
-        count, unseen = len(believed.parameters), cls.unseen()
-        mean = believed.parameters.sum(axis=0) / (count + _PRIOR_WEIGHT)
+    def seen(self, believed: Believed) -> "Field":
+        """By what is believed of its heliostats, each as far as its data tell; `SPREAD` weighs as a few of them."""
+        count = len(believed.parameters) + _PRIOR_WEIGHT
+        mean = believed.parameters.sum(axis=0) / count
         off = ((believed.parameters - mean) ** 2 + believed.spread**2).sum(axis=0)
-        spread = (off + _PRIOR_WEIGHT * np.diag(unseen.covariance)) / (count + _PRIOR_WEIGHT)
-        return cls(mean, np.diag(spread))
+        return replace(self, mean=mean, covariance=np.diag((off + _PRIOR_WEIGHT * SPREAD**2) / count))
+
+    def is_odd(self, chain: Chain) -> NDArray[np.bool_]:
+        """Heliostats (H,) whose spindles are not nearly as long at their references as those of the field."""
+        return np.asarray((np.abs(chain.stroke - self.stroke) > _ANOTHER_KIND_M).any(axis=1))
+
+    def start(self, chain: Chain) -> Chain:
+        """The chain to start from: odd drives are replaced by the field's.
+
+        Some property files hold a default stroke, with a zero that goes with it, a radian from the others.
+        """
+        odd = self.is_odd(chain)[:, None]
+        return replace(
+            chain,
+            stroke=np.where(odd, self.stroke, chain.stroke),
+            zero=np.where(odd, self.zero, chain.zero),
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class Calibrated:
-    """Posteriors of H heliostats with the field's prior, ``residuals`` (H, M, 2) [rad], and the chain they start from."""
+    """Posteriors of H heliostats, the prior and the chain that they start from, ``residuals`` (H, M, 2) [rad]."""
 
     chain: Chain
     field: Field
@@ -70,35 +95,19 @@ class Calibrated:
     residuals: Array
 
 
-def start_chain(chain: Chain) -> Chain:
-    """A chain to start from: drives of another kind than the field's are replaced by the field's median.
-
-    Some property files hold a default stroke, with a zero that goes with it, a radian from the others.
-    """
-    odd = of_another_kind(chain)
-    median = {name: np.median(getattr(chain, name)[~odd], axis=0) for name in ("stroke", "zero")}
-    return replace(chain, **{name: np.where(odd[:, None], value, getattr(chain, name)) for name, value in median.items()})
-
-
-def of_another_kind(chain: Chain) -> NDArray[np.bool_]:
-    """Heliostats (H,) whose spindles are not as long at their references as those of most of the field."""
-    odd = np.abs(chain.stroke - np.median(chain.stroke, axis=0)) > _ANOTHER_KIND_M
-    return np.asarray(odd.any(axis=1)) if 2 * odd.any(axis=1).sum() < len(odd) else np.zeros(len(odd), dtype=bool)
-
-
 def calibrate(chain: Chain, readings: Readings, noise: Noise | None = None, field: Field | None = None) -> Calibrated:
     """Calibrate all mounts of a field; with ``field`` by that prior, else by the field's own.
 
     The readings of a heliostat are in order of time. Heliostats without any get what the prior has.
     """
-    noise, chain = noise or Noise(), start_chain(chain)
-    prior = field or Field.unseen()
+    noise, prior = noise or Noise(), field or Field.unseen(chain)
+    chain = prior.start(chain)
     parameters = robust(chain, readings, prior, noise)
     zeros = np.zeros(readings.steps.shape)
     for _ in range(_FIELD_ROUNDS if field is None else 1):
         believed = _posterior(chain, readings, prior, noise, parameters, zeros)
         parameters, zeros = believed.parameters, believed.zeros
-        prior = field or Field.of(believed)
+        prior = field or prior.seen(believed)
     believed = _posterior(chain, readings, prior, noise, parameters, zeros)
     left = residuals(chain, readings, believed.parameters, believed.zeros)[0]
     return Calibrated(chain, prior, noise, believed, left)
@@ -114,8 +123,9 @@ def robust(chain: Chain, readings: Readings, prior: Field, noise: Noise) -> Arra
     for _ in range(_ROBUST_ROUNDS):
         off, slope = residuals(chain, readings, parameters, zeros)
         square = (off**2).sum(axis=-1)
-        median = np.sqrt(np.nanmedian(np.where(readings.used, square, np.nan), axis=1)) if off.size else scale
-        scale = np.clip(np.nan_to_num(median, nan=least), least, scale)
+        counted = readings.used | ~readings.used.any(axis=1, keepdims=True)
+        median = np.sqrt(np.nanmedian(np.where(counted, square, np.nan), axis=1))
+        scale = np.clip(median, least, scale)
         weight = (_TAILS + 2) / (_TAILS * scale[:, None] ** 2 + square)
         rows = (slope * weight[..., None, None]).reshape(len(off), -1, slope.shape[-1]).swapaxes(1, 2)
         flat = slope.reshape(len(off), -1, slope.shape[-1])

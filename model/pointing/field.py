@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.plant import Heliostat, TargetPlane
-from model.pointing.calibration import Field, calibrate, of_another_kind
+from model.pointing.calibration import Field, calibrate
 from model.pointing.drives import Noise
 from model.pointing.kinematics import Chain
 from model.pointing.mounts import CalibratedMount, mounts_of
@@ -48,7 +48,7 @@ def calibrate_field(
 ) -> FieldMounts:
     """Calibrate the mounts of heliostats, all of which have actuators, by their readings in any order.
 
-    ``field`` is the prior, by default the field's own. One without a reading gets the mount that the field makes likely.
+    ``field`` is the prior, by default the field's own; who has no reading gets the mount that it makes likely.
     """
     names = list(readings)
     ordered = {name: sorted(readings[name], key=lambda one: one.day) for name in names}
@@ -58,12 +58,10 @@ def calibrate_field(
     mounts = dict(zip(names, mounts_of(done, own, arrays), strict=True))
     contradictions = {
         name: {
-            ordered[name][place].name: explain(
-                name, ordered[name][place], heliostats, mounts, targets, latitude_deg
-            )
+            ordered[name][place].name: explain(name, ordered[name][place], heliostats, mounts, targets, latitude_deg)
             for place in np.nonzero(mount.foreign)[0]
         }
         for name, mount in mounts.items()
     }
-    odd = tuple(name for name, is_odd in zip(names, of_another_kind(chain), strict=True) if is_odd)
+    odd = tuple(name for name, is_odd in zip(names, done.field.is_odd(chain), strict=True) if is_odd)
     return FieldMounts(done.field, mounts, ordered, contradictions, odd)

@@ -11,7 +11,7 @@ from model.mount import Mount
 from model.plant import Heliostat, TargetPlane
 from model.pointing.calibration import Calibrated
 from model.pointing.drives import Believed, Noise
-from model.pointing.kinematics import STROKES, ZEROS, Chain, Readings, calibrated, residuals
+from model.pointing.kinematics import SPREAD, STROKES, ZEROS, Chain, Readings, calibrated, residuals
 
 Array = NDArray[np.float64]
 
@@ -56,6 +56,8 @@ class CalibratedMount:
         When it was measured, ascending.
     drift, jitter, stepped : (M, 2) [rad]
         What the zeros had beside their parameters then: slow, of hours, and by steps up to then.
+    drifted_std : (2,) [rad]
+        Of the drift from the first measurement to the newest.
     foreign : (M,) of bool
         Measurements that contradict all others.
     residuals : (M, 2) [rad]
@@ -72,10 +74,30 @@ class CalibratedMount:
     drift: Array
     jitter: Array
     stepped: Array
+    drifted_std: Array
     foreign: NDArray[np.bool_]
     residuals: Array
     steps: tuple[Step, ...]
     noise: Noise = field(default_factory=Noise)
+
+    @classmethod
+    def uncalibrated(cls) -> "CalibratedMount":
+        """That of a heliostat that was never measured, and whose field was not."""
+        none = np.zeros((0, 2))
+        return cls(
+            parameters=np.zeros(len(SPREAD)),
+            covariance=np.diag(SPREAD**2),
+            spread=SPREAD,
+            prior_spread=SPREAD,
+            days=np.zeros(0),
+            drift=none,
+            jitter=none,
+            stepped=none,
+            drifted_std=np.zeros(2),
+            foreign=np.zeros(0, dtype=bool),
+            residuals=none,
+            steps=(),
+        )
 
     @property
     def determined(self) -> NDArray[np.bool_]:
@@ -108,7 +130,8 @@ class CalibratedMount:
         if not len(self.days):
             return np.zeros((len(when), 2))
         spreads = (self.noise.drift_rad, self.noise.jitter_rad)
-        return np.sum([left[:, None] * np.square(s) for (_, _, left), s in zip(shares, spreads, strict=True)], axis=0)
+        left = [unknown[:, None] * np.square(spread) for (_, _, unknown), spread in zip(shares, spreads, strict=True)]
+        return np.asarray(np.sum(left, axis=0))
 
     def _between(
         self, days: ArrayLike
@@ -221,6 +244,7 @@ def mounts_of(done: Calibrated, heliostats: Sequence[Heliostat], readings: Readi
                 drift=believed.drift[row, known],
                 jitter=believed.jitter[row, known],
                 stepped=believed.steps[row, known],
+                drifted_std=believed.drifted_std[row],
                 foreign=believed.foreign[row, known],
                 residuals=done.residuals[row, known],
                 steps=tuple(

@@ -56,7 +56,10 @@ def explain(
     latitude_deg: float,
 ) -> Contradiction:
     """The likeliest reason why a reading of heliostat ``name`` contradicts the others."""
-    off = float(off_by(heliostats[name], mounts[name], [reading])[0])
+    try:
+        off = float(off_by(heliostats[name], mounts[name], [reading])[0])
+    except ModelError:
+        return Contradiction("motors", "its drives cannot stand where its motors are said to be", 1e3 * np.pi)
     fits = {
         (code, detail): float(off_by(heliostats[name], mounts[name], [other])[0])
         for code, detail, other in _otherwise(reading, targets, latitude_deg)

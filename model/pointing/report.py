@@ -18,6 +18,10 @@ from model.pointing.reasons import Contradiction
 Array = NDArray[np.float64]
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+
+# Standard deviations that make a drift sure.
+_SURE = 3.0
+
 _DIGITS = 9  # of radians and metres: far below what a step of a motor does
 
 
@@ -92,14 +96,13 @@ def _begin(mount: CalibratedMount) -> str | None:
 
 
 def _drift(mount: CalibratedMount) -> dict[str, Any]:
-    """How far the zeros went slowly, beside all steps, and whether that is more than noise."""
-    if len(mount.days) < 2:
-        return {"mrad": None, "mrad_per_year": None, "is_sure": False}
-    gone = 1e3 * (mount.drift[-1] - mount.drift[0])
-    years = (mount.days[-1] - mount.days[0]) / 365.25
-    sure = np.linalg.norm(gone) > 3 * 1e3 * np.sqrt(np.trace(mount.covariance[7:9, 7:9]))
-    per_year = None if years < 0.1 else _rounded(gone / years, 3)
-    return {"mrad": _rounded(gone, 3), "mrad_per_year": per_year, "is_sure": bool(sure)}
+    """How far the zeros went slowly from the first measurement to the newest, beside all steps."""
+    gone = mount.drift[-1] - mount.drift[0] if len(mount.days) else np.zeros(2)
+    return {
+        "zeros_mrad": _rounded(1e3 * gone, 3),
+        "std_mrad": _rounded(1e3 * mount.drifted_std, 3),
+        "is_sure": bool((np.abs(gone) > _SURE * np.maximum(mount.drifted_std, 1e-9)).any()),
+    }
 
 
 def mount_from_json(document: Any, where: str, noise: Noise | None = None) -> CalibratedMount:
@@ -137,6 +140,7 @@ def mount_from_json(document: Any, where: str, noise: Noise | None = None) -> Ca
         covariance=covariance,
         spread=spread,
         prior_spread=prior,
+        drifted_std=1e-3 * np.array(document["drift"]["std_mrad"], dtype=np.float64),
         days=days,
         foreign=foreign,
         steps=steps,

@@ -1,6 +1,6 @@
 """The mounts of a measurement folder: ``heliotwin calibrate`` and ``heliotwin spot``."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,10 +27,27 @@ def calibrate_folder(folder: MeasurementFolder, out: Path, progress: Progress = 
     ModelError
         Where no heliostat has a measurement with motors and a spot.
     """
-    skipped, clocks = folder.skipped, {}
+    readings, clocks = read_readings(folder, progress)
+    skipped = folder.skipped
+    if not readings:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in list(skipped.items())[:3])
+        raise ModelError(f"no heliostat can be calibrated ({reasons})")
+    done = calibrate_field(
+        folder.plant.heliostats, readings, folder.plant.targets, latitude_deg=float(folder.plant.origin[0])
+    )
+    report = field_to_json(done, skipped) | ({"clocks": clocks} if clocks else {})
+    write_json(out, report)
+    return report
+
+
+def read_readings(
+    folder: MeasurementFolder, progress: Progress = quiet
+) -> tuple[dict[str, list[Reading]], dict[str, str]]:
+    """A folder's readings by heliostat, and faults of clocks by measurement; ``folder.skipped`` notes what is none."""
+    skipped, clocks = folder.skipped, dict[str, str]()
     readings: dict[str, list[Reading]] = {}
-    measured = _measurements(folder, skipped)
-    days = _days(folder, [one for own in measured.values() for one in own], clocks)
+    measured = _measurements(folder)
+    days = _days(folder, measured, clocks)
     for name, own in measured.items():
         progress(name)
         usable = []
@@ -41,17 +58,9 @@ def calibrate_folder(folder: MeasurementFolder, out: Path, progress: Progress = 
                 skipped[measurement.key] = str(error)
         if usable:
             readings[name] = usable
-        elif name not in skipped:
+        else:
             skipped[name] = "no measurement with motors, sun and spot"
-    if not readings:
-        reasons = "; ".join(f"{name}: {reason}" for name, reason in list(skipped.items())[:3])
-        raise ModelError(f"no heliostat can be calibrated ({reasons})")
-    done = calibrate_field(
-        folder.plant.heliostats, readings, folder.plant.targets, latitude_deg=float(folder.plant.origin[0])
-    )
-    report = field_to_json(done, skipped) | ({"clocks": clocks} if clocks else {})
-    write_json(out, report)
-    return report
+    return readings, clocks
 
 
 def spot_folder(folder: MeasurementFolder, mounts: Path, out: Path, progress: Progress = quiet) -> dict[str, Any]:
@@ -66,8 +75,8 @@ def spot_folder(folder: MeasurementFolder, mounts: Path, out: Path, progress: Pr
     """
     known = read_mounts(mounts)
     skipped, spots = folder.skipped, {}
-    measured = _measurements(folder, skipped)
-    days = _days(folder, [one for own in measured.values() for one in own], {})
+    measured = _measurements(folder)
+    days = _days(folder, measured, {})
     for name, own in measured.items():
         progress(name)
         if name not in known:
@@ -94,24 +103,25 @@ def read_mounts(path: Path) -> dict[str, CalibratedMount]:
     return {name: mount_from_json(document, f"{path}, {name}") for name, document in documents.items()}
 
 
-def _measurements(folder: MeasurementFolder, skipped: dict[str, str]) -> dict[str, list[Measurement]]:
-    """Measurements by heliostat, of those that have drives."""
-    found = {}
+def _measurements(folder: MeasurementFolder) -> dict[str, list[Measurement]]:
+    """Measurements by heliostat, of those that have drives; ``folder.skipped`` notes the others."""
+    found, skipped = {}, folder.skipped
     for name, heliostat in folder.plant.heliostats.items():
         if heliostat.mount.actuators is None:
             skipped[name] = "its kinematics have no linear actuators, so motor positions say nothing of its angles"
             continue
         found[name] = folder.measurements(name, with_images=False)
-        if not found[name]:
-            skipped[name] = "no measurement"
     return found
 
 
-def _days(folder: MeasurementFolder, measurements: Sequence[Measurement], clocks: dict[str, str]) -> dict[str, float]:
+def _days(
+    folder: MeasurementFolder, measured: Mapping[str, Sequence[Measurement]], clocks: dict[str, str]
+) -> dict[str, float]:
     """Days since 1970 by measurement; those without a time, or with one that the sun belies, by their numbers.
 
     PAINT's numbers grow with time over the whole plant. Faults of clocks are noted in ``clocks``.
     """
+    measurements = [one for own in measured.values() for one in own]
     faults = {one.key: clock_fault_of(folder, one) for one in measurements}
     clocks.update({key: fault for key, fault in faults.items() if fault is not None})
     days = [np.nan if faults[one.key] else day_of(one.taken_at) for one in measurements]

@@ -36,9 +36,7 @@ def calibrate(
     for name, entry in report["heliostats"].items():
         left = entry["residual_mrad"]
         figures = ("" if left[key] is None else f"{left[key]:.2f}" for key in ("median", "p90"))
-        table.add_row(
-            name, str(entry["measurements"]), *figures, str(len(entry["steps"])), str(len(entry["outliers"]))
-        )
+        table.add_row(name, str(entry["measurements"]), *figures, str(len(entry["steps"])), str(len(entry["outliers"])))
     show(report, as_json, table)
 
 
