@@ -160,7 +160,9 @@ class _Problem:
         covariance[:, diagonal, diagonal] += np.repeat(np.where(readings.used, noise.spot_rad**2, 1.0), 2, axis=1)
         target = y.reshape(heliostats, -1) - by_parameter @ mean
         log_det = np.linalg.slogdet(covariance)[1]
-        return cls(target, by_parameter, by_zero, np.linalg.inv(covariance), log_det, readings, mean, cov, noise)
+        return cls(
+            target, by_parameter, by_zero, np.asarray(np.linalg.inv(covariance)), log_det, readings, mean, cov, noise
+        )
 
     def rows(self, rows: NDArray[np.intp]) -> "_Problem":
         """That of some heliostats."""

@@ -14,6 +14,7 @@ from service.store.tables import (
     HeliostatRow,
     JobRow,
     MeasurementRow,
+    MountRow,
     ReceiverRow,
     StudyRow,
     SurfaceRow,
@@ -55,7 +56,7 @@ def remove_heliostat(session: Session, name: str) -> None:
     _lock(session, HeliostatRow, row.id)
     users = {
         table.__tablename__: _count(session, table, table.heliostat_id == row.id)
-        for table in (MeasurementRow, SurfaceRow, ForecastRow, DriftRow)
+        for table in (MeasurementRow, SurfaceRow, MountRow, ForecastRow, DriftRow)
     }
     # A study keeps names, for its photographs may be gone before it.
     studied = sum(name in heliostats for heliostats in session.scalars(select(StudyRow.heliostats)))

@@ -75,6 +75,7 @@ class Operations(Protocol):
         plane: TargetPlane,
         *,
         aim: NDArray[Any] | None = None,
+        angles: NDArray[Any] | None = None,
         resolution: tuple[int, int] = (256, 256),
         window: float | None = None,
         optics: Optics | None = None,

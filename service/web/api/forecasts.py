@@ -15,6 +15,7 @@ from service.base.fields import (
     Flag,
     Model,
     ModelVersion,
+    MotorPosition,
     Name,
     Number,
     Plane,
@@ -48,6 +49,11 @@ class ForecastIn(Model):
     aim_point: Position | None = Field(
         default=None, description="Where the heliostat aims [m]; by default the plane's centre."
     )
+    motor_position: MotorPosition | None = Field(
+        default=None,
+        description="In place of an aim: positions of both motors [steps]. The newest calibrated mount says where they "
+        "send the light, or the heliostat's properties where it was never calibrated.",
+    )
     surface: Literal["current", "ideal"] | VersionIn = Field(
         default="current", description="The heliostat's current surface, the ideal one, or a version."
     )
@@ -66,6 +72,8 @@ class ForecastIn(Model):
     def _one(self) -> Self:
         if (self.target is None) == (self.plane is None):
             raise ValueError("give either target or plane")
+        if self.aim_point is not None and self.motor_position is not None:
+            raise ValueError("give either aim_point or motor_position")
         return self
 
 
@@ -79,6 +87,7 @@ class ForecastSummary(BaseModel):
     plane: Plane = Field(description="The plane that the light falls on [m].")
     sun: Sun
     aim_point: tuple[float, float, float] | None = Field(description="[m], as given.")
+    motor_position: tuple[float, float] | None = Field(description="[steps], as given.")
     dni_w_m2: float = Field(description="[W/m2]")
     window: float | None = Field(description="Side of the mapped square about the centre of mass [m]; null: the plane.")
     resolution: tuple[int, int] = Field(description="Rows, columns.")
@@ -105,6 +114,7 @@ def forecast_summary(row: ForecastRow) -> ForecastSummary:
             "plane": row.plane,
             "sun": {"azimuth_deg": row.sun_azimuth_deg, "elevation_deg": row.sun_elevation_deg},
             "aim_point": row.aim_point_m,
+            "motor_position": row.motor_position,
             "dni_w_m2": row.dni_w_m2,
             "window": row.window_m,
             "resolution": (row.rows, row.columns),
@@ -148,6 +158,7 @@ def _request(body: ForecastIn) -> ForecastRequest:
         sun_azimuth_deg=body.sun.azimuth_deg,
         sun_elevation_deg=body.sun.elevation_deg,
         aim=body.aim_point,
+        motors=body.motor_position,
         surface=body.surface,
         dni=body.dni_w_m2,
         resolution=body.resolution,
