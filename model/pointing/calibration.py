@@ -19,9 +19,10 @@ from model.pointing.kinematics import PARAMETERS, SPREAD, ZEROS, Chain, Readings
 
 Array = NDArray[np.float64]
 
-# Rounds of Gauss and Newton: of the robust start, and of the posterior between two looks at the field.
+# Rounds of Gauss and Newton: of the robust start, of the posterior, and the first of these, which each look at the
+# field anew.
 _ROBUST_ROUNDS = 15
-_ROUNDS = 2
+_ROUNDS = 5
 _FIELD_ROUNDS = 3
 
 # Degrees of freedom of Student's t in the robust start.
@@ -104,11 +105,11 @@ def calibrate(chain: Chain, readings: Readings, noise: Noise | None = None, fiel
     chain = prior.start(chain)
     parameters = robust(chain, readings, prior, noise)
     zeros = np.zeros(readings.steps.shape)
-    for _ in range(_FIELD_ROUNDS if field is None else 1):
+    for turn in range(_ROUNDS):
         believed = _posterior(chain, readings, prior, noise, parameters, zeros)
         parameters, zeros = believed.parameters, believed.zeros
-        prior = field or prior.seen(believed)
-    believed = _posterior(chain, readings, prior, noise, parameters, zeros)
+        if field is None and turn < _FIELD_ROUNDS:
+            prior = prior.seen(believed)
     left = residuals(chain, readings, believed.parameters, believed.zeros)[0]
     return Calibrated(chain, prior, noise, believed, left)
 
@@ -138,14 +139,11 @@ def robust(chain: Chain, readings: Readings, prior: Field, noise: Noise) -> Arra
 def _posterior(
     chain: Chain, readings: Readings, prior: Field, noise: Noise, parameters: Array, zeros: Array
 ) -> Believed:
-    for _ in range(_ROUNDS):
-        parts = [
-            (rows, _linearised(chain.rows(rows), readings.of(rows), prior, noise, parameters[rows], zeros[rows]))
-            for rows in batches(readings)
-        ]
-        believed = _joined(parts, *readings.used.shape)
-        parameters, zeros = believed.parameters, believed.zeros
-    return believed
+    parts = [
+        (rows, _linearised(chain.rows(rows), readings.of(rows), prior, noise, parameters[rows], zeros[rows]))
+        for rows in batches(readings)
+    ]
+    return _joined(parts, *readings.used.shape)
 
 
 def _linearised(

@@ -310,8 +310,11 @@ class _Terms:
         after = np.arange(self.most) >= self.place[..., None]
         alone = np.arange(self.most) == self.place[..., None]
         is_step, is_foreign = np.isin(self.kind, _STEPS), self.kind == _FOREIGN
-        design = np.einsum("htm,hmka->hmkta", (after & is_step[..., None]).astype(float), problem.by_zero)
-        design += np.einsum("htm,ka->hmkta", (alone & is_foreign[..., None]).astype(float), np.eye(2))
+        from_here, here = (
+            (places & kinds[..., None]).swapaxes(1, 2)[:, :, None, :, None]
+            for places, kinds in ((after, is_step), (alone, is_foreign))
+        )
+        design = from_here * problem.by_zero[:, :, :, None] + here * np.eye(2)[:, None]
         design = design.reshape(heliostats, 2 * self.most, 2 * count)
         variance = _variances(problem.noise)[self.kind].reshape(heliostats, 2 * count)
         weighed = problem.precision @ design
@@ -350,9 +353,7 @@ class _Terms:
         blocks = solved.precision(problem).reshape(heliostats, self.most, 2, self.most, 2)
         foreign_hess = np.einsum("hiaib->hiab", blocks)
         step_pull = _from_here(np.einsum("hmka,hmk->hma", problem.by_zero, pull), 1)
-        half = np.einsum("hika,hikjl->hiajl", problem.by_zero, blocks, optimize=True)
-        full = np.einsum("hiajl,hjlb->hijab", half, problem.by_zero, optimize=True)
-        step_hess = np.einsum("hiiab->hiab", _from_here(_from_here(full, 1), 2))
+        step_hess = self._step_hess(problem.by_zero, blocks)
         noise, used = problem.noise, problem.readings.used
         variances = _variances(noise)
         of_steps = [_gain(step_pull, step_hess, variances[kind]) for kind in _STEPS]
@@ -363,6 +364,19 @@ class _Terms:
         gains[:, steps] = np.where(self.mask(*_STEPS)[:, None], -np.inf, gains[:, steps])
         gains[:, -1] = np.where(self.mask(_FOREIGN), -np.inf, gains[:, -1])
         return np.where(used[:, None], gains, -np.inf)
+
+    def _step_hess(self, by_zero: Array, blocks: Array) -> Array:
+        """Information (H, M, 2, 2) on a step before each measurement: the sum of all pairs of those after it.
+
+        From one measurement to the next come the pair of it with itself, and those with all later ones, twice.
+        """
+        heliostats, most = by_zero.shape[:2]
+        half = by_zero.swapaxes(2, 3) @ blocks.reshape(heliostats, most, 2, 2 * most)
+        own = np.einsum("hiail->hial", half.reshape(heliostats, most, 2, most, 2)) @ by_zero
+        half *= (np.arange(2 * most) // 2 > np.arange(most)[:, None])[:, None]
+        later = half.reshape(heliostats, 2 * most, 2 * most) @ by_zero.reshape(heliostats, 2 * most, 2)
+        later = later.reshape(heliostats, most, 2, 2)
+        return _from_here(own + later + later.swapaxes(2, 3), 1)
 
     def shed(self, problem: _Problem) -> None:
         """Drop beliefs whose odds are against them by now, the worst of a heliostat first."""

@@ -11,7 +11,7 @@ from model.pointing.drives import Noise
 from model.pointing.kinematics import Chain
 from model.pointing.mounts import CalibratedMount, mounts_of
 from model.pointing.readings import Reading, padded
-from model.pointing.reasons import Contradiction, explain
+from model.pointing.reasons import Contradiction, Reasons
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,9 +56,10 @@ def calibrate_field(
     chain, arrays = Chain.of(own), padded(list(ordered.values()))
     done = calibrate(chain, arrays, noise, field)
     mounts = dict(zip(names, mounts_of(done, own, arrays), strict=True))
+    reasons = Reasons(heliostats, mounts, targets, latitude_deg)
     contradictions = {
         name: {
-            ordered[name][place].name: explain(name, ordered[name][place], heliostats, mounts, targets, latitude_deg)
+            ordered[name][place].name: reasons.explain(name, ordered[name][place])
             for place in np.nonzero(mount.foreign)[0]
         }
         for name, mount in mounts.items()

@@ -13,14 +13,19 @@ from numpy.typing import NDArray
 from model.errors import ModelError
 from model.mount import rotation
 from model.plant import Heliostat, TargetPlane
+from model.pointing.kinematics import ZEROS, Chain, residuals
 from model.pointing.mounts import CalibratedMount, landed
-from model.pointing.readings import Reading
+from model.pointing.readings import Reading, padded
 
 Array = NDArray[np.float64]
 
 # What a reason leaves must be less than this [rad], or than this share of what it explains.
 _FITS = 3e-3
 _EXPLAINS = 0.15
+
+# A spot of another heliostat lies further away than that [rad]; so many others are tried.
+_ANOTHERS = 10e-3
+_TRIED = 4
 
 # Clocks are set to whole hours of other zones, or of summer.
 _HOURS = (-2, -1, 1, 2)
@@ -47,34 +52,59 @@ def off_by(heliostat: Heliostat, mount: CalibratedMount, readings: Sequence[Read
     return np.asarray(2 * np.arcsin(np.clip(np.linalg.norm(ways - directions, axis=-1) / 2, 0, 1)))
 
 
-def explain(
-    name: str,
-    reading: Reading,
-    heliostats: Mapping[str, Heliostat],
-    mounts: Mapping[str, CalibratedMount],
-    targets: Mapping[str, TargetPlane],
-    latitude_deg: float,
-) -> Contradiction:
-    """The likeliest reason why a reading of heliostat ``name`` contradicts the others."""
-    try:
-        off = float(off_by(heliostats[name], mounts[name], [reading])[0])
-    except ModelError:
-        return Contradiction("motors", "its drives cannot stand where its motors are said to be", 1e3 * np.pi)
-    fits = {
-        (code, detail): float(off_by(heliostats[name], mounts[name], [other])[0])
-        for code, detail, other in _otherwise(reading, targets, latitude_deg)
-    }
-    for other, mount in mounts.items():
-        if other != name and len(mount.days):
+class Reasons:
+    """What may explain readings of a calibrated field: its targets, the sun, and its other heliostats."""
+
+    def __init__(
+        self,
+        heliostats: Mapping[str, Heliostat],
+        mounts: Mapping[str, CalibratedMount],
+        targets: Mapping[str, TargetPlane],
+        latitude_deg: float,
+    ) -> None:
+        self._heliostats, self._mounts, self._targets = heliostats, mounts, targets
+        self._latitude_deg = latitude_deg
+        self._measured = [name for name, mount in mounts.items() if len(mount.days)]
+        self._chain = Chain.of([heliostats[name] for name in self._measured])
+        newest = [mounts[name].parameters.copy() for name in self._measured]
+        for name, parameters in zip(self._measured, newest, strict=True):
+            parameters[ZEROS] += mounts[name].stepped[-1]
+        self._newest = np.array(newest)
+
+    def explain(self, name: str, reading: Reading) -> Contradiction:
+        """The likeliest reason why a reading of heliostat ``name`` contradicts its others."""
+        heliostat, mount = self._heliostats[name], self._mounts[name]
+        try:
+            off = float(off_by(heliostat, mount, [reading])[0])
+        except ModelError:
+            return Contradiction("motors", "its drives cannot stand where its motors are said to be", 1e3 * np.pi)
+        fits = {
+            (code, detail): float(off_by(heliostat, mount, [other])[0])
+            for code, detail, other in _otherwise(reading, self._targets, self._latitude_deg)
+        }
+        if off > _ANOTHERS:
+            fits |= self._of_others(name, reading)
+        (code, detail), left = min(fits.items(), key=lambda item: item[1], default=(("", ""), np.inf))
+        if left < max(_FITS, _EXPLAINS * off) and left < off / 2:
+            return Contradiction(code, f"{detail}, to {1e3 * left:.1f} mrad", 1e3 * off)
+        return Contradiction(*_elsewhere(heliostat, mount, reading, self._targets), 1e3 * off)
+
+    def _of_others(self, name: str, reading: Reading) -> dict[tuple[str, str], float]:
+        """How well a reading fits those heliostats that it fits best [rad]."""
+        count = len(self._measured)
+        alike = padded([[reading]] * count)
+        apart = residuals(self._chain, alike, self._newest, np.zeros((count, 1, 2)))[0][:, 0]
+        found = {}
+        for place in np.argsort(np.linalg.norm(apart, axis=-1))[:_TRIED]:
+            other = self._measured[place]
+            if other == name:
+                continue
             try:
-                left = float(off_by(heliostats[other], mount, [reading])[0])
+                left = float(off_by(self._heliostats[other], self._mounts[other], [reading])[0])
             except ModelError:  # that heliostat's drives cannot stand there
                 continue
-            fits["wrong_heliostat", f"it fits heliostat {other}"] = left
-    (code, detail), left = min(fits.items(), key=lambda item: item[1], default=(("", ""), np.inf))
-    if left < max(_FITS, _EXPLAINS * off) and left < off / 2:
-        return Contradiction(code, f"{detail}, to {1e3 * left:.1f} mrad", 1e3 * off)
-    return Contradiction(*_elsewhere(heliostats[name], mounts[name], reading, targets), 1e3 * off)
+            found["wrong_heliostat", f"it fits heliostat {other}"] = left
+        return found
 
 
 def _otherwise(

@@ -74,7 +74,9 @@ class AimIn(Model):
 
     sun: Sun | None = Field(default=None, description="Where the sun stands; either this or `time`.")
     time: Moment | None = Field(default=None, description="When (time with zone); either this or `sun`.")
-    aim_point: Position | None = Field(default=None, description="Where the light shall go; either this or `target`.")
+    aim_point: Position | None = Field(
+        default=None, description="Where the light shall go [m]; either this or `target`."
+    )
     target: Name | None = Field(default=None, description="A stored target or receiver whose middle is meant.")
 
     @model_validator(mode="after")
