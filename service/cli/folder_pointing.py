@@ -117,14 +117,14 @@ def _measurements(folder: MeasurementFolder) -> dict[str, list[Measurement]]:
 def _days(
     folder: MeasurementFolder, measured: Mapping[str, Sequence[Measurement]], clocks: dict[str, str]
 ) -> dict[str, float]:
-    """Days since 1970 by measurement; those without a time, or with one that the sun belies, by their numbers.
+    """Days since 1970 by measurement; those without a time by their numbers, which PAINT's plant counts on.
 
-    PAINT's numbers grow with time over the whole plant. Faults of clocks are noted in ``clocks``.
+    Faults of clocks are noted in ``clocks``: hours matter little where mounts change by days.
     """
     measurements = [one for own in measured.values() for one in own]
     faults = {one.key: clock_fault_of(folder, one) for one in measurements}
     clocks.update({key: fault for key, fault in faults.items() if fault is not None})
-    days = [np.nan if faults[one.key] else day_of(one.taken_at) for one in measurements]
+    days = [day_of(one.taken_at) for one in measurements]
     numbers = [int(one.identifier) if one.identifier.isdecimal() else np.nan for one in measurements]
     known = np.isfinite(numbers)
     by_number = np.array(days)

@@ -19,6 +19,7 @@ from model.plant import Heliostat, TargetPlane
 from model.pointing import CalibratedMount, Field, Reading, calibrate_field, off_by
 from service.cli.folder_pointing import read_readings
 from service.sources.folder import read_folder
+from tests.benchmarks import data_folder
 
 Array = NDArray[np.float64]
 
@@ -267,7 +268,7 @@ def picture(plant: Plant, path: Path) -> None:
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    default = [Path("../shared/stj-pointing"), Path("../shared/stj-years")]
+    default = [data_folder().parent / name for name in ("stj-pointing", "stj-years")]
     parser.add_argument("--data", type=Path, nargs="+", default=default)
     parser.add_argument("--only", choices=("accuracy", "steps", "speed", "picture"), nargs="*")
     parser.add_argument("--out", type=Path, default=Path("results/pointing.png"))

@@ -7,13 +7,9 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
-from model.frames import sun_direction
-from model.plant import Plant
-from model.pointing.kinematics import SPREAD, calibrated
-from model.pointing.mounts import landed
 from service.base.settings import Settings
-from service.sources.documents import read_heliostat, read_targets
-from tests.service.conftest import ORIGIN, QUIET, FakeOperations, Post, png, until
+from tests.service.conftest import QUIET, FakeOperations, Post, png, until
+from tests.service.spots import photographs
 
 SUN = {"azimuth_deg": 10.0, "elevation_deg": 40.0}
 NOON = "2024-06-03T11:30:00Z"
@@ -22,35 +18,6 @@ NOON = "2024-06-03T11:30:00Z"
 @pytest.fixture
 def settings(tmp_path: Path) -> Settings:
     return Settings(data_dir=tmp_path / "data", **QUIET | {"job_workers": 1, "job_poll_s": 0.05})
-
-
-def photographs(tower: Any, properties: Any, step_mrad: float = 0.0) -> list[dict[str, Any]]:
-    """What would be measured of AA39 with a mount of its own; its first drive steps after the eighth."""
-    generator = np.random.default_rng(4)
-    plane, heliostat = read_targets(tower)[1]["lower"], read_heliostat("AA39", properties, np.array(ORIGIN))
-    mount = calibrated(heliostat.mount, 0.3 * SPREAD * generator.normal(size=len(SPREAD)))
-    taken = []
-    for place in range(16):
-        azimuth, elevation = generator.uniform(-60, 60), generator.uniform(20, 60)
-        sun = sun_direction(azimuth, elevation)
-        angles = mount.align(heliostat.position, sun, plane.center)
-        motors = np.round(mount.motors_from_angles(angles))
-        step = np.array([1e-3 * step_mrad if place >= 8 else 0.0, 0.0])
-        attitude = mount.attitude(mount.angles_from_motors(motors) + step)
-        normal, center = attitude[:, 2], mount.mirror_center(heliostat.position, attitude)
-        spot = landed(center, 2 * (normal @ sun) * normal - sun, plane)
-        taken.append(
-            {
-                "id": f"{place}",
-                "kind": "flux-centered",
-                "sun_azimuth": azimuth,
-                "sun_elevation": elevation,
-                "motor_position": motors.tolist(),
-                "focal_spot": Plant("", np.array(ORIGIN)).to_wgs84(spot).tolist(),
-                "taken_at": f"2024-05-{place + 1:02d}T12:00:00Z",
-            }
-        )
-    return taken
 
 
 def calibrate(client: TestClient, **body: Any) -> dict[str, Any]:
