@@ -27,6 +27,9 @@ Array = NDArray[np.float64]
 # facing south: R_east(90 deg).
 _UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
+# Steps by which a motor's position may lie beyond an end for rounding alone.
+_ROUNDING = 0.5
+
 
 def rotation(axis: ArrayLike, angle: ArrayLike) -> Array:
     """Rotation matrices (..., 3, 3) about ``axis`` (..., 3) by ``angle`` (...) [rad], right-handed (Rodrigues)."""
@@ -92,12 +95,32 @@ class LinearActuator:
         turned = self._pivot_angle(stroke) - self._pivot_angle(self.initial_stroke_length)
         return self.initial_angle + (-turned if self.clockwise else turned)
 
+    def require_within(self, steps: ArrayLike) -> None:
+        """`UnreachableError` where a motor position (...) [steps] lies beyond an end of the travel."""
+        position = np.asarray(steps, dtype=np.float64)
+        beyond = position[~((position >= -_ROUNDING) & (position <= self.max_increment + _ROUNDING))]
+        if beyond.size:
+            raise UnreachableError(
+                f"motor position {beyond.flat[0]:.0f} lies beyond the travel, 0 to {self.max_increment:.0f} steps; "
+                "check the position, or choose another aim"
+            )
+
     def steps(self, angle: ArrayLike) -> Array:
-        """Motor position (...) [steps] at an axis angle (...) [rad]; inverts `angle`."""
+        """Motor position (...) [steps] at an axis angle (...) [rad]; inverts `angle`.
+
+        Raises
+        ------
+        UnreachableError
+            Where the angle lies beyond an end of the travel.
+        """
         turned = np.asarray(angle, dtype=np.float64) - self.initial_angle
         pivot = self._pivot_angle(self.initial_stroke_length) + (-turned if self.clockwise else turned)
+        if ((pivot < 0) | (pivot > np.pi)).any():
+            raise UnreachableError("no stroke of the actuator turns its axis that far; choose another aim or sun")
         stroke = np.sqrt(self.offset**2 + self.pivot_radius**2 - 2 * self.offset * self.pivot_radius * np.cos(pivot))
-        return np.asarray((stroke - self.initial_stroke_length) * self.increment)
+        position = np.asarray((stroke - self.initial_stroke_length) * self.increment)
+        self.require_within(position)
+        return position
 
 
 @dataclass(frozen=True, eq=False)

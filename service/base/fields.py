@@ -75,6 +75,9 @@ Wgs84 = tuple[
     Annotated[Number, Field(ge=-1e4, le=1e5)],
 ]
 
+MotorPosition = tuple[Annotated[Number, Field(ge=0, le=1e9)], Annotated[Number, Field(ge=0, le=1e9)]]
+"""Of both axes [steps]."""
+
 AZIMUTH = Field(ge=-360, le=360, description="Sun azimuth from south, positive to the east [deg].")
 ELEVATION = Field(gt=0, le=90, description="Sun elevation above the horizon [deg].")
 Azimuth = Annotated[Number, AZIMUTH]

@@ -15,6 +15,7 @@ from service.store.tables import (
     HeliostatRow,
     JobRow,
     MeasurementRow,
+    MountRow,
     ReceiverRow,
     StudyRow,
     SurfaceRow,
@@ -56,7 +57,7 @@ def remove_heliostat(session: Session, name: str) -> None:
     _lock(session, HeliostatRow, row.id)
     users = {
         table.__tablename__: _count(session, table, table.heliostat_id == row.id)
-        for table in (MeasurementRow, SurfaceRow, DecisionRow, ForecastRow, DriftRow)
+        for table in (MeasurementRow, SurfaceRow, DecisionRow, MountRow, ForecastRow, DriftRow)
     }
     # A study keeps names, for its photographs may be gone before it.
     studied = sum(name in heliostats for heliostats in session.scalars(select(StudyRow.heliostats)))

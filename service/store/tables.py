@@ -277,6 +277,25 @@ class DecisionRow(Base):
     surface: Mapped[SurfaceRow] = relationship(lazy="joined", innerjoin=True)
 
 
+class MountRow(Base):
+    """One calibration of a heliostat's mount: a document of `model.pointing.report.mount_to_json`.
+
+    ``valid_from`` is when its newest state began, by a step of its drives or the first measurement.
+    """
+
+    __tablename__ = "mounts"
+    __table_args__ = (UniqueConstraint("heliostat_id", "version"), Index(None, "heliostat_id", "valid_from"))
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    heliostat_id: Mapped[int] = mapped_column(ForeignKey("heliostats.id"))
+    version: Mapped[int]
+    created_at: Mapped[datetime] = mapped_column(default=now)
+    valid_from: Mapped[datetime]
+    measurements: Mapped[int]
+    residual_mrad: Mapped[float | None]
+    document: Mapped[dict[str, Any]] = mapped_column(deferred=True)
+
+
 class DriftRow(Base):
     """Flux accuracy [1] of a heliostat's surface on its newest photograph, when that came (`service.twin.accuracy`)."""
 
@@ -306,6 +325,7 @@ class ForecastRow(Base):
     sun_elevation_deg: Mapped[float]
     sun_at: Mapped[datetime | None]
     aim_point_m: Mapped[list[float] | None]
+    motor_position: Mapped[list[float] | None]
     dni_w_m2: Mapped[float]
     window_m: Mapped[float | None]
     normalised: Mapped[bool]

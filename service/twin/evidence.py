@@ -179,7 +179,7 @@ def evidence_of(row: MeasurementRow, origin: tuple[float, float, float], target:
         target=plane,
         flux=arrays.get("flux"),
         centered=arrays["centered"],
-        spot=_spot_of(row, plane, origin),
+        spot=spot_of(row, plane, origin),
         motor_position=None if None in motors else np.array(motors),
         taken_at=row.taken_at,
         clipped=None if clipped is None else np.asarray(clipped, dtype=bool),
@@ -187,7 +187,8 @@ def evidence_of(row: MeasurementRow, origin: tuple[float, float, float], target:
     )
 
 
-def _spot_of(row: MeasurementRow, plane: TargetPlane, origin: tuple[float, float, float]) -> Array | None:
+def spot_of(row: MeasurementRow, plane: TargetPlane, origin: tuple[float, float, float]) -> Array | None:
+    """Where a measurement's spot lies (3,) [m]: as measured, else as its sender knew it."""
     if row.center_right_m is not None and row.center_up_m is not None:
         return plane.to_enu((row.center_right_m, row.center_up_m))
     return None if row.focal_spot_wgs84 is None else wgs84_to_enu(row.focal_spot_wgs84, origin)

@@ -24,6 +24,7 @@ from service.base.fields import Sun, SunAt
 from service.store.tables import ForecastRow, HeliostatRow, SurfaceRow
 from service.twin.compute import Forecast
 from service.twin.evidence import Twin, heights_of, load_twin
+from service.twin.pointing import load_mount
 from service.twin.runtime import Runtime
 from service.twin.versions import PlantModel, get_model
 
@@ -33,9 +34,10 @@ class ForecastRequest:
     """What to forecast; ``target`` names a stored plane, else ``plane`` is one.
 
     ``sun_azimuth_deg`` counts from south, positive to the east; ``sun_at`` is the time that was asked for, if one was.
-    ``aim`` (3,) [m] is by default the plane's centre. ``surface``: "current", "ideal" or a version. ``window`` [m]: the
-    side of a square about the centre of mass that is mapped; the whole plane without it. ``model_version`` is the
-    plant's model, by default the current one.
+    ``aim`` (3,) [m] is by default the plane's centre; ``motors`` [steps] in its place turn the mirror by its calibrated
+    mount, wherever that sends the light. ``surface``: "current", "ideal" or a version. ``window`` [m]: the side of a
+    square about the centre of mass that is mapped; the whole plane without it. ``model_version`` is the plant's model,
+    by default the current one.
     """
 
     heliostat: str
@@ -45,6 +47,7 @@ class ForecastRequest:
     target: str | None = None
     plane: TargetPlane | None = None
     aim: tuple[float, float, float] | None = None
+    motors: tuple[float, float] | None = None
     surface: str | int = "current"
     dni: float = 1000.0
     resolution: tuple[int, int] = (256, 256)
@@ -115,11 +118,14 @@ def trace_request(runtime: Runtime, request: ForecastRequest) -> Traced:
     NotFoundError, ConflictError
         Where heliostat, target, model or surface version is not stored, or no surface is current.
     UnreachableError
-        Where the heliostat cannot reflect the sun to the aim point, or light does not reach the plane's lit side.
+        Where its drives cannot stand at these motor positions, or the heliostat cannot reflect the sun to the aim
+        point, or light does not reach the plane's lit side.
     """
     with runtime.database.reading() as session:
         twin = load_twin(session, request.heliostat, request.model_version)
         plane, surface = _plane(session, request), _chosen_surface(session, twin.row, request.surface)
+        if request.motors is not None:
+            twin = replace(twin, heliostat=load_mount(session, request.heliostat).turned())
     return Traced(twin.row, surface, plane, twin.model, _trace(runtime, twin, heights_of(surface), request, plane))
 
 
@@ -141,6 +147,7 @@ def _forecast_row(request: ForecastRequest, traced: Traced) -> ForecastRow:
         sun_elevation_deg=request.sun_elevation_deg,
         sun_at=request.sun_at,
         aim_point_m=None if request.aim is None else list(request.aim),
+        motor_position=None if request.motors is None else list(request.motors),
         dni_w_m2=request.dni,
         window_m=request.window,
         normalised=request.normalised,
@@ -165,7 +172,11 @@ def make_forecast(runtime: Runtime, request: ForecastRequest) -> ForecastRow:
 def _trace(
     runtime: Runtime, twin: Twin, z: NDArray[Any] | None, request: ForecastRequest, plane: TargetPlane
 ) -> Forecast:
-    model = twin.model
+    model, angles = twin.model, None
+    if request.motors is not None:
+        for position, drive in zip(request.motors, twin.heliostat.mount.actuators or (), strict=True):
+            drive.require_within(position)
+        angles = twin.heliostat.mount.angles_from_motors(request.motors)
     with runtime.computing("forecast") as operations:
         return operations.forecast(
             twin.heliostat,
@@ -173,11 +184,13 @@ def _trace(
             sun_direction(request.sun_azimuth_deg, request.sun_elevation_deg),
             plane,
             aim=None if request.aim is None else np.array(request.aim),
+            angles=angles,
             resolution=request.resolution,
             window=request.window,
             optics=replace(model.optics, dni=request.dni),
             effects=model.effects,
             latitude_deg=twin.origin[0],
+            taken_at=request.sun_at,
         )
 
 
@@ -195,7 +208,7 @@ def camera_view(session: Session, row: ForecastRow) -> NDArray[np.float32]:
     size = row.window_m or row.plane["width"], row.window_m or row.plane["height"]
     effects = of_stage(get_model(session, int(row.model_version.partition(":")[0])).effects, "image")
     with torch.no_grad():
-        return images_under(acting(effects, None), light[None], Window(*size, *light.shape))[0].clamp(min=0).numpy()
+        return images_under(acting(effects, row.sun_at), light[None], Window(*size, *light.shape))[0].clamp(min=0).numpy()
 
 
 def flux_of(row: ForecastRow, flux: NDArray[np.float32] | None = None) -> NDArray[np.float32]:

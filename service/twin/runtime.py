@@ -75,11 +75,13 @@ class Operations(Protocol):
         plane: TargetPlane,
         *,
         aim: NDArray[Any] | None = None,
+        angles: NDArray[Any] | None = None,
         resolution: tuple[int, int] = (256, 256),
         window: float | None = None,
         optics: Optics | None = None,
         effects: Sequence[Effect] = (),
         latitude_deg: float,
+        taken_at: datetime | None = None,
     ) -> Forecast:
         """The flux of a heliostat on a plane."""
 

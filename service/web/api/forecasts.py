@@ -16,6 +16,7 @@ from service.base.fields import (
     Flag,
     Model,
     ModelVersion,
+    MotorPosition,
     Name,
     Number,
     Plane,
@@ -51,6 +52,11 @@ class ForecastIn(Model):
     aim_point: Position | None = Field(
         default=None, description="Where the heliostat aims [m]; by default the plane's centre."
     )
+    motor_position: MotorPosition | None = Field(
+        default=None,
+        description="In place of an aim: positions of both motors [steps]. The newest calibrated mount says where they "
+        "send the light, or the heliostat's properties where it was never calibrated.",
+    )
     surface: Literal["current", "ideal"] | VersionIn = Field(
         default="current", description="The heliostat's current surface, the ideal one, or a version."
     )
@@ -69,6 +75,8 @@ class ForecastIn(Model):
     def _one(self) -> Self:
         if (self.target is None) == (self.plane is None):
             raise ValueError("give either target or plane")
+        if self.aim_point is not None and self.motor_position is not None:
+            raise ValueError("give either aim_point or motor_position")
         return self
 
 
@@ -83,6 +91,7 @@ class ForecastSummary(BaseModel):
     sun: Sun
     sun_at: datetime | None = Field(description="The time that was asked for; null: the sun's position was.")
     aim_point: tuple[float, float, float] | None = Field(description="[m], as given.")
+    motor_position: tuple[float, float] | None = Field(description="[steps], as given.")
     dni_w_m2: float = Field(description="[W/m2]")
     window: float | None = Field(description="Side of the mapped square about the centre of mass [m]; null: the plane.")
     resolution: tuple[int, int] = Field(description="Rows, columns.")
@@ -110,6 +119,7 @@ def forecast_summary(row: ForecastRow) -> ForecastSummary:
             "sun": {"azimuth_deg": row.sun_azimuth_deg, "elevation_deg": row.sun_elevation_deg},
             "sun_at": row.sun_at,
             "aim_point": row.aim_point_m,
+            "motor_position": row.motor_position,
             "dni_w_m2": row.dni_w_m2,
             "window": row.window_m,
             "resolution": (row.rows, row.columns),
@@ -156,6 +166,7 @@ def _request(runtime: Runtime, body: ForecastIn) -> ForecastRequest:
         sun_elevation_deg=sun.elevation_deg,
         sun_at=body.sun.at if isinstance(body.sun, SunAt) else None,
         aim=body.aim_point,
+        motors=body.motor_position,
         surface=body.surface,
         dni=body.dni_w_m2,
         resolution=body.resolution,

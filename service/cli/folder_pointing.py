@@ -1,0 +1,173 @@
+"""The mounts of a measurement folder: ``heliotwin calibrate`` and ``heliotwin spot``."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.errors import InvalidInputError, ModelError
+from model.plant import Heliostat
+from model.pointing import CalibratedMount, Reading, calibrate_field, days_by_order
+from model.pointing.report import day_of, field_to_json, mount_from_json
+from service.base.progress import Progress, quiet
+from service.cli.folder import clock_fault_of, write_json
+from service.sources.documents import Measurement, get, read_json
+from service.sources.folder import MeasurementFolder
+
+Array = NDArray[np.float64]
+
+
+def calibrate_folder(folder: MeasurementFolder, out: Path, progress: Progress = quiet) -> dict[str, Any]:
+    """Mounts of a folder's heliostats from their motors, suns and spots; MOUNTS.json.
+
+    Raises
+    ------
+    ModelError
+        Where no heliostat has a measurement with motors and a spot.
+    """
+    readings, clocks = read_readings(folder, progress)
+    skipped = folder.skipped
+    if not readings:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in list(skipped.items())[:3])
+        raise ModelError(f"no heliostat can be calibrated ({reasons})")
+    done = calibrate_field(
+        folder.plant.heliostats, readings, folder.plant.targets, latitude_deg=float(folder.plant.origin[0])
+    )
+    report = field_to_json(done, skipped) | ({"clocks": clocks} if clocks else {})
+    write_json(out, report)
+    return report
+
+
+def read_readings(
+    folder: MeasurementFolder, progress: Progress = quiet
+) -> tuple[dict[str, list[Reading]], dict[str, str]]:
+    """A folder's readings by heliostat, and faults of clocks by measurement; ``folder.skipped`` notes what is none."""
+    skipped, clocks = folder.skipped, dict[str, str]()
+    readings: dict[str, list[Reading]] = {}
+    measured = _measurements(folder)
+    days = _days(folder, measured, clocks)
+    for name, own in measured.items():
+        progress(name)
+        usable = []
+        for measurement in own:
+            try:
+                usable.append(_reading(folder, measurement, days[measurement.key]))
+            except ModelError as error:
+                skipped[measurement.key] = str(error)
+        if usable:
+            readings[name] = usable
+        else:
+            skipped[name] = "no measurement with motors, sun and spot"
+    return readings, clocks
+
+
+def spot_folder(folder: MeasurementFolder, mounts: Path, out: Path, progress: Progress = quiet) -> dict[str, Any]:
+    """Where the light of each measurement's motors lands by calibrated mounts; SPOTS.json.
+
+    Raises
+    ------
+    InvalidInputError
+        Where the file of mounts is none.
+    ModelError
+        Where there is a spot of no measurement.
+    """
+    known = read_mounts(mounts)
+    skipped, spots = folder.skipped, {}
+    measured = _measurements(folder)
+    days = _days(folder, measured, {})
+    for name, own in measured.items():
+        progress(name)
+        if name not in known:
+            skipped[name] = f"{mounts} has no mount of it; calibrate it first"
+            continue
+        for measurement in own:
+            try:
+                spots[measurement.key] = _spot(folder, measurement, known[name], days[measurement.key])
+            except ModelError as error:
+                skipped[measurement.key] = str(error)
+    report = {"spots": spots, "skipped": skipped}
+    write_json(out, report)
+    if not spots:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in list(skipped.items())[:3])
+        raise ModelError(f"no spot can be told ({reasons}); see {out}")
+    return report
+
+
+def read_mounts(path: Path) -> dict[str, CalibratedMount]:
+    """The mounts of a file that `calibrate_folder` wrote, by heliostat."""
+    documents = get(read_json(path), str(path), "heliostats")
+    if not isinstance(documents, dict):
+        raise InvalidInputError(f"{path}: 'heliostats' must be a JSON object")
+    return {name: mount_from_json(document, f"{path}, {name}") for name, document in documents.items()}
+
+
+def _measurements(folder: MeasurementFolder) -> dict[str, list[Measurement]]:
+    """Measurements by heliostat, of those that have drives; ``folder.skipped`` notes the others."""
+    found, skipped = {}, folder.skipped
+    for name, heliostat in folder.plant.heliostats.items():
+        if heliostat.mount.actuators is None:
+            skipped[name] = "its kinematics have no linear actuators, so motor positions say nothing of its angles"
+            continue
+        found[name] = folder.measurements(name, with_images=False)
+    return found
+
+
+def _days(
+    folder: MeasurementFolder, measured: Mapping[str, Sequence[Measurement]], clocks: dict[str, str]
+) -> dict[str, float]:
+    """Days since 1970 by measurement; those without a time by their numbers, which PAINT's plant counts on.
+
+    Faults of clocks are noted in ``clocks``: hours matter little where mounts change by days.
+    """
+    measurements = [one for own in measured.values() for one in own]
+    faults = {one.key: clock_fault_of(folder, one) for one in measurements}
+    clocks.update({key: fault for key, fault in faults.items() if fault is not None})
+    days = [day_of(one.taken_at) for one in measurements]
+    numbers = [int(one.identifier) if one.identifier.isdecimal() else np.nan for one in measurements]
+    known = np.isfinite(numbers)
+    by_number = np.array(days)
+    by_number[known] = days_by_order(by_number[known], np.array(numbers)[known])
+    return {one.key: float(day) for one, day in zip(measurements, by_number, strict=True)}
+
+
+def _motors(heliostat: Heliostat, measurement: Measurement) -> Array:
+    """Motor positions (2,) [steps] within the drives' travel."""
+    if measurement.motor_position is None:
+        raise InvalidInputError("no 'motor_position'")
+    for position, drive in zip(measurement.motor_position, heliostat.mount.actuators or (), strict=True):
+        drive.require_within(position)
+    return measurement.motor_position
+
+
+def _reading(folder: MeasurementFolder, measurement: Measurement, day: float) -> Reading:
+    heliostat = folder.plant.heliostats[measurement.heliostat]
+    motors = _motors(heliostat, measurement)
+    if measurement.spot is None:
+        raise InvalidInputError("no 'focal_spot'")
+    if not any(_on(plane, measurement.spot) for plane in folder.plant.targets.values()):
+        raise InvalidInputError("'focal_spot' lies off every target")
+    return Reading(
+        measurement.identifier, measurement.target, motors, measurement.sun, measurement.spot, np.nan_to_num(day)
+    )
+
+
+# How far [m] a spot may lie off a target's plane, and off its edge: rounding and surveys, not another place.
+_OFF_M = 0.5
+
+
+def _on(plane: Any, spot: Array) -> bool:
+    aside = np.abs(plane.to_plane(spot)) - np.array([plane.width, plane.height]) / 2
+    return bool((aside < _OFF_M).all() and abs((spot - plane.center) @ plane.normal) < _OFF_M)
+
+
+def _spot(folder: MeasurementFolder, measurement: Measurement, mount: CalibratedMount, day: float) -> dict[str, Any]:
+    heliostat, plane = folder.plant.heliostats[measurement.heliostat], folder.plant.targets[measurement.target]
+    point, std = mount.spot(heliostat, plane, _motors(heliostat, measurement), measurement.sun, day)
+    return {
+        "spot": np.round(point, 5).tolist(),
+        "std_m": round(std, 5),
+        "target": measurement.target,
+        "on_target": plane.holds(point),
+    }

@@ -1,0 +1,61 @@
+"""The verbs on a folder's mounts: calibrate, spot."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from model.errors import InvalidInputError
+from service.cli.output import AsJson, make_table, progress, show
+
+app = typer.Typer()
+
+Folder = Annotated[Path, typer.Argument(help="Measurement folder in PAINT's layout.", metavar="DIR")]
+
+
+def _require_file(path: Path) -> None:
+    if path.is_dir():
+        raise InvalidInputError(f"{path} is a folder; name a file to write to")
+
+
+@app.command()
+def calibrate(
+    folder: Folder,
+    out: Annotated[Path, typer.Option("--out", help="JSON file to write the mounts to.", metavar="MOUNTS.json")],
+    as_json: AsJson = False,
+) -> None:
+    """Mounts from motors, sun and spots, with uncertainties, steps, drift and named outliers: MOUNTS.json."""
+    from service.cli.folder_pointing import calibrate_folder
+    from service.sources.folder import read_folder
+
+    _require_file(out)
+    source = read_folder(folder)
+    with progress(len(source.plant.heliostats), "calibrate") as step:
+        report = calibrate_folder(source, out, step)
+    table = make_table("Mounts", "heliostat", "measurements", "residual [mrad]", "90 %", "steps", "outliers")
+    for name, entry in report["heliostats"].items():
+        left = entry["residual_mrad"]
+        figures = ("" if left[key] is None else f"{left[key]:.2f}" for key in ("median", "p90"))
+        table.add_row(name, str(entry["measurements"]), *figures, str(len(entry["steps"])), str(len(entry["outliers"])))
+    show(report, as_json, table)
+
+
+@app.command()
+def spot(
+    folder: Folder,
+    mounts: Annotated[Path, typer.Option("--mounts", help="File that calibrate wrote.", metavar="MOUNTS.json")],
+    out: Annotated[Path, typer.Option("--out", help="JSON file to write the spots to.", metavar="SPOTS.json")],
+    as_json: AsJson = False,
+) -> None:
+    """Where the light of each measurement's motors lands, and how sure that is: SPOTS.json."""
+    from service.cli.folder_pointing import spot_folder
+    from service.sources.folder import read_folder
+
+    _require_file(out)
+    source = read_folder(folder)
+    with progress(len(source.plant.heliostats), "spot") as step:
+        report = spot_folder(source, mounts, out, step)
+    table = make_table("Spots", "measurement", "east [m]", "north [m]", "up [m]", "± [m]", "target")
+    for key, entry in report["spots"].items():
+        table.add_row(key, *(f"{value:.2f}" for value in entry["spot"]), f"{entry['std_m']:.2f}", entry["target"])
+    show(report, as_json, table)

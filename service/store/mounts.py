@@ -1,0 +1,89 @@
+"""Calibrated mounts by version, as they are kept and found again."""
+
+from collections.abc import Sequence
+from datetime import datetime
+from typing import Any
+
+from sqlalchemy import Select, func, select
+from sqlalchemy.orm import Session, undefer
+
+from service.base.faults import ConflictError, NotFoundError
+from service.store.columns import now
+from service.store.rows import ROUNDS, hold, insert
+from service.store.tables import HeliostatRow, MeasurementRow, MountRow
+
+
+def _mounts(heliostat: HeliostatRow) -> Select[MountRow]:
+    return select(MountRow).where(MountRow.heliostat_id == heliostat.id)
+
+
+def add_mount(session: Session, heliostat: HeliostatRow, document: dict[str, Any]) -> MountRow:
+    """Store a mount as the heliostat's next version, valid from when its newest state began.
+
+    NotFoundError where the heliostat was deleted since it was read.
+    """
+    hold(session, HeliostatRow, heliostat.id, f"heliostat {heliostat.name}")
+    for _ in range(ROUNDS):
+        last = session.scalar(select(func.max(MountRow.version)).where(MountRow.heliostat_id == heliostat.id))
+        row = MountRow(
+            heliostat_id=heliostat.id,
+            version=(last or 0) + 1,
+            created_at=now(),
+            valid_from=datetime.fromisoformat(document["valid_from"]),
+            measurements=document["measurements"],
+            residual_mrad=document["residual_mrad"]["median"],
+            document=document,
+        )
+        if insert(session, row):
+            return row
+    raise ConflictError("too many writers on the same heliostat's mounts; try again")
+
+
+def list_mounts(session: Session, heliostat: HeliostatRow, limit: int, after: int | None = None) -> Sequence[MountRow]:
+    """Up to ``limit`` versions with their documents, oldest first, those after version ``after``."""
+    query = _mounts(heliostat).order_by(MountRow.version).limit(limit).options(undefer(MountRow.document))
+    return session.scalars(query.where(MountRow.version > after) if after else query).all()
+
+
+def find_mount_at(session: Session, heliostat: HeliostatRow, moment: datetime | None = None) -> MountRow | None:
+    """The newest version whose state had begun at ``moment``, by default now, with its document; None without one."""
+    query = _mounts(heliostat).where(MountRow.valid_from <= (moment or now()))
+    return session.scalar(query.order_by(MountRow.version.desc()).limit(1).options(undefer(MountRow.document)))
+
+
+def get_mount_at(session: Session, heliostat: HeliostatRow, moment: datetime | None = None) -> MountRow:
+    """The same; NotFoundError where there is none."""
+    row = find_mount_at(session, heliostat, moment)
+    if row is None:
+        raise NotFoundError(f"heliostat {heliostat.name} has no calibrated mount; POST to /v1/jobs/calibrations first")
+    return row
+
+
+def current_mounts(session: Session, names: Sequence[str] | None = None) -> Sequence[tuple[HeliostatRow, MountRow]]:
+    """Heliostats with their newest mounts and documents, by name; all of the store where none is named."""
+    newest = select(func.max(MountRow.id)).group_by(MountRow.heliostat_id)
+    query = select(HeliostatRow, MountRow).join(MountRow, MountRow.heliostat_id == HeliostatRow.id)
+    query = query.where(MountRow.id.in_(newest)).order_by(HeliostatRow.name).options(undefer(MountRow.document))
+    if names is not None:
+        query = query.where(HeliostatRow.name.in_(names))
+    return [(heliostat, mount) for heliostat, mount in session.execute(query)]
+
+
+def pointing_measurements(
+    session: Session, heliostat: HeliostatRow, since: datetime | None = None, until: datetime | None = None
+) -> list[MeasurementRow]:
+    """Measurements that tell where light went, one image of each, without their arrays.
+
+    Those that were accepted, or whose sender knew the spot. Of several images of a measurement the first stands.
+    """
+    moment = func.coalesce(MeasurementRow.taken_at, MeasurementRow.created_at)
+    query = select(MeasurementRow).where(MeasurementRow.heliostat_id == heliostat.id)
+    query = query.where(MeasurementRow.accepted | MeasurementRow.focal_spot_wgs84.is_not(None))
+    if since is not None:
+        query = query.where(moment >= since)
+    if until is not None:
+        query = query.where(moment < until)
+    rows: dict[str, MeasurementRow] = {}
+    for row in session.scalars(query.order_by(MeasurementRow.id)):
+        rows.setdefault(row.external_id or row.identifier, row)
+    return list(rows.values())

@@ -1,0 +1,213 @@
+"""Mounts of stored heliostats: calibrated from stored photographs, and what they say of motors and spots."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime, timedelta
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from model.ephemeris import sun_angles_at
+from model.errors import InvalidInputError, ModelError
+from model.frames import sun_direction
+from model.plant import Heliostat
+from model.pointing import CalibratedMount, FieldMounts, Reading, calibrate_field
+from model.pointing.plan import Proposal, plan
+from model.pointing.report import day_of, mount_from_json, mount_to_json
+from service import store
+from service.base.faults import ConflictError
+from service.sources.documents import read_heliostat
+from service.store import mounts
+from service.store.columns import now
+from service.store.tables import HeliostatRow, MeasurementRow, MountRow
+from service.twin.evidence import spot_of
+from service.twin.runtime import Runtime
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class StoreMounts:
+    """Mounts that are not kept yet, and what was left out of heliostats and measurements with the reasons."""
+
+    done: FieldMounts
+    skipped: dict[str, str]
+
+
+def calibrate_store(
+    runtime: Runtime, names: Sequence[str], since: datetime | None = None, until: datetime | None = None
+) -> StoreMounts:
+    """Mounts of stored heliostats, with the prior that they make together, from photographs of a time.
+
+    Raises
+    ------
+    ConflictError
+        Where none has a measurement with motors and a spot.
+    """
+    heliostats: dict[str, Heliostat] = {}
+    readings: dict[str, list[Reading]] = {}
+    skipped: dict[str, str] = {}
+    with runtime.database.reading() as session:
+        origin = store.get_plant(session).origin
+        targets = {row.name: store.target_plane(row) for row in store.list_targets(session)}
+        rows = store.get_heliostats(session, names)
+        for name in names:
+            try:
+                heliostats[name] = _with_drives(rows.get(name), name, origin)
+            except (ModelError, ConflictError) as error:
+                skipped[name] = str(error)
+                continue
+            own = []
+            for row in mounts.pointing_measurements(session, rows[name], since, until):
+                try:
+                    own.append(_reading(heliostats[name], row, origin))
+                except ModelError as error:
+                    skipped[f"{name}/{row.identifier}"] = str(error)
+            if own:
+                readings[name] = own
+            else:
+                skipped[name] = "no measurement with motor positions and a spot"
+    if not readings:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in list(skipped.items())[:3])
+        raise ConflictError(f"no heliostat can be calibrated ({reasons}); post photographs with motor_position")
+    with runtime.computing("calibrate"):
+        done = calibrate_field(heliostats, readings, targets, latitude_deg=origin[0])
+    return StoreMounts(done, skipped)
+
+
+def keep_mounts(session: Session, calibrated: StoreMounts) -> dict[str, MountRow]:
+    """Keep calibrated mounts as their heliostats' next versions, by name."""
+    done, kept = calibrated.done, {}
+    for name, row in store.get_heliostats(session, list(done.mounts)).items():
+        document = mount_to_json(done.mounts[name], done.readings[name], done.contradictions[name])
+        kept[name] = mounts.add_mount(session, row, document)
+    return kept
+
+
+def _with_drives(row: HeliostatRow | None, name: str, origin: tuple[float, float, float]) -> Heliostat:
+    if row is None:
+        raise ConflictError(f"there is no heliostat {name}")
+    heliostat = read_heliostat(name, row.properties, np.array(origin))
+    if heliostat.mount.actuators is None:
+        raise ConflictError("its kinematics have no linear actuators, so motor positions say nothing of its angles")
+    return heliostat
+
+
+def _reading(heliostat: Heliostat, row: MeasurementRow, origin: tuple[float, float, float]) -> Reading:
+    plane = store.target_plane(row.target)
+    spot = spot_of(row, plane, origin)
+    if row.motor_axis_1 is None or row.motor_axis_2 is None:
+        raise InvalidInputError("no motor_position")
+    if spot is None:
+        raise InvalidInputError("no place of its spot on the target")
+    motors = np.array([row.motor_axis_1, row.motor_axis_2])
+    for position, drive in zip(motors, heliostat.mount.actuators or (), strict=True):
+        drive.require_within(position)
+    sun = sun_direction(row.sun_azimuth_deg, row.sun_elevation_deg)
+    return Reading(row.identifier, plane.name, motors, sun, spot, day_of(row.taken_at or row.created_at))
+
+
+# --- what a calibrated mount says -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class StoredMount:
+    """A stored heliostat with its calibrated mount; ``version`` is None where none was ever calibrated."""
+
+    heliostat: Heliostat
+    mount: CalibratedMount
+    version: int | None
+    origin: tuple[float, float, float]
+
+    def turned(self, moment: datetime | None = None) -> Heliostat:
+        """The heliostat as calibrated, at a moment, by default as newly measured."""
+        if self.version is None:
+            return self.heliostat
+        return replace(self.heliostat, mount=self.mount.mount(self.heliostat.mount, day_of(moment)))
+
+
+def load_mount(session: Session, name: str) -> StoredMount:
+    """A heliostat's newest calibrated mount, or the one that its properties have.
+
+    Raises
+    ------
+    NotFoundError
+        Where there is no such heliostat.
+    ConflictError
+        Where its kinematics have no actuators, or its properties changed since it was calibrated.
+    """
+    row, origin = store.get_heliostat(session, name), store.get_plant(session).origin
+    heliostat, kept = _with_drives(row, name, origin), mounts.find_mount_at(session, row)
+    if kept is None:
+        return StoredMount(heliostat, CalibratedMount.uncalibrated(), None, origin)
+    return StoredMount(heliostat, _mount(row, kept), kept.version, origin)
+
+
+def _mount(row: HeliostatRow, kept: MountRow) -> CalibratedMount:
+    if row.updated_at > kept.created_at:
+        raise ConflictError(f"the properties of {row.name} changed since it was calibrated; POST /v1/jobs/calibrations")
+    return mount_from_json(kept.document, f"mount {kept.version} of {row.name}")
+
+
+def sun_at(moment: datetime, origin: tuple[float, float, float]) -> tuple[float, float]:
+    """Azimuth and elevation [deg] of the sun; InvalidInputError where it is night."""
+    azimuth, elevation = sun_angles_at(moment, origin[0], origin[1])
+    if elevation <= 0:
+        raise InvalidInputError(f"time: the sun is {-elevation:.1f}° below the horizon then; choose another time")
+    return azimuth, elevation
+
+
+# --- the plan ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Slot:
+    """A photograph of a plan, with its moment and sun [deg]."""
+
+    proposal: Proposal
+    moment: datetime
+    azimuth_deg: float
+    elevation_deg: float
+
+
+def make_plan(runtime: Runtime, begin: datetime | None, minutes: float, photographs: int) -> list[Slot]:
+    """So many photographs within some time, evenly, each of the heliostat that it tells most of.
+
+    Heliostats that were never calibrated are taken by what is believed of any.
+
+    Raises
+    ------
+    InvalidInputError
+        Where it is night for all that time.
+    """
+    start = begin or now()
+    moments = [start + timedelta(minutes=minutes * (place + 0.5) / photographs) for place in range(photographs)]
+    with runtime.database.reading() as session:
+        origin = store.get_plant(session).origin
+        planes = [store.target_plane(row) for row in store.list_targets(session)]
+        known = {row.name: (row, kept) for row, kept in mounts.current_mounts(session)}
+        rows = session.scalars(select(HeliostatRow).order_by(HeliostatRow.name)).all()
+    heliostats, calibrated = {}, {}
+    for row in rows:
+        try:
+            heliostats[row.name] = _with_drives(row, row.name, origin)
+            calibrated[row.name] = _mount(*known[row.name]) if row.name in known else CalibratedMount.uncalibrated()
+        except ConflictError:  # no drives, or properties that are newer: nothing to aim with
+            continue
+    angles = [sun_angles_at(moment, origin[0], origin[1]) for moment in moments]
+    days = [(moment, *angle) for moment, angle in zip(moments, angles, strict=True) if angle[1] > 0]
+    if not days:
+        raise InvalidInputError("at: the sun is below the horizon then; choose another time")
+    suns = [sun_direction(azimuth, elevation) for _, azimuth, elevation in days]
+    with runtime.computing("plan"):
+        chosen = plan(heliostats, calibrated, planes, suns, [day_of(moment) for moment, _, _ in days])
+    return [Slot(one, *days[one.slot]) for one in chosen]
+
+
+def mount_out(row: MountRow) -> dict[str, Any]:
+    """A stored mount as JSON, without what only the service needs of it."""
+    hidden = ("covariance", "history")
+    return {name: value for name, value in row.document.items() if name not in hidden}

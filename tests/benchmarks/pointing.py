@@ -1,0 +1,290 @@
+"""Where light lands: mounts calibrated from real photographs, judged by measurements left out, and how fast that is.
+
+    python -m tests.benchmarks.pointing [--data ../shared/stj-pointing ...] [--only TABLE] [--out results/pointing.png]
+
+Beam errors are angles at the heliostat between forecast and measured spot; a figure is the median over heliostats of
+each one's median, with a 90 % interval from resampled heliostats. The spreads in `model.pointing.drives.Noise` were
+chosen on half of the heliostats (`DEVELOPED_ON`); the table has the other half apart.
+"""
+
+import argparse
+import time
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.plant import Heliostat, TargetPlane
+from model.pointing import CalibratedMount, Field, Reading, calibrate_field, off_by
+from service.cli.folder_pointing import read_readings
+from service.sources.folder import read_folder
+from tests.benchmarks import data_folder
+
+Array = NDArray[np.float64]
+
+DEVELOPED_ON = ("BE36", "BF41", "BF55", "BG14", "BG23", "BH20", "BH60", "BJ14")
+
+# Fewer measurements than that are not split: their third would say nothing.
+LEAST = 24
+
+# Steps that are put into real series [mrad] of a drive's zero, and how many trials of each.
+STEPS_MRAD = (2.0, 4.0, 8.0)
+TRIALS = 40
+
+Series = dict[str, list[Reading]]
+
+
+class Plant:
+    """Heliostats, readings in order of time and targets of several folders of one plant."""
+
+    def __init__(self, folders: Sequence[Path]) -> None:
+        self.heliostats: dict[str, Heliostat] = {}
+        self.readings: Series = {}
+        self.targets: dict[str, TargetPlane] = {}
+        self.latitude_deg = 0.0
+        self.odd: tuple[str, ...] = ()
+        for path in folders:
+            folder = read_folder(path)
+            self.heliostats |= folder.plant.heliostats
+            self.targets |= folder.plant.targets
+            self.latitude_deg = float(folder.plant.origin[0])
+            self.readings |= {
+                name: sorted(own, key=lambda one: one.day) for name, own in read_readings(folder)[0].items()
+            }
+
+    def calibrate(self, readings: Series, field: Field | None = None) -> tuple[dict[str, CalibratedMount], Field]:
+        """Mounts of some readings, and the field's prior."""
+        done = calibrate_field(self.heliostats, readings, self.targets, latitude_deg=self.latitude_deg, field=field)
+        self.odd = tuple({*self.odd, *done.odd})
+        return done.mounts, done.field
+
+
+def random_third(own: Sequence[Reading], generator: np.random.Generator) -> NDArray[np.intp]:
+    """Any third."""
+    return generator.permutation(len(own))[: len(own) // 3]
+
+
+def last_third(own: Sequence[Reading], _: np.random.Generator) -> NDArray[np.intp]:
+    """The newest third."""
+    return np.arange(len(own) - len(own) // 3, len(own))
+
+
+def far_third(own: Sequence[Reading], _: np.random.Generator) -> NDArray[np.intp]:
+    """The third of suns that are farthest from all others: by the mean angle to the three nearest."""
+    suns = np.array([one.sun for one in own])
+    apart = np.arccos(np.clip(suns @ suns.T, -1, 1))
+    np.fill_diagonal(apart, np.inf)
+    return np.argsort(np.sort(apart, axis=1)[:, :3].mean(axis=1))[::-1][: len(own) // 3]
+
+
+def split(own: Sequence[Reading], judged: NDArray[np.intp]) -> tuple[list[Reading], list[Reading]]:
+    """Readings that calibrate, and those that judge."""
+    apart = set(judged.tolist())
+    kept = [one for place, one in enumerate(own) if place not in apart]
+    return kept, [own[place] for place in sorted(apart)]
+
+
+def errors_mrad(plant: Plant, mounts: dict[str, CalibratedMount], judged: Series) -> dict[str, Array]:
+    """Beam errors [mrad] of each heliostat's judges."""
+    return {name: 1e3 * off_by(plant.heliostats[name], mounts[name], own) for name, own in judged.items() if own}
+
+
+def covered(plant: Plant, mounts: dict[str, CalibratedMount], judged: Series) -> float:
+    """Share of judges within their 90 % ellipse."""
+    inside = []
+    for name, own in judged.items():
+        motors, suns, spots = (np.array([getattr(one, key) for one in own]) for key in ("motors", "sun", "spot"))
+        days = np.array([one.day for one in own])
+        cov = mounts[name].covariance_at(plant.heliostats[name], motors, suns, spots, days)
+        off = off_by(plant.heliostats[name], mounts[name], own)
+        inside.extend(off**2 < 4.605 * np.trace(cov, axis1=1, axis2=2) / 2)
+    return float(np.mean(inside))
+
+
+def median_row(label: str, errors: dict[str, Array]) -> str:
+    """A row: median of medians with its interval, those of each half, and how many heliostats."""
+    medians = {name: float(np.median(error)) for name, error in errors.items()}
+    apart = [value for name, value in medians.items() if name not in DEVELOPED_ON]
+    values = np.array(list(medians.values()))
+    drawn = np.random.default_rng(0).choice(values, (4000, len(values)))
+    low, high = np.percentile(np.median(drawn, axis=1), [5, 95])
+    return f"| {label} | {np.median(values):.2f} ({low:.2f} to {high:.2f}) | {np.median(apart):.2f} | {len(values)} |"
+
+
+def accuracy(plant: Plant) -> None:
+    """Beam errors of measurements left out."""
+    print("| left out | median [mrad] (90 % of heliostats drawn) | heliostats not developed on | heliostats |")
+    print("| --- | --- | --- | --- |")
+    many = {name: own for name, own in plant.readings.items() if len(own) >= LEAST}
+    plant.calibrate(plant.readings)
+    nominal = dict.fromkeys(many, CalibratedMount.uncalibrated())
+    # One property file has drives that could not stand where its motors were.
+    kind = {name: own for name, own in many.items() if name not in plant.odd}
+    print(median_row("nothing: PAINT's kinematics, uncorrected", errors_mrad(plant, nominal, kind)))
+    rules: dict[str, Callable[[Sequence[Reading], np.random.Generator], NDArray[np.intp]]] = {
+        "a random third": random_third,
+        "the last third in time": last_third,
+        "the third of suns farthest from all others": far_third,
+    }
+    shares = {}
+    for label, rule in rules.items():
+        generator = np.random.default_rng(0)
+        parts = {name: split(own, rule(own, generator)) for name, own in many.items()}
+        few = {name: own for name, own in plant.readings.items() if name not in many}
+        mounts, _ = plant.calibrate({name: kept for name, (kept, _) in parts.items()} | few)
+        judged = {name: apart for name, (_, apart) in parts.items()}
+        print(median_row(label, errors_mrad(plant, mounts, judged)))
+        shares[label] = covered(plant, mounts, judged)
+    print(median_row("all but five in a row, prior of the others", five_only(plant, many)))
+    print()
+    for label, share in shares.items():
+        print(f"within their 90 % interval, {label}: {100 * share:.0f} %")
+
+
+def five_only(plant: Plant, many: Series) -> dict[str, Array]:
+    """Errors of the next thirty measurements after five, at three times, with a prior that others made."""
+    errors = {}
+    for name, own in many.items():
+        _, field = plant.calibrate({other: series for other, series in plant.readings.items() if other != name})
+        found = []
+        for begin in np.linspace(0, len(own) - 15, 3).astype(int):
+            mounts, _ = plant.calibrate({name: own[begin : begin + 5]}, field)
+            found.append(errors_mrad(plant, mounts, {name: own[begin + 5 : begin + 35]})[name])
+        errors[name] = np.concatenate(found)
+    return errors
+
+
+def with_step(
+    heliostat: Heliostat, mount: CalibratedMount, own: Sequence[Reading], place: int, axis: int, size: float
+) -> list[Reading]:
+    """A series whose drive has an angle ``size`` [rad] more than its motor says, from a measurement on."""
+    zeros = np.zeros(2)
+    zeros[axis] = size
+    drives = mount.mount(heliostat.mount)
+    changed = list(own)
+    for later in range(place, len(own)):
+        motors = drives.motors_from_angles(drives.angles_from_motors(own[later].motors) - zeros)
+        changed[later] = Reading(
+            own[later].name, own[later].target, motors, own[later].sun, own[later].spot, own[later].day
+        )
+    return changed
+
+
+def steps(plant: Plant) -> None:
+    """Steps put into real series: found within one measurement, and others found that were not there before."""
+    generator = np.random.default_rng(1)
+    many = {name: own for name, own in plant.readings.items() if len(own) >= LEAST}
+    _, field = plant.calibrate(plant.readings)
+    before = {name: plant.calibrate({name: own}, field)[0][name] for name, own in many.items()}
+    real = sum(len(mount.steps) for mount in before.values())
+    moved = [name for name, mount in before.items() if mount.steps]
+    print(f"steps in the series as they are: {real} in {_years(many.values()):.1f} heliostat-years, all of {moved}")
+    print("| step [mrad] | found within one measurement | others that came with it, a heliostat-year |")
+    print("| --- | --- | --- |")
+    for size in STEPS_MRAD:
+        found, others, looked = 0, 0, 0.0
+        for _ in range(TRIALS):
+            name = str(generator.choice(list(many)))
+            own, mount = many[name], before[name]
+            believed = [place for place in range(3, len(own) - 3) if not mount.foreign[place - 1 : place + 2].any()]
+            place, axis = int(generator.choice(believed)), int(generator.integers(2))
+            angle = 1e-3 * size * generator.choice([-1.0, 1.0])
+            changed = with_step(plant.heliostats[name], mount, own, place, axis, angle)
+            places = [step.after for step in plant.calibrate({name: changed}, field)[0][name].steps]
+            found += any(abs(step - place) <= 1 for step in places)
+            known = [place, *(step.after for step in mount.steps)]
+            others += sum(min(abs(step - other) for other in known) > 1 for step in places)
+            looked += _years([own])
+        print(f"| {size:g} | {100 * found / TRIALS:.0f} % | {others / looked:.2f} |")
+
+
+def _years(series: Iterable[Sequence[Reading]]) -> float:
+    return sum((own[-1].day - own[0].day) / 365.25 for own in series)
+
+
+def synthetic(plant: Plant, heliostats: int, measurements: int) -> tuple[dict[str, Heliostat], Series]:
+    """A field of copies of real heliostats, with a part of each one's measurements."""
+    generator = np.random.default_rng(2)
+    names = [name for name, own in plant.readings.items() if len(own) >= measurements]
+    copies: dict[str, Heliostat] = {}
+    series: Series = {}
+    for number in range(heliostats):
+        name = names[number % len(names)]
+        chosen = sorted(generator.permutation(len(plant.readings[name]))[:measurements])
+        copies[f"H{number:04d}"] = plant.heliostats[name]
+        series[f"H{number:04d}"] = [plant.readings[name][place] for place in chosen]
+    return copies, series
+
+
+def speed(plant: Plant, heliostats: int = 2000, measurements: int = 60) -> None:
+    """Time of a calibration of a large field."""
+    copies, series = synthetic(plant, heliostats, measurements)
+    began = time.perf_counter(), time.process_time()
+    done = calibrate_field(copies, series, plant.targets, latitude_deg=plant.latitude_deg)
+    wall, busy = time.perf_counter() - began[0], time.process_time() - began[1]
+    found = sum(len(mount.steps) for mount in done.mounts.values())
+    print(f"{heliostats} heliostats x {measurements} measurements: {wall:.1f} s, {busy:.1f} s of a core, {found} steps")
+
+
+def picture(plant: Plant, path: Path) -> None:
+    """Residuals by the sun, before and after, and over time with the steps."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    from model.frames import sun_angles
+
+    names = [name for name in ("BE36", "BF57", "BG16", "AA39") if name in plant.readings]
+    mounts, _ = plant.calibrate(plant.readings)
+    uncorrected = CalibratedMount.uncalibrated()
+    figure, axes = plt.subplots(len(names), 3, figsize=(15, 3 * len(names)), squeeze=False, layout="constrained")
+    for row, name in zip(axes, names, strict=True):
+        own, mount, heliostat = plant.readings[name], mounts[name], plant.heliostats[name]
+        azimuth, elevation = sun_angles(np.array([one.sun for one in own]))
+        for panel, (label, off) in zip(
+            row, {"uncorrected": off_by(heliostat, uncorrected, own), "calibrated": mount.off}.items(), strict=False
+        ):
+            color = np.log10(1e3 * off + 1e-3)
+            shown = panel.scatter(azimuth, elevation, c=color, vmin=-1, vmax=2, s=12, cmap="viridis")
+            panel.set(title=f"{name}, {label}", xlabel="sun azimuth from south [deg]", ylabel="elevation [deg]")
+            bar = figure.colorbar(shown, ax=panel, ticks=[-1, 0, 1, 2])
+            bar.ax.set_yticklabels(["0.1", "1", "10", "100 mrad"])
+        days = mount.days - mount.days[0]
+        zeros = 1e3 * (mount.drift + mount.jitter + mount.stepped)
+        for axis, label in enumerate(("first drive", "second drive")):
+            row[2].plot(days[~mount.foreign], zeros[~mount.foreign, axis], ".", label=label)
+        for step in mount.steps:
+            row[2].axvline((days[step.before] + days[step.after]) / 2, color="0.7", linewidth=1)
+        row[2].set(title=f"{name}: zeros of the drives, steps grey", xlabel="days", ylabel="mrad")
+        row[2].set_yscale("symlog", linthresh=2)
+        row[2].legend(fontsize=8)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=70)
+    print(f"{path} drawn")
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    default = [data_folder().parent / name for name in ("stj-pointing", "stj-years")]
+    parser.add_argument("--data", type=Path, nargs="+", default=default)
+    parser.add_argument("--only", choices=("accuracy", "steps", "speed", "picture"), nargs="*")
+    parser.add_argument("--out", type=Path, default=Path("results/pointing.png"))
+    options = parser.parse_args()
+    plant = Plant(options.data)
+    parts: dict[str, Callable[[], None]] = {
+        "accuracy": lambda: accuracy(plant),
+        "steps": lambda: steps(plant),
+        "speed": lambda: speed(plant),
+        "picture": lambda: picture(plant, options.out),
+    }
+    for name, part in parts.items():
+        if not options.only or name in options.only:
+            part()
+            print()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,256 @@
+"""Mounts calibrated from synthetic motors and spots whose truth is known."""
+
+from dataclasses import replace
+from datetime import UTC, datetime
+
+import numpy as np
+import pytest
+
+from model.errors import InvalidInputError, UnreachableError
+from model.frames import sun_direction_at
+from model.mount import LinearActuator, Mount
+from model.plant import JUELICH_LATITUDE, Heliostat, TargetPlane
+from model.pointing import CalibratedMount, Reading, calibrate_field, days_by_order, off_by
+from model.pointing.calibration import Field
+from model.pointing.drives import Noise
+from model.pointing.kinematics import NAMES, SPREAD, ZEROS, Chain, calibrated, residuals
+from model.pointing.mounts import landed
+from model.pointing.readings import padded
+from model.pointing.report import day_of, field_to_json, moment_of, mount_from_json
+
+NOISE = Noise()
+QUIET = replace(NOISE, drift_rad=(1e-5, 1e-5), jitter_rad=(1e-5, 1e-5))
+SOUTH, UP = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
+TARGETS = {
+    "upper": TargetPlane("upper", np.array([0.0, -3.2, 43.0]), SOUTH, UP, 8.6, 7.2),
+    "lower": TargetPlane("lower", np.array([0.0, -3.2, 35.8]), SOUTH, UP, 8.6, 7.2),
+}
+ACTUATORS = (
+    LinearActuator(154166.6667, 0.0757, 0.3353, 0.3381, 0.0137, False, 69001),
+    LinearActuator(154166.6667, 0.0784, 0.3408, 0.3191, 0.9371, True, 75454),
+)
+
+
+def heliostats(count: int) -> dict[str, Heliostat]:
+    mount = Mount.juelich(ACTUATORS, mirror_offset=(0, 0, 0.175))
+    places = np.stack([np.linspace(-80, 80, count), np.linspace(120, 220, count), np.full(count, 1.7)], axis=-1)
+    return {f"H{i:02d}": Heliostat.juelich(f"H{i:02d}", place, mount=mount) for i, place in enumerate(places)}
+
+
+def truth(generator: np.random.Generator) -> np.ndarray:
+    return 0.6 * SPREAD * generator.normal(size=len(SPREAD))
+
+
+def suns(generator: np.random.Generator, count: int) -> np.ndarray:
+    declination, hour_angle = generator.uniform(-15, 23, count), generator.uniform(-50, 50, count)
+    return sun_direction_at(declination, hour_angle, JUELICH_LATITUDE)
+
+
+def series(
+    heliostat: Heliostat, parameters: np.ndarray, days: np.ndarray, generator: np.random.Generator, zeros=None
+) -> list[Reading]:
+    """Readings of a heliostat that aims by the mount it takes for its own, and whose true one has ``parameters``.
+
+    ``zeros`` (N, 2) [rad] come to those of the drives.
+    """
+    zeros = np.zeros((len(days), 2)) if zeros is None else zeros
+    readings = []
+    for place, (day, sun) in enumerate(zip(days, suns(generator, len(days)), strict=True)):
+        plane = list(TARGETS.values())[place % 2]
+        true = parameters.copy()
+        aims = calibrated(heliostat.mount, true)
+        aim = plane.to_enu(generator.uniform(-1, 1, 2))
+        motors = np.round(aims.motors_from_angles(aims.align(heliostat.position, sun, aim)))
+        true[ZEROS] += zeros[place]
+        mount = calibrated(heliostat.mount, true)
+        attitude = mount.attitude(mount.angles_from_motors(motors))
+        normal, center = attitude[:, 2], mount.mirror_center(heliostat.position, attitude)
+        spot = landed(center, 2 * (normal @ sun) * normal - sun, plane)
+        blur = NOISE.spot_rad * np.linalg.norm(spot - center) * generator.normal(size=2)
+        spot = plane.to_enu(plane.to_plane(spot) + blur)
+        readings.append(Reading(f"{place}", plane.name, motors, sun, spot, float(day)))
+    return readings
+
+
+def calibrate(field, readings, noise=NOISE, prior=None):
+    return calibrate_field(field, readings, TARGETS, latitude_deg=JUELICH_LATITUDE, noise=noise, field=prior)
+
+
+@pytest.fixture(scope="module")
+def world():
+    """Ten heliostats, their truths, and forty readings of each over a year."""
+    generator = np.random.default_rng(3)
+    field = heliostats(10)
+    truths = {name: truth(generator) for name in field}
+    days = np.linspace(0, 365, 40)
+    return field, truths, {name: series(field[name], truths[name], days, generator) for name in field}
+
+
+def test_derivatives_are_those_of_the_residuals(world):
+    field, truths, readings = world
+    chain, arrays = Chain.of(list(field.values())), padded(list(readings.values()))
+    parameters, zeros = np.array(list(truths.values())), np.zeros(arrays.steps.shape)
+    slope = residuals(chain, arrays, parameters, zeros)[1]
+    for place, name in enumerate(NAMES):
+        step = np.zeros(len(NAMES))
+        step[place] = 1e-5 * SPREAD[place] / 0.05
+        ahead, behind = (residuals(chain, arrays, parameters + sign * step, zeros)[0] for sign in (1, -1))
+        difference = (ahead - behind) / (2 * step[place])
+        np.testing.assert_allclose(slope[..., place], difference, atol=3e-3 * np.abs(difference).max(), err_msg=name)
+
+
+def test_true_mounts_leave_only_the_noise_of_the_spots(world):
+    field, truths, readings = world
+    chain, arrays = Chain.of(list(field.values())), padded(list(readings.values()))
+    left = residuals(chain, arrays, np.array(list(truths.values())), np.zeros(arrays.steps.shape))[0]
+    assert left.std() == pytest.approx(NOISE.spot_rad, rel=0.1)
+
+
+def test_known_mounts_are_recovered_where_data_determine_them(world):
+    field, truths, readings = world
+    done = calibrate(field, readings, QUIET)
+    for name, mount in done.mounts.items():
+        assert mount.determined[list(NAMES).index("foundation_up")]
+        off = (mount.parameters - truths[name]) / np.sqrt(np.diag(mount.covariance))
+        assert np.abs(off).max() < 4.5
+        assert not mount.steps
+        assert not done.contradictions[name]
+
+
+def test_measurements_left_out_lie_within_their_intervals(world):
+    field, truths, readings = world
+    generator = np.random.default_rng(5)
+    done, inside = calibrate(field, readings, QUIET), []
+    for name, mount in done.mounts.items():
+        fresh = series(field[name], truths[name], np.linspace(1, 364, 20), generator)
+        for reading in fresh:
+            point, std = mount.spot(field[name], TARGETS[reading.target], reading.motors, reading.sun, reading.day)
+            inside.append(np.linalg.norm(point - reading.spot) < 2.146 * std)
+    assert 0.84 < np.mean(inside) < 0.96  # 90 % of the plane's two directions
+
+
+def test_five_measurements_lean_on_the_field(world):
+    field, _, readings = world
+    prior = calibrate(field, {name: own for name, own in readings.items() if name != "H03"}).field
+    five = calibrate(field, {"H03": readings["H03"][::8]}, prior=prior).mounts["H03"]
+    rest = [one for place, one in enumerate(readings["H03"]) if place % 8]
+    uncorrected = off_by(field["H03"], CalibratedMount.uncalibrated(), rest)
+    assert np.median(off_by(field["H03"], five, rest)) < 2.5e-3 < 10e-3 < np.median(uncorrected)
+
+
+@pytest.mark.parametrize("size", [2e-3, -8e-3])
+def test_a_step_is_dated_and_measured(world, size):
+    field, truths, readings = world
+    days = np.linspace(0, 365, 40)
+    zeros = np.where(np.arange(40)[:, None] >= 23, [0.0, size], 0.0)
+    moved = series(field["H04"], truths["H04"], days, np.random.default_rng(7), zeros)
+    mount = calibrate(field, {**readings, "H04": moved}).mounts["H04"]
+    assert [step.after for step in mount.steps] == [23]
+    step = mount.steps[0]
+    assert np.abs(step.zeros - [0.0, size]).max() < 4 * step.std.max()
+    assert np.sign(step.motors[1]) == -np.sign(size)  # the second drive is clockwise
+    np.testing.assert_allclose(mount.zeros_at([days[22] + 1, days[23] - 1])[:, 1].round(3), [0, size], atol=1.1e-3)
+
+
+def test_a_slow_drift_is_no_step(world):
+    field, truths, readings = world
+    days = np.linspace(0, 365, 40)
+    drift = np.stack([np.zeros(40), 2.5e-3 * days / 365], axis=-1)
+    drifting = series(field["H05"], truths["H05"], days, np.random.default_rng(8), drift)
+    done = calibrate(field, {**readings, "H05": drifting})
+    document = field_to_json(done, {})["heliostats"]["H05"]
+    assert document["steps"] == []
+    assert document["drift"]["is_sure"]
+    assert document["drift"]["zeros_mrad"][1] == pytest.approx(2.5, abs=0.8)
+
+
+def test_contradictions_are_named(world):
+    field, _, readings = world
+    own = list(readings["H06"])
+    plane, other = TARGETS[own[4].target], TARGETS[own[5].target]
+    own[4] = replace(own[4], spot=other.to_enu(plane.to_plane(own[4].spot)), target=other.name)
+    hour = np.degrees(15 * np.pi / 180)
+    declination, angle = 5.0, 20.0
+    true_sun, told = (sun_direction_at(declination, angle + shift, JUELICH_LATITUDE) for shift in (0.0, hour))
+    mount = calibrate(field, readings).mounts["H06"]
+    motors = mount.motors(field["H06"], true_sun, TARGETS["upper"].center, own[10].day)
+    own[10] = replace(own[10], motors=motors, sun=told, spot=TARGETS["upper"].center, target="upper")
+    own[15] = replace(readings["H07"][15], name="15")
+    own[20] = replace(own[20], spot=own[20].spot + np.array([1.8, 0.0, 0.3]))
+    named = calibrate(field, {**readings, "H06": own}).contradictions["H06"]
+    assert {name: one.reason for name, one in named.items()} == {
+        "4": "wrong_target",
+        "10": "clock",
+        "15": "wrong_heliostat",
+        "20": "foreign_spot",
+    }
+    assert "1 h earlier" in named["10"].detail
+    assert "H07" in named["15"].detail
+
+
+def test_odd_property_files_start_from_the_field(world):
+    field, _, readings = world
+    odd = tuple(
+        replace(drive, initial_stroke_length=0.236, initial_angle=angle)
+        for drive, angle in zip(ACTUATORS, (-0.22, 0.385), strict=True)
+    )
+    changed = {**field, "H01": replace(field["H01"], mount=Mount.juelich(odd, mirror_offset=(0, 0, 0.175)))}
+    done = calibrate(changed, readings)
+    assert done.odd == ("H01",)
+    assert np.median(off_by(changed["H01"], done.mounts["H01"], readings["H01"])) < 1e-3
+
+
+def test_motors_send_the_light_where_it_shall_go_and_keep_their_travel(world):
+    field, _, readings = world
+    mount, heliostat = calibrate(field, readings).mounts["H02"], field["H02"]
+    sun, aim = suns(np.random.default_rng(0), 1)[0], TARGETS["lower"].center
+    motors = mount.motors(heliostat, sun, aim)
+    np.testing.assert_allclose(mount.spot(heliostat, TARGETS["lower"], motors, sun)[0], aim, atol=1e-6)
+    with pytest.raises(UnreachableError, match=r"travel|far"):
+        mount.motors(heliostat, np.array([0.0, 1.0, 0.05]), np.array([0.0, 900.0, -100.0]))
+
+
+def test_documents_bring_the_mount_back(world):
+    field, _, readings = world
+    done = calibrate(field, readings)
+    document = field_to_json(done, {})["heliostats"]["H08"]
+    mount, back = done.mounts["H08"], mount_from_json(document, "here")
+    reading = readings["H08"][9]
+    for day in (reading.day, 9999.0, np.nan):
+        told, again = (m.spot(field["H08"], TARGETS["upper"], reading.motors, reading.sun, day) for m in (mount, back))
+        np.testing.assert_allclose(told[0], again[0], atol=1e-4)
+        assert told[1] == pytest.approx(again[1], rel=1e-3)
+    with pytest.raises(InvalidInputError, match="here"):
+        mount_from_json({**document, "covariance": [1]}, "here")
+    with pytest.raises(InvalidInputError, match="finite"):
+        mount_from_json({**document, "covariance": np.full((16, 16), np.nan).tolist()}, "here")
+
+
+def test_heliostats_without_measurements_have_the_prior(world):
+    field, _, readings = world
+    mount = calibrate(field, {**readings, "H09": []}).mounts["H09"]
+    assert not mount.determined.any()
+    assert mount.spot(field["H09"], TARGETS["upper"], readings["H09"][0].motors, readings["H09"][0].sun)[1] > 0.5
+
+
+def test_the_unseen_field_has_the_spreads_of_its_parameters(world):
+    field, _, _ = world
+    unseen = Field.unseen(Chain.of(list(field.values())))
+    np.testing.assert_allclose(np.sqrt(np.diag(unseen.covariance)), SPREAD)
+
+
+def test_mounts_without_actuators_are_refused():
+    bare = Heliostat.juelich("bare", (0.0, 100.0, 1.7))
+    with pytest.raises(InvalidInputError, match="bare has no linear actuators"):
+        Chain.of([bare])
+
+
+def test_days_that_are_not_known_are_read_off_the_numbers():
+    np.testing.assert_allclose(days_by_order([1.0, np.nan, 3.0], [10, 15, 20]), [1, 2, 3])
+    np.testing.assert_allclose(days_by_order([np.nan, np.nan], [1, 2]), [0, 0])
+
+
+def test_days_and_moments_invert():
+    moment = datetime(2024, 6, 1, 12, 30, 7, tzinfo=UTC)
+    assert moment_of(day_of(moment)) == moment
+    assert np.isnan(day_of(None))

@@ -1,0 +1,157 @@
+"""``heliotwin calibrate`` and ``heliotwin spot`` on a made folder with faults, and on real heliostats."""
+
+import json
+import shutil
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from model.errors import InvalidInputError, ModelError
+from service.cli.folder_pointing import calibrate_folder, spot_folder
+from service.sources.folder import read_folder
+from tests.benchmarks import data_folder
+from tests.service.cli.test_folder_verbs import heliotwin
+from tests.service.conftest import properties_document, tower_document
+from tests.service.spots import photographs
+
+
+def write(path: Path, document: Any) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(document))
+
+
+def write_measurement(root: Path, name: str, number: int, taken: dict[str, Any], **changes: Any) -> None:
+    document = {
+        "motor_position": dict(
+            zip(("axis_1_motor_position", "axis_2_motor_position"), taken["motor_position"], strict=True)
+        ),
+        "target_name": "lower",
+        "sun_azimuth": taken["sun_azimuth"],
+        "sun_elevation": taken["sun_elevation"],
+        "focal_spot": {"UTIS": taken["focal_spot"]},
+        **changes,
+    }
+    kept = {key: value for key, value in document.items() if value is not None}
+    write(root / name / "Calibration" / f"{number}-calibration-properties.json", kept)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """AA39 with 16 good measurements and some that are not; AB01 without drives; AB02 without a measurement."""
+    root = tmp_path / "plant"
+    write(root / "P-tower-measurements.json", tower_document())
+    for name in ("AA39", "AB01", "AB02"):
+        properties = deepcopy(properties_document())
+        if name == "AB01":
+            properties["kinematics_properties"]["actuators"] = []
+        write(root / name / "Properties" / f"{name}-heliostat-properties.json", properties)
+    taken = photographs(tower_document(), properties_document())
+    for number, one in enumerate(taken):
+        write_measurement(root, "AA39", 100 + number, one)
+        item = {"properties": {"datetime": one["taken_at"]}}
+        if number % 3 != 1:  # the others are dated by their numbers
+            write(root / "AA39" / "Calibration" / f"{100 + number}-calibration-item-stac.json", item)
+    far = [50.92, 6.39, 100.0]
+    write_measurement(root, "AA39", 200, taken[0], motor_position=None)
+    write_measurement(root, "AA39", 201, taken[0], focal_spot=None)
+    write_measurement(root, "AA39", 202, taken[0], sun_azimuth=None)
+    write_measurement(root, "AA39", 203, taken[0], focal_spot={"UTIS": far})
+    write_measurement(root, "AA39", 204, {**taken[0], "motor_position": [82519.0, 100.0]})
+    write_measurement(root, "AB01", 300, taken[0])
+    return root
+
+
+def test_what_cannot_be_used_is_listed_and_costs_nothing_else(folder: Path, tmp_path: Path):
+    report = calibrate_folder(read_folder(folder), tmp_path / "mounts.json")
+    assert report == json.loads((tmp_path / "mounts.json").read_text())
+    assert report["heliostats"]["AA39"]["measurements"] == 16
+    assert report["heliostats"]["AA39"]["residual_mrad"]["median"] < 1
+    said = {
+        "AA39/200": "no 'motor_position'",
+        "AA39/201": "no 'focal_spot'",
+        "AA39/202": "'sun_azimuth' is missing",
+        "AA39/203": "off every target",
+        "AA39/204": "beyond the travel",
+        "AB01": "no linear actuators",
+        "AB02": "no measurement",
+    }
+    assert set(report["skipped"]) == set(said)
+    assert all(words in report["skipped"][key] for key, words in said.items())
+    days = report["heliostats"]["AA39"]["history"]["at"]
+    assert days == sorted(days)
+    assert days[1].startswith("2024-05-02T12:00:00")  # by its number, between two that have times
+    assert set(report["parameters"]) == set(report["heliostats"]["AA39"]["parameters"])
+    assert {entry["unit"] for entry in report["parameters"].values()} == {"m", "rad"}
+
+
+def test_spots_need_no_focal_spot(folder: Path, tmp_path: Path):
+    mounts = tmp_path / "mounts.json"
+    calibrate_folder(read_folder(folder), mounts)
+    source, measured = read_folder(folder), {}
+    for measurement in source.measurements("AA39", with_images=False):
+        measured[measurement.key] = measurement.spot
+    for path in (folder / "AA39" / "Calibration").glob("*-properties.json"):
+        document = json.loads(path.read_text())
+        document.pop("focal_spot", None)
+        write(path, document)
+    report = spot_folder(read_folder(folder), mounts, tmp_path / "spots.json")
+    assert len(report["spots"]) == 18
+    assert set(report["skipped"]) == {"AA39/200", "AA39/202", "AA39/204", "AB01", "AB02"}
+    entry = report["spots"]["AA39/105"]
+    assert np.linalg.norm(np.array(entry["spot"]) - measured["AA39/105"]) < 0.2
+    assert 0 < entry["std_m"] < 0.5
+    assert entry["target"] == "lower"
+
+
+def test_files_that_are_no_mounts_are_refused(folder: Path, tmp_path: Path):
+    wrong = tmp_path / "wrong.json"
+    for document in ({}, {"heliostats": []}, {"heliostats": {"AA39": {}}}):
+        write(wrong, document)
+        with pytest.raises(InvalidInputError, match=r"wrong\.json"):
+            spot_folder(read_folder(folder), wrong, tmp_path / "spots.json")
+    shutil.rmtree(folder / "AA39")
+    with pytest.raises(ModelError, match="no heliostat can be calibrated"):
+        calibrate_folder(read_folder(folder), tmp_path / "mounts.json")
+
+
+def test_the_command_prints_tables(folder: Path, tmp_path: Path):
+    mounts = tmp_path / "mounts.json"
+    done = heliotwin("calibrate", folder, "--out", mounts)
+    assert done.returncode == 0, done.stderr
+    assert "AA39" in done.stdout
+    assert "skipped AA39/204" in done.stderr
+    missing = heliotwin("spot", folder, "--mounts", tmp_path / "none.json", "--out", tmp_path / "spots.json")
+    assert missing.returncode == 2
+    assert "no such file" in missing.stderr
+
+
+def test_real_heliostats_are_forecast_to_a_milliradian(tmp_path: Path):
+    """A third of the measurements of two heliostats tell nothing but their motors."""
+    real = data_folder().parent / "stj-pointing"
+    if not real.is_dir():
+        pytest.skip(f"no real pointing at {real}")
+    root, measured = tmp_path / "plant", {}
+    for name in ("BG23", "BH20"):
+        shutil.copytree(real / name, root / name)
+    for path in real.glob("*tower-measurements.json"):
+        shutil.copy(path, root)
+    source = read_folder(root)
+    for name in source.plant.heliostats:
+        for measurement in source.measurements(name, with_images=False)[::3]:
+            measured[measurement.key] = measurement.spot
+            path = root / name / "Calibration" / f"{measurement.identifier}-calibration-properties.json"
+            document = json.loads(path.read_text())
+            del document["focal_spot"]
+            write(path, document)
+    calibrate_folder(read_folder(root), tmp_path / "mounts.json")
+    spots = spot_folder(read_folder(root), tmp_path / "mounts.json", tmp_path / "spots.json")["spots"]
+    for name, heliostat in source.plant.heliostats.items():
+        off = [
+            np.linalg.norm(np.array(spots[key]["spot"]) - spot) / np.linalg.norm(spot - heliostat.position)
+            for key, spot in measured.items()
+            if key.startswith(name)
+        ]
+        assert np.median(off) < 1.0e-3
