@@ -208,7 +208,8 @@ def camera_view(session: Session, row: ForecastRow) -> NDArray[np.float32]:
     size = row.window_m or row.plane["width"], row.window_m or row.plane["height"]
     effects = of_stage(get_model(session, int(row.model_version.partition(":")[0])).effects, "image")
     with torch.no_grad():
-        return images_under(acting(effects, row.sun_at), light[None], Window(*size, *light.shape))[0].clamp(min=0).numpy()
+        shown = images_under(acting(effects, row.sun_at), light[None], Window(*size, *light.shape))[0]
+        return shown.clamp(min=0).numpy()
 
 
 def flux_of(row: ForecastRow, flux: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
