@@ -16,7 +16,7 @@ from model.study.fitting import Fitter
 from model.study.flux_images import FluxImage, Forecaster, spot_window
 from model.study.judging import Gain, Rows, Split, few_gain, paired_gain, split
 from model.study.report import Candidate, Found, Study
-from model.study.scopes import SCREENED, STRENGTHS, Promise, change, days_of, promises
+from model.study.scopes import OF_THE_BEST, SCREENED, STRENGTHS, Promise, change, days_of, promises
 from model.study.unknowns import Term, Unknowns
 from model.tracing import Optics
 
@@ -194,8 +194,8 @@ class _Loop:
             saved = self._saved(trial, current, term, rows, STRENGTHS)
             found += promises(term.kind, saved, days, self.all_heliostats[rows])
         found.sort(key=lambda promise: -promise.saved)
-        fitted = [self._settled(promise.term, current, rows) for promise in found[:SCREENED]]
-        return dict(fitted)
+        best = [promise.term for promise in found[:SCREENED] if promise.saved > OF_THE_BEST * found[0].saved]
+        return dict(self._settled(term, current, rows) for term in best)
 
     def _saved(self, trial: Trial, current: Trial, term: Term, rows: Rows, strengths: Sequence[float]) -> Array:
         """Cost (strengths, n) that some images save by an effect that is always there, over the current model."""
@@ -257,9 +257,11 @@ class _Loop:
         """
         if term.whole:
             return self.gain(after, before)
+        held_out = _changes(self.measured, before.cuts, after.cuts)
+        if not held_out.sum() > 0:
+            return few_gain(held_out)
         fitted = np.sort(np.concatenate([self.split.fit, self.split.own]))
-        crossed = self._crossed(term, after, before, fitted)
-        return few_gain(np.concatenate([_changes(self.measured, before.cuts, after.cuts), crossed]))
+        return few_gain(np.concatenate([held_out, self._crossed(term, after, before, fitted)]))
 
     def _crossed(self, term: Term, after: Trial, before: Trial, rows: Rows) -> Array:
         """Changes of accuracy (n,) of images that were fitted, by an effect fitted to those held out."""

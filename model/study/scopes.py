@@ -27,8 +27,8 @@ LEAST_DAYS = 3
 BEYOND = 1.1
 """Gain of a scope, in gains of the same effect without one, below which it is not worth a fit."""
 
-SCREENED = 6
-"""How many of the most promising scopes are fitted."""
+SCREENED, OF_THE_BEST = 5, 0.4
+"""How many of the most promising scopes are fitted, and from which share of the best one's promise on."""
 
 
 @dataclass(frozen=True)
