@@ -131,6 +131,8 @@ def add_creator(router: APIRouter, kind: Kind[Any], path: str, name: str) -> Non
         response: Response,
         idempotency_key: IdempotencyKey = None,
     ) -> JobOut:
+        if kind.require is not None:
+            kind.require(runtime.settings)
         document = payload.model_dump(mode="json")  # type: ignore[attr-defined]
         row = ask_for(runtime, kind.name, document, identity.name, idempotency_key)
         response.headers["Location"] = f"/v1/jobs/{row.id}"
@@ -142,7 +144,7 @@ def add_creator(router: APIRouter, kind: Kind[Any], path: str, name: str) -> Non
         summary=kind.summary,
         description=f"{kind.summary} Answers at once; follow the job under its Location.",
         status_code=status.HTTP_202_ACCEPTED,
-        responses=problems(413, 415, 429),
+        responses=problems(409, 413, 415, 429) if kind.require is not None else problems(413, 415, 429),
         dependencies=[OPERATE, Depends(require_json)],
     )(create)
 

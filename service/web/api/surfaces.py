@@ -240,9 +240,14 @@ def _at(runtime: Runtime, name: str, moment: datetime | None, media_type: str) -
     responses={**problems(404, 406), **arrays(SurfaceOut, "`control_points`, `z`, `z_std` [m].")},
     dependencies=[READ],
 )
-def get_current_surface(name: NamePath, runtime: RuntimeDep, media_type: MediaType) -> Response:
-    """The surface that is valid now."""
-    return _at(runtime, name, None, media_type)
+def get_current_surface(
+    name: NamePath,
+    runtime: RuntimeDep,
+    media_type: MediaType,
+    at: Annotated[Moment | None, Query(description="The one that was valid then instead (time with zone).")] = None,
+) -> Response:
+    """The surface that is valid now, or was at a time."""
+    return _at(runtime, name, at, media_type)
 
 
 @router.put("/current", responses=problems(404, 413, 415), dependencies=[OPERATE, Depends(require_json)])
