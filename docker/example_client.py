@@ -2,10 +2,11 @@
 
     python example_client.py --url http://127.0.0.1:8000 --key-file ingest.key SPOOL [--predict]
 
-SPOOL/HELIOSTAT/NAME.png with its metadata in NAME.json beside it is sent, and moved to SPOOL/sent when the service has
-acknowledged it; what the service cannot take is moved to SPOOL/rejected with the reason in NAME.reason. An image whose
-metadata are not there yet is left for the next time. Ended at any moment and started again, it loses nothing; what it
-sends twice is stored once, for the same image again is the same measurement.
+SPOOL/HELIOSTAT/NAME.png, .jpg or .jpeg with its metadata in NAME.json beside it is sent, and moved to SPOOL/sent when
+the service has acknowledged it; what the service cannot take is moved to SPOOL/rejected with the reason in NAME.reason.
+An image that is not written to its end yet, or whose metadata are not, is left for the next time. Ended at any moment
+and started again, it loses nothing; what it sends twice is stored once, for the same image again is the same
+measurement.
 With --predict (a key of role operate) each heliostat that got a photograph gets a new surface, and a forecast.
 """
 
@@ -22,6 +23,10 @@ from typing import Any
 # Answers after which the same request may succeed later.
 AGAIN = (408, 429, 500, 502, 503, 504, 507)
 LONGEST_PAUSE_S = 60.0
+
+
+# How files end that are written to their end.
+ENDS = {".png": b"IEND\xaeB`\x82", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
 
 
 class RejectedError(Exception):
@@ -118,14 +123,29 @@ def _move(image: Path, spool: Path, to: str) -> Path:
     return folder / image.name
 
 
+def _whole(image: Path) -> tuple[bytes, dict[str, Any]] | None:
+    """A photograph and its metadata; None while one of them is being written."""
+    try:
+        content = image.read_bytes()
+        metadata = json.loads(image.with_suffix(".json").read_text(encoding="utf-8"))
+    except (FileNotFoundError, ValueError):
+        return None
+    return (content, metadata) if ENDS[image.suffix.lower()] in content[-64:] else None
+
+
 def send_all(service: Heliotwin, spool: Path) -> dict[str, str]:
     """Send what lies in the spool, oldest first; the heliostats that got an accepted photograph, with its target."""
     touched = {}
-    images = [path for path in spool.glob("*/*.png") if path.with_suffix(".json").is_file()]
+    folders = [folder for folder in spool.iterdir() if folder.is_dir() and folder.name not in ("sent", "rejected")]
+    images = [path for folder in folders for path in folder.iterdir() if path.suffix.lower() in ENDS]
     for image in sorted(images, key=lambda path: path.stat().st_mtime):
-        heliostat, metadata = image.parent.name, json.loads(image.with_suffix(".json").read_text(encoding="utf-8"))
+        heliostat, read = image.parent.name, _whole(image)
+        if read is None:
+            print(f"{heliostat}/{image.stem}: left for the next time, it or its metadata are not whole")
+            continue
+        content, metadata = read
         try:
-            measured = service.send_photograph(heliostat, image.read_bytes(), metadata)
+            measured = service.send_photograph(heliostat, content, metadata)
         except RejectedError as refusal:
             _move(image, spool, "rejected").with_suffix(".reason").write_text(f"{refusal}\n", encoding="utf-8")
             print(f"{heliostat}/{image.stem}: rejected, {refusal}")
@@ -150,11 +170,21 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     key = options.key_file.read_text(encoding="utf-8").strip() if options.key_file else ""
     service = Heliotwin(options.url, key, options.patience)
+    if not options.spool.is_dir():
+        parser.error(f"there is no folder {options.spool}; make it, with a folder for each heliostat in it")
     touched = send_all(service, options.spool)
+    failed = False
     for heliostat, target in touched.items() if options.predict else ():
-        surface = service.predict(heliostat)
-        forecast = service.forecast(heliostat, target, azimuth_deg=0.0, elevation_deg=45.0)
+        try:
+            surface = service.predict(heliostat)
+            forecast = service.forecast(heliostat, target, azimuth_deg=0.0, elevation_deg=45.0)
+        except RejectedError as refusal:
+            print(f"{heliostat}: no forecast, {refusal}", file=sys.stderr)
+            failed = True
+            continue
         print(f"{heliostat}: surface {surface['version']}, forecast peak {forecast['peak_w_m2']:.0f} W/m2")
+    if failed:
+        sys.exit(1)
 
 
 if __name__ == "__main__":

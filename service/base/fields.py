@@ -202,6 +202,10 @@ Resolution = Annotated[
 ]
 
 
+Rows = list[list[float]]
+"""A map as JSON: rows from the top."""
+
+
 class AccuracyOut(BaseModel):
     """How well held-out photographs are forecast."""
 

@@ -92,7 +92,7 @@ def study_page(study: Study, title: str, skipped: Mapping[str, str] | None = Non
         What was left out, with the reasons.
     """
     chart, sides = accuracy_chart(study), (study.window, study.window)
-    left = difference_map("Mean of forecast minus photograph", -study.residual_map(), sides, "of the measured peak")
+    left = difference_map("Mean of forecast minus photograph", -study.residual_map(), sides, "of peak")
     # The style is a file of our own, and `>` must stay what it is.
     style = Markup(ASSETS.joinpath("app.css").read_text(encoding="utf-8"))
     return TEMPLATES.get_template("study.html").render(

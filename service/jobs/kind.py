@@ -99,7 +99,7 @@ class Kind(Generic[Payload]):
 
     Where it has ``due``, workers ask that every hour: it gives None, or the Idempotency-Key of a job that is due, which
     is begun once, with nothing in its payload. Where it has ``so_far``, that makes a result of the steps that are done,
-    for a job that did not come to its end.
+    for a job that did not come to its end. What it needs of the settings it may ``require`` before it is queued.
     """
 
     name: str
@@ -108,6 +108,7 @@ class Kind(Generic[Payload]):
     summary: str
     due: Callable[[Session, Settings], str | None] | None = None
     so_far: Callable[[Mapping[str, Mapping[str, Any]]], dict[str, Any]] | None = None
+    require: Callable[[Settings], None] | None = None
 
 
 Kinds = Mapping[str, Kind[Any]]

@@ -7,7 +7,9 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import cv2
 import httpx
+import numpy as np
 import pytest
 
 from service.store import keys
@@ -84,6 +86,34 @@ def test_ingest_key_may_send_and_not_predict(store: Store, service: Process, tmp
     assert done.returncode == 1
     assert "403" in done.stderr
     assert len(list((root / "sent").glob("*/*.png"))) == 3
+
+
+def test_what_is_not_whole_waits_and_the_others_go(store: Store, service: Process, tmp_path: Path):
+    key, root = make_key(store, tmp_path, "ingest"), spool(tmp_path, 6, first=30)
+    torn, unsaid = root / "H0" / "32.png", root / "H0" / "34.json"
+    whole, said = torn.read_bytes(), unsaid.read_text()
+    torn.write_bytes(whole[:-20])
+    unsaid.write_text(said[:-5])
+    photograph = cv2.imencode(".jpg", np.full((64, 64, 3), 90, np.uint8))[1].tobytes()
+    (root / "H0" / "36.jpg").write_bytes(photograph)
+    (root / "H0" / "36.json").write_text(json.dumps(metadata(id="m36", kind="cropped")))
+    done = run(service.base, key, root)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("left for the next time") == 2
+    assert (root / "sent" / "H0" / "36.jpg").is_file()
+    assert {path.name for path in root.glob("H0/*.png")} == {"32.png", "34.png"}
+    torn.write_bytes(whole)
+    unsaid.write_text(said)
+    assert "H0/m32: accepted" in run(service.base, key, root).stdout
+    assert not list(root.glob("H*/*.*"))
+
+
+def test_missing_spool_is_named(tmp_path: Path):
+    key = tmp_path / "no.key"
+    key.write_text("x")
+    done = run("http://127.0.0.1:9", key, tmp_path / "spool")
+    assert done.returncode == 2
+    assert f"there is no folder {tmp_path / 'spool'}" in done.stderr
 
 
 def test_service_that_is_away_is_waited_for(store: Store, service: Process, tmp_path: Path):

@@ -8,6 +8,7 @@ from model.errors import InvalidInputError
 from service.base.faults import ConflictError
 from service.base.fields import Model
 from service.base.progress import Steps
+from service.base.settings import Settings
 from service.jobs.kind import Context, Kind, Result
 from service.sources.files import require_regular
 from service.sources.folder import read_folder
@@ -26,19 +27,26 @@ class ImportIn(Model):
     )
 
 
-def allowed_folder(root: Path | None, folder: str) -> Path:
+def allowed_root(settings: Settings) -> Path:
+    """The folder whose subfolders may be imported; ConflictError where the operator allowed none."""
+    if settings.import_root is None:
+        raise ConflictError("no folder may be imported: the operator sets HELIOTWIN_IMPORT_ROOT first")
+    return settings.import_root
+
+
+def _require_root(settings: Settings) -> None:
+    allowed_root(settings)
+
+
+def allowed_folder(root: Path, folder: str) -> Path:
     """The folder of this name under ``root``; nothing that a link or a ``..`` leads to outside of it.
 
     Raises
     ------
-    ConflictError
-        Where the operator allowed no folder.
     InvalidInputError
         Where it is none, leads outside, or holds a link that does, or what is no file of a bearable size: a pipe would
         be waited for without end, and the job with it.
     """
-    if root is None:
-        raise ConflictError("no folder may be imported: the operator sets HELIOTWIN_IMPORT_ROOT first")
     top = root.resolve()
     path = (top / folder).resolve()
     # The answer is the same for what does not exist and what lies outside: it tells nothing of the rest of the disk.
@@ -54,10 +62,10 @@ def allowed_folder(root: Path | None, folder: str) -> Path:
 
 def import_allowed(context: Context, payload: ImportIn) -> Result:
     """The plant, heliostats, images and measured surfaces of a folder; what is there already stays as it is."""
-    folder = read_folder(allowed_folder(context.runtime.settings.import_root, payload.folder))
+    folder = read_folder(allowed_folder(allowed_root(context.runtime.settings), payload.folder))
     images = [len(item.images) for name in folder.plant.heliostats for item in folder.measurements(name, False)]
     steps = Steps(len(folder.plant.heliostats) + sum(images), context.report)
     return Result(import_folder(context.runtime, folder, steps, context.created_by))
 
 
-KIND = Kind("imports", ImportIn, import_allowed, "Load a measurement folder into the store.")
+KIND = Kind("imports", ImportIn, import_allowed, "Load a measurement folder into the store.", require=_require_root)

@@ -46,7 +46,8 @@ _TAGS = [
     {"name": "health", "description": "For supervisors."},
 ]
 
-_BINARY = {"type": "string", "format": "binary"}
+TEXT = {"type": "string"}
+BINARY = {"type": "string", "format": "binary"}
 
 
 def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
@@ -54,16 +55,25 @@ def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
     return {status: {"model": Problem, "description": _MEANINGS[status]} for status in sorted({500, *statuses})}
 
 
-def arrays(description: str) -> dict[int | str, dict[str, Any]]:
-    """A documented answer in several representations beside JSON."""
-    binary = {media_type: {"schema": _BINARY} for media_type in formats.ARRAYS[1:]}
-    return {200: {"description": description, "content": binary}}
+def arrays(model: Any, description: str) -> dict[int | str, dict[str, Any]]:
+    """A documented answer in several representations beside JSON, which is a ``model``'s."""
+    binary = {media_type: {"schema": BINARY} for media_type in formats.ARRAYS[1:]}
+    return {200: {"model": model, "description": description, "content": binary}}
 
 
 def _as_problem(response: dict[str, Any]) -> None:
     content = response.get("content", {})
     if "application/json" in content:
         content[PROBLEM_MEDIA_TYPE] = content.pop("application/json")
+
+
+def _as_form(body: dict[str, Any]) -> None:
+    """A photograph's form as generators of clients and Swagger's page take it: a file, and a JSON document."""
+    image, metadata = body["properties"]["image"], body["properties"]["metadata"]
+    image.pop("contentMediaType", None)
+    image["format"] = "binary"
+    schema = metadata.pop("contentSchema")
+    body["properties"]["metadata"] = schema
 
 
 def _by_themselves(path: str, method: str, operation: dict[str, Any]) -> set[int]:
@@ -98,6 +108,11 @@ def _document(app: FastAPI) -> dict[str, Any]:
             for status, response in responses.items():
                 if int(status) >= 400 and "Problem" in str(response):
                     _as_problem(response)
+    _as_form(document["components"]["schemas"]["Body_post_measurement"])
+    post = document["paths"]["/v1/heliostats/{name}/measurements"]["post"]
+    post["requestBody"]["content"]["multipart/form-data"]["encoding"] = {
+        "metadata": {"contentType": "application/json"}
+    }
     for unused in ("HTTPValidationError", "ValidationError"):
         document["components"]["schemas"].pop(unused, None)
     return document

@@ -13,7 +13,10 @@ class FieldProblem(BaseModel):
 class Problem(BaseModel):
     """An error, by RFC 9457."""
 
-    type: str = Field(examples=["about:blank"])
+    type: str = Field(
+        description="Stable name of what is wrong; INTEGRATION.md lists all of them.",
+        examples=["urn:heliotwin:problem:invalid"],
+    )
     title: str = Field(examples=["Unprocessable Content"])
     status: int = Field(examples=[422])
     detail: str = Field(examples=["sun.elevation_deg: Input should be less than or equal to 90"])

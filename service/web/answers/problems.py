@@ -68,11 +68,39 @@ _RETRY_AFTER_S: dict[type[Exception], str] = {
 _DISK_FULL = "53100"
 
 # What the caller may do about an error that comes without a sentence of its own.
+_REMEDY_OF = {
+    "missing": "send it",
+    "extra_forbidden": "leave it out, or check its spelling",
+    "string_pattern_mismatch": "see /docs for the form of a name",
+    "timezone_aware": "add the zone, such as Z or +02:00",
+}
+
 _REMEDIES = {
     400: "the request could not be read; check its body",
     404: "there is nothing at this path; see /docs for the paths",
     405: "this path does not take this method; see the Allow header",
 }
+
+
+TYPES: dict[int, str] = {
+    400: "unreadable",
+    401: "key-needed",
+    403: "not-allowed",
+    404: "not-found",
+    405: "other-method",
+    406: "not-acceptable",
+    408: "too-slow",
+    409: "conflict",
+    410: "gone",
+    413: "too-large",
+    415: "not-taken",
+    422: "invalid",
+    429: "too-many",
+    500: "failure",
+    503: "busy",
+    507: "no-room",
+}
+"""What is wrong by status, as `type` names it: ``urn:heliotwin:problem:`` and this. These names never change."""
 
 
 def request_id(scope: Scope) -> str:
@@ -85,7 +113,7 @@ def problem(
 ) -> Response:
     """A problem document as a response, ASCII, so that any text in it can be sent; as a page where a person asks."""
     document = {
-        "type": "about:blank",
+        "type": f"urn:heliotwin:problem:{TYPES.get(status, TYPES[400 if status < 500 else 500])}",
         "title": HTTPStatus(status).phrase,
         "status": status,
         "detail": detail,
@@ -120,12 +148,25 @@ def _on_known(request: Request, error: Exception) -> Response:
     return problem(request.scope, status, str(error), {} if wait_s is None else {"Retry-After": wait_s})
 
 
+def _field_problem(entry: Mapping[str, Any]) -> dict[str, str]:
+    """Which field is wrong, and what to do about it."""
+    field, message = _field(entry["loc"]), str(entry["msg"]).removeprefix("Value error, ")
+    if entry["type"] == "json_invalid":
+        # The place of the fault stands where a field's name would.
+        field = "body" if isinstance(entry["loc"][-1], int) else field
+        where = f" at character {entry['loc'][-1]}" if isinstance(entry["loc"][-1], int) else ""
+        return {"field": field, "message": f"is no JSON{where}: {_why(entry)}; send one JSON document"}
+    remedy = _REMEDY_OF.get(entry["type"])
+    return {"field": field, "message": f"{message}; {remedy}" if remedy else message}
+
+
+def _why(entry: Mapping[str, Any]) -> str:
+    return str(entry.get("ctx", {}).get("error", entry["msg"])).rstrip(".")
+
+
 def _on_validation(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)
-    errors = [
-        {"field": _field(entry["loc"]), "message": entry["msg"].removeprefix("Value error, ")}
-        for entry in error.errors()
-    ]
+    errors = [_field_problem(entry) for entry in error.errors()]
     detail = "; ".join(f"{entry['field']}: {entry['message']}" for entry in errors[:5])
     return problem(request.scope, HTTPStatus.UNPROCESSABLE_ENTITY, detail, errors=errors[:100])
 

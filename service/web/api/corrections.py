@@ -33,10 +33,10 @@ class CorrectionIn(Model):
 
     reason: str = Field(min_length=1, max_length=200, description="Why; kept with the correction.")
     target_name: Name | None = None
-    sun_azimuth: Azimuth | None = None
-    sun_elevation: Elevation | None = None
+    sun_azimuth: Azimuth | None = Field(default=None, description="From south, positive to the east [deg].")
+    sun_elevation: Elevation | None = Field(default=None, description="[deg]")
     taken_at: Moment | None = None
-    motor_position: Motors | None = None
+    motor_position: Motors | None = Field(default=None, description="Of both axes [steps].")
     excluded: Flag | None = Field(default=None, description="Whether nothing shall be made from it any more.")
     remake: Flag = Field(default=False, description="Begin a job that makes the heliostat's surface anew.")
 

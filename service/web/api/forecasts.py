@@ -22,6 +22,7 @@ from service.base.fields import (
     Plane,
     Position,
     Resolution,
+    Rows,
     Sun,
     SunAt,
     Version,
@@ -105,6 +106,12 @@ class ForecastSummary(BaseModel):
     center_of_mass: tuple[float, float] | None = Field(description="Right and up of the plane's centre [m].")
     model_version: str = Field(description="Version of the plant's model: its number and effects.")
     created_at: datetime
+
+
+class ForecastOut(ForecastSummary):
+    """A computed flux map."""
+
+    flux: Rows = Field(description="(rows, columns) [W/m2], or what `unit` says.")
 
 
 def forecast_summary(row: ForecastRow) -> ForecastSummary:
@@ -237,7 +244,9 @@ def list_forecasts(
 
 
 @router.get(
-    "/{number}", responses={**problems(404, 406, 409), **arrays("`flux` (rows, columns).")}, dependencies=[READ]
+    "/{number}",
+    responses={**problems(404, 406, 409), **arrays(ForecastOut, "`flux` (rows, columns).")},
+    dependencies=[READ],
 )
 def get_forecast(
     number: Annotated[Version, Path(description="Id of the forecast.")],

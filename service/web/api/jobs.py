@@ -9,7 +9,7 @@ from pydantic import Field
 
 from service.base.arrays import unpack
 from service.base.faults import NotFoundError
-from service.base.fields import State, Version
+from service.base.fields import Rows, State, Version
 from service.drawing.pictures import flux_picture
 from service.jobs.asking import ask_for, cancel_for
 from service.jobs.kind import Kind, Kinds, result_of
@@ -18,7 +18,7 @@ from service.store.tables import JobRow
 from service.twin.runtime import Runtime
 from service.web.answers import formats
 from service.web.answers.formats import MediaType, json_answer, maps_answer
-from service.web.answers.openapi import arrays, problems
+from service.web.answers.openapi import TEXT, arrays, problems
 from service.web.answers.paging import Page, page
 from service.web.answers.representation import Maps
 from service.web.answers.watching import JobStream, JobSummary, Watcher, Watchers, job_summary
@@ -50,6 +50,12 @@ class JobOut(JobSummary):
     result: dict[str, Any] | None = Field(
         description="What a done job gave, by its kind; of a cancelled or failed one what it had changed until then."
     )
+
+
+class JobFluxOut(JobOut):
+    """A job with the flux map that it gave."""
+
+    flux: Rows = Field(description="(rows, columns) [W/m2].")
 
 
 def job_out(row: JobRow) -> JobOut:
@@ -125,6 +131,8 @@ def add_creator(router: APIRouter, kind: Kind[Any], path: str, name: str) -> Non
         response: Response,
         idempotency_key: IdempotencyKey = None,
     ) -> JobOut:
+        if kind.require is not None:
+            kind.require(runtime.settings)
         document = payload.model_dump(mode="json")  # type: ignore[attr-defined]
         row = ask_for(runtime, kind.name, document, identity.name, idempotency_key)
         response.headers["Location"] = f"/v1/jobs/{row.id}"
@@ -136,7 +144,7 @@ def add_creator(router: APIRouter, kind: Kind[Any], path: str, name: str) -> Non
         summary=kind.summary,
         description=f"{kind.summary} Answers at once; follow the job under its Location.",
         status_code=status.HTTP_202_ACCEPTED,
-        responses=problems(413, 415, 429),
+        responses=problems(409, 413, 415, 429) if kind.require is not None else problems(413, 415, 429),
         dependencies=[OPERATE, Depends(require_json)],
     )(create)
 
@@ -169,7 +177,7 @@ def get_job(number: Number, runtime: RuntimeDep, kinds: KindsDep) -> JobOut:
 
 @router.get(
     "/{number}/flux",
-    responses={**problems(404, 406), **arrays("`flux` (rows, columns) [W/m2].")},
+    responses={**problems(404, 406), **arrays(JobFluxOut, "`flux` (rows, columns) [W/m2].")},
     dependencies=[READ],
 )
 def get_job_flux(number: Number, runtime: RuntimeDep, media_type: MediaType) -> Response:
@@ -184,7 +192,10 @@ def get_job_flux(number: Number, runtime: RuntimeDep, media_type: MediaType) -> 
     response_class=Response,
     responses={
         **problems(404),
-        200: {"description": "Server-sent events `progress` and `end`.", "content": {"text/event-stream": {}}},
+        200: {
+            "description": "Server-sent events `progress` and `end`.",
+            "content": {"text/event-stream": {"schema": TEXT}},
+        },
         204: {"description": "The job has ended and Last-Event-ID was its last event."},
     },
     dependencies=[READ],

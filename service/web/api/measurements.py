@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, File, Form, Header, Query, Response, UploadFile, status
 from pydantic import BaseModel, BeforeValidator, Field, Json
+from starlette.datastructures import UploadFile as StarletteUploadFile
 
 from service import store
 from service.base.arrays import pair, unpack
@@ -20,6 +21,7 @@ from service.base.fields import (
     Moment,
     Name,
     Number,
+    Rows,
     Wgs84,
 )
 from service.drawing.pictures import flux_picture
@@ -31,7 +33,7 @@ from service.twin.runtime import Runtime
 from service.web.answers import formats
 from service.web.answers.files import WholeFile, is_held
 from service.web.answers.formats import MediaType, json_answer, maps_answer
-from service.web.answers.openapi import arrays, problems
+from service.web.answers.openapi import BINARY, arrays, problems
 from service.web.answers.paging import Page, page
 from service.web.answers.representation import Maps
 from service.web.door.dependencies import (
@@ -110,6 +112,15 @@ class MeasurementOut(BaseModel):
     created_at: datetime
 
 
+class MeasurementFluxOut(MeasurementOut):
+    """A measurement with its flux."""
+
+    flux: Rows | None = Field(
+        description="On the whole target, sum 100 [%]; null: only what is about the spot is known."
+    )
+    centered: Rows = Field(description="(64, 64) in 4 m about the centre of mass, sum 100 [%].")
+
+
 def measurement_out(heliostat_name: str, row: MeasurementRow) -> MeasurementOut:
     """A measurement as JSON."""
     return MeasurementOut.model_validate(
@@ -166,6 +177,9 @@ def flux_answer(heliostat_name: str, row: MeasurementRow, media_type: str) -> Re
 
 router = APIRouter(prefix="/heliostats/{name}/measurements", tags=["measurements"])
 
+# Bytes of metadata that are read of a part that came as a file.
+_MOST_METADATA = 2**16
+
 _METADATA_EXAMPLE = (
     '{"id": "205363", "kind": "flux", "target_name": "multi_focus_tower", "sun_azimuth": -41.2, "sun_elevation": 33.5}'
 )
@@ -191,6 +205,11 @@ def get_row(name: str, measurement: str, runtime: Runtime) -> MeasurementRow:
         return store.get_measurement(session, store.get_heliostat(session, name), measurement)
 
 
+def _text(part: Any) -> Any:
+    """A part of the form; browsers send JSON as if it were a file."""
+    return part.file.read(_MOST_METADATA + 1) if isinstance(part, UploadFile | StarletteUploadFile) else part
+
+
 def _bytes(upload: UploadFile, limit: int) -> bytes:
     data = upload.file.read(limit + 1)
     if len(data) > limit:
@@ -210,7 +229,9 @@ def _bytes(upload: UploadFile, limit: int) -> bytes:
 def post_measurement(
     name: NamePath,
     image: Annotated[UploadFile, File(description="A PNG, JPEG, TIFF or BMP file.")],
-    metadata: Annotated[Json[MeasurementIn], Form(description="JSON", examples=[_METADATA_EXAMPLE])],
+    metadata: Annotated[
+        Json[MeasurementIn], BeforeValidator(_text), Form(description="JSON", examples=[_METADATA_EXAMPLE])
+    ],
     runtime: RuntimeDep,
     response: Response,
 ) -> MeasurementOut:
@@ -254,7 +275,7 @@ def get_measurement(name: NamePath, measurement: MeasurementPath, runtime: Runti
     response_class=Response,
     responses={
         **problems(404, 410),
-        200: {"description": "The file as it was sent.", "content": {"image/*": {}}},
+        200: {"description": "The file as it was sent.", "content": {"image/*": {"schema": BINARY}}},
         304: {"description": "If-None-Match names the file, which the client holds already."},
     },
     dependencies=[READ],
@@ -282,7 +303,9 @@ def get_image(
 
 
 @router.get(
-    "/{measurement}/flux", responses={**problems(404, 406), **arrays("`flux` and `centered`.")}, dependencies=[READ]
+    "/{measurement}/flux",
+    responses={**problems(404, 406), **arrays(MeasurementFluxOut, "`flux` and `centered`.")},
+    dependencies=[READ],
 )
 def get_flux(name: NamePath, measurement: MeasurementPath, runtime: RuntimeDep, media_type: MediaType) -> Response:
     """The measured flux: over the whole target (256 x 256), and 64 x 64 about the centre of mass with sum 100."""

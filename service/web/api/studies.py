@@ -14,7 +14,7 @@ from service.base.fields import Flag, Model, StudyReport, Verdict, Version
 from service.jobs.kinds import KINDS
 from service.store.tables import StudyRow
 from service.twin import versions
-from service.web.answers.openapi import problems
+from service.web.answers.openapi import TEXT, problems
 from service.web.answers.paging import Page, page
 from service.web.api.jobs import add_creator
 from service.web.api.models import ModelOut, current_out, model_out
@@ -110,7 +110,10 @@ def get_study(number: Number, runtime: RuntimeDep) -> StudyOut:
 @router.get(
     "/studies/{number}/report",
     response_class=Response,
-    responses={**problems(404), 200: {"description": "A page that stands alone.", "content": {"text/html": {}}}},
+    responses={
+        **problems(404),
+        200: {"description": "A page that stands alone.", "content": {"text/html": {"schema": TEXT}}},
+    },
     dependencies=[READ],
 )
 def get_study_report(number: Number, runtime: RuntimeDep) -> HTMLResponse:

@@ -71,7 +71,7 @@ class SurfaceSummary(BaseModel):
     doubted_since: datetime | None = Field(description="Since when the heliostat's predictions have not been trusted.")
     suspicious: list[str] | None = Field(description="Ids of the measurements that it does not explain.")
     strangeness: float | None = Field(
-        description="Distance from the mirrors known, in standard deviations per root degree of freedom; about 1."
+        description="Distance from the mirrors known, in standard deviations per root degree of freedom [1]; about 1."
     )
     sun_span_deg: float | None = Field(
         description="What its photographs cover: the largest angle between their suns [deg]; 0 for a single sun."
@@ -98,7 +98,7 @@ class DecisionOut(BaseModel):
     made_by: str
     reason: str
     accuracy_before: float | None = Field(description="Mean flux accuracy of the former one [1]; null: not compared.")
-    accuracy_after: float | None = Field(description="The same of this one.")
+    accuracy_after: float | None = Field(description="The same of this one [1].")
     photographs: int = Field(description="On how many photographs.")
 
 
@@ -206,7 +206,7 @@ def post_surface(
 
 @router.get(
     "",
-    responses={**problems(404, 406), **arrays("With `at`: the surface itself.")},
+    responses={**problems(404, 406), **arrays(Page[SurfaceSummary] | SurfaceOut, "With `at`: the surface itself.")},
     response_model=None,
     dependencies=[READ],
 )
@@ -236,11 +236,18 @@ def _at(runtime: Runtime, name: str, moment: datetime | None, media_type: str) -
 
 
 @router.get(
-    "/current", responses={**problems(404, 406), **arrays("`control_points`, `z`, `z_std` [m].")}, dependencies=[READ]
+    "/current",
+    responses={**problems(404, 406), **arrays(SurfaceOut, "`control_points`, `z`, `z_std` [m].")},
+    dependencies=[READ],
 )
-def get_current_surface(name: NamePath, runtime: RuntimeDep, media_type: MediaType) -> Response:
-    """The surface that is valid now."""
-    return _at(runtime, name, None, media_type)
+def get_current_surface(
+    name: NamePath,
+    runtime: RuntimeDep,
+    media_type: MediaType,
+    at: Annotated[Moment | None, Query(description="The one that was valid then instead (time with zone).")] = None,
+) -> Response:
+    """The surface that is valid now, or was at a time."""
+    return _at(runtime, name, at, media_type)
 
 
 @router.put("/current", responses=problems(404, 413, 415), dependencies=[OPERATE, Depends(require_json)])
@@ -270,7 +277,9 @@ def list_decisions(name: NamePath, runtime: RuntimeDep, limit: Limit = 100) -> l
 
 
 @router.get(
-    "/{version}", responses={**problems(404, 406), **arrays("`control_points`, `z`, `z_std` [m].")}, dependencies=[READ]
+    "/{version}",
+    responses={**problems(404, 406), **arrays(SurfaceOut, "`control_points`, `z`, `z_std` [m].")},
+    dependencies=[READ],
 )
 def get_surface(
     name: NamePath,

@@ -3,6 +3,7 @@
 from fastapi import APIRouter, Response
 from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
 
+from service.web.answers.openapi import TEXT
 from service.web.door.dependencies import READ, RuntimeDep
 from service.web.metrics import registry
 
@@ -12,7 +13,7 @@ router = APIRouter(tags=["health"])
 @router.get(
     "/metrics",
     response_class=Response,
-    responses={200: {"description": "Prometheus' text format.", "content": {"text/plain": {}}}},
+    responses={200: {"description": "Prometheus' text format.", "content": {"text/plain": {"schema": TEXT}}}},
     dependencies=[READ],
 )
 def get_metrics(runtime: RuntimeDep) -> Response:

@@ -187,8 +187,10 @@ def test_import_needs_the_operators_leave(settings: Settings, operations: FakeOp
     shutil.rmtree(settings.data_dir, ignore_errors=True)
     closed = settings.model_copy(update={"import_root": None})
     with client_of(create_app(closed, operations)) as client:
-        job = finish(client, client.post("/v1/jobs/imports", json={"folder": "."}))
-    assert "HELIOTWIN_IMPORT_ROOT" in job["reason"]
+        answer = client.post("/v1/jobs/imports", json={"folder": "."})
+        assert answer.status_code == 409
+        assert "HELIOTWIN_IMPORT_ROOT" in answer.json()["detail"]
+        assert client.get("/v1/jobs").json()["items"] == []  # refused at once, and not queued
 
 
 @pytest.mark.parametrize(

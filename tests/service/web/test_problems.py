@@ -13,7 +13,7 @@ from service.base.faults import SchemaError
 from service.base.settings import Settings
 from service.web.answers.problem_schema import Problem
 from service.web.app import create_app
-from tests.service.conftest import client_of
+from tests.service.conftest import client_of, metadata
 
 
 def check(answer: Any, status: int) -> dict[str, Any]:
@@ -184,3 +184,27 @@ def test_unready_without_weights(bare: TestClient, monkeypatch: pytest.MonkeyPat
     assert ready.status_code == 503
     assert ready.json()["checks"]["weights"] == "unavailable"
     assert "inside" not in ready.text
+
+
+def test_problem_names_its_kind_the_field_and_the_remedy(refusing: TestClient):
+    broken = refusing.post("/v1/forecasts", content='{"heliostat": oops}', headers={"Content-Type": "application/json"})
+    assert broken.json()["type"] == "urn:heliotwin:problem:invalid"
+    assert broken.json()["detail"].startswith("body: is no JSON at character 14: Expecting value")
+    unknown = refusing.post("/v1/heliostats/AA39/surfaces", json={"metod": "network"}).json()
+    assert unknown["errors"] == [
+        {"field": "metod", "message": "Extra inputs are not permitted; leave it out, or check its spelling"}
+    ]
+    missing = refusing.post("/v1/forecasts", json={"heliostat": "AA39", "target": "lower"}).json()
+    assert missing["detail"] == "sun: Field required; send it"
+    assert refusing.get("/v1/nothing").json()["type"] == "urn:heliotwin:problem:not-found"
+
+
+def test_metadata_may_come_as_a_file_of_json(refusing: TestClient):
+    """So Swagger's page sends them."""
+    sent = {"metadata": ("blob", b"{", "application/json"), "image": ("spot.png", b"x", "image/png")}
+    answer = refusing.post("/v1/heliostats/AA39/measurements", files=sent)
+    assert answer.status_code == 422
+    assert answer.json()["errors"][0]["field"] == "metadata"
+    sent["metadata"] = ("blob", json.dumps(metadata()).encode(), "application/json")
+    answer = refusing.post("/v1/heliostats/AA39/measurements", files=sent)
+    assert answer.status_code == 415  # the metadata were taken; the image is none

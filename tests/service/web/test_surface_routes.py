@@ -74,6 +74,7 @@ def test_prediction_is_valid_from_its_newest_image(client: TestClient, post: Pos
     assert client.get(f"{BASE}/current").json()["version"] == 1
     at = {"at": "2024-06-01T00:00:00+02:00"}
     assert client.get(BASE, params=at).json()["version"] == 2
+    assert client.get(f"{BASE}/current", params=at).json()["version"] == 2
     before = client.get(BASE, params={"at": "2024-01-01T00:00:00Z"})
     assert before.status_code == 404
     picture = client.get(BASE, params=at, headers={"Accept": "image/png"})
