@@ -4,6 +4,7 @@ import itertools
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from statistics import fmean
 from typing import Annotated, Any
 
@@ -20,7 +21,8 @@ from service.base.fields import Version
 from service.drawing import charts
 from service.drawing.charts import HeatMap, History, Scale
 from service.drawing.pictures import mirror_heights
-from service.store.tables import HeliostatRow, MeasurementRow, SurfaceRow
+from service.store import mounts
+from service.store.tables import HeliostatRow, MeasurementRow, MountRow, SurfaceRow
 from service.twin.accuracy import RECENT, Compared, Comparison, ComparisonBook
 from service.twin.field import Figures, figures_of
 from service.web.answers.pages import render
@@ -137,6 +139,25 @@ def _surface_context(surface: SurfaceRow, size: tuple[float, float]) -> dict[str
     }
 
 
+# Newest spots that the pointing error of today is the median of.
+_NEWEST_SPOTS = 8
+
+
+def _pointing(mount: MountRow) -> dict[str, Any]:
+    """What the page says of a mount: its newest errors, what its drives did, and what contradicts it."""
+    history = mount.document["history"]
+    left = 1e3 * np.linalg.norm(np.array(history["residuals"]).reshape(-1, 2), axis=-1)
+    newest = np.delete(left, history["foreign"])[-_NEWEST_SPOTS:]
+    return {
+        "newest_mrad": float(np.median(newest)) if newest.size else None,
+        "steps": [
+            step | {"from": datetime.fromisoformat(step["from"]), "to": datetime.fromisoformat(step["to"])}
+            for step in reversed(mount.document["steps"])
+        ],
+        **{name: mount.document[name] for name in ("drift", "outliers", "parameters", "residual_mrad")},
+    }
+
+
 def _size(row: HeliostatRow) -> tuple[float, float]:
     return float(row.properties["width"]), float(row.properties["height"])
 
@@ -150,6 +171,7 @@ class _Read:
     surface: SurfaceRow | None
     surfaces: list[SurfaceRow]
     photographs: Sequence[MeasurementRow]
+    mount: MountRow | None
     compared: Compared
 
 
@@ -165,11 +187,11 @@ def _read(
         today = store.find_surface_at(session, row)
         surface = today if version is None else store.get_surface(session, row, version)
         surfaces = _newest_surfaces(session, row)
-        photographs = _newest_photographs(session, row)
+        photographs, mount = _newest_photographs(session, row), mounts.find_mount_at(session, row)
         shown = book.read(session, row, surface)
     # The rest of the page does not depend on them.
     compared = Compared() if shown is None else book.wait_for(shown) or _UNDER_WAY
-    return _Read(row, today, surface, surfaces, photographs, compared)
+    return _Read(row, today, surface, surfaces, photographs, mount, compared)
 
 
 @router.get("/heliostats/{name}")
@@ -189,6 +211,8 @@ def get_heliostat_page(request: Request, read: Annotated[_Read, Depends(_read)],
         trouble=read.compared.trouble,
         recent=RECENT,
         photographs=read.photographs,
+        mount=read.mount,
+        pointing=None if read.mount is None else _pointing(read.mount),
         **_means(comparisons),
         **(_surface_context(read.surface, _size(read.row)) if read.surface is not None else {}),
     )
