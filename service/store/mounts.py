@@ -30,8 +30,6 @@ def add_mount(session: Session, heliostat: HeliostatRow, document: dict[str, Any
             version=(last or 0) + 1,
             created_at=now(),
             valid_from=datetime.fromisoformat(document["valid_from"]),
-            measurements=document["measurements"],
-            residual_mrad=document["residual_mrad"]["median"],
             document=document,
         )
         if insert(session, row):

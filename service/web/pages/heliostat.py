@@ -154,7 +154,7 @@ def _pointing(mount: MountRow) -> dict[str, Any]:
             step | {"from": datetime.fromisoformat(step["from"]), "to": datetime.fromisoformat(step["to"])}
             for step in reversed(mount.document["steps"])
         ],
-        **{name: mount.document[name] for name in ("drift", "outliers", "parameters", "residual_mrad")},
+        **{name: mount.document[name] for name in ("drift", "outliers", "measurements", "residual_mrad")},
     }
 
 

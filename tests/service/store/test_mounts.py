@@ -13,7 +13,7 @@ from tests.service.conftest import ORIGIN
 
 
 def document(valid_from: str) -> dict[str, Any]:
-    return {"valid_from": valid_from, "measurements": 3, "residual_mrad": {"median": 0.2}}
+    return {"valid_from": valid_from}
 
 
 def test_mounts_are_found_by_the_time_they_are_valid(database: Database):
