@@ -17,8 +17,6 @@ def upgrade() -> None:
         sa.Column("version", sa.Integer(), nullable=False),
         sa.Column("created_at", sa.DateTime(timezone=True), nullable=False),
         sa.Column("valid_from", sa.DateTime(timezone=True), nullable=False),
-        sa.Column("measurements", sa.Integer(), nullable=False),
-        sa.Column("residual_mrad", sa.Double(), nullable=True),
         sa.Column("document", sa.JSON(none_as_null=True), nullable=False),
         sa.ForeignKeyConstraint(["heliostat_id"], ["heliostats.id"], name=op.f("fk_mounts_heliostat_id_heliostats")),
         sa.PrimaryKeyConstraint("id", name=op.f("pk_mounts")),

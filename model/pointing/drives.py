@@ -37,8 +37,8 @@ class Noise:
         Of the drives' zeros.
     drift_days, jitter_days : float [d]
         Over which they forget where they were.
-    step_rad, foreign_rad : float [rad]
-        How far a step moves a zero, and a foreign spot lies away.
+    step_rad, foreign_rad : pair of float [rad]
+        How far a step moves a zero, and a foreign spot lies away: the common ones, and the rare large ones.
     step_odds, foreign_odds : float
         Of a step before a measurement, and of a foreign spot in it, before its spot is seen.
     """
@@ -48,8 +48,8 @@ class Noise:
     drift_days: float = 300.0
     jitter_rad: tuple[float, float] = (0.05e-3, 0.45e-3)
     jitter_days: float = 0.06
-    step_rad: float = 7.5e-3
-    foreign_rad: float = 30e-3
+    step_rad: tuple[float, float] = (5e-3, 60e-3)
+    foreign_rad: tuple[float, float] = (10e-3, 0.3)
     step_odds: float = 2e-2
     foreign_odds: float = 1e-2
 
@@ -202,7 +202,7 @@ class _Problem:
             drifted_std=self._drifted_std(precision, newest),
             steps_std=steps_std,
             stepped=terms.mask(*_STEPS),
-            foreign=terms.mask(_FOREIGN),
+            foreign=terms.mask(*_FOREIGN),
             evidence=solved.evidence - 0.5 * self.log_det,
             spread=spread,
         )
@@ -236,8 +236,8 @@ class _Problem:
         return newest_cov, np.sqrt(np.maximum(variances, 0))
 
 
-# Kinds of terms beside none, 0: steps of both drives, the first, the second, and foreign spots.
-_STEPS, _FOREIGN = (1, 2, 3), 4
+# Kinds of terms beside none, 0: steps of both drives, the first, the second, common ones and large ones; foreign spots.
+_STEPS, _FOREIGN = (1, 2, 3, 4, 5, 6), (7, 8)
 
 # A drive that did not step moved by no more than this share of what one that did.
 _STILL = 1e-3
@@ -309,7 +309,7 @@ class _Terms:
         heliostats, count = self.kind.shape
         after = np.arange(self.most) >= self.place[..., None]
         alone = np.arange(self.most) == self.place[..., None]
-        is_step, is_foreign = np.isin(self.kind, _STEPS), self.kind == _FOREIGN
+        is_step, is_foreign = (np.isin(self.kind, kinds) for kinds in (_STEPS, _FOREIGN))
         from_here, here = (
             (places & kinds[..., None]).swapaxes(1, 2)[:, :, None, :, None]
             for places, kinds in ((after, is_step), (alone, is_foreign))
@@ -357,12 +357,14 @@ class _Terms:
         noise, used = problem.noise, problem.readings.used
         variances = _variances(noise)
         of_steps = [_gain(step_pull, step_hess, variances[kind]) for kind in _STEPS]
-        gains = np.stack([*of_steps, _gain(pull, foreign_hess, variances[_FOREIGN])], axis=1)
+        of_foreign = [_gain(pull, foreign_hess, variances[kind]) for kind in _FOREIGN]
+        gains = np.stack([*of_steps, *of_foreign], axis=1)
         gains += np.log(_odds(noise))[1:, None]
         steps = slice(0, len(_STEPS))
         gains[:, steps, 0] = -np.inf  # a step before the first is the zero itself
         gains[:, steps] = np.where(self.mask(*_STEPS)[:, None], -np.inf, gains[:, steps])
-        gains[:, -1] = np.where(self.mask(_FOREIGN), -np.inf, gains[:, -1])
+        foreign = slice(len(_STEPS), None)
+        gains[:, foreign] = np.where(self.mask(*_FOREIGN)[:, None], -np.inf, gains[:, foreign])
         return np.where(used[:, None], gains, -np.inf)
 
     def _step_hess(self, by_zero: Array, blocks: Array) -> Array:
@@ -410,14 +412,18 @@ class _Terms:
 
 def _odds(noise: Noise) -> Array:
     """Of each kind of term (K,); one of none has even ones."""
-    return np.array([1.0, *[noise.step_odds / len(_STEPS)] * len(_STEPS), noise.foreign_odds])
+    step, foreign = noise.step_odds / len(_STEPS), noise.foreign_odds / len(_FOREIGN)
+    return np.array([1.0] + [step] * len(_STEPS) + [foreign] * len(_FOREIGN))
 
 
 def _variances(noise: Noise) -> Array:
     """Of the two sizes of each kind of term (K, 2) [rad2]."""
-    step, foreign = noise.step_rad**2, noise.foreign_rad**2
-    still = _STILL**2 * step
-    return np.array([[1.0, 1.0], [step, step], [step, still], [still, step], [foreign, foreign]])
+    of_steps = [
+        [size * first, size * second]
+        for size in noise.step_rad
+        for first, second in ((1.0, 1.0), (1.0, _STILL), (_STILL, 1.0))
+    ]
+    return np.square([[1.0, 1.0], *of_steps, *([size, size] for size in noise.foreign_rad)])
 
 
 def _gain(pull: Array, hess: Array, variance: Array) -> Array:

@@ -1,7 +1,8 @@
 """A calibrated mount: where its light lands at a time, how sure that is, and the steps that send it to a place."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -247,19 +248,22 @@ def mounts_of(done: Calibrated, heliostats: Sequence[Heliostat], readings: Readi
                 drifted_std=believed.drifted_std[row],
                 foreign=believed.foreign[row, known],
                 residuals=done.residuals[row, known],
-                steps=tuple(
-                    _step(believed, row, int(place), nominal, readings.steps[row, place])
-                    for place in np.nonzero(believed.stepped[row])[0]
-                ),
+                steps=tuple(_steps(believed, row, nominal, readings)),
                 noise=done.noise,
             )
         )
     return mounts
 
 
-def _step(believed: Believed, row: int, after: int, mount: Mount, motors: Array) -> Step:
-    """The step that begins at a measurement, after the last one before that is believed."""
-    before = int(np.nonzero(~believed.foreign[row, :after])[0].max(initial=0))
-    zeros = believed.steps[row, after] - believed.steps[row, after - 1]
-    angle_of_a_step = (mount.angles_from_motors(motors + 1) - mount.angles_from_motors(motors - 1)) / 2
-    return Step(before, after, zeros, believed.steps_std[row, after], zeros / angle_of_a_step)
+def _steps(believed: Believed, row: int, mount: Mount, readings: Readings) -> Iterator[Step]:
+    """Steps between two measurements that are believed; what is said of those between them is one step."""
+    good = np.nonzero(readings.used[row] & ~believed.foreign[row])[0]
+    for before, after in pairwise(good):
+        begun = slice(before + 1, after + 1)
+        if not believed.stepped[row, begun].any():
+            continue
+        zeros = believed.steps[row, after] - believed.steps[row, before]
+        std = np.sqrt((believed.steps_std[row, begun] ** 2).sum(axis=0))
+        motors = readings.steps[row, after]
+        angle_of_a_step = (mount.angles_from_motors(motors + 1) - mount.angles_from_motors(motors - 1)) / 2
+        yield Step(int(before), int(after), zeros, std, zeros / angle_of_a_step)

@@ -41,11 +41,11 @@ def padded(readings: Sequence[Sequence[Reading]]) -> Readings:
 def days_by_order(days: ArrayLike, order: ArrayLike) -> Array:
     """Days (N,) with those that are NaN read off others, by numbers ``order`` (N,) that grow with time.
 
-    All 0 where no day is known.
+    All stay NaN where none is known.
     """
     when, number = np.asarray(days, dtype=np.float64), np.asarray(order, dtype=np.float64)
     known = np.isfinite(when)
     if not known.any():
-        return np.zeros(len(when))
+        return when
     by_number = np.argsort(number[known])
     return np.where(known, when, np.interp(number, number[known][by_number], when[known][by_number]))

@@ -51,9 +51,11 @@ def read_readings(
     for name, own in measured.items():
         progress(name)
         usable = []
-        for measurement in own:
+        for place, measurement in enumerate(own):
+            # What nothing dates keeps its place in the folder's order.
+            day = float(np.nan_to_num(days[measurement.key], nan=place))
             try:
-                usable.append(_reading(folder, measurement, days[measurement.key]))
+                usable.append(_reading(folder, measurement, day))
             except ModelError as error:
                 skipped[measurement.key] = str(error)
         if usable:
@@ -148,9 +150,7 @@ def _reading(folder: MeasurementFolder, measurement: Measurement, day: float) ->
         raise InvalidInputError("no 'focal_spot'")
     if not any(_on(plane, measurement.spot) for plane in folder.plant.targets.values()):
         raise InvalidInputError("'focal_spot' lies off every target")
-    return Reading(
-        measurement.identifier, measurement.target, motors, measurement.sun, measurement.spot, np.nan_to_num(day)
-    )
+    return Reading(measurement.identifier, measurement.target, motors, measurement.sun, measurement.spot, day)
 
 
 # How far [m] a spot may lie off a target's plane, and off its edge: rounding and surveys, not another place.

@@ -18,20 +18,24 @@ def _mounts(heliostat: HeliostatRow) -> Select[MountRow]:
 
 
 def add_mount(session: Session, heliostat: HeliostatRow, document: dict[str, Any]) -> MountRow:
-    """Store a mount as the heliostat's next version, valid from when its newest state began.
+    """Store a mount, valid from when its newest state began.
 
-    NotFoundError where the heliostat was deleted since it was read.
+    It is the heliostat's next version, or takes the place of the newest where that is of the same state: versions grow
+    with what happens to a mount, not with how often it is calibrated. NotFoundError where the heliostat was deleted
+    since it was read.
     """
     hold(session, HeliostatRow, heliostat.id, f"heliostat {heliostat.name}")
+    valid_from = datetime.fromisoformat(document["valid_from"])
     for _ in range(ROUNDS):
-        last = session.scalar(select(func.max(MountRow.version)).where(MountRow.heliostat_id == heliostat.id))
+        newest = session.scalar(_mounts(heliostat).order_by(MountRow.version.desc()).limit(1))
+        if newest is not None and newest.valid_from == valid_from:
+            newest.document, newest.created_at = document, now()
+            return newest
         row = MountRow(
             heliostat_id=heliostat.id,
-            version=(last or 0) + 1,
+            version=1 if newest is None else newest.version + 1,
             created_at=now(),
-            valid_from=datetime.fromisoformat(document["valid_from"]),
-            measurements=document["measurements"],
-            residual_mrad=document["residual_mrad"]["median"],
+            valid_from=valid_from,
             document=document,
         )
         if insert(session, row):

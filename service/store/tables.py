@@ -278,10 +278,7 @@ class DecisionRow(Base):
 
 
 class MountRow(Base):
-    """One calibration of a heliostat's mount: a document of `model.pointing.report.mount_to_json`.
-
-    ``valid_from`` is when its newest state began, by a step of its drives or the first measurement.
-    """
+    """One calibration of a mount, `model.pointing.report.mount_to_json`; since when its newest state is valid."""
 
     __tablename__ = "mounts"
     __table_args__ = (UniqueConstraint("heliostat_id", "version"), Index(None, "heliostat_id", "valid_from"))
@@ -291,8 +288,6 @@ class MountRow(Base):
     version: Mapped[int]
     created_at: Mapped[datetime] = mapped_column(default=now)
     valid_from: Mapped[datetime]
-    measurements: Mapped[int]
-    residual_mrad: Mapped[float | None]
     document: Mapped[dict[str, Any]] = mapped_column(deferred=True)
 
 

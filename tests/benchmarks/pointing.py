@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from model.frames import sun_angles
 from model.plant import Heliostat, TargetPlane
 from model.pointing import CalibratedMount, Field, Reading, calibrate_field, off_by
 from service.cli.folder_pointing import read_readings
@@ -227,38 +228,50 @@ def speed(plant: Plant, heliostats: int = 2000, measurements: int = 60) -> None:
     print(f"{heliostats} heliostats x {measurements} measurements: {wall:.1f} s, {busy:.1f} s of a core, {found} steps")
 
 
+def left_out(plant: Plant) -> dict[str, Array]:
+    """Beam errors [mrad] of all measurements, each by mounts that a third of them, and it, had no part in."""
+    errors = {name: np.zeros(len(own)) for name, own in plant.readings.items()}
+    order = {name: np.random.default_rng(0).permutation(len(own)) for name, own in plant.readings.items()}
+    for fold in range(3):
+        parts = {name: split(own, order[name][fold::3]) for name, own in plant.readings.items()}
+        mounts, _ = plant.calibrate({name: kept for name, (kept, _) in parts.items()})
+        for name, found in errors_mrad(plant, mounts, {name: apart for name, (_, apart) in parts.items()}).items():
+            errors[name][np.sort(order[name][fold::3])] = found
+    return errors
+
+
 def picture(plant: Plant, path: Path) -> None:
-    """Residuals by the sun, before and after, and over time with the steps."""
+    """Errors by the sun, before and after, and the drives over time with their steps."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    from model.frames import sun_angles
-
     names = [name for name in ("BE36", "BF57", "BG16", "AA39") if name in plant.readings]
     mounts, _ = plant.calibrate(plant.readings)
-    uncorrected = CalibratedMount.uncalibrated()
+    after, uncorrected = left_out(plant), CalibratedMount.uncalibrated()
     figure, axes = plt.subplots(len(names), 3, figsize=(15, 3 * len(names)), squeeze=False, layout="constrained")
     for row, name in zip(axes, names, strict=True):
-        own, mount, heliostat = plant.readings[name], mounts[name], plant.heliostats[name]
+        own, mount = plant.readings[name], mounts[name]
         azimuth, elevation = sun_angles(np.array([one.sun for one in own]))
-        for panel, (label, off) in zip(
-            row, {"uncorrected": off_by(heliostat, uncorrected, own), "calibrated": mount.off}.items(), strict=False
+        before = 1e3 * off_by(plant.heliostats[name], uncorrected, own)
+        for panel, label, off in zip(
+            row, ("uncorrected", "left out of calibration"), (before, after[name]), strict=False
         ):
-            color = np.log10(1e3 * off + 1e-3)
-            shown = panel.scatter(azimuth, elevation, c=color, vmin=-1, vmax=2, s=12, cmap="viridis")
+            shown = panel.scatter(azimuth, elevation, c=np.log10(off + 1e-3), vmin=-1, vmax=2, s=12, cmap="viridis")
             panel.set(title=f"{name}, {label}", xlabel="sun azimuth from south [deg]", ylabel="elevation [deg]")
             bar = figure.colorbar(shown, ax=panel, ticks=[-1, 0, 1, 2])
             bar.ax.set_yticklabels(["0.1", "1", "10", "100 mrad"])
-        days = mount.days - mount.days[0]
-        zeros = 1e3 * (mount.drift + mount.jitter + mount.stepped)
+        days, known = mount.days - mount.days[0], ~mount.foreign
+        zeros = 1e3 * (mount.drift + mount.jitter + mount.stepped - mount.stepped[-1])
         for axis, label in enumerate(("first drive", "second drive")):
-            row[2].plot(days[~mount.foreign], zeros[~mount.foreign, axis], ".", label=label)
+            row[2].plot(days[known], zeros[known, axis], ".", label=label)
         for step in mount.steps:
             row[2].axvline((days[step.before] + days[step.after]) / 2, color="0.7", linewidth=1)
-        row[2].set(title=f"{name}: zeros of the drives, steps grey", xlabel="days", ylabel="mrad")
+        ticks = [-100, -10, -1, 0, 1, 10, 100]
         row[2].set_yscale("symlog", linthresh=2)
+        row[2].set_yticks(ticks, [f"{tick}" for tick in ticks])
+        row[2].set(title=f"{name}: zeros of its drives, steps grey", xlabel="days", ylabel="mrad", ylim=(-200, 200))
         row[2].legend(fontsize=8)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=70)

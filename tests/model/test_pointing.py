@@ -247,7 +247,7 @@ def test_mounts_without_actuators_are_refused():
 
 def test_days_that_are_not_known_are_read_off_the_numbers():
     np.testing.assert_allclose(days_by_order([1.0, np.nan, 3.0], [10, 15, 20]), [1, 2, 3])
-    np.testing.assert_allclose(days_by_order([np.nan, np.nan], [1, 2]), [0, 0])
+    assert np.isnan(days_by_order([np.nan, np.nan], [1, 2])).all()
 
 
 def test_days_and_moments_invert():

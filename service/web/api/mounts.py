@@ -28,7 +28,7 @@ class MountOut(BaseModel):
 
     heliostat: str
     version: int
-    created_at: datetime
+    created_at: datetime = Field(description="When it was calibrated; anew, where it is still in the same state.")
     valid_from: datetime = Field(description="Since when its newest state holds: a step of its drives, or the first.")
     measurements: int
     residual_mrad: dict[str, float | None] = Field(description="Between forecast and measured spots [mrad].")

@@ -4,6 +4,7 @@ import itertools
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from statistics import fmean
 from typing import Annotated, Any
 
@@ -20,8 +21,8 @@ from service.base.fields import Version
 from service.drawing import charts
 from service.drawing.charts import HeatMap, History, Scale
 from service.drawing.pictures import mirror_heights
-from service.store import decisions
-from service.store.tables import DecisionRow, HeliostatRow, MeasurementRow, SurfaceRow
+from service.store import decisions, mounts
+from service.store.tables import DecisionRow, HeliostatRow, MeasurementRow, MountRow, SurfaceRow
 from service.twin.accuracy import RECENT, Compared, Comparison, ComparisonBook, rank_of
 from service.twin.field import Figures, figures_of
 from service.web.answers.pages import render
@@ -148,6 +149,25 @@ def _surface_context(surface: SurfaceRow, size: tuple[float, float]) -> dict[str
     }
 
 
+# Newest spots that the pointing error of today is the median of.
+_NEWEST_SPOTS = 8
+
+
+def _pointing(mount: MountRow) -> dict[str, Any]:
+    """What the page says of a mount: its newest errors, what its drives did, and what contradicts it."""
+    history = mount.document["history"]
+    left = 1e3 * np.linalg.norm(np.array(history["residuals"]).reshape(-1, 2), axis=-1)
+    newest = np.delete(left, history["foreign"])[-_NEWEST_SPOTS:]
+    return {
+        "newest_mrad": float(np.median(newest)) if newest.size else None,
+        "steps": [
+            step | {"from": datetime.fromisoformat(step["from"]), "to": datetime.fromisoformat(step["to"])}
+            for step in reversed(mount.document["steps"])
+        ],
+        **{name: mount.document[name] for name in ("drift", "outliers", "measurements", "residual_mrad")},
+    }
+
+
 def _size(row: HeliostatRow) -> tuple[float, float]:
     return float(row.properties["width"]), float(row.properties["height"])
 
@@ -162,6 +182,7 @@ class _Read:
     surfaces: list[SurfaceRow]
     decided: Sequence[DecisionRow]
     photographs: Sequence[MeasurementRow]
+    mount: MountRow | None
     compared: Compared
 
 
@@ -178,11 +199,11 @@ def _read(
         surface = today if version is None else store.get_surface(session, row, version)
         surfaces = _newest_surfaces(session, row)
         decided = decisions.list_decisions(session, row, _MOST_DECISIONS)
-        photographs = _newest_photographs(session, row)
+        photographs, mount = _newest_photographs(session, row), mounts.find_mount_at(session, row)
         shown = book.read(session, row, surface)
     # The rest of the page does not depend on them.
     compared = Compared() if shown is None else book.wait_for(shown) or _UNDER_WAY
-    return _Read(row, today, surface, surfaces, decided, photographs, compared)
+    return _Read(row, today, surface, surfaces, decided, photographs, mount, compared)
 
 
 @router.get("/heliostats/{name}")
@@ -205,5 +226,7 @@ def get_heliostat_page(request: Request, read: Annotated[_Read, Depends(_read)],
         photographs=read.photographs,
         rank=rank_of(comparisons),
         accuracy_seen=fmean(seen) if (seen := [c.accuracy for c in comparisons if c.was_used]) else None,
+        mount=read.mount,
+        pointing=None if read.mount is None else _pointing(read.mount),
         **(_surface_context(read.surface, _size(read.row)) if read.surface is not None else {}),
     )

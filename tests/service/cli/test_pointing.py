@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from model.errors import InvalidInputError, ModelError
 from service.cli.folder_pointing import calibrate_folder, spot_folder
+from service.cli.main import app
 from service.sources.folder import read_folder
 from tests.benchmarks import data_folder
-from tests.service.cli.test_folder_verbs import heliotwin
 from tests.service.conftest import properties_document, tower_document
 from tests.service.spots import photographs
 
@@ -117,15 +118,18 @@ def test_files_that_are_no_mounts_are_refused(folder: Path, tmp_path: Path):
         calibrate_folder(read_folder(folder), tmp_path / "mounts.json")
 
 
-def test_the_command_prints_tables(folder: Path, tmp_path: Path):
-    mounts = tmp_path / "mounts.json"
-    done = heliotwin("calibrate", folder, "--out", mounts)
-    assert done.returncode == 0, done.stderr
+def test_the_verbs_print_tables_and_name_bad_files(folder: Path, tmp_path: Path):
+    mounts, spots = tmp_path / "mounts.json", tmp_path / "spots.json"
+    done = CliRunner().invoke(app, ["calibrate", str(folder), "--out", str(mounts)])
+    assert done.exit_code == 0, done.output
     assert "AA39" in done.stdout
-    assert "skipped AA39/204" in done.stderr
-    missing = heliotwin("spot", folder, "--mounts", tmp_path / "none.json", "--out", tmp_path / "spots.json")
-    assert missing.returncode == 2
-    assert "no such file" in missing.stderr
+    report = CliRunner().invoke(app, ["spot", str(folder), "--mounts", str(mounts), "--out", str(spots), "--json"])
+    assert json.loads(report.stdout)["spots"] == json.loads(spots.read_text())["spots"]
+    missing = CliRunner().invoke(app, ["spot", str(folder), "--mounts", str(tmp_path / "none"), "--out", str(spots)])
+    assert isinstance(missing.exception, InvalidInputError)
+    assert "no such file" in str(missing.exception)
+    onto = CliRunner().invoke(app, ["calibrate", str(folder), "--out", str(tmp_path)])
+    assert "is a folder" in str(onto.exception)
 
 
 def test_real_heliostats_are_forecast_to_a_milliradian(tmp_path: Path):

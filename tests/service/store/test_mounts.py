@@ -12,8 +12,8 @@ from service.store.database import Database
 from tests.service.conftest import ORIGIN
 
 
-def document(valid_from: str) -> dict[str, Any]:
-    return {"valid_from": valid_from, "measurements": 3, "residual_mrad": {"median": 0.2}}
+def document(valid_from: str, measurements: int = 3) -> dict[str, Any]:
+    return {"valid_from": valid_from, "measurements": measurements}
 
 
 def test_mounts_are_found_by_the_time_they_are_valid(database: Database):
@@ -35,3 +35,18 @@ def test_mounts_are_found_by_the_time_they_are_valid(database: Database):
         assert [heliostat.name for heliostat, _ in mounts.current_mounts(session, ["AB01"])] == ["AB01"]
         with pytest.raises(NotFoundError, match="no calibrated mount"):
             mounts.get_mount_at(session, row, datetime(2024, 4, 1, tzinfo=UTC))
+
+
+def test_the_same_state_calibrated_again_is_no_new_version(database: Database):
+    with database.writing() as session:
+        store.put_plant(session, "P", ORIGIN)
+        heliostat, _ = store.put_heliostat(session, "AA39", {}, (0.0, 1.0, 2.0))
+        mounts.add_mount(session, heliostat, document("2024-05-01T00:00:00+00:00"))
+    with database.writing() as session:
+        heliostat = store.get_heliostat(session, "AA39")
+        again = mounts.add_mount(session, heliostat, document("2024-05-01T00:00:00+00:00", measurements=4))
+        assert again.version == 1
+    with database.reading() as session:
+        (row,) = mounts.list_mounts(session, store.get_heliostat(session, "AA39"), 10)
+        assert row.document["measurements"] == 4
+        assert row.created_at > row.valid_from
