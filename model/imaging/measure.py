@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from model.errors import ImageRefusedError, InvalidInputError
 from model.images import FLUX_WINDOW, normalized
 from model.imaging.light import Camera
-from model.imaging.quality import SATURATED_GRAY, Quality, judge, judge_flux, refused
+from model.imaging.quality import Quality, ceiling, judge, judge_flux, refused
 from model.imaging.rectify import BRACKETS, CROP_SIZE, Layout, check_corners, find_corners, rectify
 from model.imaging.separate import find_spots, separate
 from model.imaging.window import center_of_mass, flux_window
@@ -180,11 +180,12 @@ def _measure_crop(
     if not parts.flux.any():
         return MeasuredFlux(refused("no_spot"), crop=crop, corners=corners)
     center, centered, outside = _centered(parts.flux, (plane.width, plane.height))
-    clipped = brightest >= SATURATED_GRAY
-    quality = judge(parts, crop >= SATURATED_GRAY, clipped, outside)
+    clipped = brightest >= ceiling(brightest)
+    quality = judge(parts, crop >= ceiling(crop), clipped, outside)
     if not quality.accepted:
         return MeasuredFlux(quality, crop=crop, corners=corners)
-    clipped &= parts.main
+    # The flux was smoothed: what lies beside the plateau lost light to it.
+    clipped = cv2.dilate(clipped.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool) & parts.main
     return MeasuredFlux(
         quality,
         _normalised(parts.flux),

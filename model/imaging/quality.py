@@ -8,6 +8,9 @@ from numpy.typing import NDArray
 from model.imaging.separate import Separation
 
 SATURATED_GRAY = 250
+_LOWEST_CEILING = 240  # a frame that was averaged or scaled after it was taken has its largest count below 255
+_PILE = 6.0  # pixels at three counts from a ceiling on over those at a count below it
+_LEAST_PILE = 1.2e-4  # share of the image that a count below it holds at least, for chance makes piles of a few
 # Of what was cut off only the rim is known, and that there was at least so much light: a spot that is mostly rim tells
 # nothing. On real photographs the accuracy of forecasts falls slowly up to there.
 _LIMIT_SATURATED = 0.6
@@ -26,6 +29,20 @@ _REMEDY = {
     "cut": "the spot runs over the target's edge; aim the heliostat at the target's centre",
     "second_spot": "another spot is about as strong, so it is unknown which is meant; clear the target of others",
 }
+
+
+def ceiling(counts: NDArray[np.uint8]) -> int:
+    """The count of an image (rows, columns) from which on the camera's range has cut the light off.
+
+    Pixels pile up there: frames that were averaged or scaled after they were taken have their plateau below 255, real
+    ones at 245 to 253. `SATURATED_GRAY` where there is no such pile below it.
+    """
+    pixels = np.bincount(counts.ravel(), minlength=256)
+    for level in range(_LOWEST_CEILING, SATURATED_GRAY + 2):
+        below = max(float(pixels[level - 12 : level - 2].mean()), _LEAST_PILE * counts.size)
+        if pixels[level : level + 3].sum() > _PILE * below and pixels[level] > 1.5 * below:
+            return level - 2  # interpolation has spread the plateau's edge
+    return SATURATED_GRAY
 
 
 @dataclass(frozen=True)
