@@ -5,14 +5,18 @@ from dataclasses import dataclass
 
 from sqlalchemy.orm import Session
 
-from model.observation import SurfacePrediction
+from model.observation import Observation, SurfacePrediction
 from service import store
 from service.base.choices import Method
 from service.store import NewSurface, audit
 from service.store.keys import RESERVED
-from service.store.tables import SurfaceRow
-from service.twin.evidence import Twin, choose_measurements, evidence_of, load_twin, named_measurements
-from service.twin.runtime import Runtime
+from service.store.tables import MeasurementRow, SurfaceRow
+from service.twin.consensus import agreeing
+from service.twin.evidence import Twin, choose, choose_measurements, evidence_of, load_twin, named_measurements
+from service.twin.runtime import Operations, Runtime
+
+# Candidates for each image that is wanted: some may contradict the others.
+_SPARE = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,11 +47,15 @@ def compute_surface(
     """
     with runtime.database.reading() as session:
         twin = load_twin(session, heliostat, model_version)
-        if measurements is None:
-            measurements = [row.identifier for row in choose_measurements(session, twin.row, images)]
-        chosen = named_measurements(session, twin.row, measurements)
-    observations = [evidence_of(row, twin.origin).observation() for row in chosen]
+        names = measurements
+        if names is None:
+            names = [row.identifier for row in choose_measurements(session, twin.row, images, spare=_SPARE)]
+        rows = named_measurements(session, twin.row, names)
     with runtime.computing(f"predict_{method}") as operations:
+        if measurements is None:
+            observations = _chosen(operations, twin, rows, images)
+        else:
+            observations = [evidence_of(row, twin.origin).observation() for row in rows]
         surface = operations.predict(
             twin.heliostat,
             observations,
@@ -57,6 +65,15 @@ def compute_surface(
             latitude_deg=twin.origin[0],
         )
     return Predicted(twin, method, surface)
+
+
+def _chosen(operations: Operations, twin: Twin, rows: Sequence[MeasurementRow], images: int) -> list[Observation]:
+    """Up to ``images`` of what the candidates show, without those that contradict the others."""
+    in_time = sorted(rows, key=lambda row: row.taken_at or row.created_at)
+    observations = [evidence_of(row, twin.origin).observation() for row in in_time]
+    model = twin.model.optics, twin.model.effects
+    kept, _ = agreeing(operations, twin.heliostat, observations, *model, latitude_deg=twin.origin[0])
+    return choose(kept[::-1], images)
 
 
 def keep_surface(session: Session, predicted: Predicted, actor: str) -> SurfaceRow:
