@@ -137,3 +137,15 @@ def test_a_plateau_below_the_largest_count_is_the_cameras_range_too(plane):
 def test_a_bright_peak_without_a_plateau_is_no_ceiling(plane):
     peak = Srgb().counts(0.26 + 0.7 * gaussian(plane, 0.0, 0.0, 0.6, 0.5))
     assert ceiling(np.round(248 / peak.max() * peak).astype(np.uint8)) == SATURATED_GRAY
+
+
+def test_a_difference_of_counts_tells_by_its_plateau_where_the_camera_was_cut_off(plane):
+    spot = gaussian(plane, 0.0, 0.0, 0.6, 0.5)
+    ambient = float(Srgb().counts(0.25))
+    counts = np.round(246 * (Srgb().counts(np.minimum(0.25 + 1.2 * spot, 1)) - ambient) / (1 - ambient))
+    counts[0, 0] = 255  # a single pixel to which the image was stretched
+    taken = measure(counts.astype(np.uint8), "flux", plane, camera=Camera(Srgb(), ambient))
+    assert taken.clipped.any()
+    seen = clipped_alike(spot, taken.flux.astype(float), taken.clipped.astype(float))
+    assert accuracy(taken.flux, spot) < 0.95 < accuracy(taken.flux, seen)
+    assert measure(counts.astype(np.uint8), "flux", plane).clipped is None
