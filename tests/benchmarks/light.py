@@ -19,7 +19,7 @@ through the camera's law, with each one's ambient light by all others and by its
 import argparse
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
@@ -148,8 +148,11 @@ def table(cases: list[Case]) -> None:
     print(f"below 0.85 in light: {low}")
 
 
-def left_out(cases: list[Case]) -> None:
-    """Accuracies in light with what other photographs tell of lens and sky; intervals by days."""
+def left_out(cases: list[Case], apart: Collection[str]) -> None:
+    """Accuracies in light with what other photographs tell of lens and sky; intervals by days.
+
+    Then the same without those ``apart``, which contradict the others: no measured surface has told that.
+    """
     used = [case for case in cases if case.measured["light"].flux is not None]
     known = {
         (case.name, ratio, blur): case.accuracy("light", ratio, blur)
@@ -180,21 +183,27 @@ def left_out(cases: list[Case]) -> None:
     }
     print("| known from photographs that are not judged | mean (95 % by days) | median | by target |")
     print("| --- | --- | --- | --- |")
+    for label, found in rows.items():
+        _print_row(label, used, found)
+    agreed = [case for case in used if case.name not in apart]
+    for label, found in rows.items():
+        _print_row(f"{label}; the {len(agreed)} that agree", agreed, found)
+    print(f"blur by target [m]: { {case.plane.name: lenses[case.name] for case in used} }")
+
+
+def _print_row(label: str, cases: list[Case], found: dict[str, float]) -> None:
+    """Mean and median of photographs, and of those on each target."""
+    days = sorted({case.day for case in cases})
+    of_day = {day: [found[case.name] for case in cases if case.day == day] for day in days}
     rng = np.random.default_rng(0)
     draws = [rng.choice(days, len(days)) for _ in range(1000)]
-    for label, found in rows.items():
-        of_day = {day: [found[case.name] for case in used if case.day == day] for day in days}
-        low, high = np.percentile([np.mean([a for day in draw for a in of_day[day]]) for draw in draws], [2.5, 97.5])
-        values = np.array(list(found.values()))
-        by_target = {}
-        for name in sorted({case.plane.name for case in used}):
-            some = [found[case.name] for case in used if case.plane.name == name]
-            by_target[name] = f"{name} {np.mean(some):.3f}/{np.median(some):.3f}"
-        figures = (
-            f"{values.mean():.3f} ({low:.3f} to {high:.3f}) | {np.median(values):.3f} | {', '.join(by_target.values())}"
-        )
-        print(f"| {label} | {figures} |")
-    print(f"blur by target [m]: { {case.plane.name: lenses[case.name] for case in used} }")
+    low, high = np.percentile([np.mean([a for day in draw for a in of_day[day]]) for draw in draws], [2.5, 97.5])
+    by_target: dict[str, list[float]] = {}
+    for case in sorted(cases, key=lambda case: case.plane.name):
+        by_target.setdefault(case.plane.name, []).append(found[case.name])
+    values = [found[case.name] for case in cases]
+    targets = ", ".join(f"{name} {np.mean(some):.3f}/{np.median(some):.3f}" for name, some in by_target.items())
+    print(f"| {label} | {np.mean(values):.3f} ({low:.3f} to {high:.3f}) | {np.median(values):.3f} | {targets} |")
 
 
 def consensus(folder: MeasurementFolder, heliostat: str) -> None:
@@ -364,7 +373,10 @@ def main(arguments: list[str]) -> None:
         return
     cases = read_cases(folder, "AA39")
     table(cases)
-    left_out(cases)
+    model = folder.optics, folder.effects
+    mirror, usable = folder.plant.heliostats["AA39"], observations_of(folder, "AA39")[0]
+    _, apart = agreeing(compute, mirror, usable, *model, latitude_deg=float(folder.plant.origin[0]))
+    left_out(cases, apart)
     shadows(folder, "AA39", cases)
     draw(cases, options.out / "light.png")
     draw_pictures(cases, options.out / "light-pictures.png")
