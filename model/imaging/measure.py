@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from model.errors import ImageRefusedError, InvalidInputError
 from model.images import FLUX_WINDOW, normalized
 from model.imaging.light import Camera
-from model.imaging.quality import SATURATED_GRAY, Quality, judge, judge_flux, refused
+from model.imaging.quality import SATURATED_GRAY, Quality, ceiling, judge, judge_flux, refused
 from model.imaging.rectify import BRACKETS, CROP_SIZE, Layout, check_corners, find_corners, rectify
 from model.imaging.separate import find_spots, separate
 from model.imaging.window import center_of_mass, flux_window
@@ -19,6 +19,9 @@ from model.plant import TargetPlane
 
 ImageKind = Literal["raw", "cropped", "flux", "flux-centered"]
 Image = NDArray[np.uint8] | NDArray[np.uint16]
+
+# Below it the counts of a photograph of 16 bits are those of a camera of 12 bits or less, not scaled.
+_FULL_RANGE = 4096
 Counts = TypeVar("Counts", np.uint8, np.float32)
 
 
@@ -111,7 +114,7 @@ def measure(
             raise InvalidInputError(f"side of a centred flux must be positive metres, got {side}")
         return _measure_centered(_spot_light(image, camera), side)
     if kind == "flux":
-        return _measure_flux(_spot_light(image, camera), plane)
+        return _measure_flux(_spot_light(image, camera), plane, _plateau(image, camera))
     camera = camera or Camera()
     dark = None if empty is None else _square(_light(empty, camera))
     light, crop, brightest = _light(image, camera), _gray(image), _brightest(image)
@@ -132,6 +135,12 @@ def _check(image: Image, kind: str) -> None:
         raise InvalidInputError(
             f"image must be uint8 or uint16, (rows, columns) or (rows, columns, 3), at least 16 pixels wide and high; "
             f"got {image.dtype} {image.shape}"
+        )
+    brightest = int(image.max())
+    if image.dtype == np.uint16 and kind in ("raw", "cropped") and 0 < brightest < _FULL_RANGE:
+        raise InvalidInputError(
+            f"image: a photograph of 16 bits with no count above {brightest} holds {brightest.bit_length()} bits; "
+            "scale its counts to 16 bits, so that it can be told where the camera's range cut the light off"
         )
 
 
@@ -180,11 +189,12 @@ def _measure_crop(
     if not parts.flux.any():
         return MeasuredFlux(refused("no_spot"), crop=crop, corners=corners)
     center, centered, outside = _centered(parts.flux, (plane.width, plane.height))
-    clipped = brightest >= SATURATED_GRAY
-    quality = judge(parts, crop >= SATURATED_GRAY, clipped, outside)
+    clipped = brightest >= ceiling(brightest)
+    quality = judge(parts, crop >= ceiling(crop), clipped, outside)
     if not quality.accepted:
         return MeasuredFlux(quality, crop=crop, corners=corners)
-    clipped &= parts.main
+    # The flux was smoothed: what lies beside the plateau lost light to it.
+    clipped = cv2.dilate(clipped.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool) & parts.main
     return MeasuredFlux(
         quality,
         _normalised(parts.flux),
@@ -196,7 +206,20 @@ def _measure_crop(
     )
 
 
-def _measure_flux(image: NDArray[np.float32], plane: TargetPlane) -> MeasuredFlux:
+def _plateau(image: Image, camera: Camera | None) -> NDArray[np.bool_] | None:
+    """Where the camera's range had cut off the light of an image whose background was taken off, if it did.
+
+    Such an image is stretched; only a pile of pixels below its top tells where the camera's range ended.
+    """
+    if camera is None or image.dtype != np.uint8:
+        return None
+    gray = _square(_gray(image))
+    return gray >= ceiling(gray) if ceiling(gray) < SATURATED_GRAY else None
+
+
+def _measure_flux(
+    image: NDArray[np.float32], plane: TargetPlane, clipped: NDArray[np.bool_] | None = None
+) -> MeasuredFlux:
     size = plane.width, plane.height
     # Area weights keep the energy whatever the image's size.
     flux = flux_window(image.astype(np.float64), size, window=size, resolution=CROP_SIZE)
@@ -208,7 +231,7 @@ def _measure_flux(image: NDArray[np.float32], plane: TargetPlane) -> MeasuredFlu
     quality = judge_flux(flux, main, outside, second)
     if not quality.accepted:
         return MeasuredFlux(quality)
-    return MeasuredFlux(quality, _normalised(flux), centered, center)
+    return MeasuredFlux(quality, _normalised(flux), centered, center, clipped=clipped)
 
 
 def _measure_centered(image: NDArray[np.float32], side: float) -> MeasuredFlux:

@@ -33,6 +33,7 @@ from service.sources.documents import IMAGE_KINDS, Measurement, optics_to_json
 from service.sources.files import require_regular
 from service.sources.folder import MeasurementFolder, measured_heights, read_surface
 from service.twin import compute
+from service.twin.consensus import agreeing
 from service.twin.evidence import Evidence, choose
 
 Array = NDArray[np.float64]
@@ -190,19 +191,14 @@ def predict_heliostat(
     if not usable:
         reason = f"every image was refused: {next(iter(refused.values()))}" if refused else "no image"
         raise InvalidInputError(reason)
-    predicted = compute.predict(
-        heliostat,
-        choose(usable, images),
-        method,
-        folder.optics,
-        folder.effects,
-        latitude_deg=float(folder.plant.origin[0]),
-    )
+    model, latitude_deg = (folder.optics, folder.effects), float(folder.plant.origin[0])
+    kept, apart = agreeing(compute, heliostat, usable, *model, latitude_deg=latitude_deg)
+    predicted = compute.predict(heliostat, choose(kept, images), method, *model, latitude_deg=latitude_deg)
     entry: dict[str, Any] = {
         "method": method,
         "weights": predicted.weights,
         "images": list(predicted.used),
-        "refused": refused,
+        "refused": refused | apart,
         "misfit": round(predicted.misfit, 4),
         "trusted": predicted.trusted,
         "strangeness": round(predicted.mahalanobis, 3),

@@ -200,8 +200,9 @@ def choose_measurements(
     count: int,
     since: datetime | None = None,
     until: datetime | None = None,
+    spare: int = 1,
 ) -> list[MeasurementRow]:
-    """Up to ``count`` accepted measurements of a time: recent, and with the sun at different places.
+    """Up to ``count`` accepted measurements of a time, ``spare`` times as many: recent, the sun at different places.
 
     Raises
     ------
@@ -215,7 +216,7 @@ def choose_measurements(
         raise ConflictError(f"heliostat {heliostat.name} has no accepted measurement; post target images of it first")
     return choose(
         recent,
-        count,
+        spare * count,
         lambda row: sun_direction(row.sun_azimuth_deg, row.sun_elevation_deg),
         lambda row: float(row.quality.get("clipped_share") or 0),
     )

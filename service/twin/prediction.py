@@ -7,16 +7,20 @@ import numpy as np
 from sqlalchemy.orm import Session
 
 from model.frames import sun_direction
-from model.observation import TRUSTED_MAHALANOBIS, SurfacePrediction
+from model.observation import TRUSTED_MAHALANOBIS, Observation, SurfacePrediction
 from service import store
 from service.base.choices import Method
 from service.store import audit, decisions
 from service.store.decisions import Grounds
 from service.store.keys import RESERVED
 from service.store.tables import DecisionRow, MeasurementRow, SurfaceRow
-from service.twin.evidence import Twin, choose_measurements, evidence_of, load_twin, named_measurements
+from service.twin.consensus import agreeing
+from service.twin.evidence import Twin, choose, choose_measurements, evidence_of, load_twin, named_measurements
 from service.twin.judging import Judgement, judge_surface
-from service.twin.runtime import Runtime
+from service.twin.runtime import Operations, Runtime
+
+# Candidates for each image that is wanted: some may contradict the others.
+_SPARE = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,11 +56,16 @@ def compute_surface(
     """
     with runtime.database.reading() as session:
         twin = load_twin(session, heliostat, model_version)
-        if measurements is None:
-            measurements = [row.identifier for row in choose_measurements(session, twin.row, images)]
-        chosen, today = named_measurements(session, twin.row, measurements), store.find_surface_at(session, twin.row)
-    observations = [evidence_of(row, twin.origin).observation() for row in chosen]
+        names = measurements
+        if names is None:
+            names = [row.identifier for row in choose_measurements(session, twin.row, images, spare=_SPARE)]
+        rows = named_measurements(session, twin.row, names)
+        today = store.find_surface_at(session, twin.row)
     with runtime.computing(f"predict_{method}") as operations:
+        if measurements is None:
+            observations = _chosen(operations, twin, rows, images)
+        else:
+            observations = [evidence_of(row, twin.origin).observation() for row in rows]
         surface = operations.predict(
             twin.heliostat,
             observations,
@@ -65,12 +74,21 @@ def compute_surface(
             twin.model.effects,
             latitude_deg=twin.origin[0],
         )
-    new = _new_surface(twin, method, surface, chosen)
+    new = _new_surface(twin, method, surface, rows)
     with runtime.database.reading() as session:
         known = store.find_alike(session, twin.row, new)
     if known is not None or today is None or (new.valid_from is not None and new.valid_from < today.valid_from):
         return Predicted(twin, new, known)
     return Predicted(twin, new, None, judge_surface(runtime, twin, today, surface.z, new.measurements))
+
+
+def _chosen(operations: Operations, twin: Twin, rows: Sequence[MeasurementRow], images: int) -> list[Observation]:
+    """Up to ``images`` of what the candidates show, without those that contradict the others."""
+    in_time = sorted(rows, key=lambda row: row.taken_at or row.created_at)
+    observations = [evidence_of(row, twin.origin).observation() for row in in_time]
+    model = twin.model.optics, twin.model.effects
+    kept, _ = agreeing(operations, twin.heliostat, observations, *model, latitude_deg=twin.origin[0])
+    return choose(kept[::-1], images)
 
 
 def _new_surface(

@@ -3,44 +3,62 @@
 Every crop of AA39 in ``../shared/stj-years`` is measured twice, its values taken for light (linear) and turned into
 light (sRGB), and held against the forecast by the measured surface, without any fitted number: Buie's sun with 0.02, a
 window of 4 m. Of each photograph it also tells which circumsolar ratio suits it best, which the photograph itself has
-chosen. Prints means and medians, and draws accuracy by date and brightness against forecast.
+chosen. Prints means and medians, and draws accuracy by date, brightness against forecast, and the pictures themselves.
+
+What the other days and the day's other photographs tell of lens and sky is judged on photographs that told nothing of
+it: the blur of each target's camera by the other half of the days, the circumsolar ratio by the others of the same day.
 
 Of the photographs under low suns it asks whether neighbours shaded the mirror: all within 40 m
 (``field-positions.json``) are taken for mirrors like this one that send the sun to the receiver, which nobody recorded.
+
+``--consensus`` tells instead which photographs contradict the others, without a measured surface, and what surfaces
+gain by leaving them out; ``--differences`` compares the differences of counts that PAINT publishes (``../shared/stj``)
+through the camera's law, with each one's ambient light by all others and by itself.
 """
 
 import argparse
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+import cv2
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from model.forecast import Setup, View, align
-from model.images import clipped_alike
-from model.imaging import Camera, MeasuredFlux, measure
+from model.images import clipped_alike, normalized
+from model.imaging import Camera, MeasuredFlux, center_of_mass, flux_window, measure
 from model.imaging.light import LINEAR
 from model.metrics import compare_on_target
 from model.neighbours import Neighbours, outlines
+from model.network.architecture import MAX_IMAGES
+from model.observation import misfits
+from model.plant import TargetPlane
 from model.sunshape import Buie
 from model.tracing import Optics, Scene, Window, trace
 from model.tracing.alignment import align_scene
 from model.tracing.convolution import central_rays
+from service.base.choices import Method
+from service.cli.folder import observations_of, surface_errors
 from service.sources.decode import decode_image
 from service.sources.documents import Measurement
-from service.sources.folder import MeasurementFolder, read_folder
+from service.sources.folder import MeasurementFolder, measured_heights, read_folder
+from service.twin import compute
+from service.twin.consensus import agreeing
+from service.twin.evidence import choose
 from tests.benchmarks import data_folder
 
 Array = NDArray[np.float64]
 
 RATIOS = (0.005, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4)
+BLURS = (0.0, 0.03, 0.06, 0.09, 0.12)
+AMBIENTS = (0.40, 0.44, 0.48, 0.53, 0.58, 0.62, 0.66)
 CAMERAS = {"counts": Camera(LINEAR), "light": Camera()}
 VIEW = View(256, 256, samples=24, padding=0.5, cones="facet")
 
@@ -50,20 +68,37 @@ class Case:
     """A photograph: what was measured by each camera's law, and forecasts (256, 256) by circumsolar ratio."""
 
     name: str
-    target: tuple[float, float]
+    plane: TargetPlane
     taken_at: datetime | None
     measured: dict[str, MeasuredFlux]
     forecasts: dict[float, Array]
 
-    def accuracy(self, law: str, ratio: float) -> float:
+    @property
+    def target(self) -> tuple[float, float]:
+        """Width and height [m]."""
+        return self.plane.width, self.plane.height
+
+    @property
+    def day(self) -> str:
+        """Of unknown times: the name, for nothing is known of the same day."""
+        return self.name if self.taken_at is None else self.taken_at.date().isoformat()
+
+    def shown(self, law: str, ratio: float, blur_m: float = 0.0) -> Array:
+        """The forecast, blurred by a lens, as far as the camera's range shows it."""
+        forecast, taken = self.forecasts[ratio], self.measured[law]
+        if blur_m > 0:
+            sigmas = (blur_m * pixels / side for pixels, side in zip(forecast.shape[::-1], self.target, strict=True))
+            forecast = np.asarray(cv2.GaussianBlur(forecast, (0, 0), *sigmas), dtype=np.float64)
+        if taken.clipped is None or taken.flux is None:
+            return forecast
+        return clipped_alike(forecast, taken.flux.astype(float), taken.clipped.astype(float))
+
+    def accuracy(self, law: str, ratio: float, blur_m: float = 0.0) -> float:
         """NaN where the photograph is refused."""
-        taken = self.measured[law]
-        if taken.flux is None:
+        flux = self.measured[law].flux
+        if flux is None:
             return float("nan")
-        flux, forecast = taken.flux.astype(float), self.forecasts[ratio]
-        if taken.clipped is not None:
-            forecast = clipped_alike(forecast, flux, taken.clipped.astype(float))
-        return compare_on_target(flux, forecast, self.target).accuracy
+        return compare_on_target(flux, self.shown(law, ratio, blur_m), self.target).accuracy
 
     def best(self, law: str) -> float:
         """Circumsolar ratio that suits it best."""
@@ -79,13 +114,21 @@ def read_cases(folder: MeasurementFolder, heliostat: str) -> list[Case]:
 
 def _case(folder: MeasurementFolder, one: Measurement, points: Array, degree: int) -> Case:
     plane = folder.plant.targets[one.target]
-    setup = Setup(folder.plant.heliostats[one.heliostat], points, one.sun, plane, spot=one.spot, degree=degree)
+    forecasts = _forecasts(folder, one, points, degree)
     image = decode_image(one.images["cropped"].read_bytes())
     measured = {law: measure(image, "cropped", plane, camera=camera) for law, camera in CAMERAS.items()}
+    return Case(one.identifier, plane, one.taken_at, measured, forecasts)
+
+
+def _forecasts(
+    folder: MeasurementFolder, one: Measurement, points: Array, degree: int, ratios: tuple[float, ...] = RATIOS
+) -> dict[float, Array]:
+    """Light (256, 256) over the whole target by circumsolar ratio."""
+    mirror, plane = folder.plant.heliostats[one.heliostat], folder.plant.targets[one.target]
+    setup = Setup(mirror, points, one.sun, plane, spot=one.spot, degree=degree)
     with torch.no_grad():
         aligned = align([setup], latitude_deg=float(folder.plant.origin[0]), dtype=torch.float64)
-        forecasts = {ratio: aligned.flux(Optics(Buie(ratio)), (), VIEW)[0].clamp(min=0).numpy() for ratio in RATIOS}
-    return Case(one.identifier, (plane.width, plane.height), one.taken_at, measured, forecasts)
+        return {ratio: aligned.flux(Optics(Buie(ratio)), (), VIEW)[0].clamp(min=0).numpy() for ratio in ratios}
 
 
 def table(cases: list[Case]) -> None:
@@ -105,6 +148,126 @@ def table(cases: list[Case]) -> None:
     print(f"below 0.85 in light: {low}")
 
 
+def left_out(cases: list[Case], apart: Collection[str]) -> None:
+    """Accuracies in light with what other photographs tell of lens and sky; intervals by days.
+
+    Then the same without those ``apart``, which contradict the others: no measured surface has told that.
+    """
+    used = [case for case in cases if case.measured["light"].flux is not None]
+    known = {
+        (case.name, ratio, blur): case.accuracy("light", ratio, blur)
+        for case in used
+        for ratio in RATIOS
+        for blur in BLURS
+    }
+    days = sorted({case.day for case in used})
+    half = {day: index % 2 for index, day in enumerate(days)}
+
+    def lens(case: Case) -> float:
+        others = [o for o in used if o.plane.name == case.plane.name and half[o.day] != half[case.day]]
+        return max(BLURS, key=lambda blur: np.median([known[o.name, 0.02, blur] for o in others]))
+
+    def sky(case: Case, blur: float) -> float:
+        others = [o for o in used if o.day == case.day and o is not case]
+        return max(RATIOS, key=lambda ratio: np.mean([known[o.name, ratio, blur] for o in others])) if others else 0.02
+
+    lenses = {case.name: lens(case) for case in used}
+    rows = {
+        "nothing": {case.name: known[case.name, 0.02, 0.0] for case in used},
+        "the camera's blur, by the other half of the days": {
+            case.name: known[case.name, 0.02, lenses[case.name]] for case in used
+        },
+        "and the sky, by the day's other photographs": {
+            case.name: known[case.name, sky(case, lenses[case.name]), lenses[case.name]] for case in used
+        },
+    }
+    print("| known from photographs that are not judged | mean (95 % by days) | median | by target |")
+    print("| --- | --- | --- | --- |")
+    for label, found in rows.items():
+        _print_row(label, used, found)
+    agreed = [case for case in used if case.name not in apart]
+    for label, found in rows.items():
+        _print_row(f"{label}; the {len(agreed)} that agree", agreed, found)
+    print(f"blur by target [m]: { {case.plane.name: lenses[case.name] for case in used} }")
+
+
+def _print_row(label: str, cases: list[Case], found: dict[str, float]) -> None:
+    """Mean and median of photographs, and of those on each target."""
+    days = sorted({case.day for case in cases})
+    of_day = {day: [found[case.name] for case in cases if case.day == day] for day in days}
+    rng = np.random.default_rng(0)
+    draws = [rng.choice(days, len(days)) for _ in range(1000)]
+    low, high = np.percentile([np.mean([a for day in draw for a in of_day[day]]) for draw in draws], [2.5, 97.5])
+    by_target: dict[str, list[float]] = {}
+    for case in sorted(cases, key=lambda case: case.plane.name):
+        by_target.setdefault(case.plane.name, []).append(found[case.name])
+    values = [found[case.name] for case in cases]
+    targets = ", ".join(f"{name} {np.mean(some):.3f}/{np.median(some):.3f}" for name, some in by_target.items())
+    print(f"| {label} | {np.mean(values):.3f} ({low:.3f} to {high:.3f}) | {np.median(values):.3f} | {targets} |")
+
+
+def consensus(folder: MeasurementFolder, heliostat: str) -> None:
+    """Which photographs contradict the others, and the surfaces from all and from the others."""
+    surface = folder.measured_surface(heliostat)
+    assert surface is not None
+    mirror, truth = folder.plant.heliostats[heliostat], measured_heights(folder.plant.heliostats[heliostat], surface)
+    model, latitude_deg = (folder.optics, folder.effects), float(folder.plant.origin[0])
+    usable, _ = observations_of(folder, heliostat)
+    kept, apart = agreeing(compute, mirror, usable, *model, latitude_deg=latitude_deg)
+    against = dict(
+        zip(
+            (o.identifier for o in usable),
+            misfits(mirror, usable, truth, *model, latitude_deg=latitude_deg),
+            strict=True,
+        )
+    )
+    print("| contradicts the others | accuracy of the forecast by the measured surface's 8 x 8 heights |")
+    print("| --- | --- |")
+    for name in apart:
+        print(f"| {name} | {1 - against[name]:.3f} |")
+    worst = sorted(against, key=lambda name: -against[name])[: len(apart)]
+    print(
+        f"of the {len(apart)} that the measured surface forecasts worst, {len(set(worst) & set(apart))} are among them"
+    )
+    print("| surface | from all [mm] | from those that agree [mm] |")
+    print("| --- | --- | --- |")
+    methods: tuple[Method, ...] = ("network", "refined")
+    for method in methods:
+        errors = []
+        for pool in (usable, kept):
+            found = compute.predict(mirror, choose(pool, MAX_IMAGES), method, *model, latitude_deg=latitude_deg)
+            errors.append(f"{surface_errors(found.z, truth)['mae_mm']:.3f}")
+        print(f"| {method} | {' | '.join(errors)} |")
+
+
+def differences() -> None:
+    """PAINT's differences of counts, through the law: as light, by a usual ambient, by all others', by their own."""
+    rows: dict[str, dict[float, float]] = {}
+    plain: dict[str, float] = {}
+    folder = read_folder(data_folder(), ["AA39", "AC43"])
+    for heliostat in folder.plant.heliostats:
+        surface = folder.measured_surface(heliostat)
+        assert surface is not None
+        for one in (m for m in folder.measurements(heliostat) if "flux" in m.images):
+            plane, image = folder.plant.targets[one.target], decode_image(one.images["flux"].read_bytes())
+            cameras = {ambient: Camera(ambient=ambient) for ambient in AMBIENTS}
+            taken = {str(a): measure(image, "flux", plane, camera=camera) for a, camera in cameras.items()}
+            taken["counts"] = measure(image, "flux", plane)
+            forecast = {0.02: _forecasts(folder, one, *surface, ratios=(0.02,))[0.02]}
+            case = Case(one.identifier, plane, one.taken_at, taken, forecast)
+            rows[one.key] = {ambient: case.accuracy(str(ambient), 0.02) for ambient in AMBIENTS}
+            plain[one.key] = case.accuracy("counts", 0.02)
+    print("| photograph | counts | ambient 0.53 | ambient by the others | its own ambient |")
+    print("| --- | --- | --- | --- | --- |")
+    table = []
+    for name, by_ambient in rows.items():
+        others = max(AMBIENTS, key=lambda a: np.mean([row[a] for key, row in rows.items() if key != name]))
+        own = max(AMBIENTS, key=lambda a: by_ambient[a])
+        table.append((plain[name], by_ambient[0.53], by_ambient[others], by_ambient[own]))
+        print(f"| {name} | {' | '.join(f'{value:.3f}' for value in table[-1])} ({own:.2f}) |")
+    print(f"| mean | {' | '.join(f'{value:.3f}' for value in np.mean(table, axis=0))} |")
+
+
 def shadows(folder: MeasurementFolder, heliostat: str, cases: list[Case]) -> None:
     """Accuracies of the photographs whose mirror neighbours would shade or block, without them and with them."""
     surface = folder.measured_surface(heliostat)
@@ -114,6 +277,7 @@ def shadows(folder: MeasurementFolder, heliostat: str, cases: list[Case]) -> Non
     places = {name: np.array(entry["position_enu"]) for name, entry in positions.items()}
     near = [replace(mirror, name=n, position=p) for n, p in places.items() if _is_near(p - mirror.position)]
     aims = np.tile(next(iter(folder.plant.receivers.values())).center, (len(near) + 1, 1))
+    gained: dict[str, float] = {}
     print("| photograph | sun's elevation [deg] | light that neighbours leave | accuracy without them | with them |")
     print("| --- | --- | --- | --- | --- |")
     for case, one in zip(cases, (m for m in folder.measurements(heliostat) if "cropped" in m.images), strict=True):
@@ -131,6 +295,10 @@ def shadows(folder: MeasurementFolder, heliostat: str, cases: list[Case]) -> Non
         with_them = replace(case, forecasts={0.02: image}).accuracy("light", 0.02)
         figures = f"{one.elevation_deg:.0f} | {left:.2f} | {case.accuracy('light', 0.02):.3f} | {with_them:.3f}"
         print(f"| {one.identifier} | {figures} |")
+        gained[case.name] = max(0.0, with_them - case.accuracy("light", 0.02))
+    plain = np.array([case.accuracy("light", 0.02) for case in cases if case.measured["light"].flux is not None])
+    mean = plain.mean() + sum(gained.values()) / len(plain)
+    print(f"mean of all {plain.mean():.3f}; {mean:.3f} where each says itself whether its neighbours stood so")
 
 
 def _is_near(apart: Array) -> bool:
@@ -163,19 +331,55 @@ def draw(cases: list[Case], path: Path) -> None:
     print(f"drawn: {path}")
 
 
+def draw_pictures(cases: list[Case], path: Path) -> None:
+    """Light, forecast and difference of the worst photographs and of a usual one of each target."""
+    used = sorted((c for c in cases if c.measured["light"].flux is not None), key=lambda c: c.accuracy("light", 0.02))
+    names = sorted({case.plane.name for case in used})
+    of_target = [[case for case in used if case.plane.name == name] for name in names]
+    shown = used[:10] + [some[len(some) // 2] for some in of_target]
+    figure, axes = plt.subplots(3, len(shown), figsize=(1.6 * len(shown), 5.4), layout="constrained")
+    for column, case in zip(axes.T, shown, strict=True):
+        flux = case.measured["light"].flux
+        assert flux is not None
+        images = (flux.astype(float), case.shown("light", 0.02))
+        seen, forecast = (normalized(flux_window(i, case.target, center_of_mass(i, case.target))) for i in images)
+        peak = seen.max()
+        for axis, image in zip(column, (seen, forecast), strict=False):
+            axis.imshow(image, vmin=0, vmax=peak)
+        column[2].imshow(seen - forecast, vmin=-0.3 * peak, vmax=0.3 * peak, cmap="RdBu")
+        column[0].set_title(f"{case.name}\n{case.accuracy('light', 0.02):.3f}", fontsize=9)
+    for axis in axes.flat:
+        axis.axis("off")
+    figure.savefig(path, dpi=90)
+    print(f"drawn: {path}")
+
+
 def main(arguments: list[str]) -> None:
     """Print the table and draw."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("out/light"))
+    parser.add_argument("--consensus", action="store_true", help="photographs that contradict the others")
+    parser.add_argument("--differences", action="store_true", help="PAINT's differences of counts, through the law")
     options = parser.parse_args(arguments)
     root = data_folder().parent / "stj-years"
     if not root.is_dir():
         parser.error(f"no photographs at {root}; set HELIOTWIN_STJ to its neighbour stj")
     folder = read_folder(root)
+    if options.differences:
+        differences()
+    if options.consensus:
+        consensus(folder, "AA39")
+    if options.differences or options.consensus:
+        return
     cases = read_cases(folder, "AA39")
     table(cases)
+    model = folder.optics, folder.effects
+    mirror, usable = folder.plant.heliostats["AA39"], observations_of(folder, "AA39")[0]
+    _, apart = agreeing(compute, mirror, usable, *model, latitude_deg=float(folder.plant.origin[0]))
+    left_out(cases, apart)
     shadows(folder, "AA39", cases)
     draw(cases, options.out / "light.png")
+    draw_pictures(cases, options.out / "light-pictures.png")
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ from model.errors import InvalidInputError
 from model.images import clipped_alike
 from model.imaging import Camera, center_of_mass, measure
 from model.imaging.light import LINEAR, Measured, Power, Srgb, camera_at, cameras_from_json
+from model.imaging.quality import SATURATED_GRAY, ceiling
 from model.metrics import flux_accuracy
 from service.cli.demo_camera import CameraOptions, photograph
 from tests.imaging import accuracy, gaussian
@@ -120,3 +121,31 @@ def test_cameras_are_declared():
 def test_a_camera_that_cannot_be_is_refused_by_name(camera, says):
     with pytest.raises(InvalidInputError, match=says):
         cameras_from_json([camera])
+
+
+def test_a_plateau_below_the_largest_count_is_the_cameras_range_too(plane):
+    """A frame that was scaled after it was taken: real ones pile up at 245 to 253."""
+    spot = gaussian(plane, 0.0, 0.0, 0.6, 0.5)
+    light = np.minimum(0.26 + 1.2 * spot, 1)
+    crop, scaled = (np.round(largest * Srgb().counts(light)).astype(np.uint8) for largest in (255, 247))
+    assert (ceiling(crop), ceiling(scaled)) == (SATURATED_GRAY, 245)
+    whole, taken = measure(crop, "cropped", plane), measure(scaled, "cropped", plane)
+    assert taken.quality.saturated_share == pytest.approx(whole.quality.saturated_share, abs=0.05)
+    assert taken.clipped.mean() == pytest.approx(whole.clipped.mean(), rel=0.1)
+
+
+def test_a_bright_peak_without_a_plateau_is_no_ceiling(plane):
+    peak = Srgb().counts(0.26 + 0.7 * gaussian(plane, 0.0, 0.0, 0.6, 0.5))
+    assert ceiling(np.round(248 / peak.max() * peak).astype(np.uint8)) == SATURATED_GRAY
+
+
+def test_a_difference_of_counts_tells_by_its_plateau_where_the_camera_was_cut_off(plane):
+    spot = gaussian(plane, 0.0, 0.0, 0.6, 0.5)
+    ambient = float(Srgb().counts(0.25))
+    counts = np.round(246 * (Srgb().counts(np.minimum(0.25 + 1.2 * spot, 1)) - ambient) / (1 - ambient))
+    counts[0, 0] = 255  # a single pixel to which the image was stretched
+    taken = measure(counts.astype(np.uint8), "flux", plane, camera=Camera(Srgb(), ambient))
+    assert taken.clipped.any()
+    seen = clipped_alike(spot, taken.flux.astype(float), taken.clipped.astype(float))
+    assert accuracy(taken.flux, spot) < 0.95 < accuracy(taken.flux, seen)
+    assert measure(counts.astype(np.uint8), "flux", plane).clipped is None

@@ -141,3 +141,12 @@ def test_black_images_are_refused_and_not_raised(plane, kind):
 def test_malformed_arguments_raise(plane, image, kind):
     with pytest.raises(InvalidInputError):
         measure(image, kind, plane)
+
+
+def test_a_photograph_whose_counts_do_not_fill_their_bits_is_one_clear_error(plane, spot):
+    """A camera of 12 bits whose counts were stored unscaled: nothing tells where its range ended."""
+    crop = np.round(4095 * (0.25 + 0.7 * spot)).astype(np.uint16)
+    with pytest.raises(InvalidInputError, match="holds 12 bits; scale its counts to 16 bits"):
+        measure(crop, "cropped", plane)
+    assert measure(16 * crop, "cropped", plane).quality.accepted
+    assert measure(np.round(4095 * spot).astype(np.uint16), "flux", plane).quality.accepted
