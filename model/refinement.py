@@ -1,31 +1,36 @@
 """Surface refinement: maximum a posteriori through the tracer.
 
 Heights are ``mean + basis @ c`` with standard normal coefficients c: a Gaussian prior estimated from measured mirrors.
-Levenberg-Marquardt steps bring the traced images to the measured ones; what a camera adds to an image (a shift, another
-exposure, background, a little blur, another response) enters as a few directions per image with priors of their own and
-is marginalised exactly. The curvature at the end gives the uncertainty.
+Levenberg-Marquardt steps bring the traced images to the measured ones; the curvature at the end gives the uncertainty.
 
-The Jacobian is taken by differences, one batched trace of all coefficients and images. That is most of the work, so a
-Jacobian serves many steps, and every step corrects it by what the images really did (Broyden 1965).
+Two things decide whether that ends where it should. Derivatives must be those of the images (`model.tracing.sensitivity`):
+light that moves with a facet's canting changes an image by one percent, and differences of coarse traces miss a third
+of it. And what is minimised must not change on the way: images are weighed by what was measured, not by what the
+surface of the moment makes of it. Then every start ends at the same surface, and one start is enough.
 
-Light from four facets lies in one spot, and facets can take each other's part: the posterior has several local
-optima. The optimisation starts from every guess there is, and the best local optimum is taken.
+What a camera adds to an image (a shift, another exposure, background, a little blur, another response) enters as a few
+directions per image with priors of their own and is marginalised exactly. All other errors, of the camera and of the
+model, grow with the flux and come in patches: they are taken for independent in the cosine transform of the image,
+with one variance for each band of spatial frequency, estimated from what is left of the images and by how much a
+surface was able to bend to them (MacKay 1992, doi:10.1162/neco.1992.4.3.415, eq. 4.9).
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.fft import dct
 
 from model.effects import Effect
 from model.errors import InvalidInputError
 from model.forecast import Aligned
 from model.images import COARSE_SIZE, FLUX_WINDOW, binned
-from model.least_squares import Descent, minimize
+from model.least_squares import Descent, Minimum, minimize
 from model.network.inputs import STEP_HEIGHT
-from model.observation import Observation, Ranges, SurfacePrediction, align_observations, misfits
+from model.observation import Observation, Ranges, SurfacePrediction, align_observations, misfits, spread_suns
 from model.plant import Heliostat
 from model.prior import SurfacePrior, default_prior
 from model.surface import control_points, require_own_grid
@@ -33,77 +38,97 @@ from model.tracing import Optics
 
 Array = NDArray[np.float64]
 
-BLOCK = 4
-"""Pixels along the side of the patches in which residuals of images err together."""
+BANDS = (3.0, 6.0, 10.0, 16.0, 24.0)
+"""Ends of the bands of spatial frequency [half cycles per window]; what is finer the sun has blurred."""
 
 DESCENT = Descent(
-    steps=16,
-    jacobians=1,
-    corrected=True,
-    damping=0.1,
-    raising=4.0,
-    least_damping=1e-4,
-    most_damping=100.0,
-    least_gain=0.5,
+    steps=12, jacobians=12, damping=0.03, easing=10.0, raising=6.0, least_damping=1e-6, patience=5, least_gain=0.5, least_share=1e-3
 )
-"""How the minimum of the negative log posterior is sought; a gain of half a unit is none."""
+"""How the minimum of the negative log posterior is sought; a gain of half a unit, or of a thousandth, is none."""
 
 
 @dataclass(frozen=True)
 class RefinementOptions:
     """How images are trusted.
 
-    ``noise`` is the least standard deviation of a pixel as a share of the image's peak; what the images then turn out
-    to err by, times ``noise_share``, is taken instead where it is more, in several ``rounds``. Errors of a model that
-    lacks something come in patches, in which pixels err together and must not be counted one by one: variance that
-    blocks of `BLOCK` pixels a side have beyond that of grain counts ``patches`` times. ``annealing`` are the noises to
-    begin with, stage by stage, with the ``leading`` directions of the prior: images that are trusted little at first
-    let the large features settle before the small ones are looked at. ``calibration`` is how many times the images'
-    variance is counted in the uncertainty: the curvature at one local optimum knows nothing of others nearby. It was
-    chosen so that 90 % intervals hold nine of ten heights of mirrors left out, in five folds.
+    Errors of a pixel have standard deviations relative to the image's peak, ``grain`` at least in each of `BANDS`, that
+    grow with the root of the flux from a share ``dark`` of the peak on. ``annealing`` are the errors to begin with,
+    stage by stage: images that are trusted little at first let the large features settle before the small ones are
+    looked at, by up to ``few`` of the images. Then they are estimated, in several ``rounds``, from all.
     ``shift_m``, ``exposure``, ``background`` [of the peak], ``blur_m`` and ``gamma`` are the standard deviations of the
-    nuisance parameters; pixels up to ``dark`` [of the peak] are lifted by noise that cannot go below black. Images are
-    compared at ``resolution`` pixels a side. Their changes may be traced more
-    coarsely than they themselves, which are few.
+    nuisance parameters; noise that cannot go below black lifts pixels up to ``black`` [of the peak]. Images are
+    compared at ``resolution`` pixels a side, traced with ``samples``.
     """
 
-    noise: float = 0.005
-    noise_share: float = 0.7
-    patches: float = 32.0
-    rounds: int = 4
-    annealing: tuple[float, ...] = (0.5, 0.1, 0.03)
-    leading: int = 60
-    steps: int = 16
-    calibration: float = 30.0
+    grain: float = 0.005
+    dark: float = 0.1
+    annealing: tuple[float, ...] = (0.1, 0.03)
+    rounds: int = 3
+    few: int = 8
+    steps: int = 12
     shift_m: float = 0.03
     exposure: float = 0.1
     background: float = 0.02
     blur_m: float = 0.05
     gamma: float = 0.1
-    dark: float = 0.01
+    black: float = 0.01
     resolution: int = COARSE_SIZE
     samples: int = 32
-    jacobian_samples: int = 12
 
 
 def _nuisance(image: Array, options: RefinementOptions) -> Array:
-    """Directions (n, 7) in which a camera may change an image, each as long as its standard deviation."""
+    """Directions (7, R, R) in which a camera may change an image, each as long as its standard deviation."""
     pixel = FLUX_WINDOW / image.shape[0]
     up, right = np.gradient(image, pixel)
     laplacian = np.gradient(up, pixel, axis=0) + np.gradient(right, pixel, axis=1)
     peak = image.max()
     relative = np.clip(image / peak, 1e-4, None)
-    directions = [
-        right * options.shift_m,
-        up * options.shift_m,
-        image * options.exposure,
-        np.full_like(image, peak * options.background),
-        laplacian * options.blur_m**2 / 2,
-        image * np.log(relative) * options.gamma,
-        # Noise that is cut at black lifts the dark, and only the dark.
-        np.exp(-relative / options.dark) * peak * options.background,
-    ]
-    return np.stack([d.ravel() for d in directions], axis=-1)
+    return np.stack(
+        [
+            right * options.shift_m,
+            up * options.shift_m,
+            image * options.exposure,
+            np.full_like(image, peak * options.background),
+            laplacian * options.blur_m**2 / 2,
+            image * np.log(relative) * options.gamma,
+            # Noise that is cut at black lifts the dark, and only the dark.
+            np.exp(-relative / options.black) * peak * options.background,
+        ]
+    )
+
+
+class _Weights:
+    """What a change of M images weighs, where bands of frequency err by ``sigma`` (5,).
+
+    With residual r = J dc + N n + noise and n ~ N(0, 1), the noise covariance is S + N N'. Its inverse root is known:
+    the nuisances' directions, made orthogonal in units of S, shrink. S and N are those of ``images`` (M, R, R) of a
+    surface near the one that is looked for. They stay while it is, or what is minimised would not be what was
+    differentiated; and they come of no photograph, or its noise would be weighed with itself.
+    """
+
+    def __init__(self, images: Array, sigma: Array, options: RefinementOptions) -> None:
+        size, peak = images.shape[-1], images.max(axis=(1, 2), keepdims=True)
+        frequency = np.hypot(*np.meshgrid(np.arange(size), np.arange(size)))
+        self._kept = frequency < BANDS[-1]
+        self._cosines = dct(np.eye(size), axis=0, norm="ortho")
+        self.bands = np.digitize(frequency[self._kept], BANDS)
+        self._scale, self._sigma = peak * np.sqrt(np.clip(images / peak, 0, None) + options.dark), sigma[self.bands]
+        nuisances = self._white(np.stack([_nuisance(image, options) for image in images]).swapaxes(0, 1))
+        _, singular, self._directions = np.linalg.svd(nuisances.swapaxes(0, 1), full_matrices=False)
+        self._shrunk = 1 - 1 / np.sqrt(1 + singular**2)
+
+    def __call__(self, changes: NDArray[Any]) -> NDArray[Any]:
+        """Changes (..., M, R, R) as ones (..., M, n) that err independently of each other with unit variance."""
+        white = self._white(changes)
+        directions, shrunk = (values.astype(changes.dtype) for values in (self._directions, self._shrunk))
+        along = np.einsum("...mn,mdn->...md", white, directions, optimize=True) * shrunk
+        white -= np.einsum("...md,mdn->...mn", along, directions, optimize=True)
+        return white
+
+    def _white(self, changes: NDArray[Any]) -> NDArray[Any]:
+        cosines, scale, sigma = (values.astype(changes.dtype) for values in (self._cosines, self._scale, self._sigma))
+        modes = cosines @ (changes / scale) @ cosines.T
+        return np.asarray(modes[..., self._kept] / sigma)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,154 +152,94 @@ class _Posterior:
         latitude_deg: float,
         options: RefinementOptions,
     ) -> None:
-        self.heliostat, self.observations = heliostat, observations
-        self.prior, self.options = prior, options
+        self.heliostat, self.observations, self.prior, self.options = heliostat, observations, prior, options
         (self.optics, self.effects), self.latitude_deg = model, latitude_deg
         self.ranges = Ranges(observations, options.resolution)
-        self.measured = binned(np.array([o.flux for o in observations], dtype=np.float64), options.resolution)
+        flux = np.array([o.flux for o in observations], dtype=np.float64)
+        self.measured = binned(flux, options.resolution)
         # The same height for each direction: small enough for images to be linear in it, large enough to stand out from
         # their last digits.
         height = np.sqrt((prior.basis**2).mean(axis=(1, 2, 3)))
-        self.steps = np.clip(STEP_HEIGHT / height, 0.1, 4.0)
-        untilted = _untilted(prior.basis, control_points(heliostat))
-        changes = np.einsum("k,kfij,fc->kfcij", self.steps, untilted, heliostat.facet_normals)
-        self.changes = torch.as_tensor(changes, dtype=torch.float32)
-
-    def _rendered(self, aligned: Aligned, samples: int) -> Array:
-        """Images (B, R, R), sum 100, of aligned mirrors, the M observations over and over, as the cameras show them."""
-        with torch.no_grad():
-            images = aligned.flux_images(self.optics, self.effects, size=self.options.resolution, samples=samples)
-            each = images.double().view(-1, *self.measured.shape)
-        return np.asarray(self.ranges.seen(each).flatten(0, 1).numpy())
+        self.steps = np.clip(STEP_HEIGHT / height, 0.1, 4.0).astype(np.float32)
+        self.changes = torch.as_tensor(prior.basis, dtype=torch.float32) * torch.as_tensor(self.steps)[:, None, None, None]
 
     def state(self, c: Array) -> _State:
         """The mirror of coefficients (K,), aligned under each sun."""
         aligned = align_observations(
             self.heliostat, self.observations, self.prior.surface(c), self.effects, latitude_deg=self.latitude_deg
         )
-        return _State(c, aligned, self._rendered(aligned, self.options.samples))
+        size, samples = self.options.resolution, self.options.samples
+        with torch.no_grad():
+            images = self.ranges.seen(aligned.flux_images(self.optics, self.effects, size=size, samples=samples))
+        return _State(c, aligned, images.double().numpy())
 
-    def jacobian(self, state: _State, count: int) -> Array:
-        """Change of the images per coefficient (count, M, R, R), of the first so many.
+    def jacobian(self, state: _State) -> NDArray[np.float32]:
+        """Change of the images per coefficient (K, M, R, R)."""
+        size, samples = self.options.resolution, self.options.samples
+        with torch.no_grad():
+            images = state.aligned.flux_changes(self.changes, self.optics, self.effects, size=size, samples=samples)
+            images = self.ranges.seen(images)
+            changes: NDArray[np.float32] = (images[1:] - images[:1]).numpy()
+        return np.asarray(changes / self.steps[:, None, None, None])
 
-        The mount takes back what a change tilts the mirror as a whole (`_untilted`).
-        """
-        (group,), samples, changes = state.aligned.groups, self.options.jacobian_samples, self.changes[:count]
-        points = (group.scene.control_points + changes[:, None]).flatten(0, 1)
-        scene = group.scene.repeated(count).with_(control_points=points)
-        stacked = replace(group, rows=list(range(scene.batch)), planes=group.planes * count, scene=scene)
-        changed = self._rendered(Aligned((stacked,)), samples).reshape(count, *state.images.shape)
-        return np.asarray((changed - self._rendered(state.aligned, samples)) / self.steps[:count, None, None, None])
+    def optimum(self, state: _State, sigma: Array) -> Minimum[_State]:
+        """The highest density near a state where bands err by ``sigma`` (5,)."""
+        problem = _Problem(self, _Weights(state.images, sigma, self.options))
+        return minimize(problem, state, replace(DESCENT, steps=self.options.steps))
 
-    def _whitened(self, image: Array, noise: float) -> tuple[float, Array, Array]:
-        """Noise of an image's pixels, its nuisance directions over that noise (n, 7), and Woodbury's inner inverse.
+    def estimated(self, state: _State) -> tuple[_State, Array]:
+        """The state of the highest density near another, and its covariance (K, K), with errors as they turn out."""
+        state, sigma = self.state(state.c), np.full(len(BANDS), self.options.annealing[-1])
+        jacobian = self.jacobian(state)
+        for _ in range(self.options.rounds):
+            sigma = self.errors(state, jacobian, sigma)
+            found = self.optimum(state, sigma)
+            state, jacobian = found.state, found.jacobian
+        return state, self.covariance(jacobian, _Weights(state.images, sigma, self.options))
 
-        With residual r = J dc + N n + noise and n ~ N(0, 1), the noise covariance is s^2 + N N'.
-        """
-        sigma = noise * float(image.max())
-        directions = _nuisance(image, self.options) / sigma
-        inner = np.linalg.inv(np.eye(directions.shape[1]) + directions.T @ directions)
-        return sigma, directions, np.asarray(inner, dtype=np.float64)
+    def covariance(self, jacobian: NDArray[np.float32], weights: _Weights) -> Array:
+        """Covariance (K, K) of the coefficients."""
+        white = weights(jacobian).reshape(len(jacobian), -1)
+        return np.linalg.inv((white @ white.T).astype(np.float64) + np.eye(len(white)))
 
-    def cost(self, state: _State, noise: float) -> float:
-        """Negative logarithm of the posterior density, to a constant."""
-        total = float(state.c @ state.c)
-        for measured, image in zip(self.measured, state.images, strict=True):
-            sigma, directions, inner = self._whitened(image, noise)
-            r = (measured - image).ravel() / sigma
-            along = directions.T @ r
-            total += float(r @ r - along @ inner @ along)
-        return total / 2
-
-    def quadratic(self, state: _State, jacobian: Array, noise: float) -> tuple[Array, Array]:
-        """Downhill gradient (k,) and Gauss-Newton curvature (k, k) of the cost, in a Jacobian's k coefficients."""
-        count = len(jacobian)
-        gradient, curvature = -state.c[:count], np.eye(count)
-        for index, (measured, image) in enumerate(zip(self.measured, state.images, strict=True)):
-            sigma, directions, inner = self._whitened(image, noise)
-            r = (measured - image).ravel() / sigma
-            j = jacobian[:, index].reshape(count, -1).T / sigma
-            projected = inner @ (directions.T @ j)
-            gradient = gradient + j.T @ r - projected.T @ (directions.T @ r)
-            curvature = curvature + j.T @ j - (directions.T @ j).T @ projected
-        return gradient, curvature
-
-    def moved(self, state: _State, change: Array) -> _State:
-        """The mirror after a change (k,) of its first coefficients."""
-        return self.state(state.c + np.pad(change, (0, len(state.c) - len(change))))
-
-    def optimize(self, state: _State, noise: float, jacobian: Array, retraced: int = 1) -> tuple[_State, Array]:
-        """The state of the highest density near another, in a Jacobian's (k, M, R, R) coefficients, and its Jacobian.
-
-        The Jacobian is traced anew up to ``retraced`` times, where corrections no longer help.
-        """
-        descent = replace(DESCENT, steps=self.options.steps, jacobians=retraced)
-        found = minimize(_Problem(self, noise, len(jacobian)), state, descent, jacobian)
-        return found.state, found.jacobian
-
-    def optimum(self, c: Array) -> tuple[_State, Array]:
-        """The local optimum near coefficients (K,) and the Jacobian there: large features first, then all."""
-        state, options = self.state(c), self.options
-        jacobian = self.jacobian(state, min(options.leading, len(c)))
-        for noise in options.annealing:
-            state, jacobian = self.optimize(state, noise, jacobian)
-        jacobian = self.jacobian(state, len(c))
-        for left in reversed(range(options.rounds)):
-            state, jacobian = self.optimize(
-                state, self.noise(state, options.noise_share), jacobian, retraced=int(left == 0)
-            )
-        return state, jacobian
-
-    def covariance(self, state: _State, jacobian: Array) -> Array:
-        """Covariance (K, K) of the coefficients: the inverse curvature, the images' noise counted more than once."""
-        _, curvature = self.quadratic(state, jacobian, self.noise(state) * np.sqrt(self.options.calibration))
-        return np.asarray(np.linalg.inv(curvature), dtype=np.float64)
-
-    def noise(self, state: _State, share: float = 1.0) -> float:
-        """Standard deviation of a pixel, of the peak: a ``share`` of what the state leaves of the images."""
-        grain, patch = 0.0, 0.0
-        for measured, image in zip(self.measured, state.images, strict=True):
-            directions = _nuisance(image, self.options)
-            residual = (measured - image).ravel() / image.max()
-            residual -= directions @ np.linalg.lstsq(directions, residual, rcond=None)[0]
-            grain += residual.var()
-            patch += binned(residual.reshape(1, *image.shape), image.shape[0] // BLOCK).var() / BLOCK**2
-        variance = (grain + self.options.patches * max(0.0, patch - grain)) / len(self.measured)
-        return max(self.options.noise, share * float(np.sqrt(variance)))
+    def errors(self, state: _State, jacobian: NDArray[np.float32], sigma: Array) -> Array:
+        """What bands err by (5,) where a state was found that they were thought to err by ``sigma``."""
+        weights = _Weights(state.images, sigma, self.options)
+        white, left = weights(jacobian), weights(self.measured - state.images)
+        covariance = self.covariance(jacobian, weights).astype(np.float32)
+        spent = np.einsum("kmn,kmn->n", white, np.tensordot(covariance, white, axes=1))
+        free = np.maximum(np.bincount(weights.bands, len(left) - spent), 1)
+        return np.clip(sigma * np.sqrt(np.bincount(weights.bands, (left**2).sum(axis=0)) / free), self.options.grain, None)
 
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """A posterior as a least-squares problem: in its first ``count`` coefficients, with one ``noise`` of images."""
+    """A posterior as a least-squares problem, with fixed weights of the images."""
 
     posterior: _Posterior
-    noise: float
-    count: int
+    weights: _Weights
 
     def cost(self, state: _State) -> float:
-        return self.posterior.cost(state, self.noise)
+        left = self.weights(self.posterior.measured - state.images)
+        return float(state.c @ state.c + (left**2).sum()) / 2
 
     def response(self, state: _State) -> Array:
         return state.images
 
     def jacobian(self, state: _State) -> Array:
-        return self.posterior.jacobian(state, self.count)
+        return self.posterior.jacobian(state)
 
     def quadratic(self, state: _State, jacobian: Array) -> tuple[Array, Array]:
-        return self.posterior.quadratic(state, jacobian, self.noise)
+        white = self.weights(jacobian).reshape(len(jacobian), -1)
+        left = self.weights(self.posterior.measured - state.images).ravel()
+        gradient = (white @ left.astype(white.dtype)).astype(np.float64) - state.c
+        return gradient, (white @ white.T).astype(np.float64) + np.eye(len(white))
 
     def bounds(self, state: _State) -> None:
         return None
 
     def moved(self, state: _State, change: Array) -> _State:
-        return self.posterior.moved(state, change)
-
-
-def _untilted(z: Array, ideal: Array) -> Array:
-    """Heights (K, F, I, J) [m] over ideal control points (F, I, J, 3) [m] without the tilt of the whole mirror."""
-    modes = np.moveaxis(ideal[..., :2] - ideal[..., :2].mean(axis=(1, 2), keepdims=True), -1, 0).reshape(2, -1)
-    flat = z.reshape(len(z), -1)
-    return np.asarray((flat - flat @ np.linalg.pinv(modes) @ modes).reshape(z.shape))
+        return self.posterior.state(state.c + change)
 
 
 def refine(
@@ -296,7 +261,7 @@ def refine(
     observations : sequence of Observation
         Any number from one.
     start : (4, 8, 8) [m], optional
-        Where to begin besides the prior's mean: the network's prediction, say.
+        Where to begin instead of the prior's mean: the network's prediction, say.
     latitude_deg : float [deg]
         Of the plant.
 
@@ -310,14 +275,18 @@ def refine(
     require_own_grid(heliostat)
     prior, optics = prior or default_prior(), optics or Optics()
     options = options or RefinementOptions()
-    posterior = _Posterior(heliostat, observations, prior, (optics, effects), latitude_deg, options)
-    starts = [np.zeros(len(prior.basis))] + ([] if start is None else [prior.coefficients(start)])
-    optima = [posterior.optimum(c) for c in starts]
-    state, jacobian = min(optima, key=lambda optimum: posterior.cost(optimum[0], options.noise))
+    few = [observations[i] for i in spread_suns(np.array([o.sun for o in observations]), options.few)]
+    first, whole = (
+        _Posterior(heliostat, part, prior, (optics, effects), latitude_deg, options) for part in (few, observations)
+    )
+    state = first.state(np.zeros(len(prior.basis)) if start is None else prior.coefficients(start))
+    for error in options.annealing:
+        state = first.optimum(state, np.full(len(BANDS), error)).state
+    state, covariance = whole.estimated(state)
     z = prior.surface(state.c)
     return SurfacePrediction(
         z=z,
-        z_std=prior.deviation(posterior.covariance(state, jacobian)),
+        z_std=prior.deviation(covariance),
         control_points=control_points(heliostat, z),
         method="refined",
         weights=prior.name,
