@@ -182,46 +182,60 @@ class _Posterior:
             changes: NDArray[np.float32] = (images[1:] - images[:1]).numpy()
         return np.asarray(changes / self.steps[:, None, None, None])
 
-    def optimum(self, state: _State, sigma: Array) -> Minimum[_State]:
-        """The highest density near a state where bands err by ``sigma`` (5,)."""
-        problem = _Problem(self, _Weights(state.images, sigma, self.options))
-        return minimize(problem, state, replace(DESCENT, steps=self.options.steps))
+    def optimum(self, state: _State, belief: "_Belief") -> Minimum[_State]:
+        """The highest density near a state."""
+        weights = _Weights(state.images, belief.sigma, self.options)
+        return minimize(_Problem(self, weights, belief.precision), state, replace(DESCENT, steps=self.options.steps))
 
-    def estimated(self, state: _State) -> tuple[_State, Array]:
+    def estimated(self, state: _State, belief: "_Belief") -> tuple[_State, Array]:
         """The state of the highest density near another, and its covariance (K, K), with errors as they turn out."""
-        state, sigma = self.state(state.c), np.full(len(BANDS), self.options.annealing[-1])
+        state = self.state(state.c)
         jacobian = self.jacobian(state)
         for _ in range(self.options.rounds):
-            sigma = self.errors(state, jacobian, sigma)
-            found = self.optimum(state, sigma)
+            belief = self.believed(state, jacobian, belief)
+            found = self.optimum(state, belief)
             state, jacobian = found.state, found.jacobian
-        return state, self.covariance(jacobian, _Weights(state.images, sigma, self.options))
+        white = _Weights(state.images, belief.sigma, self.options)(jacobian)
+        return state, _covariance(white, belief.precision)
 
-    def covariance(self, jacobian: NDArray[np.float32], weights: _Weights) -> Array:
-        """Covariance (K, K) of the coefficients."""
-        white = weights(jacobian).reshape(len(jacobian), -1)
-        return np.linalg.inv((white @ white.T).astype(np.float64) + np.eye(len(white)))
-
-    def errors(self, state: _State, jacobian: NDArray[np.float32], sigma: Array) -> Array:
-        """What bands err by (5,) where a state was found that they were thought to err by ``sigma``."""
-        weights = _Weights(state.images, sigma, self.options)
+    def believed(self, state: _State, jacobian: NDArray[np.float32], belief: "_Belief") -> "_Belief":
+        """What bands err by, and scales of the prior, where a state was found with a belief of them."""
+        weights = _Weights(state.images, belief.sigma, self.options)
         white, left = weights(jacobian), weights(self.measured - state.images)
-        covariance = self.covariance(jacobian, weights).astype(np.float32)
-        spent = np.einsum("kmn,kmn->n", white, np.tensordot(covariance, white, axes=1))
+        covariance = _covariance(white, belief.precision)
+        spent = np.einsum("kmn,kmn->n", white, np.tensordot(covariance.astype(np.float32), white, axes=1))
         free = np.maximum(np.bincount(weights.bands, len(left) - spent), 1)
-        return np.clip(sigma * np.sqrt(np.bincount(weights.bands, (left**2).sum(axis=0)) / free), self.options.grain, None)
+        error = belief.sigma * np.sqrt(np.bincount(weights.bands, (left**2).sum(axis=0)) / free)
+        return _Belief(
+            np.clip(error, self.options.grain, None), self.prior.precision(state.c, np.diag(covariance))
+        )
+
+
+def _covariance(white: NDArray[np.float32], precision: Array) -> Array:
+    """Covariance (K, K) of coefficients of a prior ``precision`` (K,), with derivatives of weighed images (K, M, n)."""
+    flat = white.reshape(len(white), -1)
+    return np.asarray(np.linalg.inv((flat @ flat.T).astype(np.float64) + np.diag(precision)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Belief:
+    """What bands of frequency err by (5,), and the precision of the prior's coefficients (K,)."""
+
+    sigma: Array
+    precision: Array
 
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """A posterior as a least-squares problem, with fixed weights of the images."""
+    """A posterior as a least-squares problem, with fixed weights of the images and a fixed prior."""
 
     posterior: _Posterior
     weights: _Weights
+    precision: Array
 
     def cost(self, state: _State) -> float:
         left = self.weights(self.posterior.measured - state.images)
-        return float(state.c @ state.c + (left**2).sum()) / 2
+        return float(state.c @ (self.precision * state.c) + (left**2).sum()) / 2
 
     def response(self, state: _State) -> Array:
         return state.images
@@ -232,8 +246,8 @@ class _Problem:
     def quadratic(self, state: _State, jacobian: Array) -> tuple[Array, Array]:
         white = self.weights(jacobian).reshape(len(jacobian), -1)
         left = self.weights(self.posterior.measured - state.images).ravel()
-        gradient = (white @ left.astype(white.dtype)).astype(np.float64) - state.c
-        return gradient, (white @ white.T).astype(np.float64) + np.eye(len(white))
+        gradient = (white @ left.astype(white.dtype)).astype(np.float64) - self.precision * state.c
+        return gradient, (white @ white.T).astype(np.float64) + np.diag(self.precision)
 
     def bounds(self, state: _State) -> None:
         return None
@@ -281,8 +295,9 @@ def refine(
     )
     state = first.state(np.zeros(len(prior.basis)) if start is None else prior.coefficients(start))
     for error in options.annealing:
-        state = first.optimum(state, np.full(len(BANDS), error)).state
-    state, covariance = whole.estimated(state)
+        belief = _Belief(np.full(len(BANDS), error), np.ones(len(prior.basis)))
+        state = first.optimum(state, belief).state
+    state, covariance = whole.estimated(state, belief)
     z = prior.surface(state.c)
     return SurfacePrediction(
         z=z,
