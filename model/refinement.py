@@ -17,6 +17,7 @@ surface was able to bend to them (MacKay 1992, doi:10.1162/neco.1992.4.3.415, eq
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -41,8 +42,22 @@ Array = NDArray[np.float64]
 BANDS = (3.0, 6.0, 10.0, 16.0, 24.0)
 """Ends of the bands of spatial frequency [half cycles per window]; what is finer the sun has blurred."""
 
+CONSENSUS = 4
+"""Images that it takes to say of one that the others contradict it."""
+
+CONTRADICTION = 3.0
+"""Mean square by which the others miss an image, in medians of all, from which on it is left out."""
+
 DESCENT = Descent(
-    steps=12, jacobians=12, damping=0.03, easing=10.0, raising=6.0, least_damping=1e-6, patience=5, least_gain=0.5, least_share=1e-3
+    steps=12,
+    jacobians=12,
+    damping=0.03,
+    easing=10.0,
+    raising=6.0,
+    least_damping=1e-6,
+    patience=5,
+    least_gain=0.5,
+    least_share=1e-3,
 )
 """How the minimum of the negative log posterior is sought; a gain of half a unit, or of a thousandth, is none."""
 
@@ -62,7 +77,7 @@ class RefinementOptions:
 
     grain: float = 0.005
     dark: float = 0.1
-    annealing: tuple[float, ...] = (0.1, 0.03)
+    annealing: tuple[float, ...] = (0.3, 0.1)
     rounds: int = 3
     few: int = 8
     steps: int = 12
@@ -148,12 +163,13 @@ class _Posterior:
         heliostat: Heliostat,
         observations: Sequence[Observation],
         prior: SurfacePrior,
-        model: tuple[Optics, Sequence[Effect]],
+        optics: Optics,
+        effects: Sequence[Effect],
         latitude_deg: float,
         options: RefinementOptions,
     ) -> None:
         self.heliostat, self.observations, self.prior, self.options = heliostat, observations, prior, options
-        (self.optics, self.effects), self.latitude_deg = model, latitude_deg
+        self.optics, self.effects, self.latitude_deg = optics, effects, latitude_deg
         self.ranges = Ranges(observations, options.resolution)
         flux = np.array([o.flux for o in observations], dtype=np.float64)
         self.measured = binned(flux, options.resolution)
@@ -161,7 +177,9 @@ class _Posterior:
         # their last digits.
         height = np.sqrt((prior.basis**2).mean(axis=(1, 2, 3)))
         self.steps = np.clip(STEP_HEIGHT / height, 0.1, 4.0).astype(np.float32)
-        self.changes = torch.as_tensor(prior.basis, dtype=torch.float32) * torch.as_tensor(self.steps)[:, None, None, None]
+        self.changes = (
+            torch.as_tensor(prior.basis, dtype=torch.float32) * torch.as_tensor(self.steps)[:, None, None, None]
+        )
 
     def state(self, c: Array) -> _State:
         """The mirror of coefficients (K,), aligned under each sun."""
@@ -182,39 +200,40 @@ class _Posterior:
             changes: NDArray[np.float32] = (images[1:] - images[:1]).numpy()
         return np.asarray(changes / self.steps[:, None, None, None])
 
-    def optimum(self, state: _State, belief: "_Belief") -> Minimum[_State]:
-        """The highest density near a state."""
+    def optimum(self, state: _State, belief: "_Belief", jacobian: NDArray[np.float32] | None = None) -> Minimum[_State]:
+        """The highest density near a state; its Jacobian saves one."""
         weights = _Weights(state.images, belief.sigma, self.options)
-        return minimize(_Problem(self, weights, belief.precision), state, replace(DESCENT, steps=self.options.steps))
+        descent = replace(DESCENT, steps=self.options.steps)
+        return minimize(_Problem(self, weights, belief.precision), state, descent, jacobian)
 
-    def estimated(self, state: _State, belief: "_Belief") -> tuple[_State, Array]:
-        """The state of the highest density near another, and its covariance (K, K), with errors as they turn out."""
-        state = self.state(state.c)
-        jacobian = self.jacobian(state)
-        for _ in range(self.options.rounds):
-            belief = self.believed(state, jacobian, belief)
-            found = self.optimum(state, belief)
+    def fit(self, state: _State, jacobian: NDArray[np.float32], belief: "_Belief") -> "_Fit":
+        """What there is to say of a state that was found with a belief."""
+        weights = _Weights(state.images, belief.sigma, self.options)
+        return _Fit(belief, weights(jacobian), weights(self.measured - state.images), weights.bands)
+
+    def settled(self, state: _State) -> tuple[_State, NDArray[np.float32], "_Belief"]:
+        """The state near another at which large features are right, the Jacobian there and what it was found with."""
+        jacobian = None
+        for error in self.options.annealing:
+            belief = _Belief(np.full(len(BANDS), error), np.ones(len(state.c)))
+            found = self.optimum(state, belief, jacobian)
             state, jacobian = found.state, found.jacobian
-        white = _Weights(state.images, belief.sigma, self.options)(jacobian)
-        return state, _covariance(white, belief.precision)
+        return state, jacobian, belief
 
-    def believed(self, state: _State, jacobian: NDArray[np.float32], belief: "_Belief") -> "_Belief":
-        """What bands err by, and scales of the prior, where a state was found with a belief of them."""
-        weights = _Weights(state.images, belief.sigma, self.options)
-        white, left = weights(jacobian), weights(self.measured - state.images)
-        covariance = _covariance(white, belief.precision)
-        spent = np.einsum("kmn,kmn->n", white, np.tensordot(covariance.astype(np.float32), white, axes=1))
-        free = np.maximum(np.bincount(weights.bands, len(left) - spent), 1)
-        error = belief.sigma * np.sqrt(np.bincount(weights.bands, (left**2).sum(axis=0)) / free)
-        return _Belief(
-            np.clip(error, self.options.grain, None), self.prior.precision(state.c, np.diag(covariance))
-        )
-
-
-def _covariance(white: NDArray[np.float32], precision: Array) -> Array:
-    """Covariance (K, K) of coefficients of a prior ``precision`` (K,), with derivatives of weighed images (K, M, n)."""
-    flat = white.reshape(len(white), -1)
-    return np.asarray(np.linalg.inv((flat @ flat.T).astype(np.float64) + np.diag(precision)))
+    def estimated(self, state: _State, jacobian: NDArray[np.float32], belief: "_Belief") -> tuple[_State, "_Fit"]:
+        """The state of the highest density near another, with errors of the images as they turn out."""
+        for left in reversed(range(self.options.rounds)):
+            fit = self.fit(state, jacobian, belief)
+            belief = _Belief(
+                np.maximum(
+                    fit.errors() if left else fit.belief.sigma * np.sqrt(max(fit.overdispersion(), 1.0)),
+                    self.options.grain,
+                ),
+                self.prior.precision(state.c, np.diag(fit.covariance)),
+            )
+            found = self.optimum(state, belief, jacobian)
+            state, jacobian = found.state, np.asarray(found.jacobian, dtype=np.float32)
+        return state, self.fit(state, jacobian, belief)
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,6 +242,73 @@ class _Belief:
 
     sigma: Array
     precision: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """Derivatives (K, M, n) of weighed images, what is left of them (M, n), and the band (n,) of each mode."""
+
+    belief: _Belief
+    white: NDArray[np.float32]
+    left: Array
+    bands: NDArray[np.int64]
+
+    @cached_property
+    def covariance(self) -> Array:
+        """Covariance (K, K) of the coefficients."""
+        return self._covariance(np.ones(len(BANDS)))
+
+    def _covariance(self, share: Array) -> Array:
+        """Covariance (K, K), where bands tell a ``share`` (5,) of what they seem to."""
+        flat = (self.white * np.sqrt(share[self.bands]).astype(np.float32)).reshape(len(self.white), -1)
+        return np.asarray(np.linalg.inv((flat @ flat.T).astype(np.float64) + np.diag(self.belief.precision)))
+
+    @cached_property
+    def information(self) -> Array:
+        """What each image tells of the coefficients (M, K, K)."""
+        each = self.white.swapaxes(0, 1)
+        return (each @ each.swapaxes(1, 2)).astype(np.float64)
+
+    @cached_property
+    def scores(self) -> Array:
+        """Where each image would move the coefficients (M, K): down the gradient of its cost."""
+        return np.einsum("kmn,mn->mk", self.white, self.left, optimize=True)
+
+    def errors(self) -> Array:
+        """What bands err by (5,): what is left of them, less what coefficients took away."""
+        spent = np.einsum(
+            "kmn,kmn->n", self.white, np.tensordot(self.covariance.astype(np.float32), self.white, axes=1)
+        )
+        free = np.maximum(np.bincount(self.bands, len(self.left) - spent), 1)
+        return self.belief.sigma * np.sqrt(np.bincount(self.bands, (self.left**2).sum(axis=0)) / free)
+
+    def overdispersion(self) -> float:
+        """How many times farther apart images pull the surface than independent errors would make them, squared.
+
+        Of one where they err as they are thought to: errors that look like a bent mirror weigh more than others.
+        """
+        along = self.covariance @ self.information
+        expected = np.trace(along, axis1=1, axis2=2).sum() - np.einsum("mij,mji->", along, along)
+        return float(np.einsum("mi,ij,mj->", self.scores, self.covariance, self.scores) / max(expected, 1.0))
+
+    def contradicting(self) -> list[int]:
+        """The images that the others contradict most, by what a surface found from them leaves of each."""
+        if len(self.left) < CONSENSUS:
+            return []
+        missed = self.missed()
+        limit = max(CONTRADICTION * np.median(missed), missed.max() / 2)
+        return [int(i) for i in np.flatnonzero(missed > limit)]
+
+    def missed(self) -> Array:
+        """Mean square (M,) of what is left of each image where a surface is found from the others, to first order."""
+        others = np.eye(len(self.covariance)) - self.information @ self.covariance
+        turned = np.linalg.solve(others, self.scores[..., None])[..., 0] @ self.covariance
+        return np.asarray(((self.left + np.einsum("mk,kmn->mn", turned, self.white)) ** 2).mean(axis=1))
+
+    def cautious(self, grain: float) -> Array:
+        """Covariance (K, K) where photographs share errors: all variance beyond a ``grain`` counts once for each."""
+        extra = np.clip(1 - (grain / self.belief.sigma) ** 2, 0, None)
+        return self._covariance(1 / (1 + (len(self.left) - 1) * extra))
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,23 +375,47 @@ def refine(
     require_own_grid(heliostat)
     prior, optics = prior or default_prior(), optics or Optics()
     options = options or RefinementOptions()
-    few = [observations[i] for i in spread_suns(np.array([o.sun for o in observations]), options.few)]
-    first, whole = (
-        _Posterior(heliostat, part, prior, (optics, effects), latitude_deg, options) for part in (few, observations)
-    )
-    state = first.state(np.zeros(len(prior.basis)) if start is None else prior.coefficients(start))
-    for error in options.annealing:
-        belief = _Belief(np.full(len(BANDS), error), np.ones(len(prior.basis)))
-        state = first.optimum(state, belief).state
-    state, covariance = whole.estimated(state, belief)
+    state, fit, left_out = _consensus(heliostat, observations, start, (prior, optics, effects), latitude_deg, options)
     z = prior.surface(state.c)
     return SurfacePrediction(
         z=z,
-        z_std=prior.deviation(covariance),
+        z_std=prior.deviation(fit.cautious(options.grain)),
         control_points=control_points(heliostat, z),
         method="refined",
         weights=prior.name,
         misfits=misfits(heliostat, observations, z, optics, effects, latitude_deg=latitude_deg),
         used=tuple(o.identifier for o in observations),
         mahalanobis=prior.mahalanobis(z),
+        contradicting=tuple(observations[i].identifier for i in left_out),
     )
+
+
+def _consensus(
+    heliostat: Heliostat,
+    observations: Sequence[Observation],
+    start: Array | None,
+    model: tuple[SurfacePrior, Optics, Sequence[Effect]],
+    latitude_deg: float,
+    options: RefinementOptions,
+) -> tuple[_State, _Fit, list[int]]:
+    """The most probable surface, what there is to say of it, and the places of images that were left out for it."""
+
+    def posterior(part: Sequence[int]) -> _Posterior:
+        return _Posterior(heliostat, [observations[i] for i in part], *model, latitude_deg, options)
+
+    kept = list(range(len(observations)))
+    c = np.zeros(len(model[0].basis)) if start is None else model[0].coefficients(start)
+    while True:
+        few = [kept[i] for i in spread_suns(np.array([observations[i].sun for i in kept]), options.few)]
+        first = posterior(few)
+        state, jacobian, belief = first.settled(first.state(c))
+        whole = first
+        if len(few) < len(kept):
+            whole = posterior(kept)
+            state = whole.state(state.c)
+            jacobian = whole.jacobian(state)
+        out = whole.fit(state, jacobian, belief).contradicting()
+        if 2 * (len(kept) - len(out)) < len(observations) or not out:
+            found, fit = whole.estimated(state, jacobian, belief)
+            return found, fit, sorted(set(range(len(observations))) - set(kept))
+        kept = [kept[i] for i in range(len(kept)) if i not in out]

@@ -19,9 +19,7 @@ TILT = 1e-4
 """Slope [rad] over which the movement of light with slope is taken."""
 
 
-def sensitivity(
-    scene: Scene, window: Window, optics: Optics, *, samples: int = 12, padding: float = 0.25
-) -> Tensor:
+def sensitivity(scene: Scene, window: Window, optics: Optics, *, samples: int = 12, padding: float = 0.25) -> Tensor:
     """Change of irradiance per control height (F * I * J, B, rows, columns) [W/m3] of a scene's B mirrors.
 
     Heights stand along the facets' normals. Windows on the plane's centre show what a mount makes of a change that
