@@ -276,7 +276,8 @@ class Aligned:
             heights = sensitivity(scene, window, effective, samples=samples, padding=view.padding)
             changes = (directions.flatten(1) @ heights.flatten(1)).view(-1, *flux.shape)
             images = flux + torch.cat([torch.zeros_like(flux)[None], changes])
-            return _measured(images.flatten(0, 1), window, effects, size).unflatten(0, (-1, len(rows))).transpose(0, 1)
+            seen = _measured(images.flatten(0, 1), window, effects, size)
+            return seen.view(-1, len(rows), size, size).transpose(0, 1)
 
         return self._each_window(view, measured).transpose(0, 1)
 

@@ -1,18 +1,20 @@
 """Surface refinement: maximum a posteriori through the tracer.
 
-Heights are ``mean + basis @ c`` with standard normal coefficients c: a Gaussian prior estimated from measured mirrors.
+Heights are ``mean + basis @ c`` with a prior of c that was estimated from measured mirrors (`model.prior`).
 Levenberg-Marquardt steps bring the traced images to the measured ones; the curvature at the end gives the uncertainty.
 
-Two things decide whether that ends where it should. Derivatives must be those of the images (`model.tracing.sensitivity`):
-light that moves with a facet's canting changes an image by one percent, and differences of coarse traces miss a third
-of it. And what is minimised must not change on the way: images are weighed by what was measured, not by what the
-surface of the moment makes of it. Then every start ends at the same surface, and one start is enough.
+Two things decide whether that ends where it should. Derivatives must be those of the images
+(`model.tracing.sensitivity`): a facet's canting changes an image by one percent, and differences of coarse traces miss
+a third of it. And what is minimised must not change on the way: images are weighed as those of the surface that a
+stage begins with. Then every start ends at the same surface, and one start is enough.
 
 What a camera adds to an image (a shift, another exposure, background, a little blur, another response) enters as a few
 directions per image with priors of their own and is marginalised exactly. All other errors, of the camera and of the
 model, grow with the flux and come in patches: they are taken for independent in the cosine transform of the image,
-with one variance for each band of spatial frequency, estimated from what is left of the images and by how much a
-surface was able to bend to them (MacKay 1992, doi:10.1162/neco.1992.4.3.415, eq. 4.9).
+with one variance for each band of spatial frequency, estimated from what is left of the images and from how far a
+surface could bend to them (MacKay 1992, doi:10.1162/neco.1992.4.3.415). Errors that look like a bent mirror weigh more
+than that: how far apart the images pull the surface tells by how much (the overdispersion of quasi-likelihoods,
+Wedderburn 1974, doi:10.1093/biomet/61.3.439). An image that the others contradict is left out.
 """
 
 from collections.abc import Sequence
@@ -191,48 +193,44 @@ class _Posterior:
             images = self.ranges.seen(aligned.flux_images(self.optics, self.effects, size=size, samples=samples))
         return _State(c, aligned, images.double().numpy())
 
-    def jacobian(self, state: _State) -> NDArray[np.float32]:
+    def jacobian(self, state: _State) -> NDArray[Any]:
         """Change of the images per coefficient (K, M, R, R)."""
         size, samples = self.options.resolution, self.options.samples
         with torch.no_grad():
             images = state.aligned.flux_changes(self.changes, self.optics, self.effects, size=size, samples=samples)
             images = self.ranges.seen(images)
-            changes: NDArray[np.float32] = (images[1:] - images[:1]).numpy()
+            changes: NDArray[Any] = (images[1:] - images[:1]).numpy()
         return np.asarray(changes / self.steps[:, None, None, None])
 
-    def optimum(self, state: _State, belief: "_Belief", jacobian: NDArray[np.float32] | None = None) -> Minimum[_State]:
+    def optimum(self, state: _State, belief: "_Belief", jacobian: NDArray[Any] | None = None) -> Minimum[_State]:
         """The highest density near a state; its Jacobian saves one."""
         weights = _Weights(state.images, belief.sigma, self.options)
         descent = replace(DESCENT, steps=self.options.steps)
         return minimize(_Problem(self, weights, belief.precision), state, descent, jacobian)
 
-    def fit(self, state: _State, jacobian: NDArray[np.float32], belief: "_Belief") -> "_Fit":
+    def fit(self, state: _State, jacobian: NDArray[Any], belief: "_Belief") -> "_Fit":
         """What there is to say of a state that was found with a belief."""
         weights = _Weights(state.images, belief.sigma, self.options)
         return _Fit(belief, weights(jacobian), weights(self.measured - state.images), weights.bands)
 
-    def settled(self, state: _State) -> tuple[_State, NDArray[np.float32], "_Belief"]:
+    def settled(self, state: _State) -> tuple[_State, NDArray[Any], "_Belief"]:
         """The state near another at which large features are right, the Jacobian there and what it was found with."""
-        jacobian = None
+        jacobian = self.jacobian(state)
         for error in self.options.annealing:
             belief = _Belief(np.full(len(BANDS), error), np.ones(len(state.c)))
             found = self.optimum(state, belief, jacobian)
             state, jacobian = found.state, found.jacobian
         return state, jacobian, belief
 
-    def estimated(self, state: _State, jacobian: NDArray[np.float32], belief: "_Belief") -> tuple[_State, "_Fit"]:
+    def estimated(self, state: _State, jacobian: NDArray[Any], belief: "_Belief") -> tuple[_State, "_Fit"]:
         """The state of the highest density near another, with errors of the images as they turn out."""
         for left in reversed(range(self.options.rounds)):
             fit = self.fit(state, jacobian, belief)
-            belief = _Belief(
-                np.maximum(
-                    fit.errors() if left else fit.belief.sigma * np.sqrt(max(fit.overdispersion(), 1.0)),
-                    self.options.grain,
-                ),
-                self.prior.precision(state.c, np.diag(fit.covariance)),
-            )
+            sigma = fit.errors() if left else belief.sigma * np.sqrt(max(fit.overdispersion(), 1.0))
+            precision = self.prior.precision(state.c, np.diag(fit.covariance))
+            belief = _Belief(np.maximum(sigma, self.options.grain), precision)
             found = self.optimum(state, belief, jacobian)
-            state, jacobian = found.state, np.asarray(found.jacobian, dtype=np.float32)
+            state, jacobian = found.state, found.jacobian
         return state, self.fit(state, jacobian, belief)
 
 
@@ -249,7 +247,7 @@ class _Fit:
     """Derivatives (K, M, n) of weighed images, what is left of them (M, n), and the band (n,) of each mode."""
 
     belief: _Belief
-    white: NDArray[np.float32]
+    white: NDArray[Any]
     left: Array
     bands: NDArray[np.int64]
 
@@ -267,12 +265,12 @@ class _Fit:
     def information(self) -> Array:
         """What each image tells of the coefficients (M, K, K)."""
         each = self.white.swapaxes(0, 1)
-        return (each @ each.swapaxes(1, 2)).astype(np.float64)
+        return np.asarray(each @ each.swapaxes(1, 2), dtype=np.float64)
 
     @cached_property
     def scores(self) -> Array:
         """Where each image would move the coefficients (M, K): down the gradient of its cost."""
-        return np.einsum("kmn,mn->mk", self.white, self.left, optimize=True)
+        return np.asarray(np.einsum("kmn,mn->mk", self.white, self.left, optimize=True))
 
     def errors(self) -> Array:
         """What bands err by (5,): what is left of them, less what coefficients took away."""
@@ -280,7 +278,7 @@ class _Fit:
             "kmn,kmn->n", self.white, np.tensordot(self.covariance.astype(np.float32), self.white, axes=1)
         )
         free = np.maximum(np.bincount(self.bands, len(self.left) - spent), 1)
-        return self.belief.sigma * np.sqrt(np.bincount(self.bands, (self.left**2).sum(axis=0)) / free)
+        return np.asarray(self.belief.sigma * np.sqrt(np.bincount(self.bands, (self.left**2).sum(axis=0)) / free))
 
     def overdispersion(self) -> float:
         """How many times farther apart images pull the surface than independent errors would make them, squared.
@@ -291,13 +289,12 @@ class _Fit:
         expected = np.trace(along, axis1=1, axis2=2).sum() - np.einsum("mij,mji->", along, along)
         return float(np.einsum("mi,ij,mj->", self.scores, self.covariance, self.scores) / max(expected, 1.0))
 
-    def contradicting(self) -> list[int]:
-        """The images that the others contradict most, by what a surface found from them leaves of each."""
+    def contradicted(self) -> int | None:
+        """The image that the others contradict most, if they do: by what a surface found from them leaves of it."""
         if len(self.left) < CONSENSUS:
-            return []
+            return None
         missed = self.missed()
-        limit = max(CONTRADICTION * np.median(missed), missed.max() / 2)
-        return [int(i) for i in np.flatnonzero(missed > limit)]
+        return int(missed.argmax()) if missed.max() > CONTRADICTION * np.median(missed) else None
 
     def missed(self) -> Array:
         """Mean square (M,) of what is left of each image where a surface is found from the others, to first order."""
@@ -403,19 +400,17 @@ def _consensus(
     def posterior(part: Sequence[int]) -> _Posterior:
         return _Posterior(heliostat, [observations[i] for i in part], *model, latitude_deg, options)
 
-    kept = list(range(len(observations)))
+    kept, left_out = list(range(len(observations))), list[int]()
     c = np.zeros(len(model[0].basis)) if start is None else model[0].coefficients(start)
     while True:
         few = [kept[i] for i in spread_suns(np.array([observations[i].sun for i in kept]), options.few)]
-        first = posterior(few)
-        state, jacobian, belief = first.settled(first.state(c))
-        whole = first
+        whole = posterior(few)
+        state, jacobian, belief = whole.settled(whole.state(c))
         if len(few) < len(kept):
             whole = posterior(kept)
             state = whole.state(state.c)
             jacobian = whole.jacobian(state)
-        out = whole.fit(state, jacobian, belief).contradicting()
-        if 2 * (len(kept) - len(out)) < len(observations) or not out:
-            found, fit = whole.estimated(state, jacobian, belief)
-            return found, fit, sorted(set(range(len(observations))) - set(kept))
-        kept = [kept[i] for i in range(len(kept)) if i not in out]
+        out = whole.fit(state, jacobian, belief).contradicted()
+        if out is None:
+            return *whole.estimated(state, jacobian, belief), left_out
+        left_out.append(kept.pop(out))
