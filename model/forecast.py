@@ -28,6 +28,7 @@ from model.plant import Heliostat, TargetPlane
 from model.surface import DEGREE
 from model.tracing import Optics, Scene, Window, trace
 from model.tracing.alignment import align_scene
+from model.tracing.sensitivity import sensitivity
 
 Array = NDArray[np.float64]
 Tracer = Callable[[Scene, Window, Optics], Tensor]
@@ -261,18 +262,48 @@ class Aligned:
         As a measurement has it: what the camera shows of the whole target, and of that the window about its centre of
         mass. Where no effect of a camera acts, that is the window about the light's.
         """
-        pixel = FLUX_WINDOW / size
-        if not any(effect.stage == "image" for effect in effects):
-            return normalized(self.flux(optics, effects, View(size, size, window=FLUX_WINDOW, samples=samples)))
-        planes = [plane for group in self.groups for plane in group.planes]
-        rows, columns = (math.ceil(max(getattr(p, side) for p in planes) / pixel) for side in ("height", "width"))
-        view, declared = View(rows, columns, samples=samples), optics or Optics()
+        view, declared = self._flux_view(effects, size, samples), optics or Optics()
 
         def measured(group: Group, window: Window, there: Sequence[Effect], rows: list[int]) -> Tensor:
             flux = view.trace(group.scene.subset(rows), window, optics_under(there, declared))
-            return centered(images_under(there, flux, window).clamp(min=0), window, size)
+            return _measured(flux, window, there, size)
 
-        return normalized(self._each_part(view, of_stage(effects, "optics", "image"), measured))
+        return self._each_part(view, of_stage(effects, "optics", "image"), measured)
+
+    def flux_changes(
+        self,
+        directions: Tensor,
+        optics: Optics | None = None,
+        effects: Sequence[Effect] = (),
+        *,
+        size: int = FLUX_SIZE,
+        samples: int = 20,
+    ) -> Tensor:
+        """`flux_images` (K + 1, B, size, size) as they are, and to first order after each of K changes of the heights.
+
+        ``directions`` are changes (K, F, I, J) [m] of all mirrors alike, for which the mounts keep the spots in place.
+        """
+        view, declared = self._flux_view(effects, size, samples), optics or Optics()
+
+        def measured(group: Group, window: Window, there: Sequence[Effect], rows: list[int]) -> Tensor:
+            scene, effective = group.scene.subset(rows), optics_under(there, declared)
+            flux = view.trace(scene, window, effective)
+            heights = sensitivity(scene, window, effective, samples=samples, padding=view.padding)
+            changes = (directions.flatten(1) @ heights.flatten(1)).view(-1, *flux.shape)
+            images = flux + torch.cat([torch.zeros_like(flux)[None], changes])
+            seen = _measured(images.flatten(0, 1), window, there, size)
+            return seen.view(-1, len(rows), size, size).transpose(0, 1)
+
+        return self._each_part(view, of_stage(effects, "optics", "image"), measured).transpose(0, 1)
+
+    def _flux_view(self, effects: Sequence[Effect], size: int, samples: int) -> View:
+        """What is traced for flux images: the window about the spot, or whole targets where a camera's effects act."""
+        if not any(effect.stage == "image" for effect in effects):
+            return View(size, size, window=FLUX_WINDOW, samples=samples)
+        pixel = FLUX_WINDOW / size
+        planes = [plane for group in self.groups for plane in group.planes]
+        rows, columns = (math.ceil(max(getattr(p, side) for p in planes) / pixel) for side in ("height", "width"))
+        return View(rows, columns, samples=samples)
 
     def _each_part(
         self,
@@ -287,6 +318,13 @@ class Aligned:
                 parts.append(act(group, window, there, rows))
                 places += [group.rows[row] for row in rows]
         return torch.cat(parts)[torch.as_tensor(places).argsort()]
+
+
+def _measured(flux: Tensor, window: Window, effects: Sequence[Effect], size: int) -> Tensor:
+    """Flux images (B, size, size), sum 100, of what cameras with effects show of ``flux`` (B, rows, columns)."""
+    if window.on_spot:
+        return normalized(flux)
+    return normalized(centered(images_under(effects, flux, window).clamp(min=0), window, size))
 
 
 def _in_order(parts: Sequence[Array], groups: Sequence[Group]) -> Array:

@@ -96,6 +96,8 @@ class SurfacePrediction:
         Identifiers of the images.
     mahalanobis : float
         Mahalanobis distance of the surface from the prior; about one is usual (`SurfacePrior.mahalanobis`).
+    contradicting : tuple of str
+        Identifiers of images that the surface does without: what the others tell contradicts them.
     """
 
     z: NDArray[np.float64]
@@ -106,6 +108,7 @@ class SurfacePrediction:
     misfits: tuple[float, ...]
     used: tuple[str, ...]
     mahalanobis: float = 1.0
+    contradicting: tuple[str, ...] = ()
 
     @property
     def misfit(self) -> float:

@@ -1,109 +1,151 @@
 """Surface refinement: maximum a posteriori through the tracer.
 
-Heights are ``mean + basis @ c`` with standard normal coefficients c: a Gaussian prior estimated from measured mirrors.
-Levenberg-Marquardt steps bring the traced images to the measured ones; what a camera adds to an image (a shift, another
-exposure, background, a little blur, another response) enters as a few directions per image with priors of their own and
-is marginalised exactly. The curvature at the end gives the uncertainty.
+Heights are ``mean + basis @ c`` with a prior of c that was estimated from measured mirrors (`model.prior`).
+Levenberg-Marquardt steps bring the traced images to the measured ones; the curvature at the end gives the uncertainty.
 
-The Jacobian is taken by differences, one batched trace of all coefficients and images. That is most of the work, so a
-Jacobian serves many steps, and every step corrects it by what the images really did (Broyden 1965).
+Two things decide whether that ends where it should. Derivatives must be those of the images
+(`model.tracing.sensitivity`): a facet's canting changes an image by one percent, and differences of coarse traces miss
+a third of it. And what is minimised must not change on the way: images are weighed as those of the surface that a
+stage begins with. Then every start ends at the same surface, and one start is enough.
 
-Light from four facets lies in one spot, and facets can take each other's part: the posterior has several local
-optima. The optimisation starts from every guess there is, and the best local optimum is taken.
+What a camera adds to an image (a shift, another exposure, background, a little blur, another response) enters as a few
+directions per image with priors of their own and is marginalised exactly. All other errors, of the camera and of the
+model, grow with the flux and come in patches: they are taken for independent in the cosine transform of the image,
+with one variance for each band of spatial frequency, estimated from what is left of the images and from how far a
+surface could bend to them (MacKay 1992, doi:10.1162/neco.1992.4.3.415). Errors that look like a bent mirror weigh more
+than that: how far apart the images pull the surface tells by how much (the overdispersion of quasi-likelihoods,
+Wedderburn 1974, doi:10.1093/biomet/61.3.439). An image that the others contradict is left out.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.fft import dct
 
 from model.effects import Effect
 from model.errors import InvalidInputError
 from model.forecast import Aligned
 from model.images import COARSE_SIZE, FLUX_WINDOW, binned
-from model.least_squares import Descent, minimize
+from model.least_squares import Descent, Minimum, minimize
 from model.network.inputs import STEP_HEIGHT
-from model.observation import Observation, Ranges, SurfacePrediction, align_observations, misfits
+from model.observation import Observation, Ranges, SurfacePrediction, align_observations, misfits, spread_suns
 from model.plant import Heliostat
-from model.prior import SurfacePrior, default_prior
+from model.prior import SurfacePrior, prior_of
 from model.surface import control_points, require_own_grid
 from model.tracing import Optics
 
 Array = NDArray[np.float64]
 
-BLOCK = 4
-"""Pixels along the side of the patches in which residuals of images err together."""
+BANDS = (3.0, 6.0, 10.0, 16.0, 24.0)
+"""Ends of the bands of spatial frequency [half cycles per window]; what is finer the sun has blurred."""
+
+CONSENSUS = 4
+"""Images that it takes to say of one that the others contradict it."""
+
+CONTRADICTION = 3.0
+"""Mean square by which the others miss an image, in medians of all, from which on it is left out."""
 
 DESCENT = Descent(
-    steps=16,
-    jacobians=1,
-    corrected=True,
-    damping=0.1,
-    raising=4.0,
-    least_damping=1e-4,
-    most_damping=100.0,
+    steps=12,
+    jacobians=12,
+    damping=0.03,
+    easing=10.0,
+    raising=6.0,
+    least_damping=1e-6,
+    patience=5,
     least_gain=0.5,
+    least_share=1e-3,
 )
-"""How the minimum of the negative log posterior is sought; a gain of half a unit is none."""
+"""How the minimum of the negative log posterior is sought; a gain of half a unit, or of a thousandth, is none."""
 
 
 @dataclass(frozen=True)
 class RefinementOptions:
     """How images are trusted.
 
-    ``noise`` is the least standard deviation of a pixel as a share of the image's peak; what the images then turn out
-    to err by, times ``noise_share``, is taken instead where it is more, in several ``rounds``. Errors of a model that
-    lacks something come in patches, in which pixels err together and must not be counted one by one: variance that
-    blocks of `BLOCK` pixels a side have beyond that of grain counts ``patches`` times. ``annealing`` are the noises to
-    begin with, stage by stage, with the ``leading`` directions of the prior: images that are trusted little at first
-    let the large features settle before the small ones are looked at. ``calibration`` is how many times the images'
-    variance is counted in the uncertainty: the curvature at one local optimum knows nothing of others nearby. It was
-    chosen so that 90 % intervals hold nine of ten heights of mirrors left out, in five folds.
+    Errors of a pixel have standard deviations relative to the image's peak, ``grain`` at least in each of `BANDS`, that
+    grow with the root of the flux from a share ``dark`` of the peak on. ``annealing`` are the errors to begin with,
+    stage by stage: images that are trusted little at first let the large features settle before the small ones are
+    looked at, by up to ``few`` of the images. Then they are estimated, in several ``rounds``, from all.
     ``shift_m``, ``exposure``, ``background`` [of the peak], ``blur_m`` and ``gamma`` are the standard deviations of the
-    nuisance parameters; pixels up to ``dark`` [of the peak] are lifted by noise that cannot go below black. Images are
-    compared at ``resolution`` pixels a side. Their changes may be traced more
-    coarsely than they themselves, which are few.
+    nuisance parameters; noise that cannot go below black lifts pixels up to ``black`` [of the peak]. Images are
+    compared at ``resolution`` pixels a side, traced with ``samples``.
     """
 
-    noise: float = 0.005
-    noise_share: float = 0.7
-    patches: float = 32.0
-    rounds: int = 4
-    annealing: tuple[float, ...] = (0.5, 0.1, 0.03)
-    leading: int = 60
-    steps: int = 16
-    calibration: float = 30.0
+    grain: float = 0.005
+    dark: float = 0.1
+    annealing: tuple[float, ...] = (0.3, 0.1)
+    rounds: int = 3
+    few: int = 8
+    steps: int = 12
     shift_m: float = 0.03
     exposure: float = 0.1
     background: float = 0.02
     blur_m: float = 0.05
     gamma: float = 0.1
-    dark: float = 0.01
+    black: float = 0.01
     resolution: int = COARSE_SIZE
     samples: int = 32
-    jacobian_samples: int = 12
 
 
 def _nuisance(image: Array, options: RefinementOptions) -> Array:
-    """Directions (n, 7) in which a camera may change an image, each as long as its standard deviation."""
+    """Directions (7, R, R) in which a camera may change an image, each as long as its standard deviation."""
     pixel = FLUX_WINDOW / image.shape[0]
     up, right = np.gradient(image, pixel)
     laplacian = np.gradient(up, pixel, axis=0) + np.gradient(right, pixel, axis=1)
     peak = image.max()
     relative = np.clip(image / peak, 1e-4, None)
-    directions = [
-        right * options.shift_m,
-        up * options.shift_m,
-        image * options.exposure,
-        np.full_like(image, peak * options.background),
-        laplacian * options.blur_m**2 / 2,
-        image * np.log(relative) * options.gamma,
-        # Noise that is cut at black lifts the dark, and only the dark.
-        np.exp(-relative / options.dark) * peak * options.background,
-    ]
-    return np.stack([d.ravel() for d in directions], axis=-1)
+    return np.stack(
+        [
+            right * options.shift_m,
+            up * options.shift_m,
+            image * options.exposure,
+            np.full_like(image, peak * options.background),
+            laplacian * options.blur_m**2 / 2,
+            image * np.log(relative) * options.gamma,
+            # Noise that is cut at black lifts the dark, and only the dark.
+            np.exp(-relative / options.black) * peak * options.background,
+        ]
+    )
+
+
+class _Weights:
+    """What a change of M images weighs, where bands of frequency err by ``sigma`` (5,).
+
+    With residual r = J dc + N n + noise and n ~ N(0, 1), the noise covariance is S + N N'. Its inverse root is known:
+    the nuisances' directions, made orthogonal in units of S, shrink. S and N are those of ``images`` (M, R, R) of a
+    surface near the one that is looked for. They stay while it is, or what is minimised would not be what was
+    differentiated; and they come of no photograph, or its noise would be weighed with itself.
+    """
+
+    def __init__(self, images: Array, sigma: Array, options: RefinementOptions) -> None:
+        size, peak = images.shape[-1], images.max(axis=(1, 2), keepdims=True)
+        frequency = np.hypot(*np.meshgrid(np.arange(size), np.arange(size)))
+        self._kept = frequency < BANDS[-1]
+        self._cosines = dct(np.eye(size), axis=0, norm="ortho")
+        self.bands = np.digitize(frequency[self._kept], BANDS)
+        self._scale, self._sigma = peak * np.sqrt(np.clip(images / peak, 0, None) + options.dark), sigma[self.bands]
+        nuisances = self._white(np.stack([_nuisance(image, options) for image in images]).swapaxes(0, 1))
+        _, singular, self._directions = np.linalg.svd(nuisances.swapaxes(0, 1), full_matrices=False)
+        self._shrunk = 1 - 1 / np.sqrt(1 + singular**2)
+
+    def __call__(self, changes: NDArray[Any]) -> NDArray[Any]:
+        """Changes (..., M, R, R) as ones (..., M, n) that err independently of each other with unit variance."""
+        white = self._white(changes)
+        directions, shrunk = (values.astype(changes.dtype) for values in (self._directions, self._shrunk))
+        along = np.einsum("...mn,mdn->...md", white, directions, optimize=True) * shrunk
+        white -= np.einsum("...md,mdn->...mn", along, directions, optimize=True)
+        return white
+
+    def _white(self, changes: NDArray[Any]) -> NDArray[Any]:
+        cosines, scale, sigma = (values.astype(changes.dtype) for values in (self._cosines, self._scale, self._sigma))
+        modes = cosines @ (changes / scale) @ cosines.T
+        return np.asarray(modes[..., self._kept] / sigma)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,158 +165,178 @@ class _Posterior:
         heliostat: Heliostat,
         observations: Sequence[Observation],
         prior: SurfacePrior,
-        model: tuple[Optics, Sequence[Effect]],
+        optics: Optics,
+        effects: Sequence[Effect],
         latitude_deg: float,
         options: RefinementOptions,
     ) -> None:
-        self.heliostat, self.observations = heliostat, observations
-        self.prior, self.options = prior, options
-        (self.optics, self.effects), self.latitude_deg = model, latitude_deg
+        self.heliostat, self.observations, self.prior, self.options = heliostat, observations, prior, options
+        self.optics, self.effects, self.latitude_deg = optics, effects, latitude_deg
         self.ranges = Ranges(observations, options.resolution)
-        self.measured = binned(np.array([o.flux for o in observations], dtype=np.float64), options.resolution)
+        flux = np.array([o.flux for o in observations], dtype=np.float64)
+        self.measured = binned(flux, options.resolution)
         # The same height for each direction: small enough for images to be linear in it, large enough to stand out from
         # their last digits.
         height = np.sqrt((prior.basis**2).mean(axis=(1, 2, 3)))
-        self.steps = np.clip(STEP_HEIGHT / height, 0.1, 4.0)
-        untilted = _untilted(prior.basis, control_points(heliostat))
-        changes = np.einsum("k,kfij,fc->kfcij", self.steps, untilted, heliostat.facet_normals)
-        self.changes = torch.as_tensor(changes, dtype=torch.float32)
-
-    def _rendered(self, aligned: Aligned, samples: int) -> Array:
-        """Images (B, R, R), sum 100, of aligned mirrors, the M observations over and over, as the cameras show them."""
-        with torch.no_grad():
-            images = aligned.flux_images(self.optics, self.effects, size=self.options.resolution, samples=samples)
-            each = images.double().view(-1, *self.measured.shape)
-        return np.asarray(self.ranges.seen(each).flatten(0, 1).numpy())
+        self.steps = np.clip(STEP_HEIGHT / height, 0.1, 4.0).astype(np.float32)
+        self.changes = (
+            torch.as_tensor(prior.basis, dtype=torch.float32) * torch.as_tensor(self.steps)[:, None, None, None]
+        )
 
     def state(self, c: Array) -> _State:
         """The mirror of coefficients (K,), aligned under each sun."""
         aligned = align_observations(
             self.heliostat, self.observations, self.prior.surface(c), self.effects, latitude_deg=self.latitude_deg
         )
-        return _State(c, aligned, self._rendered(aligned, self.options.samples))
+        size, samples = self.options.resolution, self.options.samples
+        with torch.no_grad():
+            images = self.ranges.seen(aligned.flux_images(self.optics, self.effects, size=size, samples=samples))
+        return _State(c, aligned, images.double().numpy())
 
-    def jacobian(self, state: _State, count: int) -> Array:
-        """Change of the images per coefficient (count, M, R, R), of the first so many.
+    def jacobian(self, state: _State) -> NDArray[Any]:
+        """Change of the images per coefficient (K, M, R, R)."""
+        size, samples = self.options.resolution, self.options.samples
+        with torch.no_grad():
+            images = state.aligned.flux_changes(self.changes, self.optics, self.effects, size=size, samples=samples)
+            images = self.ranges.seen(images)
+            changes: NDArray[Any] = (images[1:] - images[:1]).numpy()
+        return np.asarray(changes / self.steps[:, None, None, None])
 
-        The mount takes back what a change tilts the mirror as a whole (`_untilted`).
+    def optimum(self, state: _State, belief: "_Belief", jacobian: NDArray[Any] | None = None) -> Minimum[_State]:
+        """The highest density near a state; its Jacobian saves one."""
+        weights = _Weights(state.images, belief.sigma, self.options)
+        descent = replace(DESCENT, steps=self.options.steps)
+        return minimize(_Problem(self, weights, belief.precision), state, descent, jacobian)
+
+    def fit(self, state: _State, jacobian: NDArray[Any], belief: "_Belief") -> "_Fit":
+        """What there is to say of a state that was found with a belief."""
+        weights = _Weights(state.images, belief.sigma, self.options)
+        return _Fit(belief, weights(jacobian), weights(self.measured - state.images), weights.bands)
+
+    def settled(self, state: _State) -> tuple[_State, NDArray[Any], "_Belief"]:
+        """The state near another at which large features are right, the Jacobian there and what it was found with."""
+        jacobian = self.jacobian(state)
+        for error in self.options.annealing:
+            belief = _Belief(np.full(len(BANDS), error), np.ones(len(state.c)))
+            found = self.optimum(state, belief, jacobian)
+            state, jacobian = found.state, found.jacobian
+        return state, jacobian, belief
+
+    def estimated(self, state: _State, jacobian: NDArray[Any], belief: "_Belief") -> tuple[_State, "_Fit"]:
+        """The state of the highest density near another, with errors of the images as they turn out."""
+        for left in reversed(range(self.options.rounds)):
+            fit = self.fit(state, jacobian, belief)
+            sigma = fit.errors() if left else belief.sigma * np.sqrt(max(fit.overdispersion(), 1.0))
+            precision = self.prior.precision(state.c, np.diag(fit.covariance))
+            belief = _Belief(np.maximum(sigma, self.options.grain), precision)
+            found = self.optimum(state, belief, jacobian)
+            state, jacobian = found.state, found.jacobian
+        return state, self.fit(state, jacobian, belief)
+
+
+@dataclass(frozen=True, eq=False)
+class _Belief:
+    """What bands of frequency err by (5,), and the precision of the prior's coefficients (K,)."""
+
+    sigma: Array
+    precision: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """Derivatives (K, M, n) of weighed images, what is left of them (M, n), and the band (n,) of each mode."""
+
+    belief: _Belief
+    white: NDArray[Any]
+    left: Array
+    bands: NDArray[np.int64]
+
+    @cached_property
+    def covariance(self) -> Array:
+        """Covariance (K, K) of the coefficients."""
+        return self._covariance(np.ones(len(BANDS)))
+
+    def _covariance(self, share: Array) -> Array:
+        """Covariance (K, K), where bands tell a ``share`` (5,) of what they seem to."""
+        flat = (self.white * np.sqrt(share[self.bands]).astype(np.float32)).reshape(len(self.white), -1)
+        return np.asarray(np.linalg.inv((flat @ flat.T).astype(np.float64) + np.diag(self.belief.precision)))
+
+    @cached_property
+    def information(self) -> Array:
+        """What each image tells of the coefficients (M, K, K)."""
+        each = self.white.swapaxes(0, 1)
+        return np.asarray(each @ each.swapaxes(1, 2), dtype=np.float64)
+
+    @cached_property
+    def scores(self) -> Array:
+        """Where each image would move the coefficients (M, K): down the gradient of its cost."""
+        return np.asarray(np.einsum("kmn,mn->mk", self.white, self.left, optimize=True))
+
+    def errors(self) -> Array:
+        """What bands err by (5,): what is left of them, less what coefficients took away."""
+        spent = np.einsum(
+            "kmn,kmn->n", self.white, np.tensordot(self.covariance.astype(np.float32), self.white, axes=1)
+        )
+        free = np.maximum(np.bincount(self.bands, len(self.left) - spent), 1)
+        return np.asarray(self.belief.sigma * np.sqrt(np.bincount(self.bands, (self.left**2).sum(axis=0)) / free))
+
+    def overdispersion(self) -> float:
+        """How many times farther apart images pull the surface than independent errors would make them, squared.
+
+        Of one where they err as they are thought to: errors that look like a bent mirror weigh more than others.
         """
-        (group,), samples, changes = state.aligned.groups, self.options.jacobian_samples, self.changes[:count]
-        points = (group.scene.control_points + changes[:, None]).flatten(0, 1)
-        scene = group.scene.repeated(count).with_(control_points=points)
-        stacked = replace(group, rows=list(range(scene.batch)), planes=group.planes * count, scene=scene)
-        changed = self._rendered(Aligned((stacked,)), samples).reshape(count, *state.images.shape)
-        return np.asarray((changed - self._rendered(state.aligned, samples)) / self.steps[:count, None, None, None])
+        along = self.covariance @ self.information
+        expected = np.trace(along, axis1=1, axis2=2).sum() - np.einsum("mij,mji->", along, along)
+        return float(np.einsum("mi,ij,mj->", self.scores, self.covariance, self.scores) / max(expected, 1.0))
 
-    def _whitened(self, image: Array, noise: float) -> tuple[float, Array, Array]:
-        """Noise of an image's pixels, its nuisance directions over that noise (n, 7), and Woodbury's inner inverse.
+    def contradicted(self) -> int | None:
+        """The image that the others contradict most, if they do: by what a surface found from them leaves of it."""
+        if len(self.left) < CONSENSUS:
+            return None
+        missed = self.missed()
+        return int(missed.argmax()) if missed.max() > CONTRADICTION * np.median(missed) else None
 
-        With residual r = J dc + N n + noise and n ~ N(0, 1), the noise covariance is s^2 + N N'.
-        """
-        sigma = noise * float(image.max())
-        directions = _nuisance(image, self.options) / sigma
-        inner = np.linalg.inv(np.eye(directions.shape[1]) + directions.T @ directions)
-        return sigma, directions, np.asarray(inner, dtype=np.float64)
+    def missed(self) -> Array:
+        """Mean square (M,) of what is left of each image where a surface is found from the others, to first order."""
+        others = np.eye(len(self.covariance)) - self.information @ self.covariance
+        turned = np.linalg.solve(others, self.scores[..., None])[..., 0] @ self.covariance
+        return np.asarray(((self.left + np.einsum("mk,kmn->mn", turned, self.white)) ** 2).mean(axis=1))
 
-    def cost(self, state: _State, noise: float) -> float:
-        """Negative logarithm of the posterior density, to a constant."""
-        total = float(state.c @ state.c)
-        for measured, image in zip(self.measured, state.images, strict=True):
-            sigma, directions, inner = self._whitened(image, noise)
-            r = (measured - image).ravel() / sigma
-            along = directions.T @ r
-            total += float(r @ r - along @ inner @ along)
-        return total / 2
-
-    def quadratic(self, state: _State, jacobian: Array, noise: float) -> tuple[Array, Array]:
-        """Downhill gradient (k,) and Gauss-Newton curvature (k, k) of the cost, in a Jacobian's k coefficients."""
-        count = len(jacobian)
-        gradient, curvature = -state.c[:count], np.eye(count)
-        for index, (measured, image) in enumerate(zip(self.measured, state.images, strict=True)):
-            sigma, directions, inner = self._whitened(image, noise)
-            r = (measured - image).ravel() / sigma
-            j = jacobian[:, index].reshape(count, -1).T / sigma
-            projected = inner @ (directions.T @ j)
-            gradient = gradient + j.T @ r - projected.T @ (directions.T @ r)
-            curvature = curvature + j.T @ j - (directions.T @ j).T @ projected
-        return gradient, curvature
-
-    def moved(self, state: _State, change: Array) -> _State:
-        """The mirror after a change (k,) of its first coefficients."""
-        return self.state(state.c + np.pad(change, (0, len(state.c) - len(change))))
-
-    def optimize(self, state: _State, noise: float, jacobian: Array, retraced: int = 1) -> tuple[_State, Array]:
-        """The state of the highest density near another, in a Jacobian's (k, M, R, R) coefficients, and its Jacobian.
-
-        The Jacobian is traced anew up to ``retraced`` times, where corrections no longer help.
-        """
-        descent = replace(DESCENT, steps=self.options.steps, jacobians=retraced)
-        found = minimize(_Problem(self, noise, len(jacobian)), state, descent, jacobian)
-        return found.state, found.jacobian
-
-    def optimum(self, c: Array) -> tuple[_State, Array]:
-        """The local optimum near coefficients (K,) and the Jacobian there: large features first, then all."""
-        state, options = self.state(c), self.options
-        jacobian = self.jacobian(state, min(options.leading, len(c)))
-        for noise in options.annealing:
-            state, jacobian = self.optimize(state, noise, jacobian)
-        jacobian = self.jacobian(state, len(c))
-        for left in reversed(range(options.rounds)):
-            state, jacobian = self.optimize(
-                state, self.noise(state, options.noise_share), jacobian, retraced=int(left == 0)
-            )
-        return state, jacobian
-
-    def covariance(self, state: _State, jacobian: Array) -> Array:
-        """Covariance (K, K) of the coefficients: the inverse curvature, the images' noise counted more than once."""
-        _, curvature = self.quadratic(state, jacobian, self.noise(state) * np.sqrt(self.options.calibration))
-        return np.asarray(np.linalg.inv(curvature), dtype=np.float64)
-
-    def noise(self, state: _State, share: float = 1.0) -> float:
-        """Standard deviation of a pixel, of the peak: a ``share`` of what the state leaves of the images."""
-        grain, patch = 0.0, 0.0
-        for measured, image in zip(self.measured, state.images, strict=True):
-            directions = _nuisance(image, self.options)
-            residual = (measured - image).ravel() / image.max()
-            residual -= directions @ np.linalg.lstsq(directions, residual, rcond=None)[0]
-            grain += residual.var()
-            patch += binned(residual.reshape(1, *image.shape), image.shape[0] // BLOCK).var() / BLOCK**2
-        variance = (grain + self.options.patches * max(0.0, patch - grain)) / len(self.measured)
-        return max(self.options.noise, share * float(np.sqrt(variance)))
+    def cautious(self, grain: float) -> Array:
+        """Covariance (K, K) where photographs share errors: all variance beyond a ``grain`` counts once for each."""
+        extra = np.clip(1 - (grain / self.belief.sigma) ** 2, 0, None)
+        return self._covariance(1 / (1 + (len(self.left) - 1) * extra))
 
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """A posterior as a least-squares problem: in its first ``count`` coefficients, with one ``noise`` of images."""
+    """A posterior as a least-squares problem, with fixed weights of the images and a fixed prior."""
 
     posterior: _Posterior
-    noise: float
-    count: int
+    weights: _Weights
+    precision: Array
 
     def cost(self, state: _State) -> float:
-        return self.posterior.cost(state, self.noise)
+        left = self.weights(self.posterior.measured - state.images)
+        return float(state.c @ (self.precision * state.c) + (left**2).sum()) / 2
 
     def response(self, state: _State) -> Array:
         return state.images
 
     def jacobian(self, state: _State) -> Array:
-        return self.posterior.jacobian(state, self.count)
+        return self.posterior.jacobian(state)
 
     def quadratic(self, state: _State, jacobian: Array) -> tuple[Array, Array]:
-        return self.posterior.quadratic(state, jacobian, self.noise)
+        white = self.weights(jacobian).reshape(len(jacobian), -1)
+        left = self.weights(self.posterior.measured - state.images).ravel()
+        gradient = (white @ left.astype(white.dtype)).astype(np.float64) - self.precision * state.c
+        return gradient, (white @ white.T).astype(np.float64) + np.diag(self.precision)
 
     def bounds(self, state: _State) -> None:
         return None
 
     def moved(self, state: _State, change: Array) -> _State:
-        return self.posterior.moved(state, change)
-
-
-def _untilted(z: Array, ideal: Array) -> Array:
-    """Heights (K, F, I, J) [m] over ideal control points (F, I, J, 3) [m] without the tilt of the whole mirror."""
-    modes = np.moveaxis(ideal[..., :2] - ideal[..., :2].mean(axis=(1, 2), keepdims=True), -1, 0).reshape(2, -1)
-    flat = z.reshape(len(z), -1)
-    return np.asarray((flat - flat @ np.linalg.pinv(modes) @ modes).reshape(z.shape))
+        return self.posterior.state(state.c + change)
 
 
 def refine(
@@ -296,7 +358,7 @@ def refine(
     observations : sequence of Observation
         Any number from one.
     start : (4, 8, 8) [m], optional
-        Where to begin besides the prior's mean: the network's prediction, say.
+        Where to begin instead of the prior's mean: the network's prediction, say.
     latitude_deg : float [deg]
         Of the plant.
 
@@ -308,20 +370,47 @@ def refine(
     if not observations:
         raise InvalidInputError("a refinement takes at least one image")
     require_own_grid(heliostat)
-    prior, optics = prior or default_prior(), optics or Optics()
+    prior, optics = prior or prior_of(heliostat), optics or Optics()
     options = options or RefinementOptions()
-    posterior = _Posterior(heliostat, observations, prior, (optics, effects), latitude_deg, options)
-    starts = [np.zeros(len(prior.basis))] + ([] if start is None else [prior.coefficients(start)])
-    optima = [posterior.optimum(c) for c in starts]
-    state, jacobian = min(optima, key=lambda optimum: posterior.cost(optimum[0], options.noise))
+    state, fit, left_out = _consensus(heliostat, observations, start, (prior, optics, effects), latitude_deg, options)
     z = prior.surface(state.c)
     return SurfacePrediction(
         z=z,
-        z_std=prior.deviation(posterior.covariance(state, jacobian)),
+        z_std=prior.deviation(fit.cautious(options.grain)),
         control_points=control_points(heliostat, z),
         method="refined",
         weights=prior.name,
         misfits=misfits(heliostat, observations, z, optics, effects, latitude_deg=latitude_deg),
         used=tuple(o.identifier for o in observations),
         mahalanobis=prior.mahalanobis(z),
+        contradicting=tuple(observations[i].identifier for i in left_out),
     )
+
+
+def _consensus(
+    heliostat: Heliostat,
+    observations: Sequence[Observation],
+    start: Array | None,
+    model: tuple[SurfacePrior, Optics, Sequence[Effect]],
+    latitude_deg: float,
+    options: RefinementOptions,
+) -> tuple[_State, _Fit, list[int]]:
+    """The most probable surface, what there is to say of it, and the places of images that were left out for it."""
+
+    def posterior(part: Sequence[int]) -> _Posterior:
+        return _Posterior(heliostat, [observations[i] for i in part], *model, latitude_deg, options)
+
+    kept, left_out = list(range(len(observations))), list[int]()
+    c = np.zeros(len(model[0].basis)) if start is None else model[0].coefficients(start)
+    while True:
+        few = [kept[i] for i in spread_suns(np.array([observations[i].sun for i in kept]), options.few)]
+        whole = posterior(few)
+        state, jacobian, belief = whole.settled(whole.state(c))
+        if len(few) < len(kept):
+            whole = posterior(kept)
+            state = whole.state(state.c)
+            jacobian = whole.jacobian(state)
+        out = whole.fit(state, jacobian, belief).contradicted()
+        if out is None:
+            return *whole.estimated(state, jacobian, belief), left_out
+        left_out.append(kept.pop(out))

@@ -1,12 +1,18 @@
-"""Estimate the surface prior that ships: ``python -m training.prior --run runs/best``."""
+"""Estimate the surface prior that ships: ``python -m training.prior --run runs/best``.
+
+``--compare ../shared/stj`` prints which prior predicts measured mirrors best that were left out.
+"""
 
 import argparse
+import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import gammaln
 
-from model.prior import PRIOR, SurfacePrior
+from model.prior import FREEDOM, GROUPS, KNOWN_SIZE, PRIOR, SurfacePrior, generic_prior, orthogonal
 from training.config import TrainConfig
 from training.surfaces import load_surfaces, split_by_heliostat, tilt_modes, untilted, with_symmetries
 
@@ -15,6 +21,9 @@ Array = NDArray[np.float64]
 
 FACET_SHARE = 0.5
 """Share of the covariance that takes facets for independent samples of one kind (`shrunk`)."""
+
+SPAN = 246
+"""Directions by which priors are compared: so many any of them has."""
 
 FLOOR = 7e-6
 """Standard deviation [m] of each control point on its own, of which no covariance of forty mirrors tells.
@@ -78,20 +87,63 @@ def canting_directions(sigma_mrad: float = 0.6) -> Array:
     return free.reshape(8, 4, 8, 8)
 
 
-def orthogonal(directions: Array) -> Array:
-    """Orthogonal directions (K, 4, 8, 8) [m] of the same covariance, the longest first, their largest height up."""
-    flat = directions.reshape(len(directions), -1)
-    _, singular, axes = np.linalg.svd(flat, full_matrices=False)
-    signs = np.sign(axes[np.arange(len(axes)), np.abs(axes).argmax(axis=1)])
-    return np.asarray(((signs * singular)[:, None] * axes)[singular > 1e-9].reshape(-1, *directions.shape[1:]))
+def compare(surfaces: Array) -> str:
+    """What priors say of mirrors (N, 4, 8, 8) [m] that were left out of them, in Markdown.
+
+    Log density of their coefficients [nats a mirror], above the Gaussian's that is estimated from the same others; a
+    generic prior has directions of its own, and is told by its own Gaussian and by its scales.
+    """
+    gauss: list[float] = []
+    found: dict[str, list[float]] = {
+        name: [] for name in ("Gaussian, one scale a mirror", "a scale for each group", "generic")
+    }
+    for left_out, surface in enumerate(surfaces):
+        prior = estimate(np.delete(surfaces, left_out, axis=0))
+        seen = generic_prior(np.tile(KNOWN_SIZE, (4, 1)))
+        gauss.append(_nats(prior, surface, (), np.inf))
+        found["Gaussian, one scale a mirror"].append(_nats(prior, surface, (0,), FREEDOM))
+        found["a scale for each group"].append(_nats(prior, surface, GROUPS, FREEDOM))
+        found["generic"].append(_nats(seen, surface, GROUPS, FREEDOM))
+    rng = np.random.default_rng(0)
+    rows = []
+    for name, values in found.items():
+        gain = np.array(values) - np.array(gauss)
+        low, high = np.quantile(gain[rng.integers(len(gain), size=(4000, len(gain)))].mean(axis=1), (0.05, 0.95))
+        rows.append(
+            f"| {name} | {gain.mean():.0f} [{low:.0f}, {high:.0f}] | {np.median(gain):.0f} | {(gain > 0).mean():.0%} |"
+        )
+    head = ["| prior | mean gain over the Gaussian [nats a mirror], 90 % | median | mirrors it is better for |"]
+    return "\n".join([*head, "| --- | --- | --- | --- |", *rows])
+
+
+def _nats(prior: SurfacePrior, surface: Array, groups: Sequence[int], freedom: float) -> float:
+    """Logarithm of the density of a surface (4, 8, 8) [m] in `SPAN` dimensions that all priors share."""
+    c = prior.coefficients(surface)[:SPAN]
+    size = float(np.log((prior.basis[:SPAN] ** 2).sum(axis=(1, 2, 3))).sum()) / 2
+    if not groups:
+        return float(-(c @ c + SPAN * np.log(2 * np.pi)) / 2) - size
+    counts = np.diff([*groups, SPAN])
+    squares = np.add.reduceat(c**2, groups)
+    each = gammaln((freedom + counts) / 2) - gammaln(freedom / 2) - counts / 2 * np.log(freedom * np.pi)
+    return float((each - (freedom + counts) / 2 * np.log1p(squares / freedom)).sum()) - size
 
 
 def main() -> None:
-    """Write the prior of a run's training heliostats."""
+    """Write the prior of a run's training heliostats, or compare priors."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--run", type=Path, default=Path("runs/best"))
     parser.add_argument("--out", type=Path, default=PRIOR)
+    parser.add_argument(
+        "--compare", type=Path, metavar="DATA", help="print what priors say of mirrors left out of them"
+    )
     arguments = parser.parse_args()
+    if arguments.compare is not None:
+        surfaces, names = load_surfaces(arguments.compare)
+        apart = json.loads((arguments.compare / "surfaces-apart.json").read_text(encoding="utf-8"))
+        chosen = [i for i, name in enumerate(names) if name not in apart]
+        print(f"{len(chosen)} measured mirrors, each left out in turn; without {', '.join(apart)}")
+        print(compare(surfaces[chosen]))
+        return
     config = TrainConfig.read(arguments.run / "config.json")
     surfaces, _ = load_surfaces(Path(config.data))
     train, _ = split_by_heliostat(len(surfaces), config.held_out, config.seed, config.fold)

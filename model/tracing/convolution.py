@@ -262,7 +262,7 @@ def _splat(x: Tensor, y: Tensor, weight: Tensor, rows: int, columns: int) -> Ten
     """
     column, row = x.detach().round(), y.detach().round()
     inside = (column >= 1) & (column < columns - 1) & (row >= 1) & (row < rows - 1)
-    across, down = _quadratic(x - column), _quadratic(y - row)
+    across, down = quadratic(x - column), quadratic(y - row)
     batch = torch.arange(x.shape[0], device=x.device)[:, None] * (rows * columns)
     corner = batch + (row.clamp(1, rows - 2).long() - 1) * columns + column.clamp(1, columns - 2).long() - 1
     corner = corner.flatten()
@@ -275,7 +275,7 @@ def _splat(x: Tensor, y: Tensor, weight: Tensor, rows: int, columns: int) -> Ten
     return image.view(x.shape[0], rows, columns)
 
 
-def _quadratic(offset: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def quadratic(offset: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Shares of the pixel before, at and after a point that lies ``offset`` in [-1/2, 1/2] from its nearest pixel."""
     return 0.5 * (0.5 - offset) ** 2, 0.75 - offset**2, 0.5 * (0.5 + offset) ** 2
 
@@ -425,16 +425,42 @@ def _of_parts(value: float | Tensor, parts: int) -> float | Tensor:
     return value.repeat_interleave(parts) if isinstance(value, Tensor) and value.numel() > 1 else value
 
 
-def _image(
-    rays: Rays,
-    center: Tensor,
-    window: Window,
-    optics: Optics,
-    irradiance: Tensor,
-    padding: tuple[float, float],
-    parts: int,
-) -> Tensor:
-    """Irradiance (B / parts, rows, columns) [W/m2] of rays (B) in windows about ``center`` (B, 2) [m]."""
+@dataclass(frozen=True, eq=False)
+class Raster:
+    """Where rays land among the pixels of padded windows, and what blurs them there.
+
+    Attributes
+    ----------
+    x, y : Tensor (B, S) [px]
+        Column and row.
+    weight : Tensor (B, S) [W/m2]
+        What each ray gives to a pixel that it lies in alone.
+    transfer : Tensor (B, R, C / 2 + 1)
+        Of cone, patch and mount, with the splat's smear undone.
+    shape : tuple of int
+        Rows R and columns C with padding.
+    inner : tuple of slice
+        The window in them.
+    """
+
+    x: Tensor
+    y: Tensor
+    weight: Tensor
+    transfer: Tensor
+    shape: tuple[int, int]
+    inner: tuple[slice, slice]
+
+    def blurred(self, images: Tensor, parts: int = 1) -> Tensor:
+        """Windows (..., rows, columns) of sharp images (..., B, R, C), those of ``parts`` mirrors each added up."""
+        spectrum = (torch.fft.rfft2(images) * self.transfer).unflatten(-3, (-1, parts)).sum(-3)
+        whole: Tensor = torch.fft.irfft2(spectrum, s=self.shape)
+        return whole[..., self.inner[0], self.inner[1]]
+
+
+def raster(
+    rays: Rays, center: Tensor, window: Window, optics: Optics, irradiance: Tensor, padding: tuple[float, float]
+) -> Raster:
+    """Rays (B) in windows about ``center`` (B, 2) [m], padded above and aside as `trace` tells."""
     pixel_x, pixel_y = window.pixel
     reach = _reach(rays, optics)
     rows, columns = (
@@ -446,10 +472,21 @@ def _image(
     first_row, first_column = (rows - window.rows) // 2, (columns - window.columns) // 2
     x = (rays.hits[:, 0] - center[:, :1] + window.width / 2) / pixel_x + first_column - 0.5
     y = (window.height / 2 - rays.hits[:, 1] + center[:, 1:]) / pixel_y + first_row - 0.5
-    image = _splat(x, y, rays.power * (irradiance / (pixel_x * pixel_y))[:, None], rows, columns)
-
-    right, up, unsmear = _frequencies(rows, columns, window.pixel, image.dtype, image.device)
+    right, up, unsmear = _frequencies(rows, columns, window.pixel, x.dtype, x.device)
     transfer = _cone_transfer(rays, optics, right, up, table) * _patch_transfer(rays, right, up) * unsmear
-    spectrum = (torch.fft.rfft2(image) * transfer).view(-1, parts, *transfer.shape[1:]).sum(1)
-    blurred: Tensor = torch.fft.irfft2(spectrum, s=(rows, columns))
-    return blurred[:, first_row : first_row + window.rows, first_column : first_column + window.columns]
+    inner = (slice(first_row, first_row + window.rows), slice(first_column, first_column + window.columns))
+    return Raster(x, y, rays.power * (irradiance / (pixel_x * pixel_y))[:, None], transfer, (rows, columns), inner)
+
+
+def _image(
+    rays: Rays,
+    center: Tensor,
+    window: Window,
+    optics: Optics,
+    irradiance: Tensor,
+    padding: tuple[float, float],
+    parts: int,
+) -> Tensor:
+    """Irradiance (B / parts, rows, columns) [W/m2] of rays (B) in windows about ``center`` (B, 2) [m]."""
+    seen = raster(rays, center, window, optics, irradiance, padding)
+    return seen.blurred(_splat(seen.x, seen.y, seen.weight, *seen.shape), parts)

@@ -49,7 +49,7 @@ def test_alignment_images_and_predictions_are_those_of_the_true_sun(latitude: fl
         for images, effects in ((recorded, known), (true, ()))
     )
     np.testing.assert_allclose(found.z, expected.z, atol=1e-7)
-    quick = RefinementOptions(annealing=(0.5,), leading=4, rounds=1, steps=2)
+    quick = RefinementOptions(annealing=(0.5,), rounds=1, steps=2)
     found, expected = (
         refine(heliostat, images, effects=effects, options=quick, latitude_deg=latitude)
         for images, effects in ((recorded, known), (true, ()))
