@@ -4,8 +4,9 @@ from alembic import context
 from sqlalchemy import Connection, text
 
 from service.base.settings import Settings
+from service.store import job_tables, tables  # noqa: F401 - the metadata knows what was loaded
+from service.store.columns import Base
 from service.store.database import make_engine
-from service.store.tables import Base
 
 # Any fixed number: it names the lock that lets one migration run at a time on PostgreSQL.
 _MIGRATION_LOCK = 0x68656C696F

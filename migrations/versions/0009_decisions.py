@@ -9,7 +9,7 @@ branch_labels = None
 depends_on = None
 
 
-_TRUST = (
+_TRUST: tuple[sa.Column[object], ...] = (
     sa.Column("trusted", sa.Boolean(), nullable=True),
     sa.Column("doubts", sa.JSON(none_as_null=True), nullable=True),
     sa.Column("doubted_since", sa.DateTime(timezone=True), nullable=True),

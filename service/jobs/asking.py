@@ -4,9 +4,9 @@ from typing import Any
 
 from service.jobs.kind import Kinds
 from service.store import audit
+from service.store.job_tables import JobRow
 from service.store.keys import ITSELF
 from service.store.queue import add_job, cancel
-from service.store.tables import JobRow
 from service.twin.runtime import Runtime
 
 

@@ -14,7 +14,7 @@ from sqlalchemy.orm import Session
 
 from service.base.settings import Settings
 from service.store import queue
-from service.store.tables import JobRow
+from service.store.job_tables import JobRow
 from service.twin.runtime import Runtime
 
 # Seconds between two writes of a job's progress: what a person can follow, and little for the database.

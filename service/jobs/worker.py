@@ -28,7 +28,7 @@ from service.base.settings import Settings
 from service.jobs.asking import begin_due
 from service.jobs.kind import CancelRequestedError, Context, Kinds, WorkerStoppingError
 from service.store import queue, retention
-from service.store.tables import JobRow
+from service.store.job_tables import JobRow
 from service.twin.runtime import Operations, Runtime
 
 logger = logging.getLogger("heliotwin.jobs")

@@ -6,7 +6,7 @@ from typing import Any
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from service.store.tables import AuditRow
+from service.store.job_tables import AuditRow
 
 
 def record(session: Session, actor: str, action: str, subject: str, **detail: Any) -> None:

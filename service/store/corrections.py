@@ -6,14 +6,7 @@ from dataclasses import dataclass
 from sqlalchemy import delete, func, select
 from sqlalchemy.orm import Session
 
-from service.store.tables import (
-    CorrectionRow,
-    DriftRow,
-    ForecastRow,
-    MeasurementRow,
-    SurfaceRow,
-    surface_measurements,
-)
+from service.store.tables import CorrectionRow, DriftRow, ForecastRow, MeasurementRow, SurfaceRow, surface_measurements
 
 EXCLUDED = "excluded"
 """Why a photograph is not accepted that somebody excluded."""

@@ -19,8 +19,8 @@ from service.base import names
 from service.base.faults import ConflictError, NotFoundError
 from service.store import audit
 from service.store.columns import now
+from service.store.job_tables import ROLES, KeyRow
 from service.store.rows import insert
-from service.store.tables import ROLES, KeyRow
 
 RESERVED = "local"
 """Who acts where no key is demanded; no key may bear this name."""

@@ -21,8 +21,8 @@ from sqlalchemy.orm import Session, defer, undefer
 from model.errors import InvalidInputError
 from service.base.faults import ConflictError, NotFoundError, TooManyError
 from service.store.columns import now
+from service.store.job_tables import JobRow, JobStepRow
 from service.store.rows import insert
-from service.store.tables import JobRow, JobStepRow
 
 ENDED = ("done", "failed", "cancelled")
 """States that a job does not leave."""

@@ -5,6 +5,7 @@ from sqlalchemy.orm import Session
 
 from service.base.faults import ConflictError
 from service.store.columns import Base
+from service.store.job_tables import JobRow
 from service.store.plant import get_heliostat, get_receiver, get_target
 from service.store.queue import ENDED
 from service.store.rows import one_at_a_time
@@ -13,7 +14,6 @@ from service.store.tables import (
     DriftRow,
     ForecastRow,
     HeliostatRow,
-    JobRow,
     MeasurementRow,
     MountRow,
     ReceiverRow,

@@ -10,17 +10,9 @@ from sqlalchemy.orm import Session, joinedload, lazyload, load_only, undefer
 
 from service.base.faults import NotFoundError
 from service.store.columns import Base
+from service.store.job_tables import JobRow
 from service.store.rows import hold
-from service.store.tables import (
-    ForecastRow,
-    HeliostatRow,
-    ImageRow,
-    JobRow,
-    MeasurementRow,
-    StudyRow,
-    SurfaceRow,
-    TargetRow,
-)
+from service.store.tables import ForecastRow, HeliostatRow, ImageRow, MeasurementRow, StudyRow, SurfaceRow, TargetRow
 
 # What a forecast tells of its heliostat and surface is a name and a number; the rest would be megabytes in a list.
 _NAMES = (

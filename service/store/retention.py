@@ -6,8 +6,9 @@ from sqlalchemy import delete, func, select
 from sqlalchemy.orm import Session
 
 from service.store import audit, queue
+from service.store.job_tables import AuditRow
 from service.store.keys import RESERVED
-from service.store.tables import AuditRow, ForecastRow
+from service.store.tables import ForecastRow
 
 
 def prune_jobs(session: Session, age: timedelta, most: int = 500) -> int:

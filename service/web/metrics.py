@@ -18,7 +18,8 @@ from sqlalchemy.orm import Session
 from service.base.meters import PROCESS
 from service.base.settings import Settings
 from service.store import queue, sizes
-from service.store.tables import DriftRow, HeliostatRow, JobRow
+from service.store.job_tables import JobRow
+from service.store.tables import DriftRow, HeliostatRow
 from service.twin.field import read_lines
 from service.twin.runtime import Runtime
 

@@ -33,8 +33,9 @@ from service.store.backup import images_of
 from service.store.columns import Base, now
 from service.store.database import Database
 from service.store.images import digest
+from service.store.job_tables import JobStepRow
 from service.store.surfaces import NewSurface
-from service.store.tables import ForecastRow, ImageRow, JobStepRow, MeasurementRow
+from service.store.tables import ForecastRow, ImageRow, MeasurementRow
 from service.twin import compute
 from service.twin.field import read_lines
 from service.twin.ingest import _row

@@ -15,7 +15,7 @@ from service.base.fields import Model
 from service.base.settings import Settings
 from service.jobs.kind import Context, Kind, Kinds, Result
 from service.jobs.worker import work
-from service.store.tables import AuditRow
+from service.store.job_tables import AuditRow
 from service.twin.runtime import Operations
 
 

@@ -17,7 +17,7 @@ from starlette.types import Receive, Scope, Send
 from service.base.faults import BusyError, TooManyError
 from service.base.fields import State
 from service.store import queue
-from service.store.tables import JobRow
+from service.store.job_tables import JobRow
 from service.twin.runtime import Runtime
 from service.web.door import security
 

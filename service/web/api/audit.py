@@ -8,7 +8,7 @@ from pydantic import BaseModel, Field
 
 from service.base.fields import Version
 from service.store import audit
-from service.store.tables import AuditRow
+from service.store.job_tables import AuditRow
 from service.web.answers.openapi import problems
 from service.web.answers.paging import Page, page
 from service.web.door.dependencies import ADMIN, Limit, RuntimeDep

@@ -14,7 +14,7 @@ from service.drawing.pictures import flux_picture
 from service.jobs.asking import ask_for, cancel_for
 from service.jobs.kind import Kind, Kinds, result_of
 from service.store import queue
-from service.store.tables import JobRow
+from service.store.job_tables import JobRow
 from service.twin.runtime import Runtime
 from service.web.answers import formats
 from service.web.answers.formats import MediaType, json_answer, maps_answer

@@ -20,7 +20,7 @@ from service.base.faults import OpenDoorError
 from service.base.settings import Settings, is_loopback
 from service.store import keys
 from service.store.database import Database
-from service.store.tables import ROLES
+from service.store.job_tables import ROLES
 
 COOKIE = "heliotwin_key"
 

@@ -14,7 +14,8 @@ from sqlalchemy.orm import Session
 from service.base.settings import Settings
 from service.drawing.charts import Scale
 from service.drawing.templates import figure
-from service.store.tables import JobRow, PlantRow, TargetRow
+from service.store.job_tables import JobRow
+from service.store.tables import PlantRow, TargetRow
 from service.twin.accuracy import RECENT
 from service.twin.field import FieldBook, Line
 from service.web.answers.pages import render

@@ -20,7 +20,8 @@ from service.jobs.asking import ask_for
 from service.jobs.kinds.field_forecasts import FleetForecastIn
 from service.store import queue
 from service.store.columns import now
-from service.store.tables import JobRow, PlantRow, ReceiverRow, TargetRow
+from service.store.job_tables import JobRow
+from service.store.tables import PlantRow, ReceiverRow, TargetRow
 from service.twin.forecast import ForecastRequest, flux_of, make_forecast, position_of
 from service.twin.runtime import Runtime
 from service.web.answers.pages import go_to, leave_for, render

@@ -13,8 +13,8 @@ from service.jobs.asking import ask_for, cancel_for
 from service.jobs.kind import result_of
 from service.jobs.kinds.predictions import PredictionsIn
 from service.store import queue
+from service.store.job_tables import JobRow
 from service.store.sizes import sizes
-from service.store.tables import JobRow
 from service.web.answers.pages import go_to, render
 from service.web.door.dependencies import DRAWS, OPERATE, READ, IdentityDep, KindsDep, RuntimeDep
 

@@ -25,7 +25,7 @@ from service.base.settings import Settings
 from service.jobs.worker import Worker, Workers, pause_s
 from service.store import queue
 from service.store.database import Database
-from service.store.tables import AuditRow, JobRow
+from service.store.job_tables import AuditRow, JobRow
 from service.twin.gate import Gate
 from service.twin.runtime import Runtime
 from tests.service.conftest import FakeOperations, until

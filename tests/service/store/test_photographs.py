@@ -23,8 +23,9 @@ from service.store.check import inspect_store, is_sound
 from service.store.columns import now
 from service.store.database import Database
 from service.store.images import ImageStore, digest
+from service.store.job_tables import JobRow
 from service.store.keys import RESERVED
-from service.store.tables import ImageRow, JobRow, MeasurementRow
+from service.store.tables import ImageRow, MeasurementRow
 from service.twin.ingest import Photograph, ingest
 from service.twin.prediction import predict_surface
 from service.twin.runtime import Runtime

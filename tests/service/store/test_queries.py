@@ -20,9 +20,10 @@ from service.base.faults import ConflictError, NotFoundError
 from service.store import keys
 from service.store.columns import now
 from service.store.database import Database
+from service.store.job_tables import KeyRow
 from service.store.rows import Change
 from service.store.surfaces import NewSurface
-from service.store.tables import HeliostatRow, ImageRow, KeyRow, MeasurementRow, SurfaceRow, TargetRow
+from service.store.tables import HeliostatRow, ImageRow, MeasurementRow, SurfaceRow, TargetRow
 from tests.service.conftest import ORIGIN
 
 PLANE = TargetPlane("lower", np.zeros(3), np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), 8.6, 7.2)

@@ -24,7 +24,8 @@ from service.store.backup import back_up, images_of, restore
 from service.store.check import inspect_store, is_sound
 from service.store.columns import Base
 from service.store.database import Database, migrate
-from service.store.tables import JobRow, JobStepRow, MeasurementRow
+from service.store.job_tables import JobRow, JobStepRow
+from service.store.tables import MeasurementRow
 from service.twin.ingest import Photograph, ingest
 from service.twin.prediction import predict_surface
 from service.twin.runtime import Runtime

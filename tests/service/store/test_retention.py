@@ -11,7 +11,8 @@ from service.jobs.worker import Worker
 from service.store import audit, queue, retention
 from service.store.columns import now
 from service.store.database import Database
-from service.store.tables import AuditRow, ForecastRow, JobRow
+from service.store.job_tables import AuditRow, JobRow
+from service.store.tables import ForecastRow
 from service.twin.runtime import Runtime
 from tests.service.conftest import FakeOperations
 from tests.service.store.test_statements import fill

@@ -19,8 +19,9 @@ from service.jobs.kinds import KINDS
 from service.jobs.worker import Worker
 from service.store import audit, keys
 from service.store.database import Database
+from service.store.job_tables import AuditRow
 from service.store.models import put_declared
-from service.store.tables import MODEL_VERSION, AuditRow, ModelRow, StudyRow
+from service.store.tables import MODEL_VERSION, ModelRow, StudyRow
 from service.twin import versions
 from tests.service.conftest import ORIGIN, FakeOperations, Post, png
 from tests.service.web.test_keys import heliotwin

@@ -23,7 +23,7 @@ from service.jobs.kind import Context
 from service.jobs.kinds import KINDS
 from service.jobs.kinds.predictions import PredictionsIn, predict_many
 from service.store import keys, queue
-from service.store.tables import JobRow
+from service.store.job_tables import JobRow
 from service.web.app import create_app
 from tests.service.conftest import QUIET, FakeOperations, Post, client_of, png, serving, until
 from tests.service.job_kinds import TEST_KINDS

@@ -18,7 +18,7 @@ from service.base.settings import Settings
 from service.cli.main import main
 from service.store import keys, tables
 from service.store.database import Database
-from service.store.tables import AuditRow, KeyRow
+from service.store.job_tables import AuditRow, KeyRow
 from service.web.app import create_app
 from service.web.door import dependencies, security
 from service.web.door.limits import Buckets

@@ -17,7 +17,7 @@ from sqlalchemy import delete
 
 from service.base.settings import Settings
 from service.store import keys
-from service.store.tables import KeyRow
+from service.store.job_tables import KeyRow
 from service.web.app import create_app
 from tests.service.conftest import (
     QUIET,
