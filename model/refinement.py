@@ -297,10 +297,14 @@ class _Fit:
         return int(missed.argmax()) if missed.max() > CONTRADICTION * np.median(missed) else None
 
     def missed(self) -> Array:
-        """Mean square (M,) of what is left of each image where a surface is found from the others, to first order."""
+        """Squared distance (M,) of each image from what the others tell of it, in what they tell it by, over its modes.
+
+        By how much the cost of all falls where the image is left out, to first order.
+        """
         others = np.eye(len(self.covariance)) - self.information @ self.covariance
         turned = np.linalg.solve(others, self.scores[..., None])[..., 0] @ self.covariance
-        return np.asarray(((self.left + np.einsum("mk,kmn->mn", turned, self.white)) ** 2).mean(axis=1))
+        alone = self.left + np.einsum("mk,kmn->mn", turned, self.white, optimize=True)
+        return np.asarray((alone * self.left).mean(axis=1))
 
     def cautious(self, grain: float) -> Array:
         """Covariance (K, K) where photographs share errors: all variance beyond a ``grain`` counts once for each."""
@@ -403,7 +407,8 @@ def _consensus(
     kept, left_out = list(range(len(observations))), list[int]()
     c = np.zeros(len(model[0].basis)) if start is None else model[0].coefficients(start)
     while True:
-        few = [kept[i] for i in spread_suns(np.array([observations[i].sun for i in kept]), options.few)]
+        suns = np.array([observations[i].sun for i in kept])
+        few = [kept[i] for i in sorted(spread_suns(suns, options.few))]
         whole = posterior(few)
         state, jacobian, belief = whole.settled(whole.state(c))
         if len(few) < len(kept):

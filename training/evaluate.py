@@ -107,14 +107,19 @@ def _series_table(name: str, steps: Sequence[str], series: dict[str, list[float]
     return markdown([name, *series], rows)
 
 
-def evaluate(methods: dict[str, Method], cases: list[Case], few: int) -> Evaluation:
-    """Try all methods, the ideal surface first, on all cases; the refinement, and fewer images, on the first few."""
+def evaluate(methods: dict[str, Method], cases: list[Case], few: int, fewest: int = 1) -> Evaluation:
+    """Try all methods, the ideal surface first, on all cases; the refinement, and fewer images, on the first few.
+
+    Of fewer images than the ``fewest`` nothing is found out.
+    """
     outcomes: dict[str, list[Outcome]] = {}
     inputs: dict[str, list[float]] = {}
     for name, method in methods.items():
         print(f"{name} ...", file=sys.stderr, flush=True)
         outcomes[name] = outcomes_of(method, cases[:few] if name == REFINEMENT else cases)
-        fewer = [median_error(method, cases[:few], images) for images in range(1, MAX_IMAGES)]
+        fewer = [
+            median_error(method, cases[:few], images) if images >= fewest else np.nan for images in range(1, MAX_IMAGES)
+        ]
         inputs[name] = [*fewer, float(np.median([o.mae_mm for o in outcomes[name][:few]]))]
     return Evaluation(outcomes, inputs, few)
 
@@ -163,6 +168,7 @@ def main() -> None:
     parser.add_argument("--paper", type=Path, default=Path("runs/paper"), help="folder of the paper's network's run")
     parser.add_argument("--cases", type=int, default=128)
     parser.add_argument("--refined", type=int, default=24, help="how many cases are refined, from 1 to 8 images each")
+    parser.add_argument("--fewest", type=int, default=1, help="images from which on cases are predicted, to 8")
     parser.add_argument("--camera", choices=("clean", "imperfect"), default="clean")
     parser.add_argument("--out", type=Path, default=Path("out/evaluation"))
     arguments = parser.parse_args()
@@ -173,7 +179,7 @@ def main() -> None:
     field, apart = load_field(arguments.data), [names[i] for i in held_out]
     cases = make_cases(surfaces[held_out], apart, field, arguments.cases, camera)
     methods = compared(arguments.network, arguments.paper, mean)
-    evaluation = evaluate(methods, cases, min(max(arguments.refined, 1), len(cases)))
+    evaluation = evaluate(methods, cases, min(max(arguments.refined, 1), len(cases)), arguments.fewest)
     arguments.out.mkdir(parents=True, exist_ok=True)
     (arguments.out / "evaluation.md").write_text(evaluation.tables(), encoding="utf-8")
     found = {"network": str(arguments.network), "camera": arguments.camera, **asdict(evaluation)}

@@ -3,6 +3,6 @@
 from tests.benchmarks import forecast, imaging, speed, surfaces
 
 forecast.main()
-surfaces.main()
+surfaces.main([])
 speed.main()
 imaging.main([])

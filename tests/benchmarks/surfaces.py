@@ -100,18 +100,25 @@ def rendered(folder: MeasurementFolder, years: MeasurementFolder, rays: int) -> 
     for name in MIRRORS:
         heliostat, truth = truth_of(folder, name)
         seen = photographed(heliostat, truth, places_of(years, IMAGES), rays, np.random.default_rng(1))
-        where = {"latitude_deg": JUELICH_LATITUDE}
         generic = generic_prior(heliostat.facet_frames[2])
-        row(f"{name} network", lambda h=heliostat, o=seen: default_predictor().predict(h, o, **where), truth)
+        row(
+            f"{name} network",
+            lambda h=heliostat, o=seen: default_predictor().predict(h, o, latitude_deg=JUELICH_LATITUDE),
+            truth,
+        )
         ends = {
-            "refined from the mean": row(f"{name} refined", lambda h=heliostat, o=seen: refine(h, o, **where), truth),
+            "refined from the mean": row(
+                f"{name} refined", lambda h=heliostat, o=seen: refine(h, o, latitude_deg=JUELICH_LATITUDE), truth
+            ),
             "from the truth": row(
-                f"{name} refined from the truth", lambda h=heliostat, o=seen, t=truth: refine(h, o, t, **where), truth
+                f"{name} refined from the truth",
+                lambda h=heliostat, o=seen, t=truth: refine(h, o, t, latitude_deg=JUELICH_LATITUDE),
+                truth,
             ),
         }
         row(
             f"{name} refined, generic prior",
-            lambda h=heliostat, o=seen, p=generic: refine(h, o, prior=p, **where),
+            lambda h=heliostat, o=seen, p=generic: refine(h, o, prior=p, latitude_deg=JUELICH_LATITUDE),
             truth,
         )
         apart = surface_error(*(end.z for end in ends.values())) * 1e3
@@ -154,8 +161,8 @@ def real(years: MeasurementFolder) -> None:
         start = default_predictor().predict(heliostat, spread(chosen, 8), latitude_deg=JUELICH_LATITUDE)
         found = row(name, lambda c=chosen, s=start: refine(heliostat, c, s.z, latitude_deg=JUELICH_LATITUDE), truth)
         print(
-            f"| | accuracy {accuracy(found.z):.3f}, network {accuracy(start.z):.3f}, deflectometry {accuracy(truth):.3f}; "
-            f"network's error {1e3 * surface_error(start.z, truth):.3f} | | | | | | |"
+            f"| | accuracy {accuracy(found.z):.3f}, network {accuracy(start.z):.3f}, deflectometry "
+            f"{accuracy(truth):.3f}; network's error {1e3 * surface_error(start.z, truth):.3f} | | | | | | |"
         )
 
 

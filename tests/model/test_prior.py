@@ -1,8 +1,11 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from model.observation import TRUSTED_MAHALANOBIS
-from model.prior import default_prior
+from model.prior import GROUPS, default_prior, generic_prior, prior_of
+from tests.conftest import flat_heliostat
 from training.surfaces import tilt_modes
 
 
@@ -20,3 +23,24 @@ def test_prior_inverts_its_own_coefficients():
     prior = default_prior()
     c = np.random.default_rng(0).normal(size=len(prior.basis))
     np.testing.assert_allclose(prior.coefficients(prior.surface(c)), c, rtol=1e-4, atol=1e-5)
+
+
+def test_a_rough_mirror_has_wider_scales():
+    """As wide as it is rough where its coefficients are known; as it was where nothing is known of them."""
+    prior = default_prior()
+    counts = len(prior.basis)
+    rough = 4 * np.random.default_rng(1).normal(size=counts)
+    known, unknown = prior.precision(rough, np.zeros(counts)), prior.precision(np.zeros(counts), np.ones(counts))
+    np.testing.assert_allclose(known[GROUPS[-1]] ** -0.5, 4, rtol=0.2)
+    np.testing.assert_allclose(unknown, 1)
+
+
+def test_facets_of_another_size_have_the_generic_prior():
+    small = flat_heliostat()
+    facets = tuple(replace(f, canting_x=f.canting_x / 2, canting_y=f.canting_y / 2) for f in small.facets)
+    found = prior_of(replace(small, facets=facets))
+    assert prior_of(small) is default_prior()
+    assert found.name == "generic"
+    half, whole = found.basis, generic_prior(small.facet_frames[2]).basis
+    np.testing.assert_allclose((half**2).sum() / (whole**2).sum(), 0.25, rtol=0.01)
+    np.testing.assert_allclose(found.basis.mean(axis=(2, 3)), 0, atol=1e-12)
