@@ -1,6 +1,9 @@
 """The demonstration: photographs in, stored mirror surfaces and flux forecasts out, with a table and pictures."""
 
 import html
+import shlex
+import shutil
+import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -261,7 +264,11 @@ def _print(console: Console, results: list[Result], out: Path, store: Path) -> N
         table.add_row(*_row(result))
     console.print(table)
     console.print(f"pictures and report: {out / 'report.html'}", highlight=False)
-    console.print(f"next: HELIOTWIN_DATA_DIR={store} heliotwin serve", highlight=False)
+    # As one line that can be pasted: the command may lie in an environment that is not on the path.
+    beside = str(Path(sys.executable).with_name("heliotwin"))
+    command = "heliotwin" if shutil.which("heliotwin") else shlex.quote(beside)
+    said = f"next: HELIOTWIN_DATA_DIR={shlex.quote(str(store))} {command} serve"
+    console.print(said, highlight=False, markup=False, soft_wrap=True)
 
 
 def _page(report: dict[str, Any], results: list[Result]) -> str:

@@ -87,7 +87,7 @@ def _write_report(folder: MeasurementFolder, report: dict[str, Any], path: Path)
     write_json(path, report)
 
 
-def _finish(folder: MeasurementFolder, report: dict[str, Any], path: Path, done: str) -> dict[str, Any]:
+def finish(folder: MeasurementFolder, report: dict[str, Any], path: Path, done: str) -> dict[str, Any]:
     """Write the report with all that was skipped; refuse to call nothing a success."""
     _write_report(folder, report, path)
     if not report[done]:
@@ -121,7 +121,7 @@ def flux_folder(folder: MeasurementFolder, out: Path, progress: Progress = quiet
                 entry["center_of_mass_wgs84"] = [float(v) for v in folder.plant.to_wgs84(spot)]
             _write_flux(out / name, measurement.identifier, measured)
             report["images"][measurement.key] = entry
-    return _finish(folder, report, out / "quality.json", "images")
+    return finish(folder, report, out / "quality.json", "images")
 
 
 def _write_flux(folder: Path, identifier: str, measured: MeasuredFlux) -> None:
@@ -250,7 +250,7 @@ def predict_folder(
         report["skipped"] = dict.fromkeys(left, "interrupted") | report["skipped"]
         _write_report(folder, report, out / "predictions.json")
         raise
-    return _finish(folder, report, out / "predictions.json", "heliostats")
+    return finish(folder, report, out / "predictions.json", "heliostats")
 
 
 def write_surface(out: Path, name: str, predicted: SurfacePrediction) -> None:
@@ -380,7 +380,7 @@ def forecast_folder(
     accuracies = [e["accuracy"] for e in report["measurements"].values() if "accuracy" in e]
     report["accuracy_mean"] = float(np.mean(accuracies)) if accuracies else None
     report["accuracy_median"] = float(np.median(accuracies)) if accuracies else None
-    return _finish(folder, report, out / "forecast.json", "measurements")
+    return finish(folder, report, out / "forecast.json", "measurements")
 
 
 def _forecast_entry(

@@ -1,5 +1,6 @@
 """The verbs on a measurement folder: flux, predict, forecast, study."""
 
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -23,6 +24,9 @@ EffectsFile = Annotated[
     Path | None,
     typer.Option("--effects", help="Effects to add to the declared ones: JSON, or a study's report.", metavar="FILE"),
 ]
+
+
+_TIMES = ["%Y-%m-%dT%H:%M", "%Y-%m-%dT%H:%M:%S", "%Y-%m-%dT%H:%M%z", "%Y-%m-%dT%H:%M:%S%z"]
 
 
 def _count(folder: "MeasurementFolder", with_images: bool = True) -> int:
@@ -89,15 +93,45 @@ def forecast(
     window: Annotated[
         float | None, typer.Option(help="Side [m] of the accuracy's window; by the spot if not given.")
     ] = None,
+    sun: Annotated[
+        tuple[float, float] | None,
+        typer.Option(help="A sun in place of the measurements': azimuth from south, elevation [deg].", metavar="AZ EL"),
+    ] = None,
+    at: Annotated[
+        datetime | None,
+        typer.Option(help="The sun at a time, in UTC unless it has a zone.", metavar="TIME", formats=_TIMES),
+    ] = None,
+    target: Annotated[str | None, typer.Option(help="With --sun or --at: the folder's target to aim at.")] = None,
+    plane: Annotated[
+        Path | None,
+        typer.Option(help="With --sun or --at: JSON with center, normal, width, height [m].", metavar="FILE"),
+    ] = None,
+    heliostat: Annotated[
+        list[str] | None, typer.Option(help="With --sun or --at: of this heliostat only; may be given again.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Flux on the whole target for each measurement [W/m2]: OUT/H/ID-forecast.npz and OUT/forecast.json."""
+    """Flux on the whole target for each measurement [W/m2]: OUT/H/ID-forecast.npz and OUT/forecast.json.
+
+    With --sun or --at it takes no photographs: OUT/H/forecast.npz of each heliostat.
+    """
     from service.cli.folder import forecast_folder
     from service.sources.documents import read_effects
     from service.sources.folder import read_folder
 
     added = () if effects is None else read_effects(effects)
     source = read_folder(folder)
+    if any(given is not None for given in (sun, at, target, plane, heliostat)):
+        from service.cli.folder_sun import asked, forecast_for
+
+        wanted = asked(source, sun, at, target, plane)
+        with progress(len(heliostat or source.plant.heliostats), "forecast") as step:
+            report = forecast_for(source, out, wanted, surfaces, added, heliostat or (), step)
+        table = make_table("Forecasts", "heliostat", "peak [kW/m2]", "power [kW]")
+        for name, entry in report["heliostats"].items():
+            table.add_row(name, f"{entry['peak_w_m2'] / 1000:.2f}", f"{entry['power_w'] / 1000:.2f}")
+        show(report, as_json, table)
+        return
     with progress(_count(source, with_images=False), "forecast") as step:
         report = forecast_folder(source, out, surfaces, window, step, added)
     table = make_table("Forecasts", "measurement", "accuracy", "window [m]", "outside", "peak [kW/m2]")

@@ -212,3 +212,40 @@ def test_demo_leaves_table_pictures_report_and_store(tmp_path, stj, made_plant):
             assert (tmp_path / "demo" / picture).read_bytes().startswith(b"\x89PNG")
     assert "heliotwin serve" in done.stderr
     assert (tmp_path / "demo" / "report.html").is_file()
+
+
+def test_forecast_for_a_sun_and_a_plane_needs_no_photographs(made_plant, tmp_path):
+    name, *_ = sorted(read_folder(made_plant).plant.heliostats)
+    wanted = ("--surfaces", "ideal", "--heliostat", name)
+    time = ("--at", "2026-06-21T13:36+02:00", "--target", "calibration_target")
+    by_time = succeeds("forecast", made_plant, "--out", tmp_path / "a", *wanted, *time)
+    assert by_time["sun"]["elevation_deg"] > 60
+    flux = np.load(tmp_path / "a" / name / "forecast.npz")["flux"]
+    assert flux.max() == pytest.approx(by_time["heliostats"][name]["peak_w_m2"])
+    target = read_folder(made_plant).plant.targets["calibration_target"]
+    plane = {"center": list(target.center), "normal": list(target.normal), "width": 8.0, "height": 8.0}
+    (tmp_path / "plane.json").write_text(json.dumps(plane))
+    sun = ("--sun", by_time["sun"]["azimuth_deg"], by_time["sun"]["elevation_deg"], "--plane", tmp_path / "plane.json")
+    by_sun = succeeds("forecast", made_plant, "--out", tmp_path / "b", *wanted, *sun)
+    assert by_sun["heliostats"][name]["power_w"] == pytest.approx(by_time["heliostats"][name]["power_w"], rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--sun", 0, 45), "--target, --plane: give one"),
+        (("--target", "calibration_target"), "--sun, --at: give one"),
+        (("--sun", 0, 95, "--target", "calibration_target"), "--sun: elevation_deg"),
+        (("--at", "2026-06-21T00:00", "--target", "calibration_target"), "--at: the sun is"),
+        (("--sun", 0, 45, "--target", "nowhere"), "--target: there is no target nowhere; known: calibration_target"),
+        (("--sun", 0, 45, "--target", "calibration_target", "--heliostat", "ZZ"), "--heliostat: there is no"),
+    ],
+)
+def test_forecast_for_a_sun_says_what_is_wrong(made_plant, tmp_path, options, said):
+    done = heliotwin("forecast", made_plant, "--out", tmp_path, *options)
+    assert done.returncode == 2
+    assert said in done.stderr
+
+
+def test_help_keeps_its_units():
+    assert "Side [m] of the accuracy's window" in " ".join(heliotwin("forecast", "--help").stdout.split())
