@@ -87,7 +87,7 @@ def by_day(name: str, parameter: str, neutral: float, sizes: Sequence[float], fi
 CHANGES: dict[str, Change] = {
     "calm": calm,
     "haze_by_day": by_day("sun_shape", "circumsolar_ratio", 0.02, (0.1, 0.2, 0.35), lambda v: {"circumsolar_ratio": v}),
-    "jitter_by_day": by_day("tracking_jitter", "sigma_mrad", 0.0, (1.0, 1.5, 2.2), lambda v: {"first_axis_mrad": v}),
+    "jitter_by_day": by_day("tracking_jitter", "sigma_mrad", 0.0, (0.7, 1.0, 1.5), lambda v: {"first_axis_mrad": v}),
     "background_by_day": by_day("background", "level", 0.0, (0.0015, 0.003, 0.006), lambda v: {"stray": (v, 0.0, 0.0)}),
     "response_since": since("camera_response"),
     "shoulder_since": since("camera_shoulder"),
