@@ -106,6 +106,8 @@ class Effect:
     prior_std : float
         Prior standard deviation of a parameter about neutral, in shares of its range. It should matter only for what
         images cannot tell.
+    relative : bool
+        Whether images show only by how much a mirror's facets differ, and not what they share.
     comes : frozenset of {"since", "day"}
         How it may come, if it is not always there: at a date, to stay, or with each day anew.
     scope : Scope
@@ -118,6 +120,7 @@ class Effect:
     scales_with: ClassVar[frozenset[Factor]]
     guesses: ClassVar[tuple[dict[str, float], ...]] = ()
     prior_std: ClassVar[float] = 1.0
+    relative: ClassVar[bool] = False
     comes: ClassVar[frozenset[Arrival]] = frozenset({"since"})
 
     scope: Scope = field(default=Always(), kw_only=True)

@@ -46,7 +46,8 @@ class FacetCanting(Effect):
     about: ClassVar[str] = "Canting error: facets that lean against the pose they are known in."
     stage: ClassVar[Stage] = "geometry"
     scales_with: ClassVar[frozenset[Factor]] = frozenset({"distance", "heliostat", "roll"})
-    prior_std: ClassVar[float] = 0.1  # the mount takes back what a mirror's facets share, and no image shows it
+    prior_std: ClassVar[float] = 0.1
+    relative: ClassVar[bool] = True  # the mount takes back what a mirror's facets share
 
     x_mrad: ByHeliostat = parameter(0.0, -5.0, 5.0, "mrad", "facet")
     y_mrad: ByHeliostat = parameter(0.0, -5.0, 5.0, "mrad", "facet")

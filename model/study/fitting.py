@@ -109,13 +109,10 @@ class Fitter:
             grid = self.forecaster.cuts(model, COARSE_SIZE) - self.fine.cuts(model, COARSE_SIZE)
             self.measured = self.forecaster.measured(COARSE_SIZE) + grid
 
-    def _prior_residuals(self, unknowns: Unknowns, values: Array) -> Array:
-        """Distances (P,) from neutral in prior standard deviations: they fix what images cannot tell."""
-        return np.asarray((values - unknowns.neutral) / unknowns.prior_std)
-
     def cost(self, unknowns: Unknowns, values: Array, residuals: Array) -> float:
-        """Half the sum of squares."""
-        return float((residuals**2).sum() + (self._prior_residuals(unknowns, values) ** 2).sum()) / 2
+        """Half the sum of squares, and of the prior's, which fixes what images cannot tell."""
+        away = values - unknowns.neutral
+        return float((residuals**2).sum() + away @ unknowns.prior_precision @ away) / 2
 
     def jacobian(self, unknowns: Unknowns, values: Array, residuals: Array) -> Array:
         """Derivatives of the residuals (P, N, COARSE_SIZE**2); a group is changed at once."""
@@ -198,15 +195,15 @@ class Fitter:
         descent = replace(DESCENT, jacobians=self.iterations, steps=self.iterations * TRIES)
         found = minimize(problem, begin, descent)
         end = found.state
-        return Fit(end.values, found.cost, self._spread(found.jacobian, end.residuals, 1 / unknowns.prior_std**2))
+        return Fit(end.values, found.cost, self._spread(found.jacobian, end.residuals, unknowns.prior_precision))
 
-    def _spread(self, jacobian: Array, residuals: Array, scale: Array) -> Array:
+    def _spread(self, jacobian: Array, residuals: Array, prior_precision: Array) -> Array:
         """Standard deviations (P,) by the sandwich of White (1980), with images, not pixels, as independent.
 
         Pixels of one image err together; how far images disagree says what a value is worth.
         """
         flat = jacobian.reshape(len(jacobian), -1)
-        bread = np.linalg.inv(flat @ flat.T + np.diag(scale))
+        bread = np.linalg.inv(flat @ flat.T + prior_precision)
         scores = np.einsum("pnk,nk->np", jacobian, residuals)
         count = len(scores)
         filling = scores.T @ scores * count / max(1, count - len(jacobian) / max(1, len(np.unique(self.heliostats))))
@@ -238,9 +235,9 @@ class _Problem:
         return self.fitter.jacobian(self.unknowns, point.values, point.residuals)
 
     def quadratic(self, point: _Point, jacobian: Array) -> tuple[Array, Array]:
-        flat, prior_std = jacobian.reshape(len(jacobian), -1), self.unknowns.prior_std
-        prior_gradient = (point.values - self.unknowns.neutral) / prior_std**2
-        return -(flat @ point.residuals.ravel() + prior_gradient), flat @ flat.T + np.diag(1 / prior_std**2)
+        flat, precision = jacobian.reshape(len(jacobian), -1), self.unknowns.prior_precision
+        prior_gradient = precision @ (point.values - self.unknowns.neutral)
+        return -(flat @ point.residuals.ravel() + prior_gradient), flat @ flat.T + precision
 
     def bounds(self, point: _Point) -> tuple[Array, Array]:
         low, high = self.unknowns.bounds

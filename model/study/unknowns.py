@@ -14,6 +14,10 @@ from model.effects import Always, ByDay, Effect, Parameter, Since
 Array = NDArray[np.float64]
 
 
+RELATIVE = 0.002
+"""Prior standard deviation, in shares of the range, of what a mirror's facets share where only differences are seen."""
+
+
 @dataclass(frozen=True)
 class Term:
     """A kind of effect and the scope that it is sought in: always, since a day, or by the values of some days.
@@ -121,11 +125,19 @@ class Unknowns:
         """Least and greatest values, (P,) each."""
         return np.array([u.parameter.low for u in self.all]), np.array([u.parameter.high for u in self.all])
 
-    @property
-    def prior_std(self) -> Array:
-        """Prior standard deviations (P,) about neutral."""
+    @cached_property
+    def prior_precision(self) -> Array:
+        """Inverse of the prior's covariance (P, P) about neutral."""
         low, high = self.bounds
-        return np.array([u.term.kind.prior_std for u in self.all]) * (high - low)
+        precision = np.diag(1 / (np.array([u.term.kind.prior_std for u in self.all]) * (high - low)) ** 2)
+        alike: dict[tuple[Term, str, str | None], list[int]] = {}
+        for place, unknown in enumerate(self.all):
+            if unknown.term.kind.relative:
+                alike.setdefault((unknown.term, unknown.parameter.name, unknown.heliostat), []).append(place)
+        for places in alike.values():
+            mean_std = RELATIVE * (high - low)[places[0]]
+            precision[np.ix_(places, places)] += 1 / (len(places) * mean_std) ** 2
+        return precision
 
     @property
     def groups(self) -> dict[tuple[Term, str, int | None], list[int]]:
