@@ -1,11 +1,10 @@
-"""The command line's verbs on a measurement folder: flux, predict, forecast.
+"""The command line's verbs on a measurement folder: flux, predict; and what all of them share.
 
 Each walks the heliostats, skips what lacks something and says why, writes its files under one folder and returns the
 report that it also writes there. A verb fails only if nothing is left.
 """
 
 import json
-from collections.abc import Sequence
 from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
@@ -15,13 +14,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from model.effects import Effect, effect_to_json, model_version
 from model.ephemeris import clock_fault
 from model.errors import InvalidInputError, ModelError
-from model.images import clipped_alike
 from model.imaging import Camera, ImageKind, MeasuredFlux
 from model.imaging.light import camera_at
-from model.metrics import accuracy_window, compare_on_target, surface_error
+from model.metrics import surface_error
 from model.network.architecture import MAX_IMAGES
 from model.observation import Observation, SurfacePrediction
 from model.plant import Heliostat, TargetPlane
@@ -29,7 +26,7 @@ from model.surface import split_canting
 from service.base.choices import Method
 from service.base.progress import Progress, quiet
 from service.sources.decode import Pixels, decode_image
-from service.sources.documents import IMAGE_KINDS, Measurement, optics_to_json
+from service.sources.documents import IMAGE_KINDS, Measurement
 from service.sources.files import require_regular
 from service.sources.folder import MeasurementFolder, measured_heights, read_surface
 from service.twin import compute
@@ -37,11 +34,6 @@ from service.twin.consensus import agreeing
 from service.twin.evidence import Evidence, choose
 
 Array = NDArray[np.float64]
-
-SPILL = 0.01
-"""Share of the measured energy that may lie outside the accuracy's window, up to one of `WIDEST` [m]."""
-
-WIDEST = 8.0
 
 ROUGHEST_FIRST: tuple[ImageKind, ...] = ("raw", "cropped", "flux", "flux-centered")
 """Kinds of image by how much is left to do to them."""
@@ -266,11 +258,7 @@ def write_surface(out: Path, name: str, predicted: SurfacePrediction) -> None:
     )
 
 
-# --- forecast ---------------------------------------------------------------------------------------------------------
-
-
-# Side [m] of a window that no target reaches.
-_WIDEST_WINDOW = 1000.0
+# --- surfaces ---------------------------------------------------------------------------------------------------------
 
 
 def check_surfaces(surfaces: str) -> None:
@@ -290,112 +278,3 @@ def surface_of(folder: MeasurementFolder, heliostat: Heliostat, surfaces: str) -
     if found is None:
         raise InvalidInputError(f"no surface in {root / heliostat.name / 'Deflectometry'}")
     return found
-
-
-def forecast_measurement(
-    folder: MeasurementFolder,
-    measurement: Measurement,
-    surface: tuple[Array, int] | None,
-    effects: Sequence[Effect] = (),
-) -> compute.Forecast:
-    """Light over a measurement's whole target, and what the camera shows of it; ``effects`` add to the declared ones.
-
-    The heliostat is aligned by its measured spot; without one by its motors; without those at the target's centre.
-    """
-    heliostat, plane = folder.plant.heliostats[measurement.heliostat], folder.plant.targets[measurement.target]
-    motors = measurement.motor_position if heliostat.mount.actuators else None
-    return compute.forecast(
-        heliostat,
-        None,
-        measurement.sun,
-        plane,
-        spot=measurement.spot,
-        angles=None if motors is None else heliostat.mount.angles_from_motors(motors),
-        optics=folder.optics,
-        surface=surface,
-        effects=[*folder.effects, *effects],
-        latitude_deg=float(folder.plant.origin[0]),
-        taken_at=measurement.taken_at,
-    )
-
-
-def compare(
-    folder: MeasurementFolder, measurement: Measurement, traced: compute.Forecast, window: float | None
-) -> dict[str, Any] | None:
-    """Accuracy of a forecast against the measurement's flux; None without an image of its target, or a refused one."""
-    if not any(kind in measurement.images for kind in ROUGHEST_FIRST[:-1]):
-        return None
-    measured = measure(folder, measurement)
-    if measured.flux is None:
-        return None
-    flux, forecast = measured.flux.astype(np.float64), traced.camera_view.astype(np.float64)
-    if measured.clipped is not None:
-        forecast = clipped_alike(forecast, flux, measured.clipped.astype(np.float64))
-    plane = folder.plant.targets[measurement.target]
-    size = (plane.width, plane.height)
-    window = window or accuracy_window([flux], [size], spill=SPILL, widest=WIDEST)
-    return asdict(compare_on_target(flux, forecast, size, window))
-
-
-def forecast_folder(
-    folder: MeasurementFolder,
-    out: Path,
-    surfaces: str = "measured",
-    window: float | None = None,
-    progress: Progress = quiet,
-    effects: Sequence[Effect] = (),
-) -> dict[str, Any]:
-    """Forecast every measurement of a folder; ``OUT/H/ID-forecast.npz`` and ``OUT/forecast.json``.
-
-    ``effects`` come in addition to those that the folder declares.
-    """
-    check_surfaces(surfaces)
-    if window is not None and not 0 < window <= _WIDEST_WINDOW:
-        raise InvalidInputError(f"--window must lie in 0 to {_WIDEST_WINDOW:g} m, got {window:g}")
-    report: dict[str, Any] = {
-        "surfaces": surfaces,
-        "model_version": model_version([*folder.effects, *effects]),
-        "effects": [effect_to_json(effect) for effect in (*folder.effects, *effects)],
-        "optics": {"dni_w_m2": folder.optics.dni, **optics_to_json(folder.optics)},
-        "measurements": {},
-        "skipped": {},
-    }
-    for name, heliostat in folder.plant.heliostats.items():
-        try:
-            surface = surface_of(folder, heliostat, surfaces)
-        except ModelError as error:
-            report["skipped"][name] = str(error)
-            continue
-        measurements = folder.measurements(name, with_images=False)
-        if not measurements:
-            report["skipped"][name] = "no measurement"
-        for measurement in measurements:
-            progress(measurement.key)
-            try:
-                entry = _forecast_entry(folder, measurement, surface, effects, out, window)
-            except ModelError as error:
-                report["skipped"][measurement.key] = str(error)
-                continue
-            report["measurements"][measurement.key] = entry
-    accuracies = [e["accuracy"] for e in report["measurements"].values() if "accuracy" in e]
-    report["accuracy_mean"] = float(np.mean(accuracies)) if accuracies else None
-    report["accuracy_median"] = float(np.median(accuracies)) if accuracies else None
-    return finish(folder, report, out / "forecast.json", "measurements")
-
-
-def _forecast_entry(
-    folder: MeasurementFolder,
-    measurement: Measurement,
-    surface: tuple[Array, int] | None,
-    effects: Sequence[Effect],
-    out: Path,
-    window: float | None,
-) -> dict[str, Any]:
-    """Write the forecast of one measurement and give back its entry in ``forecast.json``."""
-    traced = forecast_measurement(folder, measurement, surface, effects)
-    path = out / measurement.heliostat / f"{measurement.identifier}-forecast.npz"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    np.savez_compressed(path, flux=traced.flux, camera_view=traced.camera_view)
-    entry: dict[str, Any] = {"target": measurement.target, "peak_w_m2": traced.peak, "power_w": traced.power}
-    comparison = compare(folder, measurement, traced, window)
-    return entry if comparison is None else {**entry, **comparison}

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from service.cli.folder import forecast_folder
+from service.cli.folder_forecast import forecast_folder
 from service.sources.folder import read_folder
 from tests.benchmarks import data_folder
 

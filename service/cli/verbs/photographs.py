@@ -115,7 +115,7 @@ def forecast(
 
     With --sun or --at it takes no photographs: OUT/H/forecast.npz of each heliostat.
     """
-    from service.cli.folder import forecast_folder
+    from service.cli.folder_forecast import forecast_folder
     from service.sources.documents import read_effects
     from service.sources.folder import read_folder
 

@@ -11,7 +11,7 @@ import pytest
 
 from model.effects.gravity_bending import GravityBending
 from service.cli.demo_plant import write_plant
-from service.cli.folder import forecast_folder
+from service.cli.folder_forecast import forecast_folder
 from service.sources.folder import read_folder
 
 
