@@ -35,7 +35,7 @@ from model.least_squares import Descent, Minimum, minimize
 from model.network.inputs import STEP_HEIGHT
 from model.observation import Observation, Ranges, SurfacePrediction, align_observations, misfits, spread_suns
 from model.plant import Heliostat
-from model.prior import SurfacePrior, prior_of
+from model.prior import SurfacePrior, default_prior
 from model.surface import control_points, require_own_grid
 from model.tracing import Optics
 
@@ -374,7 +374,7 @@ def refine(
     if not observations:
         raise InvalidInputError("a refinement takes at least one image")
     require_own_grid(heliostat)
-    prior, optics = prior or prior_of(heliostat), optics or Optics()
+    prior, optics = prior or default_prior(), optics or Optics()
     options = options or RefinementOptions()
     state, fit, left_out = _consensus(heliostat, observations, start, (prior, optics, effects), latitude_deg, options)
     z = prior.surface(state.c)
