@@ -18,9 +18,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from model.plant import Heliostat
-from model.surface import COLUMNS, ROWS, greville
-
 Array = NDArray[np.float64]
 
 LEADING = 8
@@ -31,18 +28,6 @@ GROUPS = (0, 4, 8, 24, 64, 128)
 
 FREEDOM = 3.0
 """Degrees of freedom of the scales: as much is known of them before a mirror is seen as so many coefficients tell."""
-
-CANTING = 0.8e-3
-"""Slope [rad] along each axis by which facets are canted wrong, where no mirror of the kind was measured."""
-
-WAVINESS = 7e-5
-"""Height per side of a facet of its largest waves, where no mirror of the kind was measured."""
-
-FALL = 1.25
-"""Power of the spatial frequency with which waves become lower."""
-
-KNOWN_SIZE = (0.8025, 0.6375)
-"""Half sides [m] of the facets whose surfaces were measured: Juelich's."""
 
 PRIOR = Path(__file__).parent / "weights" / "surface-prior.npz"
 
@@ -114,48 +99,3 @@ class SurfacePrior:
 def default_prior() -> SurfacePrior:
     """The shipped prior, loaded once."""
     return SurfacePrior.load()
-
-
-def prior_of(heliostat: Heliostat) -> SurfacePrior:
-    """The shipped prior for facets of the measured kind, the generic one for all others."""
-    _, _, half_sizes = heliostat.facet_frames
-    return default_prior() if np.allclose(half_sizes, KNOWN_SIZE, rtol=0.1) else generic_prior(half_sizes)
-
-
-def generic_prior(half_sizes: Array) -> SurfacePrior:
-    """What is known of facets of half sides (F, 2) [m] of which none was measured.
-
-    They are canted wrong by `CANTING`, and their waves, cosines along x and y, fall with their frequency as polished
-    and bent glass has it: a power law (Church 1988, doi:10.1364/AO.27.001518). The tilt of the whole mirror is left to
-    the mount.
-    """
-    u, v = (greville(count) for count in (ROWS, COLUMNS))
-    waves = np.einsum(
-        "ai,bj->abij", np.cos(np.pi * np.arange(ROWS)[:, None] * u), np.cos(np.pi * np.arange(COLUMNS)[:, None] * v)
-    ).reshape(-1, ROWS, COLUMNS)
-    frequency = np.hypot(*np.meshgrid(np.arange(COLUMNS), np.arange(ROWS))).ravel()
-    x, y = np.meshgrid(2 * u - 1, 2 * v - 1, indexing="ij")
-    facets = len(half_sizes)
-    basis = np.zeros((facets, len(waves) + 1, facets, ROWS, COLUMNS))
-    for facet, (half_x, half_y) in enumerate(half_sizes):
-        side = 2 * np.sqrt(half_x * half_y)
-        wavy = WAVINESS * side * frequency[1:, None, None] ** -FALL * waves[1:]
-        basis[facet, :, facet] = np.concatenate([CANTING * np.stack([half_x * x, half_y * y]), wavy])
-    flat = basis.reshape(-1, facets, ROWS, COLUMNS)
-    flat = flat - flat.mean(axis=(2, 3), keepdims=True)
-    tilts = np.stack([np.stack([half[0] * x, half[1] * y]) for half in half_sizes], axis=1)
-    return SurfacePrior(np.zeros(flat.shape[1:]), orthogonal(without(flat, tilts)), CANTING * tilts, "generic")
-
-
-def without(directions: Array, modes: Array) -> Array:
-    """Directions (K, F, I, J) [m] without what modes (N, F, I, J) explain of them."""
-    flat, explained = directions.reshape(len(directions), -1), modes.reshape(len(modes), -1)
-    return np.asarray((flat - flat @ np.linalg.pinv(explained) @ explained).reshape(directions.shape))
-
-
-def orthogonal(directions: Array) -> Array:
-    """Orthogonal directions (K, F, I, J) [m] of the same covariance, the longest first, their largest height up."""
-    flat = directions.reshape(len(directions), -1)
-    _, singular, axes = np.linalg.svd(flat, full_matrices=False)
-    signs = np.sign(axes[np.arange(len(axes)), np.abs(axes).argmax(axis=1)])
-    return np.asarray(((signs * singular)[:, None] * axes)[singular > 1e-9].reshape(-1, *directions.shape[1:]))

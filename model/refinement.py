@@ -6,7 +6,8 @@ Levenberg-Marquardt steps bring the traced images to the measured ones; the curv
 Two things decide whether that ends where it should. Derivatives must be those of the images
 (`model.tracing.sensitivity`): a facet's canting changes an image by one percent, and differences of coarse traces miss
 a third of it. And what is minimised must not change on the way: images are weighed as those of the surface that a
-stage begins with. Then every start ends at the same surface, and one start is enough.
+stage begins with. Then one start is enough for mirrors like those measured; of mirrors whose waviness is twice what the
+prior expects, some still end beside the best surface.
 
 What a camera adds to an image (a shift, another exposure, background, a little blur, another response) enters as a few
 directions per image with priors of their own and is marginalised exactly. All other errors, of the camera and of the
@@ -35,7 +36,7 @@ from model.least_squares import Descent, Minimum, minimize
 from model.network.inputs import STEP_HEIGHT
 from model.observation import Observation, Ranges, SurfacePrediction, align_observations, misfits, spread_suns
 from model.plant import Heliostat
-from model.prior import SurfacePrior, prior_of
+from model.prior import SurfacePrior, default_prior
 from model.surface import control_points, require_own_grid
 from model.tracing import Optics
 
@@ -374,7 +375,7 @@ def refine(
     if not observations:
         raise InvalidInputError("a refinement takes at least one image")
     require_own_grid(heliostat)
-    prior, optics = prior or prior_of(heliostat), optics or Optics()
+    prior, optics = prior or default_prior(), optics or Optics()
     options = options or RefinementOptions()
     state, fit, left_out = _consensus(heliostat, observations, start, (prior, optics, effects), latitude_deg, options)
     z = prior.surface(state.c)

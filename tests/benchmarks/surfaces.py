@@ -1,8 +1,8 @@
 """Surfaces against deflectometry: ``python -m tests.benchmarks.surfaces``.
 
 Rendered: AA28, AA39 and AC43 as they were measured, at their own places, under suns and on targets of real photographs,
-traced by Monte Carlo with one per cent of noise; by the network and refined, from the prior's mean and from the truth,
-with the learned prior and with the generic one. ``--scaling`` adds the time from 8 to 64 images.
+traced by Monte Carlo with one per cent of noise; by the network and refined, from the prior's mean and from the truth.
+``--scaling`` adds the time from 8 to 64 images.
 
 Real: AA39 of two years, from sets of its photographs, some of which contradict the others; flux accuracy on
 photographs that no set holds. Errors are those of the control heights, the mirror's tilt and canting counted. AC43 is
@@ -24,7 +24,6 @@ from model.metrics import surface_error
 from model.network.predictor import default_predictor
 from model.observation import Observation, SurfacePrediction, misfits, scene_of, spread_suns
 from model.plant import JUELICH_LATITUDE, Heliostat
-from model.prior import generic_prior
 from model.refinement import refine
 from model.tracing import Window
 from model.tracing.montecarlo import trace_montecarlo
@@ -100,7 +99,6 @@ def rendered(folder: MeasurementFolder, years: MeasurementFolder, rays: int) -> 
     for name in MIRRORS:
         heliostat, truth = truth_of(folder, name)
         seen = photographed(heliostat, truth, places_of(years, IMAGES), rays, np.random.default_rng(1))
-        generic = generic_prior(heliostat.facet_frames[2])
         row(
             f"{name} network",
             lambda h=heliostat, o=seen: default_predictor().predict(h, o, latitude_deg=JUELICH_LATITUDE),
@@ -116,11 +114,6 @@ def rendered(folder: MeasurementFolder, years: MeasurementFolder, rays: int) -> 
                 truth,
             ),
         }
-        row(
-            f"{name} refined, generic prior",
-            lambda h=heliostat, o=seen, p=generic: refine(h, o, prior=p, latitude_deg=JUELICH_LATITUDE),
-            truth,
-        )
         apart = surface_error(*(end.z for end in ends.values())) * 1e3
         left = ", ".join(f"{label} {end.misfit:.4f}" for label, end in ends.items())
         print(f"| | both ends {apart:.3f} mm apart, misfit {left} | | | | | | |")

@@ -1,11 +1,8 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from model.observation import TRUSTED_MAHALANOBIS
-from model.prior import GROUPS, default_prior, generic_prior, prior_of
-from tests.conftest import flat_heliostat
+from model.prior import GROUPS, default_prior
 from training.surfaces import tilt_modes
 
 
@@ -33,14 +30,3 @@ def test_a_rough_mirror_has_wider_scales():
     known, unknown = prior.precision(rough, np.zeros(counts)), prior.precision(np.zeros(counts), np.ones(counts))
     np.testing.assert_allclose(known[GROUPS[-1]] ** -0.5, 4, rtol=0.2)
     np.testing.assert_allclose(unknown, 1)
-
-
-def test_facets_of_another_size_have_the_generic_prior():
-    small = flat_heliostat()
-    facets = tuple(replace(f, canting_x=f.canting_x / 2, canting_y=f.canting_y / 2) for f in small.facets)
-    found = prior_of(replace(small, facets=facets))
-    assert prior_of(small) is default_prior()
-    assert found.name == "generic"
-    half, whole = found.basis, generic_prior(small.facet_frames[2]).basis
-    np.testing.assert_allclose((half**2).sum() / (whole**2).sum(), 0.25, rtol=0.01)
-    np.testing.assert_allclose(found.basis.mean(axis=(2, 3)), 0, atol=1e-12)
