@@ -9,7 +9,7 @@ from fastapi.testclient import TestClient
 
 from service.base.settings import Settings
 from service.store import keys
-from service.twin.accuracy import AccuracyBook, State
+from service.twin.accuracy import AccuracyBook, Rank, State
 from service.twin.runtime import Runtime
 from service.web.app import create_app
 from tests.service.conftest import FakeOperations, client_of, until
@@ -50,12 +50,12 @@ def test_busy_pool_is_answered_with_when_to_come_again(settings: Settings, heade
 def test_accuracy_that_is_being_worked_out_is_not_begun_again(client: TestClient, monkeypatch: pytest.MonkeyPatch):
     begun, go = [], threading.Event()
 
-    def work(self: AccuracyBook, state: State) -> float:
+    def work(self: AccuracyBook, state: State) -> Rank:
         begun.append(state)
         assert go.wait(10)
-        return 0.9
+        return Rank(0.9, 3)
 
-    monkeypatch.setattr(AccuracyBook, "_accuracy", work)
+    monkeypatch.setattr(AccuracyBook, "_rank", work)
     app: Any = client.app
     book, state = AccuracyBook(app.state.runtime), State("AA39", 1, 1, None, 1)
     try:
@@ -63,7 +63,7 @@ def test_accuracy_that_is_being_worked_out_is_not_begun_again(client: TestClient
         until(lambda: bool(begun))
         assert [book.look_up([state]) for _ in range(3)] == [({}, 1)] * 3
         go.set()
-        until(lambda: book.look_up([state]) == ({"AA39": 0.9}, 0))
+        until(lambda: book.look_up([state]) == ({"AA39": Rank(0.9, 3)}, 0))
     finally:
         book.close()
     assert begun == [state]
