@@ -9,7 +9,7 @@ import numpy as np
 from torch import Tensor
 
 from model.effects.base import Effect, Parameter
-from model.effects.scope import Always, ByDay, day_from_json, scope_from_json
+from model.effects.scope import Always, ByDay, Since, day_from_json, scope_from_json
 from model.errors import InvalidInputError
 
 ORDER = (
@@ -96,7 +96,14 @@ def effect_from_json(data: object) -> Effect:
     scope = scope_from_json(data.get("scope"), name)
     if isinstance(scope, ByDay):
         scope = ByDay(_by_day(name, known, given))
-    return CATALOGUE[name](**values, scope=scope)
+    effect = CATALOGUE[name](**values, scope=scope)
+    named = data["scope"].get("heliostats") if isinstance(scope, Since) else None
+    if named is not None and (not isinstance(named, list) or sorted(map(str, named)) != effect.heliostats):
+        raise InvalidInputError(
+            f"effect {name}: the scope's 'heliostats' must be those that its parameters name, or null, "
+            f"got {str(named)[:80]}"
+        )
+    return effect
 
 
 def _by_day(effect: str, known: Mapping[str, Parameter], given: Mapping[str, Any]) -> dict[date, dict[str, float]]:

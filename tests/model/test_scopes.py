@@ -102,6 +102,15 @@ def test_a_malformed_scope_is_refused(scope: object, says: str):
         effect_from_json({"name": "sun_shape", "parameters": {}, "scope": scope})
 
 
+def test_a_scope_names_no_other_heliostats_than_the_parameters():
+    canted = {**effect_to_json(CANTED), "scope": {"kind": "since", "since": "2024-06-16", "heliostats": ["far"]}}
+    assert effect_from_json(canted).heliostats == ["far"]
+    haze = {"name": "sun_shape", "scope": canted["scope"]}
+    for wrong in (haze, {**canted, "scope": {**canted["scope"], "heliostats": ["near"]}}):
+        with pytest.raises(InvalidInputError, match="must be those that its parameters name"):
+            effect_from_json(wrong)
+
+
 @pytest.mark.parametrize("by_day", [{"June": 0.1}, {"2024-06-02": 7}, 3, {"2024-06-02": "x"}])
 def test_malformed_values_by_day_are_refused(by_day: object):
     parameters = {"circumsolar_ratio": {"value": 0.1, "by_day": by_day}}
