@@ -176,6 +176,7 @@ class Slot:
 def make_plan(runtime: Runtime, begin: datetime | None, minutes: float, photographs: int) -> list[Slot]:
     """So many photographs within some time, evenly, each of the heliostat that it tells most of.
 
+    It begins at the next full minute unless told otherwise.
     Heliostats that were never calibrated are taken by what is believed of any.
 
     Raises
@@ -183,7 +184,7 @@ def make_plan(runtime: Runtime, begin: datetime | None, minutes: float, photogra
     InvalidInputError
         Where it is night for all that time.
     """
-    start = begin or now()
+    start = begin or now().replace(second=0, microsecond=0) + timedelta(minutes=1)
     moments = [start + timedelta(minutes=minutes * (place + 0.5) / photographs) for place in range(photographs)]
     with runtime.database.reading() as session:
         origin = store.get_plant(session).origin

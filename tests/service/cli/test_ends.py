@@ -146,7 +146,7 @@ def test_what_listens_says_where_and_answers(tmp_path: Path):
 
 
 _INTERRUPTED = """
-import sys, time
+import signal, sys, time
 from service.cli import folder
 from service.cli.main import main
 
@@ -156,6 +156,7 @@ def long(*_):
 
 folder.predict_heliostat = long
 sys.argv = ["heliotwin", *sys.argv[1:]]
+signal.signal(signal.SIGINT, signal.default_int_handler)  # whoever began the tests in the background had it ignored
 main()
 """
 
