@@ -193,6 +193,7 @@ class _Loop:
         for term, trial in trials.items():
             saved = self._saved(trial, current, term, rows, STRENGTHS)
             found += promises(term.kind, saved, days, self.all_heliostats[rows])
+        found = [promise for promise in found if promise.term not in current.unknowns.terms]
         found.sort(key=lambda promise: -promise.saved)
         best = [promise.term for promise in found[:SCREENED] if promise.saved > OF_THE_BEST * found[0].saved]
         return dict(self._settled(term, current, rows) for term in best)
@@ -214,7 +215,7 @@ class _Loop:
         trial = self.added(term, current)
         for _ in range(SETTLING if term.since is not None else 0):
             day = self._changed(term, trial, current, rows)
-            if day is None or day == term.since:
+            if day is None or day == term.since or replace(term, since=day) in current.unknowns.terms:
                 break
             term = replace(term, since=day)
             trial = self.added(term, current)
@@ -235,7 +236,7 @@ class _Loop:
     def dated(self, term: Term, trial: Trial, current: Trial) -> tuple[Term, Trial]:
         """An effect that was judged since the day that all photographs name, also those that judged it."""
         day = None if term.since is None else self._changed(term, trial, current, np.arange(len(self.flux_images)))
-        if day is None or day == term.since:
+        if day is None or day == term.since or replace(term, since=day) in current.unknowns.terms:
             return term, trial
         return replace(term, since=day), trial.redated(term, day)
 

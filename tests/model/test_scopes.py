@@ -217,3 +217,14 @@ def test_hazy_days_are_found_and_named():
 def test_what_is_always_there_is_not_dated():
     (found,) = found_in([SunShapeEffect(0.12)], "sun_shape", "camera_response").to_json()["effects"]
     assert found["scope"] == {"kind": "set"}
+
+
+def test_two_mirrors_that_were_canted_anew_on_different_days_are_both_found():
+    other = FacetCanting(
+        {"near": np.array([-1.0, 0.8, 0.6, -0.4])},
+        {"near": np.array([0.8, -1.0, -0.6, 0.8])},
+        scope=Since(date(2024, 6, 10)),
+    )
+    found = found_in([CANTED, other], "facet_canting").to_json()["effects"]
+    scopes = {tuple(effect["scope"]["heliostats"]): effect["scope"]["since"] for effect in found}
+    assert scopes == {("far",): "2024-06-16", ("near",): "2024-06-10"}
