@@ -38,7 +38,7 @@ from service.store.surfaces import NewSurface
 from service.store.tables import ForecastRow, ImageRow, MeasurementRow
 from service.twin import compute
 from service.twin.field import read_lines
-from service.twin.ingest import _row
+from service.twin.ingest import row_of
 from tests.benchmarks import data_folder
 from tests.faults.harness import new_store
 from tests.service.conftest import ORIGIN, properties_document, tower_document
@@ -136,7 +136,7 @@ class Filler:
     ) -> None:
         sun = float(self.rng.uniform(-90, 90)), float(self.rng.uniform(5, 65))
         about = Photograph(self.target.name, kind, *sun, f"{200_000 + number}", at, (31234.0, 45012.0))
-        row = _row(about, measured, self.target.id)
+        row = row_of(about, measured, self.target.id, None)
         row.created_at = at
         image = ImageRow(sha256=sha256, media_type="image/png", size_bytes=round(IMAGE_KB * 1e3), created_at=at)
         image.width_px, image.height_px = 1000, 800

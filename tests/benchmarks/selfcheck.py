@@ -17,11 +17,12 @@ from model.metrics import surface_error
 from model.network.predictor import WEIGHTS
 from model.observation import SurfacePrediction, render_observations
 from model.plant import JUELICH_LATITUDE
+from service.cli.folder import observations_of
 from service.sources.folder import read_folder
 from service.twin.compute import predict
 from service.twin.evidence import choose
 from tests.benchmarks import data_folder
-from tests.benchmarks.surfaces import IMAGES, mirrors
+from tests.benchmarks.surfaces import IMAGES
 from training.cases import Case, make_cases
 from training.methods import held_out_of
 from training.render import CleanCamera, load_field
@@ -144,15 +145,16 @@ def rendered(count: int) -> None:
 
 def photographed() -> None:
     """Print what is made of AA39's and AC43's photographs, by their own models and by each other's."""
-    found = mirrors(read_folder(data_folder(), ["AA39", "AC43"]))
-    for heliostat, _, _ in found:
-        for owner, observations, _ in found:
+    folder = read_folder(data_folder(), ["AA39", "AC43"])
+    seen_of = {name: observations_of(folder, name)[0] for name in folder.plant.heliostats}
+    for heliostat in folder.plant.heliostats.values():
+        for owner, observations in seen_of.items():
             predicted = predict(heliostat, choose(observations, IMAGES), "refined", latitude_deg=JUELICH_LATITUDE)
             verdict, shown = (
                 "trusted" if predicted.trusted else "doubted",
                 " ".join(f"{m:.3f}" for m in predicted.misfits),
             )
-            print(f"  {heliostat.name} from photographs of {owner.name}: {verdict}", end="   ")
+            print(f"  {heliostat.name} from photographs of {owner}: {verdict}", end="   ")
             print(f"mahalanobis {predicted.mahalanobis:.2f}   misfits {shown}")
 
 
