@@ -38,6 +38,11 @@ class Split:
     own: Rows
     held_out: Rows
 
+    @property
+    def fitted(self) -> Rows:
+        """All that are fitted in some way."""
+        return np.sort(np.concatenate([self.fit, self.own]))
+
 
 FRESH = 2
 """Images that no surface was predicted from, from which on they alone judge."""
@@ -46,7 +51,7 @@ FRESH = 2
 def split(flux_images: Sequence[FluxImage]) -> Split:
     """Every second image of each heliostat judges; and one heliostat of several is kept apart.
 
-    They are counted by the day, where all have one, and by the sun's elevation: what comes and goes shall be seen by
+    They are counted by the day, where most have one, and by the sun's elevation: what comes and goes shall be seen by
     fits and by judges alike.
 
     The one that is kept apart is at the median distance: the others span it. Images that surfaces were predicted from

@@ -152,7 +152,7 @@ class _Loop:
         A day has its haze for all heliostats; where an effect comes by day, none is kept apart.
         """
         if any(term.days for term in whole.terms):
-            return [(np.sort(np.concatenate([self.split.fit, self.split.own])), whole)]
+            return [(self.split.fitted, whole)]
         return [(self.split.fit, whole), (self.split.own, whole.own)]
 
     def judged(self, trial: Trial) -> Trial:
@@ -188,27 +188,28 @@ class _Loop:
 
     def scoped(self, trials: dict[Term, Trial], current: Trial) -> dict[Term, Trial]:
         """Effects that are not always there, fitted: those of the most promising scopes."""
-        rows, days = self._dated(np.sort(np.concatenate([self.split.fit, self.split.own])))
+        rows, days = self._dated(self.split.fitted)
         found: list[Promise] = []
+        before = self._costs(rows, current.unknowns, current.values[None])
         for term, trial in trials.items():
-            saved = self._saved(trial, current, term, rows, STRENGTHS)
+            saved = before - self._costs_without_scope(trial, term, rows, STRENGTHS)
             found += promises(term.kind, saved, days, self.all_heliostats[rows])
         found = [promise for promise in found if promise.term not in current.unknowns.terms]
         found.sort(key=lambda promise: -promise.saved)
         best = [promise.term for promise in found[:SCREENED] if promise.saved > OF_THE_BEST * found[0].saved]
         return dict(self._settled(term, current, rows) for term in best)
 
-    def _saved(self, trial: Trial, current: Trial, term: Term, rows: Rows, strengths: Sequence[float]) -> Array:
-        """Cost (strengths, n) that some images save by an effect that is always there, over the current model."""
-        fitter = Fitter(*self._pair(rows))
-        always = replace(term, since=None)
-        terms = tuple(always if one == term else one for one in trial.unknowns.terms)
+    def _costs(self, rows: Rows, unknowns: Unknowns, trials: Array) -> Array:
+        """What each of some images (M, n) costs under trials (M, P)."""
+        return np.asarray((Fitter(*self._pair(rows)).residuals_of(unknowns, trials) ** 2).sum(axis=-1) / 2)
+
+    def _costs_without_scope(self, trial: Trial, term: Term, rows: Rows, strengths: Sequence[float]) -> Array:
+        """What each of some images costs (strengths, n) if an effect were always there, at multiples of its fit."""
+        terms = tuple(replace(term, since=None) if one == term else one for one in trial.unknowns.terms)
         unknowns, moved = Unknowns(terms, self.facets), np.array([u.term == term for u in trial.unknowns.all])
         away = np.where(moved, trial.values - trial.unknowns.neutral, 0.0)
         tried = [np.clip(trial.values + (s - 1) * away, *unknowns.bounds) for s in strengths]
-        before = (fitter.residuals(current.unknowns, current.values) ** 2).sum(axis=1)
-        after = np.array([(one**2).sum(axis=1) for one in fitter.residuals_of(unknowns, np.array(tried))])
-        return np.asarray((before - after) / 2)
+        return self._costs(rows, unknowns, np.array(tried))
 
     def _settled(self, term: Term, current: Trial, rows: Rows) -> tuple[Term, Trial]:
         """An effect in its scope, fitted; one since a day since that from which on its fit saves most."""
@@ -224,7 +225,8 @@ class _Loop:
     def _changed(self, term: Term, trial: Trial, current: Trial, rows: Rows) -> date | None:
         """The day from which on photographs among some save most by an effect as it was fitted."""
         rows, days = self._dated(self.touched(rows, [replace(term, since=None)]))
-        found = change(self._saved(trial, current, term, rows, (1.0,)), days)
+        before = self._costs(rows, current.unknowns, current.values[None])
+        found = change(before - self._costs_without_scope(trial, term, rows, (1.0,)), days)
         return None if found is None else found[0]
 
     def _dated(self, rows: Rows) -> tuple[Rows, list[date]]:
@@ -261,15 +263,14 @@ class _Loop:
         held_out = _changes(self.measured, before.cuts, after.cuts)
         if not held_out.sum() > 0:
             return few_gain(held_out)
-        fitted = np.sort(np.concatenate([self.split.fit, self.split.own]))
-        return few_gain(np.concatenate([held_out, self._crossed(term, after, before, fitted)]))
+        return few_gain(np.concatenate([held_out, self._crossed(term, after, before)]))
 
-    def _crossed(self, term: Term, after: Trial, before: Trial, rows: Rows) -> Array:
+    def _crossed(self, term: Term, after: Trial, before: Trial) -> Array:
         """Changes of accuracy (n,) of images that were fitted, by an effect fitted to those held out."""
         crossed = replace(after, values=before.unknowns.put(before.values, after.unknowns))
         moving = Unknowns((term,), self.facets)
         crossed = self._fitted(crossed, self.touched(self.split.held_out, [term]), moving, set())
-        rows = self.touched(rows, [term])
+        rows = self.touched(self.split.fitted, [term])
         if not len(rows):
             return np.empty(0)
         judge = self._pair(rows)[1]

@@ -16,7 +16,6 @@ from model.study.flux_images import FluxImage
 from model.study.unknowns import Term
 
 Array = NDArray[np.float64]
-Rows = NDArray[np.int64]
 
 STRENGTHS = (1.0, 2.0, 4.0)
 """Multiples, of what fits all photographs best, at which gains are looked at: what is not always there is diluted."""
@@ -52,9 +51,8 @@ def promises(kind: type[Effect], saved: Array, days: Sequence[date], heliostats:
     ``saved`` (strengths, N) is the cost that each of the N photographs of ``days`` and ``heliostats`` saves.
     """
     if "since" in kind.comes:
-        own = not any(p.shared for p in kind.parameters())
         names = sorted(set(heliostats.tolist()))
-        for chosen in [None, *((name,) for name in names)] if own and len(names) > 1 else [None]:
+        for chosen in [None, *((name,) for name in names)] if Term(kind).own and len(names) > 1 else [None]:
             rows = np.flatnonzero(np.isin(heliostats, names if chosen is None else chosen))
             found = change(saved[:, rows], [days[row] for row in rows.tolist()])
             if found is not None and found[1] > BEYOND * max(0.0, saved[:, rows].sum(axis=1).max()):
