@@ -109,6 +109,10 @@ class View:
             return Window.of(plane, self.rows, self.columns)
         return Window(self.window, self.window, self.rows, self.columns, on_spot=True)
 
+    def of_all(self, group: "Group") -> list[Window]:
+        """The windows on a group's targets."""
+        return [self.of(plane) for plane in group.planes]
+
     def trace(self, scene: Scene, window: Window, optics: Optics) -> Tensor:
         """The convolution tracer, as finely as this view asks."""
         flux = trace(scene, window, optics, samples=self.samples, padding=self.padding, cones=self.cones)
@@ -169,6 +173,8 @@ class Group:
     angles : (B, 2) [rad]
     aims : (B, 3) [m]
         Where their mirrors' centres aim.
+    cut : bool (B,)
+        Whether their spots run over their targets' edges.
     """
 
     rows: list[int]
@@ -177,12 +183,15 @@ class Group:
     scene: Scene
     angles: Array
     aims: Array
+    cut: NDArray[np.bool_]
 
-    def parts(self, view: View, effects: Sequence[Effect]) -> Iterator[tuple[Window, tuple[Effect, ...], list[int]]]:
-        """The windows that the view has on their targets and the effects that act, with the places of those alike."""
+    def parts(
+        self, windows: Sequence[Window], effects: Sequence[Effect]
+    ) -> Iterator[tuple[Window, tuple[Effect, ...], list[int]]]:
+        """Windows on the targets and the effects that act there, with the places of those that have them alike."""
         places: dict[tuple[Window, tuple[Effect, ...]], list[int]] = {}
-        for place, (plane, moment) in enumerate(zip(self.planes, self.moments, strict=True)):
-            places.setdefault((view.of(plane), acting(effects, moment)), []).append(place)
+        for place, (window, moment) in enumerate(zip(windows, self.moments, strict=True)):
+            places.setdefault((window, acting(effects, moment)), []).append(place)
         for (window, there), alike in places.items():
             yield window, there, alike
 
@@ -234,7 +243,7 @@ class Aligned:
         def traced(group: Group, window: Window, there: Sequence[Effect], rows: list[int]) -> Tensor:
             return by_tracer(group.scene.subset(rows), window, optics_under(there, declared))
 
-        return self._each_part(view, of_stage(effects, "optics"), traced)
+        return self._each_part(view.of_all, of_stage(effects, "optics"), traced)
 
     def camera_images(self, flux: Tensor, effects: Iterable[Effect], view: View | None = None) -> Tensor:
         """What the effects of the camera make of ``flux`` (B, rows, columns), which was traced in the same view."""
@@ -242,7 +251,7 @@ class Aligned:
         def imaged(group: Group, window: Window, there: Sequence[Effect], rows: list[int]) -> Tensor:
             return images_under(there, flux[[group.rows[row] for row in rows]], window)
 
-        return self._each_part(view or View(), of_stage(effects, "image"), imaged)
+        return self._each_part((view or View()).of_all, of_stage(effects, "image"), imaged)
 
     def images(
         self,
@@ -260,15 +269,15 @@ class Aligned:
         """What would be measured of the same light: flux images (B, size, size) about their own centres, sum 100.
 
         As a measurement has it: what the camera shows of the whole target, and of that the window about its centre of
-        mass. Where no effect of a camera acts, that is the window about the light's.
+        mass. Where no effect of a camera acts and the target shows all, that is the window about the light's.
         """
-        view, declared = self._flux_view(effects, size, samples), optics or Optics()
+        view, declared = View(samples=samples), optics or Optics()
 
         def measured(group: Group, window: Window, there: Sequence[Effect], rows: list[int]) -> Tensor:
             flux = view.trace(group.scene.subset(rows), window, optics_under(there, declared))
             return _measured(flux, window, there, size)
 
-        return self._each_part(view, of_stage(effects, "optics", "image"), measured)
+        return self._each_part(_flux_windows(effects, size), of_stage(effects, "optics", "image"), measured)
 
     def flux_changes(
         self,
@@ -283,7 +292,7 @@ class Aligned:
 
         ``directions`` are changes (K, F, I, J) [m] of all mirrors alike, for which the mounts keep the spots in place.
         """
-        view, declared = self._flux_view(effects, size, samples), optics or Optics()
+        view, declared = View(samples=samples), optics or Optics()
 
         def measured(group: Group, window: Window, there: Sequence[Effect], rows: list[int]) -> Tensor:
             scene, effective = group.scene.subset(rows), optics_under(there, declared)
@@ -294,30 +303,41 @@ class Aligned:
             seen = _measured(images.flatten(0, 1), window, there, size)
             return seen.view(-1, len(rows), size, size).transpose(0, 1)
 
-        return self._each_part(view, of_stage(effects, "optics", "image"), measured).transpose(0, 1)
-
-    def _flux_view(self, effects: Sequence[Effect], size: int, samples: int) -> View:
-        """What is traced for flux images: the window about the spot, or whole targets where a camera's effects act."""
-        if not any(effect.stage == "image" for effect in effects):
-            return View(size, size, window=FLUX_WINDOW, samples=samples)
-        pixel = FLUX_WINDOW / size
-        planes = [plane for group in self.groups for plane in group.planes]
-        rows, columns = (math.ceil(max(getattr(p, side) for p in planes) / pixel) for side in ("height", "width"))
-        return View(rows, columns, samples=samples)
+        windows, acting_there = _flux_windows(effects, size), of_stage(effects, "optics", "image")
+        return self._each_part(windows, acting_there, measured).transpose(0, 1)
 
     def _each_part(
         self,
-        view: View,
+        windows: Callable[[Group], list[Window]],
         effects: Sequence[Effect],
         act: Callable[[Group, Window, Sequence[Effect], list[int]], Tensor],
     ) -> Tensor:
         """What ``act`` makes (b, ...) of the setups alike in window and effects, in the setups' order (B, ...)."""
         parts, places = [], []
         for group in self.groups:
-            for window, there, rows in group.parts(view, effects):
+            for window, there, rows in group.parts(windows(group), effects):
                 parts.append(act(group, window, there, rows))
                 places += [group.rows[row] for row in rows]
         return torch.cat(parts)[torch.as_tensor(places).argsort()]
+
+
+def _flux_windows(effects: Sequence[Effect], size: int) -> Callable[[Group], list[Window]]:
+    """What is traced of a group's targets for flux images of ``size`` pixels.
+
+    The window about the spot; the whole target where that ends within the spot, or effects of a camera act.
+    """
+    view, pixel = View(size, size, window=FLUX_WINDOW), FLUX_WINDOW / size
+    camera = bool(of_stage(effects, "image"))
+
+    def windows(group: Group) -> list[Window]:
+        return [
+            Window.of(plane, math.ceil(plane.height / pixel), math.ceil(plane.width / pixel))
+            if cut or camera
+            else view.of(plane)
+            for plane, cut in zip(group.planes, group.cut, strict=True)
+        ]
+
+    return windows
 
 
 def _measured(flux: Tensor, window: Window, effects: Sequence[Effect], size: int) -> Tensor:
@@ -396,14 +416,14 @@ def _align_group(
         return scene
 
     if group[0].spot is None:
-        angles = _given_angles(group, heliostats, suns)
+        angles, cut = _given_angles(group, heliostats, suns), np.zeros(len(rows), dtype=bool)
         scene = Scene.build(heliostats, points, angles, suns, planes, degree=degree, dtype=torch.float64)
     else:
         goals = [setup.goal for setup in group]
-        angles, aims, scene = align_scene(
+        angles, aims, scene, cut = align_scene(
             heliostats, points, suns, planes, goals, degree=degree, start=aims, alter=alter
         )
-    return Group(rows, planes, [setup.taken_at for setup in group], alter(scene.to(dtype)), angles, aims)
+    return Group(rows, planes, [setup.taken_at for setup in group], alter(scene.to(dtype)), angles, aims, cut)
 
 
 def altered(heliostats: Sequence[Heliostat], effects: Sequence[Effect]) -> list[Heliostat]:

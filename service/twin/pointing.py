@@ -28,6 +28,9 @@ from service.twin.runtime import Runtime
 
 Array = NDArray[np.float64]
 
+MOST_CUT = 0.1
+"""Share of a spot's light beside the target up to which the centre of what is seen is that of the spot."""
+
 
 @dataclass(frozen=True, eq=False)
 class StoreMounts:
@@ -103,6 +106,10 @@ def _reading(heliostat: Heliostat, row: MeasurementRow, origin: tuple[float, flo
         raise InvalidInputError("no motor_position")
     if spot is None:
         raise InvalidInputError("no place of its spot on the target")
+    if float(row.quality.get("cut_share") or 0) > MOST_CUT:
+        raise InvalidInputError(
+            "its spot runs over the target's edge, and where the centre of all of it lies is unseen"
+        )
     motors = np.array([row.motor_axis_1, row.motor_axis_2])
     for position, drive in zip(motors, heliostat.mount.actuators or (), strict=True):
         drive.require_within(position)

@@ -104,6 +104,29 @@ def test_a_flux_image_is_what_is_measured_of_the_whole_targets_image(camera):
         assert flux_accuracy(measured, seen.numpy()) > 0.99
 
 
+@pytest.mark.parametrize("edge", [0.6, 0.2, -0.1])
+def test_a_spot_that_its_target_cuts_is_aligned_by_the_part_that_is_seen(edge):
+    """The target ends ``edge`` [m] right of the spot's centre: mirror and forecast are as of a target that does not."""
+    whole = [replace(one, spot=one.plane.center, plane=target(12.0)) for one in setups()]
+    sent = align(whole, latitude_deg=JUELICH_LATITUDE)
+    ends = replace(whole[0].plane, center=whole[0].plane.to_enu((edge - 3.0, 0.0)), width=6.0, height=6.0)
+    there = [replace(s, plane=ends, spot=None, angles=a) for s, a in zip(whole, sent.angles, strict=True)]
+    shown = align(there, latitude_deg=JUELICH_LATITUDE).flux(view=View(256, 256)).clamp(min=0).numpy()
+    spots = [ends.to_enu(center_of_mass(image, (6.0, 6.0))) for image in shown]
+    seen = [replace(s, plane=ends, spot=spot) for s, spot in zip(whole, spots, strict=True)]
+    aligned = align(seen, latitude_deg=JUELICH_LATITUDE)
+    np.testing.assert_allclose(aligned.aims, sent.aims, atol=0.03)
+    for image, expected in zip(aligned.flux_images().numpy(), shown, strict=True):
+        assert flux_accuracy(flux_window(expected, (6.0, 6.0), center_of_mass(expected, (6.0, 6.0))), image) > 0.98
+
+
+def test_a_spot_beside_its_target_brings_all_light_there():
+    (beside,) = setups(1)
+    beside = replace(beside, spot=beside.plane.to_enu((beside.plane.width, 0.0)))
+    (group,) = align([beside], latitude_deg=JUELICH_LATITUDE).groups
+    np.testing.assert_allclose(central_rays(group.scene, 12).spot[0], [beside.plane.width, 0.0], atol=1e-3)
+
+
 def test_the_order_of_the_list_is_of_no_account():
     given, view = setups(1), View(32, 32, samples=8)
     effects = [CameraResponse(1.5), Background(0.1), SlopeError(1.0), GravityBending(3.0)]
