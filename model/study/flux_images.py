@@ -177,6 +177,7 @@ class Forecaster:
         self._flux: dict[str, torch.Tensor] = {}
         self._start: Aligned | None = None
         self._copies: dict[int, Forecaster] = {}
+        self._ranges: dict[tuple[tuple[int, ...], int, int], tuple[Array, Array]] = {}
 
     def copies(self, count: int) -> "Forecaster":
         """The same of photographs that are there ``count`` times, of heliostats that are copies of the first.
@@ -220,21 +221,31 @@ class Forecaster:
         for camera in np.unique(self.cameras, axis=0):
             rows = np.flatnonzero((self.cameras == camera).all(axis=1))
             planes = [self.planes[row] for row in rows]
-            shown = in_pixels(images[rows], *camera)
-            for place, row in enumerate(rows.tolist()):
-                shown[place] = self._within_range(self.flux_images[row], shown[place])
-            cuts[rows] = cut(shown, planes, self.window, resolution)
+            cuts[rows] = cut(
+                self._within_range(rows, in_pixels(images[rows], *camera)), planes, self.window, resolution
+            )
         return cuts
 
-    @staticmethod
-    def _within_range(taken: FluxImage, forecast: Array) -> Array:
-        """A forecast (R, C), cut off where the camera's range cut off the photograph."""
-        if taken.clipped is None:
-            return forecast
-        size = forecast.shape
-        measured = in_pixels(np.asarray(taken.image, dtype=np.float64)[None], *size)
-        share = in_pixels(taken.clipped[None].astype(np.float64), *size) * (forecast.size / taken.clipped.size)
-        return np.asarray(clipped_alike(forecast[None], measured, share)[0])
+    def _within_range(self, rows: NDArray[np.intp], forecasts: Array) -> Array:
+        """Forecasts (n, R, C) of the photographs ``rows`` (n,), cut off where the camera's range cut those off."""
+        places = [place for place, row in enumerate(rows.tolist()) if self.flux_images[row].clipped is not None]
+        if not places:
+            return forecasts
+        measured, shares = self._range(tuple(rows[places].tolist()), forecasts.shape[1], forecasts.shape[2])
+        seen = forecasts.copy()
+        seen[places] = clipped_alike(forecasts[places], measured, shares)
+        return seen
+
+    def _range(self, cut_off: tuple[int, ...], rows: int, columns: int) -> tuple[Array, Array]:
+        """Of photographs that were cut off, alike in size: light and the share of each pixel, (n, rows, columns)."""
+        if (cut_off, rows, columns) not in self._ranges:
+            taken = [self.flux_images[row] for row in cut_off]
+            light = np.stack([np.asarray(one.image, dtype=np.float64) for one in taken])
+            clipped = np.stack([np.asarray(one.clipped, dtype=np.float64) for one in taken])
+            pixel = light[0].size / (rows * columns)
+            shares = in_pixels(clipped, rows, columns) / pixel
+            self._ranges[cut_off, rows, columns] = in_pixels(light, rows, columns), shares
+        return self._ranges[cut_off, rows, columns]
 
     def _traced(self, model: Sequence[Effect]) -> tuple[Aligned, torch.Tensor]:
         """Aligned setups and their flux; both are kept while only later stages change."""

@@ -39,6 +39,9 @@ NEWTON, STEP, LEAST_SLOPE, MISSED = 20, 1e-3, 0.05, 1e-3
 """Newton's steps, the difference [m] for their slopes, the slope that is taken at least, and the distance [m] up to
 which a place counts as reached."""
 
+REACH = 4.0
+"""Deviations within which a ray's light ends: a spot farther from its target's edges is whole."""
+
 WHOLE = 2e-3
 """Share of a spot's light beside the target up to which the spot counts as whole."""
 
@@ -159,24 +162,32 @@ class _Light(NamedTuple):
     def way_to(self, places: Tensor) -> tuple[Array, Array]:
         """Shifts (B, 2) [m] that bring the centres of what is shown to ``places`` (B, 2) [m], and the shares (B,) then.
 
-        Newton's method along each axis. Where no shift does, as for a place beside the target: those that bring all
-        light's there.
+        Where no shift does, as for a place beside the target: those that bring all light's there.
         """
-        spot = (self.hits * self.power[:, None]).sum(-1) / self.power.sum(-1, keepdim=True)
-        whole = shift = places - spot
+        shift = places - (self.hits * self.power[:, None]).sum(-1) / self.power.sum(-1, keepdim=True)
+        share = torch.ones_like(shift[:, 0])
+        margin = self.half[..., None] - (self.hits + shift[..., None]).abs()
+        edge = (margin < REACH * self.width[..., None]).flatten(1).any(dim=1)
+        if bool(edge.any()):
+            light = _Light(*(part[edge] for part in self))
+            found, shown, missed = light._newton(shift[edge], places[edge])
+            reached = missed < MISSED
+            shift[edge] = torch.where(reached[:, None], found, shift[edge])
+            share[edge] = torch.where(reached, shown, share[edge])
+        return shift.numpy(), share.numpy()
+
+    def _newton(self, shift: Tensor, places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Shifts, shares then, and by how much (B,) [m] places are missed, by Newton's method along each axis."""
         for _ in range(NEWTON):
             center, share = self.shown(shift)
             missed = places - center
             if not bool((missed.abs() > TOLERANCE / 10).any()):
                 break
             steps = STEP * torch.eye(2, dtype=shift.dtype)
-            slope = torch.stack(
-                [(self.shown(shift + step)[0] - center)[:, k] / STEP for k, step in enumerate(steps)], 1
-            )
-            shift = shift + (missed / slope.clamp(min=LEAST_SLOPE)).clamp(-self.half / 2, self.half / 2)
-        reached = (missed.abs().amax(dim=1) < MISSED) & torch.isfinite(shift).all(dim=1)
-        shift = torch.where(reached[:, None], shift, whole)
-        return shift.numpy(), torch.where(reached, share, torch.ones_like(share)).numpy()
+            slopes = [(self.shown(shift + step)[0] - center)[:, axis] / STEP for axis, step in enumerate(steps)]
+            towards = missed / torch.stack(slopes, dim=1).clamp(min=LEAST_SLOPE)
+            shift = shift + towards.clamp(-self.half / 2, self.half / 2)
+        return shift, share, missed.abs().amax(dim=1)
 
 
 def _density(x: Tensor) -> Tensor:
