@@ -56,6 +56,12 @@ def get_measurements(
     return [rows[identifier] for identifier in identifiers]
 
 
+def list_identifiers(session: Session, heliostat: HeliostatRow) -> Sequence[str]:
+    """The identifiers of all its measurements, in the order they came."""
+    query = select(MeasurementRow.identifier).where(MeasurementRow.heliostat_id == heliostat.id)
+    return session.scalars(query.order_by(MeasurementRow.id)).all()
+
+
 def list_measurements(
     session: Session, heliostat: HeliostatRow, limit: int, after: str | None = None, accepted: bool | None = None
 ) -> Sequence[MeasurementRow]:

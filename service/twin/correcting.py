@@ -4,6 +4,8 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Any, cast
 
+from sqlalchemy.orm import Session
+
 from model.imaging import ImageKind
 from model.imaging.light import camera_at
 from service import store
@@ -12,6 +14,7 @@ from service.sources.photograph import Photograph
 from service.store import audit
 from service.store.columns import now
 from service.store.corrections import EXCLUDED, forget_drift
+from service.store.images import digest
 from service.store.tables import CorrectionRow, MeasurementRow, TargetRow
 from service.twin.evidence import Twin, load_twin
 from service.twin.ingest import clock_of, measure_photograph, row_of
@@ -72,26 +75,57 @@ def correct(runtime: Runtime, heliostat: str, identifier: str, changes: Changes,
     fresh = _fresh(runtime, twin, row, changes.of(row), target)
     with runtime.database.writing() as session:
         row = store.get_measurement(session, store.get_heliostat(session, heliostat), identifier, arrays=True)
-        before = _state(row)
-        _write(row, fresh, changes.excluded)
-        session.flush()
-        session.refresh(row, ["target"])
-        after = _state(row)
-        apart = [name for name, value in after.items() if value != before[name]]
-        if not apart:
+        if not _keep(session, heliostat, row, fresh, changes, actor):
             raise ConflictError(f"measurement {identifier} stands so already; nothing was changed")
-        row.corrected_at = now()
-        old, new = ({name: state[name] for name in apart} for state in (before, after))
-        session.add(CorrectionRow(measurement_id=row.id, made_by=actor, reason=changes.reason, before=old, after=new))
-        forget_drift(session, row)
-        store.use_image(session, row.image, row.accepted, False)
-        about = {"reason": changes.reason, "before": old, "after": new}
-        audit.record(session, actor, "measurement.corrected", f"heliostat {heliostat} {identifier}", **about)
     return row
 
 
+def measure_anew(runtime: Runtime, heliostat: str, identifier: str, reason: str, actor: str) -> bool:
+    """Measure a stored photograph by today's camera, as this version measures; whether anything changed.
+
+    Raises
+    ------
+    NotFoundError
+        Where heliostat or measurement are not stored.
+    GoneError
+        Where its image is kept no longer.
+    """
+    with runtime.database.reading() as session:
+        twin = load_twin(session, heliostat)
+        row = store.get_measurement(session, twin.row, identifier)
+        target, changes = row.target, Changes(reason)
+    fresh = _measured(runtime, twin, row, changes.of(row), target)
+    with runtime.database.writing() as session:
+        row = store.get_measurement(session, store.get_heliostat(session, heliostat), identifier, arrays=True)
+        return _keep(session, heliostat, row, fresh, changes, actor)
+
+
+def _keep(
+    session: Session, heliostat: str, row: MeasurementRow, fresh: dict[str, Any], changes: Changes, actor: str
+) -> bool:
+    """Write the columns that change with their history; False where none does."""
+    before = _state(row)
+    _write(row, fresh, changes.excluded)
+    session.flush()
+    session.refresh(row, ["target"])
+    after = _state(row)
+    apart = [name for name, value in after.items() if value != before[name]]
+    if not apart:
+        return False
+    row.corrected_at = now()
+    old, new = ({name: state[name] for name in apart} for state in (before, after))
+    session.add(CorrectionRow(measurement_id=row.id, made_by=actor, reason=changes.reason, before=old, after=new))
+    forget_drift(session, row)
+    store.use_image(session, row.image, row.accepted, False)
+    about = {"reason": changes.reason, "before": old, "after": new}
+    audit.record(session, actor, "measurement.corrected", f"heliostat {heliostat} {row.identifier}", **about)
+    return True
+
+
 def _state(row: MeasurementRow) -> dict[str, Any]:
-    return values_of(row) | {"excluded": row.reason == EXCLUDED}
+    """What is known of a photograph, and by their hash its flux images."""
+    flux = None if row.arrays is None else digest(row.arrays)[:12]
+    return values_of(row) | {"excluded": row.reason == EXCLUDED, "flux": flux}
 
 
 def _fresh(
@@ -110,6 +144,13 @@ def _fresh(
             "motor_axis_2": motors[1],
             "quality": {**row.quality, "clock": clock_of(photograph, twin)},
         }
+    return _measured(runtime, twin, row, photograph, target)
+
+
+def _measured(
+    runtime: Runtime, twin: Twin, row: MeasurementRow, photograph: Photograph, target: TargetRow
+) -> dict[str, Any]:
+    """The columns of a photograph that is measured anew."""
     if row.image.pruned_at is not None:
         raise GoneError(
             f"measurement {row.identifier} must be measured anew, and its image was given up on "

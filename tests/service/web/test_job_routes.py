@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,10 @@ from service.jobs.kind import Context
 from service.jobs.kinds import KINDS
 from service.jobs.kinds.predictions import PredictionsIn, predict_many
 from service.store import keys, queue
+from service.store.columns import now
+from service.store.images import digest
 from service.store.job_tables import JobRow
+from service.store.tables import ImageRow
 from service.web.app import create_app
 from tests.service.conftest import QUIET, FakeOperations, Post, client_of, png, serving, until
 from tests.service.job_kinds import TEST_KINDS
@@ -121,6 +125,35 @@ def test_predictions_without_any_image_fail_with_the_reason(client: TestClient):
     job = finish(client, client.post("/v1/jobs/predictions", json={"heliostats": ["AA39", "ZZ99"]}))
     assert job["state"] == "failed"
     assert "AA39: heliostat AA39 has no accepted measurement" in job["reason"]
+
+
+def test_photographs_are_measured_anew(
+    client: TestClient, post: Post, operations: FakeOperations, monkeypatch: pytest.MonkeyPatch
+):
+    """What changes has its history, what does not stays as it was, and what is kept no longer is counted."""
+    for number in (1, 2, 3):
+        post(png(number), id=str(number))
+    app: Any = client.app
+    with app.state.runtime.database.writing() as session:
+        image = session.get_one(ImageRow, digest(png(3)))
+        image.pruned_at, image.pruned_for = now(), "age"
+    measure, calls = operations.measure, []
+
+    def brighter_the_first_time(*arguments: Any, **options: Any) -> Any:
+        taken = measure(*arguments, **options)
+        calls.append(1)
+        return replace(taken, center_of_mass=np.zeros(2), flux=2 * taken.flux) if len(calls) == 1 else taken
+
+    monkeypatch.setattr(operations, "measure", brighter_the_first_time)
+    job = finish(client, client.post("/v1/jobs/measurements", json={"reason": "a camera was declared"}))
+    assert job["result"] == {"measured": 2, "changed": 1, "gone": 1, "skipped": {}}
+    path = "/v1/heliostats/AA39/measurements"
+    (kept,) = client.get(f"{path}/1/corrections").json()
+    assert (kept["reason"], list(kept["after"])) == ("a camera was declared", ["flux"])
+    assert client.get(f"{path}/1").json()["center_of_mass"] == [0.0, 0.0]
+    assert client.get(f"{path}/2/corrections").json() == []
+    nobody = finish(client, client.post("/v1/jobs/measurements", json={"heliostats": ["ZZ99"]}))
+    assert (nobody["state"], "ZZ99" in nobody["reason"]) == ("failed", True)
 
 
 def test_fleet_forecast_is_the_sum_of_its_heliostats(client: TestClient, properties: Any):
