@@ -226,6 +226,16 @@ class Aligned:
         scene = group.scene.with_(control_points=group.scene.control_points + changes)
         return Aligned((replace(group, scene=scene),))
 
+    def soiled(self, facets: Tensor) -> "Aligned":
+        """The same setups, the light of each mirror's facets changed by shares (F,) [1]."""
+        groups = []
+        for group in self.groups:
+            before = group.scene.facet_reflectivity
+            shares = facets.to(group.scene.sun).expand(len(group.rows), -1)
+            scene = group.scene.with_(facet_reflectivity=shares if before is None else before * shares)
+            groups.append(replace(group, scene=scene))
+        return Aligned(tuple(groups))
+
     def flux(
         self,
         optics: Optics | None = None,

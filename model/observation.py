@@ -98,6 +98,8 @@ class SurfacePrediction:
         Mahalanobis distance of the surface from the prior; about one is usual (`SurfacePrior.mahalanobis`).
     contradicting : tuple of str
         Identifiers of images that the surface does without: what the others tell contradicts them.
+    doubts : tuple of str
+        What else speaks against it, in sentences (`model.doubts`).
     """
 
     z: NDArray[np.float64]
@@ -109,6 +111,7 @@ class SurfacePrediction:
     used: tuple[str, ...]
     mahalanobis: float = 1.0
     contradicting: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
 
     @property
     def misfit(self) -> float:
@@ -122,12 +125,12 @@ class SurfacePrediction:
 
     @property
     def trusted(self) -> bool:
-        """Whether every image is explained, and by a mirror like those known.
+        """Whether every image is explained, and by a mirror like those known, and nothing else speaks against it.
 
         Not so for a foreign spot, a mirror of another kind, or images of another heliostat: a surface can often be bent
         to explain those, but not a likely one.
         """
-        return not self.suspicious and self.mahalanobis <= TRUSTED_MAHALANOBIS
+        return not self.suspicious and not self.doubts and self.mahalanobis <= TRUSTED_MAHALANOBIS
 
 
 def scene_of(

@@ -28,6 +28,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.fft import dct
 
+from model import doubts
 from model.effects import Effect
 from model.errors import InvalidInputError
 from model.forecast import Aligned
@@ -50,6 +51,9 @@ CONSENSUS = 4
 
 CONTRADICTION = 3.0
 """Mean square by which the others miss an image, in medians of all, from which on it is left out."""
+
+DIMMING = 0.1
+"""Share of its light by which a facet is dimmed to see what its light does to the images."""
 
 DESCENT = Descent(
     steps=12,
@@ -189,10 +193,7 @@ class _Posterior:
         aligned = align_observations(
             self.heliostat, self.observations, self.prior.surface(c), self.effects, latitude_deg=self.latitude_deg
         )
-        size, samples = self.options.resolution, self.options.samples
-        with torch.no_grad():
-            images = self.ranges.seen(aligned.flux_images(self.optics, self.effects, size=size, samples=samples))
-        return _State(c, aligned, images.double().numpy())
+        return _State(c, aligned, self._images(aligned))
 
     def jacobian(self, state: _State) -> NDArray[Any]:
         """Change of the images per coefficient (K, M, R, R)."""
@@ -213,6 +214,24 @@ class _Posterior:
         """What there is to say of a state that was found with a belief."""
         weights = _Weights(state.images, belief.sigma, self.options)
         return _Fit(belief, weights(jacobian), weights(self.measured - state.images), weights.bands)
+
+    def facet_light(self, state: _State, fit: "_Fit") -> tuple[Array, Array]:
+        """By how much each facet sends more light than the others' mean (F,) [1], and its standard deviation.
+
+        Traced with each facet a little dimmed, and estimated with the surface, which may bend instead, to first order.
+        """
+        weights = _Weights(state.images, fit.belief.sigma, self.options)
+        count = len(self.prior.mean)
+        dimmed = 1 - DIMMING * np.eye(count)
+        images = [self._images(state.aligned.soiled(torch.as_tensor(facets))) for facets in dimmed]
+        return fit.facet_light(weights(state.images - np.stack(images)) / DIMMING)
+
+    def _images(self, aligned: Aligned) -> Array:
+        """Images (M, R, R) of aligned mirrors, as the cameras show them."""
+        size, samples = self.options.resolution, self.options.samples
+        with torch.no_grad():
+            images = self.ranges.seen(aligned.flux_images(self.optics, self.effects, size=size, samples=samples))
+        return np.asarray(images.double().numpy())
 
     def settled(self, state: _State) -> tuple[_State, NDArray[Any], "_Belief"]:
         """The state near another at which large features are right, the Jacobian there and what it was found with."""
@@ -307,6 +326,21 @@ class _Fit:
         alone = self.left + np.einsum("mk,kmn->mn", turned, self.white, optimize=True)
         return np.asarray((alone * self.left).mean(axis=1))
 
+    def facet_light(self, changes: Array) -> tuple[Array, Array]:
+        """Each facet's light over the others' mean (F,), less one, and its deviation.
+
+        ``changes`` (F, M, n) are those of weighed images with it.
+        """
+        count = len(changes)
+        flat = np.concatenate([self.white, changes]).reshape(len(self.white) + count, -1).astype(np.float64)
+        precision = np.diag(np.concatenate([self.belief.precision, np.ones(count)]))
+        covariance = np.linalg.inv(flat @ flat.T + precision)
+        # The surface is at its optimum, where its own gradient and its prior's cancel.
+        gradient = np.concatenate([np.zeros(len(self.white)), flat[-count:] @ self.left.ravel()])
+        against = (np.eye(count) * count - 1) / (count - 1)
+        found, spread = (covariance @ gradient)[-count:], covariance[-count:, -count:]
+        return against @ found, np.sqrt(np.diag(against @ spread @ against))
+
     def cautious(self, grain: float) -> Array:
         """Covariance (K, K) where photographs share errors: all variance beyond a ``grain`` counts once for each."""
         extra = np.clip(1 - (grain / self.belief.sigma) ** 2, 0, None)
@@ -377,8 +411,15 @@ def refine(
     require_own_grid(heliostat)
     prior, optics = prior or default_prior(), optics or Optics()
     options = options or RefinementOptions()
-    state, fit, left_out = _consensus(heliostat, observations, start, (prior, optics, effects), latitude_deg, options)
+    posterior, state, fit, left_out = _consensus(
+        heliostat, observations, start, (prior, optics, effects), latitude_deg, options
+    )
     z = prior.surface(state.c)
+    against = [
+        *doubts.of_the_situation(heliostat, observations),
+        *doubts.of_canting(prior, z),
+        *doubts.of_facet_light(*posterior.facet_light(state, fit)),
+    ]
     return SurfacePrediction(
         z=z,
         z_std=prior.deviation(fit.cautious(options.grain)),
@@ -389,6 +430,7 @@ def refine(
         used=tuple(o.identifier for o in observations),
         mahalanobis=prior.mahalanobis(z),
         contradicting=tuple(observations[i].identifier for i in left_out),
+        doubts=tuple(against),
     )
 
 
@@ -399,8 +441,8 @@ def _consensus(
     model: tuple[SurfacePrior, Optics, Sequence[Effect]],
     latitude_deg: float,
     options: RefinementOptions,
-) -> tuple[_State, _Fit, list[int]]:
-    """The most probable surface, what there is to say of it, and the places of images that were left out for it."""
+) -> tuple[_Posterior, _State, _Fit, list[int]]:
+    """The most probable surface, by which images, what there is to say of it, and the places of those left out."""
 
     def posterior(part: Sequence[int]) -> _Posterior:
         return _Posterior(heliostat, [observations[i] for i in part], *model, latitude_deg, options)
@@ -418,5 +460,5 @@ def _consensus(
             jacobian = whole.jacobian(state)
         out = whole.fit(state, jacobian, belief).contradicted()
         if out is None:
-            return *whole.estimated(state, jacobian, belief), left_out
+            return whole, *whole.estimated(state, jacobian, belief), left_out
         left_out.append(kept.pop(out))

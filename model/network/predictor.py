@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from model import doubts
 from model.effects import Effect
 from model.errors import InvalidInputError
 from model.forecast import Aligned
@@ -126,6 +127,7 @@ class SurfacePredictor:
             misfits=misfits(heliostat, observations, z, optics, effects, latitude_deg=latitude_deg),
             used=tuple(o.identifier for o in observations),
             mahalanobis=default_prior().mahalanobis(z),
+            doubts=(*doubts.of_the_situation(heliostat, observations), *doubts.of_canting(default_prior(), z)),
         )
 
 

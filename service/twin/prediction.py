@@ -119,6 +119,7 @@ def _trust(surface: SurfacePrediction, used: Sequence[MeasurementRow]) -> store.
             f"the mirror is unlike those known: {surface.mahalanobis:.1f} standard deviations from them, "
             f"{TRUSTED_MAHALANOBIS} are usual at most"
         )
+    doubts += surface.doubts
     if not surface.trusted and not doubts:
         doubts.append("the prediction does not trust itself")
     suns = np.array([sun_direction(row.sun_azimuth_deg, row.sun_elevation_deg) for row in used])

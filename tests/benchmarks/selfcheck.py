@@ -1,11 +1,13 @@
 """Whether surfaces that should not be trusted are told from good ones: ``python -m tests.benchmarks.selfcheck``.
 
 Mirrors held out of training are photographed at places of the field, as they should be and with something wrong, and
-refined as the product does it. A prediction is trusted where it explains all its images by a mirror like those known.
+refined as the product does it. A prediction is trusted where it explains all its images by a mirror like those known,
+and nothing else speaks against it (`model.doubts`): how often each doubt is named is printed below.
 Real photographs follow: AA39's and AC43's as their own and as each other's.
 """
 
 import argparse
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -114,13 +116,14 @@ def line(label: str, cases: list[Case], predictions: list[SurfacePrediction]) ->
     doubted = sum(not p.trusted for p in predictions)
     errors = [surface_error(p.z, case.truth) * 1e3 for p, case in zip(predictions, cases, strict=True)]
     distances = [p.mahalanobis for p in predictions]
+    named = Counter(" ".join(doubt.split()[:3]) for p in predictions for doubt in p.doubts)
     third = sum(p.suspicious == p.used[2:3] for p in predictions)
     return (
         f"  {label:<32} doubted {doubted:>2} of {len(mean):<3} third image alone {third:>2}   "
         f"misfit median {np.median(mean):.3f}   "
         f"worst image min {worst.min():.3f} median {np.median(worst):.3f} max {worst.max():.3f}   "
         f"mahalanobis min {min(distances):.2f} median {np.median(distances):.2f} max {max(distances):.2f}   "
-        f"error [mm] median {np.median(errors):.3f}"
+        f"error [mm] median {np.median(errors):.3f}   {dict(named) or ''}"
     )
 
 

@@ -1,0 +1,104 @@
+"""What speaks against a predicted surface beside the photographs that it leaves unexplained, in sentences.
+
+Predictions were learnt from and judged on mirrors of one kind at up to 300 m (`training.cases`): of others the error is
+unknown. A mirror with a facet that sends no light, or with one that was knocked, is explained by a surface, but not
+by a likely one.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from model.images import FLUX_SIZE
+from model.observation import Observation
+from model.plant import Heliostat
+from model.prior import SurfacePrior
+from model.surface import split_canting
+
+Array = NDArray[np.float64]
+
+FARTHEST = 320.0
+"""Distance [m] of a target up to which predictions have been judged."""
+
+FACET = (1.605, 1.275)
+"""Width and height [m] of the facets whose surfaces were measured."""
+
+SIZE_TOLERANCE = 0.2
+"""Share by which a facet may be larger or smaller."""
+
+RIM, RIM_SHARE = 2, 0.05
+"""Pixels of a flux image's rim, and the share of light in it from which on much must lie outside the window.
+
+At 300 m 0.045 of a sharp mirror's light lies there, at 400 m 0.067.
+"""
+
+CLIPPED = 0.5
+"""Share of a spot's brighter half beyond the camera's range from which on a photograph shows little more than a rim."""
+
+UNLIKE_FACET = 3.2
+"""Deviations by which a facet may be canted from the others': of 51 measured mirrors two reach 3, one 4."""
+
+DARK, CERTAIN = 0.3, 5.0
+"""Share by which a facet's light falls short of the others', and in standard deviations, from which on it is told.
+
+Of good mirrors' photographs the share is 0.13 at most, at 3.5 deviations.
+"""
+
+
+def of_the_situation(heliostat: Heliostat, observations: Sequence[Observation]) -> list[str]:
+    """Where distance, facets or images are not what predictions were learnt from."""
+    doubts = []
+    farthest = max(float(np.linalg.norm(o.target.center - heliostat.position)) for o in observations)
+    if farthest > FARTHEST:
+        doubts.append(f"its target is {farthest:.0f} m away; predictions have been judged up to {FARTHEST:.0f} m")
+    sizes = np.array([(np.linalg.norm(f.canting_x), np.linalg.norm(f.canting_y)) for f in heliostat.facets]) * 2
+    if (np.abs(sizes / FACET - 1) > SIZE_TOLERANCE).any():
+        width, height = sizes.mean(axis=0)
+        doubts.append(
+            f"its facets of {width:.2f} m x {height:.2f} m are not of the size that predictions were learnt from "
+            f"({FACET[0]} m x {FACET[1]} m)"
+        )
+    rim = np.median([_rim_share(o.flux) for o in observations])
+    if rim > RIM_SHARE:
+        doubts.append("its spots are larger than the window of their flux images")
+    if np.median([o.clipped_share for o in observations]) > CLIPPED:
+        doubts.append("most of its photographs show little but their rim: the rest lies beyond the camera's range")
+    return doubts
+
+
+def of_canting(prior: SurfacePrior, z: Array) -> list[str]:
+    """Facets that are canted as no mirror of the known kind has them, of heights (4, 8, 8) [m].
+
+    Against the mean of the facets: a tilt of the whole mirror is the mount's.
+    """
+    spread = np.sqrt((_relative_canting(prior.basis) ** 2).sum(axis=0))
+    distances = np.linalg.norm((_relative_canting(z) - _relative_canting(prior.mean)) / spread, axis=-1)
+    return [
+        f"facet {number} is canted {distance:.1f} standard deviations off; {UNLIKE_FACET} are usual at most"
+        for number, distance in enumerate(distances, start=1)
+        if distance > UNLIKE_FACET
+    ]
+
+
+def of_facet_light(light: ArrayLike, deviation: ArrayLike) -> list[str]:
+    """Facets that send less than the others, of each one's ``light`` (F,) [1] over the others' mean, less one."""
+    return [
+        f"facet {number} seems to send {max(0.0, 1 + share):.0%} of the light that the others do; look whether it is "
+        "soiled, broken or covered"
+        for number, (share, sigma) in enumerate(zip(np.asarray(light), np.asarray(deviation), strict=True), start=1)
+        if share < -DARK and share < -CERTAIN * sigma
+    ]
+
+
+def _rim_share(flux: NDArray[np.floating]) -> float:
+    inner = slice(RIM, FLUX_SIZE - RIM)
+    return float(1 - flux[inner, inner].sum() / flux.sum())
+
+
+def _relative_canting(z: Array) -> Array:
+    """Rises (..., F, 2) [m] over a facet along x and y, of heights (..., F, I, J) [m], less the facets' mean."""
+    canting, _ = split_canting(z)
+    rises = [canting[..., -1, 0] - canting[..., 0, 0], canting[..., 0, -1] - canting[..., 0, 0]]
+    rise = np.stack(rises, axis=-1)
+    return np.asarray(rise - rise.mean(axis=-2, keepdims=True))
