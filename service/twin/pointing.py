@@ -63,12 +63,9 @@ def calibrate_store(
             except (ModelError, ConflictError) as error:
                 skipped[name] = str(error)
                 continue
-            own = []
-            for row in mounts.pointing_measurements(session, rows[name], since, until):
-                try:
-                    own.append(_reading(heliostats[name], row, origin))
-                except ModelError as error:
-                    skipped[f"{name}/{row.identifier}"] = str(error)
+            taken = mounts.pointing_measurements(session, rows[name], since, until)
+            own, useless = readings_of(heliostats[name], taken, origin)
+            skipped |= {f"{name}/{identifier}": reason for identifier, reason in useless.items()}
             if own:
                 readings[name] = own
             else:
@@ -97,6 +94,19 @@ def _with_drives(row: HeliostatRow | None, name: str, origin: tuple[float, float
     if heliostat.mount.actuators is None:
         raise ConflictError("its kinematics have no linear actuators, so motor positions say nothing of its angles")
     return heliostat
+
+
+def readings_of(
+    heliostat: Heliostat, rows: Sequence[MeasurementRow], origin: tuple[float, float, float]
+) -> tuple[list[Reading], dict[str, str]]:
+    """What measurements tell of a mount, and by their identifiers why others tell nothing."""
+    readings, useless = [], {}
+    for row in rows:
+        try:
+            readings.append(_reading(heliostat, row, origin))
+        except ModelError as error:
+            useless[row.identifier] = str(error)
+    return readings, useless
 
 
 def _reading(heliostat: Heliostat, row: MeasurementRow, origin: tuple[float, float, float]) -> Reading:
@@ -146,8 +156,14 @@ def load_mount(session: Session, name: str) -> StoredMount:
     ConflictError
         Where its kinematics have no actuators, or its properties changed since it was calibrated.
     """
-    row, origin = store.get_heliostat(session, name), store.get_plant(session).origin
-    heliostat, kept = _with_drives(row, name, origin), mounts.find_mount_at(session, row)
+    row = store.get_heliostat(session, name)
+    return stored_mount(session, row, mounts.find_mount_at(session, row))
+
+
+def stored_mount(session: Session, row: HeliostatRow, kept: MountRow | None) -> StoredMount:
+    """A heliostat with one of its mounts, loaded with its document; raises what `load_mount` raises."""
+    origin = store.get_plant(session).origin
+    heliostat = _with_drives(row, row.name, origin)
     if kept is None:
         return StoredMount(heliostat, CalibratedMount.uncalibrated(), None, origin)
     return StoredMount(heliostat, _mount(row, kept), kept.version, origin)

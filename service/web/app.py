@@ -87,7 +87,7 @@ def create_app(settings: Settings, operations: Operations | None = None, kinds: 
             workers = Workers(runtime, kinds, settings.job_workers)
             workers.start()
             try:
-                with listening(settings, registry(runtime)):
+                with listening(settings, registry(runtime, app.state.field)):
                     yield
             finally:
                 await to_thread.run_sync(workers.stop)

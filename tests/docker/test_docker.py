@@ -20,6 +20,7 @@ import pytest
 import yaml
 
 from service.base.settings import Settings
+from service.twin.field import FieldBook
 from service.twin.runtime import Runtime
 from service.web.metrics import registry
 
@@ -136,7 +137,7 @@ def test_prometheus_reads_where_the_services_tell(compose: dict[str, Any]):
 def test_alerts_ask_for_metrics_that_exist(tmp_path: Path):
     runtime = Runtime.from_settings(Settings(data_dir=tmp_path), SimpleNamespace())  # type: ignore[arg-type]
     runtime.database.upgrade()
-    names = {family.name for family in registry(runtime).collect()}
+    names = {family.name for family in registry(runtime, FieldBook(runtime)).collect()}
     runtime.close()
     names |= {f"{name}_total" for name in names}
     rules = yaml.safe_load((DOCKER / "prometheus-rules.yml").read_text(encoding="utf-8"))["groups"][0]["rules"]
@@ -253,6 +254,7 @@ import service, pathlib, sys
 assert pathlib.Path(service.__file__).is_relative_to(sys.argv[1]), service.__file__
 from service.store.database import migrate
 from service.web.metrics import registry
+from service.twin.field import FieldBook
 from service.twin.runtime import Runtime
 from service.base.settings import Settings
 print(migrate(Settings(data_dir=pathlib.Path(sys.argv[2]))))
