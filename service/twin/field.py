@@ -220,9 +220,12 @@ class FieldBook:
 
     def pointed(self, session: Session) -> tuple[list[Line], int]:
         """All heliostats with their pointing errors but no arrays' figures, and how many are being worked out."""
+        lines, known, pending = self._lines(session)
+        return [replace(line, pointing=known[line.name]) if line.name in known else line for line in lines], pending
+
+    def _lines(self, session: Session) -> tuple[list[Line], dict[str, Pointing | None], int]:
         lines = read_lines(session)
-        known, pending = self._pointing.look_up(line.mounted for line in lines if line.mounted is not None)
-        return [replace(line, pointing=known.get(line.name)) for line in lines], pending
+        return lines, *self._pointing.look_up(line.mounted for line in lines if line.mounted is not None)
 
     def with_pointing(self, line: Line) -> Line:
         """One heliostat with its pointing error, which it waits for, without a session open."""
@@ -230,7 +233,7 @@ class FieldBook:
 
     def read(self, session: Session) -> tuple[list[Line], int]:
         """All heliostats, and of how many figures are still being worked out."""
-        lines, pointless = self.pointed(session)
+        lines, pointing, pointless = self._lines(session)
         figures = self._figures_of(session, [line.surface.id for line in lines if line.surface is not None])
         model = versions.current_number(session)
         states = (line.state(model) for line in lines)
@@ -240,6 +243,7 @@ class FieldBook:
                 line,
                 figures=None if line.surface is None else figures.get(line.surface.id),
                 rank=ranks.get(line.name),
+                pointing=pointing.get(line.name),
             )
             for line in lines
         ], max(pending, pointless)

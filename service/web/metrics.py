@@ -7,6 +7,7 @@ as the queue, is told by `serve` alone, lest it be counted twice.
 import logging
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import product
 
 from prometheus_client import CollectorRegistry
 from prometheus_client.core import GaugeMetricFamily, Metric
@@ -20,6 +21,7 @@ from service.base.settings import Settings
 from service.store import queue, sizes
 from service.store.job_tables import JobRow
 from service.store.tables import DriftRow, HeliostatRow
+from service.twin.attention import REASONS, Item, of_lines
 from service.twin.field import FieldBook, Line
 from service.twin.runtime import Runtime
 
@@ -45,6 +47,7 @@ class StoreCollector(Collector):
             with self._runtime.database.reading() as session:
                 found = [*_queue(session), *_sizes(session, self._runtime.settings)]
                 lines, _ = self._book.pointed(session)
+                found.append(_attention(of_lines(session, lines, self._runtime.settings)))
                 found += [*_trust(lines, most), *_pointing(lines, most), _drift(session, most)]
         except SQLAlchemyError as error:
             logger.warning("metrics of the store are missing: %s", error)
@@ -78,6 +81,18 @@ def _sizes(session: Session, settings: Settings) -> Iterator[Metric]:
     quota = "Most that images may take [B]; 0 without a bound."
     yield GaugeMetricFamily("heliotwin_image_quota_bytes", quota, settings.image_quota_gb * 1e9)
     yield GaugeMetricFamily("heliotwin_database_bytes", "Size of the database [B].", held.database_bytes)
+
+
+def _attention(items: Sequence[Item]) -> Metric:
+    counted = Counter((item.reason, "no" if item.acknowledged_by is None else "yes") for item in items)
+    family = GaugeMetricFamily(
+        "heliotwin_attention",
+        "What needs attention, and whether it was acknowledged.",
+        labels=["reason", "acknowledged"],
+    )
+    for reason, seen in product(REASONS, ("no", "yes")):
+        family.add_metric([reason, seen], counted[reason, seen])
+    return family
 
 
 def _trust(lines: Sequence[Line], most: int) -> Iterator[Metric]:

@@ -24,7 +24,9 @@ class MovedOut(BaseModel):
     after: datetime
     before: datetime
     when: str = Field(description="The same in words.", examples=["between 12 and 14 August 2024"])
-    mrad: float = Field(description="What its drives stepped by; how far its light lies off where not calibrated.")
+    mrad: float = Field(
+        description="What its drives stepped by, or how far its light lies off where not calibrated [mrad]."
+    )
     is_calibrated: bool = Field(description="Whether its mount was calibrated since, and knows the step.")
 
 
@@ -33,7 +35,7 @@ class DriftedOut(BaseModel):
 
     since: datetime
     until: datetime
-    mrad: float
+    mrad: float = Field(description="How far the zeros of its drives went together [mrad].")
 
 
 class PointingOut(BaseModel):

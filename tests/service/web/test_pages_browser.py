@@ -54,6 +54,7 @@ PATHS = (
     "/forecast",
     "/forecasts/1",
     "/studies",
+    "/attention",
     "/jobs",
     "/jobs/1",
 )

@@ -1,5 +1,6 @@
 """The pointing error of the newest photographs on pages, REST and metrics: size, trend, and moves with their dates."""
 
+import re
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -53,6 +54,7 @@ def test_newest_photographs_are_held_against_the_mount(client: TestClient, post:
     for told in (page, field):
         assert "m on the receiver" in told.replace("\N{NO-BREAK SPACE}", " ")
         assert "/v1/calibration-plan" in told
+    assert re.search(r'<circle [^>]*fill="#[0-9a-f]{6}"', field)
     metrics = client.get("/metrics").text
     assert 'heliotwin_heliostat_pointing_error_mrad{heliostat="AA39"} ' in metrics
     assert 'heliotwin_heliostat_pointing_error_metres{heliostat="AA39"} ' in metrics
