@@ -220,7 +220,7 @@ def _camera(session: Session) -> Iterator[Item]:
             declared.adopted_at,
             f"version {declared.number} of the model declared another camera; photographs from before it stay measured "
             "as they were",
-            "predict surfaces anew from photographs that came since",
+            "measure the stored photographs anew (POST /v1/jobs/measurements), and predict surfaces anew",
             f"version {declared.number}",
         )
 

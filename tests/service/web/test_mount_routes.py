@@ -1,5 +1,6 @@
 """Calibrated mounts over HTTP: the job, motors for an aim, forecasts from motors, the plan."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -116,6 +117,11 @@ def test_the_plan_asks_for_what_is_known_least(client: TestClient, post: Post, t
     assert plan[0]["at"] == "2024-06-03T11:35:00Z"
     night = client.get("/v1/calibration-plan", params={"at": "2024-06-03T00:00:00Z"})
     assert night.status_code == 422
+    asked = {"at": NOON, "photographs": 3, "minutes": 30}
+    page = client.get("/calibration-plan", params=asked, headers={"Accept": "text/html"}).text
+    assert re.findall(r'<th scope="row"><a href="/heliostats/(\w+)"', page) == ["AB01", "AA39"]
+    dark = client.get("/calibration-plan", params={"at": "2024-06-03T00:00"}, headers={"Accept": "text/html"}).text
+    assert "The sun is below the horizon then" in dark.replace("At: the", "The")
 
 
 def test_changed_properties_ask_for_another_calibration(client: TestClient, post: Post, tower: Any, properties: Any):
