@@ -120,7 +120,8 @@ def _pointing(line: Line, pointing: Pointing, settings: Settings, at: datetime) 
     moved, is_new = pointing.moved, False
     if moved is not None:
         is_new = not moved.is_calibrated
-        if is_new or at - moved.before < timedelta(days=settings.attention_moved_days):
+        is_late = moved.undated is None and at - moved.before < timedelta(days=settings.attention_moved_days)
+        if is_new or is_late:
             yield _moved(line.name, moved)
     if pointing.beyond_since is not None and pointing.error_mrad is not None and not is_new:
         metres = "" if line.pointing_m is None else f", {line.pointing_m:.2f} m on the receiver"

@@ -5,7 +5,7 @@ against the mount that is valid now. It is worked out in the background and reme
 """
 
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Any
@@ -51,17 +51,21 @@ class Moved:
     """That a heliostat moved between two photographs.
 
     ``mrad`` is what its drives' zeros stepped by where the calibration has found it (``is_calibrated``); else how far
-    its light lies off since.
+    its light lies off since. Where photographs do not tell when they were taken, moments are those when they came, and
+    ``undated`` names them.
     """
 
     after: datetime
     before: datetime
     mrad: float
     is_calibrated: bool
+    undated: str | None = None
 
     @property
     def when(self) -> str:
-        """Between which days, in words."""
+        """Between which days, in words; where those are not known, between which photographs."""
+        if self.undated is not None:
+            return self.undated
         first, last = (f"{moment.day} {moment:%B %Y}" for moment in (self.after, self.before))
         if first == last:
             return f"on {first} between {self.after:%H:%M} and {self.before:%H:%M} UTC"
@@ -113,15 +117,21 @@ class Pointing:
     drifted: Drifted | None = None
 
 
-def pointing_of(stored: StoredMount, kept: MountRow, newer: Sequence[Reading], limit_mrad: float) -> Pointing:
-    """By a stored mount, with its document, and photographs that were taken later, in order of time."""
+def pointing_of(
+    stored: StoredMount, kept: MountRow, newer: Sequence[Reading], undated: Collection[str], limit_mrad: float
+) -> Pointing:
+    """By a stored mount, with its document, and photographs that were taken later, in order of time.
+
+    ``undated`` names photographs whose time is not known.
+    """
     mount = stored.mount
     days, off = mount.days[~mount.foreign], 1e3 * mount.off[~mount.foreign]
     moved, begin = None, -np.inf
     if mount.steps:
         step = mount.steps[-1]
         begin, size = mount.days[step.after], 1e3 * float(np.linalg.norm(step.zeros))
-        moved = Moved(moment_of(mount.days[step.before]), moment_of(begin), size, is_calibrated=True)
+        names = [kept.document["steps"][-1][name] for name in ("after", "before")]
+        moved = Moved(moment_of(mount.days[step.before]), moment_of(begin), size, True, _undated(names, undated))
     trend = None
     if newer:
         apart, far = _forecast_errors(stored, newer)
@@ -131,7 +141,8 @@ def pointing_of(stored: StoredMount, kept: MountRow, newer: Sequence[Reading], l
             before = new_days[first - 1] if first else mount.days[-1]
             begin = new_days[first]
             size = float(np.median(apart[first:]))
-            moved = Moved(moment_of(before), moment_of(begin), size, is_calibrated=False)
+            names = [one.name for one in newer[max(first - 1, 0) : first + 1]]
+            moved = Moved(moment_of(before), moment_of(begin), size, False, _undated(names, undated))
         trend = _trend(apart)
         days, off = np.concatenate([days, new_days]), np.concatenate([off, apart])
     days, off = days[days >= begin], off[days >= begin]
@@ -146,6 +157,13 @@ def pointing_of(stored: StoredMount, kept: MountRow, newer: Sequence[Reading], l
         moved=moved,
         drifted=_drifted(kept.document),
     )
+
+
+def _undated(names: Sequence[str], undated: Collection[str]) -> str | None:
+    """Between which photographs, where one of them has no time; the first may be one of the calibration's."""
+    if not any(name in undated for name in names):
+        return None
+    return f"between photographs {names[0]} and {names[1]}" if len(names) == 2 else f"before photograph {names[0]}"
 
 
 def _forecast_errors(stored: StoredMount, newer: Sequence[Reading]) -> tuple[Array, NDArray[np.bool_]]:
@@ -226,17 +244,19 @@ class PointingBook:
         try:
             with self._runtime.database.reading() as session:
                 kept = session.get_one(MountRow, state.mount, options=[undefer(MountRow.document)])
-                stored, newer = _newer(session, state.heliostat, kept)
-            return pointing_of(stored, kept, newer, self._runtime.settings.attention_pointing_mrad)
+                stored, newer, undated = _newer(session, state.heliostat, kept)
+            return pointing_of(stored, kept, newer, undated, self._runtime.settings.attention_pointing_mrad)
         except (ModelError, ServiceError) as error:
             logger.info("the pointing error of heliostat %s is not known: %s", state.heliostat, error)
         return None
 
 
-def _newer(session: Session, name: str, kept: MountRow) -> tuple[StoredMount, list[Reading]]:
-    """The heliostat, and its photographs that were taken after the newest that the mount was calibrated by."""
+def _newer(session: Session, name: str, kept: MountRow) -> tuple[StoredMount, list[Reading], set[str]]:
+    """The heliostat, its photographs taken after the newest that the mount was calibrated by, and undated ones."""
     row = store.get_heliostat(session, name)
     stored, at = stored_mount(session, row, kept), kept.document["history"]["at"]
     since = datetime.fromisoformat(at[-1]) + timedelta(seconds=1) if at else None  # moments are kept to the second
     readings, _ = readings_of(stored.heliostat, mounts.pointing_measurements(session, row, since), stored.origin)
-    return stored, sorted(readings, key=lambda one: one.day)[-_MOST_READ:]
+    newer = sorted(readings, key=lambda one: one.day)[-_MOST_READ:]
+    stepped = [step[end] for step in kept.document["steps"][-1:] for end in ("after", "before")]
+    return stored, newer, mounts.undated(session, row, [*stepped, *(one.name for one in newer)])

@@ -23,7 +23,11 @@ class MovedOut(BaseModel):
 
     after: datetime
     before: datetime
-    when: str = Field(description="The same in words.", examples=["between 12 and 14 August 2024"])
+    when: str = Field(
+        description="The same in words; between which photographs, where those do not tell when they were taken, and "
+        "`after` and `before` are when they came.",
+        examples=["between 12 and 14 August 2024"],
+    )
     mrad: float = Field(
         description="What its drives stepped by, or how far its light lies off where not calibrated [mrad]."
     )

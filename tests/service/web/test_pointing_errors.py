@@ -1,6 +1,7 @@
 """The pointing error of the newest photographs on pages, REST and metrics: size, trend, and moves with their dates."""
 
 import re
+import time
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -85,6 +86,21 @@ def test_a_move_since_the_calibration_is_told_with_its_dates(
     assert (known["moved"]["when"], known["moved"]["is_calibrated"]) == ("between 8 and 9 May 2024", True)
     assert known["error_mrad"] < 2
     assert "moved between 8 and 9 May 2024" in client.get("/", headers=HTML).text
+
+
+def test_a_move_between_photographs_without_a_time_has_no_date(
+    client: TestClient, post: Post, tower: Any, properties: Any
+):
+    for number, one in enumerate(photographs(tower, properties, step_mrad=25.0)):
+        if number in (8, 12):
+            calibrate(client)
+        post(png(number), **{name: value for name, value in one.items() if name != "taken_at"})
+        post(png(100 + number), **{**one, "kind": "flux", "taken_at": None})  # another image of the same photograph
+        time.sleep(1.1 if number == 7 else 0)  # photographs of one second came together
+    known = client.get(PATH).json()
+    assert known["since_calibration"] <= 4
+    assert (known["moved"]["when"], known["moved"]["is_calibrated"]) == ("between photographs 7 and 8", True)
+    assert client.get("/v1/attention", params={"reason": "moved"}).json()["items"] == []
 
 
 def test_a_growing_error_has_a_trend(client: TestClient, post: Post, tower: Any, properties: Any):
