@@ -14,7 +14,7 @@ from model.ephemeris import sun_angles_at
 from model.errors import InvalidInputError, ModelError
 from model.frames import sun_direction
 from model.plant import Heliostat
-from model.pointing import CalibratedMount, FieldMounts, Reading, calibrate_field
+from model.pointing import CalibratedMount, FieldMounts, Reading, calibrate_field, days_by_order
 from model.pointing.plan import Proposal, plan
 from model.pointing.report import day_of, mount_from_json, mount_to_json
 from service import store
@@ -101,15 +101,31 @@ def readings_of(
 ) -> tuple[list[Reading], dict[str, str]]:
     """What measurements tell of a mount, and by their identifiers why others tell nothing."""
     readings, useless = [], {}
-    for row in rows:
+    days = days_of([row.taken_at for row in rows], [row.external_id or row.identifier for row in rows])
+    for row, day in zip(rows, days, strict=True):
         try:
-            readings.append(_reading(heliostat, row, origin))
+            # A day that nothing tells is taken for that on which the photograph came.
+            readings.append(
+                _reading(heliostat, row, origin, float(day) if np.isfinite(day) else day_of(row.created_at))
+            )
         except ModelError as error:
             useless[row.identifier] = str(error)
     return readings, useless
 
 
-def _reading(heliostat: Heliostat, row: MeasurementRow, origin: tuple[float, float, float]) -> Reading:
+def days_of(taken: Sequence[datetime | None], names: Sequence[str]) -> Array:
+    """Days since 1970 of measurements; of those without a time by their numbers, which PAINT's plant counts on.
+
+    NaN where neither tells.
+    """
+    days = np.array([day_of(moment) for moment in taken])
+    numbers = np.array([int(name) if name.isdecimal() else np.nan for name in names])
+    known = np.isfinite(numbers)
+    days[known] = days_by_order(days[known], numbers[known])
+    return days
+
+
+def _reading(heliostat: Heliostat, row: MeasurementRow, origin: tuple[float, float, float], day: float) -> Reading:
     plane = store.target_plane(row.target)
     spot = spot_of(row, plane, origin)
     if row.motor_axis_1 is None or row.motor_axis_2 is None:
@@ -124,7 +140,7 @@ def _reading(heliostat: Heliostat, row: MeasurementRow, origin: tuple[float, flo
     for position, drive in zip(motors, heliostat.mount.actuators or (), strict=True):
         drive.require_within(position)
     sun = sun_direction(row.sun_azimuth_deg, row.sun_elevation_deg)
-    return Reading(row.identifier, plane.name, motors, sun, spot, day_of(row.taken_at or row.created_at))
+    return Reading(row.identifier, plane.name, motors, sun, spot, day)
 
 
 # --- what a calibrated mount says -------------------------------------------------------------------------------------

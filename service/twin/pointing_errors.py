@@ -256,7 +256,10 @@ def _newer(session: Session, name: str, kept: MountRow) -> tuple[StoredMount, li
     row = store.get_heliostat(session, name)
     stored, at = stored_mount(session, row, kept), kept.document["history"]["at"]
     since = datetime.fromisoformat(at[-1]) + timedelta(seconds=1) if at else None  # moments are kept to the second
-    readings, _ = readings_of(stored.heliostat, mounts.pointing_measurements(session, row, since), stored.origin)
+    rows = mounts.pointing_measurements(session, row, since)
+    # What tells no time and was there already is of the calibration, whenever it came.
+    rows = [one for one in rows if one.taken_at is not None or one.created_at > kept.created_at]
+    readings, _ = readings_of(stored.heliostat, rows, stored.origin)
     newer = sorted(readings, key=lambda one: one.day)[-_MOST_READ:]
     stepped = [step[end] for step in kept.document["steps"][-1:] for end in ("after", "before")]
     return stored, newer, mounts.undated(session, row, [*stepped, *(one.name for one in newer)])

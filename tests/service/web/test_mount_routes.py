@@ -51,6 +51,19 @@ def test_a_calibration_finds_mount_and_step(client: TestClient, post: Post, towe
     assert early.status_code == 404
 
 
+def test_photographs_without_a_time_are_placed_by_their_numbers(
+    client: TestClient, post: Post, tower: Any, properties: Any
+):
+    """Those of an archive came last, and are not the newest for that."""
+    taken = photographs(tower, properties, step_mrad=6.0)
+    undated = [one | {"taken_at": None} for one in taken[2:5]]
+    for number, one in enumerate([*taken[:2], *taken[5:], *undated]):
+        assert post(png(number), **one).status_code == 201
+    (step,) = calibrate(client)["result"]["steps"]["AA39"]
+    assert (step["after"], step["before"]) == ("7", "8")
+    assert client.get("/v1/heliostats/AA39/pointing").json()["since_calibration"] == 0
+
+
 def test_motors_send_the_light_to_the_aim(
     client: TestClient, post: Post, operations: FakeOperations, tower: Any, properties: Any
 ):
