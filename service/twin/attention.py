@@ -15,7 +15,7 @@ from datetime import datetime, timedelta
 from itertools import pairwise
 from typing import Literal
 
-from sqlalchemy import select
+from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from model.effects import CATALOGUE
@@ -25,7 +25,7 @@ from service.base.settings import Settings
 from service.store import acknowledgements, decisions, queue
 from service.store.columns import now
 from service.store.job_tables import AcknowledgementRow, JobRow
-from service.store.tables import DriftRow, HeliostatRow, ModelRow, PlantRow, StudyRow
+from service.store.tables import DriftRow, HeliostatRow, MeasurementRow, ModelRow, PlantRow, StudyRow
 from service.twin import versions
 from service.twin.field import Current, FieldBook, Line
 from service.twin.pointing_errors import Moved, Pointing
@@ -76,8 +76,9 @@ def needs_attention(session: Session, book: FieldBook, settings: Settings) -> tu
 
 def of_lines(session: Session, lines: Sequence[Line], settings: Settings) -> list[Item]:
     """The same of heliostats with their pointing errors."""
-    found = [*_queue(session, settings), *_camera(session), *_accuracies(session, settings)]
     at = now()
+    found = [*_queue(session, settings), *_camera(session), *_accuracies(session, settings)]
+    found += _without_photograph(session, timedelta(days=settings.attention_photograph_days), at)
     for line in lines:
         found += _of_heliostat(line, settings, at)
     known = acknowledgements.acknowledged(session)
@@ -99,7 +100,6 @@ def _of_heliostat(line: Line, settings: Settings, at: datetime) -> Iterator[Item
         yield _untrusted(line.name, line.surface)
     if line.pointing is not None:
         yield from _pointing(line, line.pointing, settings, at)
-    yield from _no_photograph(line, timedelta(days=settings.attention_photograph_days), at)
 
 
 def _untrusted(name: str, surface: Current) -> Item:
@@ -157,13 +157,16 @@ def _moved(name: str, moved: Moved) -> Item:
     return Item("moved", name, moved.before, f"it moved {moved.when}: {size}", todo, mark)
 
 
-def _no_photograph(line: Line, allowed: timedelta, at: datetime) -> Iterator[Item]:
-    last = line.photographed_at or line.known_since
-    if last is None or at - last <= allowed:
-        return
-    what = "none was ever accepted" if line.photographed_at is None else f"the last accepted one is of {last:%Y-%m-%d}"
-    todo = "photograph it where the calibration plan says"
-    yield Item("no_photograph", line.name, last + allowed, what, todo, last.isoformat())
+def _without_photograph(session: Session, allowed: timedelta, at: datetime) -> Iterator[Item]:
+    row, photograph = HeliostatRow, MeasurementRow
+    taken = func.max(func.coalesce(photograph.taken_at, photograph.created_at))
+    query = select(row.name, row.created_at, taken).group_by(row.id, row.name, row.created_at)
+    query = query.outerjoin(photograph, (photograph.heliostat_id == row.id) & photograph.accepted)
+    for name, created, last in session.execute(query.having(func.coalesce(taken, row.created_at) < at - allowed)):
+        what = "none was ever accepted" if last is None else f"the last accepted one is of {last:%Y-%m-%d}"
+        begun = last or created
+        todo = "photograph it where the calibration plan says"
+        yield Item("no_photograph", name, begun + allowed, what, todo, begun.isoformat())
 
 
 def _mark(since: datetime, times: float) -> str:

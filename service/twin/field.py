@@ -67,8 +67,7 @@ class Line:
     """A heliostat in the field; what is None is not known (yet).
 
     Where it has a ``rank`` without an accuracy, no photograph can judge its surface: it was made from all of them.
-    ``photographed_at`` is when its last accepted photograph was taken, ``range_m`` [m] how far the nearest receiver's
-    centre lies from it.
+    ``range_m`` [m] is how far the nearest receiver's centre lies from it.
     """
 
     name: str
@@ -81,8 +80,6 @@ class Line:
     surface: Current | None = None
     figures: Figures | None = None
     rank: Rank | None = None
-    known_since: datetime | None = None
-    photographed_at: datetime | None = None
     range_m: float | None = None
     mounted: Mounted | None = None
     pointing: Pointing | None = None
@@ -129,19 +126,17 @@ def _current_surfaces(session: Session, heliostat: int | None = None) -> dict[in
 
 @dataclass(frozen=True)
 class _Taken:
-    """Of a heliostat's photographs: how many, the newest row, the last correction, and when the last was taken."""
+    """Of a heliostat's photographs: how many, the newest row, and the last correction."""
 
     count: int = 0
     newest: int | None = None
     corrected: datetime | None = None
-    taken_at: datetime | None = None
 
 
 def _photographs(session: Session, heliostat: int | None = None) -> dict[tuple[int, bool], _Taken]:
     """By heliostat, of one or of all, and whether they were accepted."""
     row = MeasurementRow
-    taken = func.max(func.coalesce(row.taken_at, row.created_at))
-    query = select(row.heliostat_id, row.accepted, func.count(), func.max(row.id), func.max(row.corrected_at), taken)
+    query = select(row.heliostat_id, row.accepted, func.count(), func.max(row.id), func.max(row.corrected_at))
     if heliostat is not None:
         query = query.where(row.heliostat_id == heliostat)
     found = session.execute(query.group_by(row.heliostat_id, row.accepted))
@@ -149,12 +144,14 @@ def _photographs(session: Session, heliostat: int | None = None) -> dict[tuple[i
 
 
 def _mounts(session: Session, heliostat: int | None = None) -> dict[int, tuple[int, datetime]]:
-    """Of each calibrated heliostat the newest mount, and when it was calibrated."""
+    """Of heliostats that have not changed since they were calibrated the newest mount, and when that was."""
     newest = select(func.max(MountRow.id)).group_by(MountRow.heliostat_id)
     if heliostat is not None:
         newest = newest.where(MountRow.heliostat_id == heliostat)
     query = select(MountRow.heliostat_id, MountRow.id, MountRow.created_at).where(MountRow.id.in_(newest))
-    return {number: (mount, at) for number, mount, at in session.execute(query)}
+    query = query.join(HeliostatRow, HeliostatRow.id == MountRow.heliostat_id)
+    found = session.execute(query.where(HeliostatRow.updated_at <= MountRow.created_at))
+    return {number: (mount, at) for number, mount, at in found}
 
 
 def _latest(values: Iterable[Value | None]) -> Value | None:
@@ -167,11 +164,11 @@ def read_lines(session: Session, heliostat: int | None = None) -> list[Line]:
     photographs, mounted = _photographs(session, heliostat), _mounts(session, heliostat)
     receivers = [row.center_m for row in store.list_receivers(session)]
     row, none = HeliostatRow, _Taken()
-    query = select(row.id, row.name, row.east_m, row.north_m, row.up_m, row.created_at, row.updated_at)
+    query = select(row.id, row.name, row.east_m, row.north_m, row.up_m)
     if heliostat is not None:
         query = query.where(row.id == heliostat)
     lines = []
-    for number, name, *place, created, updated in session.execute(query.order_by(row.name)):
+    for number, name, *place in session.execute(query.order_by(row.name)):
         kept, refused = photographs.get((number, True), none), photographs.get((number, False), none)
         newest, corrected = _latest((kept.newest, refused.newest)), _latest((kept.corrected, refused.corrected))
         line = Line(
@@ -183,10 +180,8 @@ def read_lines(session: Session, heliostat: int | None = None) -> list[Line]:
             kept.newest,
             corrected,
             surfaces.get(number),
-            known_since=created,
-            photographed_at=kept.taken_at,
             range_m=min((math.dist(place, center) for center in receivers), default=None),
-            mounted=Mounted(name, *mounted[number], newest, corrected, updated) if number in mounted else None,
+            mounted=Mounted(name, *mounted[number], newest, corrected) if number in mounted else None,
         )
         lines.append(line)
     return lines

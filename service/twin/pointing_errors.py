@@ -208,8 +208,8 @@ def _drifted(document: dict[str, Any]) -> Drifted | None:
 class Mounted:
     """What a heliostat's pointing error depends on.
 
-    Its newest mount by its row's id, when that was calibrated, the row of its newest photograph, when one was last
-    corrected, and when its properties were last set.
+    Its newest mount by its row's id, when that was calibrated, the row of its newest photograph, and when one was last
+    corrected.
     """
 
     heliostat: str
@@ -217,7 +217,6 @@ class Mounted:
     calibrated_at: datetime
     newest: int | None
     corrected: datetime | None
-    updated: datetime
 
 
 class PointingBook:
