@@ -33,6 +33,7 @@ MAP_SCALES: dict[str, tuple[float, float]] = {
     "uncertainty": (0.0, 0.5),
     "misfit": (5.0, 30.0),
     "age": (0.0, 365.0),
+    "pointing": (0.0, 3.0),
 }
 """What is fine and what is poor of the figures that the field's map shows, unless the settings say otherwise."""
 
@@ -197,7 +198,22 @@ class Settings(BaseSettings):
         default_factory=dict,
         validate_default=True,
         description="JSON: what is fine and what is poor, which is where the map's colours begin and end, of accuracy "
-        '[%], deviation, uncertainty [mm], misfit [%] and age [days], such as {"accuracy": [95, 80]}.',
+        '[%], deviation, uncertainty [mm], misfit [%], age [days] and pointing [mrad], such as {"accuracy": [95, 80]}.',
+    )
+    attention_accuracy: float = Field(
+        default=0.75, ge=0, le=1, description="Forecast accuracy below which a heliostat needs attention [1]."
+    )
+    attention_pointing_mrad: float = Field(
+        default=3.0, gt=0, le=1000, description="Pointing error above which it does [mrad]."
+    )
+    attention_moved_days: float = Field(
+        default=90.0, ge=0, le=36500, description="For so long after it moved it does [days]."
+    )
+    attention_photograph_days: float = Field(
+        default=30.0, gt=0, le=36500, description="So long after its last accepted photograph it does [days]."
+    )
+    attention_queue_s: float = Field(
+        default=1800.0, gt=0, le=1e7, description="The queue is stuck where a job has waited for so long [s]."
     )
     metrics_port: int | None = Field(
         default=None,

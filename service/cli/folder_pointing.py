@@ -9,12 +9,13 @@ from numpy.typing import NDArray
 
 from model.errors import InvalidInputError, ModelError
 from model.plant import Heliostat
-from model.pointing import CalibratedMount, Reading, calibrate_field, days_by_order
-from model.pointing.report import day_of, field_to_json, mount_from_json
+from model.pointing import CalibratedMount, Reading, calibrate_field
+from model.pointing.report import field_to_json, mount_from_json
 from service.base.progress import Progress, quiet
 from service.cli.folder import clock_fault_of, write_json
 from service.sources.documents import Measurement, get, read_json
 from service.sources.folder import MeasurementFolder
+from service.twin.pointing import days_of
 
 Array = NDArray[np.float64]
 
@@ -126,12 +127,8 @@ def _days(
     measurements = [one for own in measured.values() for one in own]
     faults = {one.key: clock_fault_of(folder, one) for one in measurements}
     clocks.update({key: fault for key, fault in faults.items() if fault is not None})
-    days = [day_of(one.taken_at) for one in measurements]
-    numbers = [int(one.identifier) if one.identifier.isdecimal() else np.nan for one in measurements]
-    known = np.isfinite(numbers)
-    by_number = np.array(days)
-    by_number[known] = days_by_order(by_number[known], np.array(numbers)[known])
-    return {one.key: float(day) for one, day in zip(measurements, by_number, strict=True)}
+    days = days_of([one.taken_at for one in measurements], [one.identifier for one in measurements])
+    return {one.key: float(day) for one, day in zip(measurements, days, strict=True)}
 
 
 def _motors(heliostat: Heliostat, measurement: Measurement) -> Array:

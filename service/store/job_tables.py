@@ -1,4 +1,4 @@
-"""The tables of work and of who asks for it: jobs and their steps, keys, the audit trail (`service.store.tables`)."""
+"""The tables of work and of who asks for it: jobs and their steps, keys, acknowledgements, the audit trail."""
 
 from datetime import datetime
 from typing import Any, get_args
@@ -73,6 +73,22 @@ class KeyRow(Base):
     role: Mapped[str] = mapped_column(String(16))
     created_at: Mapped[datetime] = mapped_column(default=now)
     withdrawn_at: Mapped[datetime | None]
+
+
+class AcknowledgementRow(Base):
+    """That somebody has seen what needed attention, of a heliostat or of the plant (`service.twin.attention`).
+
+    It holds while the same thing, by its ``mark``, is the reason.
+    """
+
+    __tablename__ = "acknowledgements"
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    heliostat_id: Mapped[int | None] = mapped_column(ForeignKey("heliostats.id"), index=True)
+    reason: Mapped[str] = mapped_column(String(32))
+    mark: Mapped[str] = mapped_column(String(96))
+    made_at: Mapped[datetime] = mapped_column(default=now)
+    made_by: Mapped[str] = mapped_column(String(64))
 
 
 class AuditRow(Base):

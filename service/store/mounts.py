@@ -75,19 +75,24 @@ def current_mounts(session: Session, names: Sequence[str] | None = None) -> Sequ
 
 def pointing_measurements(
     session: Session, heliostat: HeliostatRow, since: datetime | None = None, until: datetime | None = None
-) -> list[MeasurementRow]:
+) -> Sequence[MeasurementRow]:
     """Measurements that tell where light went, one image of each, without their arrays.
 
     Those that were accepted, or whose sender knew the spot. Of several images of a measurement the first stands.
     """
-    moment = func.coalesce(MeasurementRow.taken_at, MeasurementRow.created_at)
-    query = select(MeasurementRow).where(MeasurementRow.heliostat_id == heliostat.id)
-    query = query.where(MeasurementRow.accepted | MeasurementRow.focal_spot_wgs84.is_not(None))
+    row, moment = MeasurementRow, func.coalesce(MeasurementRow.taken_at, MeasurementRow.created_at)
+    first = select(func.min(row.id)).where(row.heliostat_id == heliostat.id)
+    first = first.where(row.accepted | row.focal_spot_wgs84.is_not(None))
+    query = select(row).where(row.id.in_(first.group_by(func.coalesce(row.external_id, row.identifier))))
     if since is not None:
         query = query.where(moment >= since)
     if until is not None:
         query = query.where(moment < until)
-    rows: dict[str, MeasurementRow] = {}
-    for row in session.scalars(query.order_by(MeasurementRow.id)):
-        rows.setdefault(row.external_id or row.identifier, row)
-    return list(rows.values())
+    return session.scalars(query.order_by(row.id)).all()
+
+
+def undated(session: Session, heliostat: HeliostatRow, identifiers: Sequence[str]) -> set[str]:
+    """Those of these measurements that do not tell when they were taken."""
+    row = MeasurementRow
+    query = select(row.identifier).where(row.heliostat_id == heliostat.id, row.identifier.in_(identifiers))
+    return set(session.scalars(query.where(row.taken_at.is_(None))))

@@ -1,11 +1,11 @@
 """Taking back what was set by mistake: a target, a receiver or a heliostat that nothing refers to."""
 
-from sqlalchemy import ColumnElement, func, select
+from sqlalchemy import ColumnElement, delete, func, select
 from sqlalchemy.orm import Session
 
 from service.base.faults import ConflictError
 from service.store.columns import Base
-from service.store.job_tables import JobRow
+from service.store.job_tables import AcknowledgementRow, JobRow
 from service.store.plant import get_heliostat, get_receiver, get_target
 from service.store.queue import ENDED
 from service.store.rows import one_at_a_time
@@ -61,6 +61,8 @@ def remove_heliostat(session: Session, name: str) -> None:
     }
     # A study keeps names, for its photographs may be gone before it.
     studied = sum(name in heliostats for heliostats in session.scalars(select(StudyRow.heliostats)))
+    # That somebody has seen that it has no photograph keeps nothing; where it stays, so does this.
+    session.execute(delete(AcknowledgementRow).where(AcknowledgementRow.heliostat_id == row.id))
     _delete_unused(session, row, f"heliostat {name}", {**users, "studies": studied})
 
 

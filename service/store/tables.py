@@ -289,7 +289,10 @@ class MountRow(Base):
 
 
 class DriftRow(Base):
-    """Flux accuracy [1] of a heliostat's surface on its newest photograph, when that came (`service.twin.accuracy`)."""
+    """Flux accuracy [1] of a heliostat's surface on its newest photograph, when that came (`service.twin.accuracy`).
+
+    ``poor_since`` is the first of all its last photographs that were forecast worse than the settings bear.
+    """
 
     __tablename__ = "drift"
 
@@ -298,6 +301,7 @@ class DriftRow(Base):
     surface_id: Mapped[int] = mapped_column(ForeignKey("surfaces.id"))
     taken_at: Mapped[datetime]
     accuracy: Mapped[float]
+    poor_since: Mapped[datetime | None]
 
 
 class ForecastRow(Base):

@@ -252,8 +252,11 @@ def judge(runtime: Runtime, twin: Twin, surface: SurfaceRow | None, shown: Evide
     return None
 
 
-def note(session: Session, measurement: MeasurementRow, surface: SurfaceRow, accuracy: float) -> None:
-    """Keep it as the heliostat's, unless that of a photograph that was taken later stands there."""
+def note(session: Session, measurement: MeasurementRow, surface: SurfaceRow, accuracy: float, least: float) -> None:
+    """Keep it as the heliostat's, unless that of a photograph that was taken later stands there.
+
+    Below ``least`` [1] it is poor, and has been since the first of those that came so in a row.
+    """
     new = DriftRow(
         heliostat_id=measurement.heliostat_id,
         measurement_id=measurement.id,
@@ -261,9 +264,11 @@ def note(session: Session, measurement: MeasurementRow, surface: SurfaceRow, acc
         taken_at=measurement.taken_at or measurement.created_at,
         accuracy=accuracy,
     )
+    new.poor_since = new.taken_at if accuracy < least else None
     held = session.get(DriftRow, measurement.heliostat_id, with_for_update=True)
     if held is None and store.insert(session, new):
         return
     held = held or session.get_one(DriftRow, measurement.heliostat_id, with_for_update=True)
     if held.taken_at <= new.taken_at:
+        new.poor_since = new.poor_since and (held.poor_since or new.poor_since)
         session.merge(new)

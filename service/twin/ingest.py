@@ -90,7 +90,7 @@ def ingest(
         if is_new and not runtime.images.path(image.sha256).is_file():
             runtime.images.put(data)  # it was given up before, and removed before its row was locked
         if is_new and judged is not None and known.surface is not None:
-            accuracy.note(session, row, known.surface, judged)
+            accuracy.note(session, row, known.surface, judged, runtime.settings.attention_accuracy)
     _count(row, is_new, judged)
     return row, is_new
 

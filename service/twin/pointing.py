@@ -14,7 +14,7 @@ from model.ephemeris import sun_angles_at
 from model.errors import InvalidInputError, ModelError
 from model.frames import sun_direction
 from model.plant import Heliostat
-from model.pointing import CalibratedMount, FieldMounts, Reading, calibrate_field
+from model.pointing import CalibratedMount, FieldMounts, Reading, calibrate_field, days_by_order
 from model.pointing.plan import Proposal, plan
 from model.pointing.report import day_of, mount_from_json, mount_to_json
 from service import store
@@ -63,12 +63,9 @@ def calibrate_store(
             except (ModelError, ConflictError) as error:
                 skipped[name] = str(error)
                 continue
-            own = []
-            for row in mounts.pointing_measurements(session, rows[name], since, until):
-                try:
-                    own.append(_reading(heliostats[name], row, origin))
-                except ModelError as error:
-                    skipped[f"{name}/{row.identifier}"] = str(error)
+            taken = mounts.pointing_measurements(session, rows[name], since, until)
+            own, useless = readings_of(heliostats[name], taken, origin)
+            skipped |= {f"{name}/{identifier}": reason for identifier, reason in useless.items()}
             if own:
                 readings[name] = own
             else:
@@ -99,7 +96,36 @@ def _with_drives(row: HeliostatRow | None, name: str, origin: tuple[float, float
     return heliostat
 
 
-def _reading(heliostat: Heliostat, row: MeasurementRow, origin: tuple[float, float, float]) -> Reading:
+def readings_of(
+    heliostat: Heliostat, rows: Sequence[MeasurementRow], origin: tuple[float, float, float]
+) -> tuple[list[Reading], dict[str, str]]:
+    """What measurements tell of a mount, and by their identifiers why others tell nothing."""
+    readings, useless = [], {}
+    days = days_of([row.taken_at for row in rows], [row.external_id or row.identifier for row in rows])
+    for row, day in zip(rows, days, strict=True):
+        try:
+            # A day that nothing tells is taken for that on which the photograph came.
+            readings.append(
+                _reading(heliostat, row, origin, float(day) if np.isfinite(day) else day_of(row.created_at))
+            )
+        except ModelError as error:
+            useless[row.identifier] = str(error)
+    return readings, useless
+
+
+def days_of(taken: Sequence[datetime | None], names: Sequence[str]) -> Array:
+    """Days since 1970 of measurements; of those without a time by their numbers, which PAINT's plant counts on.
+
+    NaN where neither tells.
+    """
+    days = np.array([day_of(moment) for moment in taken])
+    numbers = np.array([int(name) if name.isdecimal() else np.nan for name in names])
+    known = np.isfinite(numbers)
+    days[known] = days_by_order(days[known], numbers[known])
+    return days
+
+
+def _reading(heliostat: Heliostat, row: MeasurementRow, origin: tuple[float, float, float], day: float) -> Reading:
     plane = store.target_plane(row.target)
     spot = spot_of(row, plane, origin)
     if row.motor_axis_1 is None or row.motor_axis_2 is None:
@@ -114,7 +140,7 @@ def _reading(heliostat: Heliostat, row: MeasurementRow, origin: tuple[float, flo
     for position, drive in zip(motors, heliostat.mount.actuators or (), strict=True):
         drive.require_within(position)
     sun = sun_direction(row.sun_azimuth_deg, row.sun_elevation_deg)
-    return Reading(row.identifier, plane.name, motors, sun, spot, day_of(row.taken_at or row.created_at))
+    return Reading(row.identifier, plane.name, motors, sun, spot, day)
 
 
 # --- what a calibrated mount says -------------------------------------------------------------------------------------
@@ -146,8 +172,14 @@ def load_mount(session: Session, name: str) -> StoredMount:
     ConflictError
         Where its kinematics have no actuators, or its properties changed since it was calibrated.
     """
-    row, origin = store.get_heliostat(session, name), store.get_plant(session).origin
-    heliostat, kept = _with_drives(row, name, origin), mounts.find_mount_at(session, row)
+    row = store.get_heliostat(session, name)
+    return stored_mount(session, row, mounts.find_mount_at(session, row))
+
+
+def stored_mount(session: Session, row: HeliostatRow, kept: MountRow | None) -> StoredMount:
+    """A heliostat with one of its mounts, loaded with its document; raises what `load_mount` raises."""
+    origin = store.get_plant(session).origin
+    heliostat = _with_drives(row, row.name, origin)
     if kept is None:
         return StoredMount(heliostat, CalibratedMount.uncalibrated(), None, origin)
     return StoredMount(heliostat, _mount(row, kept), kept.version, origin)

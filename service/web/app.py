@@ -17,6 +17,7 @@ from service.jobs.kinds import KINDS
 from service.jobs.worker import Workers
 from service.store.database import Database
 from service.twin.accuracy import ComparisonBook
+from service.twin.attention import AttentionCount
 from service.twin.field import FieldBook
 from service.twin.gate import MOST_WAITING
 from service.twin.runtime import Operations, Runtime
@@ -82,12 +83,13 @@ def create_app(settings: Settings, operations: Operations | None = None, kinds: 
             await to_thread.run_sync(require_fit, settings, runtime.database)
             app.state.runtime = runtime.for_requests()
             app.state.field = FieldBook(runtime)
+            app.state.attention = AttentionCount(runtime, app.state.field)
             app.state.watchers = Watchers(runtime)
             app.state.comparisons = ComparisonBook(runtime)
             workers = Workers(runtime, kinds, settings.job_workers)
             workers.start()
             try:
-                with listening(settings, registry(runtime)):
+                with listening(settings, registry(runtime, app.state.field)):
                     yield
             finally:
                 await to_thread.run_sync(workers.stop)

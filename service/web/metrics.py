@@ -6,7 +6,8 @@ as the queue, is told by `serve` alone, lest it be counted twice.
 
 import logging
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import product
 
 from prometheus_client import CollectorRegistry
 from prometheus_client.core import GaugeMetricFamily, Metric
@@ -20,7 +21,8 @@ from service.base.settings import Settings
 from service.store import queue, sizes
 from service.store.job_tables import JobRow
 from service.store.tables import DriftRow, HeliostatRow
-from service.twin.field import read_lines
+from service.twin.attention import REASONS, Item, of_lines
+from service.twin.field import FieldBook, Line
 from service.twin.runtime import Runtime
 
 _VERDICTS = {True: "yes", False: "no", None: "unknown"}
@@ -31,8 +33,8 @@ logger = logging.getLogger("heliotwin.service")
 class StoreCollector(Collector):
     """What the store holds at the moment of asking; a database that is away is told, and harms no other figure."""
 
-    def __init__(self, runtime: Runtime) -> None:
-        self._runtime = runtime
+    def __init__(self, runtime: Runtime, book: FieldBook) -> None:
+        self._runtime, self._book = runtime, book
 
     def describe(self) -> list[Metric]:
         """Nothing, so that registering asks no database."""
@@ -40,11 +42,13 @@ class StoreCollector(Collector):
 
     def collect(self) -> Iterator[Metric]:
         """The figures, read in one transaction."""
+        most = self._runtime.settings.metrics_heliostats
         try:
             with self._runtime.database.reading() as session:
                 found = [*_queue(session), *_sizes(session, self._runtime.settings)]
-                found += _trust(session, self._runtime.settings.metrics_heliostats)
-                found.append(_drift(session, self._runtime.settings.metrics_heliostats))
+                lines, _ = self._book.pointed(session)
+                found.append(_attention(of_lines(session, lines, self._runtime.settings)))
+                found += [*_trust(lines, most), *_pointing(lines, most), _drift(session, most)]
         except SQLAlchemyError as error:
             logger.warning("metrics of the store are missing: %s", error)
             found = []
@@ -79,10 +83,22 @@ def _sizes(session: Session, settings: Settings) -> Iterator[Metric]:
     yield GaugeMetricFamily("heliotwin_database_bytes", "Size of the database [B].", held.database_bytes)
 
 
-def _trust(session: Session, most: int) -> Iterator[Metric]:
+def _attention(items: Sequence[Item]) -> Metric:
+    counted = Counter((item.reason, "no" if item.acknowledged_by is None else "yes") for item in items)
+    family = GaugeMetricFamily(
+        "heliotwin_attention",
+        "What needs attention, and whether it was acknowledged.",
+        labels=["reason", "acknowledged"],
+    )
+    for reason, seen in product(REASONS, ("no", "yes")):
+        family.add_metric([reason, seen], counted[reason, seen])
+    return family
+
+
+def _trust(lines: Sequence[Line], most: int) -> Iterator[Metric]:
     """Which surfaces of today are trusted; of those that are not, since when, those of longest standing first."""
-    lines = [line for line in read_lines(session) if line.surface is not None]
-    trusted = Counter(_VERDICTS[line.surface.trusted] for line in lines if line.surface is not None)
+    surfaces = [(line.name, line.surface) for line in lines if line.surface is not None]
+    trusted = Counter(_VERDICTS[surface.trusted] for _, surface in surfaces)
     counts = GaugeMetricFamily("heliotwin_surfaces", "Surfaces of today by trust in them.", labels=["trusted"])
     for verdict in _VERDICTS.values():
         counts.add_metric([verdict], trusted[verdict])
@@ -93,13 +109,36 @@ def _trust(session: Session, most: int) -> Iterator[Metric]:
         labels=["heliostat", "seen"],
     )
     doubted = [
-        (line.surface.doubted_since.timestamp(), line.name, "yes" if line.surface.seen_by else "no")
-        for line in lines
-        if line.surface is not None and line.surface.doubted_since is not None
+        (surface.doubted_since.timestamp(), name, "yes" if surface.seen_by else "no")
+        for name, surface in surfaces
+        if surface.doubted_since is not None
     ]
     for moment, name, seen in sorted(doubted)[:most]:
         since.add_metric([name, seen], moment)
     yield since
+
+
+def _pointing(lines: Sequence[Line], most: int) -> Iterator[Metric]:
+    """The worst heliostats' pointing errors, and when heliostats moved, the last ones."""
+    known = [(line, line.pointing) for line in lines if line.pointing is not None]
+    prefix, worst = "heliotwin_heliostat_pointing", "; the worst heliostats only."
+    errors = [(own.error_mrad, line.name) for line, own in known]
+    yield _worst(f"{prefix}_error_mrad", f"The heliostat's pointing error [mrad]{worst}", errors, most)
+    metres = [(line.pointing_m, line.name) for line, _ in known]
+    yield _worst(f"{prefix}_error_metres", f"The same on the nearest receiver [m]{worst}", metres, most)
+    trends = [(own.trend_mrad, line.name) for line, own in known]
+    yield _worst(f"{prefix}_trend_mrad", f"How it grew over its newest photographs [mrad]{worst}", trends, most)
+    moves = [(own.moved.before.timestamp(), line.name) for line, own in known if own.moved is not None]
+    about = "When the heliostat moved last [s since 1970]; those that moved last only."
+    yield _worst("heliotwin_heliostat_moved_seconds", about, moves, most)
+
+
+def _worst(name: str, about: str, told: Iterable[tuple[float | None, str]], most: int) -> Metric:
+    """A figure of heliostats, the largest first: a field of any size gives a bounded number of series."""
+    family = GaugeMetricFamily(name, about, labels=["heliostat"])
+    for value, heliostat in sorted(((value, of) for value, of in told if value is not None), reverse=True)[:most]:
+        family.add_metric([heliostat], value)
+    return family
 
 
 def _drift(session: Session, most: int) -> Metric:
@@ -120,9 +159,9 @@ def _drift(session: Session, most: int) -> Metric:
     return family
 
 
-def registry(runtime: Runtime) -> CollectorRegistry:
+def registry(runtime: Runtime, book: FieldBook) -> CollectorRegistry:
     """The meters of this process together with the store's figures."""
     both = CollectorRegistry()
     both.register(PROCESS)  # it collects like any collector
-    both.register(StoreCollector(runtime))
+    both.register(StoreCollector(runtime, book))
     return both

@@ -20,6 +20,8 @@ import pytest
 import yaml
 
 from service.base.settings import Settings
+from service.twin.attention import REASONS
+from service.twin.field import FieldBook
 from service.twin.runtime import Runtime
 from service.web.metrics import registry
 
@@ -89,7 +91,7 @@ def test_containers_have_no_more_rights_than_they_need(compose: dict[str, Any]):
         assert service["read_only"] is True
         assert service["cap_drop"] == ["ALL"]
     published = [port for service in compose["services"].values() for port in service.get("ports", [])]
-    assert len(published) == 2
+    assert len(published) == 3
     assert all(port.startswith("127.0.0.1:") for port in published)
 
 
@@ -133,15 +135,43 @@ def test_prometheus_reads_where_the_services_tell(compose: dict[str, Any]):
     assert compose["services"]["prometheus"]["profiles"] == ["monitoring"]
 
 
+def test_prometheus_sends_alerts_to_alertmanager(compose: dict[str, Any]):
+    alerting = yaml.safe_load((DOCKER / "prometheus.yml").read_text(encoding="utf-8"))["alerting"]
+    assert alerting == {"alertmanagers": [{"static_configs": [{"targets": ["alertmanager:9093"]}]}]}
+    alertmanager = compose["services"]["alertmanager"]
+    assert alertmanager["profiles"] == ["monitoring"]
+    assert "./alertmanager.yml:/etc/alertmanager/alertmanager.yml:ro" in alertmanager["volumes"]
+
+
+def _rules() -> list[dict[str, Any]]:
+    groups = yaml.safe_load((DOCKER / "prometheus-rules.yml").read_text(encoding="utf-8"))["groups"]
+    return [rule for group in groups for rule in group["rules"]]
+
+
+def test_rules_are_well_formed():
+    """What promtool checks too, in `test_alerts.py`, where it is to be had."""
+    rules = _rules()
+    assert len({rule["alert"] for rule in rules}) == len(rules)
+    for rule in rules:
+        assert {"alert", "expr", "annotations"} <= set(rule) <= {"alert", "expr", "for", "labels", "annotations"}
+        assert re.fullmatch(r"\d+[smhd]", rule.get("for", "0s"))
+        assert rule["annotations"]["summary"]
+
+
+def test_every_reason_for_attention_has_its_alert():
+    asked = [reason for rule in _rules() for reason in re.findall(r'heliotwin_attention{reason="(\w+)"', rule["expr"])]
+    assert asked == list(REASONS)
+
+
 def test_alerts_ask_for_metrics_that_exist(tmp_path: Path):
     runtime = Runtime.from_settings(Settings(data_dir=tmp_path), SimpleNamespace())  # type: ignore[arg-type]
     runtime.database.upgrade()
-    names = {family.name for family in registry(runtime).collect()}
+    names = {family.name for family in registry(runtime, FieldBook(runtime)).collect()}
     runtime.close()
     names |= {f"{name}_total" for name in names}
-    rules = yaml.safe_load((DOCKER / "prometheus-rules.yml").read_text(encoding="utf-8"))["groups"][0]["rules"]
+    rules = _rules()
     asked = {name for rule in rules for name in re.findall(r"heliotwin_\w+", rule["expr"])}
-    assert len(rules) == 7
+    assert len(rules) == 5 + len(REASONS)
     assert asked <= names
     told = set(re.findall(r"heliotwin_\w+", (DOCKER / "OPERATING.md").read_text(encoding="utf-8")))
     assert told <= names
@@ -253,6 +283,8 @@ import service, pathlib, sys
 assert pathlib.Path(service.__file__).is_relative_to(sys.argv[1]), service.__file__
 from service.store.database import migrate
 from service.web.metrics import registry
+from service.twin.attention import REASONS
+from service.twin.field import FieldBook
 from service.twin.runtime import Runtime
 from service.base.settings import Settings
 print(migrate(Settings(data_dir=pathlib.Path(sys.argv[2]))))

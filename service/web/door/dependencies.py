@@ -14,6 +14,7 @@ from fastapi import Depends, Path, Query, Request
 from service.base.faults import UnsupportedContentError
 from service.base.fields import MeasurementName, Name
 from service.jobs.kind import Kinds
+from service.twin.field import FieldBook
 from service.twin.runtime import Runtime
 from service.web.door.security import Identity, Requires, Role, presented_key
 from service.web.door.turns import Turns
@@ -26,6 +27,15 @@ async def get_runtime(request: Request) -> Runtime:
 
 
 RuntimeDep = Annotated[Runtime, Depends(get_runtime)]
+
+
+async def _field(request: Request) -> FieldBook:
+    book: FieldBook = request.app.state.field
+    return book
+
+
+FieldBookDep = Annotated[FieldBook, Depends(_field)]
+"""What is worked out once of each heliostat of the field."""
 
 # For a route's ``dependencies``: whoever has at least this role is let in.
 READ = Depends(Requires(Role.READ))

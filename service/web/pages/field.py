@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from fastapi import APIRouter, Depends, Query, Request
+from fastapi import APIRouter, Query, Request
 from fastapi.responses import HTMLResponse
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
@@ -17,9 +17,10 @@ from service.drawing.templates import figure
 from service.store.job_tables import JobRow
 from service.store.tables import PlantRow, TargetRow
 from service.twin.accuracy import RECENT
-from service.twin.field import FieldBook, Line
+from service.twin.field import Line
+from service.twin.pointing_errors import NEWEST
 from service.web.answers.pages import render
-from service.web.door.dependencies import DRAWS, READ, RuntimeDep
+from service.web.door.dependencies import DRAWS, READ, FieldBookDep, RuntimeDep
 
 router = APIRouter(include_in_schema=False, dependencies=[READ])
 
@@ -59,7 +60,11 @@ def _accuracy(line: Line) -> float | None:
     return None if line.rank is None or line.rank.accuracy is None else line.rank.accuracy * 100
 
 
-MetricName = Literal["deviation", "uncertainty", "misfit", "age", "accuracy"]
+def _pointing(line: Line) -> float | None:
+    return None if line.pointing is None else line.pointing.error_mrad
+
+
+MetricName = Literal["deviation", "uncertainty", "misfit", "age", "accuracy", "pointing"]
 
 METRICS: dict[str, Metric] = {
     metric.name: metric
@@ -98,16 +103,17 @@ METRICS: dict[str, Metric] = {
             _misfit,
         ),
         Metric("age", "Age of the surface", "days", 0, "Since the surface describes the mirror.", _age),
+        Metric(
+            "pointing",
+            "Pointing error",
+            "mrad",
+            2,
+            f"How far off light lands by the calibrated mount: median of the {NEWEST} newest photographs, none from "
+            "before it last moved.",
+            _pointing,
+        ),
     )
 }
-
-
-async def _book(request: Request) -> FieldBook:
-    book: FieldBook = request.app.state.field
-    return book
-
-
-FieldBookDep = Annotated[FieldBook, Depends(_book)]
 
 
 @dataclass(frozen=True)

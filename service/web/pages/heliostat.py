@@ -24,9 +24,9 @@ from service.drawing.pictures import mirror_heights
 from service.store import decisions, mounts
 from service.store.tables import DecisionRow, HeliostatRow, MeasurementRow, MountRow, SurfaceRow
 from service.twin.accuracy import RECENT, Compared, Comparison, ComparisonBook, rank_of
-from service.twin.field import Figures, figures_of
+from service.twin.field import Figures, Line, figures_of, read_lines
 from service.web.answers.pages import render
-from service.web.door.dependencies import READ, NamePath, RuntimeDep, Turn
+from service.web.door.dependencies import READ, FieldBookDep, NamePath, RuntimeDep, Turn
 
 router = APIRouter(include_in_schema=False, dependencies=[READ])
 
@@ -149,17 +149,9 @@ def _surface_context(surface: SurfaceRow, size: tuple[float, float]) -> dict[str
     }
 
 
-# Newest spots that the pointing error of today is the median of.
-_NEWEST_SPOTS = 8
-
-
-def _pointing(mount: MountRow) -> dict[str, Any]:
-    """What the page says of a mount: its newest errors, what its drives did, and what contradicts it."""
-    history = mount.document["history"]
-    left = 1e3 * np.linalg.norm(np.array(history["residuals"]).reshape(-1, 2), axis=-1)
-    newest = np.delete(left, history["foreign"])[-_NEWEST_SPOTS:]
+def _mount_context(mount: MountRow) -> dict[str, Any]:
+    """What the page says of a mount: what its drives did, and what contradicts it."""
     return {
-        "newest_mrad": float(np.median(newest)) if newest.size else None,
         "steps": [
             step | {"from": datetime.fromisoformat(step["from"]), "to": datetime.fromisoformat(step["to"])}
             for step in reversed(mount.document["steps"])
@@ -183,6 +175,7 @@ class _Read:
     decided: Sequence[DecisionRow]
     photographs: Sequence[MeasurementRow]
     mount: MountRow | None
+    line: Line
     compared: Compared
 
 
@@ -190,6 +183,7 @@ def _read(
     name: NamePath,
     runtime: RuntimeDep,
     book: ComparisonBookDep,
+    field: FieldBookDep,
     version: Annotated[Version | None, Query()] = None,
 ) -> _Read:
     """A heliostat with its current surface, or an earlier ``version``; waits for what is compared elsewhere."""
@@ -200,10 +194,10 @@ def _read(
         surfaces = _newest_surfaces(session, row)
         decided = decisions.list_decisions(session, row, _MOST_DECISIONS)
         photographs, mount = _newest_photographs(session, row), mounts.find_mount_at(session, row)
-        shown = book.read(session, row, surface)
+        shown, (line,) = book.read(session, row, surface), read_lines(session, row.id)
     # The rest of the page does not depend on them.
     compared = Compared() if shown is None else book.wait_for(shown) or _UNDER_WAY
-    return _Read(row, today, surface, surfaces, decided, photographs, mount, compared)
+    return _Read(row, today, surface, surfaces, decided, photographs, mount, field.with_pointing(line), compared)
 
 
 @router.get("/heliostats/{name}")
@@ -227,6 +221,7 @@ def get_heliostat_page(request: Request, read: Annotated[_Read, Depends(_read)],
         rank=rank_of(comparisons),
         accuracy_seen=fmean(seen) if (seen := [c.accuracy for c in comparisons if c.was_used]) else None,
         mount=read.mount,
-        pointing=None if read.mount is None else _pointing(read.mount),
+        line=read.line,
+        pointing=None if read.mount is None else _mount_context(read.mount),
         **(_surface_context(read.surface, _size(read.row)) if read.surface is not None else {}),
     )

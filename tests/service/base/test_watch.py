@@ -100,7 +100,7 @@ def test_database_that_is_away_harms_no_other_figure(app: FastAPI, bare: TestCli
     for leftover in settings.data_dir.glob("heliotwin.sqlite*"):
         leftover.unlink()
     (settings.data_dir / "heliotwin.sqlite").mkdir()
-    registry = metrics.registry(runtime)
+    registry = metrics.registry(runtime, app.state.field)
     assert registry.get_sample_value("heliotwin_database_up") == 0
     assert any(family.name == "heliotwin_http_requests" for family in registry.collect())
 
@@ -219,7 +219,8 @@ def test_only_the_worst_heliostats_are_told(app: FastAPI, bare: TestClient, clie
                 )
             )
     settings = runtime.settings.model_copy(update={"metrics_heliostats": 2})
-    bounded = metrics.registry(Runtime(settings, runtime.database, runtime.images, runtime.operations))
+    bounded_runtime = Runtime(settings, runtime.database, runtime.images, runtime.operations)
+    bounded = metrics.registry(bounded_runtime, app.state.field)
     (family,) = [family for family in bounded.collect() if family.name == "heliotwin_heliostat_forecast_accuracy"]
     assert {sample.labels["heliostat"]: sample.value for sample in family.samples} == {
         "B4": pytest.approx(0.5),

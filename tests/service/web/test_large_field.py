@@ -40,7 +40,16 @@ def large(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
         yield client
 
 
-PATHS = ("/forecast", "/forecast?heliostat=H2999", "/forecasts/1", "/heliostats/H0000", "/jobs", "/jobs/1", "/studies")
+PATHS = (
+    "/forecast",
+    "/forecast?heliostat=H2999",
+    "/forecasts/1",
+    "/heliostats/H0000",
+    "/attention",
+    "/jobs",
+    "/jobs/1",
+    "/studies",
+)
 
 
 @pytest.mark.parametrize("path", PATHS)

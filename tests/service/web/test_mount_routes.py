@@ -1,5 +1,6 @@
 """Calibrated mounts over HTTP: the job, motors for an aim, forecasts from motors, the plan."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +49,19 @@ def test_a_calibration_finds_mount_and_step(client: TestClient, post: Post, towe
     assert "Pointing error" in shown
     early = client.get("/v1/heliostats/AA39/mounts/current", params={"at": "2024-05-01T00:00:00Z"})
     assert early.status_code == 404
+
+
+def test_photographs_without_a_time_are_placed_by_their_numbers(
+    client: TestClient, post: Post, tower: Any, properties: Any
+):
+    """Those of an archive came last, and are not the newest for that."""
+    taken = photographs(tower, properties, step_mrad=6.0)
+    undated = [one | {"taken_at": None} for one in taken[2:5]]
+    for number, one in enumerate([*taken[:2], *taken[5:], *undated]):
+        assert post(png(number), **one).status_code == 201
+    (step,) = calibrate(client)["result"]["steps"]["AA39"]
+    assert (step["after"], step["before"]) == ("7", "8")
+    assert client.get("/v1/heliostats/AA39/pointing").json()["since_calibration"] == 0
 
 
 def test_motors_send_the_light_to_the_aim(
@@ -116,6 +130,11 @@ def test_the_plan_asks_for_what_is_known_least(client: TestClient, post: Post, t
     assert plan[0]["at"] == "2024-06-03T11:35:00Z"
     night = client.get("/v1/calibration-plan", params={"at": "2024-06-03T00:00:00Z"})
     assert night.status_code == 422
+    asked = {"at": NOON, "photographs": 3, "minutes": 30}
+    page = client.get("/calibration-plan", params=asked, headers={"Accept": "text/html"}).text
+    assert re.findall(r'<th scope="row"><a href="/heliostats/(\w+)"', page) == ["AB01", "AA39"]
+    dark = client.get("/calibration-plan", params={"at": "2024-06-03T00:00"}, headers={"Accept": "text/html"}).text
+    assert "The sun is below the horizon then" in dark.replace("At: the", "The")
 
 
 def test_changed_properties_ask_for_another_calibration(client: TestClient, post: Post, tower: Any, properties: Any):

@@ -8,16 +8,19 @@ import shutil
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
 import pytest
 from fastapi import FastAPI
-from sqlalchemy import delete
+from sqlalchemy import delete, update
 
 from service.base.settings import Settings
 from service.store import keys
+from service.store.columns import now
 from service.store.job_tables import KeyRow
+from service.store.tables import HeliostatRow
 from service.web.app import create_app
 from tests.service.conftest import (
     QUIET,
@@ -54,6 +57,8 @@ PATHS = (
     "/forecast",
     "/forecasts/1",
     "/studies",
+    "/attention",
+    "/calibration-plan?at=2026-06-21T10:00",
     "/jobs",
     "/jobs/1",
 )
@@ -223,6 +228,24 @@ def test_operator_follows_and_cancels_a_job(page: Any, served: Served):
     expect(page.locator("text=AA39, version 2")).to_be_visible()
     page.goto("/jobs")
     expect(page.locator("tbody .state")).to_have_text(["cancelled", "done"])
+
+
+@pytest.mark.parametrize("size", [DESK, PHONE])
+def test_operator_sees_what_needs_attention(page: Any, served: Served, size: dict[str, int]):
+    with served.app.state.runtime.database.writing() as session:  # another day each time, that nobody has seen
+        days = timedelta(days=40 if size is DESK else 41)
+        session.execute(update(HeliostatRow).where(HeliostatRow.name == "AB01").values(created_at=now() - days))
+    served.app.state.attention.forget()
+    page.set_viewport_size(size)
+    page.goto("/")
+    expect(page.locator("nav .count")).to_have_text("1 not acknowledged")
+    follow(page, "text=Needs attention")
+    expect(page.locator(".attention li")).to_contain_text("None was ever accepted.")
+    follow(page, "text=I have seen it")
+    expect(page.locator("#attention")).to_contain_text("Nothing.")
+    expect(page.locator("nav .count")).to_have_count(0)
+    follow(page, "text=Acknowledged (1)")
+    expect(page.locator(".attention li")).to_contain_text("seen by local")
 
 
 def test_pages_fit_desk_and_phone(page: Any):

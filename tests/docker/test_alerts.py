@@ -1,0 +1,143 @@
+"""What needs attention, told by real Prometheus and Alertmanager: the files that the composition mounts, and their way.
+
+Needs their binaries on the path, or in the folder `HELIOTWIN_TEST_PROMETHEUS`: of Debian the packages prometheus and
+prometheus-alertmanager.
+"""
+
+import http.server
+import json
+import os
+import re
+import shutil
+import subprocess
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+import yaml
+from sqlalchemy import update
+
+from service.base.settings import Settings
+from service.store.columns import now
+from service.store.tables import HeliostatRow
+from service.web.app import create_app
+from tests.service.conftest import (
+    QUIET,
+    FakeOperations,
+    free_port,
+    properties_document,
+    serving,
+    tower_document,
+    until,
+)
+
+DOCKER = Path(__file__).parents[2] / "docker"
+
+
+def binary(*names: str) -> str:
+    """The first of these programs that there is; skips the test where there is none."""
+    path = os.environ.get("HELIOTWIN_TEST_PROMETHEUS", os.environ["PATH"])
+    found = next((place for name in names if (place := shutil.which(name, path=path))), None)
+    if found is None:
+        pytest.skip(f"no {names[0]}: apt-get install prometheus prometheus-alertmanager")
+    return found
+
+
+def test_rules_and_configurations_are_sound():
+    for command in (
+        (binary("promtool"), "check", "rules", DOCKER / "prometheus-rules.yml"),
+        (binary("promtool"), "check", "config", "--syntax-only", DOCKER / "prometheus.yml"),
+        (binary("amtool"), "check-config", DOCKER / "alertmanager.yml"),
+    ):
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stdout + done.stderr
+
+
+@contextmanager
+def told(port: int) -> Iterator[list[dict[str, Any]]]:
+    """Alerts that come in at a webhook on this port."""
+    alerts: list[dict[str, Any]] = []
+
+    class Handler(http.server.BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            alerts.extend(json.loads(self.rfile.read(int(self.headers["Content-Length"])))["alerts"])
+            self.send_response(200)
+            self.end_headers()
+
+        def log_message(self, *_: Any) -> None:
+            pass
+
+    with http.server.ThreadingHTTPServer(("127.0.0.1", port), Handler) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            yield alerts
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+@contextmanager
+def running(folder: Path, *command: str) -> Iterator[None]:
+    with (folder / f"{Path(command[0]).name}.log").open("wb") as log:
+        process = subprocess.Popen(command, cwd=folder, stdout=log, stderr=log)
+        try:
+            yield
+        finally:
+            process.terminate()
+            process.wait(20)
+
+
+def configure(folder: Path, service: str, alertmanager: int, webhook: int) -> None:
+    """The composition's files with addresses of this machine, and without its patience."""
+    rules = (DOCKER / "prometheus-rules.yml").read_text(encoding="utf-8")
+    (folder / "rules.yml").write_text(re.sub(r"for: \d+[mh]", "for: 0s", rules), encoding="utf-8")
+    prometheus = yaml.safe_load((DOCKER / "prometheus.yml").read_text(encoding="utf-8"))
+    prometheus |= {
+        "global": {"scrape_interval": "1s", "evaluation_interval": "1s"},
+        "rule_files": ["rules.yml"],
+        "scrape_configs": [{"job_name": "heliotwin", "static_configs": [{"targets": [service]}]}],
+    }
+    prometheus["alerting"]["alertmanagers"][0]["static_configs"][0]["targets"] = [f"127.0.0.1:{alertmanager}"]
+    (folder / "prometheus.yml").write_text(yaml.safe_dump(prometheus), encoding="utf-8")
+    sending = yaml.safe_load((DOCKER / "alertmanager.yml").read_text(encoding="utf-8"))
+    sending["route"] |= {"group_wait": "0s", "group_interval": "1s"}
+    sending["receivers"][0]["webhook_configs"] = [{"url": f"http://127.0.0.1:{webhook}/", "send_resolved": True}]
+    (folder / "alertmanager.yml").write_text(yaml.safe_dump(sending), encoding="utf-8")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(180)
+def test_alert_is_delivered_and_ends_when_it_is_acknowledged(tmp_path: Path):
+    prometheus, alertmanager = binary("prometheus"), binary("alertmanager", "prometheus-alertmanager")
+    app = create_app(Settings(data_dir=tmp_path / "data", **QUIET), FakeOperations())
+    port, sender, webhook = free_port(), free_port(), free_port()
+    listen = "--web.listen-address=127.0.0.1:"
+    with ExitStack() as stack:
+        alerts = stack.enter_context(told(webhook))
+        address = stack.enter_context(serving(app))
+        service = stack.enter_context(httpx.Client(base_url=address))
+        service.put("/v1/plant", json=tower_document())
+        service.put("/v1/heliostats/AA39", json=properties_document())
+        with app.state.runtime.database.writing() as session:
+            session.execute(update(HeliostatRow).values(created_at=now() - timedelta(days=40)))
+        configure(tmp_path, address.removeprefix("http://"), sender, webhook)
+        sends = ("--config.file=alertmanager.yml", "--storage.path=sent", "--cluster.listen-address=")
+        stack.enter_context(running(tmp_path, alertmanager, *sends, f"{listen}{sender}"))
+        asks = ("--config.file=prometheus.yml", "--storage.tsdb.path=series")
+        stack.enter_context(running(tmp_path, prometheus, *asks, f"{listen}{port}"))
+
+        def of(status: str) -> list[dict[str, Any]]:
+            wanted = ("HeliotwinNoPhotograph", status)
+            return [alert for alert in alerts if (alert["labels"]["alertname"], alert["status"]) == wanted]
+
+        until(lambda: bool(of("firing")), 60)
+        assert of("firing")[0]["annotations"]["summary"].startswith("1 heliostats were not photographed for long")
+        (item,) = service.get("/v1/attention").json()["items"]
+        service.post("/v1/attention/acknowledgements", json={"ids": [item["id"]]})
+        until(lambda: bool(of("resolved")), 60)

@@ -1,0 +1,297 @@
+"""Needs attention: each reason, its acknowledgement and when that ends, on the page, over REST and as metrics."""
+
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any, get_args
+
+import pytest
+from fastapi import FastAPI
+from fastapi.testclient import TestClient
+from sqlalchemy import URL, select, update
+
+from service import store
+from service.base.settings import Settings
+from service.store import keys, queue
+from service.store.columns import now
+from service.store.job_tables import AuditRow, JobRow
+from service.store.tables import DriftRow, HeliostatRow, MeasurementRow
+from service.twin.attention import REASONS, Reason
+from service.web.app import create_app
+from tests.service.conftest import (
+    QUIET,
+    FakeOperations,
+    Post,
+    client_of,
+    png,
+    poster,
+    properties_document,
+    tower_document,
+    until,
+)
+from tests.service.spots import photographs
+from tests.service.twin.test_versions import SLOPE, study_row
+from tests.service.web.test_mount_routes import calibrate
+from tests.service.web.test_trust import Doubter
+
+HTML = {"Accept": "text/html"}
+PATH = "/v1/attention"
+
+
+class Blind(FakeOperations):
+    """Forecasts all light elsewhere while ``is_blind``."""
+
+    is_blind = True
+
+    def render(self, *arguments: Any, **options: Any) -> Any:
+        shown = super().render(*arguments, **options)
+        if self.is_blind:
+            shown[:, 32:] = 0
+        return shown
+
+
+def items(client: TestClient, **query: Any) -> list[dict[str, Any]]:
+    until(lambda: client.get(PATH).json()["pending"] == 0)
+    found: list[dict[str, Any]] = client.get(PATH, params={"limit": 500, **query}).json()["items"]
+    return found
+
+
+def of(client: TestClient, reason: str) -> list[dict[str, Any]]:
+    return items(client, reason=reason)
+
+
+def acknowledge(client: TestClient, *found: dict[str, Any]) -> Any:
+    return client.post(f"{PATH}/acknowledgements", json={"ids": [item["id"] for item in found]})
+
+
+def test_every_reason_has_its_words():
+    assert set(REASONS) == set(get_args(Reason))
+
+
+def test_nothing_needs_attention_where_all_is_well(client: TestClient, post: Post):
+    post(png(1))
+    assert items(client) == []
+    assert "Nothing." in client.get("/attention", headers=HTML).text
+    assert client.get("/attention/count", headers=HTML).text == ""
+
+
+def test_month_without_a_photograph(app: FastAPI, client: TestClient, post: Post):
+    post(png(1), id="1")
+    long_ago = now() - timedelta(days=40)
+    with app.state.runtime.database.writing() as session:
+        session.execute(update(MeasurementRow).values(created_at=long_ago))
+    (item,) = items(client)
+    assert (item["heliostat"], item["reason"]) == ("AA39", "no_photograph")
+    assert item["what"] == f"the last accepted one is of {long_ago:%Y-%m-%d}"
+    assert datetime.fromisoformat(item["since"]) == pytest.approx(long_ago + timedelta(days=30), abs=timedelta(0.01))
+    assert acknowledge(client, item).json()[0]["acknowledged_by"] == "local"
+    assert [one["acknowledged_by"] for one in items(client)] == ["local"]
+    assert items(client, acknowledged=False) == []
+    post(png(2), id="2")
+    assert items(client) == []
+    with app.state.runtime.database.writing() as session:
+        session.execute(update(MeasurementRow).values(created_at=long_ago + timedelta(days=1)))
+    (again,) = items(client, acknowledged=False)  # it returned: that nobody has seen
+    assert again["id"] != item["id"]
+
+
+def test_new_heliostat_has_a_month_too_and_can_be_deleted_when_seen(app: FastAPI, client: TestClient):
+    assert items(client) == []
+    with app.state.runtime.database.writing() as session:
+        session.execute(update(HeliostatRow).values(created_at=now() - timedelta(days=31)))
+    (item,) = items(client)
+    assert item["what"] == "none was ever accepted"
+    acknowledge(client, item)
+    assert client.delete("/v1/heliostats/AA39").status_code == 204
+    assert items(client) == []
+
+
+@pytest.fixture
+def blind(tmp_path: Path) -> Iterator[TestClient]:
+    with client_of(create_app(Settings(data_dir=tmp_path, **QUIET), Blind())) as client:
+        client.put("/v1/plant", json=tower_document())
+        client.put("/v1/heliostats/AA39", json=properties_document())
+        poster(client)(png(1), id="1")
+        client.post("/v1/heliostats/AA39/surfaces", json={"method": "network"})
+        yield client
+
+
+def test_poor_forecasts_until_one_is_good_again(blind: TestClient):
+    runtime, post = blind.app.state.runtime, poster(blind)  # type: ignore[attr-defined]
+    post(png(2), id="2")
+    (item,) = of(blind, "accuracy")
+    assert "with an accuracy of 0%, and 75% is the least" in item["what"]
+    acknowledge(blind, item)
+    post(png(3), id="3")
+    (still,) = of(blind, "accuracy")
+    assert (still["id"], still["acknowledged_by"]) == (item["id"], "local")
+    runtime.operations.is_blind = False
+    post(png(4), id="4")
+    assert of(blind, "accuracy") == []
+    runtime.operations.is_blind = True
+    post(png(5), id="5")
+    (returned,) = of(blind, "accuracy")
+    assert returned["acknowledged_by"] is None
+    with runtime.database.reading() as session:
+        assert session.scalars(select(DriftRow.poor_since)).one() == datetime.fromisoformat(returned["since"])
+
+
+def test_doubts_are_acknowledged_once_on_either_page(tmp_path: Path):
+    with client_of(create_app(Settings(data_dir=tmp_path, **QUIET), Doubter())) as client:
+        client.put("/v1/plant", json=tower_document())
+        client.put("/v1/heliostats/AA39", json=properties_document())
+        poster(client)(png(2), id="2", sun_azimuth=90.0)
+        client.post("/v1/heliostats/AA39/surfaces", json={"method": "network"})
+        (item,) = items(client)
+        assert item["what"].startswith("photograph 2 is not explained")
+        assert acknowledge(client, item).json()[0]["acknowledged_by"] == "local"
+        assert client.get("/v1/heliostats/AA39/surfaces/1").json()["seen_by"] == "local"
+        assert items(client, acknowledged=False) == []
+
+
+@pytest.fixture
+def calibrating(tmp_path: Path) -> Iterator[TestClient]:
+    """With a worker, and a bound that a mount calibrated by three photographs exceeds."""
+    options = QUIET | {"job_workers": 1, "job_poll_s": 0.05, "attention_pointing_mrad": 0.2}
+    settings = Settings(data_dir=tmp_path, **options)
+    with client_of(create_app(settings, FakeOperations())) as client:
+        client.put("/v1/plant", json=tower_document())
+        client.put("/v1/heliostats/AA39", json=properties_document())
+        yield client
+
+
+def test_moves_and_pointing_errors(calibrating: TestClient):
+    client, post = calibrating, poster(calibrating)
+    taken = photographs(tower_document(), properties_document(), step_mrad=25.0)
+    for number, one in enumerate(taken[:10]):
+        post(png(number), **one)
+        if number == 7:
+            calibrate(client)
+    (moved,) = of(client, "moved")
+    assert moved["what"].startswith("it moved between 8 and 9 May 2024: its light lies ")
+    assert datetime.fromisoformat(moved["since"]) == datetime(2024, 5, 9, 12, tzinfo=UTC)
+    assert of(client, "pointing") == []  # the same thing is told once
+    acknowledge(client, moved)
+    calibrate(client)
+    assert of(client, "moved") == []  # calibrated, and more than 90 days ago
+
+
+def test_pointing_error_beyond_the_bound(calibrating: TestClient):
+    client, post = calibrating, poster(calibrating)
+    taken = photographs(tower_document(), properties_document())
+    for number, one in enumerate(taken):
+        if number == 3:
+            calibrate(client)
+        post(png(number), **one)
+    (item,) = of(client, "pointing")
+    told = client.get("/v1/heliostats/AA39/pointing").json()
+    assert item["what"].startswith(f"its light lies {told['error_mrad']:.1f} mrad off")
+    assert told["error_mrad"] > 0.2
+    assert told["moved"] is None  # it knows how little it knows
+
+
+def test_camera_that_a_study_found_changed_until_that_is_adopted(app: FastAPI, client: TestClient):
+    since = {"kind": "since", "since": "2024-06-02", "heliostats": None}
+    blur = {"name": "camera_blur", "parameters": {"sigma_m": {"value": 0.1, "ci95": [0.08, 0.12], "unit": "m"}}}
+    with app.state.runtime.database.writing() as session:
+        number = store.add_study(session, study_row(SLOPE | {"scope": since}, blur | {"scope": since})).id
+    (item,) = items(client)
+    assert item["what"] == f"study {number} found camera blur in photographs from 2024-06-02 on"
+    assert (item["heliostat"], item["since"]) == (None, "2024-06-02T00:00:00Z")
+    acknowledge(client, item)
+    with app.state.runtime.database.writing() as session:
+        store.add_study(session, study_row(blur | {"scope": since}))
+    assert [one["acknowledged_by"] for one in items(client)] == ["local"]  # found again: the same reason
+    assert client.post(f"/v1/studies/{number + 1}/adopt", json={}).status_code < 300
+    assert items(client) == []
+
+
+def test_camera_that_was_declared_anew(client: TestClient):
+    declared = {"cameras": [{"transfer": {"gamma": 2.0}, "since": "2024-03-01T00:00:00Z"}]}
+    assert client.put("/v1/plant", json={**tower_document(), "declared": declared}).status_code == 200
+    (item,) = items(client)
+    assert item["what"].startswith("version 2 of the model declared another camera")
+
+
+def test_queue_that_is_stuck(app: FastAPI, client: TestClient):
+    with app.state.runtime.database.writing() as session:
+        job, _ = queue.add_job(session, "imports", {"folder": "x"}, "tester")
+    assert items(client) == []
+    with app.state.runtime.database.writing() as session:
+        session.execute(update(JobRow).values(created_at=now() - timedelta(minutes=31)))
+    (item,) = items(client)
+    assert item["what"] == f"job {job.id} has waited since then"
+    assert 'heliotwin_attention{acknowledged="no",reason="queue"} 1.0' in client.get("/metrics").text
+    acknowledge(client, item)
+    metrics = client.get("/metrics").text
+    assert 'heliotwin_attention{acknowledged="no",reason="queue"} 0.0' in metrics
+    assert 'heliotwin_attention{acknowledged="yes",reason="queue"} 1.0' in metrics
+
+
+@pytest.fixture
+def stale(store_url: URL, tmp_path: Path) -> Iterator[TestClient]:
+    """Three heliostats that nobody photographed for a year, on either engine."""
+    url = store_url.render_as_string(hide_password=False)
+    settings = Settings(data_dir=tmp_path, database_url=url, **QUIET)
+    app = create_app(settings, FakeOperations())
+    with client_of(app) as client:
+        client.put("/v1/plant", json=tower_document())
+        for name in ("AA39", "AB01", "a-1"):
+            client.put(f"/v1/heliostats/{name}", json=properties_document())
+        with app.state.runtime.database.writing() as session:
+            session.execute(update(HeliostatRow).values(created_at=now() - timedelta(days=365)))
+        yield client
+
+
+def test_list_in_parts_and_acknowledgement_of_all_or_none(stale: TestClient):
+    first = stale.get(PATH, params={"limit": 2}).json()
+    rest = stale.get(PATH, params={"limit": 2, "after": first["next"]}).json()
+    assert [item["heliostat"] for item in (*first["items"], *rest["items"])] == ["AA39", "AB01", "a-1"]
+    assert rest["next"] is None
+    gone = first["items"][0] | {"id": "AA39:no_photograph:00000000"}
+    answer = acknowledge(stale, first["items"][1], gone)
+    assert answer.status_code == 404
+    assert "does not need attention" in answer.text
+    assert items(stale, acknowledged=True) == []
+    assert acknowledge(stale, *first["items"]).status_code == 200
+    before = items(stale, acknowledged=True)
+    assert acknowledge(stale, *first["items"]).json() == before  # the first who did stays
+    assert len(before) == 2
+
+
+def test_page_and_menu_tell_and_the_forms_acknowledge(stale: TestClient):
+    page = stale.get("/attention", headers=HTML).text
+    assert "None was ever accepted." in page
+    assert "HELIOTWIN_ATTENTION_" in page
+    assert stale.get("/attention/count").text.startswith('<span class="count">3<')
+    assert 'hx-get="/attention/count"' in page
+    one, two, three = (item["id"] for item in items(stale))
+    form = {"ids": [one], "reason": "no_photograph"}
+    answer = stale.post("/attention/acknowledgements", data=form, headers=HTML, follow_redirects=False)
+    assert (answer.status_code, answer.headers["Location"]) == (303, "/attention?reason=no_photograph")
+    assert stale.get("/attention/count").text.startswith('<span class="count">2<')
+    stale.post("/attention/acknowledgements", data={"ids": [two, three]}, headers=HTML)
+    assert "Nothing." in stale.get("/attention", headers=HTML).text
+    assert "local, " in stale.get("/attention?acknowledged=true", headers=HTML).text
+
+
+def test_who_acknowledged_is_the_key_and_audited(app: FastAPI, client: TestClient):
+    database = app.state.runtime.database
+    with database.writing() as session:
+        session.execute(update(HeliostatRow).values(created_at=now() - timedelta(days=31)))
+        reader = keys.create(session, "looker", "read", "test")
+        operator = keys.create(session, "shift-2", "operate", "test")
+    client.headers["Authorization"] = f"Bearer {reader}"
+    (item,) = items(client)
+    assert acknowledge(client, item).status_code == 403
+    assert "I have seen it" not in client.get("/attention", headers=HTML).text
+    client.headers["Authorization"] = f"Bearer {operator}"
+    assert acknowledge(client, item).json()[0]["acknowledged_by"] == "shift-2"
+    with database.reading() as session:
+        (entry,) = session.scalars(select(AuditRow).where(AuditRow.action == "attention.acknowledged"))
+    assert (entry.actor, entry.subject, entry.detail["reason"]) == ("shift-2", "heliostat AA39", "no_photograph")
+
+
+@pytest.mark.parametrize("body", [{}, {"ids": []}, {"ids": ["AA39"]}, {"ids": [1]}, {"ids": ["x:y:0"] * 501}])
+def test_acknowledgement_of_nothing_is_refused(refusing: TestClient, body: dict[str, Any]):
+    assert refusing.post(f"{PATH}/acknowledgements", json=body).status_code == 422
