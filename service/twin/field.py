@@ -1,22 +1,33 @@
 """The field at a glance: every heliostat with what its twin is worth."""
 
+import threading
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 
 import numpy as np
-from sqlalchemy import func, select
+from sqlalchemy import func, select, union_all
 from sqlalchemy.orm import Session
 
 from service.base.arrays import unpack
+from service.base.faults import BusyError
 from service.store.columns import now
+from service.store.job_tables import AuditRow
 from service.store.tables import HeliostatRow, MeasurementRow, SurfaceRow
 from service.twin import versions
 from service.twin.accuracy import AccuracyBook, Rank, State
+from service.twin.book import Book
 from service.twin.runtime import Runtime
 
-# Surfaces that are read at a time, to bound memory.
-_CHUNK = 200
+# Tables that tell whether the field has changed, and how many of their newest rows are looked at.
+_TABLES = (HeliostatRow, MeasurementRow, SurfaceRow, AuditRow)
+_NEWEST = 1000
+# A field that is read so quickly [s] is waited for whenever it changed, and so are its figures.
+_QUICK_S = 0.2
+_PATIENCE_S = 20.0
+# Figures that are kept: the surfaces of the largest plant several times over.
+_MOST = 200_000
 
 
 @dataclass(frozen=True)
@@ -123,42 +134,98 @@ def read_lines(session: Session) -> list[Line]:
     return lines
 
 
+Marks = tuple[tuple[int, int], ...]
+"""What changes with the store; see `_marks`."""
+
+
+def _marks(session: Session) -> Marks:
+    """The last row of each table that a field is read from, and which ones are the newest before it.
+
+    Whatever else changes a line leaves an entry in the audit trail. Transactions that began earlier may end later, so
+    the last number alone would miss them.
+    """
+    ends = [select(table.id).order_by(table.id.desc()).limit(_NEWEST).subquery() for table in _TABLES]
+    each = [select(func.coalesce(func.max(end.c.id), 0), func.coalesce(func.sum(end.c.id), 0)) for end in ends]
+    return tuple((int(last), int(total)) for last, total in session.execute(union_all(*each)))
+
+
+class _Reading:
+    """The lines as they were read at one time, completed as figures and ranks become known."""
+
+    def __init__(self, lines: list[Line], model: int, took_s: float) -> None:
+        self.took_s = took_s
+        self._lines, self._lock = lines, threading.Lock()
+        self._figures = {i: line.surface.id for i, line in enumerate(lines) if line.surface is not None}
+        self._ranks = {i: state for i, line in enumerate(lines) if (state := line.state(model)) is not None}
+
+    def complete(
+        self, figures: Book[int, Figures | None], ranks: AccuracyBook, wait_s: float = 0.0
+    ) -> tuple[list[Line], int]:
+        """The lines, and of how many of them something is still being worked out."""
+        with self._lock:
+            shapes, _ = figures.look_up(self._figures.values(), wait_s)
+            worth, _ = ranks.look_up(self._ranks.values())
+            lines = self._lines.copy()  # others read in the former ones
+            for i in [i for i, number in self._figures.items() if number in shapes]:
+                lines[i] = replace(lines[i], figures=shapes[self._figures.pop(i)])
+            for i in [i for i, state in self._ranks.items() if state.heliostat in worth]:
+                lines[i] = replace(lines[i], rank=worth[self._ranks.pop(i).heliostat])
+            self._lines = lines
+            return lines, len(self._figures.keys() | self._ranks.keys())
+
+
+@dataclass(frozen=True)
+class FieldNow:
+    """All heliostats by name, how many of them something is still worked out of, and whether newer ones are read."""
+
+    lines: list[Line]
+    pending: int
+    is_behind: bool
+
+
 class FieldBook:
-    """What takes arrays to tell of each heliostat: computed once, kept in memory."""
+    """The field, read once for what it depends on, with what takes arrays to tell of each heliostat.
+
+    To read a large one takes longer than a page may: until then pages show it as it was.
+    """
 
     def __init__(self, runtime: Runtime) -> None:
         self._runtime = runtime
         self._accuracies = AccuracyBook(runtime)
-        self._figures: dict[int, Figures] = {}
+        self._figures: Book[int, Figures | None] = Book(self._figures_of, None, "figures", _MOST)
+        self._readings: Book[tuple[Marks, int], _Reading | None] = Book(self._read, None, "field", 1)
+        self._last: _Reading | None = None
 
     def close(self) -> None:
         """End what is under way."""
-        self._accuracies.close()
+        for book in (self._readings, self._figures, self._accuracies):
+            book.close()
 
-    def _figures_of(self, session: Session, surfaces: Sequence[int]) -> dict[int, Figures]:
-        known = self._figures  # another request may put its own in their place meanwhile
-        missing = [number for number in surfaces if number not in known]
-        fresh: dict[int, Figures] = {}
-        for start in range(0, len(missing), _CHUNK):
-            chunk = select(SurfaceRow.id, SurfaceRow.arrays).where(SurfaceRow.id.in_(missing[start : start + _CHUNK]))
-            fresh.update((number, figures_of(arrays)) for number, arrays in session.execute(chunk))
-        # Surfaces that are no longer current are let go.
-        figures = {**{number: known[number] for number in surfaces if number in known}, **fresh}
-        self._figures = figures
-        return figures
+    def read(self, session: Session, patience_s: float = 0.0) -> FieldNow:
+        """The field; the former one where it is large, changed, and not read again within ``patience_s``.
 
-    def read(self, session: Session) -> tuple[list[Line], int]:
-        """All heliostats, and how many accuracies are still being worked out."""
-        lines = read_lines(session)
-        figures = self._figures_of(session, [line.surface.id for line in lines if line.surface is not None])
-        model = versions.current_number(session)
-        states = (line.state(model) for line in lines)
-        ranks, pending = self._accuracies.look_up(state for state in states if state is not None)
-        return [
-            replace(
-                line,
-                figures=None if line.surface is None else figures.get(line.surface.id),
-                rank=ranks.get(line.name),
-            )
-            for line in lines
-        ], pending
+        Raises
+        ------
+        BusyError
+            Where it was never read yet, and that takes too long.
+        """
+        last = self._last
+        if last is None or last.took_s < _QUICK_S:
+            patience_s = _PATIENCE_S
+        found = self._readings.wait_for((_marks(session), versions.current_number(session)), patience_s)
+        reading = self._last = found or last
+        if reading is None:
+            raise BusyError("the field is being read; ask again as Retry-After says")
+        return FieldNow(*reading.complete(self._figures, self._accuracies), found is None)
+
+    def _read(self, depends: tuple[Marks, int]) -> _Reading:
+        _, model = depends
+        began = time.perf_counter()
+        with self._runtime.database.reading() as session:
+            reading = _Reading(read_lines(session), model, time.perf_counter() - began)
+        reading.complete(self._figures, self._accuracies, _QUICK_S)
+        return reading
+
+    def _figures_of(self, surface: int) -> Figures:
+        with self._runtime.database.reading() as session:
+            return figures_of(session.scalars(select(SurfaceRow.arrays).where(SurfaceRow.id == surface)).one())
