@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 
 import numpy as np
-from sqlalchemy import func, select, union_all
+from sqlalchemy import case, func, select, union_all
 from sqlalchemy.orm import Session
 
 from service.base.arrays import unpack
@@ -113,12 +113,20 @@ def _current_surfaces(session: Session) -> dict[int, Current]:
     return {row.heliostat_id: Current(*tuple(row)[1:]) for row in session.execute(query)}
 
 
-def _photographs(session: Session) -> dict[tuple[int, bool], tuple[int, int | None, datetime | None]]:
-    """Of each heliostat's photographs, accepted or not: how many, the id of the newest, and the last correction."""
-    row = MeasurementRow
-    query = select(row.heliostat_id, row.accepted, func.count(), func.max(row.id), func.max(row.corrected_at))
-    found = session.execute(query.group_by(row.heliostat_id, row.accepted))
-    return {(heliostat, accepted): (count, newest, at) for heliostat, accepted, count, newest, at in found}
+def _photographs(session: Session) -> dict[int, tuple[int, int, int | None, datetime | None]]:
+    """Of each heliostat: photographs, those of which no image is used, the newest used image, the last correction."""
+    row, is_used = MeasurementRow, case((MeasurementRow.accepted, 1), else_=0)
+    each = select(
+        row.heliostat_id,
+        func.max(is_used).label("used"),
+        func.max(case((row.accepted, row.id))).label("newest"),
+        func.max(row.corrected_at).label("corrected"),
+    )
+    # A photograph may have come as several images.
+    images = each.group_by(row.heliostat_id, func.coalesce(row.external_id, row.identifier)).subquery()
+    counts = func.count(), func.count() - func.sum(images.c.used), func.max(images.c.newest)
+    found = select(images.c.heliostat_id, *counts, func.max(images.c.corrected)).group_by(images.c.heliostat_id)
+    return {heliostat: (count, refused, newest, at) for heliostat, count, refused, newest, at in session.execute(found)}
 
 
 def read_lines(session: Session) -> list[Line]:
@@ -127,10 +135,8 @@ def read_lines(session: Session) -> list[Line]:
     columns = select(HeliostatRow.id, HeliostatRow.name, HeliostatRow.east_m, HeliostatRow.north_m)
     lines = []
     for number, name, east, north in session.execute(columns.order_by(HeliostatRow.name)):
-        accepted, newest, *kept = photographs.get((number, True), (0, None, None))
-        refused, _, *others = photographs.get((number, False), (0, None, None))
-        corrected = max((moment for moment in (*kept, *others) if moment is not None), default=None)
-        lines.append(Line(name, east, north, accepted + refused, refused, newest, corrected, surfaces.get(number)))
+        told = photographs.get(number, (0, 0, None, None))
+        lines.append(Line(name, east, north, *told, surfaces.get(number)))
     return lines
 
 
