@@ -88,9 +88,9 @@ def list_identifiers(session: Session, heliostat: HeliostatRow) -> Sequence[str]
 
 
 def list_measurements(
-    session: Session, heliostat: HeliostatRow, limit: int, after: str | None = None, accepted: bool | None = None
+    session: Session, heliostat: HeliostatRow, limit: int | None, after: str | None = None, accepted: bool | None = None
 ) -> Sequence[MeasurementRow]:
-    """Up to ``limit`` measurements in the order they came, those after the one called ``after``."""
+    """Up to ``limit`` measurements, or all, in the order they came, those after the one called ``after``."""
     query = _measurements(heliostat).order_by(MeasurementRow.id).limit(limit)
     if accepted is not None:
         query = query.where(MeasurementRow.accepted == accepted)
