@@ -64,6 +64,7 @@ def field_line(line: Line) -> FieldLine:
             "name": line.name,
             "position_m": (line.east_m, line.north_m),
             **{name: metric.value(line) for name, metric in METRICS.items()},
+            "age": None if surface is None or surface.age_days is None else round(surface.age_days, 1),
             "judged_by": None if line.rank is None else line.rank.photographs,
             "surface": None if surface is None else surface.version,
             "source": None if surface is None else surface.source,
