@@ -48,7 +48,10 @@ class Scale:
 
     def names(self, values: Sequence[float]) -> list[str]:
         """The colours of numbers, as pages write them."""
-        return ["#" + bytes(pixel[:3]).hex() for pixel in self.pixels(np.array(values))]
+        packed = np.ascontiguousarray(self.pixels(np.array(values))).view(np.uint32).ravel()
+        few, places = np.unique(packed, return_inverse=True)  # of many numbers only some hundred colours are different
+        names = ["#" + pixel.tobytes()[:3].hex() for pixel in few]
+        return [names[place] for place in places.tolist()]
 
     @property
     def stops(self) -> list[tuple[float, str]]:

@@ -2,6 +2,7 @@
 
 import io
 
+import cv2
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -26,6 +27,24 @@ def flux_picture(flux: NDArray[np.floating], size: tuple[float, float] | None, u
     axes.set(title=title, xlabel="right [m]" if size else "column", ylabel="up [m]" if size else "row")
     figure.colorbar(image, ax=axes, label=unit)
     return _png(figure)
+
+
+def photograph_picture(pixels: NDArray[np.generic], most: int, corners: NDArray[np.floating] | None = None) -> bytes:
+    """A photograph, gray or RGB, as JPEG of at most ``most`` pixels a side.
+
+    ``corners`` (4, 2) [px], upper left, upper right, lower left, lower right, are joined to an outline.
+    """
+    image = np.asarray(pixels)
+    if image.dtype != np.uint8:  # deeper ones are as bright as they may be
+        image = (image.astype(np.float32) * (255 / max(float(image.max()), 1.0))).astype(np.uint8)
+    image = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR if image.ndim == 2 else cv2.COLOR_RGB2BGR)
+    scale = min(1.0, most / max(image.shape[:2]))
+    if scale < 1:
+        image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    if corners is not None:
+        outline = np.round((np.asarray(corners) * scale)[[0, 1, 3, 2]]).astype(np.int32)
+        cv2.polylines(image, [outline], isClosed=True, color=(64, 220, 255), thickness=2, lineType=cv2.LINE_AA)
+    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 85])[1].tobytes()
 
 
 def mirror_heights(z: NDArray[np.floating], samples: int = 48) -> NDArray[np.float64]:

@@ -1,9 +1,11 @@
 """Images and measurements, as they are kept and found again."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from datetime import datetime
+from typing import Literal
 
-from sqlalchemy import Select, func, select
+from sqlalchemy import Select, case, func, select
 from sqlalchemy.orm import Session, undefer
 
 from service.base import names
@@ -15,6 +17,29 @@ from service.store.tables import HeliostatRow, ImageRow, MeasurementRow, TargetR
 
 # Which image of a measurement to use where there are several: separated ones first, for they need no guess.
 PREFERENCE = ("flux", "cropped", "raw", "flux-centered")
+
+
+PhotographVerdict = Literal["used", "refused", "excluded"]
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One photograph: its images, in the order of `PREFERENCE`, accepted ones first."""
+
+    name: str
+    images: tuple[MeasurementRow, ...]
+
+    @property
+    def best(self) -> MeasurementRow:
+        """The image that the photograph is judged by."""
+        return self.images[0]
+
+    @property
+    def verdict(self) -> PhotographVerdict:
+        """Whether any of its images is used; else whether somebody excluded it."""
+        if self.best.accepted:
+            return "used"
+        return "excluded" if any(row.reason == "excluded" for row in self.images) else "refused"
 
 
 def _measurements(heliostat: HeliostatRow) -> Select[MeasurementRow]:
@@ -63,15 +88,45 @@ def list_identifiers(session: Session, heliostat: HeliostatRow) -> Sequence[str]
 
 
 def list_measurements(
-    session: Session, heliostat: HeliostatRow, limit: int, after: str | None = None, accepted: bool | None = None
+    session: Session, heliostat: HeliostatRow, limit: int | None, after: str | None = None, accepted: bool | None = None
 ) -> Sequence[MeasurementRow]:
-    """Up to ``limit`` measurements in the order they came, those after the one called ``after``."""
+    """Up to ``limit`` measurements, or all, in the order they came, those after the one called ``after``."""
     query = _measurements(heliostat).order_by(MeasurementRow.id).limit(limit)
     if accepted is not None:
         query = query.where(MeasurementRow.accepted == accepted)
     if after is not None:
         query = query.where(MeasurementRow.id > get_measurement(session, heliostat, after).id)
     return session.scalars(query).all()
+
+
+def list_shots(
+    session: Session, heliostat: HeliostatRow, limit: int, verdict: PhotographVerdict | None = None
+) -> list[Shot]:
+    """The photographs whose images came last, newest first, or those of one verdict."""
+    name = func.coalesce(MeasurementRow.external_id, MeasurementRow.identifier).label("name")
+    is_used = func.max(case((MeasurementRow.accepted, 1), else_=0))
+    is_excluded = func.max(case((MeasurementRow.reason == "excluded", 1), else_=0))
+    query = select(name).where(MeasurementRow.heliostat_id == heliostat.id).group_by(name)
+    if verdict is not None:
+        query = query.having(is_used == int(verdict == "used"))
+    if verdict in ("refused", "excluded"):
+        query = query.having(is_excluded == int(verdict == "excluded"))
+    names = session.scalars(query.order_by(func.max(MeasurementRow.id).desc()).limit(limit)).all()
+    images: dict[str, list[MeasurementRow]] = {known: [] for known in names}
+    for row in session.scalars(_measurements(heliostat).where(name.in_(names))):
+        images[row.external_id or row.identifier].append(row)
+    return [
+        Shot(known, tuple(sorted(rows, key=lambda row: (not row.accepted, PREFERENCE.index(row.kind)))))
+        for known, rows in images.items()
+    ]
+
+
+def images_of_shot(session: Session, row: MeasurementRow) -> dict[str, MeasurementRow]:
+    """The images of the photograph that ``row`` is one of, by kind."""
+    query = select(MeasurementRow).where(MeasurementRow.heliostat_id == row.heliostat_id)
+    if row.external_id is None:
+        return {row.kind: row}
+    return {one.kind: one for one in session.scalars(query.where(MeasurementRow.external_id == row.external_id))}
 
 
 def recent_measurements(

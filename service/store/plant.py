@@ -78,15 +78,17 @@ def get_heliostats(session: Session, wanted: Sequence[str]) -> dict[str, Heliost
 
 
 def list_heliostats(
-    session: Session, limit: int, after: str | None = None, prefix: str | None = None
+    session: Session, limit: int, after: str | None = None, prefix: str | None = None, search: str = ""
 ) -> Sequence[HeliostatRow]:
     """Up to ``limit`` heliostats in the order of their names, those after ``after`` that begin by ``prefix``.
 
-    Whether the prefix is written in capitals does not matter.
+    ``search`` is in their names. Whether either is written in capitals does not matter.
     """
     query = select(HeliostatRow).options(defer(HeliostatRow.properties)).order_by(HeliostatRow.name).limit(limit)
     if prefix:
         query = query.where(HeliostatRow.name.istartswith(prefix, autoescape=True))
+    if search:
+        query = query.where(HeliostatRow.name.icontains(search, autoescape=True))
     return session.scalars(query.where(HeliostatRow.name > after) if after else query).all()
 
 

@@ -134,10 +134,12 @@ def add_surface(
 
 
 def list_surfaces(
-    session: Session, heliostat: HeliostatRow, limit: int, after: int | None = None
+    session: Session, heliostat: HeliostatRow, limit: int | None, after: int | None = None, arrays: bool = False
 ) -> Sequence[SurfaceRow]:
-    """Up to ``limit`` versions, oldest first, those after version ``after``."""
+    """Up to ``limit`` versions, or all, oldest first, those after version ``after``, with ``arrays`` where wanted."""
     query = _surfaces(heliostat).order_by(SurfaceRow.version).limit(limit)
+    if arrays:
+        query = query.options(undefer(SurfaceRow.arrays))
     return session.scalars(query.where(SurfaceRow.version > after) if after else query).all()
 
 

@@ -95,8 +95,13 @@ def compare(runtime: Runtime, name: str, surface: SurfaceRow | None) -> list[Com
     with runtime.database.reading() as session:
         twin = load_twin(session, name)
         rows, _ = unseen_first(session, twin.row, seen_by(surface))
-    if not rows:
-        return []
+    return compare_with(runtime, twin, surface, rows) if rows else []
+
+
+def compare_with(
+    runtime: Runtime, twin: Twin, surface: SurfaceRow | None, rows: Sequence[MeasurementRow]
+) -> list[Comparison]:
+    """Photographs, loaded with their arrays, against forecasts with a stored surface, or the ideal one."""
     shown = [evidence_of(row, twin.origin) for row in rows]
     used, forecasts = seen_by(surface), forecasts_of(runtime, twin, shown, heights_of(surface))
     return [

@@ -27,7 +27,7 @@ from service.store.columns import now
 from service.store.job_tables import AcknowledgementRow, JobRow
 from service.store.tables import DriftRow, HeliostatRow, MeasurementRow, ModelRow, PlantRow, StudyRow
 from service.twin import versions
-from service.twin.field import Current, FieldBook, Line
+from service.twin.field import PATIENCE_S, Current, FieldBook, Line
 from service.twin.pointing_errors import Moved, Pointing
 from service.twin.runtime import Runtime
 
@@ -70,8 +70,8 @@ class Item:
 
 def needs_attention(session: Session, book: FieldBook, settings: Settings) -> tuple[list[Item], int]:
     """All that does, the most urgent reason first, the newest of each first; and how many heliostats are pending."""
-    lines, pending = book.pointed(session)
-    return of_lines(session, lines, settings), pending
+    field = book.read(session, PATIENCE_S)
+    return of_lines(session, field.lines, settings), field.pending
 
 
 def of_lines(session: Session, lines: Sequence[Line], settings: Settings) -> list[Item]:

@@ -38,15 +38,21 @@ class Book(Generic[Key, Value]):
         self._is_closed = False
         self._thread: threading.Thread | None = None
 
-    def look_up(self, keys: Iterable[Key]) -> tuple[dict[Key, Value], int]:
-        """What is known of the keys, and how many are missing; those are the only ones worked at from now on."""
+    def look_up(self, keys: Iterable[Key], seconds: float = 0.0) -> tuple[dict[Key, Value], int]:
+        """What is known of the keys after so many seconds at the most, and how many are missing.
+
+        Those are the only ones worked at from now on.
+        """
         with self._changed:
             asked = list(keys)
             missing = [key for key in asked if key not in self._known]
             # What nobody asks for any more is not worth the work, and what is under way is not worth it twice.
             self._wanted = OrderedDict.fromkeys(key for key in missing if key != self._under_way)
             self._start()
-            return {key: self._known[key] for key in asked if key in self._known}, len(missing)
+            if missing and seconds:
+                self._changed.wait_for(lambda: all(key in self._known for key in missing) or self._is_closed, seconds)
+            known = {key: self._known[key] for key in asked if key in self._known}
+            return known, len(asked) - len(known)
 
     def wait_for(self, key: Key, seconds: float) -> Value | None:
         """The answer to one key, next in turn; None where it is not there after so many seconds."""

@@ -1,28 +1,37 @@
 """The field at a glance: every heliostat with what its twin is worth."""
 
 import math
-from collections.abc import Iterable, Sequence
+import threading
+import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
-from typing import TypeVar
+from typing import NamedTuple
 
 import numpy as np
-from sqlalchemy import func, select
+from sqlalchemy import case, func, select, union_all
 from sqlalchemy.orm import Session
 
 from service import store
 from service.base.arrays import unpack
+from service.base.faults import BusyError
 from service.store.columns import now
+from service.store.job_tables import AuditRow
 from service.store.tables import HeliostatRow, MeasurementRow, MountRow, SurfaceRow
 from service.twin import versions
 from service.twin.accuracy import AccuracyBook, Rank, State
+from service.twin.book import Book
 from service.twin.pointing_errors import Mounted, Pointing, PointingBook
 from service.twin.runtime import Runtime
 
-Value = TypeVar("Value", int, datetime)
-
-# Surfaces that are read at a time, to bound memory.
-_CHUNK = 200
+# Tables that tell whether the field has changed, and how many of their newest rows are looked at.
+_TABLES = (HeliostatRow, MeasurementRow, SurfaceRow, MountRow, AuditRow)
+_NEWEST = 1000
+# A field that is read so quickly [s] is waited for whenever it changed, and so are its figures.
+_QUICK_S = 0.2
+PATIENCE_S = 20.0
+# Figures that are kept: the surfaces of the largest plant several times over.
+_MOST = 200_000
 
 
 @dataclass(frozen=True)
@@ -98,7 +107,7 @@ class Line:
         return State(self.name, self.surface.id, self.newest, self.corrected, model)
 
 
-def _current_surfaces(session: Session, heliostat: int | None = None) -> dict[int, Current]:
+def _current_surfaces(session: Session, heliostat: int | None) -> dict[int, Current]:
     place = func.row_number().over(
         partition_by=SurfaceRow.heliostat_id, order_by=(SurfaceRow.valid_from.desc(), SurfaceRow.version.desc())
     )
@@ -124,26 +133,43 @@ def _current_surfaces(session: Session, heliostat: int | None = None) -> dict[in
     return {row.heliostat_id: Current(*tuple(row)[1:]) for row in session.execute(query)}
 
 
-@dataclass(frozen=True)
-class _Taken:
-    """Of a heliostat's photographs: how many, the newest row, and the last correction."""
+class _Taken(NamedTuple):
+    """Of a heliostat's photographs: how many, of how many no image is used, the newest used image, the newest of all.
 
-    count: int = 0
+    And when one was last corrected.
+    """
+
+    photographs: int = 0
+    refused: int = 0
+    used: int | None = None
     newest: int | None = None
     corrected: datetime | None = None
 
 
-def _photographs(session: Session, heliostat: int | None = None) -> dict[tuple[int, bool], _Taken]:
-    """By heliostat, of one or of all, and whether they were accepted."""
-    row = MeasurementRow
-    query = select(row.heliostat_id, row.accepted, func.count(), func.max(row.id), func.max(row.corrected_at))
+def _photographs(session: Session, heliostat: int | None) -> dict[int, _Taken]:
+    """By heliostat."""
+    row, is_used = MeasurementRow, case((MeasurementRow.accepted, 1), else_=0)
+    each = select(
+        row.heliostat_id,
+        func.max(is_used).label("used"),
+        func.max(case((row.accepted, row.id))).label("newest_used"),
+        func.max(row.id).label("newest"),
+        func.max(row.corrected_at).label("corrected"),
+    )
     if heliostat is not None:
-        query = query.where(row.heliostat_id == heliostat)
-    found = session.execute(query.group_by(row.heliostat_id, row.accepted))
-    return {(told[0], told[1]): _Taken(*told[2:]) for told in found}
+        each = each.where(row.heliostat_id == heliostat)
+    # A photograph may have come as several images.
+    images = each.group_by(row.heliostat_id, func.coalesce(row.external_id, row.identifier)).subquery()
+    found = select(
+        images.c.heliostat_id,
+        func.count(),
+        func.count() - func.sum(images.c.used),
+        *(func.max(column) for column in (images.c.newest_used, images.c.newest, images.c.corrected)),
+    )
+    return {number: _Taken(*told) for number, *told in session.execute(found.group_by(images.c.heliostat_id))}
 
 
-def _mounts(session: Session, heliostat: int | None = None) -> dict[int, tuple[int, datetime]]:
+def _mounts(session: Session, heliostat: int | None) -> dict[int, tuple[int, datetime]]:
     """Of heliostats that have not changed since they were calibrated the newest mount, and when that was."""
     newest = select(func.max(MountRow.id)).group_by(MountRow.heliostat_id)
     if heliostat is not None:
@@ -152,10 +178,6 @@ def _mounts(session: Session, heliostat: int | None = None) -> dict[int, tuple[i
     query = query.join(HeliostatRow, HeliostatRow.id == MountRow.heliostat_id)
     found = session.execute(query.where(HeliostatRow.updated_at <= MountRow.created_at))
     return {number: (mount, at) for number, mount, at in found}
-
-
-def _latest(values: Iterable[Value | None]) -> Value | None:
-    return max((value for value in values if value is not None), default=None)
 
 
 def read_lines(session: Session, heliostat: int | None = None) -> list[Line]:
@@ -169,76 +191,127 @@ def read_lines(session: Session, heliostat: int | None = None) -> list[Line]:
         query = query.where(row.id == heliostat)
     lines = []
     for number, name, *place in session.execute(query.order_by(row.name)):
-        kept, refused = photographs.get((number, True), none), photographs.get((number, False), none)
-        newest, corrected = _latest((kept.newest, refused.newest)), _latest((kept.corrected, refused.corrected))
+        taken = photographs.get(number, none)
         line = Line(
             name,
             place[0],
             place[1],
-            kept.count + refused.count,
-            refused.count,
-            kept.newest,
-            corrected,
+            taken.photographs,
+            taken.refused,
+            taken.used,
+            taken.corrected,
             surfaces.get(number),
             range_m=min((math.dist(place, center) for center in receivers), default=None),
-            mounted=Mounted(name, *mounted[number], newest, corrected) if number in mounted else None,
+            mounted=Mounted(name, *mounted[number], taken.newest, taken.corrected) if number in mounted else None,
         )
         lines.append(line)
     return lines
 
 
+Marks = tuple[tuple[int, int], ...]
+"""What changes with the store; see `_marks`."""
+
+
+def _marks(session: Session) -> Marks:
+    """The last row of each table that a field is read from, and which ones are the newest before it.
+
+    Whatever else changes a line leaves an entry in the audit trail. Transactions that began earlier may end later, so
+    the last number alone would miss them.
+    """
+    ends = [select(table.id).order_by(table.id.desc()).limit(_NEWEST).subquery() for table in _TABLES]
+    each = [select(func.coalesce(func.max(end.c.id), 0), func.coalesce(func.sum(end.c.id), 0)) for end in ends]
+    return tuple((int(last), int(total)) for last, total in session.execute(union_all(*each)))
+
+
+class _Reading:
+    """The lines as they were read at one time, completed as figures and ranks become known."""
+
+    def __init__(self, lines: list[Line], model: int, took_s: float) -> None:
+        self.took_s = took_s
+        self._lines, self._lock = lines, threading.Lock()
+        self._figures = {i: line.surface.id for i, line in enumerate(lines) if line.surface is not None}
+        self._ranks = {i: state for i, line in enumerate(lines) if (state := line.state(model)) is not None}
+        self._mounts = {i: line.mounted for i, line in enumerate(lines) if line.mounted is not None}
+
+    def complete(
+        self,
+        figures: Book[int, Figures | None],
+        ranks: AccuracyBook,
+        pointing: PointingBook,
+        wait_s: float = 0.0,
+    ) -> tuple[list[Line], int]:
+        """The lines, and of how many of them something is still being worked out."""
+        with self._lock:
+            shapes, _ = figures.look_up(self._figures.values(), wait_s)
+            worth, _ = ranks.look_up(self._ranks.values())
+            pointed, _ = pointing.look_up(self._mounts.values())
+            lines = self._lines.copy()  # others read in the former ones
+            for i in [i for i, number in self._figures.items() if number in shapes]:
+                lines[i] = replace(lines[i], figures=shapes[self._figures.pop(i)])
+            for i in [i for i, state in self._ranks.items() if state.heliostat in worth]:
+                lines[i] = replace(lines[i], rank=worth[self._ranks.pop(i).heliostat])
+            for i in [i for i, state in self._mounts.items() if state.heliostat in pointed]:
+                lines[i] = replace(lines[i], pointing=pointed[self._mounts.pop(i).heliostat])
+            self._lines = lines
+            return lines, len(self._figures.keys() | self._ranks.keys() | self._mounts.keys())
+
+
+@dataclass(frozen=True)
+class FieldNow:
+    """All heliostats by name, how many of them something is still worked out of, and whether newer ones are read."""
+
+    lines: list[Line]
+    pending: int
+    is_behind: bool
+
+
 class FieldBook:
-    """What takes arrays to tell of each heliostat: computed once, kept in memory."""
+    """The field, read once for what it depends on, with what takes arrays to tell of each heliostat.
+
+    To read a large one takes longer than a page may: until then pages show it as it was.
+    """
 
     def __init__(self, runtime: Runtime) -> None:
         self._runtime = runtime
-        self._accuracies = AccuracyBook(runtime)
-        self._pointing = PointingBook(runtime)
-        self._figures: dict[int, Figures] = {}
+        self._accuracies, self._pointing = AccuracyBook(runtime), PointingBook(runtime)
+        self._figures: Book[int, Figures | None] = Book(self._figures_of, None, "figures", _MOST)
+        self._readings: Book[tuple[Marks, int], _Reading | None] = Book(self._read, None, "field", 1)
+        self._last: _Reading | None = None
 
     def close(self) -> None:
         """End what is under way."""
-        self._accuracies.close()
-        self._pointing.close()
+        for book in (self._readings, self._figures, self._accuracies, self._pointing):
+            book.close()
 
-    def _figures_of(self, session: Session, surfaces: Sequence[int]) -> dict[int, Figures]:
-        known = self._figures  # another request may put its own in their place meanwhile
-        missing = [number for number in surfaces if number not in known]
-        fresh: dict[int, Figures] = {}
-        for start in range(0, len(missing), _CHUNK):
-            chunk = select(SurfaceRow.id, SurfaceRow.arrays).where(SurfaceRow.id.in_(missing[start : start + _CHUNK]))
-            fresh.update((number, figures_of(arrays)) for number, arrays in session.execute(chunk))
-        # Surfaces that are no longer current are let go.
-        figures = {**{number: known[number] for number in surfaces if number in known}, **fresh}
-        self._figures = figures
-        return figures
+    def read(self, session: Session, patience_s: float = 0.0) -> FieldNow:
+        """The field; the former one where it is large, changed, and not read again within ``patience_s``.
 
-    def pointed(self, session: Session) -> tuple[list[Line], int]:
-        """All heliostats with their pointing errors but no arrays' figures, and how many are being worked out."""
-        lines, known, pending = self._lines(session)
-        return [replace(line, pointing=known[line.name]) if line.name in known else line for line in lines], pending
-
-    def _lines(self, session: Session) -> tuple[list[Line], dict[str, Pointing | None], int]:
-        lines = read_lines(session)
-        return lines, *self._pointing.look_up(line.mounted for line in lines if line.mounted is not None)
+        Raises
+        ------
+        BusyError
+            Where it was never read yet, and that takes too long.
+        """
+        last = self._last
+        if last is None or last.took_s < _QUICK_S:
+            patience_s = PATIENCE_S
+        found = self._readings.wait_for((_marks(session), versions.current_number(session)), patience_s)
+        reading = self._last = found or last
+        if reading is None:
+            raise BusyError("the field is being read; ask again as Retry-After says")
+        return FieldNow(*reading.complete(self._figures, self._accuracies, self._pointing), found is None)
 
     def with_pointing(self, line: Line) -> Line:
         """One heliostat with its pointing error, which it waits for, without a session open."""
         return line if line.mounted is None else replace(line, pointing=self._pointing.wait_for(line.mounted))
 
-    def read(self, session: Session) -> tuple[list[Line], int]:
-        """All heliostats, and of how many figures are still being worked out."""
-        lines, pointing, pointless = self._lines(session)
-        figures = self._figures_of(session, [line.surface.id for line in lines if line.surface is not None])
-        model = versions.current_number(session)
-        states = (line.state(model) for line in lines)
-        ranks, pending = self._accuracies.look_up(state for state in states if state is not None)
-        return [
-            replace(
-                line,
-                figures=None if line.surface is None else figures.get(line.surface.id),
-                rank=ranks.get(line.name),
-                pointing=pointing.get(line.name),
-            )
-            for line in lines
-        ], max(pending, pointless)
+    def _read(self, depends: tuple[Marks, int]) -> _Reading:
+        _, model = depends
+        began = time.perf_counter()
+        with self._runtime.database.reading() as session:
+            reading = _Reading(read_lines(session), model, time.perf_counter() - began)
+        reading.complete(self._figures, self._accuracies, self._pointing, _QUICK_S)
+        return reading
+
+    def _figures_of(self, surface: int) -> Figures:
+        with self._runtime.database.reading() as session:
+            return figures_of(session.scalars(select(SurfaceRow.arrays).where(SurfaceRow.id == surface)).one())

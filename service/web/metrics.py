@@ -22,7 +22,7 @@ from service.store import queue, sizes
 from service.store.job_tables import JobRow
 from service.store.tables import DriftRow, HeliostatRow
 from service.twin.attention import REASONS, Item, of_lines
-from service.twin.field import FieldBook, Line
+from service.twin.field import PATIENCE_S, FieldBook, Line
 from service.twin.runtime import Runtime
 
 _VERDICTS = {True: "yes", False: "no", None: "unknown"}
@@ -46,7 +46,7 @@ class StoreCollector(Collector):
         try:
             with self._runtime.database.reading() as session:
                 found = [*_queue(session), *_sizes(session, self._runtime.settings)]
-                lines, _ = self._book.pointed(session)
+                lines = self._book.read(session, PATIENCE_S).lines
                 found.append(_attention(of_lines(session, lines, self._runtime.settings)))
                 found += [*_trust(lines, most), *_pointing(lines, most), _drift(session, most)]
         except SQLAlchemyError as error:

@@ -1,4 +1,4 @@
-"""The verbs that run the service or fill its store: serve, worker, migrate, import, demo."""
+"""The verbs that run the service or fill its store: serve, worker, migrate, import, export, demo."""
 
 import json
 from pathlib import Path
@@ -32,6 +32,28 @@ def import_(folder: Folder, as_json: AsJson = False) -> None:
     finally:
         runtime.close()
     table = make_table("Imported", "what", "count")
+    for what, count in report["counts"].items():
+        table.add_row(what, str(count))
+    show(report, as_json, table)
+
+
+@app.command()
+def export(
+    folder: Annotated[Path, typer.Argument(help="A new folder to write to.", metavar="DIR")], as_json: AsJson = False
+) -> None:
+    """The store as a measurement folder in PAINT's layout, with STAC items; `heliotwin import` reads it."""
+    from service.base.settings import Settings
+    from service.twin.exporting import export_folder
+    from service.twin.runtime import Runtime
+
+    runtime = Runtime.from_settings(Settings())
+    try:
+        runtime.database.require_current()
+        with progress(None, "export") as step:
+            report = export_folder(runtime, folder, step)
+    finally:
+        runtime.close()
+    table = make_table("Exported", "what", "count")
     for what, count in report["counts"].items():
         table.add_row(what, str(count))
     show(report, as_json, table)

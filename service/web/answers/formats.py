@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import orjson
-from fastapi import Depends, Header, Request, Response
+from fastapi import Depends, Header, Query, Request, Response
 from pydantic import BaseModel
 
 from service.base.faults import NotAcceptableError
@@ -31,6 +31,9 @@ _WRITERS: dict[str, Representation] = {
 
 ARRAYS = (JSON, *_WRITERS)
 """What flux maps and surfaces are offered as, the default first."""
+
+# Their short names, for links: a link bears no Accept.
+_SHORT = {"json": JSON, **{writer.suffix: writer.media_types[0] for writer in _WRITERS.values()}}
 
 
 @dataclass(frozen=True)
@@ -97,8 +100,12 @@ def choose(accept: str | None, offered: tuple[str, ...] = ARRAYS) -> str:
 async def _media_type(
     request: Request,
     accept: Annotated[str | None, Header(description=f"One of {', '.join(ARRAYS)}; JSON by default.")] = None,
+    short: Annotated[
+        str | None,
+        Query(alias="format", pattern=f"^({'|'.join(_SHORT)})$", description="The same in a link; it goes first."),
+    ] = None,
 ) -> AsyncIterator[str]:
-    media_type = choose(accept)
+    media_type = choose(accept) if short is None else _SHORT[short]
     async with turn(request):
         yield media_type
 

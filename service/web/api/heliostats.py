@@ -57,10 +57,11 @@ def list_heliostats(
     limit: Limit = 100,
     after: Annotated[Name | None, Query(description="The last name of the page before.")] = None,
     prefix: Annotated[Name | None, Query(description="Only names that begin so, in capitals or not.")] = None,
+    search: Annotated[str, Query(max_length=32, description="Only names with this in them, in capitals or not.")] = "",
 ) -> Page[HeliostatSummary]:
-    """Heliostats in the order of their names."""
+    """Heliostats in the order of their names; `/v1/field` finds them by what their twins are worth."""
     with runtime.database.reading() as session:
-        rows = store.list_heliostats(session, limit + 1, after, prefix)
+        rows = store.list_heliostats(session, limit + 1, after, prefix, search)
     items = [heliostat_summary(row) for row in rows]
     return page(items, limit, "name")
 

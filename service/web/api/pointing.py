@@ -10,7 +10,7 @@ from pydantic import BaseModel, Field
 from service import store
 from service.base.faults import NotFoundError
 from service.base.fields import Name
-from service.twin.field import Line, read_lines
+from service.twin.field import PATIENCE_S, Line, read_lines
 from service.web.answers.openapi import problems
 from service.web.answers.paging import Page, page
 from service.web.door.dependencies import READ, FieldBookDep, Limit, NamePath, RuntimeDep
@@ -83,11 +83,11 @@ def list_pointing(
 ) -> PointingPage:
     """The pointing errors of all calibrated heliostats, in the order of their names."""
     with runtime.database.reading() as session:
-        lines, pending = book.pointed(session)
-    known = [line for line in lines if line.pointing is not None and (after is None or line.name > after)]
+        field = book.read(session, PATIENCE_S)
+    known = [line for line in field.lines if line.pointing is not None and (after is None or line.name > after)]
     known.sort(key=attrgetter("name"))  # as `after` is compared, whatever the database's order of letters
     part = page([_out(line) for line in known[: limit + 1]], limit, "heliostat")
-    return PointingPage(items=part.items, next=part.next, pending=pending)
+    return PointingPage(items=part.items, next=part.next, pending=field.pending)
 
 
 @router.get("/heliostats/{name}/pointing", responses=problems(404), dependencies=[READ])

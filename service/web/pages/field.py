@@ -1,154 +1,87 @@
 """The field: every heliostat on a map, coloured by what its twin is worth, and the same as a table."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
+from urllib.parse import urlencode
 
 import numpy as np
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import HTMLResponse
+from pydantic import Field
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from service.base.settings import Settings
 from service.drawing.charts import Scale
-from service.drawing.templates import figure
 from service.store.job_tables import JobRow
 from service.store.tables import PlantRow, TargetRow
-from service.twin.accuracy import RECENT
 from service.twin.field import Line
-from service.twin.pointing_errors import NEWEST
+from service.twin.finding import CONDITIONS, METRICS, Metric, Wanted, find, usual_order
 from service.web.answers.pages import render
 from service.web.door.dependencies import DRAWS, READ, FieldBookDep, RuntimeDep
 
 router = APIRouter(include_in_schema=False, dependencies=[READ])
 
-# Heliostats in the table, unless somebody asks for the whole of it.
+# Heliostats on a page of the table.
 _LISTED = 100
 
 
-@dataclass(frozen=True)
-class Metric:
-    """What the map can be coloured by; dark is always the end that deserves a look."""
+class FieldView(Wanted):
+    """What the page shows; each view has an address of its own."""
 
-    name: str
-    label: str
-    unit: str
-    digits: int
-    about: str
-    value: Callable[[Line], float | None]
+    page: int = Field(default=1, ge=1, le=10**6)
 
+    def link(self, **changes: Any) -> str:
+        """The address of this view with some of it changed; another question begins at its first page."""
+        asked = {"page": 1, **self.model_dump(exclude_defaults=True, exclude={"page"}), **changes}
+        told = {name: value for name, value in asked.items() if value is not None and (name, value) != ("page", 1)}
+        return f"/?{urlencode(told)}" if told else "/"
 
-def _deviation(line: Line) -> float | None:
-    return None if line.figures is None else line.figures.deviation_mm
-
-
-def _uncertainty(line: Line) -> float | None:
-    return None if line.figures is None else line.figures.uncertainty_mm
-
-
-def _misfit(line: Line) -> float | None:
-    return None if line.surface is None or line.surface.misfit is None else line.surface.misfit * 100
-
-
-def _age(line: Line) -> float | None:
-    return None if line.surface is None else line.surface.age_days
-
-
-def _accuracy(line: Line) -> float | None:
-    return None if line.rank is None or line.rank.accuracy is None else line.rank.accuracy * 100
-
-
-def _pointing(line: Line) -> float | None:
-    return None if line.pointing is None else line.pointing.error_mrad
-
-
-MetricName = Literal["deviation", "uncertainty", "misfit", "age", "accuracy", "pointing"]
-
-METRICS: dict[str, Metric] = {
-    metric.name: metric
-    for metric in (
-        Metric(
-            "accuracy",
-            "Forecast accuracy",
-            "%",
-            1,
-            f"Mean agreement of forecast and measured flux, with today's surface, on the {RECENT} newest photographs "
-            "that it was not made from; not yet judged where there are none.",
-            _accuracy,
-        ),
-        Metric(
-            "deviation",
-            "Deviation from ideal",
-            "mm",
-            3,
-            "How far the mirror is from its ideal shape: root mean square of the heights.",
-            _deviation,
-        ),
-        Metric(
-            "uncertainty",
-            "Surface uncertainty",
-            "mm",
-            3,
-            "How well the surface is known: root mean square of the heights' standard deviations.",
-            _uncertainty,
-        ),
-        Metric(
-            "misfit",
-            "Surface misfit",
-            "%",
-            1,
-            "What the surface leaves unexplained of the photographs that it was made from.",
-            _misfit,
-        ),
-        Metric("age", "Age of the surface", "days", 0, "Since the surface describes the mirror.", _age),
-        Metric(
-            "pointing",
-            "Pointing error",
-            "mrad",
-            2,
-            f"How far off light lands by the calibrated mount: median of the {NEWEST} newest photographs, none from "
-            "before it last moved.",
-            _pointing,
-        ),
-    )
-}
+    def sorted_by(self, column: str) -> str:
+        """The address of the view in the order of ``column``, or, where it is in that order, in the opposite one."""
+        if column != self.column:
+            return self.link(sort=column, order=None)
+        opposite = "down" if self.rises else "up"
+        return self.link(sort=column, order=None if opposite == usual_order(column) else opposite)
 
 
 @dataclass(frozen=True)
-class Dot:
-    """A heliostat on the drawn map, in the drawing's units; without a colour where its value is not known.
+class Marks:
+    """Heliostats of one colour on the drawn map, None where the value is not known: a path of squares.
 
-    ``told`` is its value in words.
+    ``names`` and ``told``, their values in words, are in the path's order.
     """
 
-    line: Line
-    x: float
-    y: float
-    told: str
     colour: str | None
+    path: str
+    names: str
+    told: str
 
 
 @dataclass(frozen=True)
 class Drawing:
-    """The field from above, north up: size, dots with their radius, the tower, and a bar for its length."""
+    """The field from above, north up, in the drawing's units: size, side of a square, the tower, a bar for its length.
+
+    ``doubted`` are paths around untrusted ones, ``left_out`` those that are not looked for.
+    """
 
     width: float
     height: float
-    radius: float
-    dots: list[Dot]
+    side: float
+    marks: list[Marks]
+    doubted: str
+    left_out: str
     tower: tuple[float, float]
+    per_metre: float
     bar_m: float
-    bar: float
-    has_names: bool
 
 
 def _told(line: Line, metric: Metric) -> str:
-    if metric.name == "accuracy" and line.rank is not None and not line.rank.photographs:
-        return "not yet judged"
-    value = metric.value(line)
-    return "not known" if value is None else figure(value, metric.digits, metric.unit)
+    """What is said where there is no value."""
+    is_unjudged = metric.name == "accuracy" and line.rank is not None and not line.rank.photographs
+    return "not yet judged" if is_unjudged else "not known"
 
 
 def scale_for(metric: Metric, settings: Settings) -> Scale:
@@ -168,8 +101,40 @@ def _round_length(metres: float) -> float:
     return max(factor * power for factor in (1, 2, 5) if factor * power <= metres)
 
 
-def draw(lines: Sequence[Line], metric: Metric, scale: Scale) -> Drawing:
-    """The map of ``lines``; the tower stands at the origin and is always on it."""
+def _squares(places: Iterable[tuple[float, float]], side: float) -> str:
+    """A path of squares about ``places``."""
+    half, square = side / 2, f"M%.1f %.1fh{side:.1f}v{side:.1f}h-{side:.1f}z"
+    return "".join([square % (x - half, y - half) for x, y in places])
+
+
+def _marks(
+    lines: Sequence[Line], places: dict[str, tuple[float, float]], metric: Metric, scale: Scale, side: float
+) -> list[Marks]:
+    values = [metric.value(line) for line in lines]
+    known = [(line, value) for line, value in zip(lines, values, strict=True) if value is not None]
+    groups: dict[str, list[tuple[Line, float]]] = {}
+    for entry, colour in zip(known, scale.names([value for _, value in known]), strict=True):
+        groups.setdefault(colour, []).append(entry)
+    told = f"%.{metric.digits}f\N{NO-BREAK SPACE}{metric.unit.replace('%', '%%')}"  # twenty thousand are quicker so
+    marks = [
+        Marks(
+            colour,
+            _squares([places[line.name] for line, _ in group], side),
+            "|".join([line.name for line, _ in group]),
+            "|".join([told % value for _, value in group]),
+        )
+        for colour, group in groups.items()
+    ]
+    others = [line for line, value in zip(lines, values, strict=True) if value is None]
+    if others:
+        path = _squares([places[line.name] for line in others], side)
+        names, told = "|".join(line.name for line in others), "|".join(_told(line, metric) for line in others)
+        marks.append(Marks(None, path, names, told))
+    return marks
+
+
+def draw(lines: Sequence[Line], chosen: Sequence[Line], metric: Metric, scale: Scale) -> Drawing:
+    """The map of ``lines``, of which the ``chosen`` ones stand out; the tower, at the origin, is always on it."""
     east = np.array([line.east_m for line in lines] + [0.0])
     north = np.array([line.north_m for line in lines] + [0.0])
     spans = max(float(np.ptp(east)), 1.0), max(float(np.ptp(north)), 1.0)
@@ -177,23 +142,22 @@ def draw(lines: Sequence[Line], metric: Metric, scale: Scale) -> Drawing:
     width, height = (max(span * per_metre, 200.0) + 2 * _MARGIN for span in spans)
     x = width / 2 + (east - (east.max() + east.min()) / 2) * per_metre
     y = height / 2 - (north - (north.max() + north.min()) / 2) * per_metre
-    values = [metric.value(line) for line in lines]
-    colours = scale.names([math.nan if value is None else value for value in values])
-    dots = [
-        Dot(line, float(x[i]), float(y[i]), _told(line, metric), None if value is None else colour)
-        for i, (line, value, colour) in enumerate(zip(lines, values, colours, strict=True))
-    ]
-    bar_m = _round_length(width / 4 / per_metre)
-    radius = min(max(0.35 * math.sqrt(width * height / max(len(lines), 1)), 3.0), 12.0)
-    tower = float(x[-1]), float(y[-1])
-    return Drawing(width, height, radius, dots, tower, bar_m, bar_m * per_metre, len(lines) <= 60)
-
-
-def _worst_first(lines: Sequence[Line], metric: Metric) -> list[Line]:
-    """Those without a value last, each group by name."""
-    sign = 1.0 if metric.name == "accuracy" else -1.0
-    valued = [(sign * value, line.name, line) for line in lines if (value := metric.value(line)) is not None]
-    return [line for *_, line in sorted(valued)] + [line for line in lines if metric.value(line) is None]
+    side = min(max(0.6 * math.sqrt(width * height / max(len(lines), 1)), 2.5), 22.0)
+    places = dict(zip([line.name for line in lines], zip(x.tolist(), y.tolist(), strict=True), strict=False))
+    doubted = [places[line.name] for line in chosen if line.surface is not None and line.surface.doubts]
+    names = {line.name for line in chosen} if len(chosen) < len(lines) else places.keys()
+    left_out = [place for name, place in places.items() if name not in names]
+    return Drawing(
+        width,
+        height,
+        side,
+        _marks(chosen, places, metric, scale, side),
+        _squares(doubted, side + min(side, 6.0)),
+        _squares(left_out, side),
+        (float(x[-1]), float(y[-1])),
+        per_metre,
+        _round_length(width / 4 / per_metre),
+    )
 
 
 def _totals(session: Session) -> dict[str, Any]:
@@ -206,37 +170,53 @@ def _totals(session: Session) -> dict[str, Any]:
     }
 
 
+def _counts(lines: Sequence[Line]) -> dict[str, int]:
+    """Of all heliostats, for the tiles."""
+    surfaces = [line.surface for line in lines if line.surface is not None]
+    doubted = [surface for surface in surfaces if surface.doubts]
+    return {
+        "surfaces": len(surfaces),
+        "photographs": sum(line.photographs for line in lines),
+        "refused": sum(line.refused for line in lines),
+        "doubted": len(doubted),
+        "unseen": sum(not surface.seen_by for surface in doubted),
+        "judged": sum(line.rank is not None and line.rank.photographs > 0 for line in lines),
+    }
+
+
 @router.get("/", dependencies=[DRAWS])
 def get_field(
-    request: Request,
-    runtime: RuntimeDep,
-    book: FieldBookDep,
-    metric: Annotated[MetricName, Query()] = "accuracy",
-    whole: Annotated[bool, Query()] = False,
+    request: Request, runtime: RuntimeDep, book: FieldBookDep, view: Annotated[FieldView, Query()]
 ) -> HTMLResponse:
-    """The field map and its table, or the ``whole`` table of a large field."""
-    chosen = METRICS[metric]
+    """The field map, on which what is looked for stands out, and its table, page by page."""
     with runtime.database.reading() as session:
-        lines, pending = book.read(session)
-        totals = _totals(session)
-    values = [value for line in lines if (value := chosen.value(line)) is not None]
-    # A large field takes its time and its page is long: it is asked for again the less often the more is left.
-    again_ms = min(max(1500, 30 * pending), 15_000)
+        now, totals = book.read(session), _totals(session)
+    lines, chosen = now.lines, METRICS[view.metric]
+    found = find(lines, view)
+    last = max(math.ceil(len(found) / _LISTED), 1)
+    begin = (min(view.page, last) - 1) * _LISTED
     scale = scale_for(chosen, runtime.settings)
     return render(
         request,
         "field.html",
         **totals,
         lines=lines,
-        listed=_worst_first(lines, chosen)[: None if whole else _LISTED],
-        whole=whole,
+        counts=_counts(lines),
+        found=len(found),
+        listed=found[begin : begin + _LISTED],
+        begin=begin,
+        page=min(view.page, last),
+        last=last,
+        view=view,
+        conditions=CONDITIONS,
         metrics=METRICS,
         metric=chosen,
-        values=values,
         scale=scale,
-        fine=runtime.settings.map_scales[metric][0],
-        poor=runtime.settings.map_scales[metric][1],
-        drawing=draw(lines, chosen, scale) if lines else None,
-        pending=pending,
-        again_ms=again_ms,
+        fine=runtime.settings.map_scales[view.metric][0],
+        poor=runtime.settings.map_scales[view.metric][1],
+        drawing=draw(lines, found, chosen, scale) if lines else None,
+        pending=now.pending,
+        is_behind=now.is_behind,
+        # A large field takes its time and its page is long: it is asked for again the less often the more is left.
+        again_ms=min(max(1500, 30 * now.pending), 15_000) if now.pending or now.is_behind else None,
     )

@@ -22,7 +22,8 @@ from service.drawing import charts
 from service.drawing.charts import HeatMap, History, Scale
 from service.drawing.pictures import mirror_heights
 from service.store import decisions, mounts
-from service.store.tables import DecisionRow, HeliostatRow, MeasurementRow, MountRow, SurfaceRow
+from service.store.measurements import PhotographVerdict, Shot, list_shots
+from service.store.tables import DecisionRow, HeliostatRow, MountRow, SurfaceRow
 from service.twin.accuracy import RECENT, Compared, Comparison, ComparisonBook, rank_of
 from service.twin.field import Figures, Line, figures_of, read_lines
 from service.web.answers.pages import render
@@ -66,11 +67,6 @@ def _newest_surfaces(session: Session, heliostat: HeliostatRow) -> list[SurfaceR
     return list(session.scalars(query.order_by(SurfaceRow.version.desc()).limit(_MOST_SURFACES)))
 
 
-def _newest_photographs(session: Session, heliostat: HeliostatRow) -> Sequence[MeasurementRow]:
-    query = select(MeasurementRow).where(MeasurementRow.heliostat_id == heliostat.id)
-    return session.scalars(query.order_by(MeasurementRow.id.desc()).limit(_MOST_PHOTOGRAPHS)).all()
-
-
 def _rms_mm(heights: NDArray[Any]) -> float:
     return float(np.sqrt(np.mean(heights**2)) * 1e3)
 
@@ -106,8 +102,8 @@ class ComparisonFigures:
     difference: Scale
 
 
-def _comparison_figures(comparisons: Sequence[Comparison]) -> ComparisonFigures:
-    """In shares of each photograph's measured peak, as in the report of a study."""
+def comparison_figures(comparisons: Sequence[Comparison]) -> ComparisonFigures:
+    """Pictures in shares of each photograph's measured peak, as in the report of a study."""
     pairs = [(c.measured / c.measured.max(), c.forecast / c.measured.max()) for c in comparisons]
     top = max((float(image.max()) for pair in pairs for image in pair), default=1.0)
     bound = max((float(np.abs(forecast - measured).max()) for measured, forecast in pairs), default=0.0)
@@ -173,7 +169,8 @@ class _Read:
     surface: SurfaceRow | None
     surfaces: list[SurfaceRow]
     decided: Sequence[DecisionRow]
-    photographs: Sequence[MeasurementRow]
+    shots: list[Shot]
+    verdict: PhotographVerdict | None
     mount: MountRow | None
     line: Line
     compared: Compared
@@ -185,6 +182,7 @@ def _read(
     book: ComparisonBookDep,
     field: FieldBookDep,
     version: Annotated[Version | None, Query()] = None,
+    photographs: Annotated[PhotographVerdict | None, Query()] = None,
 ) -> _Read:
     """A heliostat with its current surface, or an earlier ``version``; waits for what is compared elsewhere."""
     with runtime.database.reading() as session:
@@ -193,11 +191,13 @@ def _read(
         surface = today if version is None else store.get_surface(session, row, version)
         surfaces = _newest_surfaces(session, row)
         decided = decisions.list_decisions(session, row, _MOST_DECISIONS)
-        photographs, mount = _newest_photographs(session, row), mounts.find_mount_at(session, row)
+        shots = list_shots(session, row, _MOST_PHOTOGRAPHS, photographs)
+        mount = mounts.find_mount_at(session, row)
         shown, (line,) = book.read(session, row, surface), read_lines(session, row.id)
     # The rest of the page does not depend on them.
     compared = Compared() if shown is None else book.wait_for(shown) or _UNDER_WAY
-    return _Read(row, today, surface, surfaces, decided, photographs, mount, field.with_pointing(line), compared)
+    line = field.with_pointing(line)
+    return _Read(row, today, surface, surfaces, decided, shots, photographs, mount, line, compared)
 
 
 @router.get("/heliostats/{name}")
@@ -214,10 +214,11 @@ def get_heliostat_page(request: Request, read: Annotated[_Read, Depends(_read)],
         versions=listed,
         decided=read.decided,
         histories=_histories(listed) if listed else [],
-        comparisons=_comparison_figures(comparisons),
+        comparisons=comparison_figures(comparisons),
         trouble=read.compared.trouble,
         recent=RECENT,
-        photographs=read.photographs,
+        shots=read.shots,
+        verdict=read.verdict,
         rank=rank_of(comparisons),
         accuracy_seen=fmean(seen) if (seen := [c.accuracy for c in comparisons if c.was_used]) else None,
         mount=read.mount,

@@ -8,7 +8,6 @@ from fastapi.testclient import TestClient
 
 from service.twin import field
 from service.twin.book import Book
-from service.twin.field import FieldBook, Figures
 from tests.service.conftest import FakeOperations, Post, png
 
 
@@ -44,18 +43,10 @@ def test_what_fails_has_an_answer_too_and_the_rest_is_done():
     assert book.wait_for(4, 30) is None
 
 
-def test_the_figures_of_two_requests_at_a_time_do_not_take_each_other_away(client: TestClient):
-    book = FieldBook(client.app.state.runtime)  # type: ignore[attr-defined]
-    book._figures = {1: Figures(1.0, None)}
-
-    class Meanwhile:
-        """A session in whose query another request, of a field without surface 1, ends."""
-
-        def execute(self, _query: object) -> list[Any]:
-            book._figures = {}
-            return []
-
-    assert book._figures_of(Meanwhile(), [1, 2]) == {1: Figures(1.0, None)}  # type: ignore[arg-type]
+def test_who_waits_a_while_has_what_is_quick():
+    book: Book[int, int] = Book(lambda key: 2 * key, 0, "test", 10)
+    assert book.look_up([1, 2, 3], 30) == ({1: 2, 2: 4, 3: 6}, 0)
+    book.close()
 
 
 def test_the_field_reads_one_version_of_each_heliostat(client: TestClient, post: Post, monkeypatch: pytest.MonkeyPatch):

@@ -118,7 +118,7 @@ def all_routes() -> list[tuple[str, str]]:
 
 
 def ask(client: TestClient, method: str, path: str, headers: dict[str, str]) -> Any:
-    filled = path.format(name="AA39", measurement="1", number="999", version="999")
+    filled = path.format(name="AA39", measurement="1", number="999", version="999", view="crop")
     body = {"content": b"{}"} if method in ("POST", "PUT") else {}
     return client.request(method, filled, headers={"Content-Type": "application/json", **headers}, **body)
 

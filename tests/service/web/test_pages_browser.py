@@ -4,6 +4,7 @@ Needs Chromium, `HELIOTWIN_TEST_CHROMIUM` or one on the path, and its driver fro
 """
 
 import os
+import re
 import shutil
 import threading
 from collections.abc import Iterator
@@ -153,15 +154,16 @@ def follow(page: Any, selector: str) -> None:
 def test_operator_looks_at_the_field_and_at_a_heliostat(page: Any):
     page.goto("/")
     expect(page.locator("#map-title")).to_have_text("Forecast accuracy")
-    expect(page.locator('[data-map] a[aria-label^="AA39: 100.0"]')).to_be_attached()
+    expect(page.locator('[data-map] [data-told^="100.0"]')).to_be_attached()
     page.select_option("#metric", "deviation")
     expect(page.locator("#map-title")).to_have_text("Deviation from ideal")
     assert page.url.endswith("/?metric=deviation")
     # By keyboard: one tab stop for the map, arrows to the neighbour, Enter to its page.
-    expect(page.locator('[data-map] a[tabindex="0"]')).to_have_count(1)
-    page.locator('[data-map] a[aria-label^="AA39"]').focus()
+    link = page.locator('[data-map] a[tabindex="0"]')
+    expect(link).to_have_count(1)
+    link.focus()
     page.keyboard.press("ArrowUp")
-    assert page.evaluate("document.activeElement.getAttribute('aria-label')") == "AB01: not known"
+    assert link.get_attribute("aria-label") == "AB01: not known"
     page.keyboard.press("ArrowDown")
     with page.expect_navigation():
         page.keyboard.press("Enter")
@@ -171,6 +173,38 @@ def test_operator_looks_at_the_field_and_at_a_heliostat(page: Any):
     page.keyboard.press("ArrowRight")
     assert page.locator("canvas").screenshot() != before
     assert float(page.locator("[data-exaggeration]").inner_text()) > 1
+
+
+def test_operator_finds_and_zooms(page: Any):
+    page.goto("/")
+    field = page.locator("[data-map]")
+    whole = field.get_attribute("viewBox")
+    expect(field.locator("text.name")).to_have_text(["AA39", "AB01"])
+    page.click("[data-zoom=in]")
+    seen = field.get_attribute("viewBox")
+    assert seen != whole
+    # What is looked for stands out; where the map was looked at stays, also behind the address.
+    page.select_option("#show", "no_surface")
+    expect(page.locator("tbody th[scope=row]")).to_have_text(["AB01"])
+    expect(page).to_have_url(re.compile(r"/\?metric=accuracy&show=no_surface#map="))
+    assert field.get_attribute("viewBox") == seen
+    address = page.url
+    page.goto("about:blank")
+    page.goto(address)
+    assert field.get_attribute("viewBox") == seen
+    page.click("[data-zoom=whole]")
+    assert field.get_attribute("viewBox") == whole
+    page.fill("#search", "aa")
+    page.keyboard.press("Enter")
+    expect(page.locator("text=No heliostat is like that.")).to_be_visible()
+    follow(page, "#find a.button")
+    assert page.url.endswith("/")
+    # A press on a mirror leads to its page.
+    field.scroll_into_view_if_needed()
+    box = page.locator("path.mirrors").first.bounding_box()
+    with page.expect_navigation():
+        page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    expect(page.locator("h1")).to_contain_text("Heliostat A")
 
 
 def test_operator_asks_for_a_forecast(page: Any):

@@ -1,0 +1,93 @@
+"""PAINT's documents as they are written: what `service.sources.documents` reads, and STAC items beside them."""
+
+from collections.abc import Iterable, Mapping
+from datetime import datetime
+from typing import Any
+
+import numpy as np
+
+from model.plant import Cylinder, Plant, TargetPlane
+from service.sources.photograph import Photograph
+
+STAC_VERSION = "1.0.0"
+
+
+def tower_json(plant: Plant, corners: Mapping[str, dict[str, Any] | None]) -> dict[str, Any]:
+    """``tower-measurements.json`` of a plant; ``corners`` are WGS84 corners of targets that are known as they came."""
+    return {
+        "power_plant_properties": {"ID": plant.name, "coordinates": plant.origin.tolist()},
+        **{name: _target_json(plane, plant, corners.get(name)) for name, plane in plant.targets.items()},
+        **{name: _receiver_json(cylinder, plant) for name, cylinder in plant.receivers.items()},
+    }
+
+
+def _target_json(plane: TargetPlane, plant: Plant, corners: dict[str, Any] | None) -> dict[str, Any]:
+    right, up = plane.right * plane.width / 2, plane.up * plane.height / 2
+    made = {"upper_left": up - right, "upper_right": up + right, "lower_left": -up - right, "lower_right": right - up}
+    places = corners or {name: plant.to_wgs84(plane.center + offset).tolist() for name, offset in made.items()}
+    center = plant.to_wgs84(plane.center).tolist()
+    return {"type": "planar", "normal_vector": plane.normal.tolist(), "coordinates": {"center": center, **places}}
+
+
+def _receiver_json(cylinder: Cylinder, plant: Plant) -> dict[str, Any]:
+    half, places = np.radians(cylinder.opening_deg) / 2, {}
+    for side, angle in (("left", -half), ("right", half)):
+        normal = np.cos(angle) * cylinder.normal + np.sin(angle) * cylinder.right
+        edge = cylinder.center + cylinder.radius * (normal - cylinder.normal)
+        for level, sign in (("lower", -1), ("upper", 1)):
+            corner = edge + sign * cylinder.up * cylinder.height / 2
+            places[f"receiver_inner_{level}_{side}"] = plant.to_wgs84(corner).tolist()
+    return {
+        "type": "convex_cylinder",
+        "normal_vector": cylinder.normal.tolist(),
+        "radius": cylinder.radius,
+        "opening_angle": cylinder.opening_deg,
+        "coordinates": {"center": plant.to_wgs84(cylinder.center).tolist(), **places},
+    }
+
+
+def measurement_json(photograph: Photograph) -> dict[str, Any]:
+    """``calibration-properties.json`` of a photograph."""
+    document: dict[str, Any] = {
+        "target_name": photograph.target_name,
+        "sun_azimuth": photograph.sun_azimuth_deg,
+        "sun_elevation": photograph.sun_elevation_deg,
+    }
+    if photograph.motor_position is not None:
+        motors = zip((1, 2), photograph.motor_position, strict=True)
+        document["motor_position"] = {f"axis_{axis}_motor_position": position for axis, position in motors}
+    if photograph.focal_spot_wgs84 is not None:
+        document["focal_spot"] = {"UTIS": list(photograph.focal_spot_wgs84)}
+    return document
+
+
+def stac_item(
+    identifier: str, moment: datetime, wgs84: Iterable[float], assets: Mapping[str, tuple[str, str]], **more: Any
+) -> dict[str, Any]:
+    """A STAC item at a place, latitude [deg], longitude [deg], altitude [m].
+
+    ``assets`` are names with files beside the item and their media types, ``more`` its properties.
+    """
+    latitude, longitude, altitude = wgs84
+    return {
+        "type": "Feature",
+        "stac_version": STAC_VERSION,
+        "id": identifier,
+        "geometry": {"type": "Point", "coordinates": [longitude, latitude, altitude]},
+        "bbox": [longitude, latitude, altitude, longitude, latitude, altitude],
+        "properties": {"datetime": moment.isoformat().replace("+00:00", "Z"), **more},
+        "links": [],
+        "assets": {name: {"href": f"./{file}", "type": kind} for name, (file, kind) in assets.items()},
+    }
+
+
+def stac_catalog(name: str, items: Iterable[str]) -> dict[str, Any]:
+    """A STAC catalogue of items by their paths below it."""
+    links = [{"rel": "item", "href": f"./{path}", "type": "application/geo+json"} for path in items]
+    return {
+        "type": "Catalog",
+        "stac_version": STAC_VERSION,
+        "id": name,
+        "description": f"Heliostats of {name}: photographs, properties and surfaces, as heliotwin keeps them.",
+        "links": [{"rel": "root", "href": "./catalog.json", "type": "application/json"}, *links],
+    }

@@ -1,0 +1,176 @@
+"""The store as a measurement folder in PAINT's layout: ``heliotwin export DIR``; what `importing` reads is there."""
+
+import io
+import json
+from collections import Counter
+from collections.abc import Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from sqlalchemy import select
+
+from model.errors import InvalidInputError
+from model.plant import Plant
+from model.surface import DEGREE
+from service import store
+from service.base.arrays import unpack
+from service.base.faults import StoreDamagedError
+from service.base.progress import Progress, quiet
+from service.sources.decode import decode_image
+from service.sources.paint_documents import measurement_json, stac_catalog, stac_item, tower_json
+from service.sources.photograph import Photograph
+from service.store.corrections import EXCLUDED
+from service.store.models import declared_of, find_current
+from service.store.plant import receiver_cylinder
+from service.store.tables import HeliostatRow, MeasurementRow, SurfaceRow
+from service.twin.accuracy import name_of
+from service.twin.correcting import Changes
+from service.twin.runtime import Runtime
+
+PNG = "image/png"
+
+
+class _Writer:
+    """Files under a folder, counted; what is left out stands in ``skipped`` with its reason."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.counts, self.skipped, self.items = Counter[str](), dict[str, str](), list[str]()
+
+    def bytes(self, path: str, content: bytes, what: str) -> None:
+        place = self.root / path
+        place.parent.mkdir(parents=True, exist_ok=True)
+        place.write_bytes(content)
+        self.counts[what] += 1
+
+    def json(self, path: str, document: Any, what: str) -> None:
+        self.bytes(path, json.dumps(document, indent=1).encode(), what)
+
+    def item(self, path: str, identifier: str, moment: datetime, *about: Any, **more: Any) -> None:
+        self.json(path, stac_item(identifier, moment, *about, **more), "STAC items")
+        self.items.append(path)
+
+
+def export_folder(runtime: Runtime, root: Path, progress: Progress = quiet) -> dict[str, Any]:
+    """Write plant, heliostats, photographs and surfaces into a new folder; how many of each, and what is left out.
+
+    Excluded photographs are left out, for whoever reads the folder would use them. Surfaces that were predicted lie
+    apart, under ``surfaces``: in the place of measured ones they would be taken for such.
+
+    Raises
+    ------
+    InvalidInputError
+        Where the folder holds something.
+    """
+    if root.exists() and (not root.is_dir() or any(root.iterdir())):
+        raise InvalidInputError(f"{root}: is there already, and not empty; name a new folder")
+    writer = _Writer(root)
+    plant, names = _write_plant(runtime, writer)
+    for name in names:
+        progress(name)
+        _write_heliostat(runtime, writer, plant, name)
+    writer.json("catalog.json", stac_catalog(plant.name, writer.items), "catalogues")
+    return {"counts": dict(sorted(writer.counts.items())), "skipped": writer.skipped}
+
+
+def _write_plant(runtime: Runtime, writer: _Writer) -> tuple[Plant, Sequence[str]]:
+    with runtime.database.reading() as session:
+        row, targets, receivers = store.get_plant(session), store.list_targets(session), store.list_receivers(session)
+        version = find_current(session)
+        declared = declared_of(session, version) or {}
+        names = session.scalars(select(HeliostatRow.name).order_by(HeliostatRow.name)).all()
+    if version is not None and version.effects:  # what was adopted is believed, too
+        declared = declared | {"effects": [*declared.get("effects", []), *version.effects]}
+    planes = {target.name: store.target_plane(target) for target in targets}
+    cylinders = {receiver.name: receiver_cylinder(receiver) for receiver in receivers}
+    plant = Plant(row.name, np.array(row.origin), planes, {}, cylinders)
+    tower = tower_json(plant, {target.name: target.corners for target in targets})
+    writer.json(f"{row.name}-tower-measurements.json", tower, "plants")
+    if declared:
+        writer.json("twin.json", {"declared": declared}, "declared models")
+    return plant, names
+
+
+def _write_heliostat(runtime: Runtime, writer: _Writer, plant: Plant, name: str) -> None:
+    with runtime.database.reading() as session:
+        row = store.get_heliostat(session, name)
+        rows = store.list_measurements(session, row, None)
+        measured, today = store.find_measured_surface(session, row), store.find_surface_at(session, row)
+    place, file = plant.to_wgs84([row.east_m, row.north_m, row.up_m]).tolist(), f"{name}-heliostat-properties"
+    writer.json(f"{name}/Properties/{file}.json", row.properties, "heliostats")
+    assets = {"properties": (f"{file}.json", "application/json")}
+    writer.item(f"{name}/Properties/{file}-item-stac.json", file, row.updated_at, place, assets)
+    if measured is not None:
+        _write_surface(writer, f"{name}/Deflectometry", row, measured, place)
+    if today is not None and today.source != "measured":
+        _write_surface(writer, f"surfaces/{name}/Deflectometry", row, today, place)
+    for identifier, images in _photographs(writer, name, rows).items():
+        _write_photograph(runtime, writer, f"{name}/Calibration/{identifier}", identifier, images, place)
+
+
+def _write_surface(writer: _Writer, folder: str, row: HeliostatRow, surface: SurfaceRow, place: list[float]) -> None:
+    file, buffer = f"{row.name}-nurbs-surface.npz", io.BytesIO()
+    np.savez_compressed(buffer, degrees=np.array([DEGREE, DEGREE]), **unpack(surface.arrays))  # type: ignore[arg-type]
+    writer.bytes(f"{folder}/{file}", buffer.getvalue(), "surfaces")
+    about = {"heliotwin:source": surface.source, "heliotwin:version": surface.version}
+    identifier, assets = f"{row.name}-surface-{surface.version}", {"surface": (file, "application/x-npz")}
+    path = f"{folder}/{row.name}-surface-item-stac.json"
+    writer.item(path, identifier, surface.valid_from, place, assets, **about)
+
+
+def _photographs(
+    writer: _Writer, heliostat: str, rows: Sequence[MeasurementRow]
+) -> dict[str, list[tuple[MeasurementRow, Photograph]]]:
+    """Images by the number under which they are written: those of which something else is known have their own."""
+    found: dict[str, list[tuple[MeasurementRow, Photograph]]] = {}
+    for row in rows:
+        if row.reason == EXCLUDED:
+            writer.skipped[f"{heliostat}/{row.identifier}"] = "excluded"
+            continue
+        photograph, name = Changes("").of(row), name_of(row)
+        fits = name not in found or _known(found[name][0][1]) == _known(photograph)
+        found.setdefault(name if fits else row.identifier, []).append((row, photograph))
+    return found
+
+
+def _known(photograph: Photograph) -> tuple[Any, datetime | None]:
+    return measurement_json(photograph), photograph.taken_at
+
+
+def _write_photograph(
+    runtime: Runtime,
+    writer: _Writer,
+    path: str,
+    identifier: str,
+    images: list[tuple[MeasurementRow, Photograph]],
+    place: list[float],
+) -> None:
+    document, taken_at = _known(images[0][1])
+    writer.json(f"{path}-calibration-properties.json", document, "measurements")
+    assets = {"calibration-properties": (f"{identifier}-calibration-properties.json", "application/json")}
+    for row, _ in images:
+        if row.image.pruned_at is not None:
+            writer.skipped[f"{path} {row.kind}"] = f"image kept until {row.image.pruned_at:%Y-%m-%d}"
+            continue
+        try:
+            data = runtime.images.read(row.image_sha256)
+        except StoreDamagedError as error:
+            writer.skipped[f"{path} {row.kind}"] = str(error)
+            continue
+        writer.bytes(f"{path}-{row.kind}.png", _png(data, row.image.media_type), "images")
+        assets[row.kind] = (f"{identifier}-{row.kind}.png", PNG)
+    if taken_at is None:
+        writer.counts["measurements of unknown time, without an item"] += 1
+    else:
+        writer.item(f"{path}-calibration-item-stac.json", identifier, taken_at, place, assets)
+
+
+def _png(data: bytes, media_type: str) -> bytes:
+    """An image file as PNG, pixel by pixel the same."""
+    if media_type == PNG:
+        return data
+    pixels = decode_image(data)
+    return cv2.imencode(".png", pixels if pixels.ndim == 2 else pixels[..., ::-1])[1].tobytes()

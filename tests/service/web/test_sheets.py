@@ -1,0 +1,100 @@
+"""Tables as CSV and figures as files, by links beside them."""
+
+import csv
+import io
+import re
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+import pytest
+from fastapi.testclient import TestClient
+
+from service.web.answers.sheets import cell
+from tests.service.conftest import Post, png
+from tests.service.web.test_pages import HTML, fill, settled, text_of
+
+
+@pytest.mark.parametrize("text", ["=1+1", "+1", "-1", "@SUM(A1)", "\t=1", "\r=1", '=HYPERLINK("http://x")'])
+def test_text_is_never_a_formula(text: str):
+    assert cell(text) == f"'{text}"
+
+
+def test_numbers_stay_numbers():
+    moment = datetime(2026, 6, 21, tzinfo=UTC)
+    values: list[Any] = [-1.5, 0, None, True, "a=b", moment]
+    assert [cell(value) for value in values] == [-1.5, 0, "", "yes", "a=b", "2026-06-21T00:00:00+00:00"]
+
+
+def sheet(client: TestClient, path: str) -> list[dict[str, str]]:
+    answer = client.get(path)
+    assert answer.status_code == 200, answer.text
+    assert answer.headers["Content-Type"] == "text/csv; charset=utf-8"
+    assert answer.headers["Content-Disposition"].startswith("attachment; filename=")
+    return list(csv.DictReader(io.StringIO(answer.text, newline="")))
+
+
+@pytest.fixture
+def pages(client: TestClient) -> TestClient:
+    fill(client)
+    return client
+
+
+def test_field_as_a_table(pages: TestClient):
+    page = settled(pages)
+    link = re.search(r'href="(/field\.csv[^"]*)"', page)
+    assert link is not None
+    (row,) = sheet(pages, link[1])
+    assert (row["name"], row["accuracy [%]"], row["photographs"], row["refused"]) == ("AA39", "100.0", "3", "1")
+    assert float(row["deviation [mm]"]) > 0
+    assert sheet(pages, "/field.csv?search=nobody") == []
+    narrow = settled(pages, "/?show=surface&metric=age")
+    assert 'href="/field.csv?show=surface&amp;metric=age"' in narrow
+
+
+def test_photographs_as_a_table(pages: TestClient, post: Post):
+    post(png(9), id="104", motor_position=[1.0, 2.5])
+    page = text_of(pages, "/heliostats/AA39")
+    assert 'href="/heliostats/AA39/photographs.csv"' in page
+    rows = sheet(pages, "/heliostats/AA39/photographs.csv")
+    assert [row["photograph"] for row in rows] == ["101", "102", "103", "104"]
+    assert (rows[1]["sun_azimuth [deg]"], rows[2]["reason"], rows[3]["motor_2 [steps]"]) == ("-30.0", "no_spot", "2.5")
+    assert pages.get("/heliostats/none/photographs.csv").status_code == 404
+
+
+def test_surfaces_as_a_table(pages: TestClient):
+    assert 'href="/heliostats/AA39/surfaces.csv"' in text_of(pages, "/heliostats/AA39")
+    rows = sheet(pages, "/heliostats/AA39/surfaces.csv")
+    assert [(row["version"], row["source"], row["is_todays"]) for row in rows] == [
+        ("1", "network", "no"),
+        ("2", "refined", "yes"),
+    ]
+    assert rows[0]["photographs"] == "101"
+
+
+def test_sender_who_writes_a_formula_does_no_harm(client: TestClient, post: Post):
+    post(png(1), id="1")
+    client.patch("/v1/heliostats/AA39/measurements/1", json={"excluded": True, "reason": "=1+1"})
+    client.headers.update(HTML)
+    assert not re.search(r"(^|,)\"?[=+@]", client.get("/heliostats/AA39/photographs.csv").text, re.MULTILINE)
+
+
+@pytest.mark.parametrize(
+    ("page", "path"),
+    [
+        ("/heliostats/AA39", "/v1/heliostats/AA39/surfaces/2"),
+        ("/heliostats/AA39", "/v1/heliostats/AA39/measurements/102/flux"),
+        ("/heliostats/AA39/photographs/101", "/v1/heliostats/AA39/measurements/101/flux"),
+        ("/forecasts/1", "/v1/forecasts/1"),
+    ],
+)
+def test_figure_has_its_files_beside_it(pages: TestClient, page: str, path: str):
+    shown = text_of(pages, page)
+    for suffix, kind in (("npz", "application/x-npz"), ("png", "image/png")):
+        assert f'href="{path}?format={suffix}"' in shown
+        answer = pages.get(f"{path}?format={suffix}")
+        assert answer.headers["Content-Type"] == kind
+        assert f'.{suffix}"' in answer.headers["Content-Disposition"]
+    assert np.load(io.BytesIO(pages.get(f"{path}?format=npz").content)).files
+    assert pages.get(f"{path}?format=json").headers["Content-Type"] == "application/json"
+    assert pages.get(f"{path}?format=xls").status_code == 422
