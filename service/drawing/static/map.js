@@ -1,4 +1,5 @@
-// The field map by keyboard: one tab stop for the whole map, arrow keys from heliostat to heliostat.
+// The field map by keyboard: one tab stop for the whole map, arrow keys from heliostat to heliostat. A tap beside a
+// heliostat means it, for fingers are wider than circles.
 "use strict";
 (() => {
   const directions = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
@@ -31,6 +32,14 @@
     event.preventDefault();
     const next = nearest(link, directions[event.key]);
     if (next) { stopAt(next); next.focus(); }
+  });
+  document.addEventListener("click", (event) => {
+    const map = event.target.closest("[data-map]"), all = links();
+    if (!map || event.target.closest("a") || !all.length) return;
+    const drawn = map.getScreenCTM(), at = new DOMPoint(event.clientX, event.clientY).matrixTransform(drawn.inverse());
+    const far = (link) => { const [x, y] = place(link); return Math.hypot(x - at.x, y - at.y) * drawn.a; };
+    const best = all.reduce((one, other) => (far(other) < far(one) ? other : one));
+    if (far(best) <= 20) location.assign(best.href.baseVal);
   });
   document.addEventListener("htmx:afterSettle", begin);
   begin();
