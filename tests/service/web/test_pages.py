@@ -90,6 +90,8 @@ PATHS = (
     "/jobs/1",
     "/studies",
     "/studies/1",
+    "/compare",
+    "/compare?heliostat=AA39",
     "/plant",
     "/plant/settings",
     "/plant/keys",

@@ -61,6 +61,7 @@ PATHS = (
     "/studies",
     "/jobs",
     "/jobs/1",
+    "/compare?heliostat=AA39&version=1&other_version=1",
     "/plant",
     "/plant/settings",
     "/plant/keys",
