@@ -2,7 +2,7 @@
 
 import base64
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import Any
 
@@ -79,6 +79,8 @@ class HeatMap:
     width, height : float [m]
         Of the rectangle; its middle is the origin.
     scale : Scale
+    outline : str
+        What is outlined on it, as a data URL; empty where nothing is.
     """
 
     title: str
@@ -86,6 +88,7 @@ class HeatMap:
     width: float
     height: float
     scale: Scale
+    outline: str = ""
 
     @property
     def x_ticks(self) -> tuple[Tick, ...]:
@@ -122,6 +125,17 @@ def difference_scale(bound: float, unit: str) -> Scale:
 def flux_map(title: str, flux: Array, size: tuple[float, float], unit: str, top: float | None = None) -> HeatMap:
     """A flux map, dark where there is none; ``top`` ends its scale, else its own peak."""
     return heat_map(title, flux, size, flux_scale(float(flux.max()) if top is None else top, unit))
+
+
+def outlined(drawn: HeatMap, mask: NDArray[np.bool_]) -> HeatMap:
+    """A map with the edge of what is in ``mask`` (rows, columns) drawn on it, where anything is."""
+    if not mask.any():
+        return drawn
+    fine = np.kron(mask, np.ones((8, 8), dtype=bool)).astype(np.uint8)
+    edge = (fine - cv2.erode(fine, np.ones((5, 5), np.uint8), borderValue=0)).astype(bool)
+    pixels = np.zeros((*fine.shape, 4), np.uint8)
+    pixels[edge] = 0, 255, 255, 255
+    return replace(drawn, outline=_data_url(pixels))
 
 
 def difference_map(title: str, difference: Array, size: tuple[float, float], unit: str) -> HeatMap:

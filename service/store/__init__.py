@@ -45,6 +45,7 @@ from service.store.results import (
     list_studies,
     recent_field_forecasts,
     recent_forecasts,
+    recent_plans,
 )
 from service.store.rows import Change, insert, one_at_a_time
 from service.store.surfaces import (
@@ -109,6 +110,7 @@ __all__ = [
     "recent_field_forecasts",
     "recent_forecasts",
     "recent_measurements",
+    "recent_plans",
     "remove_heliostat",
     "remove_receiver",
     "remove_target",

@@ -91,6 +91,7 @@ PATHS = (
     "/studies",
     "/studies/1",
     "/compare",
+    "/plans",
     "/compare?heliostat=AA39",
     "/plant",
     "/plant/settings",

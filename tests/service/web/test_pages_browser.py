@@ -62,6 +62,7 @@ PATHS = (
     "/jobs",
     "/jobs/1",
     "/compare?heliostat=AA39&version=1&other_version=1",
+    "/plans",
     "/plant",
     "/plant/settings",
     "/plant/keys",
@@ -331,6 +332,31 @@ def test_legend_stands_below_the_map(page: Any):
     page.goto("/?metric=deviation")
     boxes = [page.locator(selector).bounding_box() for selector in ("svg.map", "svg.map + svg.scale")]
     assert boxes[0]["y"] + boxes[0]["height"] <= boxes[1]["y"]
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_operator_plans_a_day_and_compares_surfaces(page: Any, scheme: str):
+    page.emulate_media(color_scheme=scheme)
+    page.set_viewport_size(PHONE)
+    page.goto("/plans")
+    page.fill("[name=name]", f"by {scheme}")
+    page.fill("[name=begin]", "2026-06-21T08:00")
+    page.fill("[name=end]", "2026-06-21T12:00")
+    page.fill("[name=heliostats]", "AA39 0.5 -1")
+    page.fill("[name=allowed_kw_m2]", "0.001")
+    follow(page, "form.stack button")
+    expect(page.locator("#maps-title")).to_contain_text("On the receiver")  # without a reload
+    expect(page.locator(".timeline")).to_have_count(3)
+    expect(page.locator(".timeline .limit")).to_have_count(1)
+    found = axe.Axe().run(page, options=AXE).response["violations"]
+    assert not [entry["id"] for entry in found]
+    follow(page, "tbody a >> nth=1")
+    assert page.url.endswith("?at=1")
+    follow(page, f"text=by {scheme} >> nth=-1")
+    expect(page.locator("h1")).to_have_text(f"Plan by {scheme}")
+    page.goto("/compare?heliostat=AA39&version=1&other_version=1")
+    expect(page.locator("[role=status]")).to_have_count(0)
+    expect(page.locator("#compared .columns figure")).to_have_count(6)
 
 
 @pytest.fixture
