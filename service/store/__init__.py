@@ -50,6 +50,7 @@ from service.store.results import (
 from service.store.rows import Change, insert, one_at_a_time
 from service.store.surfaces import (
     NewSurface,
+    Outdated,
     Trust,
     add_surface,
     current_surfaces,
@@ -60,11 +61,13 @@ from service.store.surfaces import (
     get_surface_at,
     list_surfaces,
     newest_prediction,
+    outdated_surfaces,
 )
 
 __all__ = [
     "Change",
     "NewSurface",
+    "Outdated",
     "Trust",
     "add_forecast",
     "add_heliostat",
@@ -103,6 +106,7 @@ __all__ = [
     "list_targets",
     "newest_prediction",
     "one_at_a_time",
+    "outdated_surfaces",
     "put_heliostat",
     "put_plant",
     "put_receiver",

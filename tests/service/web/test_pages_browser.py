@@ -18,6 +18,7 @@ import pytest
 from fastapi import FastAPI
 from sqlalchemy import delete
 
+from service import store
 from service.base.settings import Settings
 from service.store import keys
 from service.store.job_tables import KeyRow
@@ -33,6 +34,7 @@ from tests.service.conftest import (
     serving,
     tower_document,
 )
+from tests.service.twin.test_versions import SLOPE, study_row
 
 playwright = pytest.importorskip("playwright.sync_api", reason="no browser driver: pip install playwright")
 axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="no axe: pip install axe-playwright-python")
@@ -59,6 +61,7 @@ PATHS = (
     "/forecast",
     "/forecasts/1",
     "/studies",
+    "/studies/1",
     "/jobs",
     "/jobs/1",
     "/compare?heliostat=AA39&version=1&other_version=1",
@@ -67,7 +70,6 @@ PATHS = (
     "/plant/settings",
     "/plant/keys",
     "/plant/audit",
-    "/login",
 )
 
 
@@ -107,6 +109,10 @@ def fill(app: FastAPI) -> None:
         sun = {"azimuth_deg": -20, "elevation_deg": 45}
         body = {"heliostat": "AA39", "target": "lower", "sun": sun}
         assert client.post("/v1/forecasts", json=body).status_code == 201
+        study = study_row(SLOPE)
+        study.html = "<p>heliotwin study</p><p>found</p>"
+        with app.state.runtime.database.writing() as session:
+            store.add_study(session, study)
 
 
 @pytest.fixture(scope="module")
@@ -252,7 +258,7 @@ def test_pages_fit_desk_and_phone(page: Any):
 def test_text_has_contrast(page: Any):
     """WCAG 2.2 AA: 4.5 for text; measured on what the browser computed."""
     script = (Path(__file__).parent / "contrast.js").read_text("utf-8")
-    for path, scheme in itertools.product(PATHS, SCHEMES):
+    for path, scheme in itertools.product((*PATHS, "/login"), SCHEMES):
         page.emulate_media(color_scheme=scheme)
         page.goto(path)
         assert page.evaluate(script) == [], (path, scheme)
@@ -267,7 +273,7 @@ AXE = {"runOnly": ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa"], "res
 def test_axe_finds_nothing(page: Any, scheme: str, size: dict[str, int]):
     page.set_viewport_size(size)
     page.emulate_media(color_scheme=scheme)
-    for path in PATHS:
+    for path in (*PATHS, "/login"):
         page.goto(path)
         found = axe.Axe().run(page, options=AXE).response["violations"]
         assert not [(entry["id"], [node["html"] for node in entry["nodes"]]) for entry in found], path
@@ -380,6 +386,12 @@ def test_who_has_no_key_logs_in_and_out(page: Any, key: str):
     page.keyboard.press("Enter")
     expect(page.locator("h1")).to_have_text("Heliostat AA39")
     assert page.locator("text=Predict its surface").count() == 0
+    # The report is a page of its own that runs nothing; its way back takes the key along.
+    page.goto("/studies/1")
+    follow(page, "text=Open the report")
+    expect(page.locator("text=found")).to_be_visible()
+    follow(page, "a[href='/studies/1']")
+    expect(page.locator("h1")).to_have_text("Study 1")
     follow(page, "text=Log out")
     assert page.url.endswith("/login")
     assert page.locator("[role=alert]").count() == 0
