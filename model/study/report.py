@@ -255,15 +255,15 @@ class Study:
                 f"; {self.unexplained_share:.0%} of the error beyond noise stays unexplained" if self.incomplete else ""
             )
             return (
-                f"The images demand {names}: accuracy on held-out images rises from {before:.3f} to {after:.3f}"
+                f"The images demand {names}: accuracy on held-out images rises from {before:.1%} to {after:.1%}"
                 f"{doubt}{rest}."
             )
         if self.verdict == "none":
             return (
-                f"The declared model explains the images: accuracy {before:.3f}, no effect improves it significantly."
+                f"The declared model explains the images: accuracy {before:.1%}, no effect improves it significantly."
             )
-        part = f"; {names} explains part of it ({after:.3f})" if names else ""
-        return f"Something is missing that no effect of the catalogue explains: accuracy {before:.3f}{part}."
+        part = f"; {names} explains part of it ({after:.1%})" if names else ""
+        return f"Something is missing that no effect of the catalogue explains: accuracy {before:.1%}{part}."
 
     def to_json(self) -> dict[str, Any]:
         """The report of DESIGN.md, section 7."""

@@ -3,8 +3,9 @@
 import ipaddress
 import math
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Self
+from typing import Any, Literal, Self
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 from pydantic import Field, SecretStr, field_validator, model_validator
@@ -62,6 +63,31 @@ def is_within(host: str, networks: Iterable[Network]) -> bool:
     return any(address in network for network in networks)
 
 
+@dataclass(frozen=True)
+class Shown:
+    """A setting in force, as people may see it; ``is_set`` where it does not come from the defaults."""
+
+    name: str
+    value: str
+    is_set: bool
+    about: str
+
+
+def _harmless(value: Any) -> str:
+    """A value as text; of a URL neither password nor query, which may hold secrets."""
+    if isinstance(value, str) and "://" in value:
+        url = make_url(value)
+        shown = url.set(query={}).render_as_string(hide_password=True)
+        return f"{shown}?***" if url.query else shown
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {_harmless(inner)}" for name, inner in value.items())
+    if isinstance(value, tuple):
+        return " to ".join(map(_harmless, value))
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:.15g}" if isinstance(value, float) else str(value)
+
+
 class Settings(BaseSettings):
     """What an operator may set; unsafe combinations are refused when the settings are read."""
 
@@ -89,7 +115,7 @@ class Settings(BaseSettings):
         default=None, description="Bring the schema to its newest version at start; without it only SQLite is migrated."
     )
     host: str = Field(default="127.0.0.1", description="Address to listen on.")
-    port: int = Field(default=8000, ge=1, le=65535)
+    port: int = Field(default=8000, ge=1, le=65535, description="Port to listen on.")
     allow_open_network: bool = Field(
         default=False,
         description="Unsafe: while no key was made, whoever reaches a non-loopback host may read and write everything.",
@@ -189,7 +215,7 @@ class Settings(BaseSettings):
     audit_retention_days: float = Field(
         default=1825.0, ge=0, le=36500, description="Audit entries so old [days] are deleted; 0 keeps all."
     )
-    log_level: LogLevel = "info"
+    log_level: LogLevel = Field(default="info", description="The least that is logged.")
     log_format: Literal["text", "json"] = Field(default="text", description="json: one object a line.")
     time_zone: str | None = Field(
         default=None, description="The plant's zone, as `Europe/Berlin`: pages tell times in it beside UTC."
@@ -304,6 +330,20 @@ class Settings(BaseSettings):
         url = make_url(self.database_url)
         url = url.set(drivername=_DRIVERS[url.get_backend_name()])
         return url if self.password is None else url.set(password=self.password.get_secret_value())
+
+    @property
+    def in_force(self) -> list[Shown]:
+        """All of them by the names of the environment, without secrets."""
+        fields = type(self).model_fields.items()
+        return [
+            Shown(
+                f"{self.model_config['env_prefix']}{name.upper()}",
+                "" if (value := getattr(self, name)) is None else _harmless(value),
+                name in self.model_fields_set,
+                field.description or "",
+            )
+            for name, field in fields
+        ]
 
     @property
     def migrates_on_start(self) -> bool:

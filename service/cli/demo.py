@@ -1,15 +1,15 @@
 """The demonstration: photographs in, stored mirror surfaces and flux forecasts out, with a table and pictures."""
 
-import html
 import shlex
 import shutil
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
@@ -28,7 +28,8 @@ from service.base.settings import Settings
 from service.cli.demo_plant import write_plant
 from service.cli.folder import observations_of, surface_errors, write_json
 from service.cli.output import make_table
-from service.drawing.pictures import comparison_picture, surface_picture
+from service.drawing.pictures import comparison_picture, flux_bounds, mirror_heights, of_peak, surface_picture
+from service.drawing.templates import ASSETS, TEMPLATES
 from service.sources.folder import MeasurementFolder, measured_heights, read_folder
 from service.twin import compute
 from service.twin.evidence import choose
@@ -80,12 +81,13 @@ def run_demo(data: Path | None, out: Path, console: Console, quiet: bool = False
             count = sum(len(m.images) for name in folder.plant.heliostats for m in folder.measurements(name))
             task = bars.add_task("import", total=count + len(folder.plant.heliostats))
             imported = import_folder(runtime, folder, lambda name: bars.update(task, description=name, advance=1))
-            results, skipped = _predict_all(runtime, folder, out, bars)
+            made, skipped = _predict_all(runtime, folder, bars)
         finally:
             runtime.close()
-    if not results:
+    if not made:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in list(skipped.items())[:3])
         raise ModelError(f"{root}: no heliostat had an image that could be used ({reasons})")
+    results = _drawn(out, made)
     report = {
         "data": str(root),
         "store": imported["counts"],
@@ -110,20 +112,28 @@ def _open_store(folder: Path) -> Runtime:
     return runtime
 
 
-def _predict_all(
-    runtime: Runtime, folder: MeasurementFolder, out: Path, bars: Progress
-) -> tuple[list[Result], dict[str, str]]:
-    results, skipped = [], {}
+@dataclass(frozen=True, eq=False)
+class _Made:
+    """A result and what its pictures show: surfaces (4, 8, 8) [m], photographs, and forecasts by the refined one."""
+
+    result: Result
+    surfaces: dict[str, Array | None]
+    judged: list[Observation]
+    forecasts: list[Array]
+
+
+def _predict_all(runtime: Runtime, folder: MeasurementFolder, bars: Progress) -> tuple[list[_Made], dict[str, str]]:
+    made, skipped = [], {}
     task = bars.add_task("predict and forecast", total=len(folder.plant.heliostats))
     for name in folder.plant.heliostats:
         bars.update(task, description=f"predict and forecast {name}")
         usable, refused = observations_of(folder, name)
         if usable:
-            results.append(_predict(runtime, folder, name, usable, out))
+            made.append(_predict(runtime, folder, name, usable))
         else:
             skipped[name] = next(iter(refused.values()), "no image")
         bars.update(task, advance=1)
-    return results, skipped
+    return made, skipped
 
 
 def _split(observations: list[Observation]) -> tuple[list[Observation], list[Observation]]:
@@ -141,9 +151,7 @@ def _stored(runtime: Runtime, name: str, method: Method, used: Sequence[Observat
     return unpack(row.arrays)["z"].astype(np.float64)
 
 
-def _predict(
-    runtime: Runtime, folder: MeasurementFolder, name: str, observations: list[Observation], out: Path
-) -> Result:
+def _predict(runtime: Runtime, folder: MeasurementFolder, name: str, observations: list[Observation]) -> _Made:
     heliostat = folder.plant.heliostats[name]
     used, judged = _split(observations)
     surfaces: dict[str, Array | None] = {"ideal": None}
@@ -162,7 +170,7 @@ def _predict(
         key: float(np.mean([flux_accuracy(o.flux, f) for o, f in zip(judged, images, strict=True)]))
         for key, images in fluxes.items()
     }
-    return Result(
+    result = Result(
         heliostat=name,
         used=len(used),
         judged=len(judged),
@@ -173,8 +181,9 @@ def _predict(
         accuracy_measured=accuracies.get("measured"),
         error_network_mm=errors.get("network", {}).get("mae_mm"),
         error_refined_mm=errors.get("refined", {}).get("mae_mm"),
-        pictures=_draw(out, name, surfaces, judged, fluxes["refined"]),
+        pictures=(),
     )
+    return _Made(result, surfaces, judged, fluxes["refined"])
 
 
 def _store_forecast(runtime: Runtime, name: str, observation: Observation) -> None:
@@ -214,18 +223,26 @@ def _forecast(
     return flux_window(traced.camera_view, (wide, wide), center, FLUX_WINDOW, FLUX_SIZE)
 
 
-def _draw(
-    out: Path, name: str, surfaces: dict[str, Array | None], judged: list[Observation], forecasts: list[Array]
-) -> tuple[str, ...]:
+def _drawn(out: Path, made: Sequence[_Made]) -> list[Result]:
+    """The results with the pictures drawn for them, all on the same scales."""
+    heights = [mirror_heights(z) for one in made for z in one.surfaces.values() if z is not None]
+    bound_mm = max(float(np.abs(some).max()) for some in heights)
+    pairs = [of_peak(o.flux, flux) for one in made for o, flux in zip(one.judged, one.forecasts, strict=True)]
+    bounds = flux_bounds(pairs)
+    return [replace(one.result, pictures=_draw(out, one, bound_mm, bounds)) for one in made]
+
+
+def _draw(out: Path, made: _Made, bound_mm: float, bounds: tuple[float, float]) -> tuple[str, ...]:
     """Surface maps, and measured beside forecast for every judged image; gives back their paths under ``out``."""
+    name = made.result.heliostat
     drawn = {
-        f"surfaces/{name}-{key}.png": surface_picture(z, f"{name}, {key}")
-        for key, z in surfaces.items()
+        f"surfaces/{name}-{key}.png": surface_picture(z, f"{name}, {key}", bound_mm)
+        for key, z in made.surfaces.items()
         if z is not None
     }
-    for observation, flux in zip(judged, forecasts, strict=True):
-        title = f"{name}/{observation.identifier}: accuracy {flux_accuracy(observation.flux, flux):.3f}"
-        picture = comparison_picture(observation.flux, flux, FLUX_WINDOW, title)
+    for observation, flux in zip(made.judged, made.forecasts, strict=True):
+        title = f"{name}/{observation.identifier}: accuracy {flux_accuracy(observation.flux, flux):.1%}"
+        picture = comparison_picture(observation.flux, flux, FLUX_WINDOW, title, bounds)
         drawn[f"flux/{name}-{observation.identifier}.png"] = picture
     for path, content in drawn.items():
         (out / path).parent.mkdir(parents=True, exist_ok=True)
@@ -272,23 +289,20 @@ def _print(console: Console, results: list[Result], out: Path, store: Path) -> N
 
 
 def _page(report: dict[str, Any], results: list[Result]) -> str:
-    """A page of the table and the pictures; the pictures lie beside it."""
-    head = "".join(f"<th>{html.escape(c)}</th>" for c in COLUMNS)
-    rows = "".join("<tr>" + "".join(f"<td>{html.escape(c)}</td>" for c in _row(r)) + "</tr>" for r in results)
-    pictures = "".join(
-        f"<h2>{html.escape(r.heliostat)}</h2>"
-        + "".join(f'<img src="{html.escape(p)}" alt="{html.escape(Path(p).stem)}">' for p in r.pictures)
-        for r in results
-    )
-    skipped = "".join(
-        f"<li>{html.escape(name)}: {html.escape(reason)}</li>" for name, reason in report["skipped"].items()
-    )
-    return (
-        "<!doctype html><html lang=en><meta charset=utf-8><title>heliotwin demo</title>"
-        "<style>body{font:16px system-ui;margin:2rem;max-width:72rem}td,th{padding:.3rem .8rem;text-align:right}"
-        "td:first-child,th:first-child{text-align:left}img{max-width:100%;margin:.3rem}</style>"
-        f"<h1>heliotwin demo</h1><p>Data: {html.escape(report['data'])}. Accuracy is one minus the summed difference "
-        "of measured and forecast flux, in a 4 m window about the spot; errors are mean absolute differences of "
-        f"control heights. {html.escape(CAPTION)}.</p><table><tr>{head}</tr>{rows}</table>{pictures}"
-        f"<h2>Skipped</h2><ul>{skipped or '<li>none</li>'}</ul>"
+    """A page with a conclusion, the table and the pictures, which lie beside it."""
+    judging = [result for result in results if result.held_out] or results
+    photographs = sum(result.judged for result in judging)
+    accuracies = {
+        key: sum(getattr(result, f"accuracy_{key}") * result.judged for result in judging) / photographs
+        for key in ("ideal", "network", "refined")
+    }
+    return TEMPLATES.get_template("demo.html").render(
+        style=Markup(ASSETS.joinpath("app.css").read_text(encoding="utf-8")),
+        data=report["data"],
+        results=results,
+        skipped=report["skipped"],
+        accuracies=accuracies,
+        photographs=photographs,
+        is_unseen=judging[0].held_out,
+        errors_mm=[result.error_refined_mm for result in results if result.error_refined_mm is not None],
     )

@@ -1,11 +1,14 @@
 """What the pages draw: maps, colour bars, the field and histories as plain numbers, which templates turn into SVG."""
 
 import base64
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from typing import Any
 
 import cv2
 import matplotlib
+import matplotlib.dates
 import numpy as np
 from matplotlib.colors import to_hex
 from matplotlib.ticker import MaxNLocator
@@ -14,6 +17,8 @@ from numpy.typing import NDArray
 from service.drawing.pictures import mirror_heights
 
 Array = NDArray[np.floating]
+
+_dates: Any = matplotlib.dates  # it says nothing of its types
 
 
 @dataclass(frozen=True)
@@ -77,6 +82,8 @@ class HeatMap:
     width, height : float [m]
         Of the rectangle; its middle is the origin.
     scale : Scale
+    outline : str
+        What is outlined on it, as a data URL; empty where nothing is.
     """
 
     title: str
@@ -84,6 +91,7 @@ class HeatMap:
     width: float
     height: float
     scale: Scale
+    outline: str = ""
 
     @property
     def x_ticks(self) -> tuple[Tick, ...]:
@@ -122,6 +130,17 @@ def flux_map(title: str, flux: Array, size: tuple[float, float], unit: str, top:
     return heat_map(title, flux, size, flux_scale(float(flux.max()) if top is None else top, unit))
 
 
+def outlined(drawn: HeatMap, mask: NDArray[np.bool_]) -> HeatMap:
+    """A map with the edge of what is in ``mask`` (rows, columns) drawn on it, where anything is."""
+    if not mask.any():
+        return drawn
+    fine = np.kron(mask, np.ones((8, 8), dtype=bool)).astype(np.uint8)
+    edge = (fine - cv2.erode(fine, np.ones((5, 5), np.uint8), borderValue=0)).astype(bool)
+    pixels = np.zeros((*fine.shape, 4), np.uint8)
+    pixels[edge] = 0, 255, 255, 255
+    return replace(drawn, outline=_data_url(pixels))
+
+
 def difference_map(title: str, difference: Array, size: tuple[float, float], unit: str) -> HeatMap:
     """A map of differences, white where there is none."""
     return heat_map(title, difference, size, difference_scale(float(np.abs(difference).max()), unit))
@@ -138,10 +157,10 @@ def mirror_image(heights: Array) -> Array:
     return np.vstack([rows[0], np.full((1, rows[0].shape[1]), np.nan), rows[1]])
 
 
-def surface_map(title: str, z: Array, size: tuple[float, float]) -> HeatMap:
-    """A surface of control heights (4, 8, 8) [m] in mm."""
+def surface_map(title: str, z: Array, size: tuple[float, float], bound: float | None = None) -> HeatMap:
+    """A surface of control heights (4, 8, 8) [m] in mm; ``bound`` [mm] ends its scale, else its own largest height."""
     heights = mirror_heights(z)
-    bound = max(float(np.abs(heights).max()), 1e-3)
+    bound = max(float(np.abs(heights).max()) if bound is None else bound, 1e-3)
     return heat_map(title, mirror_image(heights), size, Scale("RdBu_r", -bound, bound, "mm"))
 
 
@@ -149,6 +168,101 @@ def uncertainty_map(title: str, z_std: Array, size: tuple[float, float]) -> Heat
     """Standard deviations (4, 8, 8) [m] in mm."""
     heights = mirror_heights(z_std)
     return heat_map(title, mirror_image(heights), size, Scale("viridis_r", 0.0, max(float(heights.max()), 1e-3), "mm"))
+
+
+@dataclass(frozen=True)
+class Dot:
+    """A value of a series: 0 to 1 from left to right and from bottom to top, and what it says."""
+
+    x: float
+    y: float
+    label: str
+    is_hollow: bool = False
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """Series over time by their names, the first as a line and the second dashed; ``marks`` are upright lines.
+
+    ``when`` says what the labels of the moments leave out, as the year. ``limit`` is where a bound lies, 0 to 1 from
+    bottom to top, if there is one.
+    """
+
+    title: str
+    unit: str
+    series: dict[str, tuple[Dot, ...]]
+    marks: tuple[Tick, ...]
+    x_ticks: tuple[Tick, ...]
+    y_ticks: tuple[Tick, ...]
+    when: str
+    limit: float | None = None
+
+
+@dataclass(frozen=True)
+class Value:
+    """A number at a moment; hollow where it proves less than others."""
+
+    at: datetime
+    number: float
+    name: str = ""
+    is_hollow: bool = False
+
+
+def _share(low: float, high: float, value: float) -> float:
+    return (value - low) / (high - low)
+
+
+def timeline(
+    title: str,
+    unit: str,
+    series: Mapping[str, Sequence[Value]],
+    digits: int,
+    *,
+    marks: Sequence[tuple[datetime, str]] = (),
+    limit: float | None = None,
+    from_zero: bool = True,
+    moments: Sequence[datetime] = (),
+) -> Timeline | None:
+    """Values over time, wide enough to hold these ``moments`` too, and marks within it; None without any value."""
+    values = [value for some in series.values() for value in some]
+    if not values:
+        return None
+    first, last = (_dates.date2num(of([*(value.at for value in values), *moments])) for of in (min, max))
+    margin = 0.04 * (last - first) or 0.5
+    first, last = first - margin, last + margin
+    numbers = [value.number for value in values] + ([] if limit is None else [limit])
+    low = 0.0 if from_zero else min(numbers) - 0.1 * (max(numbers) - min(numbers))
+    high = max(max(numbers) + 0.1 * (max(numbers) - low), low + 1e-9)
+    locator = _dates.AutoDateLocator(minticks=3, maxticks=5, tz=UTC)
+    places = [
+        place for place in locator.tick_values(_dates.num2date(first), _dates.num2date(last)) if first <= place <= last
+    ]
+    # Concise dates leave out what the first of them says already.
+    formatter = _dates.ConciseDateFormatter(locator, tz=UTC)
+    names = formatter.format_ticks(places)
+
+    def dots(some: Sequence[Value]) -> tuple[Dot, ...]:
+        return tuple(
+            Dot(
+                _share(first, last, _dates.date2num(value.at)),
+                _share(low, high, value.number),
+                f"{value.name or f'{value.at:%Y-%m-%d %H:%M}'}: {value.number:.{digits}f} {unit}",
+                value.is_hollow,
+            )
+            for value in some
+        )
+
+    drawn = [Tick(_share(first, last, _dates.date2num(at)), name) for at, name in marks]
+    return Timeline(
+        title,
+        unit,
+        {name: dots(some) for name, some in series.items() if some},
+        tuple(mark for mark in drawn if 0 <= mark.at <= 1),
+        tuple(Tick(_share(first, last, at), name) for at, name in zip(places, names, strict=True)),
+        ticks(low, high, 4),
+        f"{formatter.get_offset()} UTC".strip(),
+        None if limit is None else _share(low, high, limit),
+    )
 
 
 @dataclass(frozen=True)

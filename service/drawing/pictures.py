@@ -1,6 +1,7 @@
 """Pictures of flux maps and surfaces as PNG, drawn without a display and without matplotlib's global state."""
 
 import io
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -56,12 +57,15 @@ def mirror_heights(z: NDArray[np.floating], samples: int = 48) -> NDArray[np.flo
     return across @ np.asarray(z, dtype=np.float64) @ along.T * 1e3
 
 
-def surface_picture(z: NDArray[np.floating], title: str) -> bytes:
-    """A surface of control heights (4, 8, 8) [m] as a map in mm, its facets as they are seen from the front."""
+def surface_picture(z: NDArray[np.floating], title: str, bound: float | None = None) -> bytes:
+    """A surface of control heights (4, 8, 8) [m] as a map in mm, its facets as they are seen from the front.
+
+    ``bound`` [mm] ends the scale, else the largest height does.
+    """
     figure = Figure(figsize=(6.4, 5), layout="constrained")
     panes = figure.subplots(2, 2).ravel()
     heights = mirror_heights(z)
-    bound = max(float(np.abs(heights).max()), 1e-3)
+    bound = max(float(np.abs(heights).max()) if bound is None else bound, 1e-3)
     for pane, facet, name in zip(panes, heights, _FACETS, strict=True):
         # i runs with x and j with y, so columns are i and rows, from below, are j
         image = pane.imshow(facet.T, cmap="RdBu_r", vmin=-bound, vmax=bound, origin="lower", aspect=0.8)
@@ -71,16 +75,33 @@ def surface_picture(z: NDArray[np.floating], title: str) -> bytes:
     return _png(figure)
 
 
+Array = NDArray[np.floating]
+
+
+def of_peak(measured: Array, forecast: Array) -> tuple[Array, Array]:
+    """Two fluxes (n, n) of one sum, in shares of the measured peak."""
+    a, b = measured / measured.sum(), forecast / forecast.sum()
+    return a / a.max(), b / a.max()
+
+
+def flux_bounds(pairs: Sequence[tuple[Array, Array]]) -> tuple[float, float]:
+    """The largest share of the measured peak, and the largest difference, of pairs as `of_peak` gives them."""
+    top = max(float(image.max()) for pair in pairs for image in pair)
+    return top, max(max(float(np.abs(b - a).max()) for a, b in pairs), 1e-9)
+
+
 def comparison_picture(
-    measured: NDArray[np.floating], forecast: NDArray[np.floating], side: float, title: str
+    measured: Array, forecast: Array, side: float, title: str, bounds: tuple[float, float] | None = None
 ) -> bytes:
-    """Measured and forecast flux (n, n) over ``side`` [m], scaled to one sum, and their difference."""
-    a, b = (image / image.sum() for image in (np.asarray(measured), np.asarray(forecast)))
-    a, b = a / a.max(), b / a.max()
+    """Measured and forecast flux (n, n) over ``side`` [m], scaled to one sum, and their difference.
+
+    ``bounds`` end the two scales, else those of this pair do.
+    """
+    a, b = of_peak(np.asarray(measured), np.asarray(forecast))
+    top, bound = flux_bounds([(a, b)]) if bounds is None else bounds
     figure = Figure(figsize=(10, 3.4), layout="constrained")
     panes = figure.subplots(1, 3)
     extent = (-side / 2, side / 2, -side / 2, side / 2)
-    top, bound = max(float(a.max()), float(b.max())), max(float(np.abs(b - a).max()), 1e-9)
     for pane, image, name in zip(panes, (a, b), ("measured", "forecast"), strict=False):
         shown = pane.imshow(image, cmap="inferno", vmin=0, vmax=top, extent=extent)
         pane.set(title=name, xlabel="right [m]")

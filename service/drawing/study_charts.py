@@ -52,7 +52,7 @@ def accuracy_chart(study: Study) -> Chart:
     for photograph, one, other in sorted(found, key=lambda f: (f[0].heliostat, f[0].elevation_deg)):
         image = Image(photograph, one, other, place(one), place(other))
         groups.setdefault(photograph.heliostat, []).append(image)
-    return Chart(groups, ticks(low, 1.0), place(1 - study.noise_floor))
+    return Chart(groups, ticks(100 * low, 100.0), place(1 - study.noise_floor))
 
 
 @dataclass(frozen=True)
@@ -152,4 +152,4 @@ def _scatter(study: Study, label: str, x: Array) -> Scatter:
         for p, at, one, other in zip(study.images, x, before, after, strict=True)
     ]
     correlations = rank_correlation(before, x), rank_correlation(after, x)
-    return Scatter(label, dots, ticks(low, high), ticks(0.0, top), *correlations)
+    return Scatter(label, dots, ticks(low, high), ticks(0.0, 100 * top), *correlations)

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from datetime import UTC, datetime
 from importlib.resources import files
+from typing import Any
 from urllib.parse import quote
 from zoneinfo import ZoneInfo
 
@@ -61,6 +62,15 @@ def storage(size_bytes: float) -> str:
     return figure(size_bytes, 0, "B")
 
 
+def in_words(value: Any) -> str:
+    """A value as a sentence has it: no braces, no quotes."""
+    if isinstance(value, dict):
+        return ", ".join(f"{name.replace('_', ' ')} {in_words(inner)}" for name, inner in value.items())
+    if isinstance(value, list):
+        return ", ".join(in_words(inner) for inner in value)
+    return {True: "yes", False: "no"}[value] if isinstance(value, bool) else str(value)
+
+
 def environment(*packages: str) -> Environment:
     """Templates of these packages, the first one's first, with the filters above."""
     made = Environment(
@@ -77,6 +87,7 @@ def environment(*packages: str) -> Environment:
         power=power,
         irradiance=irradiance,
         storage=storage,
+        in_words=in_words,
         path=lambda value: quote(value, ""),
         words=lambda name: name.replace("_", " "),
     )

@@ -45,10 +45,12 @@ from service.store.results import (
     list_studies,
     recent_field_forecasts,
     recent_forecasts,
+    recent_plans,
 )
 from service.store.rows import Change, insert, one_at_a_time
 from service.store.surfaces import (
     NewSurface,
+    Outdated,
     Trust,
     add_surface,
     current_surfaces,
@@ -59,11 +61,13 @@ from service.store.surfaces import (
     get_surface_at,
     list_surfaces,
     newest_prediction,
+    outdated_surfaces,
 )
 
 __all__ = [
     "Change",
     "NewSurface",
+    "Outdated",
     "Trust",
     "add_forecast",
     "add_heliostat",
@@ -102,6 +106,7 @@ __all__ = [
     "list_targets",
     "newest_prediction",
     "one_at_a_time",
+    "outdated_surfaces",
     "put_heliostat",
     "put_plant",
     "put_receiver",
@@ -109,6 +114,7 @@ __all__ = [
     "recent_field_forecasts",
     "recent_forecasts",
     "recent_measurements",
+    "recent_plans",
     "remove_heliostat",
     "remove_receiver",
     "remove_target",

@@ -83,6 +83,36 @@ def recent_field_forecasts(session: Session, limit: int) -> list[FieldForecast]:
     return [FieldForecast(*row) for row in session.execute(query.order_by(JobRow.id.desc()).limit(limit))]
 
 
+@dataclass(frozen=True)
+class Plan:
+    """A plan in short: a job's, without its series."""
+
+    job: int
+    name: str
+    target: str | None
+    begin: str
+    state: str
+    peak_w_m2: float | None
+    created_at: datetime
+    created_by: str
+
+
+def recent_plans(session: Session, limit: int) -> list[Plan]:
+    """The newest ``limit`` plans, the newest first, those under way too."""
+    payload = JobRow.payload
+    query = select(
+        JobRow.id,
+        payload["name"].as_string(),
+        payload["target"].as_string(),
+        payload["begin"].as_string(),
+        JobRow.state,
+        JobRow.result["peak_w_m2"].as_float(),
+        JobRow.created_at,
+        JobRow.created_by,
+    ).where(JobRow.kind == "plans")
+    return [Plan(*row) for row in session.execute(query.order_by(JobRow.id.desc()).limit(limit))]
+
+
 def add_study(session: Session, row: StudyRow) -> StudyRow:
     """Store a study."""
     session.add(row)

@@ -203,6 +203,42 @@ def current_surfaces(session: Session, heliostats: Sequence[int]) -> dict[int, b
     return {row.heliostat_id: row.arrays for row in rows}
 
 
+@dataclass(frozen=True)
+class Outdated:
+    """A surface of today that was predicted by another version of the plant's model than one that is asked for.
+
+    ``waits``: one that was made by that version is there, but is not today's.
+    """
+
+    heliostat: str
+    version: int
+    source: str
+    model_version: str | None
+    waits: bool
+
+
+def outdated_surfaces(session: Session, model_version: str) -> list[Outdated]:
+    """Today's surfaces that were predicted by another version of the plant's model, by their heliostats' names."""
+    newest = func.row_number().over(
+        partition_by=SurfaceRow.heliostat_id, order_by=(SurfaceRow.valid_from.desc(), SurfaceRow.version.desc())
+    )
+    ranked = select(SurfaceRow.id, newest.label("place")).where(~SurfaceRow.set_aside).subquery()
+    of_version = select(SurfaceRow.heliostat_id).where(SurfaceRow.model_version == model_version)
+    query = (
+        select(
+            HeliostatRow.name,
+            SurfaceRow.version,
+            SurfaceRow.source,
+            SurfaceRow.model_version,
+            SurfaceRow.heliostat_id.in_(of_version),
+        )
+        .join(ranked, ranked.c.id == SurfaceRow.id)
+        .join(HeliostatRow, HeliostatRow.id == SurfaceRow.heliostat_id)
+        .where(ranked.c.place == 1, SurfaceRow.model_version != model_version)
+    )
+    return [Outdated(*row) for row in session.execute(query.order_by(HeliostatRow.name))]
+
+
 def get_surface_at(session: Session, heliostat: HeliostatRow, moment: datetime | None = None) -> SurfaceRow:
     """The version valid at ``moment``, by default now; NotFoundError where there is none."""
     row = find_surface_at(session, heliostat, moment)

@@ -34,7 +34,7 @@ RECENT = 8
 # Results that are kept [1]: the field of the largest plant several times over.
 _MOST = 200_000
 
-# Heliostats whose comparisons are kept: half a megabyte each.
+# Heliostats whose comparisons are kept: half a megabyte each, of a span three times that.
 _MOST_COMPARED = 64
 
 
@@ -59,6 +59,17 @@ class Comparison:
     was_used: bool
 
 
+@dataclass(frozen=True)
+class Span:
+    """When photographs were taken; None is open."""
+
+    since: datetime | None = None
+    until: datetime | None = None
+
+
+# Newest photographs of a span that are held against forecasts.
+_MOST_OF_SPAN = 24
+
 # The newest photographs, this many times as many as are held against a forecast, are looked through for unseen ones.
 _LOOKED_THROUGH = 4
 
@@ -82,8 +93,16 @@ def unseen_first(session: Session, heliostat: HeliostatRow, seen: Collection[str
     return rows, min(len(unseen), RECENT)
 
 
-def compare(runtime: Runtime, name: str, surface: SurfaceRow | None) -> list[Comparison]:
+def _of_span(session: Session, heliostat: HeliostatRow, span: Span) -> list[MeasurementRow]:
+    """A heliostat's newest photographs of a span, with arrays, whatever was made from them."""
+    recent = store.recent_measurements(session, heliostat, _MOST_OF_SPAN, span.since, span.until)
+    return store.get_measurements(session, heliostat, [row.identifier for row in recent], arrays=True)
+
+
+def compare(runtime: Runtime, name: str, surface: SurfaceRow | None, span: Span | None = None) -> list[Comparison]:
     """The heliostat's newest photographs against forecasts with a stored surface, or the ideal one.
+
+    Those that the surface was not made from come first; of a ``span`` all stand equal.
 
     Raises
     ------
@@ -94,7 +113,9 @@ def compare(runtime: Runtime, name: str, surface: SurfaceRow | None) -> list[Com
     """
     with runtime.database.reading() as session:
         twin = load_twin(session, name)
-        rows, _ = unseen_first(session, twin.row, seen_by(surface))
+        rows = (
+            unseen_first(session, twin.row, seen_by(surface))[0] if span is None else _of_span(session, twin.row, span)
+        )
     return compare_with(runtime, twin, surface, rows) if rows else []
 
 
@@ -182,13 +203,17 @@ class AccuracyBook:
 
 @dataclass(frozen=True)
 class Shown:
-    """What a heliostat's comparisons depend on; ``surface`` is a version, None the ideal mirror."""
+    """What a heliostat's comparisons depend on; ``surface`` is a version, None the ideal mirror.
+
+    ``span`` is when the photographs were taken, where they are not the newest.
+    """
 
     heliostat: str
     surface: int | None
     newest: int
     corrected: datetime | None
     model: int
+    span: Span | None = None
 
 
 @dataclass(frozen=True)
@@ -207,7 +232,9 @@ class ComparisonBook:
         failed = Compared(trouble="the comparison failed; the log says why")
         self._book: Book[Shown, Compared] = Book(self._compared, failed, "comparisons", _MOST_COMPARED)
 
-    def read(self, session: Session, heliostat: HeliostatRow, surface: SurfaceRow | None) -> Shown | None:
+    def read(
+        self, session: Session, heliostat: HeliostatRow, surface: SurfaceRow | None, span: Span | None = None
+    ) -> Shown | None:
         """What the comparisons of a heliostat with a surface depend on by now; None where there is no photograph."""
         photographs = select(func.max(MeasurementRow.id)).where(MeasurementRow.heliostat_id == heliostat.id)
         newest = session.scalar(photographs.where(MeasurementRow.accepted))
@@ -215,7 +242,7 @@ class ComparisonBook:
             return None
         corrections = select(func.max(MeasurementRow.corrected_at)).where(MeasurementRow.heliostat_id == heliostat.id)
         corrected, model = session.scalar(corrections), versions.current_number(session)
-        return Shown(heliostat.name, None if surface is None else surface.version, newest, corrected, model)
+        return Shown(heliostat.name, None if surface is None else surface.version, newest, corrected, model, span)
 
     def wait_for(self, shown: Shown, seconds: float = 5.0) -> Compared | None:
         """Them; None where they are still being worked out after so many seconds."""
@@ -230,7 +257,7 @@ class ComparisonBook:
             with self._runtime.database.reading() as session:
                 heliostat = store.get_heliostat(session, shown.heliostat)
                 surface = None if shown.surface is None else store.get_surface(session, heliostat, shown.surface)
-            return Compared(tuple(compare(self._runtime, shown.heliostat, surface)))
+            return Compared(tuple(compare(self._runtime, shown.heliostat, surface, shown.span)))
         except (ModelError, ServiceError) as error:
             logger.warning("heliostat %s cannot be compared with its photographs: %s", shown.heliostat, error)
             return Compared(trouble=str(error))

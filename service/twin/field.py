@@ -9,9 +9,11 @@ from datetime import datetime
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from sqlalchemy import case, func, select, union_all
 from sqlalchemy.orm import Session
 
+from model.surface import split_canting
 from service import store
 from service.base.arrays import unpack
 from service.base.faults import BusyError
@@ -48,6 +50,27 @@ def figures_of(arrays: bytes) -> Figures:
     z, z_std = unpacked["z"], unpacked["z_std"]
     uncertainty = float(np.sqrt(np.mean(z_std**2)) * 1e3)
     return Figures(float(np.sqrt(np.mean(z**2)) * 1e3), uncertainty or None)
+
+
+@dataclass(frozen=True)
+class Shape:
+    """What kind of deviation from the ideal a surface has, as root mean squares over the mirror.
+
+    ``deviation_mm`` is all of it; ``waviness_mm`` that within facets; ``canting_mrad`` how far facets are tilted.
+    """
+
+    deviation_mm: float
+    waviness_mm: float
+    canting_mrad: float
+
+
+def shape_of(z: NDArray[np.floating], size: tuple[float, float]) -> Shape:
+    """The shape of heights (4, 8, 8) [m] on a mirror of ``size``, width and height [m], two facets each way."""
+    canting, waviness = split_canting(z)
+    rises = canting[:, -1, :] - canting[:, 0, :], canting[:, :, -1] - canting[:, :, 0]
+    tilts = [float(np.mean((rise / (side / 2)) ** 2)) for rise, side in zip(rises, size, strict=True)]
+    deviation, wavy = (float(np.sqrt(np.mean(heights**2)) * 1e3) for heights in (z, waviness))
+    return Shape(deviation, wavy, 1e3 * math.sqrt(sum(tilts)))
 
 
 @dataclass(frozen=True)

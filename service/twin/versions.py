@@ -29,6 +29,7 @@ __all__ = [
     "adopt",
     "adopted_from",
     "current_number",
+    "current_version",
     "find_adopted",
     "find_current",
     "find_model",
@@ -70,6 +71,12 @@ def current_number(session: Session) -> int:
     """Number of the current version."""
     row = find_current(session)
     return DECLARED if row is None else row.number
+
+
+def current_version(session: Session) -> str:
+    """Number and effects of the current version, as forecasts and surfaces name it."""
+    row = find_current(session)
+    return version_name(DECLARED, ()) if row is None else row.version
 
 
 def get_model(session: Session, number: int | None = None) -> PlantModel:

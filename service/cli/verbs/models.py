@@ -49,7 +49,16 @@ def adopt(
         model = model_of_report(session, document, name)
         study = store.add_study(session, row_of_report(document, name, model, actor()))
         row = versions.adopt(session, study.id, actor(), force)
-    typer.echo(json.dumps({"study": study.id, "version": row.version}) if as_json else f"{row.version} is current")
+        outdated = {one.heliostat: one.version for one in store.outdated_surfaces(session, row.version)}
+    if as_json:
+        typer.echo(json.dumps({"study": study.id, "version": row.version, "outdated_surfaces": outdated}))
+        return
+    typer.echo(f"{row.version} is current")
+    if outdated:
+        typer.echo(
+            f"today's surfaces of {', '.join(outdated)} were made by another version; the page of studies, or a "
+            "job `predictions`, makes them anew"
+        )
 
 
 @app.command()

@@ -1,4 +1,5 @@
-// The forecast form: what is typed is what is asked for, and a time is told by the plant's clocks, too.
+// The forecast form: what is typed is what is asked for, a time is told by the plant's clocks, too, and what comes of it
+// is brought into view.
 "use strict";
 (() => {
   const ways = { azimuth_deg: "position", elevation_deg: "position", moment: "time" };
@@ -19,5 +20,9 @@
     if (!form || !way) return;
     form.querySelector(`[name=sun_by][value=${way}]`).checked = true;
     if (way === "time") tell(form);
+  });
+
+  document.addEventListener("htmx:afterSettle", (event) => {
+    if (event.target.id === "result" && event.target.getBoundingClientRect().top > innerHeight / 2) event.target.scrollIntoView();
   });
 })();

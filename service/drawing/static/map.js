@@ -80,8 +80,9 @@
       return [point.x, point.y];
     };
 
+    // Fingers are wider than mirrors: what lies within 20 pixels is meant.
     const near = (x, y) => {
-      let best = null, least = Math.max(side, 14 * (view ? view.share : 1));
+      let best = null, least = Math.max(side, 20 / map.getScreenCTM().a);
       for (const m of mirrors) {
         const distance = Math.hypot(m.x - x, m.y - y);
         if (distance < least) { best = m; least = distance; }
@@ -156,6 +157,14 @@
   document.addEventListener("htmx:configRequest", (event) => {
     if (event.target.id === "find")
       for (const [name, value] of Object.entries(event.detail.parameters)) if (value === "") delete event.detail.parameters[name];
+  });
+  document.addEventListener("click", (event) => {
+    const map = event.target.closest("[data-map]"), all = links();
+    if (!map || event.target.closest("a") || !all.length) return;
+    const drawn = map.getScreenCTM(), at = new DOMPoint(event.clientX, event.clientY).matrixTransform(drawn.inverse());
+    const far = (link) => { const [x, y] = place(link); return Math.hypot(x - at.x, y - at.y) * drawn.a; };
+    const best = all.reduce((one, other) => (far(other) < far(one) ? other : one));
+    if (far(best) <= 20) location.assign(best.href.baseVal);
   });
   document.addEventListener("htmx:afterSettle", begin);
   begin();

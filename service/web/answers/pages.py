@@ -53,16 +53,14 @@ TEMPLATES = _environment()
 
 def _page(scope: Scope, template: str, status: int, context: dict[str, Any]) -> HTMLResponse:
     identity: Identity | None = scope.get("state", {}).get("identity")
-    may_operate = identity is not None and identity.role.includes(Role.OPERATE)
-    text = TEMPLATES.get_template(template).render(
-        context, identity=identity, may_operate=may_operate, here=scope.get("path", "")
-    )
+    may = {f"may_{role}": identity is not None and identity.role.includes(role) for role in (Role.OPERATE, Role.ADMIN)}
+    text = TEMPLATES.get_template(template).render(context, identity=identity, here=scope.get("path", ""), **may)
     return HTMLResponse(text, status)
 
 
-def render(request: Request, template: str, **context: Any) -> HTMLResponse:
+def render(request: Request, template: str, status: int = HTTPStatus.OK, **context: Any) -> HTMLResponse:
     """A page."""
-    return _page(request.scope, template, HTTPStatus.OK, context)
+    return _page(request.scope, template, status, context)
 
 
 def go_to(path: str) -> Response:

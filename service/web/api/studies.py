@@ -41,6 +41,15 @@ class StudyOut(StudySummary, StudyReport):
     """A study with its report."""
 
 
+class AdoptedOut(ModelOut):
+    """The version that an adoption made, and the surfaces that were not made by it."""
+
+    outdated_surfaces: dict[str, int] = Field(
+        description="Versions of today's surfaces that another version of the model made, by heliostat; "
+        "`POST /v1/jobs/predictions` makes them anew."
+    )
+
+
 class AdoptIn(Model):
     """How to adopt what a study found."""
 
@@ -69,11 +78,11 @@ def study_out(row: StudyRow, adopted: str | None) -> StudyOut:
 router = APIRouter(tags=["studies"])
 Number = Annotated[Version, Path(description="Id of the study.")]
 
-# The page holds its style and its pictures, and nothing else may run or load in it.
-_PAGE_POLICY = (
+REPORT_POLICY = (
     "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'; "
-    "frame-ancestors 'none'"
+    "frame-ancestors 'none'; sandbox allow-same-origin"
 )
+"""The page holds its style and its pictures, and nothing else may run or load in it; of this origin, for its links."""
 
 
 add_creator(router, KINDS["studies"], "/studies", "post_study")
@@ -122,7 +131,7 @@ def get_study_report(number: Number, runtime: RuntimeDep) -> HTMLResponse:
         row = store.get_study(session, number, page=True)
     if row.html is None:
         raise NotFoundError(f"study {number} came as a report without a page")
-    return HTMLResponse(row.html, headers={"Content-Security-Policy": _PAGE_POLICY})
+    return HTMLResponse(row.html, headers={"Content-Security-Policy": REPORT_POLICY})
 
 
 @router.post(
@@ -136,11 +145,13 @@ def adopt_study(
     runtime: RuntimeDep,
     identity: IdentityDep,
     request: Annotated[AdoptIn | None, Body(examples=[{"force": False}])] = None,
-) -> ModelOut:
+) -> AdoptedOut:
     """Make what the study found the next version of the plant's model, which is used from then on."""
     force = request is not None and request.force
     with runtime.database.writing() as session:
-        return model_out(versions.adopt(session, number, identity.name, force), is_current=True)
+        row = versions.adopt(session, number, identity.name, force)
+        outdated = {one.heliostat: one.version for one in store.outdated_surfaces(session, row.version)}
+        return AdoptedOut(**dict(model_out(row, is_current=True)), outdated_surfaces=outdated)
 
 
 @router.post("/studies/{number}/withdraw", responses=problems(404, 409), dependencies=[OPERATE])

@@ -80,7 +80,7 @@ class ForecastForm(Model):
         return Sun(azimuth_deg=self.azimuth_deg, elevation_deg=self.elevation_deg)
 
 
-def _sun_now(plant: PlantRow | None) -> tuple[float, float]:
+def sun_now(plant: PlantRow | None) -> tuple[float, float]:
     """Where the sun stands now, [deg]; at night, or without a plant, a high sun in the south."""
     if plant is None:
         return 0.0, 45.0
@@ -158,7 +158,7 @@ def get_forecast_form(
         if job is not None:
             filled = _filled_as(session, queue.get_job(session, job))
             return _page(request, runtime, choices, filled, forecast=None)
-        azimuth, elevation = _sun_now(session.get(PlantRow, 1))
+        azimuth, elevation = sun_now(session.get(PlantRow, 1))
     first = next((row.name for row in choices["heliostats"]), "")
     filled = _filled(heliostat=heliostat or first, azimuth_deg=azimuth, elevation_deg=elevation)
     return _page(request, runtime, choices, filled, forecast=None)

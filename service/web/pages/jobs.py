@@ -9,6 +9,7 @@ from service.base.arrays import unpack
 from service.base.fields import Method, Model, Name, Version
 from service.drawing import charts
 from service.drawing.charts import HeatMap
+from service.drawing.templates import in_words
 from service.jobs.asking import ask_for, cancel_for
 from service.jobs.kind import result_of
 from service.jobs.kinds.predictions import PredictionsIn
@@ -81,17 +82,8 @@ def _asked(payload: dict[str, Any]) -> dict[str, Any]:
     """What was asked, long lists by their length."""
     given = {name: value for name, value in payload.items() if value not in (None, {}, [])}
     long = {name: len(value) for name, value in given.items() if isinstance(value, list | dict) and len(value) > _SHOWN}
-    short = {name: _in_words(value) for name, value in given.items() if name not in long}
+    short = {name: in_words(value) for name, value in given.items() if name not in long}
     return short | {name: f"{count} entries" for name, count in long.items()}
-
-
-def _in_words(value: Any) -> str:
-    """A value as a sentence has it: no braces, no quotes."""
-    if isinstance(value, dict):
-        return ", ".join(f"{name.replace('_', ' ')} {_in_words(inner)}" for name, inner in value.items())
-    if isinstance(value, list):
-        return ", ".join(_in_words(inner) for inner in value)
-    return {True: "yes", False: "no"}[value] if isinstance(value, bool) else str(value)
 
 
 @router.get("/jobs/{number}", dependencies=[READ, DRAWS])

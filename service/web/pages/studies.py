@@ -6,12 +6,14 @@ from fastapi import APIRouter, Form, Path, Query, Request, Response
 from fastapi.responses import HTMLResponse
 
 from service import store
-from service.base.faults import NotFoundError
-from service.base.fields import Model, Version
+from service.base.faults import ConflictError, NotFoundError
+from service.base.fields import Method, Model, Version
 from service.jobs.asking import ask_for
+from service.jobs.kinds.predictions import PredictionsIn
 from service.jobs.kinds.studies import StudyIn
 from service.twin import versions
 from service.web.answers.pages import go_to, render
+from service.web.api.studies import REPORT_POLICY
 from service.web.door.dependencies import OPERATE, READ, IdentityDep, RuntimeDep
 
 router = APIRouter(include_in_schema=False)
@@ -20,21 +22,20 @@ Number = Annotated[Version, Path(description="Id of the study.")]
 
 _PAGE = 50
 
-# The report brings its style and pictures along. In its frame, sandboxed, nothing runs and nothing is asked for; only
-# this service's own pages may frame it.
-_FRAMED = {
-    "Content-Security-Policy": (
-        "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'; "
-        "frame-ancestors 'self'; sandbox"
-    ),
-    "X-Frame-Options": "SAMEORIGIN",
-}
+# What a report begins with, whoever it is mailed to; here it leads back to its study.
+_CRUMB = "heliotwin study</p>"
 
 
 class AdoptForm(Model):
     """The button; ``force`` is ticked where the operator knows better than the verdict."""
 
     force: bool = False
+
+
+class RemakeForm(Model):
+    """The button that makes surfaces anew by the current model."""
+
+    method: Method = "refined"
 
 
 @router.get("/studies", dependencies=[READ])
@@ -46,6 +47,7 @@ def get_studies_page(
         rows = store.list_studies(session, _PAGE + 1, after)
         adopted = versions.adopted_from(session, [row.id for row in rows])
         current, adoptions = versions.get_model(session), versions.list_models(session)
+        outdated = store.outdated_surfaces(session, current.version)
     more = rows[_PAGE - 1].id if len(rows) > _PAGE else None
     return render(
         request,
@@ -53,6 +55,7 @@ def get_studies_page(
         studies=rows[:_PAGE],
         adopted=adopted,
         current=current,
+        outdated=outdated,
         versions=adoptions,
         more=more,
         after=after,
@@ -65,17 +68,21 @@ def get_study_page(number: Number, request: Request, runtime: RuntimeDep) -> HTM
     with runtime.database.reading() as session:
         row, has_page = store.get_study(session, number), store.has_study_page(session, number)
         adopted, current = versions.find_adopted(session, number), versions.current_number(session)
-    return render(request, "studied.html", study=row, has_page=has_page, adopted=adopted, current=current)
+        outdated = store.outdated_surfaces(session, versions.current_version(session))
+    return render(
+        request, "studied.html", study=row, has_page=has_page, adopted=adopted, current=current, outdated=outdated
+    )
 
 
 @router.get("/studies/{number}/report", dependencies=[READ])
 def get_study_report_page(number: Number, runtime: RuntimeDep) -> HTMLResponse:
-    """The report by itself, for the frame in its page."""
+    """The report, a page of its own, which leads back to its study."""
     with runtime.database.reading() as session:
         row = store.get_study(session, number, page=True)
     if row.html is None:
         raise NotFoundError(f"study {number} came as a report without a page")
-    return HTMLResponse(row.html, headers=_FRAMED)
+    back = f'heliotwin / <a href="/studies">studies</a> / <a href="/studies/{number}">{number}</a> / report</p>'
+    return HTMLResponse(row.html.replace(_CRUMB, back, 1), headers={"Content-Security-Policy": REPORT_POLICY})
 
 
 @router.post("/studies", dependencies=[OPERATE])
@@ -83,6 +90,18 @@ def post_study_form(runtime: RuntimeDep, identity: IdentityDep) -> Response:
     """Study what is stored, as the settings of a study are by default; go to the job's page."""
     row = ask_for(runtime, "studies", StudyIn().model_dump(mode="json"), identity.name)
     return go_to(f"/jobs/{row.id}")
+
+
+@router.post("/studies/remake", dependencies=[OPERATE])
+def post_remake_form(form: Annotated[RemakeForm, Form()], runtime: RuntimeDep, identity: IdentityDep) -> Response:
+    """Make those of today's surfaces anew that another version of the model made; go to the job's page."""
+    with runtime.database.reading() as session:
+        outdated = store.outdated_surfaces(session, versions.current_version(session))
+    names = [surface.heliostat for surface in outdated if not surface.waits]
+    if not names:
+        raise ConflictError("all surfaces were made by the current model, or one that was waits aside")
+    payload = PredictionsIn(heliostats=names, method=form.method).model_dump(mode="json")
+    return go_to(f"/jobs/{ask_for(runtime, 'predictions', payload, identity.name).id}")
 
 
 @router.post("/studies/{number}/adopt", dependencies=[OPERATE])

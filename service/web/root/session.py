@@ -15,10 +15,9 @@ router = APIRouter(tags=["session"])
 _LASTS_S = 12 * 3600
 
 
-def require_valid(runtime: Runtime, key: str) -> None:
-    """401 unless the key opens something."""
-    if security.identify(runtime.database, runtime.settings, key) is None:
-        raise HTTPException(HTTPStatus.UNAUTHORIZED, "this key is not valid", {"WWW-Authenticate": "Bearer"})
+def is_valid(runtime: Runtime, key: str) -> bool:
+    """Whether a key opens something."""
+    return security.identify(runtime.database, runtime.settings, key) is not None
 
 
 def keep_key(response: Response, request: Request, key: str) -> None:
@@ -40,7 +39,8 @@ def post_session(
     response: Response,
 ) -> None:
     """Keep a valid key in a cookie for half a day; it stops working at once when the key is withdrawn."""
-    require_valid(runtime, key)
+    if not is_valid(runtime, key):
+        raise HTTPException(HTTPStatus.UNAUTHORIZED, "this key is not valid", {"WWW-Authenticate": "Bearer"})
     keep_key(response, request, key)
 
 

@@ -211,7 +211,10 @@ def test_demo_leaves_table_pictures_report_and_store(tmp_path, stj, made_plant):
         for picture in entry["pictures"]:
             assert (tmp_path / "demo" / picture).read_bytes().startswith(b"\x89PNG")
     assert "heliotwin serve" in done.stderr
-    assert (tmp_path / "demo" / "report.html").is_file()
+    page = (tmp_path / "demo" / "report.html").read_text(encoding="utf-8")
+    assert '<meta name="viewport"' in page
+    assert "forecasts with refined surfaces are" in page
+    assert all(f'src="{picture}"' in page for result in report["heliostats"] for picture in result["pictures"])
 
 
 def test_forecast_for_a_sun_and_a_plane_needs_no_photographs(made_plant, tmp_path):

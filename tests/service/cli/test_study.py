@@ -202,6 +202,15 @@ def text(page: str) -> str:
     return re.sub(r"\s+", " ", "".join(read(page).words))
 
 
+def test_accuracies_are_in_percent_as_on_all_pages(hazy):
+    page = text(study_page(hazy.study, "few"))
+    before, after = (100 * float(values.mean()) for values in (hazy.study.accuracy_before, hazy.study.accuracy_after))
+    assert f"{before:.1f} % → {after:.1f} %" in page
+    assert f"rises from {before:.1f}% to {after:.1f}%" in hazy.study.conclusion()
+    assert "accuracy [%]" in page
+    assert f"{100 * hazy.study.found[0].gain.mean:.1f} points" in page
+
+
 def test_the_page_stands_alone(hazy):
     page = study_page(hazy.study, "few")
     reader = read(page)

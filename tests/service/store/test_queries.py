@@ -17,7 +17,7 @@ from model.plant import TargetPlane
 from service import store
 from service.base.arrays import pack, unpack
 from service.base.faults import ConflictError, NotFoundError
-from service.store import keys
+from service.store import keys, queue
 from service.store.columns import now
 from service.store.database import Database
 from service.store.job_tables import KeyRow
@@ -382,3 +382,36 @@ def test_what_a_check_forbids_is_no_other_writers_fault(database: Database):
         store.insert(session, nowhere)
     with database.reading() as session:
         assert store.counts(session)["measurements"] == 0
+
+
+def test_outdated_surfaces_are_those_of_today_by_another_version_of_the_model(database: Database):
+    with database.writing() as session:
+        heliostat, _ = setup(session)
+        measured, bare = (store.put_heliostat(session, name, {}, (0, 0, 0))[0] for name in ("AB01", "AB02"))
+        store.add_surface(session, heliostat, surface(1, model_version="1:none"))
+        store.add_surface(session, measured, surface(2, source="measured"))
+        assert bare.id
+    with database.writing() as session:
+        assert store.outdated_surfaces(session, "1:none") == []
+        expected = store.Outdated("AA39", 1, "network", "1:none", waits=False)
+        assert store.outdated_surfaces(session, "2:slope_error") == [expected]
+        heliostat = store.get_heliostat(session, "AA39")
+        row, _ = store.add_surface(session, heliostat, surface(3, model_version="2:slope_error"))
+        row.set_aside = True
+    with database.reading() as session:
+        assert store.outdated_surfaces(session, "2:slope_error") == [replace(expected, waits=True)]
+
+
+def test_plans_are_listed_newest_first_under_way_or_done(database: Database):
+    payload = {"name": "June", "target": "lower", "begin": "2026-06-21T04:00:00Z"}
+    with database.writing() as session:
+        first, _ = queue.add_job(session, "plans", payload, "tester", None)
+        first.result, first.state = {"peak_w_m2": 1.5}, "done"
+        queue.add_job(session, "predictions", {}, "tester", None)
+        queue.add_job(session, "plans", payload | {"name": "July"}, "tester", None)
+    with database.reading() as session:
+        plans = store.recent_plans(session, 10)
+    assert [(plan.name, plan.state, plan.peak_w_m2) for plan in plans] == [
+        ("July", "queued", None),
+        ("June", "done", 1.5),
+    ]

@@ -432,7 +432,11 @@ def test_report_of_a_folder_is_adopted_and_withdrawn_by_the_command_line(
     file = tmp_path / "report.json"
     file.write_text(json.dumps(report_of(GAMMA)))
     assert heliotwin("models", "adopt", str(file), "--json") == 0
-    assert json.loads(capsys.readouterr().out) == {"study": 1, "version": "2:camera_response"}
+    assert json.loads(capsys.readouterr().out) == {
+        "study": 1,
+        "version": "2:camera_response",
+        "outdated_surfaces": {},
+    }
     assert heliotwin("models", "list", "--json") == 0
     listed = json.loads(capsys.readouterr().out)
     assert [(entry["number"], entry["is_current"]) for entry in listed] == [(1, False), (2, True)]

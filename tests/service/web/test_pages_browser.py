@@ -3,6 +3,7 @@
 Needs Chromium, `HELIOTWIN_TEST_CHROMIUM` or one on the path, and its driver from the package playwright.
 """
 
+import itertools
 import os
 import re
 import shutil
@@ -13,10 +14,13 @@ from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 from fastapi import FastAPI
 from sqlalchemy import delete, update
 
+from service import store
 from service.base.settings import Settings
 from service.store import keys
 from service.store.columns import now
@@ -34,8 +38,10 @@ from tests.service.conftest import (
     serving,
     tower_document,
 )
+from tests.service.twin.test_versions import SLOPE, study_row
 
 playwright = pytest.importorskip("playwright.sync_api", reason="no browser driver: pip install playwright")
+axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="no axe: pip install axe-playwright-python")
 expect = playwright.expect
 expect.set_options(timeout=40_000)
 
@@ -49,6 +55,7 @@ FLAGS = [
     "--disable-component-update",
     "--disable-sync",
 ]
+SCHEMES = ("light", "dark")
 DESK, PHONE = {"width": 1280, "height": 900}, {"width": 390, "height": 844}
 PATHS = (
     "/",
@@ -60,8 +67,15 @@ PATHS = (
     "/studies",
     "/attention",
     "/calibration-plan?at=2026-06-21T10:00",
+    "/studies/1",
     "/jobs",
     "/jobs/1",
+    "/compare?heliostat=AA39&version=1&other_version=1",
+    "/plans",
+    "/plant",
+    "/plant/settings",
+    "/plant/keys",
+    "/plant/audit",
 )
 
 
@@ -101,6 +115,10 @@ def fill(app: FastAPI) -> None:
         sun = {"azimuth_deg": -20, "elevation_deg": 45}
         body = {"heliostat": "AA39", "target": "lower", "sun": sun}
         assert client.post("/v1/forecasts", json=body).status_code == 201
+        study = study_row(SLOPE)
+        study.html = "<p>heliotwin study</p><p>found</p>"
+        with app.state.runtime.database.writing() as session:
+            store.add_study(session, study)
 
 
 @pytest.fixture(scope="module")
@@ -297,9 +315,111 @@ def test_pages_fit_desk_and_phone(page: Any):
 def test_text_has_contrast(page: Any):
     """WCAG 2.2 AA: 4.5 for text; measured on what the browser computed."""
     script = (Path(__file__).parent / "contrast.js").read_text("utf-8")
+    for path, scheme in itertools.product((*PATHS, "/login"), SCHEMES):
+        page.emulate_media(color_scheme=scheme)
+        page.goto(path)
+        assert page.evaluate(script) == [], (path, scheme)
+
+
+# What axe-core knows of WCAG 2.2, levels A and AA.
+AXE = {"runOnly": ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa"], "resultTypes": ["violations"]}
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize("size", [DESK, PHONE], ids=["desk", "phone"])
+def test_axe_finds_nothing(page: Any, scheme: str, size: dict[str, int]):
+    page.set_viewport_size(size)
+    page.emulate_media(color_scheme=scheme)
+    for path in (*PATHS, "/login"):
+        page.goto(path)
+        found = axe.Axe().run(page, options=AXE).response["violations"]
+        assert not [(entry["id"], [node["html"] for node in entry["nodes"]]) for entry in found], path
+
+
+def test_dark_is_dark(page: Any):
+    page.emulate_media(color_scheme="dark")
+    page.goto("/")
+    assert page.evaluate("getComputedStyle(document.documentElement).backgroundColor") == "rgb(17, 24, 27)"
+
+
+# --- a phone ----------------------------------------------------------------------------------------------------------
+
+
+# What a finger shall meet and is less than 40 px high; links within a sentence may be lower.
+LOW = """() => [...document.querySelectorAll("button, select, input, summary, .choice, nav a, .button, .brand, th a")]
+    .filter((e) => !e.matches("[type=hidden], [type=radio], [type=checkbox], .note") && e.getClientRects().length)
+    .filter((e) => e.getBoundingClientRect().height < 39.5).map((e) => e.outerHTML.slice(0, 80))"""
+
+
+def test_fingers_meet_what_they_mean(page: Any):
+    page.set_viewport_size(PHONE)
     for path in PATHS:
         page.goto(path)
-        assert page.evaluate(script) == [], path
+        assert page.evaluate(LOW) == [], path
+    # On the map a tap beside a heliostat means it.
+    page.goto("/")
+    drawn = page.locator('[data-map] a[aria-label^="AB01"] circle')
+    drawn.scroll_into_view_if_needed()
+    box = drawn.bounding_box()
+    with page.expect_navigation():
+        page.mouse.click(box["x"] + box["width"] + 8, box["y"] + box["height"] / 2)
+    expect(page.locator("h1")).to_have_text("Heliostat AB01")
+
+
+def test_result_is_seen_after_a_tap(page: Any):
+    page.set_viewport_size(PHONE)
+    page.goto("/forecast")
+    page.click("form.stack button")
+    expect(page.locator("#result-title")).to_have_text("AA39 on lower")
+    expect(page.locator("#result-title")).to_be_in_viewport()
+    # So is what is wrong, wherever the form stands.
+    page.fill("[name=moment]", "2026-06-21T00:00")
+    page.click("form.stack button")
+    expect(page.locator("#notice [role=alert]")).to_be_in_viewport()
+
+
+def test_tables_show_that_they_scroll(page: Any):
+    """A shade at the right, until the last column is in sight."""
+    page.set_viewport_size(PHONE)
+    page.goto("/plant")
+    table = page.locator(".scroll").first
+    before = table.screenshot()
+    table.evaluate("e => e.scrollTo(e.scrollWidth, 0)")
+    after = table.screenshot()
+    darkness = [cv2.imdecode(np.frombuffer(shot, np.uint8), 0)[:, -3:].mean() for shot in (before, after)]
+    assert darkness[0] < darkness[1] - 20
+
+
+def test_legend_stands_below_the_map(page: Any):
+    page.set_viewport_size(PHONE)
+    page.goto("/?metric=deviation")
+    boxes = [page.locator(selector).bounding_box() for selector in ("svg.map", "svg.map + svg.scale")]
+    assert boxes[0]["y"] + boxes[0]["height"] <= boxes[1]["y"]
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_operator_plans_a_day_and_compares_surfaces(page: Any, scheme: str):
+    page.emulate_media(color_scheme=scheme)
+    page.set_viewport_size(PHONE)
+    page.goto("/plans")
+    page.fill("[name=name]", f"by {scheme}")
+    page.fill("[name=begin]", "2026-06-21T08:00")
+    page.fill("[name=end]", "2026-06-21T12:00")
+    page.fill("[name=heliostats]", "AA39 0.5 -1")
+    page.fill("[name=allowed_kw_m2]", "0.001")
+    follow(page, "form.stack button")
+    expect(page.locator("#maps-title")).to_contain_text("On the receiver")  # without a reload
+    expect(page.locator(".timeline")).to_have_count(3)
+    expect(page.locator(".timeline .limit")).to_have_count(1)
+    found = axe.Axe().run(page, options=AXE).response["violations"]
+    assert not [entry["id"] for entry in found]
+    follow(page, "tbody a >> nth=1")
+    assert page.url.endswith("?at=1")
+    follow(page, f"text=by {scheme} >> nth=-1")
+    expect(page.locator("h1")).to_have_text(f"Plan by {scheme}")
+    page.goto("/compare?heliostat=AA39&version=1&other_version=1")
+    expect(page.locator("[role=status]")).to_have_count(0)
+    expect(page.locator("#compared .columns figure")).to_have_count(6)
 
 
 @pytest.fixture
@@ -319,10 +439,16 @@ def test_who_has_no_key_logs_in_and_out(page: Any, key: str):
     page.fill("[name=key]", "htw_nonsense")
     follow(page, "text=Log in >> nth=-1")
     expect(page.locator("[role=alert]")).to_contain_text("not valid")
-    page.goto("/login?next=/heliostats/AA39")
-    page.fill("[name=key]", key)
+    page.fill("[name=key]", key)  # the form stands there again, and knows the way
     page.keyboard.press("Enter")
     expect(page.locator("h1")).to_have_text("Heliostat AA39")
     assert page.locator("text=Predict its surface").count() == 0
+    # The report is a page of its own that runs nothing; its way back takes the key along.
+    page.goto("/studies/1")
+    follow(page, "text=Open the report")
+    expect(page.locator("text=found")).to_be_visible()
+    follow(page, "a[href='/studies/1']")
+    expect(page.locator("h1")).to_have_text("Study 1")
     follow(page, "text=Log out")
     assert page.url.endswith("/login")
+    assert page.locator("[role=alert]").count() == 0

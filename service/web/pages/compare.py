@@ -1,0 +1,326 @@
+"""Two surfaces side by side, of a heliostat or of two: on one scale, what each forecasts, and how it went over time."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, date, datetime, time, timedelta
+from statistics import fmean
+from typing import Annotated, Any
+
+import numpy as np
+from fastapi import APIRouter, Depends, Query, Request
+from fastapi.responses import HTMLResponse
+from pydantic import BeforeValidator
+from sqlalchemy import select
+from sqlalchemy.orm import Session, undefer
+
+from model.errors import ModelError
+from model.metrics import flux_accuracy
+from service import store
+from service.base.arrays import unpack
+from service.base.faults import NotFoundError
+from service.base.fields import AZIMUTH, ELEVATION, Model, Name, Version
+from service.drawing import charts
+from service.drawing.charts import HeatMap, Timeline, Value
+from service.drawing.pictures import mirror_heights
+from service.store import mounts
+from service.store.tables import HeliostatRow, MountRow, PlantRow, SurfaceRow, TargetRow
+from service.twin.accuracy import Compared, Comparison, Span
+from service.twin.accuracy import name_of as photograph_of
+from service.twin.compute import Forecast
+from service.twin.field import Shape, figures_of, shape_of
+from service.twin.forecast import ForecastRequest, trace_request
+from service.twin.runtime import Runtime
+from service.web.answers.pages import render
+from service.web.door.dependencies import COMPUTES, DRAWS, READ, RuntimeDep
+from service.web.pages.forecast import sun_now
+from service.web.pages.heliostat import ComparisonBookDep
+
+router = APIRouter(include_in_schema=False, dependencies=[READ])
+
+_RESOLUTION = (128, 128)
+
+_EMPTY = BeforeValidator(lambda value: None if value == "" else value)  # as forms send what nobody filled in
+
+
+class CompareQuery(Model):
+    """What is compared: a version each of one heliostat or two, under a sun on a target; ``since`` and ``until`` days.
+
+    Without versions they are today's and, of the same heliostat, the one before it.
+    """
+
+    heliostat: Annotated[Name | None, _EMPTY] = None
+    version: Annotated[Version | None, _EMPTY] = None
+    other: Annotated[Name | None, _EMPTY] = None
+    other_version: Annotated[Version | None, _EMPTY] = None
+    target: Annotated[Name | None, _EMPTY] = None
+    azimuth_deg: Annotated[Annotated[float, AZIMUTH] | None, _EMPTY] = None
+    elevation_deg: Annotated[Annotated[float, ELEVATION] | None, _EMPTY] = None
+    since: Annotated[date | None, _EMPTY] = None
+    until: Annotated[date | None, _EMPTY] = None
+
+    @property
+    def span(self) -> Span:
+        """From the beginning of the first day to the end of the last, UTC."""
+        return Span(
+            None if self.since is None else datetime.combine(self.since, time(), UTC),
+            None if self.until is None else datetime.combine(self.until, time(), UTC) + timedelta(days=1),
+        )
+
+
+@dataclass(frozen=True)
+class Side:
+    """A surface with all that it is held against the other by; ``versions`` are its heliostat's, oldest first."""
+
+    heliostat: HeliostatRow
+    surface: SurfaceRow
+    versions: Sequence[SurfaceRow]
+    mounts: Sequence[MountRow]
+    z: charts.Array
+
+    @property
+    def name(self) -> str:
+        """As the page calls it."""
+        return f"{self.heliostat.name}, version {self.surface.version}"
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Width and height of the mirror [m]."""
+        return float(self.heliostat.properties["width"]), float(self.heliostat.properties["height"])
+
+    @property
+    def shape(self) -> Shape:
+        """The kind of its deviation."""
+        return shape_of(self.z, self.size)
+
+    @property
+    def uncertainty_mm(self) -> float | None:
+        """How well it is known [mm]."""
+        return figures_of(self.surface.arrays).uncertainty_mm
+
+
+def since_of(surface: SurfaceRow) -> datetime:
+    """Since when a surface describes the mirror, or, where that is not known, when it was made."""
+    return surface.valid_from if surface.valid_from.year > 1970 else surface.created_at
+
+
+_MOST_VERSIONS = 40
+_MOST_MOUNTS = 40
+
+
+def _side(session: Session, name: str, version: int | None, before: SurfaceRow | None = None) -> Side:
+    """A heliostat's surface of this version, else today's; of those but ``before`` the newest, where that is given."""
+    heliostat = store.get_heliostat(session, name)
+    query = select(SurfaceRow).where(SurfaceRow.heliostat_id == heliostat.id).options(undefer(SurfaceRow.arrays))
+    versions = list(session.scalars(query.order_by(SurfaceRow.version.desc()).limit(_MOST_VERSIONS)))
+    if version is not None:
+        surface = store.get_surface(session, heliostat, version)
+    elif before is None:
+        surface = store.get_surface_at(session, heliostat)
+    else:
+        others = [row for row in versions if row.id != before.id]
+        if not others:
+            raise NotFoundError(f"heliostat {name} has one surface only; name another heliostat")
+        surface = others[0]
+    made = mounts.list_mounts(session, heliostat, _MOST_MOUNTS)
+    return Side(heliostat, surface, versions[::-1], made, unpack(surface.arrays)["z"].astype(np.float64))
+
+
+def _sides(session: Session, query: CompareQuery) -> tuple[Side, Side]:
+    """The two; where versions are not said, the newer one comes second."""
+    assert query.heliostat is not None
+    if query.other is None or query.other == query.heliostat:
+        second = _side(session, query.heliostat, query.other_version)
+        return _side(session, query.heliostat, query.version, second.surface), second
+    return _side(session, query.heliostat, query.version), _side(session, query.other, query.other_version)
+
+
+# --- maps -------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Trio:
+    """Two maps on one scale, and the second minus the first."""
+
+    first: HeatMap
+    second: HeatMap
+    difference: HeatMap
+
+
+def _surfaces(first: Side, second: Side) -> Trio:
+    bound = max(float(np.abs(mirror_heights(side.z)).max()) for side in (first, second))
+    one, other = (charts.surface_map(f"Deviation of {side.name}", side.z, side.size, bound) for side in (first, second))
+    title = f"{second.name} minus {first.name}"
+    return Trio(one, other, charts.surface_map(title, second.z - first.z, second.size))
+
+
+@dataclass(frozen=True)
+class Forecasts:
+    """What two surfaces throw on one target, and how alike that is."""
+
+    maps: Trio
+    first: Forecast
+    second: Forecast
+    agreement: float
+
+
+def _forecasts(runtime: Runtime, sides: tuple[Side, Side], target: str, sun: tuple[float, float]) -> Forecasts:
+    """Raises ModelError where the light does not get there."""
+    traced = [
+        trace_request(
+            runtime,
+            ForecastRequest(
+                side.heliostat.name,
+                *sun,
+                target=target,
+                surface=side.surface.version,
+                resolution=_RESOLUTION,
+            ),
+        )
+        for side in sides
+    ]
+    one, other = (made.forecast for made in traced)
+    size = traced[0].plane.width, traced[0].plane.height
+    top = max(float(one.flux.max()), float(other.flux.max()))
+    first, second = (
+        charts.flux_map(f"Flux of {side.name} on {target}", made.flux, size, "W/m²", top)
+        for side, made in zip(sides, (one, other), strict=True)
+    )
+    difference = charts.difference_map("Second minus first", other.flux - one.flux, size, "W/m²")
+    return Forecasts(Trio(first, second, difference), one, other, flux_accuracy(one.flux, other.flux))
+
+
+# --- over time --------------------------------------------------------------------------------------------------------
+
+
+def _within(values: Sequence[Value], span: Span) -> list[Value]:
+    return [
+        value
+        for value in sorted(values, key=lambda value: value.at)
+        if (span.since is None or value.at >= span.since) and (span.until is None or value.at < span.until)
+    ]
+
+
+def _judged(comparison: Comparison) -> Value:
+    """The accuracy [%] with which a photograph is forecast."""
+    row = comparison.measurement
+    return Value(row.taken_at or row.created_at, 100 * comparison.accuracy, photograph_of(row), comparison.was_used)
+
+
+def _pointing(side: Side) -> list[Value]:
+    """How far off the light was of what its newest mount says [mrad], photograph by photograph."""
+    if not side.mounts:
+        return []
+    history = side.mounts[-1].document["history"]
+    off_mrad = 1e3 * np.linalg.norm(np.array(history["residuals"]).reshape(-1, 2), axis=-1)
+    foreign = set(history["foreign"])
+    return [
+        Value(datetime.fromisoformat(at), float(off))
+        for index, (at, off) in enumerate(zip(history["at"], off_mrad, strict=True))
+        if index not in foreign
+    ]
+
+
+def _timelines(sides: tuple[Side, Side], compared: Sequence[Compared], span: Span) -> list[Timeline]:
+    """Accuracy, shape and pointing on one axis of time, each with the versions of the surfaces marked."""
+    heliostats = {side.heliostat.name: side for side in sides}
+    marks = [
+        (since_of(row), f"{name} {row.version}" if len(heliostats) > 1 else f"v{row.version}")
+        for name, side in heliostats.items()
+        for row in side.versions
+    ]
+    accuracy = {
+        side.name: [_judged(comparison) for comparison in one.comparisons]
+        for side, one in zip(sides, compared, strict=True)
+    }
+    shapes = {
+        name: [(row, shape_of(unpack(row.arrays)["z"], side.size)) for row in side.versions]
+        for name, side in heliostats.items()
+    }
+
+    def of_shape(figure: str) -> dict[str, list[Value]]:
+        return {
+            name: [Value(since_of(row), getattr(shape, figure), f"version {row.version}") for row, shape in rows]
+            for name, rows in shapes.items()
+        }
+
+    drawn: list[tuple[str, str, Mapping[str, Sequence[Value]], int]] = [
+        ("Forecast accuracy of photographs; hollow: the surface was made from it", "%", accuracy, 1),
+        ("Deviation from the ideal mirror", "mm", of_shape("deviation_mm"), 3),
+        ("Canting of the facets", "mrad", of_shape("canting_mrad"), 3),
+        ("Pointing error", "mrad", {name: _pointing(side) for name, side in heliostats.items()}, 2),
+    ]
+    shown = [{name: _within(values, span) for name, values in series.items()} for _, _, series, _ in drawn]
+    moments = [value.at for series in shown for values in series.values() for value in values]
+    made = [
+        charts.timeline(title, unit, series, digits, marks=marks, from_zero=unit != "%", moments=moments)
+        for (title, unit, _, digits), series in zip(drawn, shown, strict=True)
+    ]
+    return [chart for chart in made if chart is not None]
+
+
+def _unseen(compared: Sequence[Compared]) -> tuple[list[float], int]:
+    """Mean accuracies [1] on photographs that neither was made from, and how many those are."""
+    found = [{c.measurement.id: c for c in one.comparisons} for one in compared]
+    either = found[0].keys() & found[1].keys() or found[0].keys() | found[1].keys()
+    fair = {number for number in either if not any(one[number].was_used for one in found if number in one)}
+    means = [[c.accuracy for number, c in one.items() if number in fair] for one in found]
+    return [fmean(some) for some in means if some], len(fair)
+
+
+# --- the page ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Read:
+    """What the page shows, before it is drawn; nobody waits in his turn for comparisons."""
+
+    sides: tuple[Side, Side] | None
+    compared: Sequence[Compared | None]
+    targets: Sequence[str]
+    sun: tuple[float, float]
+
+
+def _read(query: Annotated[CompareQuery, Query()], runtime: RuntimeDep, book: ComparisonBookDep) -> _Read:
+    with runtime.database.reading() as session:
+        targets = session.scalars(select(TargetRow.name).order_by(TargetRow.name)).all()
+        azimuth, elevation = sun_now(session.get(PlantRow, 1))
+        sides = None if query.heliostat is None else _sides(session, query)
+        shown = [book.read(session, side.heliostat, side.surface, query.span) for side in sides or ()]
+    compared = [Compared() if one is None else book.wait_for(one) for one in shown]
+    given = query.azimuth_deg, query.elevation_deg
+    sun = (azimuth if given[0] is None else given[0], elevation if given[1] is None else given[1])
+    return _Read(sides, compared, targets, sun)
+
+
+@router.get("/compare", dependencies=[DRAWS, COMPUTES])
+def get_compare_page(
+    query: Annotated[CompareQuery, Query()],
+    read: Annotated[_Read, Depends(_read)],
+    request: Request,
+    runtime: RuntimeDep,
+) -> HTMLResponse:
+    """Two surfaces, or the form that asks which."""
+    target = query.target or next(iter(read.targets), None)
+    filled: dict[str, Any] = {"query": query, "sun": read.sun, "target": target, "targets": read.targets}
+    if read.sides is None:
+        return render(request, "compare.html", **filled, sides=None)
+    known = [one for one in read.compared if one is not None]
+    forecasts, trouble = None, next((one.trouble for one in known if one.trouble), None)
+    try:
+        forecasts = None if target is None else _forecasts(runtime, read.sides, target, read.sun)
+    except ModelError as error:
+        trouble = str(error)
+    is_whole = len(known) == len(read.compared)
+    return render(
+        request,
+        "compare.html",
+        **filled,
+        sides=read.sides,
+        surfaces=_surfaces(*read.sides),
+        change_mm=1e3 * float(np.sqrt(np.mean((read.sides[1].z - read.sides[0].z) ** 2))),
+        forecasts=forecasts,
+        trouble=trouble,
+        unseen=_unseen(known) if is_whole else None,
+        timelines=_timelines(read.sides, [one or Compared() for one in read.compared], query.span),
+        again=None if is_whole else str(request.url.query),
+    )

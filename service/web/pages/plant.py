@@ -1,0 +1,71 @@
+"""The plant: its targets and receivers, and what its administrators look at: settings, keys, the audit trail."""
+
+from collections.abc import Sequence
+from typing import Annotated
+
+from fastapi import APIRouter, Query, Request
+from fastapi.responses import HTMLResponse
+from sqlalchemy import func, select
+from sqlalchemy.orm import Session
+
+from service import store
+from service.base.fields import Version
+from service.store import audit, keys
+from service.store.tables import MeasurementRow, PlantRow, TargetRow
+from service.twin import versions
+from service.web.answers.pages import render
+from service.web.door.dependencies import ADMIN, READ, RuntimeDep
+
+router = APIRouter(include_in_schema=False, prefix="/plant")
+
+_PAGE = 100
+
+
+def _targets(session: Session) -> Sequence[tuple[TargetRow, int]]:
+    """Target planes with the number of their photographs."""
+    counted = select(TargetRow, func.count(MeasurementRow.id)).outerjoin(MeasurementRow).group_by(TargetRow.id)
+    return [(row, count) for row, count in session.execute(counted.order_by(TargetRow.name))]
+
+
+@router.get("", dependencies=[READ])
+def get_plant_page(request: Request, runtime: RuntimeDep) -> HTMLResponse:
+    """What stands on the tower, and what is believed of the light."""
+    with runtime.database.reading() as session:
+        plant = session.get(PlantRow, 1)
+        targets, receivers = _targets(session), store.list_receivers(session)
+        model = versions.get_model(session)
+    shape = model.optics.sun_shape
+    return render(
+        request,
+        "plant.html",
+        plant=plant,
+        targets=targets,
+        receivers=receivers,
+        model=model,
+        sun_shape=(type(shape).__name__, vars(shape)),
+    )
+
+
+@router.get("/settings", dependencies=[ADMIN])
+def get_settings_page(request: Request, runtime: RuntimeDep) -> HTMLResponse:
+    """The settings in force, without secrets."""
+    return render(request, "settings.html", settings=runtime.settings.in_force)
+
+
+@router.get("/keys", dependencies=[ADMIN])
+def get_keys_page(request: Request, runtime: RuntimeDep) -> HTMLResponse:
+    """Who may come in; the keys themselves are not stored."""
+    with runtime.database.reading() as session:
+        rows = keys.list_keys(session)
+    return render(request, "keys.html", keys=rows)
+
+
+@router.get("/audit", dependencies=[ADMIN])
+def get_audit_page(
+    request: Request, runtime: RuntimeDep, after: Annotated[Version | None, Query()] = None
+) -> HTMLResponse:
+    """Who did what, newest first."""
+    with runtime.database.reading() as session:
+        rows = audit.entries(session, _PAGE + 1, after)
+    more = rows[_PAGE - 1].id if len(rows) > _PAGE else None
+    return render(request, "audit.html", entries=rows[:_PAGE], more=more, after=after)

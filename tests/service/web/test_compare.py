@@ -1,0 +1,108 @@
+"""The page that holds two surfaces against each other."""
+
+import re
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+from fastapi.testclient import TestClient
+
+from model.surface import greville
+from service.twin.field import shape_of
+from tests.service.conftest import FakeOperations, Post, png
+from tests.service.web.test_pages import HTML, text_of
+
+DAYS = ("2024-06-01", "2024-07-01", "2024-08-01")
+
+
+@pytest.fixture
+def pages(client: TestClient, post: Post, properties: dict[str, Any]) -> TestClient:
+    """Three photographs of a summer, and two surfaces: of the first, and of the first two."""
+    for number, day in enumerate(DAYS, 1):
+        taken = f"{day}T11:30:00Z"
+        assert post(png(number), id=f"10{number}", taken_at=taken, sun_azimuth=10.0 * number).status_code == 201
+    for used in (["101"], ["101", "102"]):
+        assert client.post("/v1/heliostats/AA39/surfaces", json={"measurements": used}).status_code == 201
+    assert client.put("/v1/heliostats/AB01", json=properties).status_code == 201
+    client.headers.update(HTML)
+    return client
+
+
+def settled(client: TestClient, path: str) -> str:
+    for _ in range(100):
+        page = text_of(client, path)
+        if "being worked out" not in page:
+            return page
+        time.sleep(0.05)
+    raise AssertionError("comparisons are never done")
+
+
+def test_asks_what_to_compare(pages: TestClient):
+    page = text_of(pages, "/compare")
+    assert 'name="other_version"' in page
+    assert "In figures" not in page
+
+
+def test_versions_stand_side_by_side_with_what_they_forecast(pages: TestClient, operations: FakeOperations):
+    page = settled(pages, "/compare?heliostat=AA39")
+    assert "AA39, version 1 with AA39, version 2" in page
+    assert page.count('<svg class="figure" viewBox="0 0 430') == 6
+    assert "Deviation of AA39, version 2; from -1 to 1 mm" in page
+    assert [made["resolution"] for made in operations.forecasts[-2:]] == [(128, 128)] * 2
+    assert "they agree by 100.0" in page
+    # Only the third photograph has been seen by neither.
+    assert "of 1 photographs that neither was made from" in page
+    assert re.search(r'Forecast accuracy</th>(<td class="number">100\.0\s*%</td>){2}', page)
+
+
+def test_time_range_of_the_link_bounds_what_is_shown(pages: TestClient):
+    def dots(path: str) -> int:
+        charts = settled(pages, path).partition("Over time")[2]
+        return charts.partition("Deviation from the ideal")[0].count("<circle")
+
+    path = "/compare?heliostat=AA39&version=1&other_version=2"
+    assert dots(path) == 6
+    assert dots(f"{path}&since=2024-07-01&until=2024-07-31") == 2
+    page = settled(pages, f"{path}&since=2030-01-01")
+    assert "Nothing falls into this time" in page
+    assert 'name="since" value="2030-01-01"' in page
+
+
+def test_versions_are_marked_in_time(pages: TestClient):
+    charts = settled(pages, "/compare?heliostat=AA39").partition("Over time")[2]
+    assert charts.count('class="noted"') == 6
+    for label in ("v1", "v2"):
+        assert f">{label}</text>" in charts
+
+
+def test_two_heliostats_are_compared(pages: TestClient, post: Post):
+    assert "AB01" in text_of(pages, "/compare?heliostat=AA39&other=AB01", 404)
+    assert post(png(9), heliostat="AB01", id="201", taken_at="2024-06-15T11:30:00Z").status_code == 201
+    assert pages.post("/v1/heliostats/AB01/surfaces", json={}).status_code == 201
+    page = settled(pages, "/compare?heliostat=AA39&other=AB01")
+    assert "AA39, version 2 with AB01, version 1" in page
+    assert page.count('class="series other"') == 3  # accuracy, deviation, canting; no mount is calibrated
+    assert "AB01 1</text>" in page
+
+
+@pytest.mark.parametrize("query", ["heliostat=none", "heliostat=AB01", "heliostat=AA39&version=9"])
+def test_what_is_not_there_is_named(pages: TestClient, query: str):
+    assert "<h1>Not Found" in text_of(pages, f"/compare?{query}", 404)
+
+
+def test_one_surface_has_nothing_to_be_compared_with(pages: TestClient):
+    assert "AB01" in text_of(pages, "/compare?heliostat=AB01", 404)
+
+
+@pytest.mark.parametrize("query", ["since=yesterday", "version=x", "elevation_deg=91"])
+def test_bad_links_are_refused_by_name(pages: TestClient, query: str):
+    assert query.partition("=")[0] in text_of(pages, f"/compare?heliostat=AA39&{query}", 422)
+
+
+def test_tilted_facets_are_canting_and_no_waviness():
+    """One mrad about each axis of every facet of a 4 m x 2 m mirror."""
+    x, y = np.meshgrid(2 * (greville(8) - 0.5), 1 * (greville(8) - 0.5), indexing="ij")
+    shape = shape_of(np.stack([1e-3 * (x + y)] * 4), (4.0, 2.0))
+    assert shape.canting_mrad == pytest.approx(2**0.5, rel=1e-9)
+    assert shape.waviness_mm == pytest.approx(0.0, abs=1e-9)

@@ -1,0 +1,153 @@
+"""Plans: a day of light on a receiver as a job, and its page."""
+
+import re
+import threading
+from typing import Any
+
+import numpy as np
+import pytest
+from fastapi import FastAPI
+from fastapi.testclient import TestClient
+
+from model.fleet import FleetFlux
+from model.plant import Cylinder, TargetPlane
+from service.jobs.kinds import KINDS
+from service.jobs.kinds.plans import aim_on, load_of
+from service.jobs.worker import Worker
+from tests.service.conftest import FakeOperations, Post, png
+from tests.service.web.test_pages import HTML, make_key, text_of
+
+DAY = {"name": "June", "target": "lower", "begin": "2026-06-21T02:00:00Z", "end": "2026-06-21T10:00:00Z"}
+FORM = {
+    "name": "June",
+    "target": "lower",
+    "begin": "2026-06-21T02:00",
+    "end": "2026-06-21T10:00",
+    "step_minutes": "120",
+}
+DRUM = {"center": [0, 0, 55.2], "normal": [0, 1, 0], "radius": 4.1, "height": 5.2, "opening_deg": 60}
+
+
+@pytest.fixture
+def pages(client: TestClient, post: Post, properties: dict[str, Any]) -> TestClient:
+    """Two heliostats, one of them with a surface."""
+    assert post(png(1), id="101").status_code == 201
+    assert client.post("/v1/heliostats/AA39/surfaces", json={}).status_code == 201
+    assert client.put("/v1/heliostats/AB01", json=properties).status_code == 201
+    assert client.put("/v1/receivers/drum", json=DRUM).status_code == 201
+    client.headers.update(HTML)
+    return client
+
+
+def work(app: FastAPI) -> None:
+    worker = Worker(app.state.runtime, KINDS, "tester", threading.Event())
+    while worker.work():
+        pass
+
+
+def planned(app: FastAPI, client: TestClient, **changes: Any) -> dict[str, Any]:
+    """The job of a plan, when it has ended."""
+    path = client.post("/v1/jobs/plans", json=DAY | {"step_minutes": 120} | changes).headers["Location"]
+    work(app)
+    job: dict[str, Any] = client.get(path).json()
+    return job
+
+
+def test_day_is_a_series_by_twin_and_ideal_mirrors(app: FastAPI, pages: TestClient, operations: FakeOperations):
+    job = planned(app, pages, allowed_w_m2=1.5)
+    result = job["result"]
+    # At two o'clock it is night in Jülich; the heliostat without a surface is left out of both.
+    assert [step["at"][11:16] for step in result["steps"]] == ["04:00", "06:00", "08:00", "10:00"]
+    assert (result["left_out"], result["heliostats"], list(result["skipped"])) == (1, 1, ["AB01"])
+    elevations = [step["sun"]["elevation_deg"] for step in result["steps"]]
+    assert elevations == sorted(elevations)
+    for step in result["steps"]:
+        for kind in ("twin", "ideal"):
+            load = step[kind]
+            assert (load["peak_w_m2"], load["reflected_w"]) == (2.0, 60.0)
+            assert load["intercept"] == 1.0
+            assert load["exceeded_m2"] == pytest.approx(result["plane"]["width"] * result["plane"]["height"])
+    assert len(operations.fleets) == 8
+    maps = pages.get(f"/v1/jobs/{job['id']}/flux", headers={"Accept": "application/json"}).json()
+    assert np.shape(maps["flux"]) == (64, 64)
+
+
+def test_what_is_wrong_is_named(pages: TestClient):
+    for changes, said in (
+        ({"end": "2026-06-20T00:00:00Z"}, "end: give a time after begin"),
+        ({"step_minutes": 1}, "more than 100 times"),
+        ({"allowed_w_m2": 0}, "allowed_w_m2"),
+        ({"name": " "}, "name"),
+    ):
+        answer = pages.post("/v1/jobs/plans", json=DAY | changes)
+        assert answer.status_code == 422
+        assert said in answer.json()["detail"]
+
+
+def test_plan_of_the_night_fails_with_its_reason(app: FastAPI, pages: TestClient):
+    job = planned(app, pages, end="2026-06-21T02:30:00Z")
+    assert job["state"] == "failed"
+    assert "night" in job["reason"]
+    assert "night" in text_of(pages, f"/plans/{job['id']}")
+
+
+def test_form_leads_to_the_plan_which_can_be_reopened(app: FastAPI, pages: TestClient):
+    asked = FORM | {"heliostats": "AA39 0.5 -1\n\nAB01", "allowed_kw_m2": "0.0015", "dni_w_m2": "900"}
+    path = pages.post("/plans", data=asked, follow_redirects=False).headers["Location"]
+    assert 'hx-trigger="load delay:2s"' in text_of(pages, path)
+    work(app)
+    page = text_of(pages, path)
+    for told in ("Plan June", "at 4 of 4 times", "Intercept", "Spillage", "Through the day", "outlined"):
+        assert told in page
+    assert "hx-trigger" not in page.partition("<main")[2]
+    assert page.count('class="limit"') == 1
+    # The form holds what was asked, and the list leads back.
+    assert "AA39 0.5 -1\nAB01</textarea>" in page
+    assert re.search(r'name="allowed_kw_m2"[^>]* value="0.0015"', page)
+    assert 'value="2026-06-21T02:00"' in page
+    assert f'<a href="{path}">June</a>' in text_of(pages, "/plans")
+    assert "2026-06-21 06:00 UTC</time></h2>" in text_of(pages, f"{path}?at=1")
+    assert "2026-06-21 10:00 UTC</time></h2>" in text_of(pages, f"{path}?at=99")
+    assert f'href="{path}">June</a>' in text_of(pages, path.replace("plans", "jobs"))
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"heliostats": "AA39\nAB01 1"}, "line 2"),
+        ({"heliostats": "AA39 a b"}, "line 1"),
+        ({"heliostats": "AA/39"}, "heliostats"),
+        ({"heliostats": "AA39 nan 1"}, "aim_offsets"),
+        ({"end": "2026-06-20T02:00"}, "after begin"),
+        ({"begin": ""}, "begin"),
+    ],
+)
+def test_form_says_what_is_wrong(pages: TestClient, changes: dict[str, str], said: str):
+    answer = pages.post("/plans", data=FORM | changes)
+    assert answer.status_code == 422
+    assert said in answer.text
+
+
+def test_plan_is_no_other_job(app: FastAPI, pages: TestClient):
+    number = pages.post("/v1/jobs/predictions", json={}).json()["id"]
+    assert "is no plan" in text_of(pages, f"/plans/{number}", 404)
+    key = make_key(app, "read")
+    pages.headers["Authorization"] = f"Bearer {key}"
+    assert "plans need the role operate" in text_of(pages, "/plans")
+    assert pages.post("/plans", data=FORM).status_code == 403
+
+
+def test_offset_lies_on_the_receiver():
+    plane = TargetPlane("wall", np.array([0.0, 0, 50]), np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), 8.0, 6.0)
+    # Seen from the north, right is west.
+    assert aim_on(plane, 1.0, -2.0) == pytest.approx((-1.0, 0.0, 48.0))
+    drum = Cylinder("drum", np.array([0.0, 4, 50]), np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), 4.0, 6.0, 360.0)
+    assert aim_on(drum, np.pi / 2 * 4, 1.0) == pytest.approx((-4.0, 0.0, 51.0))
+
+
+def test_load_is_what_lands_and_what_is_too_much():
+    """Four pixels of a square metre each: 3 and 1 W/m2 on two of them, of 8 W that the mirrors reflect."""
+    plane = TargetPlane("wall", np.zeros(3), np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), 2.0, 2.0)
+    load = load_of(FleetFlux(np.array([[3.0, 1.0], [0.0, 0.0]]), power=8.0, heliostats=1), plane, 2.0)
+    assert (load["power_w"], load["intercept"], load["spillage"], load["exceeded_m2"]) == (4.0, 0.5, 0.5, 1.0)
+    assert load_of(FleetFlux(np.zeros((2, 2))), plane, None)["intercept"] is None
