@@ -158,14 +158,6 @@
     if (event.target.id === "find")
       for (const [name, value] of Object.entries(event.detail.parameters)) if (value === "") delete event.detail.parameters[name];
   });
-  document.addEventListener("click", (event) => {
-    const map = event.target.closest("[data-map]"), all = links();
-    if (!map || event.target.closest("a") || !all.length) return;
-    const drawn = map.getScreenCTM(), at = new DOMPoint(event.clientX, event.clientY).matrixTransform(drawn.inverse());
-    const far = (link) => { const [x, y] = place(link); return Math.hypot(x - at.x, y - at.y) * drawn.a; };
-    const best = all.reduce((one, other) => (far(other) < far(one) ? other : one));
-    if (far(best) <= 20) location.assign(best.href.baseVal);
-  });
   document.addEventListener("htmx:afterSettle", begin);
   begin();
 })();

@@ -166,6 +166,7 @@ def test_rest_has_the_same_field(large: TestClient):
         "uncertainty": None,
         "misfit": None,
         "age": pytest.approx(0, abs=1),
+        "pointing": None,
         "surface": 1,
         "source": "refined",
         "trusted": True,
