@@ -23,7 +23,7 @@ from model.network.architecture import MAX_IMAGES
 from model.observation import Observation, SurfacePrediction
 from model.plant import Heliostat, TargetPlane
 from model.surface import split_canting
-from service.base.choices import Method
+from service.base.choices import Method, require_images
 from service.base.progress import Progress, quiet
 from service.sources.decode import Pixels, decode_image
 from service.sources.documents import IMAGE_KINDS, Measurement
@@ -195,6 +195,8 @@ def predict_heliostat(
         "trusted": predicted.trusted,
         "strangeness": round(predicted.mahalanobis, 3),
         "suspicious": list(predicted.suspicious),
+        "contradicting": list(predicted.contradicting),
+        "doubts": list(predicted.doubts),
         "z_rms_mm": round(float(np.sqrt((predicted.z**2).mean()) * 1e3), 4),
         "z_std_mean_mm": round(float(predicted.z_std.mean() * 1e3), 4),
     }
@@ -224,8 +226,7 @@ def predict_folder(
     progress: Progress = quiet,
 ) -> dict[str, Any]:
     """Predict every heliostat's surface from up to ``images`` of its images; files as DESIGN.md, section 6."""
-    if not 1 <= images <= MAX_IMAGES:
-        raise InvalidInputError(f"--images must lie in 1 to {MAX_IMAGES}, got {images}")
+    require_images(method, images)
     report: dict[str, Any] = {"method": method, "heliostats": {}, "skipped": {}}
     try:
         for name, heliostat in folder.plant.heliostats.items():

@@ -9,14 +9,14 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from model.effects import Effect, model_version
-from model.errors import InvalidInputError
 from model.fleet import Engine, FleetFlux, Superposition, Tile
 from model.fleet import superpose as superpose_tiles
 from model.forecast import Setup, View, align
 from model.imaging import Camera, ImageKind, MeasuredFlux
 from model.imaging import measure as measure_image
+from model.network.architecture import MAX_IMAGES
 from model.network.predictor import default_predictor
-from model.observation import Observation, SurfacePrediction, render_observations
+from model.observation import Observation, SurfacePrediction, render_observations, spread_suns
 from model.plant import Heliostat, Receiver, TargetPlane
 from model.refinement import refine
 from model.study import FluxImage, Study, StudyOptions
@@ -24,7 +24,7 @@ from model.study import study as study_photographs
 from model.surface import COLUMNS, DEGREE, ROWS, control_points
 from model.tracing import Optics
 from model.tracing.convolution import central_rays
-from service.base.choices import Method
+from service.base.choices import Method, require_images
 from service.base.progress import Progress, quiet
 from service.sources.juelich import CENTERED_WINDOW, mark_layouts
 
@@ -69,12 +69,13 @@ def predict(
     InvalidInputError
         For no or too many images, or an unknown method.
     """
-    if method not in ("network", "refined"):
-        raise InvalidInputError(f"method must be 'network' or 'refined', got {method!r}")
+    require_images(method, len(observations))
     predictor = default_predictor()
     if method == "network":
         return predictor.predict(heliostat, observations, optics, effects, latitude_deg=latitude_deg)
-    start, _ = predictor.heights(heliostat, observations, optics, effects, latitude_deg=latitude_deg)
+    far_apart = spread_suns(np.array([o.sun for o in observations]), MAX_IMAGES)
+    few = [observations[place] for place in far_apart]
+    start, _ = predictor.heights(heliostat, few, optics, effects, latitude_deg=latitude_deg)
     refined = refine(heliostat, observations, start, latitude_deg=latitude_deg, optics=optics, effects=effects)
     return replace(refined, weights=f"{predictor.name}+{refined.weights}")
 

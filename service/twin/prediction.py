@@ -9,7 +9,7 @@ from sqlalchemy.orm import Session
 from model.frames import sun_direction
 from model.observation import TRUSTED_MAHALANOBIS, Observation, SurfacePrediction
 from service import store
-from service.base.choices import Method
+from service.base.choices import Method, require_images
 from service.store import audit, decisions
 from service.store.decisions import Grounds
 from service.store.keys import RESERVED
@@ -53,7 +53,10 @@ def compute_surface(
     ------
     NotFoundError, ConflictError
         Where the heliostat, a measurement or the model is not stored, or no measurement is accepted.
+    InvalidInputError
+        Where the method takes fewer images.
     """
+    require_images(method, images if measurements is None else len(measurements))
     with runtime.database.reading() as session:
         twin = load_twin(session, heliostat, model_version)
         names = measurements

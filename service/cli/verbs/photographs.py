@@ -61,7 +61,7 @@ def predict(
     method: Annotated[
         Method, typer.Option(help="network, or refined: the network, then MAP through the tracer.")
     ] = "network",
-    images: Annotated[int, typer.Option(help="Most images used for a heliostat, 1 to 8.")] = 8,
+    images: Annotated[int, typer.Option(help="Most images used for a heliostat: 1 to 8, to 64 where refined.")] = 8,
     as_json: AsJson = False,
 ) -> None:
     """Mirror surfaces from images: OUT/H/Deflectometry/H-nurbs-surface.npz and OUT/predictions.json."""

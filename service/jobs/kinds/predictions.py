@@ -22,7 +22,9 @@ class PredictionsIn(Model):
 
     heliostats: Heliostats = None
     method: Method = Field(default="network", description="network: at once; refined: fitted through the ray tracer.")
-    images: Whole = Field(default=8, ge=1, le=8, description="How many measurements to take of each heliostat.")
+    images: Whole = Field(
+        default=8, ge=1, le=64, description="How many measurements to take of each heliostat; 8 the network."
+    )
     model_version: ModelVersion = None
 
 

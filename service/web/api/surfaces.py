@@ -38,13 +38,16 @@ class SurfaceIn(Model):
 
     method: Method = Field(default="network", description="network: at once; refined: fitted through the ray tracer.")
     measurements: list[MeasurementName] | None = Field(
-        default=None, min_length=1, max_length=8, description="Ids of 1 to 8 accepted measurements."
+        default=None,
+        min_length=1,
+        max_length=64,
+        description="Ids of accepted measurements: 1 to 8 for the network, to 64 refined.",
     )
     images: Whole = Field(
         default=8,
         ge=1,
-        le=8,
-        description="How many of the newest accepted ones to take, spread over the sun's positions.",
+        le=64,
+        description="How many of the newest accepted ones to take, spread over the sun's positions; 8 the network.",
     )
     model_version: ModelVersion = None
 

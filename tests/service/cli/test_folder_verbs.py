@@ -128,7 +128,10 @@ def test_contract_on_undeclared_sets(undeclared, tmp_path, number):
         (("predict", "PLANT", "--out", "x", "--method", "magic"), "'magic' is not one of 'network', 'refined'"),
         (("predict", "PLANT", "--out", "x", "--images", "many"), "--images must be"),
         (("predict", "PLANT"), "Missing option '--out'"),
-        (("predict", "PLANT", "--out", "x", "--images", "9"), "--images must lie in 1 to 8"),
+        (
+            ("predict", "PLANT", "--out", "x", "--images", "9"),
+            "images must lie in 1 to 8 for the method network, got 9; refined takes up to 64",
+        ),
         (("forecast", "PLANT", "--out", "x", "--surfaces", "nowhere"), "--surfaces must be"),
         (("forecast", "PLANT", "--out", "x", "--effects", "nowhere.json"), "nowhere.json: no such file"),
     ],

@@ -136,3 +136,14 @@ def test_what_is_not_there(refusing: TestClient):
     assert refusing.get(f"{BASE}/current").status_code == 404
     assert refusing.get("/v1/heliostats/AB01/surfaces").status_code == 404
     assert refusing.post("/v1/heliostats/AB01/surfaces", json={}).status_code == 404
+
+
+def test_refinement_takes_more_images_than_the_network(client: TestClient, post: Post, operations: FakeOperations):
+    for number in range(1, 12):
+        post(png(number))
+    path = "/v1/heliostats/AA39/surfaces"
+    refused = client.post(path, json={"method": "network", "images": 11})
+    assert refused.status_code == 422
+    assert "images must lie in 1 to 8 for the method network, got 11" in refused.json()["detail"]
+    assert client.post(path, json={"method": "refined", "images": 11}).status_code == 201
+    assert len(operations.predictions[-1]) == 11
