@@ -26,6 +26,7 @@ from service.base.settings import Settings
 from service.store.columns import now
 from service.store.tables import HeliostatRow
 from service.web.app import create_app
+from tests.docker.test_docker import drawn_expressions
 from tests.service.conftest import (
     QUIET,
     FakeOperations,
@@ -56,6 +57,14 @@ def test_rules_and_configurations_are_sound():
     ):
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_the_dashboard_asks_what_prometheus_understands(tmp_path: Path):
+    asked = [{"record": f"drawn:{place}", "expr": expression} for place, expression in enumerate(drawn_expressions())]
+    rules = tmp_path / "drawn.yml"
+    rules.write_text(yaml.safe_dump({"groups": [{"name": "drawn", "rules": asked}]}), encoding="utf-8")
+    done = subprocess.run((binary("promtool"), "check", "rules", rules), capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
 
 
 @contextmanager

@@ -91,7 +91,7 @@ def test_containers_have_no_more_rights_than_they_need(compose: dict[str, Any]):
         assert service["read_only"] is True
         assert service["cap_drop"] == ["ALL"]
     published = [port for service in compose["services"].values() for port in service.get("ports", [])]
-    assert len(published) == 3
+    assert len(published) == 4
     assert all(port.startswith("127.0.0.1:") for port in published)
 
 
@@ -143,6 +143,32 @@ def test_prometheus_sends_alerts_to_alertmanager(compose: dict[str, Any]):
     assert "./alertmanager.yml:/etc/alertmanager/alertmanager.yml:ro" in alertmanager["volumes"]
 
 
+def drawn_expressions() -> list[str]:
+    """What the dashboard asks Prometheus for."""
+    panels = json.loads((DOCKER / "grafana" / "heliotwin.json").read_text(encoding="utf-8"))["panels"]
+    return [target["expr"] for panel in panels for target in panel["targets"]]
+
+
+def test_grafana_draws_what_prometheus_has(compose: dict[str, Any]):
+    grafana = compose["services"]["grafana"]
+    assert grafana["profiles"] == ["monitoring"]
+    sources = [mount.split(":")[0] for mount in grafana["volumes"] if mount.startswith("./")]
+    assert all((DOCKER / source).is_file() for source in sources)
+    (source,) = yaml.safe_load((DOCKER / "grafana" / "datasource.yml").read_text(encoding="utf-8"))["datasources"]
+    assert source["url"] == "http://prometheus:9090"
+    dashboard = json.loads((DOCKER / "grafana" / "heliotwin.json").read_text(encoding="utf-8"))
+    cells = [
+        (x, y)
+        for place in (panel["gridPos"] for panel in dashboard["panels"])
+        for x in range(place["x"], place["x"] + place["w"])
+        for y in range(place["y"], place["y"] + place["h"])
+    ]
+    assert len(cells) == len(set(cells))
+    assert max(x for x, _ in cells) < 24
+    assert {panel["datasource"]["uid"] for panel in dashboard["panels"]} == {source["uid"]}
+    assert len({panel["id"] for panel in dashboard["panels"]}) == len(dashboard["panels"])
+
+
 def _rules() -> list[dict[str, Any]]:
     groups = yaml.safe_load((DOCKER / "prometheus-rules.yml").read_text(encoding="utf-8"))["groups"]
     return [rule for group in groups for rule in group["rules"]]
@@ -173,6 +199,8 @@ def test_alerts_ask_for_metrics_that_exist(tmp_path: Path):
     asked = {name for rule in rules for name in re.findall(r"heliotwin_\w+", rule["expr"])}
     assert len(rules) == 5 + len(REASONS)
     assert asked <= names
+    drawn = {name for expression in drawn_expressions() for name in re.findall(r"heliotwin_\w+", expression)}
+    assert {name.removesuffix("_bucket") for name in drawn} <= names
     told = set(re.findall(r"heliotwin_\w+", (DOCKER / "OPERATING.md").read_text(encoding="utf-8")))
     assert told <= names
 
