@@ -55,7 +55,7 @@ def test_newest_photographs_are_held_against_the_mount(client: TestClient, post:
     for told in (page, field):
         assert "m on the receiver" in told.replace("\N{NO-BREAK SPACE}", " ")
         assert 'href="/calibration-plan"' in told
-    assert re.search(r'<circle [^>]*fill="#[0-9a-f]{6}"', field)
+    assert re.search(r'<path class="mirrors" fill="#[0-9a-f]{6}"', field)
     metrics = client.get("/metrics").text
     assert 'heliotwin_heliostat_pointing_error_mrad{heliostat="AA39"} ' in metrics
     assert 'heliotwin_heliostat_pointing_error_metres{heliostat="AA39"} ' in metrics
