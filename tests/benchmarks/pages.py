@@ -1,6 +1,6 @@
 """Pictures of a running service's pages at a desk and on a phone: ``python -m tests.benchmarks.pages [--url URL]``.
 
-They are there to be looked at: ``results/pages`` has those of a store of ``../shared/stj``. Needs Chromium and
+They are there to be looked at: ``results/pages`` has those of the demonstration's store. Needs Chromium and
 playwright.
 """
 
