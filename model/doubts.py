@@ -6,6 +6,7 @@ by a likely one.
 """
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,7 +15,7 @@ from model.images import FLUX_SIZE
 from model.observation import Observation
 from model.plant import Heliostat
 from model.prior import SurfacePrior
-from model.surface import split_canting
+from model.surface import canting_rises
 
 Array = NDArray[np.float64]
 
@@ -37,7 +38,7 @@ CLIPPED = 0.5
 """Share of a spot's brighter half beyond the camera's range from which on a photograph shows little more than a rim."""
 
 UNLIKE_FACET = 3.2
-"""Deviations by which a facet may be canted from the others': of 51 measured mirrors two reach 3, one 4."""
+"""Deviations by which a facet may be canted from the others': of the measured mirrors one reaches 3.1, AA39 4.3."""
 
 DARK, CERTAIN = 0.3, 5.0
 """Share by which a facet's light falls short of the others', and in standard deviations, from which on it is told.
@@ -72,8 +73,8 @@ def of_canting(prior: SurfacePrior, z: Array) -> list[str]:
 
     Against the mean of the facets: a tilt of the whole mirror is the mount's.
     """
-    spread = np.sqrt((_relative_canting(prior.basis) ** 2).sum(axis=0))
-    distances = np.linalg.norm((_relative_canting(z) - _relative_canting(prior.mean)) / spread, axis=-1)
+    usual, spread = _usual_canting(prior)
+    distances = np.linalg.norm((_relative_canting(z) - usual) / spread, axis=-1)
     return [
         f"facet {number} is canted {distance:.1f} standard deviations off; {UNLIKE_FACET} are usual at most"
         for number, distance in enumerate(distances, start=1)
@@ -97,8 +98,13 @@ def _rim_share(flux: NDArray[np.floating]) -> float:
 
 
 def _relative_canting(z: Array) -> Array:
-    """Rises (..., F, 2) [m] over a facet along x and y, of heights (..., F, I, J) [m], less the facets' mean."""
-    canting, _ = split_canting(z)
-    rises = [canting[..., -1, 0] - canting[..., 0, 0], canting[..., 0, -1] - canting[..., 0, 0]]
-    rise = np.stack(rises, axis=-1)
-    return np.asarray(rise - rise.mean(axis=-2, keepdims=True))
+    """`canting_rises` (..., F, 2) [m] of heights (..., F, I, J) [m], less the facets' mean."""
+    rises = canting_rises(z)
+    return np.asarray(rises - rises.mean(axis=-2, keepdims=True))
+
+
+@lru_cache(maxsize=4)
+def _usual_canting(prior: SurfacePrior) -> tuple[Array, Array]:
+    """Mean and standard deviation (F, 2) [m] of the same, of mirrors of the known kind."""
+    spread = np.sqrt((_relative_canting(prior.basis) ** 2).sum(axis=0))
+    return _relative_canting(prior.mean), spread

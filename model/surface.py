@@ -241,3 +241,10 @@ def split_canting(z: ArrayLike) -> tuple[Array, Array]:
     plane = design @ np.linalg.lstsq(design, surface.reshape(-1, x.size * y.size).T, rcond=None)[0]
     canting = plane.T.reshape(surface.shape)
     return canting, surface - canting
+
+
+def canting_rises(z: ArrayLike) -> Array:
+    """By how much (..., F, 2) [m] canting lifts facets of heights (..., F, I, J) [m] over their width and height."""
+    canting, _ = split_canting(z)
+    across, up = canting[..., -1, 0] - canting[..., 0, 0], canting[..., 0, -1] - canting[..., 0, 0]
+    return np.stack([across, up], axis=-1)

@@ -133,13 +133,15 @@ def align_scene(
 
 
 class _Light(NamedTuple):
-    """Light about rays on targets: ``hits`` (B, 2, S) [m], ``power`` (B, S), ``width``, ``half`` (B, 2) [m].
+    """Light about rays on targets: ``hits`` (B, 2, S) [m], ``power`` (B, S), ``spot``, ``width``, ``half`` (B, 2) [m].
 
-    Right and up of the targets' centres; ``width`` is the deviation about each ray, ``half`` half of a target's size.
+    Right and up of the targets' centres; ``spot`` is the centre of all of it, ``width`` the deviation about each ray,
+    ``half`` half of a target's size.
     """
 
     hits: Tensor
     power: Tensor
+    spot: Tensor
     width: Tensor
     half: Tensor
 
@@ -147,7 +149,8 @@ class _Light(NamedTuple):
     def of(cls, rays: Rays, half: Tensor) -> "_Light":
         """That of traced rays."""
         slope = rays.direction[:, :2] / rays.direction[:, 2:]
-        return cls(rays.hits, rays.power, CONE * rays.slant_range[:, None] * (1 + slope**2).sqrt(), half)
+        width = CONE * rays.slant_range[:, None] * (1 + slope**2).sqrt()
+        return cls(rays.hits, rays.power, rays.spot, width, half)
 
     def shown(self, shift: Tensor) -> tuple[Tensor, Tensor]:
         """Centre (B, 2) [m] and share (B,) of what the targets show of the light, shifted by ``shift`` (B, 2) [m]."""
@@ -164,7 +167,7 @@ class _Light(NamedTuple):
 
         Where no shift does, as for a place beside the target: those that bring all light's there.
         """
-        shift = places - (self.hits * self.power[:, None]).sum(-1) / self.power.sum(-1, keepdim=True)
+        shift = places - self.spot
         share = torch.ones_like(shift[:, 0])
         margin = self.half[..., None] - (self.hits + shift[..., None]).abs()
         edge = (margin < REACH * self.width[..., None]).flatten(1).any(dim=1)

@@ -2,11 +2,10 @@
 
 from dataclasses import dataclass, replace
 from datetime import datetime
-from typing import Any, cast
+from typing import Any
 
 from sqlalchemy.orm import Session
 
-from model.imaging import ImageKind
 from model.imaging.light import camera_at
 from service import store
 from service.base.faults import ConflictError, GoneError
@@ -17,8 +16,8 @@ from service.store.corrections import EXCLUDED, forget_drift
 from service.store.images import digest
 from service.store.tables import CorrectionRow, MeasurementRow, TargetRow
 from service.twin.evidence import Twin, load_twin
-from service.twin.ingest import clock_of, measure_photograph, row_of
-from service.twin.photographs import values_of
+from service.twin.ingest import clock_of, measure_stored, row_of
+from service.twin.photographs import photograph_of, values_of
 from service.twin.runtime import Runtime
 
 # What another sun, time or pair of motor positions changes, and what is measured anew with another target or camera.
@@ -40,20 +39,10 @@ class Changes:
 
     def of(self, row: MeasurementRow) -> Photograph:
         """The photograph as it shall be known."""
-        motors = (row.motor_axis_1, row.motor_axis_2)
-        known = Photograph(
-            target_name=row.target.name,
-            kind=cast(ImageKind, row.kind),
-            sun_azimuth_deg=row.sun_azimuth_deg,
-            sun_elevation_deg=row.sun_elevation_deg,
-            external_id=row.external_id,
-            taken_at=row.taken_at,
-            motor_position=None if None in motors else cast(tuple[float, float], motors),
-            focal_spot_wgs84=cast(Any, row.focal_spot_wgs84),
-            corners=None if row.corners_px is None else row.corners_px["corners"],
-        )
         names = ("target_name", "sun_azimuth_deg", "sun_elevation_deg", "taken_at", "motor_position")
-        return replace(known, **{name: value for name in names if (value := getattr(self, name)) is not None})
+        return replace(
+            photograph_of(row), **{name: value for name in names if (value := getattr(self, name)) is not None}
+        )
 
 
 def correct(runtime: Runtime, heliostat: str, identifier: str, changes: Changes, actor: str) -> MeasurementRow:
@@ -156,8 +145,7 @@ def _measured(
             f"measurement {row.identifier} must be measured anew, and its image was given up on "
             f"{row.image.pruned_at:%Y-%m-%d}; exclude it instead"
         )
-    data = runtime.images.read(row.image_sha256)
-    _, measured = measure_photograph(runtime, photograph, data, twin, store.target_plane(target))
+    _, measured = measure_stored(runtime, row, photograph, twin, store.target_plane(target))
     made = row_of(photograph, measured, target.id, clock_of(photograph, twin))
     return {name: getattr(made, name) for name in (*_TOLD, *_MEASURED)}
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sqlalchemy import case, func, select, union_all
 from sqlalchemy.orm import Session
 
-from model.surface import split_canting
+from model.surface import canting_rises, split_canting
 from service import store
 from service.base.arrays import unpack
 from service.base.faults import BusyError
@@ -66,11 +66,10 @@ class Shape:
 
 def shape_of(z: NDArray[np.floating], size: tuple[float, float]) -> Shape:
     """The shape of heights (4, 8, 8) [m] on a mirror of ``size``, width and height [m], two facets each way."""
-    canting, waviness = split_canting(z)
-    rises = canting[:, -1, :] - canting[:, 0, :], canting[:, :, -1] - canting[:, :, 0]
-    tilts = [float(np.mean((rise / (side / 2)) ** 2)) for rise, side in zip(rises, size, strict=True)]
+    _, waviness = split_canting(z)
+    tilts = (canting_rises(z) / (np.array(size) / 2)) ** 2
     deviation, wavy = (float(np.sqrt(np.mean(heights**2)) * 1e3) for heights in (z, waviness))
-    return Shape(deviation, wavy, 1e3 * math.sqrt(sum(tilts)))
+    return Shape(deviation, wavy, 1e3 * math.sqrt(tilts.mean(axis=0).sum()))
 
 
 @dataclass(frozen=True)

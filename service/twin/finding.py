@@ -2,10 +2,11 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
+from service.base.fields import filled
 from service.twin.accuracy import RECENT
 from service.twin.field import Line
 from service.twin.pointing_errors import NEWEST
@@ -175,10 +176,7 @@ class Wanted(BaseModel):
     sort: Column | None = Field(default=None, description="What they are sorted by; without it the figure.")
     order: Order | None = Field(default=None, description="Without it, what deserves a look comes first.")
 
-    @model_validator(mode="before")
-    @classmethod
-    def _drop_empty(cls, given: Any) -> Any:
-        return {name: value for name, value in given.items() if value != ""} if isinstance(given, dict) else given
+    _filled = model_validator(mode="before")(filled)
 
     @property
     def column(self) -> str:

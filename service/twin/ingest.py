@@ -172,6 +172,13 @@ def measure_photograph(
             return pixels, MeasuredFlux(refused(refusal.reason, refusal.detail))
 
 
+def measure_stored(
+    runtime: Runtime, row: MeasurementRow, photograph: Photograph, twin: Twin, plane: TargetPlane
+) -> tuple[Pixels, MeasuredFlux]:
+    """The same of an image that is kept, as ``photograph`` tells of it."""
+    return measure_photograph(runtime, photograph, runtime.images.read(row.image_sha256), twin, plane)
+
+
 def clock_of(photograph: Photograph, twin: Twin) -> str | None:
     """What is wrong with the time that the sender gave, by the sun; it is told, and refuses nothing."""
     if photograph.taken_at is None:

@@ -1,7 +1,8 @@
 """What is known of a photograph beside its image: as it was sent, as it is stored, and what of it may be corrected."""
 
-from typing import Any
+from typing import Any, cast
 
+from model.imaging import ImageKind
 from service.sources.photograph import Photograph
 from service.store.tables import MeasurementRow
 
@@ -28,3 +29,19 @@ def values_of(row: MeasurementRow) -> dict[str, Any]:
         "taken_at": None if row.taken_at is None else row.taken_at.isoformat(),
         "motor_position": None if None in motors else list(motors),
     }
+
+
+def photograph_of(row: MeasurementRow) -> Photograph:
+    """A stored measurement's photograph, as it could be sent."""
+    motors = (row.motor_axis_1, row.motor_axis_2)
+    return Photograph(
+        target_name=row.target.name,
+        kind=cast(ImageKind, row.kind),
+        sun_azimuth_deg=row.sun_azimuth_deg,
+        sun_elevation_deg=row.sun_elevation_deg,
+        external_id=row.external_id,
+        taken_at=row.taken_at,
+        motor_position=None if None in motors else cast(tuple[float, float], motors),
+        focal_spot_wgs84=cast(Any, row.focal_spot_wgs84),
+        corners=None if row.corners_px is None else row.corners_px["corners"],
+    )

@@ -6,9 +6,9 @@ from service.base.faults import NotFoundError
 from service.sources.decode import Pixels, decode_image
 from service.store.tables import MeasurementRow
 from service.twin.accuracy import Comparison, compare_with
-from service.twin.correcting import Changes
 from service.twin.evidence import load_twin
-from service.twin.ingest import measure_photograph
+from service.twin.ingest import measure_stored
+from service.twin.photographs import photograph_of
 from service.twin.runtime import Runtime
 
 
@@ -18,12 +18,11 @@ def pixels_of(runtime: Runtime, row: MeasurementRow) -> Pixels:
     return decode_image(data, max_pixels=runtime.settings.max_image_pixels)
 
 
-def measure_anew(runtime: Runtime, heliostat: str, row: MeasurementRow) -> tuple[Pixels, MeasuredFlux]:
+def look_at(runtime: Runtime, heliostat: str, row: MeasurementRow) -> tuple[Pixels, MeasuredFlux]:
     """A stored photograph's pixels and what is measured in it, with what is not kept: the outline and the crop."""
     with runtime.database.reading() as session:
         twin = load_twin(session, heliostat)
-    photograph, plane = Changes("").of(row), store.target_plane(row.target)
-    return measure_photograph(runtime, photograph, runtime.images.read(row.image_sha256), twin, plane)
+    return measure_stored(runtime, row, photograph_of(row), twin, store.target_plane(row.target))
 
 
 def compare_one(runtime: Runtime, heliostat: str, identifier: str) -> Comparison:

@@ -52,16 +52,16 @@ def shortened(plane: TargetPlane, image: NDArray[np.uint8], side: str, at: float
     return replace(plane, center=center, height=size * plane.height), left
 
 
-def accuracies(setup: Setup, whole: TargetPlane, taken: MeasuredFlux) -> tuple[float, float]:
+def accuracies(setup: Setup, whole: TargetPlane, taken: MeasuredFlux, latitude_deg: float) -> tuple[float, float]:
     """Of the forecast whose light on the target, and of that whose light in all, has its centre where it was seen."""
     assert taken.flux is not None
     large = replace(whole, width=20.0, height=20.0, center=setup.plane.center)
     size, scores = (setup.plane.width, setup.plane.height), []
     for plane in (setup.plane, large):
-        aligned = align([replace(setup, plane=plane)], latitude_deg=50.9)
+        aligned = align([replace(setup, plane=plane)], latitude_deg=latitude_deg)
         if plane is large:  # the mount of the large target before the one that ends early
             mount = aligned.angles[0]
-            aligned = align([replace(setup, spot=None, angles=mount)], latitude_deg=50.9)
+            aligned = align([replace(setup, spot=None, angles=mount)], latitude_deg=latitude_deg)
         forecast = aligned.flux(Optics(Buie(0.02)), (), VIEW)[0].clamp(min=0).numpy()
         scores.append(compare_on_target(taken.flux, forecast, size).accuracy)
     return scores[0], scores[1]
@@ -74,7 +74,9 @@ def main() -> None:
     options = parser.parse_args()
     quality._LIMIT_CUT = 1.0  # the limit is what is looked for
     folder = read_folder(data_folder().parent / "stj-years")
-    points, degree = folder.measured_surface("AA39") or (np.zeros(0), 0)
+    surface, latitude_deg = folder.measured_surface("AA39"), float(folder.plant.origin[0])
+    assert surface is not None
+    points, degree = surface
     crops = [one for one in folder.measurements("AA39") if "cropped" in one.images][:: options.every]
     found: dict[float, list[tuple[float, float, float]]] = {share: [] for share in SHARES}
     for number, one in enumerate(crops):
@@ -90,7 +92,7 @@ def main() -> None:
                 continue
             spot = target.to_enu(taken.center_of_mass)
             setup = Setup(folder.plant.heliostats["AA39"], points, one.sun, target, spot=spot, degree=degree)
-            found[share].append((taken.quality.cut_share, *accuracies(setup, plane, taken)))
+            found[share].append((taken.quality.cut_share, *accuracies(setup, plane, taken, latitude_deg)))
     print("| light beside the target | photographs | taken for | accuracy, aligned by the part shown | by all light |")
     print("| --- | --- | --- | --- | --- |")
     for share, rows in found.items():

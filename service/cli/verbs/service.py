@@ -31,10 +31,7 @@ def import_(folder: Folder, as_json: AsJson = False) -> None:
             report = import_folder(runtime, source, step, actor())
     finally:
         runtime.close()
-    table = make_table("Imported", "what", "count")
-    for what, count in report["counts"].items():
-        table.add_row(what, str(count))
-    show(report, as_json, table)
+    _show_counts("Imported", report, as_json)
 
 
 @app.command()
@@ -53,7 +50,11 @@ def export(
             report = export_folder(runtime, folder, step)
     finally:
         runtime.close()
-    table = make_table("Exported", "what", "count")
+    _show_counts("Exported", report, as_json)
+
+
+def _show_counts(title: str, report: dict[str, Any], as_json: bool) -> None:
+    table = make_table(title, "what", "count")
     for what, count in report["counts"].items():
         table.add_row(what, str(count))
     show(report, as_json, table)

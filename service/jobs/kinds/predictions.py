@@ -1,10 +1,11 @@
 """The job `predictions`: surfaces of many heliostats."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
+from service.base.choices import require_images
 from service.base.faults import SKIPPED
 from service.base.fields import Method, Model, ModelVersion, Whole
 from service.jobs.common import Heliostats, chosen_names, require_some
@@ -26,6 +27,11 @@ class PredictionsIn(Model):
         default=8, ge=1, le=64, description="How many measurements to take of each heliostat; 8 the network."
     )
     model_version: ModelVersion = None
+
+    @model_validator(mode="after")
+    def _not_too_many(self) -> Self:
+        require_images(self.method, self.images)
+        return self
 
 
 def predict_many(context: Context, payload: PredictionsIn) -> Result:

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import numpy as np
 from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import HTMLResponse
-from pydantic import BeforeValidator
+from pydantic import model_validator
 from sqlalchemy import select
 from sqlalchemy.orm import Session, undefer
 
@@ -18,7 +18,7 @@ from model.metrics import flux_accuracy
 from service import store
 from service.base.arrays import unpack
 from service.base.faults import NotFoundError
-from service.base.fields import AZIMUTH, ELEVATION, Model, Name, Version
+from service.base.fields import AZIMUTH, ELEVATION, Model, Name, Version, filled
 from service.drawing import charts
 from service.drawing.charts import HeatMap, Timeline, Value
 from service.drawing.pictures import mirror_heights
@@ -39,8 +39,6 @@ router = APIRouter(include_in_schema=False, dependencies=[READ])
 
 _RESOLUTION = (128, 128)
 
-_EMPTY = BeforeValidator(lambda value: None if value == "" else value)  # as forms send what nobody filled in
-
 
 class CompareQuery(Model):
     """What is compared: a version each of one heliostat or two, under a sun on a target; ``since`` and ``until`` days.
@@ -48,15 +46,17 @@ class CompareQuery(Model):
     Without versions they are today's and, of the same heliostat, the one before it.
     """
 
-    heliostat: Annotated[Name | None, _EMPTY] = None
-    version: Annotated[Version | None, _EMPTY] = None
-    other: Annotated[Name | None, _EMPTY] = None
-    other_version: Annotated[Version | None, _EMPTY] = None
-    target: Annotated[Name | None, _EMPTY] = None
-    azimuth_deg: Annotated[Annotated[float, AZIMUTH] | None, _EMPTY] = None
-    elevation_deg: Annotated[Annotated[float, ELEVATION] | None, _EMPTY] = None
-    since: Annotated[date | None, _EMPTY] = None
-    until: Annotated[date | None, _EMPTY] = None
+    heliostat: Name | None = None
+    version: Version | None = None
+    other: Name | None = None
+    other_version: Version | None = None
+    target: Name | None = None
+    azimuth_deg: Annotated[float, AZIMUTH] | None = None
+    elevation_deg: Annotated[float, ELEVATION] | None = None
+    since: date | None = None
+    until: date | None = None
+
+    _filled = model_validator(mode="before")(filled)
 
     @property
     def span(self) -> Span:

@@ -19,7 +19,7 @@ from service.store.measurements import images_of_shot
 from service.store.tables import MeasurementRow, TargetRow
 from service.twin.correcting import Changes, correct
 from service.twin.runtime import Runtime
-from service.twin.viewing import compare_one, measure_anew, pixels_of
+from service.twin.viewing import compare_one, look_at, pixels_of
 from service.web.answers.files import is_held
 from service.web.answers.pages import go_to, render
 from service.web.api.corrections import remake
@@ -63,12 +63,12 @@ def _thumbnail(runtime: Runtime, _: str, row: MeasurementRow) -> bytes:
 
 
 def _outlined(runtime: Runtime, heliostat: str, row: MeasurementRow) -> bytes:
-    pixels, measured = measure_anew(runtime, heliostat, row)
+    pixels, measured = look_at(runtime, heliostat, row)
     return photograph_picture(pixels, _SHOWN, measured.corners)
 
 
 def _crop(runtime: Runtime, heliostat: str, row: MeasurementRow) -> bytes:
-    measured = measure_anew(runtime, heliostat, row)[1]
+    measured = look_at(runtime, heliostat, row)[1]
     if measured.crop is None:
         raise NotFoundError(f"measurement {row.identifier}: the target was not found in it, so it has no crop")
     return photograph_picture(measured.crop, _SHOWN)
