@@ -105,7 +105,7 @@ class Fitter:
     def _take_off_grid(self, unknowns: Unknowns, begin: Array) -> None:
         """Add to the measured images what the coarse forecast of ``begin`` differs by from the fine one."""
         if self.fine is not None:
-            model = [*self.fixed, *unknowns.effects(begin)]
+            model = [*self.fixed, *unknowns.acting(begin)]
             grid = self.forecaster.cuts(model, COARSE_SIZE) - self.fine.cuts(model, COARSE_SIZE)
             self.measured = self.forecaster.measured(COARSE_SIZE) + grid
 

@@ -177,6 +177,8 @@ class Forecaster:
         self._flux: dict[str, torch.Tensor] = {}
         self._start: Aligned | None = None
         self._copies: dict[int, Forecaster] = {}
+        self._copied: Forecaster | None = None
+        self._measured: dict[int, Array] = {}
         self._ranges: dict[tuple[tuple[int, ...], int, int], tuple[Array, Array]] = {}
 
     def copies(self, count: int) -> "Forecaster":
@@ -196,12 +198,15 @@ class Forecaster:
             self._copies[count] = Forecaster(
                 flux_images, self.optics, declared, self.window, self.view, latitude_deg=self.latitude_deg
             )
+            self._copies[count]._copied = self
         return self._copies[count]
 
     def measured(self, resolution: int = FLUX_SIZE) -> Array:
         """The photographs' cuts (N, resolution, resolution)."""
-        cuts = [cut(p.image[None], [p.setup.plane], self.window, resolution) for p in self.flux_images]
-        return np.concatenate(cuts)
+        if resolution not in self._measured:
+            cuts = [cut(p.image[None], [p.setup.plane], self.window, resolution) for p in self.flux_images]
+            self._measured[resolution] = np.concatenate(cuts)
+        return self._measured[resolution]
 
     def cuts(self, effects: Sequence[Effect], resolution: int = FLUX_SIZE) -> Array:
         """The forecasts' cuts (N, resolution, resolution) under the declared effects and these.
@@ -238,7 +243,12 @@ class Forecaster:
 
     def _range(self, cut_off: tuple[int, ...], rows: int, columns: int) -> tuple[Array, Array]:
         """Of photographs that were cut off, alike in size: light and the share of each pixel, (n, rows, columns)."""
-        if (cut_off, rows, columns) not in self._ranges:
+        if (cut_off, rows, columns) not in self._ranges and self._copied is not None:
+            originals = len(self._copied.flux_images)
+            first = self._copied._range(tuple(row for row in cut_off if row < originals), rows, columns)
+            light, shares = (np.tile(one, (len(cut_off) // len(one), 1, 1)) for one in first)
+            self._ranges[cut_off, rows, columns] = light, shares
+        elif (cut_off, rows, columns) not in self._ranges:
             taken = [self.flux_images[row] for row in cut_off]
             light = np.stack([np.asarray(one.image, dtype=np.float64) for one in taken])
             clipped = np.stack([np.asarray(one.clipped, dtype=np.float64) for one in taken])

@@ -172,6 +172,11 @@ class Unknowns:
         """Effects with parameters ``values`` (P,)."""
         return [self._effect(term, [float(v) for v in values]) for term in self.terms]
 
+    def acting(self, values: Array) -> list[Effect]:
+        """Those effects with parameters ``values`` (P,) that change something."""
+        moved = {u.term for u, value in zip(self.all, values, strict=True) if value != u.parameter.neutral}
+        return [effect for term, effect in zip(self.terms, self.effects(values), strict=True) if term in moved]
+
     def _effect(self, term: Term, values: Sequence[float]) -> Effect:
         parameters: dict[str, Any] = _arrays(self.nested(term, values))
         if not term.days:
