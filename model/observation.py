@@ -94,6 +94,8 @@ class SurfacePrediction:
         How badly the surface explains each of its own images: one minus the flux accuracy of re-rendering it.
     used : tuple of str
         Identifiers of the images.
+    tells : tuple of float [1]
+        Share of each image in what all of them tell of the surface, where that was estimated.
     mahalanobis : float
         Mahalanobis distance of the surface from the prior; about one is usual (`SurfacePrior.mahalanobis`).
     contradicting : tuple of str
@@ -109,6 +111,7 @@ class SurfacePrediction:
     weights: str
     misfits: tuple[float, ...]
     used: tuple[str, ...]
+    tells: tuple[float, ...] = ()
     mahalanobis: float = 1.0
     contradicting: tuple[str, ...] = ()
     doubts: tuple[str, ...] = ()

@@ -12,10 +12,11 @@ prior expects, some still end beside the best surface.
 What a camera adds to an image (a shift, another exposure, background, a little blur, another response) enters as a few
 directions per image with priors of their own and is marginalised exactly. All other errors, of the camera and of the
 model, grow with the flux and come in patches: they are taken for independent in the cosine transform of the image,
-with one variance for each band of spatial frequency, estimated from what is left of the images and from how far a
-surface could bend to them (MacKay 1992, doi:10.1162/neco.1992.4.3.415). Errors that look like a bent mirror weigh more
-than that: how far apart the images pull the surface tells by how much (the overdispersion of quasi-likelihoods,
-Wedderburn 1974, doi:10.1093/biomet/61.3.439). An image that the others contradict is left out.
+with one variance for each band of spatial frequency and another for each image, a factor of the former: a hazy
+photograph tells less. They are estimated from what is left of the images and from how far a surface could bend to them
+(MacKay 1992, doi:10.1162/neco.1992.4.3.415). Errors that look like a bent mirror weigh more than that: how far apart
+the images pull the surface tells by how much (the overdispersion of quasi-likelihoods, Wedderburn 1974,
+doi:10.1093/biomet/61.3.439). An image that the others contradict is left out.
 """
 
 from collections.abc import Sequence
@@ -120,7 +121,7 @@ def _nuisance(image: Array, options: RefinementOptions) -> Array:
 
 
 class _Weights:
-    """What a change of M images weighs, where bands of frequency err by ``sigma`` (5,).
+    """What a change of M images weighs, where bands of frequency err by ``sigma`` (M, 5), or (1, 5) in all alike.
 
     With residual r = J dc + N n + noise and n ~ N(0, 1), the noise covariance is S + N N'. Its inverse root is known:
     the nuisances' directions, made orthogonal in units of S, shrink. S and N are those of ``images`` (M, R, R) of a
@@ -134,7 +135,8 @@ class _Weights:
         self._kept = frequency < BANDS[-1]
         self._cosines = dct(np.eye(size), axis=0, norm="ortho")
         self.bands = np.digitize(frequency[self._kept], BANDS)
-        self._scale, self._sigma = peak * np.sqrt(np.clip(images / peak, 0, None) + options.dark), sigma[self.bands]
+        self._scale = peak * np.sqrt(np.clip(images / peak, 0, None) + options.dark)
+        self._sigma = sigma[:, self.bands]
         nuisances = self._white(np.stack([_nuisance(image, options) for image in images]).swapaxes(0, 1))
         _, singular, self._directions = np.linalg.svd(nuisances.swapaxes(0, 1), full_matrices=False)
         self._shrunk = 1 - 1 / np.sqrt(1 + singular**2)
@@ -237,7 +239,7 @@ class _Posterior:
         """The state near another at which large features are right, the Jacobian there and what it was found with."""
         jacobian = self.jacobian(state)
         for error in self.options.annealing:
-            belief = _Belief(np.full(len(BANDS), error), np.ones(len(state.c)))
+            belief = _Belief(np.full((1, len(BANDS)), error), np.ones(len(state.c)))
             found = self.optimum(state, belief, jacobian)
             state, jacobian = found.state, found.jacobian
         return state, jacobian, belief
@@ -256,7 +258,7 @@ class _Posterior:
 
 @dataclass(frozen=True, eq=False)
 class _Belief:
-    """What bands of frequency err by (5,), and the precision of the prior's coefficients (K,)."""
+    """What bands of each image err by (M, 5), or (1, 5) of all alike, and the precision (K,) of the prior."""
 
     sigma: Array
     precision: Array
@@ -274,11 +276,11 @@ class _Fit:
     @cached_property
     def covariance(self) -> Array:
         """Covariance (K, K) of the coefficients."""
-        return self._covariance(np.ones(len(BANDS)))
+        return self._covariance(np.ones((1, len(BANDS))))
 
     def _covariance(self, share: Array) -> Array:
-        """Covariance (K, K), where bands tell a ``share`` (5,) of what they seem to."""
-        flat = (self.white * np.sqrt(share[self.bands]).astype(np.float32)).reshape(len(self.white), -1)
+        """Covariance (K, K), where bands tell a ``share`` (M, 5) or (1, 5) of what they seem to."""
+        flat = (self.white * np.sqrt(share[:, self.bands]).astype(np.float32)).reshape(len(self.white), -1)
         return np.asarray(np.linalg.inv((flat @ flat.T).astype(np.float64) + np.diag(self.belief.precision)))
 
     @cached_property
@@ -293,12 +295,18 @@ class _Fit:
         return np.asarray(np.einsum("kmn,mn->mk", self.white, self.left, optimize=True))
 
     def errors(self) -> Array:
-        """What bands err by (5,): what is left of them, less what coefficients took away."""
-        spent = np.einsum(
-            "kmn,kmn->n", self.white, np.tensordot(self.covariance.astype(np.float32), self.white, axes=1)
-        )
-        free = np.maximum(np.bincount(self.bands, len(self.left) - spent), 1)
-        return np.asarray(self.belief.sigma * np.sqrt(np.bincount(self.bands, (self.left**2).sum(axis=0)) / free))
+        """What bands of each image err by (M, 5): what is left of them, less what coefficients took away."""
+        turned = np.tensordot(self.covariance.astype(np.float32), self.white, axes=1)
+        free = 1 - np.einsum("kmn,kmn->mn", self.white, turned)
+        modes = np.maximum(np.bincount(self.bands, free.sum(axis=0)), 1)
+        of_band = np.bincount(self.bands, (self.left**2).sum(axis=0)) / modes
+        of_image = (self.left**2 / of_band[self.bands]).sum(axis=1) / np.maximum(free.sum(axis=1), 1)
+        return np.asarray(self.belief.sigma * np.sqrt(of_band * of_image[:, None]))
+
+    def tells(self) -> Array:
+        """Share (M,) of each image in what all tell of the coefficients, by the numbers that they settle."""
+        settled = np.einsum("mij,ji->m", self.information, self.covariance)
+        return np.asarray(settled / settled.sum())
 
     def overdispersion(self) -> float:
         """How many times farther apart images pull the surface than independent errors would make them, squared.
@@ -414,7 +422,8 @@ def refine(
     posterior, state, fit, left_out = _consensus(
         heliostat, observations, start, (prior, optics, effects), latitude_deg, options
     )
-    z = prior.surface(state.c)
+    z, tells = prior.surface(state.c), np.zeros(len(observations))
+    tells[[i for i in range(len(observations)) if i not in left_out]] = fit.tells()
     against = [
         *doubts.of_the_situation(heliostat, observations),
         *doubts.of_canting(prior, z),
@@ -428,6 +437,7 @@ def refine(
         weights=prior.name,
         misfits=misfits(heliostat, observations, z, optics, effects, latitude_deg=latitude_deg),
         used=tuple(o.identifier for o in observations),
+        tells=tuple(tells.tolist()),
         mahalanobis=prior.mahalanobis(z),
         contradicting=tuple(observations[i].identifier for i in left_out),
         doubts=tuple(against),

@@ -177,9 +177,9 @@ class Forecaster:
         self._flux: dict[str, torch.Tensor] = {}
         self._start: Aligned | None = None
         self._copies: dict[int, Forecaster] = {}
-        self._copied: Forecaster | None = None
         self._measured: dict[int, Array] = {}
         self._ranges: dict[tuple[tuple[int, ...], int, int], tuple[Array, Array]] = {}
+        self._different = len(self.flux_images)
 
     def copies(self, count: int) -> "Forecaster":
         """The same of photographs that are there ``count`` times, of heliostats that are copies of the first.
@@ -198,7 +198,7 @@ class Forecaster:
             self._copies[count] = Forecaster(
                 flux_images, self.optics, declared, self.window, self.view, latitude_deg=self.latitude_deg
             )
-            self._copies[count]._copied = self
+            self._copies[count]._ranges, self._copies[count]._different = self._ranges, self._different
         return self._copies[count]
 
     def measured(self, resolution: int = FLUX_SIZE) -> Array:
@@ -243,19 +243,17 @@ class Forecaster:
 
     def _range(self, cut_off: tuple[int, ...], rows: int, columns: int) -> tuple[Array, Array]:
         """Of photographs that were cut off, alike in size: light and the share of each pixel, (n, rows, columns)."""
-        if (cut_off, rows, columns) not in self._ranges and self._copied is not None:
-            originals = len(self._copied.flux_images)
-            first = self._copied._range(tuple(row for row in cut_off if row < originals), rows, columns)
-            light, shares = (np.tile(one, (len(cut_off) // len(one), 1, 1)) for one in first)
-            self._ranges[cut_off, rows, columns] = light, shares
-        elif (cut_off, rows, columns) not in self._ranges:
-            taken = [self.flux_images[row] for row in cut_off]
+        once = tuple(row for row in cut_off if row < self._different)
+        if (once, rows, columns) not in self._ranges:
+            taken = [self.flux_images[row] for row in once]
             light = np.stack([np.asarray(one.image, dtype=np.float64) for one in taken])
             clipped = np.stack([np.asarray(one.clipped, dtype=np.float64) for one in taken])
             pixel = light[0].size / (rows * columns)
             shares = in_pixels(clipped, rows, columns) / pixel
-            self._ranges[cut_off, rows, columns] = in_pixels(light, rows, columns), shares
-        return self._ranges[cut_off, rows, columns]
+            self._ranges[once, rows, columns] = in_pixels(light, rows, columns), shares
+        light, shares = self._ranges[once, rows, columns]
+        times = len(cut_off) // len(once), 1, 1
+        return np.tile(light, times), np.tile(shares, times)
 
     def _traced(self, model: Sequence[Effect]) -> tuple[Aligned, torch.Tensor]:
         """Aligned setups and their flux; both are kept while only later stages change."""

@@ -190,6 +190,7 @@ def predict_heliostat(
         "method": method,
         "weights": predicted.weights,
         "images": list(predicted.used),
+        "tells": {name: round(share, 3) for name, share in zip(predicted.used, predicted.tells, strict=False)},
         "refused": refused | apart,
         "misfit": round(predicted.misfit, 4),
         "trusted": predicted.trusted,

@@ -8,6 +8,7 @@ import pytest
 from model.effects.camera_response import CameraResponse
 from model.errors import InvalidInputError
 from model.frames import sun_direction_at
+from model.images import normalized
 from model.metrics import surface_error
 from model.observation import Observation, misfits, render_observations
 from model.plant import JUELICH_LATITUDE, Heliostat
@@ -98,6 +99,19 @@ def test_a_foreign_image_is_named(heliostat, truth):
     assert found.suspicious == found.contradicting == ("2",)
     assert surface_error(found.z, truth) < 2e-4
     assert not found.trusted
+
+
+def test_a_poor_image_tells_less(refined, heliostat, truth):
+    """One whose patches err by a tenth of the peak: the surface goes by the others, and says so."""
+    taken = images(heliostat, truth)
+    patches = np.kron(np.random.default_rng(7).normal(0, 0.1, (16, 16)), np.ones((4, 4)))
+    poor = taken[2].flux + (taken[2].flux.max() * patches).clip(min=0)
+    taken[2] = replace(taken[2], flux=normalized(poor).astype(np.float32))
+    found = refine(heliostat, taken, latitude_deg=JUELICH_LATITUDE)
+    others = np.delete(found.tells, 2)
+    assert found.tells[2] < 0.5 * others.mean()
+    assert sum(found.tells) == pytest.approx(1)
+    assert surface_error(found.z, truth) < 2 * surface_error(refined.z, truth)
 
 
 def test_effects_that_are_believed_are_not_taken_for_shape(heliostat, truth):
