@@ -113,6 +113,18 @@ def _drift(mount: CalibratedMount) -> dict[str, Any]:
     }
 
 
+def parameters_from_json(document: Any, where: str) -> Array:
+    """The parameters (P,) of a document that `mount_to_json` wrote: all but how its drives' zeros went in time."""
+    try:
+        return np.array([document["parameters"][name]["value"] for name in NAMES], dtype=np.float64)
+    except (KeyError, TypeError, ValueError) as error:
+        raise _no_mount(where, error) from None
+
+
+def _no_mount(where: str, error: Exception) -> InvalidInputError:
+    return InvalidInputError(f"{where}: no calibrated mount as `heliotwin calibrate` writes it ({error})")
+
+
 def mount_from_json(document: Any, where: str, noise: Noise | None = None) -> CalibratedMount:
     """The mount of a document that `mount_to_json` wrote; `InvalidInputError` for any other."""
     try:
@@ -140,7 +152,7 @@ def mount_from_json(document: Any, where: str, noise: Noise | None = None) -> Ca
         )
         finite = all(np.isfinite(value).all() for value in (*values.values(), parameters, covariance))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InvalidInputError(f"{where}: no calibrated mount as `heliotwin calibrate` writes it ({error})") from None
+        raise _no_mount(where, error) from None
     if not finite:
         raise InvalidInputError(f"{where}: a calibrated mount has finite numbers only")
     return CalibratedMount(

@@ -16,7 +16,8 @@ from model.effects import Effect, acting
 from model.forecast import suns_under
 from model.plant import Heliostat
 from model.pointing import CalibratedMount
-from model.pointing.report import day_of, mount_from_json, sun_to_json
+from model.pointing.kinematics import calibrated
+from model.pointing.report import day_of, mount_from_json, parameters_from_json, sun_to_json
 from service import store
 from service.base.faults import ConflictError
 from service.sources.documents import read_heliostat
@@ -119,9 +120,10 @@ def _changed(row: HeliostatRow, kept: MountRow, effects: Iterable[Effect]) -> st
 def standing(row: HeliostatRow, kept: MountRow | None, origin: Iterable[float], effects: Iterable[Effect]) -> Heliostat:
     """A heliostat as it stands: on its mount as calibrated where that holds, else as its properties have it.
 
-    The zeros of its drives are those of the newest measurement, and matter only to who turns it by its motors.
+    Who turns it by its motors wants the zeros of its drives at the time, too: `StoredMount.turned`.
     """
     heliostat = read_heliostat(row.name, row.properties, np.array(origin))
     if kept is None or heliostat.mount.actuators is None or _changed(row, kept, effects) is not None:
         return heliostat
-    return replace(heliostat, mount=mount_of(row, kept, effects).mount(heliostat.mount))
+    parameters = parameters_from_json(kept.document, f"mount {kept.version} of {row.name}")
+    return replace(heliostat, mount=calibrated(heliostat.mount, parameters))
