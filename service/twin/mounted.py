@@ -85,11 +85,21 @@ def stored_mount(
 
 
 def _knowing(session: Session, row: HeliostatRow, moment: datetime | None) -> MountRow | None:
-    """The newest mount, which knows its drives' zeros since its first measurement; before that the one valid then."""
+    """The newest mount that was calibrated by photographs from before a moment, too: it knows its drives' zeros then.
+
+    The newest of all where none was, or no moment is asked for.
+    """
     newest = mounts.find_mount_at(session, row)
-    if newest is None or moment is None or datetime.fromisoformat(newest.document["history"]["at"][0]) <= moment:
+    if newest is None or moment is None or _begin(newest) <= moment:
         return newest
-    return mounts.find_mount_at(session, row, moment) or newest
+    every = mounts.list_mounts(session, row, newest.version)[::-1]
+    holding = (kept for kept in every if row.updated_at <= kept.created_at)
+    return next((kept for kept in holding if _begin(kept) <= moment), newest)
+
+
+def _begin(kept: MountRow) -> datetime:
+    """The first photograph that it was calibrated by."""
+    return datetime.fromisoformat(kept.document["history"]["at"][0])
 
 
 def with_drives(row: HeliostatRow, origin: tuple[float, float, float]) -> Heliostat:

@@ -56,31 +56,29 @@ def calibrate_store(
     ConflictError
         Where none has a measurement with motors and a spot.
     """
-    heliostats: dict[str, Heliostat] = {}
-    readings: dict[str, list[Reading]] = {}
-    skipped: dict[str, str] = {}
     wanted = set(names)
     with runtime.database.reading() as session:
         origin, effects = store.get_plant(session).origin, versions.get_model(session).effects
         targets = {row.name: store.target_plane(row) for row in store.list_targets(session)}
         rows = {row.name: row for row in session.scalars(select(HeliostatRow).order_by(HeliostatRow.name))}
-        why = {name: f"there is no heliostat {name}" for name in names if name not in rows}
+        useless = {name: f"there is no heliostat {name}" for name in names if name not in rows}
+        heliostats: dict[str, Heliostat] = {}
+        readings: dict[str, list[Reading]] = {}
         for name, row in rows.items():
+            # The others make the prior, whenever they were photographed.
+            taken = mounts.pointing_measurements(session, row, *((since, until) if name in wanted else ()))
             try:
                 heliostats[name] = with_drives(row, origin)
             except (ModelError, ConflictError) as error:
-                why[name] = str(error)
+                useless[name] = str(error)
                 continue
-            span = (since, until) if name in wanted else ()
-            taken = mounts.pointing_measurements(session, row, *span)
-            own, useless = readings_of(heliostats[name], taken, origin, effects)
+            own, unread = readings_of(heliostats[name], taken, origin, effects)
+            useless |= {f"{name}/{identifier}": reason for identifier, reason in unread.items()}
             if own:
                 readings[name] = own
             else:
-                why[name] = "no measurement with motor positions and a spot"
-            if name in wanted:
-                skipped |= {f"{name}/{identifier}": reason for identifier, reason in useless.items()}
-    skipped |= {name: why[name] for name in names if name in why}
+                useless[name] = "no measurement with motor positions and a spot"
+    skipped = {key: reason for key, reason in useless.items() if key.partition("/")[0] in wanted}
     if not wanted & readings.keys():
         reasons = "; ".join(f"{name}: {reason}" for name, reason in list(skipped.items())[:3])
         raise ConflictError(f"no heliostat can be calibrated ({reasons}); post photographs with motor_position")
