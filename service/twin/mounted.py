@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sqlalchemy.orm import Session
 
 from model.effects import Effect, acting
-from model.forecast import suns_under
+from model.forecast import altered, suns_under
 from model.plant import Heliostat
 from model.pointing import CalibratedMount
 from model.pointing.kinematics import calibrated
@@ -50,6 +50,15 @@ class StoredMount:
     def sun(self, recorded: Array, moment: datetime | None = None) -> Array:
         """Where the sun (3,) stood that was ``recorded``: the mount was calibrated under such."""
         return true_sun(self.effects, recorded, moment, self.origin[0])
+
+    def motors(self, recorded: Array, aim: Array, moment: datetime | None = None) -> Array:
+        """Motor positions (2,) [steps] that send the light of a sun (3,), as recorded, to ``aim`` (3,) [m].
+
+        Raises `UnreachableError` where no attitude does, or a drive would go beyond an end of its travel.
+        """
+        (standing,) = altered([self.turned(moment)], acting(self.effects, moment))
+        angles = standing.mount.align(standing.position, self.sun(recorded, moment), aim)
+        return standing.mount.motors_from_angles(angles)
 
 
 def true_sun(effects: Iterable[Effect], recorded: Array, moment: datetime | None, latitude_deg: float) -> Array:

@@ -127,8 +127,8 @@ def post_motors(
     else:
         assert request.time is not None
         angles = sun_at(request.time, stored.origin)
-    sun, day = stored.sun(sun_direction(*angles), request.time), day_of(request.time)
-    motors = stored.mount.motors(stored.heliostat, sun, aim, day)
+    recorded, day = sun_direction(*angles), day_of(request.time)
+    motors, sun = stored.motors(recorded, aim, request.time), stored.sun(recorded, request.time)
     cov = stored.mount.covariance_at(stored.heliostat, motors[None], sun[None], aim[None], np.array([day]))[0]
     std = float(np.sqrt(np.trace(cov) / 2))
     return MotorsOut(

@@ -12,6 +12,7 @@ from fastapi.testclient import TestClient
 
 from model.forecast import Setup, align
 from model.mount import Mount, rotation
+from model.plant import Heliostat
 from model.pointing.kinematics import NAMES, SPREAD
 from model.surface import control_points
 from model.tracing.convolution import central_rays
@@ -191,8 +192,7 @@ def test_mounts_hold_under_the_sun_they_were_calibrated_under(
     calibrate(client)
     assert client.get("/v1/heliostats/AA39/mounts/current").json()["sun"] == []
     assert client.put("/v1/plant", json={**tower, "declared": slow}).status_code == 200
-    motors = {"sun": SUN, "target": "lower"}
-    refused = client.post("/v1/heliostats/AA39/motors", json=motors)
+    refused = client.post("/v1/heliostats/AA39/motors", json={"sun": SUN, "target": "lower"})
     assert refused.status_code == 409
     assert "moves the sun otherwise" in refused.json()["detail"]
     calibrate(client)
@@ -200,19 +200,31 @@ def test_mounts_hold_under_the_sun_they_were_calibrated_under(
     assert mount["sun"] == slow["effects"]
     assert mount["residual_mrad"]["median"] < 0.5
 
-    motors = client.post("/v1/heliostats/AA39/motors", json=motors).json()["motor_position"]
-    asked = {"heliostat": "AA39", "sun": SUN, "surface": "ideal", "target": "lower"}
-    client.post("/v1/forecasts", json={**asked, "motor_position": motors})
+    np.testing.assert_allclose(sent(client, operations, heliostat), [0, 0], atol=0.02)
+
+
+def test_a_tilt_acts_on_a_mount_that_was_never_calibrated(
+    client: TestClient, operations: FakeOperations, tower: Any, properties: Any
+):
+    """Motors for an aim, and the light of those motors, by one mount."""
+    heliostat = read_heliostat("AA39", properties, np.array(ORIGIN))
+    tilt = {"effects": [{"name": "axis_tilt", "parameters": {"north_deg": 1.0, "up_deg": -2.0}}]}
+    assert client.put("/v1/plant", json={**tower, "declared": tilt}).status_code == 200
+    np.testing.assert_allclose(sent(client, operations, heliostat), [0, 0], atol=0.02)
+
+
+def sent(client: TestClient, operations: FakeOperations, heliostat: Heliostat) -> np.ndarray:
+    """Where light lands on a target (2,) [m] by the forecast from the motors that shall send it to the middle."""
+    asked = {"sun": SUN, "target": "lower"}
+    motors = client.post("/v1/heliostats/AA39/motors", json=asked).json()["motor_position"]
+    forecast = {"heliostat": "AA39", "surface": "ideal", "motor_position": motors, **asked}
+    assert client.post("/v1/forecasts", json=forecast).status_code == 201
     made = operations.forecasts[-1]
-    shot = Setup(
-        replace(heliostat, mount=made["mount"]),
-        control_points(heliostat),
-        made["sun"],
-        made["plane"],
-        angles=made["angles"],
-    )
+    mirror = replace(heliostat, mount=made["mount"])
+    shot = Setup(mirror, control_points(heliostat), made["sun"], made["plane"], angles=made["angles"])
     scene = align([shot], made["effects"], latitude_deg=ORIGIN[0], dtype=torch.float64).groups[0].scene
-    np.testing.assert_allclose(central_rays(scene, 8).spot[0], [0, 0], atol=0.02)  # where the motors were to send it
+    spot: np.ndarray = central_rays(scene, 8).spot[0].numpy()
+    return spot
 
 
 @pytest.mark.parametrize(
