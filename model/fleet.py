@@ -27,7 +27,7 @@ from torch import Tensor
 from model.effects import Effect, acting, light_effects
 from model.effects.blocking import Blocking
 from model.errors import ModelError, UnreachableError
-from model.forecast import Setup, align, altered, optics_under
+from model.forecast import Setup, align, altered, optics_under, suns_under
 from model.neighbours import Neighbours, outlines
 from model.plant import Heliostat, Receiver, TargetPlane
 from model.sunshape import half_angle
@@ -269,9 +269,7 @@ def aligned_field(
     Those whose mounts cannot turn there are left out.
     """
     there = acting(effects, None)
-    true_sun = np.asarray(sun, dtype=np.float64)[None]
-    for effect in there:
-        true_sun = effect.on_sun(true_sun, latitude_deg)
+    true_sun = suns_under(there, np.asarray(sun, dtype=np.float64)[None], latitude_deg)
 
     def outlined(part: Sequence[tuple[Heliostat, ArrayLike]]) -> tuple[list[str], Array, Array]:
         heliostats, aims = [one for one, _ in part], np.array([aim for _, aim in part], dtype=np.float64)

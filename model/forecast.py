@@ -131,6 +131,13 @@ def optics_under(effects: Iterable[Effect], optics: Optics) -> Optics:
     return optics
 
 
+def suns_under(effects: Iterable[Effect], suns: Array, latitude_deg: float) -> Array:
+    """Unit vectors (B, 3) towards the sun, as recorded, to where it really stood; latitude [deg] of the plant."""
+    for effect in effects:
+        suns = effect.on_sun(suns, latitude_deg)
+    return suns
+
+
 def images_under(effects: Iterable[Effect], flux: Tensor, window: Window) -> Tensor:
     """Irradiance (B, rows, columns) over ``window`` to what a camera with effects shows of it."""
     for effect in in_light_order(effects):
@@ -411,9 +418,7 @@ def _align_group(
     """Align the setups of one kind."""
     group = [setups[row] for row in rows]
     heliostats = altered([setup.heliostat for setup in group], effects)
-    suns = np.array([setup.sun for setup in group], dtype=np.float64)
-    for effect in effects:
-        suns = effect.on_sun(suns, latitude_deg)
+    suns = suns_under(effects, np.array([setup.sun for setup in group], dtype=np.float64), latitude_deg)
     points, planes, degree = (
         [setup.control_points for setup in group],
         [setup.plane for setup in group],
@@ -437,12 +442,15 @@ def _align_group(
 
 
 def altered(heliostats: Sequence[Heliostat], effects: Sequence[Effect]) -> list[Heliostat]:
-    """The heliostats on their mounts as the effects leave them; one that comes twice stays one."""
+    """The heliostats on their mounts as the effects leave them; one that comes twice stays one.
+
+    A calibrated mount stays as it is: what effects say of a surveyed one, the calibration has found in it.
+    """
     altered: dict[int, Heliostat] = {}
     for heliostat in heliostats:
         if id(heliostat) not in altered:
             mount = heliostat.mount
-            for effect in effects:
+            for effect in () if mount.is_calibrated else effects:
                 mount = effect.on_mount(mount)
             altered[id(heliostat)] = replace(heliostat, mount=mount)
     return [altered[id(heliostat)] for heliostat in heliostats]

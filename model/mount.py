@@ -141,6 +141,8 @@ class Mount:
         None where an axis is driven directly, or its drive is not known.
     axis_zero : (2,) [rad]
         What is added to the actuators' angles to give the axis angles.
+    is_calibrated : bool
+        Whether its axes are as they were found standing, not as surveyed: no tilt is missing in them.
     """
 
     first_axis: Array
@@ -150,6 +152,7 @@ class Mount:
     mirror_offset: Array
     actuators: tuple[LinearActuator, LinearActuator] | None = None
     axis_zero: tuple[float, float] = (0.0, 0.0)
+    is_calibrated: bool = False
 
     @classmethod
     def juelich(

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.pointing.drives import Believed, Noise, believe
-from model.pointing.kinematics import PARAMETERS, SPREAD, ZEROS, Chain, Readings, residuals
+from model.pointing.kinematics import ANOTHER_KIND_M, PARAMETERS, SPREAD, ZEROS, Chain, Readings, residuals
 
 Array = NDArray[np.float64]
 
@@ -34,13 +34,13 @@ _PRIOR_WEIGHT = 4.0
 # Most numbers in a covariance of one batch: what a processor's caches bear, and memory on a small machine.
 _BATCH = 4_000_000
 
-# Strokes of drives of one kind differ by millimetres; a file with another kind's [m] is started by the field's median.
-_ANOTHER_KIND_M = 0.02
+# Heliostats that make a prior of their own kind; fewer take that of the largest kind.
+_LEAST_OF_KIND = 5
 
 
 @dataclass(frozen=True, eq=False)
 class Field:
-    """What heliostats of one kind share.
+    """What heliostats with drives of one kind share.
 
     Attributes
     ----------
@@ -61,6 +61,11 @@ class Field:
         count = len(PARAMETERS)
         return cls(np.zeros(count), np.diag(SPREAD**2), np.median(chain.stroke, axis=0), np.median(chain.zero, axis=0))
 
+    def of_kind(self, chain: Chain) -> "Field":
+        """The same for heliostats of another kind, whose drives have references of their own."""
+        own = Field.unseen(chain)
+        return replace(self, stroke=own.stroke, zero=own.zero)
+
     def seen(self, believed: Believed) -> "Field":
         """By what is believed of its heliostats, each as far as its data tell; `SPREAD` weighs as a few of them."""
         count = len(believed.parameters) + _PRIOR_WEIGHT
@@ -70,7 +75,7 @@ class Field:
 
     def is_odd(self, chain: Chain) -> NDArray[np.bool_]:
         """Heliostats (H,) whose spindles are not nearly as long at their references as those of the field."""
-        return np.asarray((np.abs(chain.stroke - self.stroke) > _ANOTHER_KIND_M).any(axis=1))
+        return np.asarray((np.abs(chain.stroke - self.stroke) > ANOTHER_KIND_M).any(axis=1))
 
     def start(self, chain: Chain) -> Chain:
         """The chain to start from: odd drives are replaced by the field's.
@@ -97,7 +102,7 @@ class Calibrated:
 
 
 def calibrate(chain: Chain, readings: Readings, noise: Noise | None = None, field: Field | None = None) -> Calibrated:
-    """Calibrate all mounts of a field; with ``field`` by that prior, else by the field's own.
+    """Calibrate all mounts of one kind; with ``field`` by that prior, else by their own.
 
     The readings of a heliostat are in order of time. Heliostats without any get what the prior has.
     """
@@ -112,6 +117,21 @@ def calibrate(chain: Chain, readings: Readings, noise: Noise | None = None, fiel
             prior = prior.seen(believed)
     left = residuals(chain, readings, believed.parameters, believed.zeros)[0]
     return Calibrated(chain, prior, noise, believed, left)
+
+
+def calibrate_kinds(
+    chain: Chain, readings: Readings, noise: Noise | None = None
+) -> list[tuple[NDArray[np.intp], Calibrated]]:
+    """Mounts of a field by the priors that its kinds of drives make: each kind's with its rows, the largest first.
+
+    A kind of few heliostats with readings takes the spreads of the largest kind.
+    """
+    done: list[tuple[NDArray[np.intp], Calibrated]] = []
+    for rows in chain.kinds():
+        of_kind, own = chain.rows(rows), readings.of(rows)
+        few = bool(done) and own.used.any(axis=1).sum() < _LEAST_OF_KIND
+        done.append((rows, calibrate(of_kind, own, noise, done[0][1].field.of_kind(of_kind) if few else None)))
+    return done
 
 
 def robust(chain: Chain, readings: Readings, prior: Field, noise: Noise) -> Array:

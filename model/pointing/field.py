@@ -1,12 +1,12 @@
 """The mounts of a field: from readings to calibrated mounts, steps, and what contradicts them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from model.plant import Heliostat, TargetPlane
-from model.pointing.calibration import Field, calibrate
+from model.pointing.calibration import Field, calibrate, calibrate_kinds
 from model.pointing.drives import Noise
 from model.pointing.kinematics import Chain
 from model.pointing.mounts import CalibratedMount, mounts_of
@@ -21,9 +21,9 @@ class FieldMounts:
     Attributes
     ----------
     field : Field
-        What its heliostats share.
+        What its heliostats share; of several kinds of drives, those of the largest.
     mounts, readings : by heliostat
-        Readings in order of time.
+        Of those that were wanted; readings in order of time.
     contradictions : by heliostat and reading
         Readings that were left out.
     odd : tuple of str
@@ -45,18 +45,29 @@ def calibrate_field(
     latitude_deg: float,
     noise: Noise | None = None,
     field: Field | None = None,
+    wanted: Collection[str] | None = None,
 ) -> FieldMounts:
     """Calibrate the mounts of heliostats, all of which have actuators, by their readings in any order.
 
-    ``field`` is the prior, by default the field's own; who has no reading gets the mount that it makes likely.
+    ``field`` is the prior, by default what those with drives of one kind make together; who has no reading gets the
+    mount that it makes likely. Where mounts of some are ``wanted``, the others make the prior with them, and are among
+    those that a spot may be of.
     """
     names = list(readings)
     ordered = {name: sorted(readings[name], key=lambda one: one.day) for name in names}
-    own = [heliostats[name] for name in names]
-    chain, arrays = Chain.of(own), padded(list(ordered.values()))
-    done = calibrate(chain, arrays, noise, field)
-    mounts = dict(zip(names, mounts_of(done, own, arrays), strict=True))
-    reasons = Reasons(heliostats, mounts, targets, latitude_deg)
+    chain, arrays = Chain.of([heliostats[name] for name in names]), padded(list(ordered.values()))
+    if field is None:
+        kinds = calibrate_kinds(chain, arrays, noise)
+    else:
+        kinds = [(np.arange(len(names)), calibrate(chain, arrays, noise, field))]
+    every: dict[str, CalibratedMount] = {}
+    odd: set[str] = set()
+    for rows, done in kinds:
+        of_kind = [names[row] for row in rows]
+        every |= zip(of_kind, mounts_of(done, [heliostats[name] for name in of_kind], arrays.of(rows)), strict=True)
+        odd |= {name for name, is_odd in zip(of_kind, done.field.is_odd(chain.rows(rows)), strict=True) if is_odd}
+    mounts = {name: every[name] for name in names if wanted is None or name in wanted}
+    reasons = Reasons(heliostats, every, targets, latitude_deg)
     contradictions = {
         name: {
             ordered[name][place].name: reasons.explain(name, ordered[name][place])
@@ -64,5 +75,10 @@ def calibrate_field(
         }
         for name, mount in mounts.items()
     }
-    odd = tuple(name for name, is_odd in zip(names, done.field.is_odd(chain), strict=True) if is_odd)
-    return FieldMounts(done.field, mounts, ordered, contradictions, odd)
+    return FieldMounts(
+        kinds[0][1].field,
+        mounts,
+        {name: ordered[name] for name in mounts},
+        contradictions,
+        tuple(name for name in mounts if name in odd),
+    )

@@ -68,6 +68,12 @@ ZEROS = slice(NAMES.index("first_zero"), NAMES.index("second_zero") + 1)
 STROKES = slice(NAMES.index("first_stroke"), NAMES.index("second_stroke") + 1)
 """Where the spindles' lengths at their references stand."""
 
+ANOTHER_KIND_M = 0.02
+"""Lengths [m] of drives of one kind differ by millimetres; by more than this they are another kind's."""
+
+# Their motors' steps a metre differ by less than this share.
+_ANOTHER_KIND = 0.01
+
 _X, _Y, _Z = np.eye(3)
 
 
@@ -151,6 +157,25 @@ class Chain:
             sense=np.where(values("clockwise") > 0, -1.0, 1.0),
         )
 
+    def kinds(self) -> list[NDArray[np.intp]]:
+        """Rows of heliostats whose drives are of one kind, the largest kind first.
+
+        Those of one kind turn the same ways, and differ by what single heliostats are adjusted by. Their strokes and
+        zeros are no mark of a kind: some property files hold defaults for them.
+        """
+        found, left = [], np.arange(len(self.pivot))
+        while left.size:
+            one = left[0]
+            alike = (self.sense[left] == self.sense[one]) & (
+                np.abs(self.increment[left] / self.increment[one] - 1) < _ANOTHER_KIND
+            )
+            for lengths in (self.offset, self.radius):
+                alike &= np.abs(lengths[left] - lengths[one]) < ANOTHER_KIND_M
+            of_kind = alike.all(axis=1)
+            found.append(left[of_kind])
+            left = left[~of_kind]
+        return sorted(found, key=len, reverse=True)
+
     def rows(self, rows: NDArray[np.intp] | slice) -> "Chain":
         """The chain of some of the heliostats."""
         return Chain(**{name: value[rows] for name, value in vars(self).items()})
@@ -176,6 +201,7 @@ def calibrated(mount: Mount, parameters: Array) -> Mount:
         mirror_offset=mount.mirror_offset + p["mirror_ahead"] * _Z,
         actuators=(first_drive, second_drive),
         axis_zero=(mount.axis_zero[0] + p["first_zero"], mount.axis_zero[1] + p["second_zero"]),
+        is_calibrated=True,
     )
 
 

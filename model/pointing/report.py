@@ -1,12 +1,13 @@
 """Calibrated mounts as JSON, and back: MOUNTS.json of the command line, documents of the store."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from model.effects import Effect, effect_to_json, in_light_order
 from model.errors import InvalidInputError
 from model.pointing.drives import Noise
 from model.pointing.field import FieldMounts
@@ -35,6 +36,11 @@ def moment_of(day: float) -> datetime:
     return _EPOCH + timedelta(seconds=round(day * 86400))
 
 
+def sun_to_json(effects: Iterable[Effect]) -> list[dict[str, Any]]:
+    """Those of a model's effects that move the sun, as JSON: a mount holds under the sun it was calibrated under."""
+    return [effect_to_json(one) for one in in_light_order(effects) if type(one).on_sun is not Effect.on_sun]
+
+
 def parameters_to_json(mount: CalibratedMount) -> dict[str, Any]:
     """Every parameter with its unit, its spread before and after, and whether the data determine it."""
     rows = zip(PARAMETERS, mount.parameters, mount.spread, mount.prior_spread, mount.determined, strict=True)
@@ -54,11 +60,13 @@ def mount_to_json(
     mount: CalibratedMount,
     readings: Sequence[Reading],
     contradictions: Mapping[str, Contradiction],
+    effects: Iterable[Effect] = (),
 ) -> dict[str, Any]:
-    """A mount as JSON, with what it was made of; ``readings`` in order of time."""
+    """A mount as JSON, with what it was made of; ``readings`` in order of time, their suns as ``effects`` move them."""
     believed = 1e3 * mount.off[~mount.foreign]
     return {
         "valid_from": _begin(mount),
+        "sun": sun_to_json(effects),
         "measurements": len(readings),
         "residual_mrad": {
             "median": round(float(np.median(believed)), 3) if believed.size else None,
@@ -105,6 +113,18 @@ def _drift(mount: CalibratedMount) -> dict[str, Any]:
     }
 
 
+def parameters_from_json(document: Any, where: str) -> Array:
+    """The parameters (P,) of a document that `mount_to_json` wrote: all but how its drives' zeros went in time."""
+    try:
+        return np.array([document["parameters"][name]["value"] for name in NAMES], dtype=np.float64)
+    except (KeyError, TypeError, ValueError) as error:
+        raise _no_mount(where, error) from None
+
+
+def _no_mount(where: str, error: Exception) -> InvalidInputError:
+    return InvalidInputError(f"{where}: no calibrated mount as `heliotwin calibrate` writes it ({error})")
+
+
 def mount_from_json(document: Any, where: str, noise: Noise | None = None) -> CalibratedMount:
     """The mount of a document that `mount_to_json` wrote; `InvalidInputError` for any other."""
     try:
@@ -132,7 +152,7 @@ def mount_from_json(document: Any, where: str, noise: Noise | None = None) -> Ca
         )
         finite = all(np.isfinite(value).all() for value in (*values.values(), parameters, covariance))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InvalidInputError(f"{where}: no calibrated mount as `heliotwin calibrate` writes it ({error})") from None
+        raise _no_mount(where, error) from None
     if not finite:
         raise InvalidInputError(f"{where}: a calibrated mount has finite numbers only")
     return CalibratedMount(
@@ -149,7 +169,7 @@ def mount_from_json(document: Any, where: str, noise: Noise | None = None) -> Ca
     )
 
 
-def field_to_json(done: FieldMounts, skipped: Mapping[str, str]) -> dict[str, Any]:
+def field_to_json(done: FieldMounts, skipped: Mapping[str, str], effects: Sequence[Effect] = ()) -> dict[str, Any]:
     """MOUNTS.json: the field's prior, each mount, and what was left out with the reasons."""
     means, spreads = done.field.mean, np.sqrt(np.diag(done.field.covariance))
     return {
@@ -158,7 +178,7 @@ def field_to_json(done: FieldMounts, skipped: Mapping[str, str]) -> dict[str, An
             for p, mean, spread in zip(PARAMETERS, means, spreads, strict=True)
         },
         "heliostats": {
-            name: mount_to_json(mount, done.readings[name], done.contradictions[name])
+            name: mount_to_json(mount, done.readings[name], done.contradictions[name], effects)
             | ({"note": _ODD} if name in done.odd else {})
             for name, mount in done.mounts.items()
         },

@@ -14,6 +14,7 @@ from model.images import clipped_alike
 from model.metrics import accuracy_window, compare_on_target
 from service.base.progress import Progress, quiet
 from service.cli.folder import ROUGHEST_FIRST, check_surfaces, finish, measure, surface_of
+from service.cli.folder_pointing import Mounts, motors_of
 from service.sources.documents import Measurement, optics_to_json
 from service.sources.folder import MeasurementFolder
 from service.twin import compute
@@ -34,13 +35,19 @@ def forecast_measurement(
     measurement: Measurement,
     surface: tuple[Array, int] | None,
     effects: Sequence[Effect] = (),
+    mounts: Mounts | None = None,
 ) -> compute.Forecast:
     """Light over a measurement's whole target, and what the camera shows of it; ``effects`` add to the declared ones.
 
-    The heliostat is aligned by its measured spot; without one by its motors; without those at the target's centre.
+    The heliostat is aligned by its measured spot; without one by its motors, on its mount of that time; without those
+    at the target's centre.
     """
     heliostat, plane = folder.plant.heliostats[measurement.heliostat], folder.plant.targets[measurement.target]
-    motors = measurement.motor_position if heliostat.mount.actuators else None
+    if mounts is not None:
+        heliostat = mounts.stand(heliostat, measurement)
+    motors = None
+    if measurement.spot is None and measurement.motor_position is not None and heliostat.mount.actuators:
+        motors = motors_of(heliostat, measurement)
     return compute.forecast(
         heliostat,
         None,
@@ -81,10 +88,12 @@ def forecast_folder(
     window: float | None = None,
     progress: Progress = quiet,
     effects: Sequence[Effect] = (),
+    mounts: Mounts | None = None,
 ) -> dict[str, Any]:
     """Forecast every measurement of a folder; ``OUT/H/ID-forecast.npz`` and ``OUT/forecast.json``.
 
-    ``effects`` come in addition to those that the folder declares.
+    ``effects`` come in addition to those that the folder declares; without ``mounts`` heliostats stand as their
+    properties say.
     """
     check_surfaces(surfaces)
     if window is not None and not 0 < window <= _WIDEST_WINDOW:
@@ -109,7 +118,7 @@ def forecast_folder(
         for measurement in measurements:
             progress(measurement.key)
             try:
-                entry = _forecast_entry(folder, measurement, surface, effects, out, window)
+                entry = _forecast_entry(folder, measurement, surface, effects, mounts, out, window)
             except ModelError as error:
                 report["skipped"][measurement.key] = str(error)
                 continue
@@ -125,11 +134,12 @@ def _forecast_entry(
     measurement: Measurement,
     surface: tuple[Array, int] | None,
     effects: Sequence[Effect],
+    mounts: Mounts | None,
     out: Path,
     window: float | None,
 ) -> dict[str, Any]:
     """Write the forecast of one measurement and give back its entry in ``forecast.json``."""
-    traced = forecast_measurement(folder, measurement, surface, effects)
+    traced = forecast_measurement(folder, measurement, surface, effects, mounts)
     path = out / measurement.heliostat / f"{measurement.identifier}-forecast.npz"
     path.parent.mkdir(parents=True, exist_ok=True)
     np.savez_compressed(path, flux=traced.flux, camera_view=traced.camera_view)

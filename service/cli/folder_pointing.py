@@ -1,20 +1,23 @@
-"""The mounts of a measurement folder: ``heliotwin calibrate`` and ``heliotwin spot``."""
+"""The mounts of a measurement folder: ``heliotwin calibrate``, ``heliotwin spot``, and ``--mounts`` of other verbs."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from model.effects import Effect
 from model.errors import InvalidInputError, ModelError
 from model.plant import Heliostat
 from model.pointing import CalibratedMount, Reading, calibrate_field
-from model.pointing.report import field_to_json, mount_from_json
+from model.pointing.report import field_to_json, mount_from_json, sun_to_json
 from service.base.progress import Progress, quiet
 from service.cli.folder import clock_fault_of, write_json
 from service.sources.documents import Measurement, get, read_json
 from service.sources.folder import MeasurementFolder
+from service.twin.mounted import true_sun
 from service.twin.pointing import days_of
 
 Array = NDArray[np.float64]
@@ -36,7 +39,7 @@ def calibrate_folder(folder: MeasurementFolder, out: Path, progress: Progress = 
     done = calibrate_field(
         folder.plant.heliostats, readings, folder.plant.targets, latitude_deg=float(folder.plant.origin[0])
     )
-    report = field_to_json(done, skipped) | ({"clocks": clocks} if clocks else {})
+    report = field_to_json(done, skipped, folder.effects) | ({"clocks": clocks} if clocks else {})
     write_json(out, report)
     return report
 
@@ -76,7 +79,7 @@ def spot_folder(folder: MeasurementFolder, mounts: Path, out: Path, progress: Pr
     ModelError
         Where there is a spot of no measurement.
     """
-    known = read_mounts(mounts)
+    known = read_mounts(mounts, folder.effects)
     skipped, spots = folder.skipped, {}
     measured = _measurements(folder)
     days = _days(folder, measured, {})
@@ -98,12 +101,47 @@ def spot_folder(folder: MeasurementFolder, mounts: Path, out: Path, progress: Pr
     return report
 
 
-def read_mounts(path: Path) -> dict[str, CalibratedMount]:
-    """The mounts of a file that `calibrate_folder` wrote, by heliostat."""
+def read_mounts(path: Path, effects: Sequence[Effect]) -> dict[str, CalibratedMount]:
+    """The mounts of a file that `calibrate_folder` wrote, by heliostat, to be used under a model's effects.
+
+    Raises
+    ------
+    InvalidInputError
+        Where it is no such file, or its mounts were calibrated under another sun than the model's.
+    """
     documents = get(read_json(path), str(path), "heliostats")
     if not isinstance(documents, dict):
         raise InvalidInputError(f"{path}: 'heliostats' must be a JSON object")
-    return {name: mount_from_json(document, f"{path}, {name}") for name, document in documents.items()}
+    mounts = {name: mount_from_json(document, f"{path}, {name}") for name, document in documents.items()}
+    if any(document.get("sun", []) != sun_to_json(effects) for document in documents.values()):
+        raise InvalidInputError(
+            f"{path}: its mounts were calibrated under another sun than this model has; declare what moves the sun in "
+            "twin.json, and calibrate again"
+        )
+    return mounts
+
+
+class Mounts:
+    """What a folder's heliostats stand on: calibrated mounts where a file has them, else what their properties say."""
+
+    def __init__(self, folder: MeasurementFolder, path: Path | None, effects: Sequence[Effect] = ()) -> None:
+        """Those in a file, if one is named, under the folder's effects and others; raises what `read_mounts` raises."""
+        self._known = {} if path is None else read_mounts(path, [*folder.effects, *effects])
+        names = folder.plant.heliostats if self._known else ()
+        self._days = _days_of([one for name in names for one in folder.measurements(name, with_images=False)])
+
+    def stand(self, heliostat: Heliostat, measurement: Measurement | None = None) -> Heliostat:
+        """A heliostat as it stood at a measurement, by default as newly measured."""
+        mount = self._known.get(heliostat.name)
+        if mount is None:
+            return heliostat
+        day = np.nan if measurement is None else self._days[measurement.key]
+        return replace(heliostat, mount=mount.mount(heliostat.mount, day))
+
+    def under(self, folder: MeasurementFolder) -> MeasurementFolder:
+        """The folder, its heliostats as newly measured: zeros of drives matter only to who turns them by motors."""
+        heliostats = {name: self.stand(one) for name, one in folder.plant.heliostats.items()}
+        return replace(folder, plant=replace(folder.plant, heliostats=heliostats))
 
 
 def _measurements(folder: MeasurementFolder) -> dict[str, list[Measurement]]:
@@ -127,11 +165,15 @@ def _days(
     measurements = [one for own in measured.values() for one in own]
     faults = {one.key: clock_fault_of(folder, one) for one in measurements}
     clocks.update({key: fault for key, fault in faults.items() if fault is not None})
+    return _days_of(measurements)
+
+
+def _days_of(measurements: Sequence[Measurement]) -> dict[str, float]:
     days = days_of([one.taken_at for one in measurements], [one.identifier for one in measurements])
     return {one.key: float(day) for one, day in zip(measurements, days, strict=True)}
 
 
-def _motors(heliostat: Heliostat, measurement: Measurement) -> Array:
+def motors_of(heliostat: Heliostat, measurement: Measurement) -> Array:
     """Motor positions (2,) [steps] within the drives' travel."""
     if measurement.motor_position is None:
         raise InvalidInputError("no 'motor_position'")
@@ -142,12 +184,17 @@ def _motors(heliostat: Heliostat, measurement: Measurement) -> Array:
 
 def _reading(folder: MeasurementFolder, measurement: Measurement, day: float) -> Reading:
     heliostat = folder.plant.heliostats[measurement.heliostat]
-    motors = _motors(heliostat, measurement)
+    motors = motors_of(heliostat, measurement)
     if measurement.spot is None:
         raise InvalidInputError("no 'focal_spot'")
     if not any(_on(plane, measurement.spot) for plane in folder.plant.targets.values()):
         raise InvalidInputError("'focal_spot' lies off every target")
-    return Reading(measurement.identifier, measurement.target, motors, measurement.sun, measurement.spot, day)
+    return Reading(measurement.identifier, measurement.target, motors, _sun(folder, measurement), measurement.spot, day)
+
+
+def _sun(folder: MeasurementFolder, measurement: Measurement) -> Array:
+    """Where the sun (3,) stood by the declared model."""
+    return true_sun(folder.effects, measurement.sun, measurement.taken_at, float(folder.plant.origin[0]))
 
 
 # How far [m] a spot may lie off a target's plane, and off its edge: rounding and surveys, not another place.
@@ -161,7 +208,8 @@ def _on(plane: Any, spot: Array) -> bool:
 
 def _spot(folder: MeasurementFolder, measurement: Measurement, mount: CalibratedMount, day: float) -> dict[str, Any]:
     heliostat, plane = folder.plant.heliostats[measurement.heliostat], folder.plant.targets[measurement.target]
-    point, std = mount.spot(heliostat, plane, _motors(heliostat, measurement), measurement.sun, day)
+    motors, sun = motors_of(heliostat, measurement), _sun(folder, measurement)
+    point, std = mount.spot(heliostat, plane, motors, sun, day)
     return {
         "spot": np.round(point, 5).tolist(),
         "std_m": round(std, 5),

@@ -66,10 +66,11 @@ def get_mount_at(session: Session, heliostat: HeliostatRow, moment: datetime | N
 def current_mounts(session: Session, names: Sequence[str] | None = None) -> Sequence[tuple[HeliostatRow, MountRow]]:
     """Heliostats with their newest mounts and documents, by name; all of the store where none is named."""
     newest = select(func.max(MountRow.id)).group_by(MountRow.heliostat_id)
+    if names is not None:
+        of_names = select(HeliostatRow.id).where(HeliostatRow.name.in_(names))
+        newest = newest.where(MountRow.heliostat_id.in_(of_names))
     query = select(HeliostatRow, MountRow).join(MountRow, MountRow.heliostat_id == HeliostatRow.id)
     query = query.where(MountRow.id.in_(newest)).order_by(HeliostatRow.name).options(undefer(MountRow.document))
-    if names is not None:
-        query = query.where(HeliostatRow.name.in_(names))
     return [(heliostat, mount) for heliostat, mount in session.execute(query)]
 
 

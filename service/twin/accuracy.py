@@ -20,7 +20,7 @@ from model.errors import ModelError
 from model.metrics import flux_accuracy
 from service import store
 from service.base.faults import ServiceError
-from service.store.tables import DriftRow, HeliostatRow, MeasurementRow, SurfaceRow
+from service.store.tables import DriftRow, HeliostatRow, MeasurementRow, MountRow, SurfaceRow
 from service.twin import versions
 from service.twin.book import Book
 from service.twin.evidence import Array, Evidence, Twin, evidence_of, heights_of, load_twin
@@ -163,8 +163,8 @@ def rank_of(comparisons: Sequence[Comparison]) -> Rank:
 class State:
     """What a heliostat's accuracy depends on.
 
-    Its surface and its newest photograph, by their rows' ids, when one was last corrected, and the version of the
-    plant's model.
+    Its surface and its newest photograph, by their rows' ids, when one was last corrected, the version of the plant's
+    model, and when its mount was calibrated.
     """
 
     heliostat: str
@@ -172,6 +172,7 @@ class State:
     newest: int
     corrected: datetime | None
     model: int
+    calibrated_at: datetime | None = None
 
 
 class AccuracyBook:
@@ -213,6 +214,7 @@ class Shown:
     newest: int
     corrected: datetime | None
     model: int
+    calibrated_at: datetime | None = None
     span: Span | None = None
 
 
@@ -241,8 +243,16 @@ class ComparisonBook:
         if newest is None:
             return None
         corrections = select(func.max(MeasurementRow.corrected_at)).where(MeasurementRow.heliostat_id == heliostat.id)
-        corrected, model = session.scalar(corrections), versions.current_number(session)
-        return Shown(heliostat.name, None if surface is None else surface.version, newest, corrected, model, span)
+        calibrations = select(func.max(MountRow.created_at)).where(MountRow.heliostat_id == heliostat.id)
+        return Shown(
+            heliostat.name,
+            None if surface is None else surface.version,
+            newest,
+            session.scalar(corrections),
+            versions.current_number(session),
+            session.scalar(calibrations),
+            span,
+        )
 
     def wait_for(self, shown: Shown, seconds: float = 5.0) -> Compared | None:
         """Them; None where they are still being worked out after so many seconds."""

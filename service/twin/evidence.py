@@ -26,9 +26,10 @@ from model.surface import DEGREE
 from service import store
 from service.base.arrays import unpack
 from service.base.faults import ConflictError
-from service.sources.documents import read_heliostat
+from service.store import mounts
 from service.store.tables import HeliostatRow, MeasurementRow, SurfaceRow
 from service.twin import versions
+from service.twin.mounted import standing
 from service.twin.versions import PlantModel
 
 Array = NDArray[np.float64]
@@ -141,7 +142,7 @@ def choose(
 
 @dataclass(frozen=True, eq=False)
 class Twin:
-    """A stored heliostat with the plant's model: all that tracing it takes but a surface and a sun."""
+    """A stored heliostat as it stands, with the plant's model: all that tracing it takes but a surface and a sun."""
 
     row: HeliostatRow
     heliostat: Heliostat
@@ -150,7 +151,7 @@ class Twin:
 
 
 def load_twin(session: Session, name: str, model_version: int | None = None) -> Twin:
-    """A heliostat by its name, under a version of the plant's model, by default the current one.
+    """A heliostat by its name on its newest mount, under a version of the plant's model, by default the current one.
 
     Raises
     ------
@@ -160,8 +161,9 @@ def load_twin(session: Session, name: str, model_version: int | None = None) -> 
         Where the plant is not set.
     """
     row, origin = store.get_heliostat(session, name), store.get_plant(session).origin
-    heliostat = read_heliostat(row.name, row.properties, np.array(origin))
-    return Twin(row, heliostat, origin, versions.get_model(session, model_version))
+    model = versions.get_model(session, model_version)
+    heliostat = standing(row, mounts.find_mount_at(session, row), origin, model.effects)
+    return Twin(row, heliostat, origin, model)
 
 
 def heights_of(surface: SurfaceRow | None) -> Array | None:

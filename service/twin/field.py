@@ -126,7 +126,8 @@ class Line:
         """What its accuracy by this version of the model depends on; None where there is nothing to compare."""
         if self.surface is None or self.newest is None:
             return None
-        return State(self.name, self.surface.id, self.newest, self.corrected, model)
+        calibrated_at = None if self.mounted is None else self.mounted.calibrated_at
+        return State(self.name, self.surface.id, self.newest, self.corrected, model, calibrated_at)
 
 
 def _current_surfaces(session: Session, heliostat: int | None) -> dict[int, Current]:
@@ -206,14 +207,14 @@ def read_lines(session: Session, heliostat: int | None = None) -> list[Line]:
     """All heliostats in the order of their names, or one, without what arrays and photographs' spots would tell."""
     surfaces = _current_surfaces(session, heliostat)
     photographs, mounted = _photographs(session, heliostat), _mounts(session, heliostat)
-    receivers = [row.center_m for row in store.list_receivers(session)]
+    model, receivers = versions.current_number(session), [row.center_m for row in store.list_receivers(session)]
     row, none = HeliostatRow, _Taken()
     query = select(row.id, row.name, row.east_m, row.north_m, row.up_m)
     if heliostat is not None:
         query = query.where(row.id == heliostat)
     lines = []
     for number, name, *place in session.execute(query.order_by(row.name)):
-        taken = photographs.get(number, none)
+        taken, mount = photographs.get(number, none), mounted.get(number)
         line = Line(
             name,
             place[0],
@@ -224,7 +225,7 @@ def read_lines(session: Session, heliostat: int | None = None) -> list[Line]:
             taken.corrected,
             surfaces.get(number),
             range_m=min((math.dist(place, center) for center in receivers), default=None),
-            mounted=Mounted(name, *mounted[number], taken.newest, taken.corrected) if number in mounted else None,
+            mounted=None if mount is None else Mounted(name, *mount, taken.newest, taken.corrected, model),
         )
         lines.append(line)
     return lines

@@ -17,9 +17,10 @@ from model.tracing import Optics
 from service import store
 from service.base.arrays import unpack
 from service.base.progress import Report
-from service.sources.documents import read_heliostat
-from service.store.tables import HeliostatRow
+from service.store import mounts
+from service.store.tables import HeliostatRow, MountRow
 from service.twin.engines import engine_of
+from service.twin.mounted import standing
 from service.twin.runtime import Runtime
 from service.twin.versions import PlantModel
 
@@ -95,14 +96,28 @@ def _batches(fleet: Fleet, report: Callable[[float], None]) -> Iterator[Sequence
         yield fleet.names[start : start + TILE]
 
 
-def _heliostats(fleet: Fleet, rows: Mapping[str, HeliostatRow], names: Sequence[str]) -> Iterator[Heliostat]:
-    """Those that can be read; the others go to ``skipped``."""
-    for name in names:
-        if name not in rows:
+@dataclass(frozen=True, eq=False)
+class _Batch:
+    """Some of a fleet's heliostats as they are stored, with their newest mounts, by name."""
+
+    names: Sequence[str]
+    rows: Mapping[str, HeliostatRow]
+    mounts: Mapping[str, MountRow]
+
+    @classmethod
+    def read(cls, session: Session, names: Sequence[str]) -> "_Batch":
+        kept = {row.name: mount for row, mount in mounts.current_mounts(session, names)}
+        return cls(names, store.get_heliostats(session, names), kept)
+
+
+def _heliostats(fleet: Fleet, batch: _Batch) -> Iterator[Heliostat]:
+    """Those that can be read, as they stand; the others go to ``skipped``."""
+    for name in batch.names:
+        if name not in batch.rows:
             fleet.skipped[name] = f"there is no heliostat {name}; POST it to /v1/heliostats first"
             continue
         try:
-            yield read_heliostat(name, rows[name].properties, np.array(fleet.origin))
+            yield standing(batch.rows[name], batch.mounts.get(name), fleet.origin, fleet.model.effects)
         except ModelError as error:
             fleet.skipped[name] = str(error)
 
@@ -113,8 +128,8 @@ def _standing(runtime: Runtime, fleet: Fleet, report: Callable[[float], None]) -
     def all_of_them() -> Iterator[tuple[Heliostat, Array]]:
         for names in _batches(fleet, report):
             with runtime.database.reading() as session:
-                rows = store.get_heliostats(session, names)
-            for heliostat in _heliostats(fleet, rows, names):
+                batch = _Batch.read(session, names)
+            for heliostat in _heliostats(fleet, batch):
                 yield heliostat, fleet.aim_of(heliostat.name)
 
     return aligned_field(all_of_them(), fleet.sun, fleet.model.effects, latitude_deg=fleet.origin[0])
@@ -125,9 +140,9 @@ def _tiles(
 ) -> Iterator[Tile]:
     for names in _batches(fleet, report):
         with runtime.database.reading() as session:
-            rows = store.get_heliostats(session, names)
-            heights = {} if fleet.ideal else _heights(session, rows)
-        shots = list(_shots(fleet, rows, names, heights))
+            batch = _Batch.read(session, names)
+            heights = {} if fleet.ideal else _heights(session, batch.rows)
+        shots = list(_shots(fleet, batch, heights))
         if shots:
             yield tile_of(shots, neighbours)
 
@@ -138,10 +153,8 @@ def _heights(session: Session, rows: Mapping[str, HeliostatRow]) -> dict[str, Ar
     return {name: unpack(found[row.id])["z"].astype(np.float64) for name, row in rows.items() if row.id in found}
 
 
-def _shots(
-    fleet: Fleet, rows: Mapping[str, HeliostatRow], names: Sequence[str], heights: Mapping[str, Array]
-) -> Iterator[Setup]:
-    for heliostat in _heliostats(fleet, rows, names):
+def _shots(fleet: Fleet, batch: _Batch, heights: Mapping[str, Array]) -> Iterator[Setup]:
+    for heliostat in _heliostats(fleet, batch):
         name = heliostat.name
         if not fleet.ideal and name not in heights:
             fleet.skipped[name] = f'surface: heliostat {name} has no surface yet; predict one, or ask for "ideal"'

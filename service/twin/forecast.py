@@ -24,7 +24,7 @@ from service.base.fields import Sun, SunAt
 from service.store.tables import ForecastRow, HeliostatRow, SurfaceRow
 from service.twin.compute import Forecast
 from service.twin.evidence import Twin, heights_of, load_twin
-from service.twin.pointing import load_mount
+from service.twin.mounted import load_mount
 from service.twin.runtime import Runtime
 from service.twin.versions import PlantModel, get_model
 
@@ -35,9 +35,9 @@ class ForecastRequest:
 
     ``sun_azimuth_deg`` counts from south, positive to the east; ``sun_at`` is the time that was asked for, if one was.
     ``aim`` (3,) [m] is by default the plane's centre; ``motors`` [steps] in its place turn the mirror by its calibrated
-    mount, wherever that sends the light. ``surface``: "current", "ideal" or a version. ``window`` [m]: the side of a
-    square about the centre of mass that is mapped; the whole plane without it. ``model_version`` is the plant's model,
-    by default the current one.
+    mount as it was at ``sun_at``, by default as newly measured, wherever that sends the light. ``surface``: "current",
+    "ideal" or a version. ``window`` [m]: the side of a square about the centre of mass that is mapped; the whole plane
+    without it. ``model_version`` is the plant's model, by default the current one.
     """
 
     heliostat: str
@@ -125,7 +125,8 @@ def trace_request(runtime: Runtime, request: ForecastRequest) -> Traced:
         twin = load_twin(session, request.heliostat, request.model_version)
         plane, surface = _plane(session, request), _chosen_surface(session, twin.row, request.surface)
         if request.motors is not None:
-            twin = replace(twin, heliostat=load_mount(session, request.heliostat).turned())
+            mount = load_mount(session, request.heliostat, request.sun_at, request.model_version)
+            twin = replace(twin, heliostat=mount.turned(request.sun_at))
     return Traced(twin.row, surface, plane, twin.model, _trace(runtime, twin, heights_of(surface), request, plane))
 
 

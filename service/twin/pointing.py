@@ -1,7 +1,7 @@
-"""Mounts of stored heliostats: calibrated from stored photographs, and what they say of motors and spots."""
+"""Mounts of stored heliostats: calibrated from stored photographs, and which photographs to take next."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Any
 
@@ -10,20 +10,22 @@ from numpy.typing import NDArray
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from model.effects import Effect
 from model.ephemeris import sun_angles_at
 from model.errors import InvalidInputError, ModelError
 from model.frames import sun_direction
 from model.plant import Heliostat
 from model.pointing import CalibratedMount, FieldMounts, Reading, calibrate_field, days_by_order
 from model.pointing.plan import Proposal, plan
-from model.pointing.report import day_of, mount_from_json, mount_to_json
+from model.pointing.report import day_of, mount_to_json
 from service import store
 from service.base.faults import ConflictError
-from service.sources.documents import read_heliostat
 from service.store import mounts
 from service.store.columns import now
 from service.store.tables import HeliostatRow, MeasurementRow, MountRow
+from service.twin import versions
 from service.twin.evidence import spot_of
+from service.twin.mounted import mount_of, true_sun, with_drives
 from service.twin.runtime import Runtime
 
 Array = NDArray[np.float64]
@@ -34,80 +36,80 @@ MOST_CUT = 0.1
 
 @dataclass(frozen=True, eq=False)
 class StoreMounts:
-    """Mounts that are not kept yet, and what was left out of heliostats and measurements with the reasons."""
+    """Mounts that are not kept yet, and what was left out of heliostats and measurements with the reasons.
+
+    ``effects`` are those of the plant's model.
+    """
 
     done: FieldMounts
     skipped: dict[str, str]
+    effects: Sequence[Effect]
 
 
 def calibrate_store(
     runtime: Runtime, names: Sequence[str], since: datetime | None = None, until: datetime | None = None
 ) -> StoreMounts:
-    """Mounts of stored heliostats, with the prior that they make together, from photographs of a time.
+    """Mounts of stored heliostats from photographs of a time, by the prior that all heliostats of the store make.
 
     Raises
     ------
     ConflictError
         Where none has a measurement with motors and a spot.
     """
-    heliostats: dict[str, Heliostat] = {}
-    readings: dict[str, list[Reading]] = {}
-    skipped: dict[str, str] = {}
+    wanted = set(names)
     with runtime.database.reading() as session:
-        origin = store.get_plant(session).origin
+        origin, effects = store.get_plant(session).origin, versions.get_model(session).effects
         targets = {row.name: store.target_plane(row) for row in store.list_targets(session)}
-        rows = store.get_heliostats(session, names)
-        for name in names:
+        rows = {row.name: row for row in session.scalars(select(HeliostatRow).order_by(HeliostatRow.name))}
+        useless = {name: f"there is no heliostat {name}" for name in names if name not in rows}
+        heliostats: dict[str, Heliostat] = {}
+        readings: dict[str, list[Reading]] = {}
+        for name, row in rows.items():
+            # The others make the prior, whenever they were photographed.
+            taken = mounts.pointing_measurements(session, row, *((since, until) if name in wanted else ()))
             try:
-                heliostats[name] = _with_drives(rows.get(name), name, origin)
+                heliostats[name] = with_drives(row, origin)
             except (ModelError, ConflictError) as error:
-                skipped[name] = str(error)
+                useless[name] = str(error)
                 continue
-            taken = mounts.pointing_measurements(session, rows[name], since, until)
-            own, useless = readings_of(heliostats[name], taken, origin)
-            skipped |= {f"{name}/{identifier}": reason for identifier, reason in useless.items()}
+            own, unread = readings_of(heliostats[name], taken, origin, effects)
+            useless |= {f"{name}/{identifier}": reason for identifier, reason in unread.items()}
             if own:
                 readings[name] = own
             else:
-                skipped[name] = "no measurement with motor positions and a spot"
-    if not readings:
+                useless[name] = "no measurement with motor positions and a spot"
+    skipped = {key: reason for key, reason in useless.items() if key.partition("/")[0] in wanted}
+    if not wanted & readings.keys():
         reasons = "; ".join(f"{name}: {reason}" for name, reason in list(skipped.items())[:3])
         raise ConflictError(f"no heliostat can be calibrated ({reasons}); post photographs with motor_position")
     with runtime.computing("calibrate"):
-        done = calibrate_field(heliostats, readings, targets, latitude_deg=origin[0])
-    return StoreMounts(done, skipped)
+        done = calibrate_field(heliostats, readings, targets, latitude_deg=origin[0], wanted=wanted)
+    return StoreMounts(done, skipped, effects)
 
 
 def keep_mounts(session: Session, calibrated: StoreMounts) -> dict[str, MountRow]:
     """Keep calibrated mounts as their heliostats' next versions, by name."""
     done, kept = calibrated.done, {}
     for name, row in store.get_heliostats(session, list(done.mounts)).items():
-        document = mount_to_json(done.mounts[name], done.readings[name], done.contradictions[name])
+        document = mount_to_json(done.mounts[name], done.readings[name], done.contradictions[name], calibrated.effects)
         kept[name] = mounts.add_mount(session, row, document)
     return kept
 
 
-def _with_drives(row: HeliostatRow | None, name: str, origin: tuple[float, float, float]) -> Heliostat:
-    if row is None:
-        raise ConflictError(f"there is no heliostat {name}")
-    heliostat = read_heliostat(name, row.properties, np.array(origin))
-    if heliostat.mount.actuators is None:
-        raise ConflictError("its kinematics have no linear actuators, so motor positions say nothing of its angles")
-    return heliostat
-
-
 def readings_of(
-    heliostat: Heliostat, rows: Sequence[MeasurementRow], origin: tuple[float, float, float]
+    heliostat: Heliostat,
+    rows: Sequence[MeasurementRow],
+    origin: tuple[float, float, float],
+    effects: Sequence[Effect],
 ) -> tuple[list[Reading], dict[str, str]]:
-    """What measurements tell of a mount, and by their identifiers why others tell nothing."""
+    """What measurements tell of a mount under the model's sun, and by their identifiers why others tell nothing."""
     readings, useless = [], {}
     days = days_of([row.taken_at for row in rows], [row.external_id or row.identifier for row in rows])
     for row, day in zip(rows, days, strict=True):
         try:
             # A day that nothing tells is taken for that on which the photograph came.
-            readings.append(
-                _reading(heliostat, row, origin, float(day) if np.isfinite(day) else day_of(row.created_at))
-            )
+            when = float(day) if np.isfinite(day) else day_of(row.created_at)
+            readings.append(_reading(heliostat, row, origin, effects, when))
         except ModelError as error:
             useless[row.identifier] = str(error)
     return readings, useless
@@ -125,7 +127,13 @@ def days_of(taken: Sequence[datetime | None], names: Sequence[str]) -> Array:
     return days
 
 
-def _reading(heliostat: Heliostat, row: MeasurementRow, origin: tuple[float, float, float], day: float) -> Reading:
+def _reading(
+    heliostat: Heliostat,
+    row: MeasurementRow,
+    origin: tuple[float, float, float],
+    effects: Iterable[Effect],
+    day: float,
+) -> Reading:
     plane = store.target_plane(row.target)
     spot = spot_of(row, plane, origin)
     if row.motor_axis_1 is None or row.motor_axis_2 is None:
@@ -139,56 +147,8 @@ def _reading(heliostat: Heliostat, row: MeasurementRow, origin: tuple[float, flo
     motors = np.array([row.motor_axis_1, row.motor_axis_2])
     for position, drive in zip(motors, heliostat.mount.actuators or (), strict=True):
         drive.require_within(position)
-    sun = sun_direction(row.sun_azimuth_deg, row.sun_elevation_deg)
+    sun = true_sun(effects, sun_direction(row.sun_azimuth_deg, row.sun_elevation_deg), row.taken_at, origin[0])
     return Reading(row.identifier, plane.name, motors, sun, spot, day)
-
-
-# --- what a calibrated mount says -------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class StoredMount:
-    """A stored heliostat with its calibrated mount; ``version`` is None where none was ever calibrated."""
-
-    heliostat: Heliostat
-    mount: CalibratedMount
-    version: int | None
-    origin: tuple[float, float, float]
-
-    def turned(self, moment: datetime | None = None) -> Heliostat:
-        """The heliostat as calibrated, at a moment, by default as newly measured."""
-        if self.version is None:
-            return self.heliostat
-        return replace(self.heliostat, mount=self.mount.mount(self.heliostat.mount, day_of(moment)))
-
-
-def load_mount(session: Session, name: str) -> StoredMount:
-    """A heliostat's newest calibrated mount, or the one that its properties have.
-
-    Raises
-    ------
-    NotFoundError
-        Where there is no such heliostat.
-    ConflictError
-        Where its kinematics have no actuators, or its properties changed since it was calibrated.
-    """
-    row = store.get_heliostat(session, name)
-    return stored_mount(session, row, mounts.find_mount_at(session, row))
-
-
-def stored_mount(session: Session, row: HeliostatRow, kept: MountRow | None) -> StoredMount:
-    """A heliostat with one of its mounts, loaded with its document; raises what `load_mount` raises."""
-    origin = store.get_plant(session).origin
-    heliostat = _with_drives(row, row.name, origin)
-    if kept is None:
-        return StoredMount(heliostat, CalibratedMount.uncalibrated(), None, origin)
-    return StoredMount(heliostat, _mount(row, kept), kept.version, origin)
-
-
-def _mount(row: HeliostatRow, kept: MountRow) -> CalibratedMount:
-    if row.updated_at > kept.created_at:
-        raise ConflictError(f"the properties of {row.name} changed since it was calibrated; POST /v1/jobs/calibrations")
-    return mount_from_json(kept.document, f"mount {kept.version} of {row.name}")
 
 
 def sun_at(moment: datetime, origin: tuple[float, float, float]) -> tuple[float, float]:
@@ -226,22 +186,23 @@ def make_plan(runtime: Runtime, begin: datetime | None, minutes: float, photogra
     start = begin or now().replace(second=0, microsecond=0) + timedelta(minutes=1)
     moments = [start + timedelta(minutes=minutes * (place + 0.5) / photographs) for place in range(photographs)]
     with runtime.database.reading() as session:
-        origin = store.get_plant(session).origin
+        origin, effects = store.get_plant(session).origin, versions.get_model(session).effects
         planes = [store.target_plane(row) for row in store.list_targets(session)]
         known = {row.name: (row, kept) for row, kept in mounts.current_mounts(session)}
         rows = session.scalars(select(HeliostatRow).order_by(HeliostatRow.name)).all()
     heliostats, calibrated = {}, {}
     for row in rows:
         try:
-            heliostats[row.name] = _with_drives(row, row.name, origin)
-            calibrated[row.name] = _mount(*known[row.name]) if row.name in known else CalibratedMount.uncalibrated()
-        except ConflictError:  # no drives, or properties that are newer: nothing to aim with
+            heliostats[row.name] = with_drives(row, origin)
+            own = known.get(row.name)
+            calibrated[row.name] = CalibratedMount.uncalibrated() if own is None else mount_of(*own, effects)
+        except ConflictError:  # no drives, or a mount that does not hold any more: nothing to aim with
             continue
     angles = [sun_angles_at(moment, origin[0], origin[1]) for moment in moments]
     days = [(moment, *angle) for moment, angle in zip(moments, angles, strict=True) if angle[1] > 0]
     if not days:
         raise InvalidInputError("at: the sun is below the horizon then; choose another time")
-    suns = [sun_direction(azimuth, elevation) for _, azimuth, elevation in days]
+    suns = [true_sun(effects, sun_direction(*angle), moment, origin[0]) for moment, *angle in days]
     with runtime.computing("plan"):
         chosen = plan(heliostats, calibrated, planes, suns, [day_of(moment) for moment, _, _ in days])
     return [Slot(one, *days[one.slot]) for one in chosen]

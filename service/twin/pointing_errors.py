@@ -22,7 +22,8 @@ from service.base.faults import ServiceError
 from service.store import mounts
 from service.store.tables import MountRow
 from service.twin.book import Book
-from service.twin.pointing import StoredMount, readings_of, stored_mount
+from service.twin.mounted import StoredMount, stored_mount
+from service.twin.pointing import readings_of
 from service.twin.runtime import Runtime
 
 Array = NDArray[np.float64]
@@ -208,8 +209,8 @@ def _drifted(document: dict[str, Any]) -> Drifted | None:
 class Mounted:
     """What a heliostat's pointing error depends on.
 
-    Its newest mount by its row's id, when that was calibrated, the row of its newest photograph, and when one was last
-    corrected.
+    Its newest mount by its row's id, when that was calibrated, the row of its newest photograph, when one was last
+    corrected, and the version of the plant's model.
     """
 
     heliostat: str
@@ -217,6 +218,7 @@ class Mounted:
     calibrated_at: datetime
     newest: int | None
     corrected: datetime | None
+    model: int
 
 
 class PointingBook:
@@ -258,7 +260,7 @@ def _newer(session: Session, name: str, kept: MountRow) -> tuple[StoredMount, li
     rows = mounts.pointing_measurements(session, row, since)
     # What tells no time and was there already is of the calibration, whenever it came.
     rows = [one for one in rows if one.taken_at is not None or one.created_at > kept.created_at]
-    readings, _ = readings_of(stored.heliostat, rows, stored.origin)
+    readings, _ = readings_of(stored.heliostat, rows, stored.origin, stored.effects)
     newer = sorted(readings, key=lambda one: one.day)[-_MOST_READ:]
     stepped = [step[end] for step in kept.document["steps"][-1:] for end in ("after", "before")]
     return stored, newer, mounts.undated(session, row, [*stepped, *(one.name for one in newer)])

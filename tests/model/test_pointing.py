@@ -5,8 +5,12 @@ from datetime import UTC, datetime
 
 import numpy as np
 import pytest
+import torch
 
+from model.effects import Effect
+from model.effects.axis_tilt import AxisTilt
 from model.errors import InvalidInputError, UnreachableError
+from model.forecast import Setup, align
 from model.frames import sun_direction_at
 from model.mount import LinearActuator, Mount
 from model.plant import JUELICH_LATITUDE, Heliostat, TargetPlane
@@ -17,6 +21,8 @@ from model.pointing.kinematics import NAMES, SPREAD, ZEROS, Chain, calibrated, r
 from model.pointing.mounts import landed
 from model.pointing.readings import padded
 from model.pointing.report import day_of, field_to_json, moment_of, mount_from_json
+from model.surface import control_points
+from model.tracing.convolution import central_rays
 
 NOISE = Noise()
 QUIET = replace(NOISE, drift_rad=(1e-5, 1e-5), jitter_rad=(1e-5, 1e-5))
@@ -72,8 +78,10 @@ def series(
     return readings
 
 
-def calibrate(field, readings, noise=NOISE, prior=None):
-    return calibrate_field(field, readings, TARGETS, latitude_deg=JUELICH_LATITUDE, noise=noise, field=prior)
+def calibrate(field, readings, noise=NOISE, prior=None, wanted=None):
+    return calibrate_field(
+        field, readings, TARGETS, latitude_deg=JUELICH_LATITUDE, noise=noise, field=prior, wanted=wanted
+    )
 
 
 @pytest.fixture(scope="module")
@@ -224,6 +232,84 @@ def test_documents_bring_the_mount_back(world):
         mount_from_json({**document, "covariance": [1]}, "here")
     with pytest.raises(InvalidInputError, match="finite"):
         mount_from_json({**document, "covariance": np.full((16, 16), np.nan).tolist()}, "here")
+
+
+def by_motors(heliostat: Heliostat, reading: Reading, effects: list[Effect]) -> np.ndarray:
+    """Where the light's centre lies (3,) [m] as the forecast from a reading's motors has it under effects."""
+    angles, plane = heliostat.mount.angles_from_motors(reading.motors), TARGETS[reading.target]
+    shot = Setup(heliostat, control_points(heliostat), reading.sun, plane, angles=angles)
+    scene = align([shot], effects, latitude_deg=JUELICH_LATITUDE, dtype=torch.float64).groups[0].scene
+    return plane.to_enu(central_rays(scene, 8).spot[0].numpy())
+
+
+def test_a_tilt_is_in_the_calibrated_mount_and_not_applied_again(world):
+    """Foundations lean by 1 and 2 degrees: spots told the calibration, and images the effect."""
+    field, _, _ = world
+    leaning = np.zeros(len(NAMES))
+    leaning[[NAMES.index("foundation_north"), NAMES.index("foundation_up")]] = np.radians([1.0, -2.0])
+    own = series(field["H03"], leaning, np.linspace(0, 365, 30), np.random.default_rng(6))
+    mount = calibrate({"H03": field["H03"]}, {"H03": own}).mounts["H03"].mount(field["H03"].mount)
+    tilt, found = AxisTilt(1.0, -2.0), replace(field["H03"], mount=mount)
+    np.testing.assert_allclose(found.mount.first_axis, tilt.on_mount(field["H03"].mount).first_axis, atol=5e-3)
+    for reading in own[:5]:
+        distance = np.linalg.norm(reading.spot - found.position)
+        off = [np.linalg.norm(by_motors(one, reading, [tilt]) - reading.spot) for one in (found, field["H03"])]
+        assert max(off) < 3e-3 * distance  # the surveyed mount with the tilt, and the calibrated one as it is
+        assert np.linalg.norm(by_motors(field["H03"], reading, []) - reading.spot) > 15e-3 * distance
+
+
+def with_drives(heliostat: Heliostat, factor: float) -> Heliostat:
+    """The heliostat with drives ``factor`` times as long."""
+    drives = tuple(
+        replace(
+            drive,
+            increment=drive.increment / factor,
+            initial_stroke_length=factor * drive.initial_stroke_length,
+            offset=factor * drive.offset,
+            pivot_radius=factor * drive.pivot_radius,
+        )
+        for drive in ACTUATORS
+    )
+    return replace(heliostat, mount=Mount.juelich(drives, mirror_offset=(0, 0, 0.175)))
+
+
+def test_kinds_of_drives_make_priors_of_their_own(world):
+    """Those of a second kind stand straight, whatever those of the first do; one of a third has no others."""
+    field, truths, readings = world
+    generator, days = np.random.default_rng(9), np.linspace(0, 365, 40)
+    tight = {f"L{place}": with_drives(heliostats(6)[f"H0{place}"], 1.5) for place in range(6)}
+    alone = {"Z0": with_drives(heliostats(1)["H00"], 2.0)}
+    straight = {name: 0.1 * truth(generator) for name in tight}
+    mixed = readings | {name: series(one, straight[name], days, generator) for name, one in tight.items()}
+    mixed |= {"Z0": series(alone["Z0"], truths["H00"], days, generator)}
+    done = calibrate(field | tight | alone, mixed)
+    assert done.odd == ()
+    spreads = {name: mount.prior_spread for name, mount in done.mounts.items()}
+    np.testing.assert_allclose(spreads["H01"], calibrate(field, readings).mounts["H01"].prior_spread)
+    up = NAMES.index("foundation_up")
+    assert spreads["L1"][up] < 0.85 * spreads["H01"][up]
+    np.testing.assert_allclose(spreads["Z0"], spreads["H01"])
+    for name, heliostat in (tight | alone).items():
+        assert np.median(off_by(heliostat, done.mounts[name], mixed[name])) < 1e-3
+
+
+def test_drives_that_single_heliostats_are_adjusted_by_are_of_one_kind(world):
+    field, _, _ = world
+    adjusted = [
+        replace(one, mount=Mount.juelich(tuple(replace(d, offset=d.offset + 1e-3 * place) for d in ACTUATORS)))
+        for place, one in enumerate(field.values())
+    ]
+    assert [len(rows) for rows in Chain.of(adjusted).kinds()] == [10]
+
+
+def test_mounts_of_some_lean_on_all_that_were_read(world):
+    field, _, readings = world
+    foreign = replace(readings["H07"][15], name="other")
+    few = {**readings, "H03": [*readings["H03"][::8], foreign]}
+    whole, some = calibrate(field, few), calibrate(field, few, wanted=["H03"])
+    assert list(some.mounts) == list(some.readings) == list(some.contradictions) == ["H03"]
+    np.testing.assert_array_equal(some.mounts["H03"].parameters, whole.mounts["H03"].parameters)
+    assert "H07" in some.contradictions["H03"]["other"].detail  # which is not wanted
 
 
 def test_heliostats_without_measurements_have_the_prior(world):

@@ -327,6 +327,19 @@ def test_what_no_candidate_explains_is_said(hazy):
     }
 
 
+def test_calibrated_mounts_are_not_tilted(hazy):
+    def stand(photograph):
+        heliostat = photograph.setup.heliostat
+        mount = replace(heliostat.mount, is_calibrated=True)
+        return replace(photograph, setup=replace(photograph.setup, heliostat=replace(heliostat, mount=mount)))
+
+    options = replace(QUICK, candidates=("axis_tilt",))
+    found = study([stand(p) for p in hazy], Optics(), options=options, latitude_deg=JUELICH_LATITUDE)
+    assert found.verdict == "unexplained"
+    (candidate,) = found.candidates
+    assert candidate.gain.low == candidate.gain.high == 0
+
+
 def test_an_error_that_grows_with_time_is_seen_where_times_were_recorded(hazy):
     first = datetime(2026, 6, 1, 12, tzinfo=UTC)
     dated = [replace(p, setup=replace(p.setup, taken_at=first + timedelta(days=day))) for day, p in enumerate(hazy)]

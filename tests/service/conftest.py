@@ -25,6 +25,7 @@ from sqlalchemy import URL, make_url
 from model.errors import UnreachableError
 from model.fleet import FleetFlux
 from model.imaging import MeasuredFlux, Quality
+from model.mount import Mount
 from model.observation import Observation, SurfacePrediction
 from model.plant import Heliostat, TargetPlane
 from service.base.settings import Settings
@@ -155,6 +156,7 @@ class FakeOperations:
     latitudes: list[float] = field(default_factory=list)
     forecasts: list[dict[str, Any]] = field(default_factory=list)
     fleets: list[dict[str, Any]] = field(default_factory=list)
+    mounts: dict[str, Mount] = field(default_factory=dict)
     measured: int = 0
     rendered: int = 0
 
@@ -182,6 +184,7 @@ class FakeOperations:
     ) -> SurfacePrediction:
         self.latitudes.append(latitude_deg)
         self.predictions.append(list(observations))
+        self.mounts["predict"] = heliostat.mount
         self.believed.append(effects)
         z = np.linspace(-1e-3, 1e-3, 256).reshape(4, 8, 8)
         return SurfacePrediction(
@@ -206,10 +209,12 @@ class FakeOperations:
     ) -> Any:
         self.latitudes.append(latitude_deg)
         self.rendered += 1
+        self.mounts["render"] = heliostat.mount
         return np.stack([observation.flux for observation in observations])
 
     def forecast(self, heliostat: Heliostat, z: Any, sun: Any, plane: TargetPlane, **options: Any) -> Forecast:
-        self.forecasts.append({"heliostat": heliostat.name, "z": z, "sun": sun, "plane": plane, **options})
+        asked = {"heliostat": heliostat.name, "mount": heliostat.mount, "z": z, "sun": sun, "plane": plane}
+        self.forecasts.append(asked | options)
         if options["aim"] is not None and options["aim"][2] < 0:
             raise UnreachableError("the aim point lies behind the mirror")
         flux = np.full(options["resolution"], 2.0, dtype=np.float32)
@@ -217,7 +222,8 @@ class FakeOperations:
         return Forecast(flux=flux, center_of_mass=center, peak=2.0, power=50.0, camera_view=flux, model_version="fake")
 
     def superpose(self, receiver: Any, tiles: Any, **options: Any) -> FleetFlux:
-        self.fleets.append({"receiver": receiver, **options})
+        tiles = list(tiles)
+        self.fleets.append({"receiver": receiver, "tiles": tiles, **options})
         count = sum(len(tile) for tile in tiles)
         return FleetFlux(np.full(options["resolution"], 2.0 * count), 60.0 * count, count)
 

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from model.effects.sun_position import SunPosition
 from model.frames import sun_direction
 from model.plant import Plant
 from model.pointing.kinematics import SPREAD, calibrated
@@ -12,15 +13,20 @@ from service.sources.documents import read_heliostat, read_targets
 from tests.service.conftest import ORIGIN
 
 
-def photographs(tower: Any, properties: Any, step_mrad: float = 0.0) -> list[dict[str, Any]]:
-    """Metadata of 16 photographs, one a day from 1 May 2024; the first drive steps before the ninth."""
+def photographs(
+    tower: Any, properties: Any, step_mrad: float = 0.0, clock_minutes: float = 0.0
+) -> list[dict[str, Any]]:
+    """Metadata of 16 photographs, one a day from 1 May 2024; the first drive steps before the ninth.
+
+    ``clock_minutes`` is how far the sun had gone on since the moment that it is recorded at.
+    """
     generator = np.random.default_rng(4)
     plane, heliostat = read_targets(tower)[1]["lower"], read_heliostat("AA39", properties, np.array(ORIGIN))
     mount = calibrated(heliostat.mount, 0.3 * SPREAD * generator.normal(size=len(SPREAD)))
     taken = []
     for place in range(16):
         azimuth, elevation = generator.uniform(-60, 60), generator.uniform(20, 60)
-        sun = sun_direction(azimuth, elevation)
+        sun = SunPosition(clock_minutes).on_sun(sun_direction(azimuth, elevation)[None], ORIGIN[0])[0]
         angles = mount.align(heliostat.position, sun, plane.center)
         motors = np.round(mount.motors_from_angles(angles))
         step = np.array([1e-3 * step_mrad if place >= 8 else 0.0, 0.0])

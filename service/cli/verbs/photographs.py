@@ -25,6 +25,14 @@ EffectsFile = Annotated[
     typer.Option("--effects", help="Effects to add to the declared ones: JSON, or a study's report.", metavar="FILE"),
 ]
 
+MountsFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--mounts",
+        help="File that calibrate wrote: heliostats stand on its mounts, others as their properties say.",
+        metavar="MOUNTS.json",
+    ),
+]
 
 _TIMES = ["%Y-%m-%dT%H:%M", "%Y-%m-%dT%H:%M:%S", "%Y-%m-%dT%H:%M%z", "%Y-%m-%dT%H:%M:%S%z"]
 
@@ -62,13 +70,16 @@ def predict(
         Method, typer.Option(help="network, or refined: the network, then MAP through the tracer.")
     ] = "network",
     images: Annotated[int, typer.Option(help="Most images used for a heliostat: 1 to 8, to 64 where refined.")] = 8,
+    mounts: MountsFile = None,
     as_json: AsJson = False,
 ) -> None:
     """Mirror surfaces from images: OUT/H/Deflectometry/H-nurbs-surface.npz and OUT/predictions.json."""
     from service.cli.folder import predict_folder
+    from service.cli.folder_pointing import Mounts
     from service.sources.folder import read_folder
 
     source = read_folder(folder)
+    source = Mounts(source, mounts).under(source)
     with progress(len(source.plant.heliostats), "predict") as step:
         report = predict_folder(source, out, method, images, step)
     table = make_table("Surfaces", "heliostat", "images", "misfit", "rms [mm]", "error to measured [mm]")
@@ -90,6 +101,7 @@ def forecast(
     out: Out,
     surfaces: Surfaces = "measured",
     effects: EffectsFile = None,
+    mounts: MountsFile = None,
     window: Annotated[
         float | None, typer.Option(help="Side [m] of the accuracy's window; by the spot if not given.")
     ] = None,
@@ -116,24 +128,26 @@ def forecast(
     With --sun or --at it takes no photographs: OUT/H/forecast.npz of each heliostat.
     """
     from service.cli.folder_forecast import forecast_folder
+    from service.cli.folder_pointing import Mounts
     from service.sources.documents import read_effects
     from service.sources.folder import read_folder
 
     added = () if effects is None else read_effects(effects)
     source = read_folder(folder)
+    known = Mounts(source, mounts, added)
     if any(given is not None for given in (sun, at, target, plane, heliostat)):
         from service.cli.folder_sun import asked, forecast_for
 
         wanted = asked(source, sun, at, target, plane)
         with progress(len(heliostat or source.plant.heliostats), "forecast") as step:
-            report = forecast_for(source, out, wanted, surfaces, added, heliostat or (), step)
+            report = forecast_for(known.under(source), out, wanted, surfaces, added, heliostat or (), step)
         table = make_table("Forecasts", "heliostat", "peak [kW/m2]", "power [kW]")
         for name, entry in report["heliostats"].items():
             table.add_row(name, f"{entry['peak_w_m2'] / 1000:.2f}", f"{entry['power_w'] / 1000:.2f}")
         show(report, as_json, table)
         return
     with progress(_count(source, with_images=False), "forecast") as step:
-        report = forecast_folder(source, out, surfaces, window, step, added)
+        report = forecast_folder(source, out, surfaces, window, step, added, known)
     table = make_table("Forecasts", "measurement", "accuracy", "window [m]", "outside", "peak [kW/m2]")
     for key, entry in report["measurements"].items():
         compared = "accuracy" in entry
@@ -159,10 +173,12 @@ def study(
     ] = None,
     surfaces: Surfaces = "measured",
     effects: EffectsFile = None,
+    mounts: MountsFile = None,
     as_json: AsJson = False,
 ) -> None:
     """Which physical effect the photographs demand that the declared model lacks, and what it buys: REPORT.json."""
     from service.cli.folder import write_json
+    from service.cli.folder_pointing import Mounts
     from service.cli.folder_study import study_folder
     from service.sources.documents import read_effects
     from service.sources.folder import read_folder
@@ -172,6 +188,7 @@ def study(
             raise InvalidInputError(f"{path} is a folder; name a file to write to")
     added = () if effects is None else read_effects(effects)
     source = read_folder(folder)
+    source = Mounts(source, mounts, added).under(source)
     with progress(None, "study") as step:
         done = study_folder(source, surfaces, effects=added, progress=step)
     report = done.to_json()

@@ -55,8 +55,9 @@ class ForecastIn(Model):
     )
     motor_position: MotorPosition | None = Field(
         default=None,
-        description="In place of an aim: positions of both motors [steps]. The newest calibrated mount says where they "
-        "send the light, or the heliostat's properties where it was never calibrated.",
+        description="In place of an aim: positions of both motors [steps]. The calibrated mount, as it was at the time "
+        "in `sun`, else the newest, says where they send the light, or the heliostat's properties where it was never "
+        "calibrated.",
     )
     surface: Literal["current", "ideal"] | VersionIn = Field(
         default="current", description="The heliostat's current surface, the ideal one, or a version."

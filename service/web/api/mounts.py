@@ -13,7 +13,8 @@ from service import store
 from service.base.fields import Model, Moment, Name, Position, Sun, Version
 from service.store import mounts
 from service.store.tables import MountRow
-from service.twin.pointing import load_mount, make_plan, mount_out, sun_at
+from service.twin.mounted import load_mount
+from service.twin.pointing import make_plan, mount_out, sun_at
 from service.web.answers.openapi import problems
 from service.web.answers.paging import Page, page
 from service.web.door.dependencies import COMPUTES, READ, Limit, NamePath, RuntimeDep, require_json
@@ -30,6 +31,9 @@ class MountOut(BaseModel):
     version: int
     created_at: datetime = Field(description="When it was calibrated; anew, where it is still in the same state.")
     valid_from: datetime = Field(description="Since when its newest state holds: a step of its drives, or the first.")
+    sun: list[dict[str, Any]] = Field(
+        default=[], description="Effects of the plant's model that moved the sun when it was calibrated."
+    )
     measurements: int
     residual_mrad: dict[str, float | None] = Field(description="Between forecast and measured spots [mrad].")
     parameters: dict[str, dict[str, Any]] = Field(
@@ -110,9 +114,9 @@ def post_motors(
         AimIn, Body(examples=[{"target": "multi_focus_tower", "sun": {"azimuth_deg": -20.0, "elevation_deg": 45.0}}])
     ],
 ) -> MotorsOut:
-    """The motor positions that send the sun's light to a point, by the newest calibrated mount."""
+    """The motor positions that send the sun's light to a point, by the calibrated mount of `time`, or the newest."""
     with runtime.database.reading() as session:
-        stored = load_mount(session, name)
+        stored = load_mount(session, name, request.time)
         if request.aim_point is not None:
             aim = np.array(request.aim_point)
         else:
@@ -123,8 +127,8 @@ def post_motors(
     else:
         assert request.time is not None
         angles = sun_at(request.time, stored.origin)
-    sun, day = sun_direction(*angles), day_of(request.time)
-    motors = stored.mount.motors(stored.heliostat, sun, aim, day)
+    recorded, day = sun_direction(*angles), day_of(request.time)
+    motors, sun = stored.motors(recorded, aim, request.time), stored.sun(recorded, request.time)
     cov = stored.mount.covariance_at(stored.heliostat, motors[None], sun[None], aim[None], np.array([day]))[0]
     std = float(np.sqrt(np.trace(cov) / 2))
     return MotorsOut(

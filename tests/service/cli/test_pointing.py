@@ -11,6 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from model.errors import InvalidInputError, ModelError
+from model.imaging import center_of_mass
 from service.cli.folder_pointing import calibrate_folder, spot_folder
 from service.cli.main import app
 from service.sources.folder import read_folder
@@ -105,6 +106,58 @@ def test_spots_need_no_focal_spot(folder: Path, tmp_path: Path):
     assert np.linalg.norm(np.array(entry["spot"]) - measured["AA39/105"]) < 0.2
     assert 0 < entry["std_m"] < 0.5
     assert entry["target"] == "lower"
+
+
+def test_verbs_stand_on_the_mounts_of_a_file(folder: Path, tmp_path: Path):
+    """Without a spot the light of the motors lands where it was seen, and not 29 mrad away; with one it is rolled."""
+    mounts, measured = tmp_path / "mounts.json", {}
+    calibrate_folder(read_folder(folder), mounts)
+    for measurement in read_folder(folder).measurements("AA39", with_images=False):
+        measured[measurement.key] = measurement.spot
+    options = ["--surfaces", "ideal", "--json"]
+
+    def forecasts(out: str, *more: str) -> dict[str, Any]:
+        made = CliRunner().invoke(app, ["forecast", str(folder), "--out", str(tmp_path / out), *options, *more])
+        assert made.exit_code == 0, made.output
+        keys = json.loads(made.stdout)["measurements"]
+        return {key: np.load(tmp_path / out / f"{key}-forecast.npz")["flux"] for key in keys}
+
+    plain, standing = forecasts("plain"), forecasts("standing", "--mounts", str(mounts))
+    changes = [np.abs(standing[key] - plain[key]).sum() / plain[key].sum() for key in plain]
+    assert 0.003 < np.median(changes) < 0.2
+    for path in (folder / "AA39" / "Calibration").glob("*-properties.json"):
+        document = json.loads(path.read_text())
+        document.pop("focal_spot", None)
+        write(path, document)
+    by_motors = forecasts("motors", "--mounts", str(mounts))
+    assert "AA39/204" not in by_motors  # beyond the travel
+    plant = read_folder(folder).plant
+    plane, heliostat = plant.targets["lower"], plant.heliostats["AA39"]
+    off = []
+    for key, flux in by_motors.items():
+        if key[-3:] < "116":  # those that were measured well
+            spot = plane.to_enu(center_of_mass(flux, (plane.width, plane.height)))
+            off.append(np.linalg.norm(spot - measured[key]) / np.linalg.norm(heliostat.position - spot))
+    assert len(off) == 16
+    assert np.median(off) < 1e-3
+
+
+def test_mounts_of_another_sun_are_refused(folder: Path, tmp_path: Path):
+    mounts = str(tmp_path / "mounts.json")
+    calibrate_folder(read_folder(folder), tmp_path / "mounts.json")
+    late = {"effects": [{"name": "sun_position", "parameters": {"minutes": 12.0}}]}
+    write(tmp_path / "late.json", late)
+    for verb in ("forecast", "study"):
+        asked = [verb, str(folder), "--out", str(tmp_path / "o"), "--mounts", mounts]
+        done = CliRunner().invoke(app, [*asked, "--effects", str(tmp_path / "late.json")])
+        assert isinstance(done.exception, InvalidInputError)
+        assert "another sun" in str(done.exception)
+    write(folder / "twin.json", {"declared": late})
+    report = calibrate_folder(read_folder(folder), tmp_path / "mounts.json")
+    assert report["heliostats"]["AA39"]["sun"] == late["effects"]
+    off = spot_folder(read_folder(folder), tmp_path / "mounts.json", tmp_path / "spots.json")["spots"]["AA39/105"]
+    (measured,) = [m.spot for m in read_folder(folder).measurements("AA39", False) if m.key == "AA39/105"]
+    assert np.linalg.norm(np.array(off["spot"]) - measured) < 0.3
 
 
 def test_files_that_are_no_mounts_are_refused(folder: Path, tmp_path: Path):

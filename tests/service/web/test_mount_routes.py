@@ -1,17 +1,27 @@
 """Calibrated mounts over HTTP: the job, motors for an aim, forecasts from motors, the plan."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from fastapi.testclient import TestClient
 
+from model.forecast import Setup, align
+from model.mount import Mount, rotation
+from model.plant import Heliostat
+from model.pointing.kinematics import NAMES, SPREAD
+from model.surface import control_points
+from model.tracing.convolution import central_rays
 from service.base.settings import Settings
-from tests.service.conftest import QUIET, FakeOperations, Post, png, until
+from service.sources.documents import read_heliostat
+from tests.service.conftest import ORIGIN, QUIET, FakeOperations, Post, png, until
 from tests.service.spots import photographs
 
+NORTH, UP = np.eye(3)[1:]
 SUN = {"azimuth_deg": 10.0, "elevation_deg": 40.0}
 NOON = "2024-06-03T11:30:00Z"
 
@@ -86,6 +96,135 @@ def test_motors_send_the_light_to_the_aim(
     assert turned["angles"] is not None
     aimed = client.post(path, json={"time": NOON, "aim_point": [0.0, -3.0, 36.0]}).json()
     assert aimed["sun"]["elevation_deg"] > 55
+
+
+def test_the_past_is_turned_by_the_drives_of_then(
+    client: TestClient, post: Post, operations: FakeOperations, tower: Any, properties: Any
+):
+    """The first drive stepped by 6 mrad between the 8th and the 9th of May."""
+    for number, taken in enumerate(photographs(tower, properties, step_mrad=6.0)):
+        post(png(number), **taken)
+    calibrate(client)
+    asked = {"heliostat": "AA39", "surface": "ideal", "target": "lower", "motor_position": [40000, 40000]}
+
+    def angles(sun: dict[str, Any]) -> np.ndarray:
+        assert client.post("/v1/forecasts", json={**asked, "sun": sun}).status_code == 201
+        return np.asarray(operations.forecasts[-1]["angles"])
+
+    early, late = (angles({"at": f"2024-05-{day:02d}T11:30:00Z"}) for day in (4, 14))
+    assert (late - early)[0] == pytest.approx(6e-3, abs=1.5e-3)
+    np.testing.assert_allclose(angles(SUN), late, atol=1e-3)
+    calibrate(client, since="2024-05-10T00:00:00Z")  # a mount that knows nothing of the days before
+    np.testing.assert_allclose(angles({"at": "2024-05-04T11:30:00Z"}), early, atol=1e-9)
+
+    path, place = "/v1/heliostats/AA39/motors", read_heliostat("AA39", properties, np.array(ORIGIN)).position
+    for time in ("2024-05-04T11:30:00Z", "2024-05-14T11:30:00Z"):
+        motors = client.post(path, json={"time": time, "target": "lower"}).json()["motor_position"]
+        told = client.post("/v1/forecasts", json={**asked, "sun": {"at": time}, "motor_position": motors})
+        assert told.status_code == 201
+        turned = operations.forecasts[-1]
+        attitude = turned["mount"].attitude(turned["angles"])
+        goal = turned["mount"].attitude(turned["mount"].align(place, turned["sun"], turned["plane"].center))
+        np.testing.assert_allclose(attitude, goal, atol=1e-5)
+
+
+def test_some_are_calibrated_by_the_prior_of_all(client: TestClient, post: Post, tower: Any, properties: Any):
+    """Five photographs lean on heliostats of their kind, also where the job names one of them only."""
+    taken = photographs(tower, properties)
+    for number, one in enumerate(taken[:5]):
+        post(png(number), **one)
+    for name in ("AB01", "AB02", "AB03", "AB04", "AB05", "AB06"):
+        client.put(f"/v1/heliostats/{name}", json=properties)
+        for number, one in enumerate(taken):
+            assert post(png(number), heliostat=name, **one).status_code == 201
+    job = calibrate(client, heliostats=["AA39", "nobody"])
+    assert job["result"]["mounts"] == {"AA39": 1}
+    assert job["result"]["skipped"] == {"nobody": "there is no heliostat nobody"}
+    assert client.get("/v1/heliostats/AB01/mounts/current").status_code == 404
+    parameters = client.get("/v1/heliostats/AA39/mounts/current").json()["parameters"]
+    assert parameters["foundation_up"]["prior_std"] < 0.8 * SPREAD[NAMES.index("foundation_up")]
+    assert parameters["second_zero"]["prior_std"] < 0.8 * SPREAD[NAMES.index("second_zero")]
+
+
+def test_all_that_is_forecast_stands_on_the_calibrated_mount(
+    client: TestClient, post: Post, operations: FakeOperations, tower: Any, properties: Any
+):
+    client.put("/v1/heliostats/AB01", json=properties)
+    for number, taken in enumerate(photographs(tower, properties)):
+        post(png(number), **taken)
+    aim = {"sun": SUN, "surface": "ideal", "target": "lower"}
+
+    def mounts() -> dict[str, Mount]:
+        """Under a forecast with an aim, a surface's prediction, a comparison and a fleet's forecast."""
+        client.post("/v1/forecasts", json={"heliostat": "AA39", **aim})
+        assert client.post("/v1/heliostats/AA39/surfaces", json={}).status_code in (200, 201)
+        post(png(99), taken_at=None)
+        job = client.post("/v1/forecasts", json={**aim, "neighbours": True}).headers["Location"]
+        until(lambda: client.get(job).json()["state"] == "done")
+        setups = [setup for tile in operations.fleets[-1]["tiles"] for setup in tile.setups]
+        assert [setup.heliostat.name for setup in setups] == ["AA39", "AB01"]
+        assert not setups[1].heliostat.mount.is_calibrated
+        return {
+            "forecast": operations.forecasts[-1]["mount"],
+            "prediction": operations.mounts["predict"],
+            "comparison": operations.mounts["render"],
+            "fleet": setups[0].heliostat.mount,
+        }
+
+    assert not any(mount.is_calibrated for mount in mounts().values())
+    calibrate(client)
+    parameters = client.get("/v1/heliostats/AA39/mounts/current").json()["parameters"]
+    east = rotation(UP, parameters["foundation_up"]["value"]) @ rotation(NORTH, parameters["foundation_north"]["value"])
+    for name, mount in mounts().items():
+        np.testing.assert_allclose(mount.first_axis, east[:, 0], atol=1e-9, err_msg=name)
+    client.put("/v1/heliostats/AA39", json=properties | {"height": 2.5})
+    assert not any(mount.is_calibrated for mount in mounts().values())
+
+
+def test_mounts_hold_under_the_sun_they_were_calibrated_under(
+    client: TestClient, post: Post, operations: FakeOperations, tower: Any, properties: Any
+):
+    """Every clock was 12 minutes slow: the mount is calibrated under the suns of then, and none is moved twice."""
+    slow = {"effects": [{"name": "sun_position", "parameters": {"minutes": 12.0}}]}
+    heliostat = read_heliostat("AA39", properties, np.array(ORIGIN))
+    for number, taken in enumerate(photographs(tower, properties, clock_minutes=12.0)):
+        post(png(number), **taken)
+    calibrate(client)
+    assert client.get("/v1/heliostats/AA39/mounts/current").json()["sun"] == []
+    assert client.put("/v1/plant", json={**tower, "declared": slow}).status_code == 200
+    refused = client.post("/v1/heliostats/AA39/motors", json={"sun": SUN, "target": "lower"})
+    assert refused.status_code == 409
+    assert "moves the sun otherwise" in refused.json()["detail"]
+    calibrate(client)
+    mount = client.get("/v1/heliostats/AA39/mounts/current").json()
+    assert mount["sun"] == slow["effects"]
+    assert mount["residual_mrad"]["median"] < 0.5
+
+    np.testing.assert_allclose(sent(client, operations, heliostat), [0, 0], atol=0.02)
+
+
+def test_a_tilt_acts_on_a_mount_that_was_never_calibrated(
+    client: TestClient, operations: FakeOperations, tower: Any, properties: Any
+):
+    """Motors for an aim, and the light of those motors, by one mount."""
+    heliostat = read_heliostat("AA39", properties, np.array(ORIGIN))
+    tilt = {"effects": [{"name": "axis_tilt", "parameters": {"north_deg": 1.0, "up_deg": -2.0}}]}
+    assert client.put("/v1/plant", json={**tower, "declared": tilt}).status_code == 200
+    np.testing.assert_allclose(sent(client, operations, heliostat), [0, 0], atol=0.02)
+
+
+def sent(client: TestClient, operations: FakeOperations, heliostat: Heliostat) -> np.ndarray:
+    """Where light lands on a target (2,) [m] by the forecast from the motors that shall send it to the middle."""
+    asked = {"sun": SUN, "target": "lower"}
+    motors = client.post("/v1/heliostats/AA39/motors", json=asked).json()["motor_position"]
+    forecast = {"heliostat": "AA39", "surface": "ideal", "motor_position": motors, **asked}
+    assert client.post("/v1/forecasts", json=forecast).status_code == 201
+    made = operations.forecasts[-1]
+    mirror = replace(heliostat, mount=made["mount"])
+    shot = Setup(mirror, control_points(heliostat), made["sun"], made["plane"], angles=made["angles"])
+    scene = align([shot], made["effects"], latitude_deg=ORIGIN[0], dtype=torch.float64).groups[0].scene
+    spot: np.ndarray = central_rays(scene, 8).spot[0].numpy()
+    return spot
 
 
 @pytest.mark.parametrize(
