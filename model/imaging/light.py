@@ -14,12 +14,12 @@ SIGGRAPH 1997. On two years' photographs of one mirror the sRGB curve lifts the 
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from model.errors import InvalidInputError
 
@@ -110,38 +110,59 @@ class Camera:
 
     Attributes
     ----------
-    transfer : Transfer
+    transfer : Transfer or None
+        None: sRGB where it stores 8 bits, linear where it stores more.
     ambient : float [1]
         Counts of the sheet under daylight, for images whose background was taken off in counts.
     since : datetime or None
         With time zone; None: ever since.
     targets : tuple of str
         Names of those that it looks at; none: all.
+    peak_counts : float [1]
+        Counts of the sheet at the spot's brightest place, likewise: such images are stretched, and do not tell it.
+    bits : int or None
+        Of its counts in files of 16 bits; None: they were scaled to 16.
     """
 
-    transfer: Transfer = field(default_factory=Srgb)
+    transfer: Transfer | None = None
     ambient: float = USUAL_AMBIENT
     since: datetime | None = None
     targets: tuple[str, ...] = ()
+    peak_counts: float = 1.0
+    bits: int | None = None
 
     def __post_init__(self) -> None:
         if not 0 <= self.ambient < 1:
             raise InvalidInputError(f"a camera's 'ambient' must lie in [0, 1) of its counts, got {self.ambient}")
+        if not self.ambient < self.peak_counts <= 1:
+            raise InvalidInputError(
+                f"a camera's 'peak_counts' must lie above its ambient {self.ambient}, up to 1, got {self.peak_counts}"
+            )
+        if self.bits is not None and not 8 < self.bits <= 16:
+            raise InvalidInputError(f"a camera's 'bits' must lie in 9 to 16, got {self.bits}")
+
+    def law(self, depth: DTypeLike) -> Transfer:
+        """Its transfer function in files of a depth, uint8 or uint16."""
+        return self.transfer or (Srgb() if depth == np.uint8 else LINEAR)
+
+    def most(self, depth: DTypeLike) -> int:
+        """Its largest count in such files."""
+        return 255 if depth == np.uint8 else (1 << (self.bits or 16)) - 1
 
     def light_of(self, image: NDArray[np.integer[Any]]) -> NDArray[np.float32]:
-        """Light (...) [1] of an image's counts; 16 bits are a linear camera's, whatever the curve of its 8 bits."""
-        transfer, most = self.transfer if image.dtype == np.uint8 else LINEAR, np.iinfo(image.dtype).max
-        levels = transfer.light(np.arange(most + 1) / most)
+        """Light (...) [1] of an image's counts, none above its largest."""
+        most = self.most(image.dtype)
+        levels = self.law(image.dtype).light(np.arange(most + 1) / most)
         return np.asarray(levels.astype(np.float32)[image])
 
-    def light_of_difference(self, counts: ArrayLike) -> Array:
-        """Light (...) [1] of a spot of which ``counts`` (...) [1] over the sheet are known: PAINT's ``flux``.
+    def light_of_difference(self, counts: ArrayLike, depth: DTypeLike = np.uint8) -> Array:
+        """Light (...) [1] of a spot of which ``counts`` (...) over the sheet are known, in any unit: PAINT's ``flux``.
 
-        Such an image is stretched: its brightest place stands for the largest count.
+        Such an image is stretched: its brightest place stands for `peak_counts`.
         """
-        share = np.asarray(counts, dtype=np.float64)
-        stretched = (1 - self.ambient) * share / max(float(share.max(initial=0)), 1e-12)
-        return self.transfer.light(self.ambient + stretched) - self.transfer.light(self.ambient)
+        law, share = self.law(depth), np.asarray(counts, dtype=np.float64)
+        over = (self.peak_counts - self.ambient) * share / max(float(share.max(initial=0)), 1e-12)
+        return law.light(self.ambient + over) - law.light(self.ambient)
 
 
 def camera_at(cameras: Sequence[Camera], target: str, taken_at: datetime | None) -> Camera | None:
@@ -161,8 +182,8 @@ def camera_at(cameras: Sequence[Camera], target: str, taken_at: datetime | None)
 def cameras_from_json(data: object) -> tuple[Camera, ...]:
     """Cameras of ``twin.json``: ``[{"transfer": "srgb", "ambient": 0.53, "since": TIME, "targets": [..]}]``.
 
-    ``transfer`` is ``srgb``, ``linear``, ``{"gamma": 2.2}`` or ``{"counts": [..], "light": [..]}``. Each key may be
-    left out.
+    ``transfer`` is ``srgb``, ``linear``, ``{"gamma": 2.2}`` or ``{"counts": [..], "light": [..]}``; there are also
+    ``bits`` and ``peak_counts``. Each key may be left out.
 
     Raises
     ------
@@ -175,15 +196,29 @@ def cameras_from_json(data: object) -> tuple[Camera, ...]:
 
 
 def _camera(data: object) -> Camera:
-    known = {"transfer", "ambient", "since", "targets"}
+    known = {"transfer", "ambient", "peak_counts", "bits", "since", "targets"}
     if not isinstance(data, Mapping) or set(data) - known:
         raise InvalidInputError(f"a camera must be an object with {', '.join(sorted(known))}, got {str(data)[:80]}")
-    targets, ambient = data.get("targets", []), data.get("ambient", USUAL_AMBIENT)
+    targets, bits = data.get("targets", []), data.get("bits")
     if not isinstance(targets, list) or not all(isinstance(name, str) for name in targets):
         raise InvalidInputError("a camera's 'targets' must be a list of names")
-    if isinstance(ambient, bool) or not isinstance(ambient, int | float):
-        raise InvalidInputError(f"a camera's 'ambient' must be a number, got {str(ambient)[:80]}")
-    return Camera(_transfer(data.get("transfer", "srgb")), float(ambient), _moment(data.get("since")), tuple(targets))
+    if bits is not None and (isinstance(bits, bool) or not isinstance(bits, int)):
+        raise InvalidInputError(f"a camera's 'bits' must be a whole number, got {str(bits)[:80]}")
+    return Camera(
+        transfer=_transfer(data["transfer"]) if "transfer" in data else None,
+        ambient=_number(data, "ambient", USUAL_AMBIENT),
+        since=_moment(data.get("since")),
+        targets=tuple(targets),
+        peak_counts=_number(data, "peak_counts", 1.0),
+        bits=bits,
+    )
+
+
+def _number(data: Mapping[str, object], key: str, usual: float) -> float:
+    value = data.get(key, usual)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise InvalidInputError(f"a camera's '{key}' must be a number, got {str(value)[:80]}")
+    return float(value)
 
 
 def _moment(since: object) -> datetime | None:

@@ -1,7 +1,7 @@
 """From a photograph to a measured flux: find, turn into light, rectify, separate, centre, crop, normalise, judge."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, TypeVar, get_args
 
 import cv2
@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from model.errors import ImageRefusedError, InvalidInputError
 from model.images import FLUX_WINDOW, normalized
-from model.imaging.light import Camera
-from model.imaging.quality import SATURATED_GRAY, Quality, ceiling, judge, judge_flux, refused
+from model.imaging.light import Camera, Power
+from model.imaging.quality import SATURATED_GRAY, Quality, ceiling, cut_off_at, judge, judge_flux, refused
 from model.imaging.rectify import BRACKETS, CROP_SIZE, Layout, check_corners, find_corners, rectify
 from model.imaging.separate import find_spots, separate
 from model.imaging.window import center_of_mass, flux_window
@@ -22,6 +22,7 @@ Image = NDArray[np.uint8] | NDArray[np.uint16]
 
 # Below it the counts of a photograph of 16 bits are those of a camera of 12 bits or less, not scaled.
 _FULL_RANGE = 4096
+_REMEDY = "scale its counts to 16 bits, or declare the camera's 'bits'"
 Counts = TypeVar("Counts", np.uint8, np.float32)
 
 
@@ -95,7 +96,7 @@ def measure(
     empty : uint8 or uint16 (256, 256), optional
         A rectified image of the same target without light.
     camera : Camera, optional
-        How it turns light into counts. Photographs are sRGB without one (16 bits are linear anyway); images whose
+        How it turns light into counts. Photographs are sRGB without one, those of 16 bits linear; images whose
         background is off already are then taken as light.
 
     Returns
@@ -116,8 +117,10 @@ def measure(
     if kind == "flux":
         return _measure_flux(_spot_light(image, camera), plane, _plateau(image, camera))
     camera = camera or Camera()
+    for photograph in (image,) if empty is None else (image, empty):
+        _check_range(photograph, camera)
     dark = None if empty is None else _square(_light(empty, camera))
-    light, crop, brightest = _light(image, camera), _gray(image), _brightest(image)
+    light, crop, brightest = _light(image, camera), _gray(image, camera), _brightest(image, camera)
     if kind == "cropped":
         return _measure_crop(_square(light), _square(crop), _square(brightest), plane, dark)
     try:
@@ -136,11 +139,34 @@ def _check(image: Image, kind: str) -> None:
             f"image must be uint8 or uint16, (rows, columns) or (rows, columns, 3), at least 16 pixels wide and high; "
             f"got {image.dtype} {image.shape}"
         )
-    brightest = int(image.max())
-    if image.dtype == np.uint16 and kind in ("raw", "cropped") and 0 < brightest < _FULL_RANGE:
+
+
+def _check_range(image: Image, camera: Camera) -> None:
+    """That a photograph of 16 bits tells where the camera's range ends, for it cuts light off there."""
+    if image.dtype != np.uint16 or not image.any():
+        return
+    brightest, most = int(image.max()), camera.most(image.dtype)
+    if brightest > most:
+        raise InvalidInputError(
+            f"image: a count of {brightest} is beyond the {camera.bits} bits of its camera; correct the camera's 'bits'"
+        )
+    level = cut_off_at(image if image.ndim == 2 else image.max(axis=2), most)
+    if level is not None:
+        raise InvalidInputError(
+            f"image: pixels pile up at the count {level}, where the camera's range ends, but {most} is the largest; "
+            f"{_REMEDY}"
+        )
+    if camera.bits is not None:
+        return
+    if brightest < _FULL_RANGE:
         raise InvalidInputError(
             f"image: a photograph of 16 bits with no count above {brightest} holds {brightest.bit_length()} bits; "
-            "scale its counts to 16 bits, so that it can be told where the camera's range cut the light off"
+            f"{_REMEDY}, so that it can be told where the camera's range cut the light off"
+        )
+    if not isinstance(camera.law(image.dtype), Power) and brightest < 2**15:  # a power has no scale of its own
+        raise InvalidInputError(
+            f"image: a photograph of 16 bits with no count above {brightest} does not tell where on the camera's "
+            f"declared curve it lies; {_REMEDY}"
         )
 
 
@@ -155,20 +181,20 @@ def _luma(image: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def _spot_light(image: Image, camera: Camera | None) -> NDArray[np.float32]:
     """Light (rows, columns), in any unit, of an image whose background was taken off."""
-    if camera is None or image.dtype != np.uint8:
-        return _luma(image.astype(np.float32))
-    return np.asarray(255 * camera.light_of_difference(_gray(image) / 255), dtype=np.float32)
+    counts = _luma(image.astype(np.float32))
+    return counts if camera is None else (255 * camera.light_of_difference(counts, image.dtype)).astype(np.float32)
 
 
-def _gray(image: Image) -> NDArray[np.uint8]:
+def _gray(image: Image, camera: Camera) -> NDArray[np.uint8]:
     """Counts (rows, columns) in 8 bits: what people see, and where marks are looked for."""
-    counts = image if image.dtype == np.uint8 else np.asarray(image // 257, dtype=np.uint8)
+    most = camera.most(image.dtype)
+    counts = image if most == 255 else (image * np.uint32(255) // np.uint32(most)).astype(np.uint8)
     return np.asarray(counts if counts.ndim == 2 else cv2.cvtColor(counts, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
 
 
-def _brightest(image: Image) -> NDArray[np.uint8]:
+def _brightest(image: Image, camera: Camera) -> NDArray[np.uint8]:
     """The brightest channel: the first that the camera's range cuts off."""
-    return _gray(image if image.ndim == 2 else image.max(axis=2))
+    return _gray(image if image.ndim == 2 else image.max(axis=2), camera)
 
 
 def _square(image: NDArray[Counts]) -> NDArray[Counts]:
@@ -211,9 +237,9 @@ def _plateau(image: Image, camera: Camera | None) -> NDArray[np.bool_] | None:
 
     Such an image is stretched; only a pile of pixels below its top tells where the camera's range ended.
     """
-    if camera is None or image.dtype != np.uint8:
+    if camera is None:
         return None
-    gray = _square(_gray(image))
+    gray = _square(_gray(image, replace(camera, bits=None)))
     return gray >= ceiling(gray) if ceiling(gray) < SATURATED_GRAY else None
 
 

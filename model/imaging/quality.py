@@ -47,6 +47,21 @@ def ceiling(counts: NDArray[np.uint8]) -> int:
     return SATURATED_GRAY
 
 
+def cut_off_at(counts: NDArray[np.unsignedinteger], most: int) -> int | None:
+    """The count of an image (rows, columns) of 16 bits at which its range ends too early, or None.
+
+    Of a camera of fewer bits, or with a black level taken off, pixels pile up at one count that lies too far below the
+    largest one, ``most``, for `ceiling` to look there.
+    """
+    pixels = np.bincount(counts.ravel(), minlength=1 << 16)
+    for level in (*((1 << bits) - 1 for bits in range(10, 16)), int(counts.max())):
+        if 255 * level < _LOWEST_CEILING * most:
+            below = 0.1 * float(pixels[level - 12 * level // 255 : level - 2 * level // 255].sum())
+            if pixels[level] > _PILE * max(below, _LEAST_PILE * counts.size):
+                return level
+    return None
+
+
 @dataclass(frozen=True)
 class Quality:
     """What a photograph is worth.

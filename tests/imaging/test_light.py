@@ -51,9 +51,43 @@ def test_differences_of_counts_are_turned_into_light_by_the_ambient_they_were_ta
     assert accuracy(measure(image, "flux", plane).flux, spot) < 0.90
 
 
+def test_the_counts_of_a_difference_s_brightest_place_part_ambient_from_exposure(plane, spot):
+    """A dim spot's difference is stretched like a bright one's; taken for that it is turned into too fat a light."""
+    day, peak = 0.25, 0.2
+    ambient, brightest = (float(Srgb().counts(light)) for light in (day, day + peak))
+    counts = Srgb().counts(day + peak * spot) - ambient
+    for largest, depth in ((255, np.uint8), (65535, np.uint16)):
+        image = np.round(largest * counts / counts.max()).astype(depth)
+        told, full = (
+            measure(image, "flux", plane, camera=Camera(Srgb(), ambient, peak_counts=top)) for top in (brightest, 1.0)
+        )
+        assert accuracy(told.flux, spot) > 0.985 > 0.96 > accuracy(full.flux, spot)
+
+
 def test_sixteen_bits_are_light_already(plane, spot):
     crop = np.round(65535 * (0.25 + 0.7 * spot)).astype(np.uint16)
     assert accuracy(measure(crop, "cropped", plane).flux, spot) > 0.97
+    (plain,) = cameras_from_json([{"ambient": 0.4}])
+    assert accuracy(measure(crop, "cropped", plane, camera=plain).flux, spot) > 0.97
+
+
+@pytest.mark.parametrize("curve", CURVES, ids=repr)
+def test_a_declared_curve_is_that_of_sixteen_bits_too(plane, spot, curve):
+    light = 0.25 + 0.7 * spot
+    crop = np.round(65535 * curve.counts(light)).astype(np.uint16)
+    assert accuracy(measure(crop, "cropped", plane, camera=Camera(curve)).flux, spot) > 0.97
+    counts = curve.counts(0.25 + 0.75 * spot) - curve.counts(0.25)
+    flux, camera = np.round(65535 * counts / counts.max()).astype(np.uint16), Camera(curve, float(curve.counts(0.25)))
+    assert accuracy(measure(flux, "flux", plane, camera=camera).flux, spot) > 0.98
+
+
+def test_where_unscaled_counts_lie_on_a_declared_curve_is_asked(plane, spot):
+    """A power has no scale of its own; any other curve bends elsewhere for 14 bits than for 16."""
+    crop = np.round(16383 * Srgb().counts(0.25 + 0.7 * spot)).astype(np.uint16)
+    with pytest.raises(InvalidInputError, match=r"declared curve.*declare the camera's 'bits'"):
+        measure(crop, "cropped", plane, camera=Camera(Srgb()))
+    assert accuracy(measure(crop, "cropped", plane, camera=Camera(Srgb(), bits=14)).flux, spot) > 0.97
+    assert measure(crop, "cropped", plane, camera=Camera(Power(2.2))).quality.accepted
 
 
 def test_light_beyond_the_cameras_range_is_known_to_be_at_least_so_much(plane):
@@ -94,6 +128,8 @@ def test_cameras_are_declared():
     given = [{}, {"transfer": "linear", "ambient": 0.4}, {"transfer": {"gamma": 2}, "since": "2024-03-01T00:00:00Z"}]
     plain, linear, power, measured = cameras_from_json([*given, {"transfer": table, "targets": ["upper"]}])
     assert plain == Camera()
+    (deep,) = cameras_from_json([{"transfer": "srgb", "bits": 12, "peak_counts": 0.9}])
+    assert (deep.transfer, deep.bits, deep.peak_counts) == (Srgb(), 12, 0.9)
     assert (linear.transfer, linear.ambient) == (LINEAR, 0.4)
     assert (power.transfer, power.since) == (Power(2.0), datetime(2024, 3, 1, tzinfo=UTC))
     assert (measured.transfer, measured.targets) == (Measured((0, 0.5, 1), (0, 0.2, 1)), ("upper",))
@@ -112,6 +148,10 @@ def test_cameras_are_declared():
         ({"transfer": "log"}, "'transfer' must be"),
         ({"ambient": 1.0}, "'ambient' must lie in"),
         ({"ambient": True}, "'ambient' must be a number"),
+        ({"ambient": 0.6, "peak_counts": 0.5}, "'peak_counts' must lie above its ambient"),
+        ({"peak_counts": "most"}, "'peak_counts' must be a number"),
+        ({"bits": 8}, "'bits' must lie in 9 to 16"),
+        ({"bits": 12.5}, "'bits' must be a whole number"),
         ({"since": "yesterday"}, "with its zone"),
         ({"since": "2024-03-01T00:00:00"}, "with its zone"),
         ({"targets": "upper"}, "list of names"),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from model.errors import InvalidInputError
-from model.imaging import MeasuredFlux, center_of_mass, measure
+from model.imaging import Camera, MeasuredFlux, center_of_mass, measure
 from model.imaging.rectify import rectify
 from service.cli.demo_camera import CameraOptions, photograph, target_corners
 from tests.imaging import accuracy, gaussian
@@ -150,3 +150,55 @@ def test_a_photograph_whose_counts_do_not_fill_their_bits_is_one_clear_error(pla
         measure(crop, "cropped", plane)
     assert measure(16 * crop, "cropped", plane).quality.accepted
     assert measure(np.round(4095 * spot).astype(np.uint16), "flux", plane).quality.accepted
+
+
+def clipped_crop(plane, bits: int, largest: int | None = None, colour: bool = False):
+    """A crop of a linear camera of some bits whose range cuts the spot off, unscaled."""
+    light = 0.26 + 1.2 * gaussian(plane, 0.0, 0.0, 0.6, 0.5)
+    counts = np.round((2**bits - 1) * light).clip(max=largest or 2**bits - 1).astype(np.uint16)
+    return np.repeat(counts[..., None], 3, axis=2) if colour else counts
+
+
+@pytest.mark.parametrize(
+    ("bits", "largest"), [(10, None), (12, None), (14, None), (15, None), (14, 15871)], ids=lambda value: str(value)
+)
+@pytest.mark.parametrize("colour", [False, True])
+def test_light_that_a_camera_of_fewer_bits_cut_off_is_never_taken_for_whole(plane, bits, largest, colour):
+    """Unscaled counts end below the file's 65535; 15871 is where a black level that was taken off leaves 14 bits."""
+    crop = clipped_crop(plane, bits, largest, colour)
+    with pytest.raises(InvalidInputError, match=rf"pile up at the count {crop.max()}.*or declare the camera's 'bits'"):
+        measure(crop, "cropped", plane)
+    whole = measure(clipped_crop(plane, 16, colour=colour), "cropped", plane)
+    told = measure(crop, "cropped", plane, camera=Camera(bits=bits))
+    assert whole.quality.saturated_share > 0.3
+    assert told.quality.saturated_share == pytest.approx(whole.quality.saturated_share, abs=0.03)
+    assert accuracy(told.flux, whole.flux) > 0.98
+    assert told.clipped.mean() == pytest.approx(whole.clipped.mean(), rel=0.1)
+
+
+def test_a_stamp_of_full_range_does_not_hide_where_the_camera_was_cut_off(plane):
+    crop = clipped_crop(plane, 14)
+    crop[:12, :40] = 65535
+    with pytest.raises(InvalidInputError, match="pile up at the count 16383"):
+        measure(crop, "cropped", plane)
+
+
+def test_bits_that_a_photograph_contradicts_are_one_clear_error(plane, spot):
+    light = 0.25 + 0.7 * spot
+    with pytest.raises(InvalidInputError, match="beyond the 12 bits of its camera"):
+        measure(np.round(16383 * light).astype(np.uint16), "cropped", plane, camera=Camera(bits=12))
+    with pytest.raises(InvalidInputError, match="pile up at the count 4095"):
+        measure(clipped_crop(plane, 12), "cropped", plane, camera=Camera(bits=14))
+    whole, empty = np.round(65535 * light).astype(np.uint16), np.full((256, 256), 4095, np.uint16)
+    with pytest.raises(InvalidInputError, match="pile up"):
+        measure(whole, "cropped", plane, empty=empty)
+
+
+def test_photographs_that_are_not_cut_off_are_not_taken_for_such(plane, spot):
+    """Of 14 bits unscaled, of 8 and 12 bits scaled to 16, with noise and without: none has a pile at its top."""
+    rng = np.random.default_rng(2)
+    light = 0.25 + 0.6 * spot
+    for largest, scale in ((16383, 1), (65535, 1), (255, 257), (255, 256), (4095, 16)):
+        for noise in (0.0, 0.004):
+            counts = np.round(largest * (light + noise * rng.standard_normal(light.shape)))
+            assert accuracy(measure((scale * counts).astype(np.uint16), "cropped", plane).flux, spot) > 0.95
