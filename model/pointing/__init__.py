@@ -1,6 +1,7 @@
 """Motors and spots to calibrated mounts: their parameters, steps and drift, and where the light lands."""
 
 from model.pointing.calibration import Field
+from model.pointing.clock import Clock
 from model.pointing.drives import Noise
 from model.pointing.field import FieldMounts, calibrate_field
 from model.pointing.kinematics import PARAMETERS
@@ -11,6 +12,7 @@ from model.pointing.reasons import Contradiction, off_by
 __all__ = [
     "PARAMETERS",
     "CalibratedMount",
+    "Clock",
     "Contradiction",
     "Field",
     "FieldMounts",

@@ -149,11 +149,17 @@ def _posterior(
 def _linearised(
     chain: Chain, readings: Readings, prior: Field, noise: Noise, parameters: Array, zeros: Array
 ) -> Believed:
+    y, slope = linearised(chain, readings, parameters, zeros)
+    return believe(y, slope, readings, prior.mean, prior.covariance, noise)
+
+
+def linearised(chain: Chain, readings: Readings, parameters: Array, zeros: Array) -> tuple[Array, Array]:
+    """What parameters and zeros shall explain (H, M, 2) [rad], counted from zero, and its slopes (H, M, 2, P)."""
     zeros = zeros[:, : readings.used.shape[1]]
     off, slope = residuals(chain, readings, parameters, zeros)
     slope = slope * readings.used[..., None, None]
     explained = (slope @ parameters[:, None, :, None])[..., 0] + (slope[..., ZEROS] @ zeros[..., None])[..., 0]
-    return believe(explained - off, slope, readings, prior.mean, prior.covariance, noise)
+    return explained - off, slope
 
 
 def batches(readings: Readings) -> Iterator[NDArray[np.intp]]:

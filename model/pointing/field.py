@@ -7,6 +7,7 @@ import numpy as np
 
 from model.plant import Heliostat, TargetPlane
 from model.pointing.calibration import Field, calibrate
+from model.pointing.clock import Clock, find_clock
 from model.pointing.drives import Noise
 from model.pointing.kinematics import Chain
 from model.pointing.mounts import CalibratedMount, mounts_of
@@ -28,6 +29,8 @@ class FieldMounts:
         Readings that were left out.
     odd : tuple of str
         Heliostats whose property files have drives of another kind than the field's.
+    clock : Clock or None
+        A fault of the clock that was taken for steps. Mounts are calibrated by the suns as they were recorded.
     """
 
     field: Field
@@ -35,6 +38,7 @@ class FieldMounts:
     readings: dict[str, list[Reading]]
     contradictions: dict[str, dict[str, Contradiction]]
     odd: tuple[str, ...] = ()
+    clock: Clock | None = None
 
 
 def calibrate_field(
@@ -65,4 +69,4 @@ def calibrate_field(
         for name, mount in mounts.items()
     }
     odd = tuple(name for name, is_odd in zip(names, done.field.is_odd(chain), strict=True) if is_odd)
-    return FieldMounts(done.field, mounts, ordered, contradictions, odd)
+    return FieldMounts(done.field, mounts, ordered, contradictions, odd, find_clock(done, arrays, latitude_deg))

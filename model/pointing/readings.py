@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from model.mount import rotation
 from model.pointing.kinematics import Readings
 
 Array = NDArray[np.float64]
@@ -49,3 +50,10 @@ def days_by_order(days: ArrayLike, order: ArrayLike) -> Array:
         return when
     by_number = np.argsort(number[known])
     return np.where(known, when, np.interp(number, number[known][by_number], when[known][by_number]))
+
+
+def later(suns: Array, minutes: float, latitude_deg: float) -> Array:
+    """Suns (..., 3) that stand where they are some minutes after: they turn about the pole, 15 degrees an hour."""
+    latitude = np.radians(latitude_deg)
+    pole = np.array([0.0, np.cos(latitude), np.sin(latitude)])
+    return np.asarray(suns @ rotation(pole, -np.radians(minutes / 4)).T)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.errors import InvalidInputError
+from model.pointing.clock import Clock
 from model.pointing.drives import Noise
 from model.pointing.field import FieldMounts
 from model.pointing.kinematics import NAMES, PARAMETERS
@@ -162,8 +163,27 @@ def field_to_json(done: FieldMounts, skipped: Mapping[str, str]) -> dict[str, An
             | ({"note": _ODD} if name in done.odd else {})
             for name, mount in done.mounts.items()
         },
+        "clock": clock_to_json(done.clock),
         "skipped": dict(skipped),
     }
+
+
+def clock_to_json(clock: Clock | None) -> dict[str, Any] | None:
+    """A fault of the clock: minutes that the sun stood later than recorded, since a day."""
+    if clock is None:
+        return None
+    since = moment_of(clock.since).date().isoformat()
+    return {"minutes": round(clock.minutes, 2), "std_minutes": round(clock.std_minutes, 2), "since": since}
+
+
+def clock_in_words(document: Mapping[str, Any]) -> str:
+    """The same in words."""
+    minutes = document["minutes"]
+    way = "slow" if minutes > 0 else "fast"
+    return (
+        f"from {document['since']} on the clock was {abs(minutes):.1f} ± {document['std_minutes']:.1f} minutes {way}: "
+        "that explains where the light of most heliostats went"
+    )
 
 
 _ODD = "its property file has spindles of another length than all others; the field's median was the start"

@@ -16,7 +16,7 @@ from model.frames import sun_direction
 from model.plant import Heliostat
 from model.pointing import CalibratedMount, FieldMounts, Reading, calibrate_field, days_by_order
 from model.pointing.plan import Proposal, plan
-from model.pointing.report import day_of, mount_from_json, mount_to_json
+from model.pointing.report import clock_to_json, day_of, mount_from_json, mount_to_json
 from service import store
 from service.base.faults import ConflictError
 from service.sources.documents import read_heliostat
@@ -79,11 +79,12 @@ def calibrate_store(
 
 
 def keep_mounts(session: Session, calibrated: StoreMounts) -> dict[str, MountRow]:
-    """Keep calibrated mounts as their heliostats' next versions, by name."""
+    """Keep calibrated mounts as their heliostats' next versions, by name; what was found of the clock with each."""
     done, kept = calibrated.done, {}
+    clock = {"clock": clock_to_json(done.clock)}
     for name, row in store.get_heliostats(session, list(done.mounts)).items():
         document = mount_to_json(done.mounts[name], done.readings[name], done.contradictions[name])
-        kept[name] = mounts.add_mount(session, row, document)
+        kept[name] = mounts.add_mount(session, row, document | clock)
     return kept
 
 

@@ -15,8 +15,8 @@ from model.pointing.calibration import Field
 from model.pointing.drives import Noise
 from model.pointing.kinematics import NAMES, SPREAD, ZEROS, Chain, calibrated, residuals
 from model.pointing.mounts import landed
-from model.pointing.readings import padded
-from model.pointing.report import day_of, field_to_json, moment_of, mount_from_json
+from model.pointing.readings import later, padded
+from model.pointing.report import clock_in_words, day_of, field_to_json, moment_of, mount_from_json
 
 NOISE = Noise()
 QUIET = replace(NOISE, drift_rad=(1e-5, 1e-5), jitter_rad=(1e-5, 1e-5))
@@ -162,6 +162,53 @@ def test_a_slow_drift_is_no_step(world):
     assert document["steps"] == []
     assert document["drift"]["is_sure"]
     assert document["drift"]["zeros_mrad"][1] == pytest.approx(2.5, abs=0.8)
+
+
+def recorded_by(clock_minutes: float, since: float, readings: dict[str, list[Reading]]) -> dict[str, list[Reading]]:
+    """Readings whose suns are computed by a clock that goes so many minutes fast from a day on."""
+    return {
+        name: [
+            replace(one, sun=later(one.sun, clock_minutes, JUELICH_LATITUDE)) if one.day >= since else one
+            for one in own
+        ]
+        for name, own in readings.items()
+    }
+
+
+@pytest.mark.parametrize("minutes", [-1.0, 0.5, 20.0])
+def test_a_clock_that_goes_wrong_is_dated_and_measured(world, minutes):
+    field, _, readings = world
+    since = readings["H00"][23].day
+    done = calibrate(field, recorded_by(minutes, since, readings))
+    assert done.clock is not None
+    assert done.clock.since == np.floor(since)
+    assert done.clock.minutes == pytest.approx(-minutes, abs=4 * done.clock.std_minutes)
+    assert done.clock.std_minutes < 0.1
+    told = field_to_json(done, {})["clock"]
+    assert ("slow" if minutes < 0 else "fast") in clock_in_words(told)
+    assert told["since"] == f"{moment_of(since):%Y-%m-%d}"
+
+
+def test_a_clock_that_is_right_is_no_fault(world):
+    field, _, readings = world
+    assert calibrate(field, readings).clock is None
+    assert field_to_json(calibrate(field, readings), {})["clock"] is None
+
+
+def test_steps_of_some_heliostats_are_no_clock(world):
+    """Of one, of several on one day that do not agree, and of one whose sun alone is wrong."""
+    field, truths, readings = world
+    days = np.linspace(0, 365, 40)
+    moved = dict(readings)
+    for number, (name, size) in enumerate({"H01": 3e-3, "H02": -3e-3, "H04": 8e-3}.items()):
+        zeros = np.where(np.arange(40)[:, None] >= 23, [0.0, size], 0.0)
+        moved[name] = series(field[name], truths[name], days, np.random.default_rng(number), zeros)
+    done = calibrate(field, moved)
+    assert all(done.mounts[name].steps for name in ("H01", "H02", "H04"))
+    assert done.clock is None
+    alone = recorded_by(1.0, days[23], {"H05": readings["H05"]})
+    assert calibrate(field, readings | alone).clock is None
+    assert calibrate(field, alone).clock is None
 
 
 def test_contradictions_are_named(world):

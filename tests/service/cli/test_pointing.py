@@ -11,10 +11,12 @@ import pytest
 from typer.testing import CliRunner
 
 from model.errors import InvalidInputError, ModelError
+from model.pointing import calibrate_field
 from service.cli.folder_pointing import calibrate_folder, spot_folder
 from service.cli.main import app
 from service.sources.folder import read_folder
 from tests.benchmarks import data_folder
+from tests.benchmarks.pointing import Plant, with_clock
 from tests.service.conftest import properties_document, tower_document
 from tests.service.spots import photographs
 
@@ -130,6 +132,36 @@ def test_the_verbs_print_tables_and_name_bad_files(folder: Path, tmp_path: Path)
     assert "no such file" in str(missing.exception)
     onto = CliRunner().invoke(app, ["calibrate", str(folder), "--out", str(tmp_path)])
     assert "is a folder" in str(onto.exception)
+
+
+def test_a_wrong_clock_is_said_first(folder: Path, tmp_path: Path):
+    taken = photographs(tower_document(), properties_document(), fast_minutes=2.0)
+    for name in ("AB02", "AB03", "AB04"):
+        write(folder / name / "Properties" / f"{name}-heliostat-properties.json", properties_document())
+        for number, one in enumerate(taken):
+            write_measurement(folder, name, 100 + number, one)
+    mounts = tmp_path / "mounts.json"
+    done = CliRunner().invoke(app, ["calibrate", str(folder), "--out", str(mounts)])
+    assert done.exit_code == 0, done.output
+    clock = json.loads(mounts.read_text())["clock"]
+    assert clock["minutes"] == pytest.approx(-2, abs=0.3)
+    assert f"clock: from {clock['since']} on the clock was" in " ".join(done.stderr.split())
+
+
+def test_the_clock_of_real_photographs_is_right_until_it_is_put_wrong():
+    real = data_folder().parent / "stj-pointing"
+    if not real.is_dir():
+        pytest.skip(f"no real pointing at {real}")
+    plant = Plant([real])
+    wrong = with_clock(plant.readings, 19481.0, 1.0, plant.latitude_deg)
+    right, found = (
+        calibrate_field(plant.heliostats, readings, plant.targets, latitude_deg=plant.latitude_deg).clock
+        for readings in (plant.readings, wrong)
+    )
+    assert right is None
+    assert found is not None
+    assert found.since == 19481.0
+    assert found.minutes == pytest.approx(-1.0, abs=0.15)
 
 
 def test_real_heliostats_are_forecast_to_a_milliradian(tmp_path: Path):
