@@ -6,7 +6,7 @@ from model.pointing.drives import Noise
 from model.pointing.field import FieldMounts, calibrate_field
 from model.pointing.kinematics import PARAMETERS
 from model.pointing.mounts import CalibratedMount, Step
-from model.pointing.readings import Reading, days_by_order
+from model.pointing.readings import Reading, Weather, days_by_order
 from model.pointing.reasons import Contradiction, off_by
 
 __all__ = [
@@ -19,6 +19,7 @@ __all__ = [
     "Noise",
     "Reading",
     "Step",
+    "Weather",
     "calibrate_field",
     "days_by_order",
     "off_by",

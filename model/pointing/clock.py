@@ -11,14 +11,14 @@ a minute even where 16 of them are believed to be straight in the mean. So it is
 one that is put right is found as well, by the opposite sign.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from model.pointing.calibration import Calibrated, batches, calibrate, linearised
-from model.pointing.drives import told_of_a_change
-from model.pointing.kinematics import Chain, Readings, residuals
+from model.pointing.calibration import Kind, Part, calibrate, parts
+from model.pointing.kinematics import Readings, residuals
 from model.pointing.readings import later
 
 Array = NDArray[np.float64]
@@ -59,21 +59,21 @@ class Clock:
     since: float
 
 
-def find_clock(done: Calibrated, readings: Readings, latitude_deg: float) -> Clock | None:
-    """The fault of the clock that a calibration ``done`` by ``readings`` took for steps; None where none is sure.
+def find_clock(kinds: Sequence[Kind], readings: Readings, latitude_deg: float) -> Clock | None:
+    """The fault of the clock that calibrations by ``readings`` took for steps; None where none is sure.
 
     It needs three heliostats that were measured before and after. Steps that were believed in its place have taken a
     part of it: with the suns that it makes likely they go, and what is left by then is added.
     """
     days = np.unique(np.floor(readings.days[readings.used]))
-    minutes, std, is_fault = _agreed(*_by_day(done, readings, latitude_deg, days))
+    minutes, std, is_fault = _agreed(*_by_day(kinds, readings, latitude_deg, days))
     if not is_fault.any():
         return None
     best = int(np.where(is_fault, np.abs(minutes) / std, 0.0).argmax())
     since, first = days[best], float(minutes[best])
     wrong = (readings.days >= since)[..., None]
     turned = replace(readings, sun=np.where(wrong, later(readings.sun, first, latitude_deg), readings.sun))
-    again = calibrate(done.chain, turned, done.noise, done.field)
+    again = [(rows, calibrate(done.chain, turned.of(rows), done.noise, done.field)) for rows, done in kinds]
     left, std, _ = _agreed(*_by_day(again, turned, latitude_deg, days[best : best + 1]))
     return Clock(first + float(left[0]), float(std[0]), float(since))
 
@@ -104,37 +104,27 @@ def _agreed(pull: Array, information: Array) -> tuple[Array, Array, NDArray[np.b
     return center, scatter / np.sqrt(total), is_fault
 
 
-def _by_day(done: Calibrated, readings: Readings, latitude_deg: float, days: Array) -> tuple[Array, Array]:
+def _by_day(kinds: Sequence[Kind], readings: Readings, latitude_deg: float, days: Array) -> tuple[Array, Array]:
     """Pull and information (H, D) on minutes from each of ``days`` (D,) on; none before a heliostat's first."""
     pull, information = np.zeros((2, len(readings.days), len(days)))
-    for rows in batches(readings):
-        own = readings.of(rows)
-        chain, zeros = done.chain.rows(rows), done.believed.zeros[rows]
-        parameters = done.believed.parameters[rows]
-        most = own.used.shape[1]
-        y, slope = linearised(chain, own, parameters, zeros)
-        told = told_of_a_change(
-            y,
-            slope,
-            _by_minute(chain, own, parameters, zeros[:, :most], latitude_deg),
-            own,
-            done.field.mean,
-            done.field.covariance,
-            done.noise,
-            done.believed.stepped[rows, :most],
-            done.believed.foreign[rows, :most],
-        )
-        for row, *own_told, when, used in zip(rows, *told, own.days, own.used, strict=True):
+    for part in parts(kinds, readings):
+        told = part.posterior.told_of_a_change(_by_minute(part, latitude_deg))
+        for row, when, used, *own in zip(part.rows, part.readings.days, part.readings.used, *told, strict=True):
             first = np.searchsorted(when[used], days)
             inside = (first > 0) & (first < used.sum())
-            pull[row, inside], information[row, inside] = (value[first[inside]] for value in own_told)
+            pull[row, inside], information[row, inside] = (value[first[inside]] for value in own)
     return pull, information
 
 
-def _by_minute(chain: Chain, readings: Readings, parameters: Array, zeros: Array, latitude_deg: float) -> Array:
+def _by_minute(part: Part, latitude_deg: float) -> Array:
     """What residuals change (H, M, 2) [rad/min] by later suns; they are linear in the sun."""
     ahead, behind = (
-        residuals(chain, replace(readings, sun=later(readings.sun, half, latitude_deg)), parameters, zeros)[0]
+        residuals(
+            part.chain,
+            replace(part.readings, sun=later(part.readings.sun, half, latitude_deg)),
+            part.parameters,
+            part.zeros,
+        )[0]
         for half in (0.5, -0.5)
     )
     return np.asarray(ahead - behind)

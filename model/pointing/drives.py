@@ -124,50 +124,6 @@ def believe(
     return problem.posterior(terms)
 
 
-def told_of_a_change(
-    y: Array,
-    jacobian: Array,
-    by_change: Array,
-    readings: Readings,
-    prior_mean: Array,
-    prior_cov: Array,
-    noise: Noise,
-    stepped: Mask,
-    foreign: Mask,
-) -> tuple[Array, Array]:
-    """What data tell of a number that is 0 up to a measurement and one value from it on, for each measurement.
-
-    ``by_change`` (H, M, 2) are the residuals' derivatives by it; the rest is as in `believe`, with the steps and
-    foreign spots that were believed, of any size now. Gives its pull (H, M) and information (H, M): the number is
-    likeliest ``pull / information``, with variance ``1 / information``. Steps within one measurement are not believed
-    for this question: they would be the change itself by another name.
-    """
-    problem = _Problem.of(y, jacobian, readings, prior_mean, prior_cov, noise)
-    terms = _Terms.marked(stepped, foreign)
-    change = (by_change * readings.used[..., None])[..., None]
-    pull, information = _of_change(problem, terms, change)
-    is_step = np.isin(terms.kind, _STEPS)
-    for term in range(terms.kind.shape[1]):
-        place = terms.place[:, term, None]
-        beside = is_step & (np.abs(terms.place - place) <= 1)
-        without = replace(terms, kind=np.where(beside, 0, terms.kind).astype(np.int8))
-        near = is_step[:, term, None] & (np.abs(np.arange(terms.most) - place) <= 1)
-        rows = np.nonzero(near.any(axis=1))[0]
-        other = _of_change(problem.rows(rows), without.rows(rows), change[rows])
-        pull[rows], information[rows] = (
-            np.where(near[rows], new, old[rows]) for new, old in zip(other, (pull, information), strict=True)
-        )
-    return pull, information
-
-
-def _of_change(problem: "_Problem", terms: "_Terms", change: Array) -> tuple[Array, Array]:
-    heliostats, most = problem.readings.used.shape
-    solved = terms.solve(problem)
-    pull = np.einsum("hmka,hmk->hm", change, solved.precision_y.reshape(heliostats, most, 2))
-    blocks = solved.precision(problem).reshape(heliostats, most, 2, most, 2)
-    return _from_here(pull, 1), _of_pairs(change, blocks)[..., 0, 0]
-
-
 @dataclass(frozen=True, eq=False)
 class _Problem:
     """Gaussian data without steps and foreign spots; N = 2 M.
@@ -278,6 +234,66 @@ class _Problem:
         newest_cov = prior - cross @ precision @ cross.swapaxes(1, 2)
         variances = np.diagonal(own, axis1=1, axis2=2)
         return newest_cov, np.sqrt(np.maximum(variances, 0))
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """Data with the steps and foreign spots that are believed in them, of any size: what else is asked of them."""
+
+    problem: _Problem
+    terms: "_Terms"
+
+    @classmethod
+    def of(
+        cls, y: Array, jacobian: Array, readings: Readings, mean: Array, cov: Array, noise: Noise, believed: Believed
+    ) -> "Posterior":
+        """As `believe`, of heliostats that ``believed`` is of; it may be padded further."""
+        most = readings.used.shape[1]
+        terms = _Terms.marked(believed.stepped[:, :most], believed.foreign[:, :most])
+        return cls(_Problem.of(y, jacobian, readings, mean, cov, noise), terms)
+
+    def left_out(self) -> Array:
+        """What each measurement (H, M, 2) [rad] lies off what all others of its heliostat foretell.
+
+        NaN where one is foreign, or there is none. Source: Rasmussen and Williams 2006, eq. 5.12.
+        """
+        heliostats, most = self.problem.readings.used.shape
+        solved = self.terms.solve(self.problem)
+        blocks = solved.precision(self.problem).reshape(heliostats, most, 2, most, 2)
+        own = np.einsum("hiaib->hiab", blocks)
+        off = np.linalg.solve(own, solved.precision_y.reshape(heliostats, most, 2, 1))[..., 0]
+        told = self.problem.readings.used & ~self.terms.mask(*_FOREIGN)
+        return np.where(told[..., None], off, np.nan)
+
+    def told_of_a_change(self, by_change: Array) -> tuple[Array, Array]:
+        """What data tell of a number that is 0 up to a measurement and one value from it on, for each measurement.
+
+        ``by_change`` (H, M, 2) are the residuals' derivatives by it. Gives its pull (H, M) and information (H, M): the
+        number is likeliest ``pull / information``, with variance ``1 / information``. Steps within one measurement are
+        not believed for this question: they would be the change itself by another name.
+        """
+        problem, terms = self.problem, self.terms
+        change = (by_change * problem.readings.used[..., None])[..., None]
+        pull, information = _of_change(problem, terms, change)
+        is_step = np.isin(terms.kind, _STEPS)
+        for term in range(terms.kind.shape[1]):
+            place = terms.place[:, term, None]
+            beside = is_step & (np.abs(terms.place - place) <= 1)
+            without = replace(terms, kind=np.where(beside, 0, terms.kind).astype(np.int8))
+            near = is_step[:, term, None] & (np.abs(np.arange(terms.most) - place) <= 1)
+            rows = np.nonzero(near.any(axis=1))[0]
+            other = _of_change(problem.rows(rows), without.rows(rows), change[rows])
+            for old, new in zip((pull, information), other, strict=True):
+                old[rows] = np.where(near[rows], new, old[rows])
+        return pull, information
+
+
+def _of_change(problem: _Problem, terms: "_Terms", change: Array) -> tuple[Array, Array]:
+    heliostats, most = problem.readings.used.shape
+    solved = terms.solve(problem)
+    pull = np.einsum("hmka,hmk->hm", change, solved.precision_y.reshape(heliostats, most, 2))
+    blocks = solved.precision(problem).reshape(heliostats, most, 2, most, 2)
+    return _from_here(pull, 1), _of_pairs(change, blocks)[..., 0, 0]
 
 
 # Kinds of terms beside none, 0: steps of both drives, the first, the second, common ones and large ones; foreign spots.

@@ -1,5 +1,6 @@
 """The mounts of a field: from readings to calibrated mounts, steps, and what contradicts them."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -8,6 +9,7 @@ import numpy as np
 from model.plant import Heliostat, TargetPlane
 from model.pointing.calibration import Field, calibrate
 from model.pointing.clock import Clock, find_clock
+from model.pointing.covariates import Explained, explain
 from model.pointing.drives import Noise
 from model.pointing.kinematics import Chain
 from model.pointing.mounts import CalibratedMount, mounts_of
@@ -31,6 +33,8 @@ class FieldMounts:
         Heliostats whose property files have drives of another kind than the field's.
     clock : Clock or None
         A fault of the clock that was taken for steps. Mounts are calibrated by the suns as they were recorded.
+    covariates : by name
+        What time of day, season and weather explain of the errors that are left.
     """
 
     field: Field
@@ -39,6 +43,7 @@ class FieldMounts:
     contradictions: dict[str, dict[str, Contradiction]]
     odd: tuple[str, ...] = ()
     clock: Clock | None = None
+    covariates: dict[str, Explained] = dataclasses.field(default_factory=dict)
 
 
 def calibrate_field(
@@ -69,4 +74,13 @@ def calibrate_field(
         for name, mount in mounts.items()
     }
     odd = tuple(name for name, is_odd in zip(names, done.field.is_odd(chain), strict=True) if is_odd)
-    return FieldMounts(done.field, mounts, ordered, contradictions, odd, find_clock(done, arrays, latitude_deg))
+    kinds = [(np.arange(len(names)), done)]
+    return FieldMounts(
+        done.field,
+        mounts,
+        ordered,
+        contradictions,
+        odd,
+        find_clock(kinds, arrays, latitude_deg),
+        explain(kinds, arrays, list(ordered.values()), latitude_deg),
+    )

@@ -12,6 +12,15 @@ from model.pointing.kinematics import Readings
 Array = NDArray[np.float64]
 
 
+@dataclass(frozen=True)
+class Weather:
+    """The air while a photograph was taken, None where it is not stored; ``wind_from_deg`` from north, over east."""
+
+    wind_speed_m_s: float | None = None
+    wind_from_deg: float | None = None
+    temperature_c: float | None = None
+
+
 @dataclass(frozen=True, eq=False)
 class Reading:
     """One measurement of one heliostat: ``motors`` (2,) [steps], unit ``sun`` (3,), ``spot`` (3,) [m], ``day`` [d]."""
@@ -22,6 +31,7 @@ class Reading:
     sun: Array
     spot: Array
     day: float
+    weather: Weather = Weather()
 
 
 def padded(readings: Sequence[Sequence[Reading]]) -> Readings:

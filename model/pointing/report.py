@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from model.errors import InvalidInputError
 from model.pointing.clock import Clock
+from model.pointing.covariates import Explained
 from model.pointing.drives import Noise
 from model.pointing.field import FieldMounts
 from model.pointing.kinematics import NAMES, PARAMETERS
@@ -164,6 +165,7 @@ def field_to_json(done: FieldMounts, skipped: Mapping[str, str]) -> dict[str, An
             for name, mount in done.mounts.items()
         },
         "clock": clock_to_json(done.clock),
+        "covariates": {name: _covariate(one) for name, one in done.covariates.items()},
         "skipped": dict(skipped),
     }
 
@@ -174,6 +176,12 @@ def clock_to_json(clock: Clock | None) -> dict[str, Any] | None:
         return None
     since = moment_of(clock.since).date().isoformat()
     return {"minutes": round(clock.minutes, 2), "std_minutes": round(clock.std_minutes, 2), "since": since}
+
+
+def _covariate(one: Explained) -> dict[str, Any]:
+    """How many measurements tell it, and the shares of squared errors that it explains; None where too few do."""
+    shares = {way: {"value": round(value, 4), "ci95": _rounded(one.ci95[way], 4)} for way, value in one.share.items()}
+    return {"measurements": one.measurements, "share": shares or None}
 
 
 def clock_in_words(document: Mapping[str, Any]) -> str:

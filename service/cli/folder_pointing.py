@@ -147,7 +147,8 @@ def _reading(folder: MeasurementFolder, measurement: Measurement, day: float) ->
         raise InvalidInputError("no 'focal_spot'")
     if not any(_on(plane, measurement.spot) for plane in folder.plant.targets.values()):
         raise InvalidInputError("'focal_spot' lies off every target")
-    return Reading(measurement.identifier, measurement.target, motors, measurement.sun, measurement.spot, day)
+    told = (measurement.identifier, measurement.target, motors, measurement.sun, measurement.spot, day)
+    return Reading(*told, measurement.weather)
 
 
 # How far [m] a spot may lie off a target's plane, and off its edge: rounding and surveys, not another place.

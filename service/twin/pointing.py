@@ -24,6 +24,7 @@ from service.store import mounts
 from service.store.columns import now
 from service.store.tables import HeliostatRow, MeasurementRow, MountRow
 from service.twin.evidence import spot_of
+from service.twin.photographs import photograph_of
 from service.twin.runtime import Runtime
 
 Array = NDArray[np.float64]
@@ -141,7 +142,7 @@ def _reading(heliostat: Heliostat, row: MeasurementRow, origin: tuple[float, flo
     for position, drive in zip(motors, heliostat.mount.actuators or (), strict=True):
         drive.require_within(position)
     sun = sun_direction(row.sun_azimuth_deg, row.sun_elevation_deg)
-    return Reading(row.identifier, plane.name, motors, sun, spot, day)
+    return Reading(row.identifier, plane.name, motors, sun, spot, day, photograph_of(row).weather)
 
 
 # --- what a calibrated mount says -------------------------------------------------------------------------------------

@@ -224,6 +224,19 @@ def clocks(plant: Plant) -> None:
     print(f"a minute, at {CLOCK_TRIALS} times: {len(errors)} found, {dated} of them on its day, {said}")
 
 
+def covariates(plant: Plant) -> None:
+    """What time of day, season and weather explain of errors of measurements left out."""
+    done = calibrate_field(plant.heliostats, plant.readings, plant.targets, latitude_deg=plant.latitude_deg)
+    print("| covariate | measurements | sidewards, share of squared errors (95 %) | upwards |")
+    print("| --- | --- | --- | --- |")
+    for name, one in done.covariates.items():
+        shares = [
+            f"{100 * share:.1f} % ({100 * one.ci95[way][0]:.1f} to {100 * one.ci95[way][1]:.1f})"
+            for way, share in one.share.items()
+        ]
+        print(f"| {name} | {one.measurements} | {' | '.join(shares or ['not stored', 'not stored'])} |")
+
+
 def with_clock(readings: Series, since: float, minutes: float, latitude_deg: float) -> Series:
     """Series whose suns are computed by a clock that goes so many minutes fast from a day on."""
     return {
@@ -315,7 +328,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     default = [data_folder().parent / name for name in ("stj-pointing", "stj-years")]
     parser.add_argument("--data", type=Path, nargs="+", default=default)
-    parser.add_argument("--only", choices=("accuracy", "steps", "clock", "speed", "picture"), nargs="*")
+    parser.add_argument("--only", choices=("accuracy", "steps", "clock", "covariates", "speed", "picture"), nargs="*")
     parser.add_argument("--out", type=Path, default=Path("results/pointing.png"))
     options = parser.parse_args()
     plant = Plant(options.data)
@@ -323,6 +336,7 @@ def main() -> None:
         "accuracy": lambda: accuracy(plant),
         "steps": lambda: steps(plant),
         "clock": lambda: clocks(plant),
+        "covariates": lambda: covariates(plant),
         "speed": lambda: speed(plant),
         "picture": lambda: picture(plant, options.out),
     }

@@ -10,7 +10,7 @@ from model.errors import InvalidInputError, UnreachableError
 from model.frames import sun_direction_at
 from model.mount import LinearActuator, Mount
 from model.plant import JUELICH_LATITUDE, Heliostat, TargetPlane
-from model.pointing import CalibratedMount, Reading, calibrate_field, days_by_order, off_by
+from model.pointing import CalibratedMount, Reading, Weather, calibrate_field, days_by_order, off_by
 from model.pointing.calibration import Field
 from model.pointing.drives import Noise
 from model.pointing.kinematics import NAMES, SPREAD, ZEROS, Chain, calibrated, residuals
@@ -162,6 +162,42 @@ def test_a_slow_drift_is_no_step(world):
     assert document["steps"] == []
     assert document["drift"]["is_sure"]
     assert document["drift"]["zeros_mrad"][1] == pytest.approx(2.5, abs=0.8)
+
+
+def test_what_the_weather_does_to_spots_is_told(world):
+    """A field whose light goes up in the heat and westwards in the wind from the east, and one that does neither."""
+    field, _, readings = world
+    generator = np.random.default_rng(11)
+    moved, still = {}, {}
+    for name, own in readings.items():
+        moved[name], still[name] = [], []
+        for one in own:
+            weather = Weather(generator.uniform(0, 8), generator.uniform(0, 360), generator.normal(15, 8))
+            east = weather.wind_speed_m_s**2 * np.sin(np.radians(weather.wind_from_deg))
+            apart = np.linalg.norm(one.spot - field[name].position)
+            shift = 1e-3 * apart * np.array([-0.02 * east, 0.0, 0.06 * (weather.temperature_c - 15)])
+            moved[name].append(replace(one, spot=one.spot + shift, weather=weather))
+            still[name].append(replace(one, weather=weather))
+    found, none = calibrate(field, moved).covariates, calibrate(field, still).covariates
+    assert found["temperature"].share["upwards"] > 0.3
+    assert found["temperature"].ci95["upwards"][0] > 0.2
+    assert found["wind"].ci95["sidewards"][0] > 0.2
+    for covariate, way in (("temperature", "sidewards"), ("wind", "upwards"), ("season", "upwards")):
+        assert abs(found[covariate].share[way]) < 0.1
+    for explained in none.values():
+        assert explained.measurements == 400
+        assert max(map(abs, explained.share.values())) < 0.05
+
+
+def test_weather_that_is_not_stored_is_not_asked(world):
+    field, _, readings = world
+    some = {
+        name: own if name < "H08" else [replace(one, weather=Weather(temperature_c=9.0)) for one in own]
+        for name, own in readings.items()
+    }
+    covariates = field_to_json(calibrate(field, some), {})["covariates"]
+    assert covariates["wind"] == {"measurements": 0, "share": None}
+    assert covariates["temperature"] == {"measurements": 80, "share": None}  # of two heliostats
 
 
 def recorded_by(clock_minutes: float, since: float, readings: dict[str, list[Reading]]) -> dict[str, list[Reading]]:
