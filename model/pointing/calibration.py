@@ -8,13 +8,13 @@ drift, steps and foreign spots as `model.pointing.drives` believes in them.
 Source of the prior: Dempster, Laird and Rubin 1977, doi:10.1111/j.2517-6161.1977.tb01600.x (expectation maximisation).
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from model.pointing.drives import Believed, Noise, believe
+from model.pointing.drives import Believed, Noise, Posterior, believe
 from model.pointing.kinematics import ANOTHER_KIND_M, PARAMETERS, SPREAD, ZEROS, Chain, Readings, residuals
 
 Array = NDArray[np.float64]
@@ -101,6 +101,10 @@ class Calibrated:
     residuals: Array
 
 
+Kind = tuple[NDArray[np.intp], Calibrated]
+"""Rows of a field's heliostats, and their calibration."""
+
+
 def calibrate(chain: Chain, readings: Readings, noise: Noise | None = None, field: Field | None = None) -> Calibrated:
     """Calibrate all mounts of one kind; with ``field`` by that prior, else by their own.
 
@@ -169,11 +173,43 @@ def _posterior(
 def _linearised(
     chain: Chain, readings: Readings, prior: Field, noise: Noise, parameters: Array, zeros: Array
 ) -> Believed:
+    y, slope = linearised(chain, readings, parameters, zeros)
+    return believe(y, slope, readings, prior.mean, prior.covariance, noise)
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Some ``rows`` of a calibrated field: what their residuals come of, and the posterior about what is believed."""
+
+    rows: NDArray[np.intp]
+    chain: Chain
+    readings: Readings
+    parameters: Array
+    zeros: Array
+    posterior: Posterior
+
+
+def parts(kinds: Sequence[Kind], readings: Readings) -> Iterator[Part]:
+    """All heliostats of a calibrated field, in batches."""
+    for rows, done in kinds:
+        of_kind = readings.of(rows)
+        for batch in batches(of_kind):
+            chain, own = done.chain.rows(batch), of_kind.of(batch)
+            believed = Believed(**{name: value[batch] for name, value in vars(done.believed).items()})
+            parameters, zeros = believed.parameters, believed.zeros[:, : own.used.shape[1]]
+            y, slope = linearised(chain, own, parameters, zeros)
+            prior = done.field
+            posterior = Posterior.of(y, slope, own, prior.mean, prior.covariance, done.noise, believed)
+            yield Part(rows[batch], chain, own, parameters, zeros, posterior)
+
+
+def linearised(chain: Chain, readings: Readings, parameters: Array, zeros: Array) -> tuple[Array, Array]:
+    """What parameters and zeros shall explain (H, M, 2) [rad], counted from zero, and its slopes (H, M, 2, P)."""
     zeros = zeros[:, : readings.used.shape[1]]
     off, slope = residuals(chain, readings, parameters, zeros)
     slope = slope * readings.used[..., None, None]
     explained = (slope @ parameters[:, None, :, None])[..., 0] + (slope[..., ZEROS] @ zeros[..., None])[..., 0]
-    return believe(explained - off, slope, readings, prior.mean, prior.covariance, noise)
+    return explained - off, slope
 
 
 def batches(readings: Readings) -> Iterator[NDArray[np.intp]]:

@@ -236,8 +236,69 @@ class _Problem:
         return newest_cov, np.sqrt(np.maximum(variances, 0))
 
 
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """Data with the steps and foreign spots that are believed in them, of any size: what else is asked of them."""
+
+    problem: _Problem
+    terms: "_Terms"
+
+    @classmethod
+    def of(
+        cls, y: Array, jacobian: Array, readings: Readings, mean: Array, cov: Array, noise: Noise, believed: Believed
+    ) -> "Posterior":
+        """As `believe`, of heliostats that ``believed`` is of; it may be padded further."""
+        most = readings.used.shape[1]
+        terms = _Terms.marked(believed.stepped[:, :most], believed.foreign[:, :most])
+        return cls(_Problem.of(y, jacobian, readings, mean, cov, noise), terms)
+
+    def left_out(self) -> Array:
+        """What each measurement (H, M, 2) [rad] lies off what all others of its heliostat foretell.
+
+        NaN where one is foreign, or there is none. Source: Rasmussen and Williams 2006, eq. 5.12.
+        """
+        heliostats, most = self.problem.readings.used.shape
+        solved = self.terms.solve(self.problem)
+        blocks = solved.precision(self.problem).reshape(heliostats, most, 2, most, 2)
+        own = np.einsum("hiaib->hiab", blocks)
+        off = np.linalg.solve(own, solved.precision_y.reshape(heliostats, most, 2, 1))[..., 0]
+        told = self.problem.readings.used & ~self.terms.mask(*_FOREIGN)
+        return np.where(told[..., None], off, np.nan)
+
+    def told_of_a_change(self, by_change: Array) -> tuple[Array, Array]:
+        """What data tell of a number that is 0 up to a measurement and one value from it on, for each measurement.
+
+        ``by_change`` (H, M, 2) are the residuals' derivatives by it. Gives its pull (H, M) and information (H, M): the
+        number is likeliest ``pull / information``, with variance ``1 / information``. Steps within one measurement are
+        not believed for this question: they would be the change itself by another name.
+        """
+        problem, terms = self.problem, self.terms
+        change = (by_change * problem.readings.used[..., None])[..., None]
+        pull, information = _of_change(problem, terms, change)
+        is_step = np.isin(terms.kind, _STEPS)
+        for term in range(terms.kind.shape[1]):
+            place = terms.place[:, term, None]
+            beside = is_step & (np.abs(terms.place - place) <= 1)
+            without = replace(terms, kind=np.where(beside, 0, terms.kind).astype(np.int8))
+            near = is_step[:, term, None] & (np.abs(np.arange(terms.most) - place) <= 1)
+            rows = np.nonzero(near.any(axis=1))[0]
+            other = _of_change(problem.rows(rows), without.rows(rows), change[rows])
+            for old, new in zip((pull, information), other, strict=True):
+                old[rows] = np.where(near[rows], new, old[rows])
+        return pull, information
+
+
+def _of_change(problem: _Problem, terms: "_Terms", change: Array) -> tuple[Array, Array]:
+    heliostats, most = problem.readings.used.shape
+    solved = terms.solve(problem)
+    pull = np.einsum("hmka,hmk->hm", change, solved.precision_y.reshape(heliostats, most, 2))
+    blocks = solved.precision(problem).reshape(heliostats, most, 2, most, 2)
+    return _from_here(pull, 1), _of_pairs(change, blocks)[..., 0, 0]
+
+
 # Kinds of terms beside none, 0: steps of both drives, the first, the second, common ones and large ones; foreign spots.
 _STEPS, _FOREIGN = (1, 2, 3, 4, 5, 6), (7, 8)
+_LARGE = 4  # of both drives
 
 # A drive that did not step moved by no more than this share of what one that did.
 _STILL = 1e-3
@@ -278,6 +339,15 @@ class _Terms:
     @classmethod
     def none(cls, heliostats: int, most: int) -> "_Terms":
         return cls(np.zeros((heliostats, 0), np.int8), np.zeros((heliostats, 0), np.intp), most)
+
+    @classmethod
+    def marked(cls, stepped: Mask, foreign: Mask) -> "_Terms":
+        """Terms of the largest kinds where steps and foreign spots are believed (H, M)."""
+        kinds = np.concatenate([stepped * _LARGE, foreign * _FOREIGN[-1]], axis=1).astype(np.int8)
+        count = int((kinds > 0).sum(axis=1).max(initial=0))
+        first = np.argsort(kinds == 0, axis=1, kind="stable")[:, :count]
+        most = stepped.shape[1]
+        return cls(np.take_along_axis(kinds, first, axis=1), first % most, most)
 
     def rows(self, rows: NDArray[np.intp]) -> "_Terms":
         return _Terms(self.kind[rows], self.place[rows], self.most)
@@ -353,7 +423,7 @@ class _Terms:
         blocks = solved.precision(problem).reshape(heliostats, self.most, 2, self.most, 2)
         foreign_hess = np.einsum("hiaib->hiab", blocks)
         step_pull = _from_here(np.einsum("hmka,hmk->hma", problem.by_zero, pull), 1)
-        step_hess = self._step_hess(problem.by_zero, blocks)
+        step_hess = _of_pairs(problem.by_zero, blocks)
         noise, used = problem.noise, problem.readings.used
         variances = _variances(noise)
         of_steps = [_gain(step_pull, step_hess, variances[kind]) for kind in _STEPS]
@@ -366,19 +436,6 @@ class _Terms:
         foreign = slice(len(_STEPS), None)
         gains[:, foreign] = np.where(self.mask(*_FOREIGN)[:, None], -np.inf, gains[:, foreign])
         return np.where(used[:, None], gains, -np.inf)
-
-    def _step_hess(self, by_zero: Array, blocks: Array) -> Array:
-        """Information (H, M, 2, 2) on a step before each measurement: the sum of all pairs of those after it.
-
-        From one measurement to the next come the pair of it with itself, and those with all later ones, twice.
-        """
-        heliostats, most = by_zero.shape[:2]
-        half = by_zero.swapaxes(2, 3) @ blocks.reshape(heliostats, most, 2, 2 * most)
-        own = np.einsum("hiail->hial", half.reshape(heliostats, most, 2, most, 2)) @ by_zero
-        half *= (np.arange(2 * most) // 2 > np.arange(most)[:, None])[:, None]
-        later = half.reshape(heliostats, 2 * most, 2 * most) @ by_zero.reshape(heliostats, 2 * most, 2)
-        later = later.reshape(heliostats, most, 2, 2)
-        return _from_here(own + later + later.swapaxes(2, 3), 1)
 
     def shed(self, problem: _Problem) -> None:
         """Drop beliefs whose odds are against them by now, the worst of a heliostat first."""
@@ -408,6 +465,21 @@ class _Terms:
         variance = np.diagonal(solved.cov, axis1=1, axis2=2).reshape(heliostats, count, 2)
         std[rows, places] = np.sqrt(variance[rows, terms])
         return size, std
+
+
+def _of_pairs(columns: Array, blocks: Array) -> Array:
+    """Information (H, M, A, A) on what begins at a measurement: the sum of all pairs of those from it on.
+
+    ``columns`` (H, M, 2, A) are what it moves, ``blocks`` (H, M, 2, M, 2) the precision. From one measurement to the
+    next come the pair of it with itself, and those with all later ones, twice.
+    """
+    heliostats, most, _, count = columns.shape
+    half = columns.swapaxes(2, 3) @ blocks.reshape(heliostats, most, 2, 2 * most)
+    own = np.einsum("hiail->hial", half.reshape(heliostats, most, count, most, 2)) @ columns
+    half *= (np.arange(2 * most) // 2 > np.arange(most)[:, None])[:, None]
+    later = half.reshape(heliostats, count * most, 2 * most) @ columns.reshape(heliostats, 2 * most, count)
+    later = later.reshape(heliostats, most, count, count)
+    return _from_here(own + later + later.swapaxes(2, 3), 1)
 
 
 def _odds(noise: Noise) -> Array:

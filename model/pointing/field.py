@@ -1,5 +1,6 @@
 """The mounts of a field: from readings to calibrated mounts, steps, and what contradicts them."""
 
+import dataclasses
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -7,6 +8,8 @@ import numpy as np
 
 from model.plant import Heliostat, TargetPlane
 from model.pointing.calibration import Field, calibrate, calibrate_kinds
+from model.pointing.clock import Clock, find_clock
+from model.pointing.covariates import Explained, explain
 from model.pointing.drives import Noise
 from model.pointing.kinematics import Chain
 from model.pointing.mounts import CalibratedMount, mounts_of
@@ -28,6 +31,10 @@ class FieldMounts:
         Readings that were left out.
     odd : tuple of str
         Heliostats whose property files have drives of another kind than the field's.
+    clock : Clock or None
+        A fault of the clock that was taken for steps. Mounts are calibrated by the suns as they were recorded.
+    covariates : by name
+        What time of day, season and weather explain of the errors that are left.
     """
 
     field: Field
@@ -35,6 +42,8 @@ class FieldMounts:
     readings: dict[str, list[Reading]]
     contradictions: dict[str, dict[str, Contradiction]]
     odd: tuple[str, ...] = ()
+    clock: Clock | None = None
+    covariates: dict[str, Explained] = dataclasses.field(default_factory=dict)
 
 
 def calibrate_field(
@@ -81,4 +90,6 @@ def calibrate_field(
         {name: ordered[name] for name in mounts},
         contradictions,
         tuple(name for name in mounts if name in odd),
+        find_clock(kinds, arrays, latitude_deg),
+        explain(kinds, arrays, list(ordered.values()), latitude_deg),
     )

@@ -6,9 +6,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from model.mount import rotation
 from model.pointing.kinematics import Readings
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Weather:
+    """The air while a photograph was taken, None where it is not stored; ``wind_from_deg`` from north, over east."""
+
+    wind_speed_m_s: float | None = None
+    wind_from_deg: float | None = None
+    temperature_c: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,6 +31,7 @@ class Reading:
     sun: Array
     spot: Array
     day: float
+    weather: Weather = Weather()
 
 
 def padded(readings: Sequence[Sequence[Reading]]) -> Readings:
@@ -49,3 +60,10 @@ def days_by_order(days: ArrayLike, order: ArrayLike) -> Array:
         return when
     by_number = np.argsort(number[known])
     return np.where(known, when, np.interp(number, number[known][by_number], when[known][by_number]))
+
+
+def later(suns: Array, minutes: float, latitude_deg: float) -> Array:
+    """Suns (..., 3) that stand where they are some minutes after: they turn about the pole, 15 degrees an hour."""
+    latitude = np.radians(latitude_deg)
+    pole = np.array([0.0, np.cos(latitude), np.sin(latitude)])
+    return np.asarray(suns @ rotation(pole, -np.radians(minutes / 4)).T)

@@ -11,11 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.errors import ModelError
-from model.mount import rotation
 from model.plant import Heliostat, TargetPlane
 from model.pointing.kinematics import ZEROS, Chain, residuals
 from model.pointing.mounts import CalibratedMount, landed
-from model.pointing.readings import Reading, padded
+from model.pointing.readings import Reading, later, padded
 
 Array = NDArray[np.float64]
 
@@ -116,10 +115,8 @@ def _otherwise(
         if name != reading.target:
             spot = plane.to_enu(own.to_plane(reading.spot))
             yield "wrong_target", f"its spot fits on {name} in place of {own.name}", replace(reading, spot=spot)
-    pole = np.array([0.0, np.cos(np.radians(latitude_deg)), np.sin(np.radians(latitude_deg))])
     for hours in _HOURS:
-        # The sun turns about the pole by 15 degrees an hour, clockwise seen from above.
-        sun = rotation(pole, -np.radians(15.0 * hours)) @ reading.sun
+        sun = later(reading.sun, 60.0 * hours, latitude_deg)
         way = "later" if hours > 0 else "earlier"
         yield "clock", f"it fits a sun {abs(hours)} h {way}: check the clock's time zone", replace(reading, sun=sun)
 

@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 from model.effects import Effect, effect_to_json, in_light_order
 from model.errors import InvalidInputError
+from model.pointing.clock import Clock
+from model.pointing.covariates import Explained
 from model.pointing.drives import Noise
 from model.pointing.field import FieldMounts
 from model.pointing.kinematics import NAMES, PARAMETERS
@@ -182,8 +184,34 @@ def field_to_json(done: FieldMounts, skipped: Mapping[str, str], effects: Sequen
             | ({"note": _ODD} if name in done.odd else {})
             for name, mount in done.mounts.items()
         },
+        "clock": clock_to_json(done.clock),
+        "covariates": {name: _covariate(one) for name, one in done.covariates.items()},
         "skipped": dict(skipped),
     }
+
+
+def clock_to_json(clock: Clock | None) -> dict[str, Any] | None:
+    """A fault of the clock: minutes that the sun stood later than recorded, since a day."""
+    if clock is None:
+        return None
+    since = moment_of(clock.since).date().isoformat()
+    return {"minutes": round(clock.minutes, 2), "std_minutes": round(clock.std_minutes, 2), "since": since}
+
+
+def _covariate(one: Explained) -> dict[str, Any]:
+    """How many measurements tell it, and the shares of squared errors that it explains; None where too few do."""
+    shares = {way: {"value": round(value, 4), "ci95": _rounded(one.ci95[way], 4)} for way, value in one.share.items()}
+    return {"measurements": one.measurements, "share": shares or None}
+
+
+def clock_in_words(document: Mapping[str, Any]) -> str:
+    """The same in words."""
+    minutes = document["minutes"]
+    way = "slow" if minutes > 0 else "fast"
+    return (
+        f"from {document['since']} on the clock was {abs(minutes):.1f} ± {document['std_minutes']:.1f} minutes {way}: "
+        "that explains where the light of most heliostats went"
+    )
 
 
 _ODD = "its property file has spindles of another length than all others; the field's median was the start"

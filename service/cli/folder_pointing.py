@@ -189,7 +189,8 @@ def _reading(folder: MeasurementFolder, measurement: Measurement, day: float) ->
         raise InvalidInputError("no 'focal_spot'")
     if not any(_on(plane, measurement.spot) for plane in folder.plant.targets.values()):
         raise InvalidInputError("'focal_spot' lies off every target")
-    return Reading(measurement.identifier, measurement.target, motors, _sun(folder, measurement), measurement.spot, day)
+    told = (measurement.identifier, measurement.target, motors, _sun(folder, measurement), measurement.spot, day)
+    return Reading(*told, measurement.weather)
 
 
 def _sun(folder: MeasurementFolder, measurement: Measurement) -> Array:

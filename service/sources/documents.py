@@ -4,6 +4,7 @@ Source: the PAINT database of the Solar Tower Juelich, https://paint-database.or
 """
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,6 +20,7 @@ from model.imaging import Camera, ImageKind
 from model.imaging.light import cameras_from_json
 from model.mount import LinearActuator, Mount
 from model.plant import Cylinder, Facet, Heliostat, Plant, TargetPlane
+from model.pointing import Weather
 from model.sunshape import SHAPES, SunShape
 from model.tracing import Optics
 from service.sources.files import require_regular
@@ -50,6 +52,8 @@ class Measurement:
         Files by kind.
     taken_at : datetime or None
         With time zone; from PAINT's STAC item ``ID-calibration-item-stac.json`` where there is one.
+    weather : Weather
+        Of its properties, or of those of the STAC item.
     """
 
     identifier: str
@@ -61,6 +65,7 @@ class Measurement:
     motor_position: Array | None = None
     images: dict[ImageKind, Path] = field(default_factory=dict)
     taken_at: datetime | None = None
+    weather: Weather = field(default_factory=Weather)
 
     @property
     def sun(self) -> Array:
@@ -85,6 +90,7 @@ class Measurement:
             taken_at=self.taken_at,
             motor_position=None if motors is None else (motors[0], motors[1]),
             focal_spot_wgs84=None if spot is None else (spot[0], spot[1], spot[2]),
+            weather=self.weather,
         )
 
 
@@ -277,7 +283,21 @@ def read_measurement(identifier: str, heliostat: str, data: Any, plant: Plant) -
         elevation_deg=elevation,
         spot=_spot(data, where, plant),
         motor_position=_motors(data, where),
+        weather=read_weather(data, where),
     )
+
+
+_WEATHER = {"wind_speed_m_s": (0.0, 100.0), "wind_from_deg": (0.0, 360.0), "temperature_c": (-90.0, 60.0)}
+
+
+def read_weather(data: Mapping[str, Any], where: str) -> Weather:
+    """Wind and temperature among other properties; each may lack."""
+    found = {name: _number(data, where, name) for name in _WEATHER if data.get(name) is not None}
+    for name, value in found.items():
+        least, most = _WEATHER[name]
+        if not least <= value <= most:
+            raise InvalidInputError(f"{where}: '{name}' must lie in {least:g} to {most:g}, got {value}")
+    return Weather(**found)
 
 
 def read_moment(item: Any, where: str) -> datetime:

@@ -58,7 +58,8 @@ def measurement_json(photograph: Photograph) -> dict[str, Any]:
         document["motor_position"] = {f"axis_{axis}_motor_position": position for axis, position in motors}
     if photograph.focal_spot_wgs84 is not None:
         document["focal_spot"] = {"UTIS": list(photograph.focal_spot_wgs84)}
-    return document
+    weather = vars(photograph.weather)
+    return document | {name: value for name, value in weather.items() if value is not None}
 
 
 def stac_item(

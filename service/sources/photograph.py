@@ -1,9 +1,10 @@
 """What the sender of an image says of it, whoever sends it: a calibration system over HTTP, or a folder."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
 
 from model.imaging import ImageKind
+from model.pointing import Weather
 
 
 @dataclass(frozen=True)
@@ -22,3 +23,4 @@ class Photograph:
     motor_position: tuple[float, float] | None = None
     focal_spot_wgs84: tuple[float, float, float] | None = None
     corners: tuple[tuple[float, float], ...] | None = None
+    weather: Weather = field(default_factory=Weather)

@@ -164,6 +164,9 @@ class MeasurementRow(Base):
     taken_at: Mapped[datetime | None]
     focal_spot_wgs84: Mapped[list[float] | None]
     corners_px: Mapped[dict[str, Any] | None]
+    wind_speed_m_s: Mapped[float | None]
+    wind_from_deg: Mapped[float | None]
+    temperature_c: Mapped[float | None]
     accepted: Mapped[bool]
     reason: Mapped[str | None] = mapped_column(String(64))
     quality: Mapped[dict[str, Any]]

@@ -19,23 +19,25 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from model.effects import CATALOGUE
+from model.pointing.report import clock_in_words
 from service import store
 from service.base.faults import NotFoundError
 from service.base.settings import Settings
 from service.store import acknowledgements, decisions, queue
 from service.store.columns import now
 from service.store.job_tables import AcknowledgementRow, JobRow
-from service.store.tables import DriftRow, HeliostatRow, MeasurementRow, ModelRow, PlantRow, StudyRow
+from service.store.tables import DriftRow, HeliostatRow, MeasurementRow, ModelRow, MountRow, PlantRow, StudyRow
 from service.twin import versions
 from service.twin.field import PATIENCE_S, Current, FieldBook, Line
 from service.twin.pointing_errors import Moved, Pointing
 from service.twin.runtime import Runtime
 
-Reason = Literal["queue", "camera", "moved", "pointing", "drift", "accuracy", "untrusted", "no_photograph"]
+Reason = Literal["queue", "camera", "clock", "moved", "pointing", "drift", "accuracy", "untrusted", "no_photograph"]
 
 REASONS: dict[Reason, str] = {
     "queue": "Queue stuck",
     "camera": "Camera changed",
+    "clock": "Clock wrong",
     "moved": "Moved",
     "pointing": "Pointing error",
     "drift": "Drives drift",
@@ -77,7 +79,7 @@ def needs_attention(session: Session, book: FieldBook, settings: Settings) -> tu
 def of_lines(session: Session, lines: Sequence[Line], settings: Settings) -> list[Item]:
     """The same of heliostats with their pointing errors."""
     at = now()
-    found = [*_queue(session, settings), *_camera(session), *_accuracies(session, settings)]
+    found = [*_queue(session, settings), *_camera(session), *_clock(session), *_accuracies(session, settings)]
     found += _without_photograph(session, timedelta(days=settings.attention_photograph_days), at)
     for line in lines:
         found += _of_heliostat(line, settings, at)
@@ -226,6 +228,21 @@ def _camera(session: Session) -> Iterator[Item]:
             "as they were",
             "measure the stored photographs anew (POST /v1/jobs/measurements), and predict surfaces anew",
             f"version {declared.number}",
+        )
+
+
+def _clock(session: Session) -> Iterator[Item]:
+    """What the newest calibration found of the clock."""
+    newest = select(MountRow.document["clock"]).order_by(MountRow.created_at.desc(), MountRow.id.desc()).limit(1)
+    clock = session.scalar(newest)
+    if clock is not None:
+        yield Item(
+            "clock",
+            None,
+            datetime.fromisoformat(f"{clock['since']}T00:00:00+00:00"),
+            clock_in_words(clock),
+            "set the clock that suns are computed by; correct the suns of photographs since then, and calibrate anew",
+            f"{clock['since']} {'slow' if clock['minutes'] > 0 else 'fast'}",
         )
 
 

@@ -208,6 +208,7 @@ def row_of(photograph: Photograph, measured: MeasuredFlux, target_id: int, clock
         taken_at=photograph.taken_at,
         focal_spot_wgs84=None if photograph.focal_spot_wgs84 is None else list(photograph.focal_spot_wgs84),
         corners_px=None if photograph.corners is None else {"corners": plain(photograph.corners)},
+        **asdict(photograph.weather),
         accepted=bool(measured.quality.accepted),
         reason=measured.quality.reason or None,
         quality=plain(asdict(measured.quality)) | {"clock": clock},

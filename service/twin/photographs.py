@@ -3,6 +3,7 @@
 from typing import Any, cast
 
 from model.imaging import ImageKind
+from model.pointing import Weather
 from service.sources.photograph import Photograph
 from service.store.tables import MeasurementRow
 
@@ -44,4 +45,5 @@ def photograph_of(row: MeasurementRow) -> Photograph:
         motor_position=None if None in motors else cast(tuple[float, float], motors),
         focal_spot_wgs84=cast(Any, row.focal_spot_wgs84),
         corners=None if row.corners_px is None else row.corners_px["corners"],
+        weather=Weather(row.wind_speed_m_s, row.wind_from_deg, row.temperature_c),
     )

@@ -17,7 +17,7 @@ from model.frames import sun_direction
 from model.plant import Heliostat
 from model.pointing import CalibratedMount, FieldMounts, Reading, calibrate_field, days_by_order
 from model.pointing.plan import Proposal, plan
-from model.pointing.report import day_of, mount_to_json
+from model.pointing.report import clock_to_json, day_of, mount_to_json
 from service import store
 from service.base.faults import ConflictError
 from service.store import mounts
@@ -26,6 +26,7 @@ from service.store.tables import HeliostatRow, MeasurementRow, MountRow
 from service.twin import versions
 from service.twin.evidence import spot_of
 from service.twin.mounted import mount_of, true_sun, with_drives
+from service.twin.photographs import photograph_of
 from service.twin.runtime import Runtime
 
 Array = NDArray[np.float64]
@@ -88,11 +89,12 @@ def calibrate_store(
 
 
 def keep_mounts(session: Session, calibrated: StoreMounts) -> dict[str, MountRow]:
-    """Keep calibrated mounts as their heliostats' next versions, by name."""
+    """Keep calibrated mounts as their heliostats' next versions, by name; what was found of the clock with each."""
     done, kept = calibrated.done, {}
+    clock = {"clock": clock_to_json(done.clock)}
     for name, row in store.get_heliostats(session, list(done.mounts)).items():
         document = mount_to_json(done.mounts[name], done.readings[name], done.contradictions[name], calibrated.effects)
-        kept[name] = mounts.add_mount(session, row, document)
+        kept[name] = mounts.add_mount(session, row, document | clock)
     return kept
 
 
@@ -148,7 +150,7 @@ def _reading(
     for position, drive in zip(motors, heliostat.mount.actuators or (), strict=True):
         drive.require_within(position)
     sun = true_sun(effects, sun_direction(row.sun_azimuth_deg, row.sun_elevation_deg), row.taken_at, origin[0])
-    return Reading(row.identifier, plane.name, motors, sun, spot, day)
+    return Reading(row.identifier, plane.name, motors, sun, spot, day, photograph_of(row).weather)
 
 
 def sun_at(moment: datetime, origin: tuple[float, float, float]) -> tuple[float, float]:

@@ -10,6 +10,7 @@ chosen on half of the heliostats (`DEVELOPED_ON`); the table has the other half 
 import argparse
 import time
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from model.frames import sun_angles
 from model.plant import Heliostat, TargetPlane
 from model.pointing import CalibratedMount, Field, Reading, calibrate_field, off_by
+from model.pointing.readings import later
 from service.cli.folder_pointing import read_readings
 from service.sources.folder import read_folder
 from tests.benchmarks import data_folder
@@ -32,6 +34,9 @@ LEAST = 24
 # Steps that are put into real series [mrad] of a drive's zero, and how many trials of each.
 STEPS_MRAD = (2.0, 4.0, 8.0)
 TRIALS = 40
+
+# Times at which a clock is put wrong.
+CLOCK_TRIALS = 12
 
 Series = dict[str, list[Reading]]
 
@@ -164,10 +169,10 @@ def with_step(
     zeros[axis] = size
     drives = mount.mount(heliostat.mount)
     changed = list(own)
-    for later in range(place, len(own)):
-        motors = drives.motors_from_angles(drives.angles_from_motors(own[later].motors) - zeros)
-        changed[later] = Reading(
-            own[later].name, own[later].target, motors, own[later].sun, own[later].spot, own[later].day
+    for after in range(place, len(own)):
+        motors = drives.motors_from_angles(drives.angles_from_motors(own[after].motors) - zeros)
+        changed[after] = Reading(
+            own[after].name, own[after].target, motors, own[after].sun, own[after].spot, own[after].day
         )
     return changed
 
@@ -198,6 +203,46 @@ def steps(plant: Plant) -> None:
             others += sum(min(abs(step - other) for other in known) > 1 for step in places)
             looked += _years([own])
         print(f"| {size:g} | {100 * found / TRIALS:.0f} % | {others / looked:.2f} |")
+
+
+def clocks(plant: Plant) -> None:
+    """A clock that goes a minute wrong from a measurement of real series on."""
+    generator = np.random.default_rng(3)
+    days = np.sort([one.day for own in plant.readings.values() for one in own])
+    found = calibrate_field(plant.heliostats, plant.readings, plant.targets, latitude_deg=plant.latitude_deg).clock
+    print(f"fault of the clock in the series as they are: {found}")
+    errors, late = [], []
+    for trial in range(CLOCK_TRIALS):
+        since, minutes = generator.choice(days[len(days) // 10 : -len(days) // 10]), (-1.0) ** trial
+        changed = with_clock(plant.readings, float(since), minutes, plant.latitude_deg)
+        done = calibrate_field(plant.heliostats, changed, plant.targets, latitude_deg=plant.latitude_deg)
+        if done.clock is not None:
+            errors.append(done.clock.minutes + minutes)
+            late.append(done.clock.since - np.floor(since))
+    said = f"off by {np.sqrt(np.mean(np.square(errors))):.2f} minutes (root mean square)" if errors else ""
+    dated = sum(apart == 0 for apart in late)
+    print(f"a minute, at {CLOCK_TRIALS} times: {len(errors)} found, {dated} of them on its day, {said}")
+
+
+def covariates(plant: Plant) -> None:
+    """What time of day, season and weather explain of errors of measurements left out."""
+    done = calibrate_field(plant.heliostats, plant.readings, plant.targets, latitude_deg=plant.latitude_deg)
+    print("| covariate | measurements | sidewards, share of squared errors (95 %) | upwards |")
+    print("| --- | --- | --- | --- |")
+    for name, one in done.covariates.items():
+        shares = [
+            f"{100 * share:.1f} % ({100 * one.ci95[way][0]:.1f} to {100 * one.ci95[way][1]:.1f})"
+            for way, share in one.share.items()
+        ]
+        print(f"| {name} | {one.measurements} | {' | '.join(shares or ['not stored', 'not stored'])} |")
+
+
+def with_clock(readings: Series, since: float, minutes: float, latitude_deg: float) -> Series:
+    """Series whose suns are computed by a clock that goes so many minutes fast from a day on."""
+    return {
+        name: [replace(one, sun=later(one.sun, minutes, latitude_deg)) if one.day >= since else one for one in own]
+        for name, own in readings.items()
+    }
 
 
 def _years(series: Iterable[Sequence[Reading]]) -> float:
@@ -283,13 +328,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     default = [data_folder().parent / name for name in ("stj-pointing", "stj-years")]
     parser.add_argument("--data", type=Path, nargs="+", default=default)
-    parser.add_argument("--only", choices=("accuracy", "steps", "speed", "picture"), nargs="*")
+    parser.add_argument("--only", choices=("accuracy", "steps", "clock", "covariates", "speed", "picture"), nargs="*")
     parser.add_argument("--out", type=Path, default=Path("results/pointing.png"))
     options = parser.parse_args()
     plant = Plant(options.data)
     parts: dict[str, Callable[[], None]] = {
         "accuracy": lambda: accuracy(plant),
         "steps": lambda: steps(plant),
+        "clock": lambda: clocks(plant),
+        "covariates": lambda: covariates(plant),
         "speed": lambda: speed(plant),
         "picture": lambda: picture(plant, options.out),
     }

@@ -14,13 +14,13 @@ from model.forecast import Setup, align
 from model.frames import sun_direction_at
 from model.mount import LinearActuator, Mount
 from model.plant import JUELICH_LATITUDE, Heliostat, TargetPlane
-from model.pointing import CalibratedMount, Reading, calibrate_field, days_by_order, off_by
+from model.pointing import CalibratedMount, Reading, Weather, calibrate_field, days_by_order, off_by
 from model.pointing.calibration import Field
 from model.pointing.drives import Noise
 from model.pointing.kinematics import NAMES, SPREAD, ZEROS, Chain, calibrated, residuals
 from model.pointing.mounts import landed
-from model.pointing.readings import padded
-from model.pointing.report import day_of, field_to_json, moment_of, mount_from_json
+from model.pointing.readings import later, padded
+from model.pointing.report import clock_in_words, day_of, field_to_json, moment_of, mount_from_json
 from model.surface import control_points
 from model.tracing.convolution import central_rays
 
@@ -170,6 +170,89 @@ def test_a_slow_drift_is_no_step(world):
     assert document["steps"] == []
     assert document["drift"]["is_sure"]
     assert document["drift"]["zeros_mrad"][1] == pytest.approx(2.5, abs=0.8)
+
+
+def test_what_the_weather_does_to_spots_is_told(world):
+    """A field whose light goes up in the heat and westwards in the wind from the east, and one that does neither."""
+    field, _, readings = world
+    generator = np.random.default_rng(11)
+    moved, still = {}, {}
+    for name, own in readings.items():
+        moved[name], still[name] = [], []
+        for one in own:
+            weather = Weather(generator.uniform(0, 8), generator.uniform(0, 360), generator.normal(15, 8))
+            east = weather.wind_speed_m_s**2 * np.sin(np.radians(weather.wind_from_deg))
+            apart = np.linalg.norm(one.spot - field[name].position)
+            shift = 1e-3 * apart * np.array([-0.02 * east, 0.0, 0.06 * (weather.temperature_c - 15)])
+            moved[name].append(replace(one, spot=one.spot + shift, weather=weather))
+            still[name].append(replace(one, weather=weather))
+    found, none = calibrate(field, moved).covariates, calibrate(field, still).covariates
+    assert found["temperature"].share["upwards"] > 0.3
+    assert found["temperature"].ci95["upwards"][0] > 0.2
+    assert found["wind"].ci95["sidewards"][0] > 0.2
+    for covariate, way in (("temperature", "sidewards"), ("wind", "upwards"), ("season", "upwards")):
+        assert abs(found[covariate].share[way]) < 0.1
+    for explained in none.values():
+        assert explained.measurements == 400
+        assert max(map(abs, explained.share.values())) < 0.05
+
+
+def test_weather_that_is_not_stored_is_not_asked(world):
+    field, _, readings = world
+    some = {
+        name: own if name < "H08" else [replace(one, weather=Weather(temperature_c=9.0)) for one in own]
+        for name, own in readings.items()
+    }
+    covariates = field_to_json(calibrate(field, some), {})["covariates"]
+    assert covariates["wind"] == {"measurements": 0, "share": None}
+    assert covariates["temperature"] == {"measurements": 80, "share": None}  # of two heliostats
+
+
+def recorded_by(clock_minutes: float, since: float, readings: dict[str, list[Reading]]) -> dict[str, list[Reading]]:
+    """Readings whose suns are computed by a clock that goes so many minutes fast from a day on."""
+    return {
+        name: [
+            replace(one, sun=later(one.sun, clock_minutes, JUELICH_LATITUDE)) if one.day >= since else one
+            for one in own
+        ]
+        for name, own in readings.items()
+    }
+
+
+@pytest.mark.parametrize("minutes", [-1.0, 0.5, 20.0])
+def test_a_clock_that_goes_wrong_is_dated_and_measured(world, minutes):
+    field, _, readings = world
+    since = readings["H00"][23].day
+    done = calibrate(field, recorded_by(minutes, since, readings))
+    assert done.clock is not None
+    assert done.clock.since == np.floor(since)
+    assert done.clock.minutes == pytest.approx(-minutes, abs=4 * done.clock.std_minutes)
+    assert done.clock.std_minutes < 0.1
+    told = field_to_json(done, {})["clock"]
+    assert ("slow" if minutes < 0 else "fast") in clock_in_words(told)
+    assert told["since"] == f"{moment_of(since):%Y-%m-%d}"
+
+
+def test_a_clock_that_is_right_is_no_fault(world):
+    field, _, readings = world
+    assert calibrate(field, readings).clock is None
+    assert field_to_json(calibrate(field, readings), {})["clock"] is None
+
+
+def test_steps_of_some_heliostats_are_no_clock(world):
+    """Of one, of several on one day that do not agree, and of one whose sun alone is wrong."""
+    field, truths, readings = world
+    days = np.linspace(0, 365, 40)
+    moved = dict(readings)
+    for number, (name, size) in enumerate({"H01": 3e-3, "H02": -3e-3, "H04": 8e-3}.items()):
+        zeros = np.where(np.arange(40)[:, None] >= 23, [0.0, size], 0.0)
+        moved[name] = series(field[name], truths[name], days, np.random.default_rng(number), zeros)
+    done = calibrate(field, moved)
+    assert all(done.mounts[name].steps for name in ("H01", "H02", "H04"))
+    assert done.clock is None
+    alone = recorded_by(1.0, days[23], {"H05": readings["H05"]})
+    assert calibrate(field, readings | alone).clock is None
+    assert calibrate(field, alone).clock is None
 
 
 def test_contradictions_are_named(world):

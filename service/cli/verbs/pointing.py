@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from model.errors import InvalidInputError
-from service.cli.output import AsJson, make_table, progress, show
+from service.cli.output import AsJson, console, make_table, progress, show
 
 app = typer.Typer()
 
@@ -25,6 +25,7 @@ def calibrate(
     as_json: AsJson = False,
 ) -> None:
     """Mounts from motors, sun and spots, with uncertainties, steps, drift and named outliers: MOUNTS.json."""
+    from model.pointing.report import clock_in_words
     from service.cli.folder_pointing import calibrate_folder
     from service.sources.folder import read_folder
 
@@ -32,6 +33,8 @@ def calibrate(
     source = read_folder(folder)
     with progress(len(source.plant.heliostats), "calibrate") as step:
         report = calibrate_folder(source, out, step)
+    if report["clock"] is not None:
+        console.print(f"clock: {clock_in_words(report['clock'])}", style="yellow", highlight=False)
     table = make_table("Mounts", "heliostat", "measurements", "residual [mrad]", "90 %", "steps", "outliers")
     for name, entry in report["heliostats"].items():
         left = entry["residual_mrad"]

@@ -2,6 +2,7 @@
 
 from pydantic import Field
 
+from model.pointing.report import clock_to_json
 from service.base.fields import Model, Moment
 from service.jobs.common import Heliostats, chosen_names
 from service.jobs.kind import Context, Kind, Result
@@ -33,6 +34,7 @@ def calibrate_many(context: Context, payload: CalibrationIn) -> Result:
                     for name, own in done.contradictions.items()
                     for reading, one in own.items()
                 },
+                "clock": clock_to_json(done.clock),
                 "skipped": calibrated.skipped,
             }
             context.keep(session, "mounts", figures)

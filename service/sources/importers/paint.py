@@ -7,6 +7,7 @@ from typing import Any
 
 from model.errors import InvalidInputError
 from model.plant import Heliostat, Plant
+from model.pointing import Weather
 from service.sources.documents import (
     IMAGE_KINDS,
     Measurement,
@@ -16,6 +17,7 @@ from service.sources.documents import (
     read_moment,
     read_receivers,
     read_targets,
+    read_weather,
 )
 from service.sources.folder import Importer, MeasurementFolder, read_declared
 
@@ -35,13 +37,21 @@ class PaintFolder(MeasurementFolder):
                 measurement = read_measurement(identifier, heliostat, read_json(path), self.plant)
                 item = folder / f"{identifier}-calibration-item-stac.json"
                 if item.is_file():
-                    measurement = replace(measurement, taken_at=read_moment(read_json(item), str(item)))
+                    measurement = _with_item(measurement, read_json(item), str(item))
             except InvalidInputError as error:
                 self.skipped[f"{heliostat}/{identifier}"] = str(error)
                 continue
             images = {kind: folder / f"{identifier}-{kind}.png" for kind in IMAGE_KINDS}
             measurement.images.update({kind: file for kind, file in images.items() if file.is_file()})
             yield measurement
+
+
+def _with_item(measurement: Measurement, item: Any, where: str) -> Measurement:
+    """With the moment of its STAC item, and its weather where the measurement tells none."""
+    taken_at, weather = read_moment(item, where), measurement.weather
+    if weather == Weather():
+        weather = read_weather(item["properties"], where)
+    return replace(measurement, taken_at=taken_at, weather=weather)
 
 
 def _towers(root: Path) -> list[Path]:

@@ -8,6 +8,7 @@ from fastapi import APIRouter, Depends, File, Form, Header, Query, Response, Upl
 from pydantic import BaseModel, BeforeValidator, Field, Json
 from starlette.datastructures import UploadFile as StarletteUploadFile
 
+from model.pointing import Weather
 from service import store
 from service.base.arrays import pair, unpack
 from service.base.faults import GoneError, NotFoundError, StoreDamagedError, TooLargeError
@@ -80,6 +81,11 @@ class MeasurementIn(Model):
         description="Positions (x, y) [px] of the target's upper left, upper right, lower left and lower right "
         "corners in a raw frame; without them they are searched.",
     )
+    wind_speed_m_s: float | None = Field(default=None, ge=0, le=100, description="Of the wind then [m/s].")
+    wind_from_deg: float | None = Field(
+        default=None, ge=0, le=360, description="Where the wind came from, from north, over east [deg]."
+    )
+    temperature_c: float | None = Field(default=None, ge=-90, le=60, description="Of the air then [°C].")
 
 
 class MeasurementOut(BaseModel):
@@ -97,6 +103,9 @@ class MeasurementOut(BaseModel):
     focal_spot: tuple[float, float, float] | None = Field(
         description="As given: latitude [deg], longitude [deg], altitude [m]."
     )
+    wind_speed_m_s: float | None = Field(description="[m/s]")
+    wind_from_deg: float | None = Field(description="From north, over east [deg].")
+    temperature_c: float | None = Field(description="[°C]")
     accepted: bool = Field(description="Whether the image can be used; a refused one is kept with its reason.")
     reason: str | None = Field(description="Why it was refused; `excluded`: somebody did.")
     quality: dict[str, Any] = Field(
@@ -135,6 +144,9 @@ def measurement_out(heliostat_name: str, row: MeasurementRow) -> MeasurementOut:
             "motor_position": pair(row.motor_axis_1, row.motor_axis_2),
             "taken_at": row.taken_at,
             "focal_spot": row.focal_spot_wgs84,
+            "wind_speed_m_s": row.wind_speed_m_s,
+            "wind_from_deg": row.wind_from_deg,
+            "temperature_c": row.temperature_c,
             "accepted": row.accepted,
             "reason": row.reason,
             "quality": row.quality,
@@ -196,6 +208,7 @@ def _photograph(metadata: MeasurementIn) -> Photograph:
         motor_position=metadata.motor_position,
         focal_spot_wgs84=metadata.focal_spot,
         corners=metadata.corners,
+        weather=Weather(metadata.wind_speed_m_s, metadata.wind_from_deg, metadata.temperature_c),
     )
 
 

@@ -12,10 +12,12 @@ from typer.testing import CliRunner
 
 from model.errors import InvalidInputError, ModelError
 from model.imaging import center_of_mass
-from service.cli.folder_pointing import calibrate_folder, spot_folder
+from model.pointing import Weather, calibrate_field
+from service.cli.folder_pointing import calibrate_folder, read_readings, spot_folder
 from service.cli.main import app
 from service.sources.folder import read_folder
 from tests.benchmarks import data_folder
+from tests.benchmarks.pointing import Plant, with_clock
 from tests.service.conftest import properties_document, tower_document
 from tests.service.spots import photographs
 
@@ -183,6 +185,68 @@ def test_the_verbs_print_tables_and_name_bad_files(folder: Path, tmp_path: Path)
     assert "no such file" in str(missing.exception)
     onto = CliRunner().invoke(app, ["calibrate", str(folder), "--out", str(tmp_path)])
     assert "is a folder" in str(onto.exception)
+
+
+def test_what_the_weather_explains_is_asked_where_it_is_stored(folder: Path, tmp_path: Path):
+    taken = photographs(tower_document(), properties_document())
+    for name in ("AB02", "AB03", "AB04"):
+        write(folder / name / "Properties" / f"{name}-heliostat-properties.json", properties_document())
+        for number, one in enumerate(taken):
+            write_measurement(folder, name, 100 + number, one, temperature_c=10.0 + number)
+            item = {"properties": {"datetime": one["taken_at"], "wind_speed_m_s": 4.0 + number, "wind_from_deg": 90.0}}
+            if name == "AB03":  # where the measurement itself tells of the weather, its item's is not asked
+                write(folder / name / "Calibration" / f"{100 + number}-calibration-item-stac.json", item)
+    write_measurement(folder, "AB02", 300, taken[0], temperature_c="cold")
+    write_measurement(folder, "AB02", 301, taken[0], wind_from_deg=400.0)
+    told = [one.weather for one in read_readings(read_folder(folder))[0]["AB03"]]
+    assert told[2] == Weather(temperature_c=12.0)
+    report = calibrate_folder(read_folder(folder), tmp_path / "mounts.json")
+    assert "'temperature_c' must be a finite number" in report["skipped"]["AB02/300"]
+    assert "'wind_from_deg' must lie in 0 to 360" in report["skipped"]["AB02/301"]
+    covariates = report["covariates"]
+    assert covariates["temperature"]["measurements"] == 48
+    assert set(covariates["temperature"]["share"]) == {"sidewards", "upwards"}
+    assert covariates["wind"] == {"measurements": 0, "share": None}
+    assert covariates["time_of_day"]["measurements"] == 64
+
+
+def test_weather_of_items_is_read(folder: Path):
+    for path in (folder / "AA39" / "Calibration").glob("*-item-stac.json"):
+        document = json.loads(path.read_text())
+        document["properties"] |= {"wind_speed_m_s": 4, "wind_from_deg": 90, "temperature_c": 7.5}
+        write(path, document)
+    told = [one.weather for one in read_readings(read_folder(folder))[0]["AA39"]]
+    assert told[:2] == [Weather(4.0, 90.0, 7.5), Weather()]
+
+
+def test_a_wrong_clock_is_said_first(folder: Path, tmp_path: Path):
+    taken = photographs(tower_document(), properties_document(), fast_minutes=2.0)
+    for name in ("AB02", "AB03", "AB04"):
+        write(folder / name / "Properties" / f"{name}-heliostat-properties.json", properties_document())
+        for number, one in enumerate(taken):
+            write_measurement(folder, name, 100 + number, one)
+    mounts = tmp_path / "mounts.json"
+    done = CliRunner().invoke(app, ["calibrate", str(folder), "--out", str(mounts)])
+    assert done.exit_code == 0, done.output
+    clock = json.loads(mounts.read_text())["clock"]
+    assert clock["minutes"] == pytest.approx(-2, abs=0.3)
+    assert f"clock: from {clock['since']} on the clock was" in " ".join(done.stderr.split())
+
+
+def test_the_clock_of_real_photographs_is_right_until_it_is_put_wrong():
+    real = data_folder().parent / "stj-pointing"
+    if not real.is_dir():
+        pytest.skip(f"no real pointing at {real}")
+    plant = Plant([real])
+    wrong = with_clock(plant.readings, 19481.0, 1.0, plant.latitude_deg)
+    right, found = (
+        calibrate_field(plant.heliostats, readings, plant.targets, latitude_deg=plant.latitude_deg).clock
+        for readings in (plant.readings, wrong)
+    )
+    assert right is None
+    assert found is not None
+    assert found.since == 19481.0
+    assert found.minutes == pytest.approx(-1.0, abs=0.15)
 
 
 def test_real_heliostats_are_forecast_to_a_milliradian(tmp_path: Path):

@@ -39,6 +39,7 @@ def filled(client: TestClient, tower: dict[str, Any]) -> TestClient:
     """Photographs with all that is known of them, a measured surface and a predicted one, a receiver, a model."""
     send, spot = poster(client), [50.9136, 6.3879, 123.0]
     known = {"taken_at": "2024-06-03T11:30:00Z", "motor_position": [31234.0, 45012.5], "focal_spot": spot}
+    known |= {"wind_speed_m_s": 3.5, "wind_from_deg": 210.0, "temperature_c": -2.25}
     send(png(1), id="1", **known)
     send(png(2), id="1", kind="cropped", **known)
     send(png(3, refused=True), id="2", sun_azimuth=-33.25)
@@ -105,6 +106,7 @@ def told(runtime: Runtime) -> dict[str, Any]:
                     "motors": (row.motor_axis_1, row.motor_axis_2),
                     "taken": row.taken_at,
                     "spot": row.focal_spot_wgs84,
+                    "weather": (row.wind_speed_m_s, row.wind_from_deg, row.temperature_c),
                     "accepted": (row.accepted, row.reason),
                 }
                 for row in rows
@@ -134,6 +136,7 @@ def test_round_trip_loses_nothing(filled: TestClient, exported: tuple[Path, dict
     app: FastAPI = filled.app  # type: ignore[assignment]
     before, after = told(app.state.runtime), told(other)
     assert len(before["measurements"]) == 5
+    assert before["measurements"]["1", "flux"]["weather"] == (3.5, 210.0, -2.25)
     for name, value in before.items():
         assert same(value, after[name]), (name, value, after[name])
 

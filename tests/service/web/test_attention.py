@@ -206,6 +206,29 @@ def test_camera_that_a_study_found_changed_until_that_is_adopted(app: FastAPI, c
     assert items(client) == []
 
 
+def test_clock_that_went_wrong_until_it_is_calibrated_without(calibrating: TestClient):
+    client, post, names = calibrating, poster(calibrating), ("AA39", "AB01", "AB02")
+    wrong = photographs(tower_document(), properties_document(), fast_minutes=2.0)
+    right = photographs(tower_document(), properties_document())
+    for name in names:
+        client.put(f"/v1/heliostats/{name}", json=properties_document())
+        for number, one in enumerate(wrong):
+            post(png(number), name, **one)
+    result = calibrate(client)["result"]
+    assert result["clock"]["since"] == "2024-05-09"
+    assert result["clock"]["minutes"] == pytest.approx(-2, abs=0.3)
+    (item,) = of(client, "clock")
+    assert item["what"].startswith("from 2024-05-09 on the clock was 2.")
+    assert (item["heliostat"], item["since"]) == (None, "2024-05-09T00:00:00Z")
+    for name in names:
+        for one in right[8:]:
+            sun = {key: one[key] for key in ("sun_azimuth", "sun_elevation")}
+            path = f"/v1/heliostats/{name}/measurements/{one['id']}"
+            assert client.patch(path, json=sun | {"reason": "clock"}).status_code == 200
+    assert calibrate(client)["result"]["clock"] is None
+    assert of(client, "clock") == []
+
+
 def test_camera_that_was_declared_anew(client: TestClient):
     declared = {"cameras": [{"transfer": {"gamma": 2.0}, "since": "2024-03-01T00:00:00Z"}]}
     assert client.put("/v1/plant", json={**tower_document(), "declared": declared}).status_code == 200
