@@ -15,6 +15,7 @@ from model.pointing.calibration import Field
 from model.pointing.drives import Noise
 from model.pointing.kinematics import NAMES, SPREAD, ZEROS, Chain, calibrated, residuals
 from model.pointing.mounts import landed
+from model.pointing.plan import best_sun, propose
 from model.pointing.readings import later, padded
 from model.pointing.report import clock_in_words, day_of, field_to_json, moment_of, mount_from_json
 
@@ -291,6 +292,22 @@ def test_motors_send_the_light_where_it_shall_go_and_keep_their_travel(world):
     np.testing.assert_allclose(mount.spot(heliostat, TARGETS["lower"], motors, sun)[0], aim, atol=1e-6)
     with pytest.raises(UnreachableError, match=r"travel|far"):
         mount.motors(heliostat, np.array([0.0, 1.0, 0.05]), np.array([0.0, 900.0, -100.0]))
+
+
+def test_a_photograph_tells_most_under_the_sun_that_was_never_seen(world):
+    """Of a mount that was measured in the morning only, in the late afternoon; of no sun where none is in reach."""
+    field, _, readings = world
+    morning = [one for one in readings["H02"] if one.sun[0] > 0.1]
+    mount = calibrate(field, {**readings, "H02": morning}, QUIET).mounts["H02"]
+    hours = np.arange(8.0, 16.25, 0.25)
+    sky = [sun_direction_at(10.0, 15 * (hour - 12), JUELICH_LATITUDE) for hour in hours]
+    days, planes = [366.0] * len(sky), list(TARGETS.values())
+    best = best_sun(field["H02"], mount, planes, sky, days)
+    assert best is not None
+    assert hours[best.slot] > 15
+    told = [propose(field["H02"], mount, planes[0], sun, 366.0).information_bits for sun in sky]
+    assert best.information_bits == pytest.approx(max(told))
+    assert best_sun(field["H02"], mount, [], sky, days) is None
 
 
 def test_documents_bring_the_mount_back(world):
