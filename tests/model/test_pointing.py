@@ -248,6 +248,41 @@ def test_steps_of_some_heliostats_are_no_clock(world):
     assert calibrate(field, alone).clock is None
 
 
+@pytest.mark.parametrize(
+    ("steps", "changes"),
+    [
+        ({12: (0.0, 6e-3)}, ["lost_steps"]),
+        ({12: (6e-3, -8e-3)}, ["referenced"]),
+        ({12: (8e-3, 0.0), 27: (-8e-3, 0.0)}, ["lost_steps", "referenced"]),
+        ({12: (8e-3, 0.0), 27: (0.0, 8e-3)}, ["lost_steps", "lost_steps"]),
+    ],
+)
+def test_lost_steps_are_told_from_drives_that_were_referenced(world, steps, changes):
+    field, truths, readings = world
+    zeros = np.zeros((40, 2))
+    for place, size in steps.items():
+        zeros[place:] += size
+    days = np.linspace(0, 365, 40)
+    moved = series(field["H04"], truths["H04"], days, np.random.default_rng(7), zeros)
+    done = calibrate(field, {**readings, "H04": moved})
+    told = field_to_json(done, {})["heliostats"]["H04"]["steps"]
+    assert [step["change"] for step in told] == changes
+    assert [step.after for step in done.mounts["H04"].steps] == list(steps)
+
+
+@pytest.mark.parametrize("hours", [-0.5, 1.5])
+def test_a_clock_half_an_hour_off_is_named(world, hours):
+    field, _, readings = world
+    own = list(readings["H06"])
+    mount = calibrate(field, readings).mounts["H06"]
+    true_sun, told = (sun_direction_at(5.0, 20.0 + 15 * shift, JUELICH_LATITUDE) for shift in (0.0, hours))
+    motors = mount.motors(field["H06"], true_sun, TARGETS["upper"].center, own[10].day)
+    own[10] = replace(own[10], motors=motors, sun=told, spot=TARGETS["upper"].center, target="upper")
+    (found,) = calibrate(field, {**readings, "H06": own}).contradictions["H06"].values()
+    assert found.reason == "clock"
+    assert f"{abs(hours):g} h {'earlier' if hours > 0 else 'later'}" in found.detail
+
+
 def test_contradictions_are_named(world):
     field, _, readings = world
     own = list(readings["H06"])

@@ -150,7 +150,9 @@ def _mount_context(mount: MountRow) -> dict[str, Any]:
     """What the page says of a mount: what its drives did, and what contradicts it."""
     return {
         "steps": [
-            step | {"from": datetime.fromisoformat(step["from"]), "to": datetime.fromisoformat(step["to"])}
+            {"detail": ""}
+            | step
+            | {"from": datetime.fromisoformat(step["from"]), "to": datetime.fromisoformat(step["to"])}
             for step in reversed(mount.document["steps"])
         ],
         **{name: mount.document[name] for name in ("drift", "outliers", "measurements", "residual_mrad")},
