@@ -19,6 +19,11 @@ Array = NDArray[np.float64]
 DETERMINED = 0.5
 """A parameter is determined where data leave less than this share of its prior's spread."""
 
+# Standard deviations by which a drive has surely moved.
+_SURE = 3.0
+
+_DRIVES = ("first", "second")
+
 
 @dataclass(frozen=True, eq=False)
 class Step:
@@ -99,6 +104,24 @@ class CalibratedMount:
             residuals=none,
             steps=(),
         )
+
+    def change(self, step: Step) -> tuple[str, str]:
+        """What likely happened at one of its steps: a short code, ``referenced`` or ``lost_steps``, and in words.
+
+        A drive that loses steps does so alone; who references drives, or mends a mount, moves both at once, or brings
+        one back to where it stood before an earlier step.
+        """
+        moved = np.abs(step.zeros) > _SURE * step.std
+        moved |= np.abs(step.zeros) == np.abs(step.zeros).max()
+        variance = step.std**2
+        for earlier in reversed([one for one in self.steps if one.after <= step.before]):
+            variance = variance + earlier.std**2
+            apart = np.abs(self.stepped[step.after] - self.stepped[earlier.before])
+            if (apart < _SURE * np.sqrt(variance))[moved].all():
+                return "referenced", "back to where it stood before an earlier step: referenced anew"
+        if moved.all():
+            return "referenced", "both drives at once: referenced anew, or mended"
+        return "lost_steps", f"the {_DRIVES[int(moved.argmax())]} drive alone: it likely lost steps"
 
     @property
     def determined(self) -> NDArray[np.bool_]:

@@ -80,6 +80,18 @@ def plan(
     return chosen
 
 
+def best_sun(
+    heliostat: Heliostat,
+    mount: CalibratedMount,
+    planes: Sequence[TargetPlane],
+    suns: Sequence[Array],
+    days: Sequence[float],
+) -> Proposal | None:
+    """The photograph that tells most of one heliostat, each sun's on the first of ``planes`` in reach; None without."""
+    found = [_best(heliostat, mount, planes, suns, days, [slot], True) for slot in range(len(suns))]
+    return max((one for one in found if one is not None), key=lambda one: one.information_bits, default=None)
+
+
 def _best(
     heliostat: Heliostat,
     mount: CalibratedMount,

@@ -26,8 +26,8 @@ _EXPLAINS = 0.15
 _ANOTHERS = 10e-3
 _TRIED = 4
 
-# Clocks are set to whole hours of other zones, or of summer.
-_HOURS = (-2, -1, 1, 2)
+# Clocks are set to other zones, which are whole or half hours apart, or to summer.
+_HOURS = (-2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0)
 
 
 @dataclass(frozen=True)
@@ -116,9 +116,9 @@ def _otherwise(
             spot = plane.to_enu(own.to_plane(reading.spot))
             yield "wrong_target", f"its spot fits on {name} in place of {own.name}", replace(reading, spot=spot)
     for hours in _HOURS:
-        sun = later(reading.sun, 60.0 * hours, latitude_deg)
+        sun = later(reading.sun, 60 * hours, latitude_deg)
         way = "later" if hours > 0 else "earlier"
-        yield "clock", f"it fits a sun {abs(hours)} h {way}: check the clock's time zone", replace(reading, sun=sun)
+        yield "clock", f"it fits a sun {abs(hours):g} h {way}: check the clock's time zone", replace(reading, sun=sun)
 
 
 def _elsewhere(

@@ -84,6 +84,7 @@ def mount_to_json(
                 "zeros_mrad": _rounded(1e3 * step.zeros, 3),
                 "std_mrad": _rounded(1e3 * step.std, 3),
                 "motor_steps": _rounded(step.motors, 1),
+                **dict(zip(("change", "detail"), mount.change(step), strict=True)),
             }
             for step in mount.steps
         ],

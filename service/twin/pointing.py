@@ -16,7 +16,7 @@ from model.errors import InvalidInputError, ModelError
 from model.frames import sun_direction
 from model.plant import Heliostat
 from model.pointing import CalibratedMount, FieldMounts, Reading, calibrate_field, days_by_order
-from model.pointing.plan import Proposal, plan
+from model.pointing.plan import Proposal, best_sun, plan
 from model.pointing.report import clock_to_json, day_of, mount_to_json
 from service import store
 from service.base.faults import ConflictError
@@ -25,7 +25,7 @@ from service.store.columns import now
 from service.store.tables import HeliostatRow, MeasurementRow, MountRow
 from service.twin import versions
 from service.twin.evidence import spot_of
-from service.twin.mounted import mount_of, true_sun, with_drives
+from service.twin.mounted import load_mount, mount_of, true_sun, with_drives
 from service.twin.photographs import photograph_of
 from service.twin.runtime import Runtime
 
@@ -208,6 +208,30 @@ def make_plan(runtime: Runtime, begin: datetime | None, minutes: float, photogra
     with runtime.computing("plan"):
         chosen = plan(heliostats, calibrated, planes, suns, [day_of(moment) for moment, _, _ in days])
     return [Slot(one, *days[one.slot]) for one in chosen]
+
+
+# A quarter of an hour turns the sun by 4 degrees; below so many [deg] it is too weak for a spot that is seen whole.
+_QUARTER = timedelta(minutes=15)
+_LEAST_ELEVATION_DEG = 10.0
+
+
+def best_slot(runtime: Runtime, name: str, begin: datetime | None = None) -> Slot | None:
+    """The photograph of one heliostat that would tell most within a day, by suns each quarter of an hour.
+
+    None where no target is in reach then. Raises what `load_mount` raises.
+    """
+    with runtime.database.reading() as session:
+        stored = load_mount(session, name)
+        planes = [store.target_plane(row) for row in store.list_targets(session)]
+    start = begin or now()
+    start += (datetime.min.replace(tzinfo=start.tzinfo) - start) % _QUARTER
+    moments = [start + place * _QUARTER for place in range(96)]
+    days = [(moment, *sun_angles_at(moment, *stored.origin[:2])) for moment in moments]
+    days = [(moment, azimuth, elevation) for moment, azimuth, elevation in days if elevation >= _LEAST_ELEVATION_DEG]
+    suns = [stored.sun(sun_direction(azimuth, elevation), moment) for moment, azimuth, elevation in days]
+    with runtime.computing("plan"):
+        best = best_sun(stored.heliostat, stored.mount, planes, suns, [day_of(moment) for moment, _, _ in days])
+    return None if best is None else Slot(best, *days[best.slot])
 
 
 def mount_out(row: MountRow) -> dict[str, Any]:

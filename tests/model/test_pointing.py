@@ -19,6 +19,7 @@ from model.pointing.calibration import Field
 from model.pointing.drives import Noise
 from model.pointing.kinematics import NAMES, SPREAD, ZEROS, Chain, calibrated, residuals
 from model.pointing.mounts import landed
+from model.pointing.plan import best_sun, propose
 from model.pointing.readings import later, padded
 from model.pointing.report import clock_in_words, day_of, field_to_json, moment_of, mount_from_json
 from model.surface import control_points
@@ -255,6 +256,41 @@ def test_steps_of_some_heliostats_are_no_clock(world):
     assert calibrate(field, alone).clock is None
 
 
+@pytest.mark.parametrize(
+    ("steps", "changes"),
+    [
+        ({12: (0.0, 6e-3)}, ["lost_steps"]),
+        ({12: (6e-3, -8e-3)}, ["referenced"]),
+        ({12: (8e-3, 0.0), 27: (-8e-3, 0.0)}, ["lost_steps", "referenced"]),
+        ({12: (8e-3, 0.0), 27: (0.0, 8e-3)}, ["lost_steps", "lost_steps"]),
+    ],
+)
+def test_lost_steps_are_told_from_drives_that_were_referenced(world, steps, changes):
+    field, truths, readings = world
+    zeros = np.zeros((40, 2))
+    for place, size in steps.items():
+        zeros[place:] += size
+    days = np.linspace(0, 365, 40)
+    moved = series(field["H04"], truths["H04"], days, np.random.default_rng(7), zeros)
+    done = calibrate(field, {**readings, "H04": moved})
+    told = field_to_json(done, {})["heliostats"]["H04"]["steps"]
+    assert [step["change"] for step in told] == changes
+    assert [step.after for step in done.mounts["H04"].steps] == list(steps)
+
+
+@pytest.mark.parametrize("hours", [-0.5, 1.5])
+def test_a_clock_half_an_hour_off_is_named(world, hours):
+    field, _, readings = world
+    own = list(readings["H06"])
+    mount = calibrate(field, readings).mounts["H06"]
+    true_sun, told = (sun_direction_at(5.0, 20.0 + 15 * shift, JUELICH_LATITUDE) for shift in (0.0, hours))
+    motors = mount.motors(field["H06"], true_sun, TARGETS["upper"].center, own[10].day)
+    own[10] = replace(own[10], motors=motors, sun=told, spot=TARGETS["upper"].center, target="upper")
+    (found,) = calibrate(field, {**readings, "H06": own}).contradictions["H06"].values()
+    assert found.reason == "clock"
+    assert f"{abs(hours):g} h {'earlier' if hours > 0 else 'later'}" in found.detail
+
+
 def test_contradictions_are_named(world):
     field, _, readings = world
     own = list(readings["H06"])
@@ -299,6 +335,22 @@ def test_motors_send_the_light_where_it_shall_go_and_keep_their_travel(world):
     np.testing.assert_allclose(mount.spot(heliostat, TARGETS["lower"], motors, sun)[0], aim, atol=1e-6)
     with pytest.raises(UnreachableError, match=r"travel|far"):
         mount.motors(heliostat, np.array([0.0, 1.0, 0.05]), np.array([0.0, 900.0, -100.0]))
+
+
+def test_a_photograph_tells_most_under_the_sun_that_was_never_seen(world):
+    """Of a mount that was measured in the morning only, in the late afternoon; of no sun where none is in reach."""
+    field, _, readings = world
+    morning = [one for one in readings["H02"] if one.sun[0] > 0.1]
+    mount = calibrate(field, {**readings, "H02": morning}, QUIET).mounts["H02"]
+    hours = np.arange(8.0, 16.25, 0.25)
+    sky = [sun_direction_at(10.0, 15 * (hour - 12), JUELICH_LATITUDE) for hour in hours]
+    days, planes = [366.0] * len(sky), list(TARGETS.values())
+    best = best_sun(field["H02"], mount, planes, sky, days)
+    assert best is not None
+    assert hours[best.slot] > 15
+    told = [propose(field["H02"], mount, planes[0], sun, 366.0).information_bits for sun in sky]
+    assert best.information_bits == pytest.approx(max(told))
+    assert best_sun(field["H02"], mount, [], sky, days) is None
 
 
 def test_documents_bring_the_mount_back(world):

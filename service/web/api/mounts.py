@@ -14,7 +14,7 @@ from service.base.fields import Model, Moment, Name, Position, Sun, Version
 from service.store import mounts
 from service.store.tables import MountRow
 from service.twin.mounted import load_mount
-from service.twin.pointing import make_plan, mount_out, sun_at
+from service.twin.pointing import Slot, make_plan, mount_out, sun_at
 from service.web.answers.openapi import problems
 from service.web.answers.paging import Page, page
 from service.web.door.dependencies import COMPUTES, READ, Limit, NamePath, RuntimeDep, require_json
@@ -154,6 +154,20 @@ class PlannedOut(BaseModel):
     std_mrad: float = Field(description="How unsure the spot's place is by what is known now [mrad].")
 
 
+def planned_out(slot: Slot) -> PlannedOut:
+    """A photograph to take, as JSON."""
+    proposal = slot.proposal
+    return PlannedOut(
+        at=slot.moment,
+        heliostat=proposal.heliostat,
+        target=proposal.target,
+        motor_position=(float(proposal.motors[0]), float(proposal.motors[1])),
+        sun=Sun(azimuth_deg=slot.azimuth_deg, elevation_deg=slot.elevation_deg),
+        information_bits=proposal.information_bits,
+        std_mrad=proposal.std_mrad,
+    )
+
+
 class PlanOut(BaseModel):
     """The next photographs, in order of time."""
 
@@ -172,17 +186,4 @@ def get_plan(
     A mount that was never measured, long ago, or under few suns tells most.
     """
     slots = make_plan(runtime, at, minutes, photographs)
-    return PlanOut(
-        items=[
-            PlannedOut(
-                at=slot.moment,
-                heliostat=slot.proposal.heliostat,
-                target=slot.proposal.target,
-                motor_position=(float(slot.proposal.motors[0]), float(slot.proposal.motors[1])),
-                sun=Sun(azimuth_deg=slot.azimuth_deg, elevation_deg=slot.elevation_deg),
-                information_bits=slot.proposal.information_bits,
-                std_mrad=slot.proposal.std_mrad,
-            )
-            for slot in slots
-        ]
-    )
+    return PlanOut(items=[planned_out(slot) for slot in slots])

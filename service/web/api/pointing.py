@@ -2,7 +2,7 @@
 
 from datetime import datetime
 from operator import attrgetter
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Query
 from pydantic import BaseModel, Field
@@ -11,8 +11,10 @@ from service import store
 from service.base.faults import NotFoundError
 from service.base.fields import Name
 from service.twin.field import PATIENCE_S, Line, read_lines
+from service.twin.pointing import best_slot
 from service.web.answers.openapi import problems
 from service.web.answers.paging import Page, page
+from service.web.api.mounts import PlannedOut, planned_out
 from service.web.door.dependencies import READ, FieldBookDep, Limit, NamePath, RuntimeDep
 
 router = APIRouter(tags=["mounts"])
@@ -62,10 +64,22 @@ class PointingOut(BaseModel):
     drifted: DriftedOut | None = Field(description="Slow drift of its drives, where it is sure.")
 
 
-def _out(line: Line) -> PointingOut:
+class HeliostatPointingOut(PointingOut):
+    """The same of one heliostat, with what to do about it."""
+
+    tells_most: PlannedOut | None = Field(
+        description="Of a photograph each quarter of an hour of the coming day, under a sun of 10 degrees at least, "
+        "the one that is expected to tell most of its mount; null where it reaches no target."
+    )
+
+
+def _about(line: Line) -> dict[str, Any]:
     own = {} if line.pointing is None else vars(line.pointing)
-    about = own | {"heliostat": line.name, "error_m": line.pointing_m}
-    return PointingOut.model_validate(about, from_attributes=True)
+    return own | {"heliostat": line.name, "error_m": line.pointing_m}
+
+
+def _out(line: Line) -> PointingOut:
+    return PointingOut.model_validate(_about(line), from_attributes=True)
 
 
 class PointingPage(Page[PointingOut]):
@@ -91,11 +105,13 @@ def list_pointing(
 
 
 @router.get("/heliostats/{name}/pointing", responses=problems(404), dependencies=[READ])
-def get_pointing(name: NamePath, runtime: RuntimeDep, book: FieldBookDep) -> PointingOut:
-    """The pointing error of a heliostat's newest photographs, its trend, and when it moved."""
+def get_pointing(name: NamePath, runtime: RuntimeDep, book: FieldBookDep) -> HeliostatPointingOut:
+    """The pointing error of a heliostat's newest photographs, its trend, when it moved, and when to look next."""
     with runtime.database.reading() as session:
         (line,) = read_lines(session, store.get_heliostat(session, name).id)
     line = book.with_pointing(line)
     if line.pointing is None:
         raise NotFoundError(f"heliostat {name} has no mount that fits it; POST to /v1/jobs/calibrations first")
-    return _out(line)
+    slot = best_slot(runtime, name)
+    about = _about(line) | {"tells_most": None if slot is None else planned_out(slot)}
+    return HeliostatPointingOut.model_validate(about, from_attributes=True)

@@ -26,6 +26,7 @@ from service.store.measurements import PhotographVerdict, Shot, list_shots
 from service.store.tables import DecisionRow, HeliostatRow, MountRow, SurfaceRow
 from service.twin.accuracy import RECENT, Compared, Comparison, ComparisonBook, rank_of
 from service.twin.field import Figures, Line, figures_of, read_lines
+from service.twin.pointing import Slot, best_slot
 from service.web.answers.pages import render
 from service.web.door.dependencies import READ, FieldBookDep, NamePath, RuntimeDep, Turn
 
@@ -149,7 +150,9 @@ def _mount_context(mount: MountRow) -> dict[str, Any]:
     """What the page says of a mount: what its drives did, and what contradicts it."""
     return {
         "steps": [
-            step | {"from": datetime.fromisoformat(step["from"]), "to": datetime.fromisoformat(step["to"])}
+            {"detail": ""}
+            | step
+            | {"from": datetime.fromisoformat(step["from"]), "to": datetime.fromisoformat(step["to"])}
             for step in reversed(mount.document["steps"])
         ],
         **{name: mount.document[name] for name in ("drift", "outliers", "measurements", "residual_mrad")},
@@ -173,6 +176,7 @@ class _Read:
     verdict: PhotographVerdict | None
     mount: MountRow | None
     line: Line
+    best: Slot | None
     compared: Compared
 
 
@@ -197,7 +201,8 @@ def _read(
     # The rest of the page does not depend on them.
     compared = Compared() if shown is None else book.wait_for(shown) or _UNDER_WAY
     line = field.with_pointing(line)
-    return _Read(row, today, surface, surfaces, decided, shots, photographs, mount, line, compared)
+    best = None if line.pointing is None else best_slot(runtime, name)
+    return _Read(row, today, surface, surfaces, decided, shots, photographs, mount, line, best, compared)
 
 
 @router.get("/heliostats/{name}")
@@ -223,6 +228,7 @@ def get_heliostat_page(request: Request, read: Annotated[_Read, Depends(_read)],
         accuracy_seen=fmean(seen) if (seen := [c.accuracy for c in comparisons if c.was_used]) else None,
         mount=read.mount,
         line=read.line,
+        best=read.best,
         pointing=None if read.mount is None else _mount_context(read.mount),
         **(_surface_context(read.surface, _size(read.row)) if read.surface is not None else {}),
     )

@@ -56,6 +56,7 @@ def test_a_calibration_finds_mount_and_step(client: TestClient, post: Post, towe
     assert client.get("/v1/heliostats/AA39/mounts").json()["items"] == [mount]
     shown = client.get("/heliostats/AA39").text
     assert "Steps of its drives" in shown
+    assert "the first drive alone: it likely lost steps" in shown
     assert "Pointing error" in shown
     early = client.get("/v1/heliostats/AA39/mounts/current", params={"at": "2024-05-01T00:00:00Z"})
     assert early.status_code == 404

@@ -50,11 +50,14 @@ def test_newest_photographs_are_held_against_the_mount(client: TestClient, post:
     after = client.get(PATH).json()
     assert (after["since_calibration"], after["photographs"]) == (1, 8)
     assert after["error_m"] == pytest.approx(1e-3 * after["error_mrad"] * 61, rel=0.2)
+    best = after.pop("tells_most")
     assert of_field(client)["items"] == [after]
+    assert (best["heliostat"], best["sun"]["elevation_deg"] >= 10) == ("AA39", True)
     page, field = client.get("/heliostats/AA39", headers=HTML).text, client.get("/?metric=pointing", headers=HTML).text
     for told in (page, field):
         assert "m on the receiver" in told.replace("\N{NO-BREAK SPACE}", " ")
         assert 'href="/calibration-plan"' in told
+    assert "A photograph tells most <time" in page
     assert re.search(r'<path class="mirrors" fill="#[0-9a-f]{6}"', field)
     metrics = client.get("/metrics").text
     assert 'heliotwin_heliostat_pointing_error_mrad{heliostat="AA39"} ' in metrics
