@@ -169,6 +169,7 @@ class _Read:
     surface: SurfaceRow | None
     surfaces: list[SurfaceRow]
     decided: Sequence[DecisionRow]
+    undoable: DecisionRow | None
     shots: list[Shot]
     verdict: PhotographVerdict | None
     mount: MountRow | None
@@ -191,13 +192,14 @@ def _read(
         surface = today if version is None else store.get_surface(session, row, version)
         surfaces = _newest_surfaces(session, row)
         decided = decisions.list_decisions(session, row, _MOST_DECISIONS)
+        undoable = decisions.find_undoable(session, row)
         shots = list_shots(session, row, _MOST_PHOTOGRAPHS, photographs)
         mount = mounts.find_mount_at(session, row)
         shown, (line,) = book.read(session, row, surface), read_lines(session, row.id)
     # The rest of the page does not depend on them.
     compared = Compared() if shown is None else book.wait_for(shown) or _UNDER_WAY
     line = field.with_pointing(line)
-    return _Read(row, today, surface, surfaces, decided, shots, photographs, mount, line, compared)
+    return _Read(row, today, surface, surfaces, decided, undoable, shots, photographs, mount, line, compared)
 
 
 @router.get("/heliostats/{name}")
@@ -213,6 +215,7 @@ def get_heliostat_page(request: Request, read: Annotated[_Read, Depends(_read)],
         today=read.today,
         versions=listed,
         decided=read.decided,
+        undoable=read.undoable,
         histories=_histories(listed) if listed else [],
         comparisons=comparison_figures(comparisons),
         trouble=read.compared.trouble,

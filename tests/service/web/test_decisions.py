@@ -3,6 +3,7 @@
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -93,6 +94,31 @@ def test_better_surface_becomes_todays_and_is_taken_back(client: TestClient):
     assert client.get(f"{BASE}/2").json()["set_aside"] is False
 
 
+def test_undo_is_of_the_last_decision_that_changed_todays(client: TestClient, mirrors: Mirrors):
+    """Not of what was set aside since, which changed nothing."""
+    predict(client, "network")
+    predict(client, "refined")
+    mirrors.bends["network"] = 3.0
+    assert predict(client, "network")["set_aside"] is True
+    client.put(f"{BASE}/current", json={"version": 2, "reason": "it stays"})  # nor of what left it in its place
+    assert "Undo: back to version 1" in page_of(client, "/heliostats/AA39")
+    undone = client.post(f"{BASE}/undo")
+    assert (undone.status_code, undone.json()["previous"], current(client)) == (200, 2, 1)
+    assert "Undo: back to version 2" in page_of(client, "/heliostats/AA39")
+    assert client.get(f"{BASE}/3").json()["set_aside"] is True
+
+
+def test_what_came_since_is_not_undone(client: TestClient):
+    """A surface that was measured is today's without a decision: no earlier decision says what was before it."""
+    predict(client, "network")
+    predict(client, "refined")
+    measure(client, 4e-3)
+    assert current(client) == 3
+    assert client.post(f"{BASE}/undo").status_code == 409
+    assert "Undo: back" not in page_of(client, "/heliostats/AA39")
+    assert current(client) == 3
+
+
 def test_somebody_decides_otherwise(client: TestClient):
     predict(client, "refined")
     predict(client, "network")
@@ -124,14 +150,7 @@ def test_photographs_that_neither_has_seen_judge(client: TestClient):
 
 
 def test_measured_surface_stays_unless_an_unseen_photograph_speaks(client: TestClient):
-    app: Any = client.app
-    with app.state.runtime.database.writing() as session:
-        z = np.full((4, 8, 8), 5e-3)
-        heliostat = store.get_heliostat(session, "AA39")
-        store.add_surface(session, heliostat, store.NewSurface("measured", z, 0 * z, np.stack([z] * 3, -1)))
-    with app.state.runtime.database.writing() as session:
-        measured = store.find_surface_at(session, store.get_heliostat(session, "AA39"))
-        measured.valid_from = measured.valid_from.replace(year=1970)
+    measure(client, 5e-3, datetime(1970, 1, 1, tzinfo=UTC))
     assert predict(client, "refined")["set_aside"] is True  # it has seen all
     assert "was measured" in client.get(f"{BASE}/decisions").json()[0]["reason"]
     assert predict(client, "refined", "2")["set_aside"] is False
@@ -152,6 +171,15 @@ def test_surface_of_earlier_photographs_is_history(client: TestClient):
     assert predict(client, "refined", "0")["set_aside"] is False
     assert current(client) == 1
     assert client.get(f"{BASE}/decisions").json() == []
+
+
+def measure(client: TestClient, bend_m: float, valid_from: datetime | None = None) -> None:
+    """Store a surface that was measured: it bends by so much."""
+    app: Any = client.app
+    with app.state.runtime.database.writing() as session:
+        z = np.full((4, 8, 8), bend_m)
+        new = store.NewSurface("measured", z, 0 * z, np.stack([z] * 3, -1), valid_from)
+        store.add_surface(session, store.get_heliostat(session, "AA39"), new)
 
 
 def page_of(client: TestClient, path: str) -> str:
