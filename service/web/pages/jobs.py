@@ -106,6 +106,7 @@ def get_job_page(number: Number, request: Request, runtime: RuntimeDep, kinds: K
         is_live=is_live,
         asked=asked,
         flux=flux,
+        has_changed=any(result.values()),
         light=result if row.kind == "forecasts" and "peak_w_m2" in result else None,
         target=asked.get("target") if asked else None,
         facts={name: value for name, value in result.items() if _plain(value)},
