@@ -51,7 +51,10 @@ _COUNT_HOLDS_S = 15.0
 
 @dataclass(frozen=True)
 class Item:
-    """Something that needs attention; of the plant where it names no heliostat."""
+    """Something that needs attention; of the plant where it names no heliostat.
+
+    ``photographs`` are measurements of the heliostat to look at.
+    """
 
     reason: Reason
     heliostat: str | None
@@ -61,6 +64,7 @@ class Item:
     mark: str
     acknowledged_by: str | None = None
     acknowledged_at: datetime | None = None
+    photographs: tuple[str, ...] = ()
 
     @property
     def id(self) -> str:
@@ -103,16 +107,18 @@ def _of_heliostat(line: Line, settings: Settings, at: datetime) -> Iterator[Item
 
 
 def _untrusted(name: str, surface: Current) -> Item:
-    since = surface.doubted_since or surface.valid_from
+    since, photographs = surface.doubted_since or surface.valid_from, tuple(surface.suspicious or ())
+    which = f"photographs {', '.join(photographs)}" if len(photographs) > 1 else f"photograph {''.join(photographs)}"
     return Item(
         "untrusted",
         name,
         since,
         "; ".join(surface.doubts or ()),
-        "look at the photographs that are named, exclude those that are wrong, and predict its surface anew",
+        f"look at {which if photographs else 'its photographs'}, exclude what is wrong, and predict its surface anew",
         since.isoformat(),
         surface.seen_by,
         surface.seen_at,
+        photographs,
     )
 
 

@@ -86,6 +86,7 @@ class Current:
     doubted_since: datetime | None = None
     seen_by: str | None = None
     seen_at: datetime | None = None
+    suspicious: Sequence[str] | None = None
 
     @property
     def age_days(self) -> float | None:
@@ -149,6 +150,7 @@ def _current_surfaces(session: Session, heliostat: int | None) -> dict[int, Curr
         SurfaceRow.doubted_since,
         SurfaceRow.seen_by,
         SurfaceRow.seen_at,
+        SurfaceRow.suspicious,
     )
     # The database picks them: a plant has many versions, and this is read at every refresh.
     query = query.join(ranked, ranked.c.id == SurfaceRow.id).where(ranked.c.place == 1)

@@ -65,6 +65,12 @@ def test_doubts_are_told_with_why_and_since_when(client: TestClient):
     for told in (field, page):
         assert "hotograph 2 is not explained: 31% of it is missed" in told
     assert "I have seen it" in page
+    # Both lead to where the photograph is corrected or excluded.
+    (item,) = client.get("/v1/attention").json()["items"]
+    assert (item["photographs"], item["todo"][:20]) == (["2"], "look at photograph 2")
+    for told in (page, client.get("/attention", headers=HTML).text):
+        assert '<a href="/heliostats/AA39/photographs/2">2</a>' in told
+    assert "Excluded: nothing is made from it" in client.get("/heliostats/AA39/photographs/2", headers=HTML).text
 
 
 def test_who_has_seen_it_is_kept_while_the_doubts_are_the_same(client: TestClient):
