@@ -229,6 +229,13 @@ class Settings(BaseSettings):
     attention_accuracy: float = Field(
         default=0.75, ge=0, le=1, description="Forecast accuracy below which a heliostat needs attention [1]."
     )
+    attention_accuracy_drop: float = Field(
+        default=0.05,
+        ge=0,
+        le=1,
+        description="By how much more than this the accuracy of a heliostat's newest photographs must have fallen [1], "
+        "surely (95 %), for it to need attention.",
+    )
     attention_pointing_mrad: float = Field(
         default=3.0, gt=0, le=1000, description="Pointing error above which it does [mrad]."
     )

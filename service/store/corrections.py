@@ -35,4 +35,5 @@ def list_corrections(session: Session, measurement: MeasurementRow) -> Sequence[
 
 def forget_drift(session: Session, measurement: MeasurementRow) -> None:
     """What a photograph said of the twin when it came, it said wrongly."""
+    measurement.forecast_accuracy = None
     session.execute(delete(DriftRow).where(DriftRow.measurement_id == measurement.id))
