@@ -374,6 +374,15 @@ def test_forecast_of_all_heliostats_shows_its_light(app: FastAPI, pages: TestCli
     for told in ("Power on lower", "Reflected by the mirrors", "62.5° high", "Flux of 1 heliostats together"):
         assert told in page
     assert 'href="data:image/png' in page
+    told = dict(re.findall("<dt>([^<]*)</dt><dd>([^<]*)</dd>", page.partition("What was asked")[2]))
+    assert told == {
+        "target": "lower",
+        "mirrors shade and block each other": "yes",
+        "direct normal irradiance": "900\N{NO-BREAK SPACE}W/m²",
+        "resolution": "256 × 256 pixels",
+        "sun": "at 2026-06-21 11:36 UTC",
+        "surface": "current",
+    }
     assert "{" not in page.partition("<main")[2]  # nothing as Python writes it
     listed = text_of(pages, "/forecast")
     assert f'<a href="{path}">job' in listed
