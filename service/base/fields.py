@@ -84,18 +84,20 @@ Azimuth = Annotated[Number, AZIMUTH]
 Elevation = Annotated[Number, ELEVATION]
 Extent = Annotated[Number, Field(ge=0.01, le=1e3)]
 
-Moment = Annotated[
-    AwareDatetime,
-    Field(ge=datetime(1970, 1, 1, tzinfo=UTC), lt=datetime(9000, 1, 1, tzinfo=UTC)),
-    AfterValidator(lambda moment: moment.astimezone(UTC)),
-]
 
-FormMoment = Annotated[
-    datetime,
-    AfterValidator(lambda moment: moment.replace(tzinfo=UTC) if moment.tzinfo is None else moment),
-    Field(ge=datetime(1970, 1, 1, tzinfo=UTC), lt=datetime(9000, 1, 1, tzinfo=UTC)),
-    AfterValidator(lambda moment: moment.astimezone(UTC)),
-]
+def moment_of(told: datetime) -> datetime:
+    """A moment in UTC, which one without a zone means; ValueError where its year is a slip of the finger."""
+    moment = told.replace(tzinfo=UTC) if told.tzinfo is None else told
+    if moment < datetime(1970, 1, 1, tzinfo=UTC):
+        raise ValueError("give a year from 1970 on")
+    if moment >= datetime(9000, 1, 1, tzinfo=UTC):
+        raise ValueError("give a year before 9000")
+    return moment.astimezone(UTC)
+
+
+Moment = Annotated[AwareDatetime, AfterValidator(moment_of)]
+
+FormMoment = Annotated[datetime, AfterValidator(moment_of)]
 """In forms: what a browser's field for a moment gives bears no zone; the pages say that it means UTC."""
 
 Version = Annotated[int, Field(ge=1, le=2**31 - 1)]

@@ -35,6 +35,7 @@ MAP_SCALES: dict[str, tuple[float, float]] = {
     "misfit": (5.0, 30.0),
     "age": (0.0, 365.0),
     "pointing": (0.0, 3.0),
+    "sun_span": (60.0, 0.0),
 }
 """What is fine and what is poor of the figures that the field's map shows, unless the settings say otherwise."""
 
@@ -224,10 +225,18 @@ class Settings(BaseSettings):
         default_factory=dict,
         validate_default=True,
         description="JSON: what is fine and what is poor, which is where the map's colours begin and end, of accuracy "
-        '[%], deviation, uncertainty [mm], misfit [%], age [days] and pointing [mrad], such as {"accuracy": [95, 80]}.',
+        "[%], deviation, uncertainty [mm], misfit [%], age [days], pointing [mrad] and sun_span [deg], such as "
+        '{"accuracy": [95, 80]}.',
     )
     attention_accuracy: float = Field(
         default=0.75, ge=0, le=1, description="Forecast accuracy below which a heliostat needs attention [1]."
+    )
+    attention_accuracy_drop: float = Field(
+        default=0.05,
+        ge=0,
+        le=1,
+        description="By how much more than this the accuracy of a heliostat's newest photographs must have fallen [1], "
+        "surely (95 %), for it to need attention.",
     )
     attention_pointing_mrad: float = Field(
         default=3.0, gt=0, le=1000, description="Pointing error above which it does [mrad]."
@@ -275,8 +284,8 @@ class Settings(BaseSettings):
         if unknown:
             raise ValueError(f"there is no figure {', '.join(unknown)}; name {', '.join(MAP_SCALES)}")
         for name, (fine, poor) in value.items():
-            rises = poor < fine if name == "accuracy" else fine < poor
-            if not rises or not math.isfinite(fine - poor):
+            fine_is_high = MAP_SCALES[name][1] < MAP_SCALES[name][0]
+            if (poor < fine) is not fine_is_high or fine == poor or not math.isfinite(fine - poor):
                 raise ValueError(f"{name}: give what is fine, then what is poor, not {fine:g}, {poor:g}")
         return MAP_SCALES | value
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from model.ephemeris import sun_angles_at
 from model.errors import InvalidInputError, ModelError
 from model.frames import sun_direction
 from model.plant import TargetPlane
-from service.base.fields import Plane, Sun
+from service.base.fields import Plane, Sun, moment_of
 from service.base.progress import Progress, quiet
 from service.cli.folder import check_surfaces, finish, surface_of
 from service.sources.documents import optics_to_json, read_json
@@ -43,14 +43,16 @@ def asked(
     Raises
     ------
     InvalidInputError
-        Where they say nothing, or two things, or it is night at that time.
+        Where they say nothing, or two things, or it is night at that time, or that is before 1970.
     """
     if (sun is None) == (at is None):
         raise InvalidInputError("--sun, --at: give one of them, a position or a time")
     if (target is None) == (plane is None):
         raise InvalidInputError("--target, --plane: give one of them, a target of the folder or a file")
-    if at is not None and at.tzinfo is None:
-        at = at.replace(tzinfo=UTC)
+    try:
+        at = None if at is None else moment_of(at)
+    except ValueError as error:
+        raise InvalidInputError(f"--at: {error}") from None
     return Asked(_sun(folder, sun, at), _plane(folder, target, plane), at)
 
 

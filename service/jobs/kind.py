@@ -3,7 +3,8 @@
 import math
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
@@ -91,6 +92,16 @@ class Context:
         """Note a part as done in the transaction that did it; LeaseLostError undoes both."""
         self.alive_s = time.monotonic()
         queue.keep_step(session, self.lease, name, result)
+
+    @contextmanager
+    def keeping(self, name: str, made: Callable[[], dict[str, Any]]) -> Iterator[None]:
+        """Where the job is cancelled within the block, note what that had ``made`` by then: it is not begun again."""
+        try:
+            yield
+        except CancelRequestedError:
+            with self.runtime.database.writing() as session:
+                self.keep(session, name, made())
+            raise
 
 
 @dataclass(frozen=True)

@@ -81,16 +81,16 @@ def keep_aside(
 
 
 def undo(session: Session, heliostat: HeliostatRow, actor: str) -> DecisionRow:
-    """Take the last decision back: what was today's before it is so again. Undone again, it is as it was.
+    """Take `find_undoable` back: what was today's before it is so again. Undone again, it is as it was.
 
     Raises
     ------
     ConflictError
-        Where the last decision left everything in its place, or there is none.
+        Where there is none.
     """
     hold(session, HeliostatRow, heliostat.id, f"heliostat {heliostat.name}")
-    last = find_decision(session, heliostat)
-    if last is None or not last.taken or last.previous is None:
+    last = find_undoable(session, heliostat)
+    if last is None or last.previous is None:
         raise ConflictError(f"heliostat {heliostat.name}: no decision took another surface's place; choose a version")
     of_heliostat = select(SurfaceRow).where(SurfaceRow.heliostat_id == heliostat.id)
     rows = {row.version: row for row in session.scalars(of_heliostat)}
@@ -124,6 +124,12 @@ def list_decisions(session: Session, heliostat: HeliostatRow, limit: int) -> Seq
     return session.scalars(query.order_by(DecisionRow.id.desc()).limit(limit)).all()
 
 
-def find_decision(session: Session, heliostat: HeliostatRow) -> DecisionRow | None:
-    """The last decision, or None."""
-    return next(iter(list_decisions(session, heliostat, 1)), None)
+def find_undoable(session: Session, heliostat: HeliostatRow) -> DecisionRow | None:
+    """The last decision that changed today's surface, whatever was set aside since; None where nothing can be undone.
+
+    Nor can it where today's surface is not the one that it took: one that was measured came since, say.
+    """
+    query = select(DecisionRow).join(SurfaceRow).where(DecisionRow.heliostat_id == heliostat.id, DecisionRow.taken)
+    query = query.where(DecisionRow.previous.is_not(None), DecisionRow.previous != SurfaceRow.version)
+    last, today = session.scalar(query.order_by(DecisionRow.id.desc()).limit(1)), find_surface_at(session, heliostat)
+    return last if last is not None and today is not None and last.surface_id == today.id else None

@@ -19,6 +19,9 @@ from service.store.tables import HeliostatRow, ImageRow, MeasurementRow, TargetR
 PREFERENCE = ("flux", "cropped", "raw", "flux-centered")
 
 
+EXCLUDED = "excluded"
+"""Why a photograph is not accepted that somebody excluded."""
+
 PhotographVerdict = Literal["used", "refused", "excluded"]
 
 
@@ -39,7 +42,7 @@ class Shot:
         """Whether any of its images is used; else whether somebody excluded it."""
         if self.best.accepted:
             return "used"
-        return "excluded" if any(row.reason == "excluded" for row in self.images) else "refused"
+        return "excluded" if any(row.reason == EXCLUDED for row in self.images) else "refused"
 
 
 def _measurements(heliostat: HeliostatRow) -> Select[MeasurementRow]:
@@ -105,7 +108,7 @@ def list_shots(
     """The photographs whose images came last, newest first, or those of one verdict."""
     name = func.coalesce(MeasurementRow.external_id, MeasurementRow.identifier).label("name")
     is_used = func.max(case((MeasurementRow.accepted, 1), else_=0))
-    is_excluded = func.max(case((MeasurementRow.reason == "excluded", 1), else_=0))
+    is_excluded = func.max(case((MeasurementRow.reason == EXCLUDED, 1), else_=0))
     query = select(name).where(MeasurementRow.heliostat_id == heliostat.id).group_by(name)
     if verdict is not None:
         query = query.having(is_used == int(verdict == "used"))
@@ -121,12 +124,23 @@ def list_shots(
     ]
 
 
-def images_of_shot(session: Session, row: MeasurementRow) -> dict[str, MeasurementRow]:
-    """The images of the photograph that ``row`` is one of, by kind."""
-    query = select(MeasurementRow).where(MeasurementRow.heliostat_id == row.heliostat_id)
+def images_of_shot(session: Session, row: MeasurementRow, arrays: bool = False) -> dict[str, MeasurementRow]:
+    """The images of the photograph that ``row`` is one of, by kind, with their ``arrays`` where wanted."""
     if row.external_id is None:
         return {row.kind: row}
-    return {one.kind: one for one in session.scalars(query.where(MeasurementRow.external_id == row.external_id))}
+    query = select(MeasurementRow).where(
+        MeasurementRow.heliostat_id == row.heliostat_id, MeasurementRow.external_id == row.external_id
+    )
+    query = query.order_by(MeasurementRow.id).options(undefer(MeasurementRow.arrays)) if arrays else query
+    return {one.kind: one for one in session.scalars(query)}
+
+
+def _is_excluded(session: Session, heliostat: HeliostatRow, row: MeasurementRow) -> bool:
+    """Whether somebody excluded the photograph that an image, yet to be stored, is another one of."""
+    if row.external_id is None:
+        return False
+    query = _measurements(heliostat).where(MeasurementRow.external_id == row.external_id)
+    return session.scalar(query.where(MeasurementRow.reason == EXCLUDED).limit(1)) is not None
 
 
 def recent_measurements(
@@ -194,7 +208,7 @@ def _keep_image(session: Session, image: ImageRow, accepted: bool) -> tuple[Imag
 def add_measurement(
     session: Session, heliostat: HeliostatRow, image: ImageRow, row: MeasurementRow
 ) -> tuple[MeasurementRow, bool]:
-    """Store a measurement of ``image`` once, under an identifier that is free.
+    """Store a measurement of ``image`` once, under an identifier that is free; of an excluded photograph excluded.
 
     The second value is False where this image of this kind was there already; the first is then the row that was.
 
@@ -211,6 +225,8 @@ def add_measurement(
         names.require(names.IDENTIFIER, row.external_id, "id")
     hold(session, HeliostatRow, heliostat.id, f"heliostat {heliostat.name}")
     hold(session, TargetRow, row.target_id, "its target")
+    if _is_excluded(session, heliostat, row):
+        row.accepted, row.reason = False, EXCLUDED
     image, is_new = _keep_image(session, image, row.accepted)
     row.heliostat_id, row.image_sha256 = heliostat.id, image.sha256
     for _ in range(ROUNDS):

@@ -140,6 +140,7 @@ class MeasurementRow(Base):
     ``arrays`` holds npz ``flux`` and ``centered``; a refused image has neither and keeps its ``reason``.
     ``center_right_m``, ``center_up_m``: centre of mass from the target's centre. ``corrected_at``: since when it stands
     as it does, where it was corrected (`CorrectionRow`); an excluded one is not accepted for the reason `excluded`.
+    ``forecast_accuracy`` [1]: how the surface of its day forecast it when it came, which had not seen it.
     """
 
     __tablename__ = "measurements"
@@ -175,6 +176,7 @@ class MeasurementRow(Base):
     arrays: Mapped[bytes | None] = mapped_column(LargeBinary, deferred=True)
     created_at: Mapped[datetime] = mapped_column(default=now)
     corrected_at: Mapped[datetime | None]
+    forecast_accuracy: Mapped[float | None]
 
     target: Mapped[TargetRow] = relationship(lazy="joined", innerjoin=True)
     image: Mapped[ImageRow] = relationship(lazy="joined", innerjoin=True)
@@ -294,7 +296,9 @@ class MountRow(Base):
 class DriftRow(Base):
     """Flux accuracy [1] of a heliostat's surface on its newest photograph, when that came (`service.twin.accuracy`).
 
-    ``poor_since`` is the first of all its last photographs that were forecast worse than the settings bear.
+    ``poor_since`` is the first of all its last photographs that were forecast worse than the settings bear. ``recent``
+    and ``earlier`` are medians of its newest photographs and of those before, each when it came; that fell by
+    ``least_drop`` at least (95 %), and ``fell_since`` then by more than the settings bear.
     """
 
     __tablename__ = "drift"
@@ -305,6 +309,10 @@ class DriftRow(Base):
     taken_at: Mapped[datetime]
     accuracy: Mapped[float]
     poor_since: Mapped[datetime | None]
+    recent: Mapped[float | None]
+    earlier: Mapped[float | None]
+    least_drop: Mapped[float | None]
+    fell_since: Mapped[datetime | None]
 
 
 class ForecastRow(Base):

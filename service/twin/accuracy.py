@@ -12,6 +12,7 @@ from datetime import datetime
 from statistics import fmean
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
@@ -20,6 +21,8 @@ from model.errors import ModelError
 from model.metrics import flux_accuracy
 from service import store
 from service.base.faults import ServiceError
+from service.base.settings import Settings
+from service.store.measurements import PREFERENCE
 from service.store.tables import DriftRow, HeliostatRow, MeasurementRow, MountRow, SurfaceRow
 from service.twin import versions
 from service.twin.book import Book
@@ -294,10 +297,56 @@ def judge(runtime: Runtime, twin: Twin, surface: SurfaceRow | None, shown: Evide
     return None
 
 
-def note(session: Session, measurement: MeasurementRow, surface: SurfaceRow, accuracy: float, least: float) -> None:
+@dataclass(frozen=True)
+class Fall:
+    """Medians of accuracies [1], of the newest photographs and of those before, and the 95 % interval of their drop."""
+
+    recent: float
+    earlier: float
+    low: float
+    high: float
+
+
+# Newest photographs whose median is held against that of those before: so many at most, and at least as many.
+_NEWEST = 5
+_BEFORE = 60
+_DRAWS = 1000
+
+
+def fall_of(accuracies: Sequence[float]) -> Fall | None:
+    """Whether accuracies (n,) [1], the newest first, fell; None where there are too few to tell.
+
+    The interval is a bootstrap's: Efron and Tibshirani 1993, *An Introduction to the Bootstrap*, chapter 13.
+    """
+    recent, earlier = np.array(accuracies[:_NEWEST]), np.array(accuracies[_NEWEST : _NEWEST + _BEFORE])
+    if len(earlier) < _NEWEST:
+        return None
+    rng = np.random.default_rng(0)
+    before, after = (np.median(rng.choice(some, (_DRAWS, len(some))), axis=1) for some in (earlier, recent))
+    low, high = np.quantile(before - after, [0.025, 0.975])
+    return Fall(float(np.median(recent)), float(np.median(earlier)), float(low), float(high))
+
+
+def _came_so(session: Session, heliostat: int) -> list[float]:
+    """How well a heliostat's photographs were forecast when they came, one image of each, the newest first."""
+    row = MeasurementRow
+    moment = func.coalesce(row.taken_at, row.created_at)
+    query = select(func.coalesce(row.external_id, row.identifier), row.kind, row.forecast_accuracy)
+    query = query.where(row.heliostat_id == heliostat, row.accepted, row.forecast_accuracy.is_not(None))
+    query = query.order_by(moment.desc(), row.id.desc()).limit(len(PREFERENCE) * (_NEWEST + _BEFORE))
+    shots: dict[str, tuple[int, float]] = {}
+    for name, kind, accuracy in session.execute(query):
+        shots[name] = min(shots.get(name, (len(PREFERENCE), 0.0)), (PREFERENCE.index(kind), accuracy or 0.0))
+    return [accuracy for _, accuracy in shots.values()]
+
+
+def note(
+    session: Session, measurement: MeasurementRow, surface: SurfaceRow, accuracy: float, settings: Settings
+) -> None:
     """Keep it as the heliostat's, unless that of a photograph that was taken later stands there.
 
-    Below ``least`` [1] it is poor, and has been since the first of those that came so in a row.
+    Below the settings' least it is poor, and has been since the first of those that came so in a row; where the newest
+    ones lie further below the earlier ones than the settings bear, it fell.
     """
     new = DriftRow(
         heliostat_id=measurement.heliostat_id,
@@ -306,11 +355,16 @@ def note(session: Session, measurement: MeasurementRow, surface: SurfaceRow, acc
         taken_at=measurement.taken_at or measurement.created_at,
         accuracy=accuracy,
     )
-    new.poor_since = new.taken_at if accuracy < least else None
+    new.poor_since = new.taken_at if accuracy < settings.attention_accuracy else None
+    fall = fall_of(_came_so(session, measurement.heliostat_id))
+    if fall is not None:
+        new.recent, new.earlier, new.least_drop = fall.recent, fall.earlier, fall.low
+        new.fell_since = new.taken_at if fall.low > settings.attention_accuracy_drop else None
     held = session.get(DriftRow, measurement.heliostat_id, with_for_update=True)
     if held is None and store.insert(session, new):
         return
     held = held or session.get_one(DriftRow, measurement.heliostat_id, with_for_update=True)
     if held.taken_at <= new.taken_at:
         new.poor_since = new.poor_since and (held.poor_since or new.poor_since)
+        new.fell_since = new.fell_since and (held.fell_since or new.fell_since)
         session.merge(new)

@@ -32,7 +32,9 @@ from service.twin.field import PATIENCE_S, Current, FieldBook, Line
 from service.twin.pointing_errors import Moved, Pointing
 from service.twin.runtime import Runtime
 
-Reason = Literal["queue", "camera", "clock", "moved", "pointing", "drift", "accuracy", "untrusted", "no_photograph"]
+Reason = Literal[
+    "queue", "camera", "clock", "moved", "pointing", "drift", "accuracy", "fell", "untrusted", "no_photograph"
+]
 
 REASONS: dict[Reason, str] = {
     "queue": "Queue stuck",
@@ -41,7 +43,8 @@ REASONS: dict[Reason, str] = {
     "moved": "Moved",
     "pointing": "Pointing error",
     "drift": "Drives drift",
-    "accuracy": "Forecasts poor",
+    "accuracy": "Newest forecast poor",
+    "fell": "Accuracy fell",
     "untrusted": "Surface not trusted",
     "no_photograph": "No photograph",
 }
@@ -53,7 +56,10 @@ _COUNT_HOLDS_S = 15.0
 
 @dataclass(frozen=True)
 class Item:
-    """Something that needs attention; of the plant where it names no heliostat."""
+    """Something that needs attention; of the plant where it names no heliostat.
+
+    ``photographs`` are measurements of the heliostat to look at.
+    """
 
     reason: Reason
     heliostat: str | None
@@ -63,6 +69,7 @@ class Item:
     mark: str
     acknowledged_by: str | None = None
     acknowledged_at: datetime | None = None
+    photographs: tuple[str, ...] = ()
 
     @property
     def id(self) -> str:
@@ -79,7 +86,8 @@ def needs_attention(session: Session, book: FieldBook, settings: Settings) -> tu
 def of_lines(session: Session, lines: Sequence[Line], settings: Settings) -> list[Item]:
     """The same of heliostats with their pointing errors."""
     at = now()
-    found = [*_queue(session, settings), *_camera(session), *_clock(session), *_accuracies(session, settings)]
+    found = [*_queue(session, settings), *_camera(session), *_clock(session)]
+    found += [*_accuracies(session, settings), *_falls(session, settings)]
     found += _without_photograph(session, timedelta(days=settings.attention_photograph_days), at)
     for line in lines:
         found += _of_heliostat(line, settings, at)
@@ -105,16 +113,18 @@ def _of_heliostat(line: Line, settings: Settings, at: datetime) -> Iterator[Item
 
 
 def _untrusted(name: str, surface: Current) -> Item:
-    since = surface.doubted_since or surface.valid_from
+    since, photographs = surface.doubted_since or surface.valid_from, tuple(surface.suspicious or ())
+    which = f"photographs {', '.join(photographs)}" if len(photographs) > 1 else f"photograph {''.join(photographs)}"
     return Item(
         "untrusted",
         name,
         since,
         "; ".join(surface.doubts or ()),
-        "look at the photographs that are named, exclude those that are wrong, and predict its surface anew",
+        f"look at {which if photographs else 'its photographs'}, exclude what is wrong, and predict its surface anew",
         since.isoformat(),
         surface.seen_by,
         surface.seen_at,
+        photographs,
     )
 
 
@@ -185,6 +195,20 @@ def _accuracies(session: Session, settings: Settings) -> Iterator[Item]:
         what = f"its newest photograph was forecast with an accuracy of {accuracy:.0%}, and {least:.0%} is the least"
         todo = "predict its surface anew; if that does not help, study the photographs"
         yield Item("accuracy", name, since, what, todo, _mark(since, (1 - accuracy) / max(1 - least, 1e-6)))
+
+
+def _falls(session: Session, settings: Settings) -> Iterator[Item]:
+    """Heliostats whose newest photographs were forecast worse than those before, each when it came."""
+    allowed = settings.attention_accuracy_drop
+    query = select(HeliostatRow.name, DriftRow).join(DriftRow, DriftRow.heliostat_id == HeliostatRow.id)
+    for name, row in session.execute(query.where(DriftRow.least_drop > allowed)):
+        since, drop = row.fell_since or row.taken_at, row.least_drop or 0.0
+        what = (
+            f"its newest photographs were forecast with an accuracy of {row.recent:.0%} in the median when they came, "
+            f"{row.earlier:.0%} before; by {drop:.0%} at least, and {allowed:.0%} is allowed"
+        )
+        todo = "look for what changed on its mirror, and predict its surface anew"
+        yield Item("fell", name, since, what, todo, _mark(since, drop / max(allowed, 1e-6)))
 
 
 # --- the plant --------------------------------------------------------------------------------------------------------

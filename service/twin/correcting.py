@@ -1,4 +1,4 @@
-"""Correcting what is known of a photograph, or excluding it: with a reason, its history kept."""
+"""Correcting what is known of a photograph, or excluding it, in all its images: with a reason, its history kept."""
 
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -12,8 +12,9 @@ from service.base.faults import ConflictError, GoneError
 from service.sources.photograph import Photograph
 from service.store import audit
 from service.store.columns import now
-from service.store.corrections import EXCLUDED, forget_drift
+from service.store.corrections import forget_drift
 from service.store.images import digest
+from service.store.measurements import EXCLUDED, images_of_shot
 from service.store.tables import CorrectionRow, MeasurementRow, TargetRow
 from service.twin.evidence import Twin, load_twin
 from service.twin.ingest import clock_of, measure_stored, row_of
@@ -46,25 +47,33 @@ class Changes:
 
 
 def correct(runtime: Runtime, heliostat: str, identifier: str, changes: Changes, actor: str) -> MeasurementRow:
-    """Correct or exclude a photograph; where it is another target, or another camera's, it is measured anew.
+    """Correct or exclude the photograph that an image shows; the image is returned, all kinds of it are changed.
+
+    Where it is another target, or another camera's, it is measured anew.
 
     Raises
     ------
     NotFoundError
         Where heliostat, measurement or target are not stored.
     ConflictError
-        Where nothing would change.
+        Where nothing would change, or another image of the photograph came meanwhile.
     GoneError
         Where it must be measured anew, and its image is kept no longer.
     """
     with runtime.database.reading() as session:
         twin = load_twin(session, heliostat)
-        row = store.get_measurement(session, twin.row, identifier)
-        target = row.target if changes.target_name is None else store.get_target(session, changes.target_name)
-    fresh = _fresh(runtime, twin, row, changes.of(row), target)
+        images = images_of_shot(session, store.get_measurement(session, twin.row, identifier))
+        named = None if changes.target_name is None else store.get_target(session, changes.target_name)
+    fresh = {
+        row.identifier: _fresh(runtime, twin, row, changes.of(row), named or row.target) for row in images.values()
+    }
     with runtime.database.writing() as session:
         row = store.get_measurement(session, store.get_heliostat(session, heliostat), identifier, arrays=True)
-        if not _keep(session, heliostat, row, fresh, changes, actor):
+        of_shot = {one.identifier: one for one in images_of_shot(session, row, arrays=True).values()}
+        if of_shot.keys() != fresh.keys():
+            raise ConflictError(f"measurement {identifier}: another image of it came meanwhile; correct it again")
+        kept = [_keep(session, heliostat, one, fresh[name], changes, actor) for name, one in of_shot.items()]
+        if not any(kept):
             raise ConflictError(f"measurement {identifier} stands so already; nothing was changed")
     return row
 

@@ -22,7 +22,7 @@ from service.base.progress import Progress, quiet
 from service.sources.decode import decode_image
 from service.sources.paint_documents import measurement_json, stac_catalog, stac_item, tower_json
 from service.sources.photograph import Photograph
-from service.store.corrections import EXCLUDED
+from service.store.measurements import EXCLUDED
 from service.store.models import declared_of, find_current
 from service.store.plant import receiver_cylinder
 from service.store.tables import HeliostatRow, MeasurementRow, SurfaceRow

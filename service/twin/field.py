@@ -86,6 +86,8 @@ class Current:
     doubted_since: datetime | None = None
     seen_by: str | None = None
     seen_at: datetime | None = None
+    suspicious: Sequence[str] | None = None
+    sun_span_deg: float | None = None
 
     @property
     def age_days(self) -> float | None:
@@ -150,6 +152,8 @@ def _current_surfaces(session: Session, heliostat: int | None) -> dict[int, Curr
         SurfaceRow.doubted_since,
         SurfaceRow.seen_by,
         SurfaceRow.seen_at,
+        SurfaceRow.suspicious,
+        SurfaceRow.sun_span_deg,
     )
     # The database picks them: a plant has many versions, and this is read at every refresh.
     query = query.join(ranked, ranked.c.id == SurfaceRow.id).where(ranked.c.place == 1)

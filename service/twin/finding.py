@@ -45,11 +45,15 @@ def _accuracy(line: Line) -> float | None:
     return None if line.rank is None or line.rank.accuracy is None else line.rank.accuracy * 100
 
 
+def _sun_span(line: Line) -> float | None:
+    return None if line.surface is None else line.surface.sun_span_deg
+
+
 def _pointing(line: Line) -> float | None:
     return None if line.pointing is None else line.pointing.error_mrad
 
 
-MetricName = Literal["deviation", "uncertainty", "misfit", "age", "accuracy", "pointing"]
+MetricName = Literal["deviation", "uncertainty", "misfit", "age", "accuracy", "pointing", "sun_span"]
 
 METRICS: dict[str, Metric] = {
     metric.name: metric
@@ -98,6 +102,16 @@ METRICS: dict[str, Metric] = {
             "before it last moved.",
             _pointing,
         ),
+        Metric(
+            "sun_span",
+            "Span of suns",
+            "°",
+            0,
+            "How far apart the suns of the photographs stood that the surface was made from: the largest angle. Beyond "
+            "it forecasts are less sure.",
+            _sun_span,
+            is_better_high=True,
+        ),
     )
 }
 
@@ -135,6 +149,7 @@ Column = Literal[
     "misfit",
     "age",
     "pointing",
+    "sun_span",
     "surface",
     "trusted",
     "photographs",

@@ -1,6 +1,7 @@
 """Loading a measurement folder into the store: ``heliotwin import DIR``. A second run changes nothing."""
 
 from collections import Counter
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any
 
@@ -26,15 +27,34 @@ UNREADABLE = (InvalidInputError, ImageRefusedError, ConflictError, TooLargeError
 """What one image may be refused for without ending the import."""
 
 
+@dataclass(eq=False)
+class Imported:
+    """How many of each were new, changed or there already, and what was skipped, with the reason."""
+
+    counts: Counter[str] = field(default_factory=Counter)
+    skipped: dict[str, str] = field(default_factory=dict)
+
+    def to_json(self) -> dict[str, Any]:
+        """Both, as reports have them."""
+        return {"counts": dict(sorted(self.counts.items())), "skipped": self.skipped}
+
+
 def import_folder(
-    runtime: Runtime, folder: MeasurementFolder, progress: Progress = quiet, actor: str = RESERVED
+    runtime: Runtime,
+    folder: MeasurementFolder,
+    progress: Progress = quiet,
+    actor: str = RESERVED,
+    made: Imported | None = None,
 ) -> dict[str, Any]:
     """Store the plant, its targets, and every heliostat with its images and measured surface, on behalf of ``actor``.
 
-    Returns how many of each were new, changed or there already; measurements without an image, and images and
-    measured surfaces that cannot be read, are listed with the reason.
+    Returns what was ``made``, which tells whoever gives it what was done until the import ended, however that was.
+    Skipped are measurements without an image, and images and measured surfaces that cannot be read.
     """
-    counts, skipped = _put_plant(runtime, folder, actor), dict[str, str]()
+    made = Imported() if made is None else made
+    counts, skipped = made.counts, made.skipped
+    skipped.update(folder.skipped)
+    counts.update(_put_plant(runtime, folder, actor))
     for name in folder.plant.heliostats:
         progress(name)
         try:
@@ -51,7 +71,7 @@ def import_folder(
                     counts[_put_image(runtime, folder, measurement, kind)] += 1
                 except UNREADABLE as error:
                     skipped[f"{measurement.key} {kind}"] = str(error)
-    return {"counts": dict(sorted(counts.items())), "skipped": {**folder.skipped, **skipped}}
+    return made.to_json()
 
 
 def _put_plant(runtime: Runtime, folder: MeasurementFolder, actor: str) -> Counter[str]:

@@ -81,7 +81,7 @@ def ingest(
         return known.measurement, False
     pixels, measured = measure_photograph(runtime, photograph, data, known.twin, known.plane)
     row = row_of(photograph, measured, known.target_id, clock_of(photograph, known.twin))
-    judged = _judge(runtime, known, row) if is_live else None
+    judged = row.forecast_accuracy = _judge(runtime, known, row) if is_live else None
     height, width = pixels.shape[:2]
     image = ImageRow(sha256=runtime.images.put(data), media_type=kind_of_file, size_bytes=len(data))
     image.width_px, image.height_px = width, height
@@ -89,8 +89,8 @@ def ingest(
         row, is_new = store.add_measurement(session, known.twin.row, image, row)
         if is_new and not runtime.images.path(image.sha256).is_file():
             runtime.images.put(data)  # it was given up before, and removed before its row was locked
-        if is_new and judged is not None and known.surface is not None:
-            accuracy.note(session, row, known.surface, judged, runtime.settings.attention_accuracy)
+        if is_new and row.accepted and judged is not None and known.surface is not None:
+            accuracy.note(session, row, known.surface, judged, runtime.settings)
     _count(row, is_new, judged)
     return row, is_new
 

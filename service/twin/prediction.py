@@ -82,7 +82,7 @@ def compute_surface(
         known = store.find_alike(session, twin.row, new)
     if known is not None or today is None or (new.valid_from is not None and new.valid_from < today.valid_from):
         return Predicted(twin, new, known)
-    return Predicted(twin, new, None, judge_surface(runtime, twin, today, surface.z, new.measurements))
+    return Predicted(twin, new, None, judge_surface(runtime, twin, today, new))
 
 
 def _chosen(operations: Operations, twin: Twin, rows: Sequence[MeasurementRow], images: int) -> list[Observation]:

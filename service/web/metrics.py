@@ -116,6 +116,9 @@ def _trust(lines: Sequence[Line], most: int) -> Iterator[Metric]:
     for moment, name, seen in sorted(doubted)[:most]:
         since.add_metric([name, seen], moment)
     yield since
+    spans = [(surface.sun_span_deg, name) for name, surface in surfaces]
+    about = "Largest angle between the suns of the photographs that the surface was made from [deg]; the smallest only."
+    yield _worst("heliotwin_heliostat_sun_span_degrees", about, spans, most, is_better_high=True)
 
 
 def _pointing(lines: Sequence[Line], most: int) -> Iterator[Metric]:
@@ -133,10 +136,13 @@ def _pointing(lines: Sequence[Line], most: int) -> Iterator[Metric]:
     yield _worst("heliotwin_heliostat_moved_seconds", about, moves, most)
 
 
-def _worst(name: str, about: str, told: Iterable[tuple[float | None, str]], most: int) -> Metric:
-    """A figure of heliostats, the largest first: a field of any size gives a bounded number of series."""
+def _worst(
+    name: str, about: str, told: Iterable[tuple[float | None, str]], most: int, is_better_high: bool = False
+) -> Metric:
+    """A figure of heliostats, the worst first: a field of any size gives a bounded number of series."""
     family = GaugeMetricFamily(name, about, labels=["heliostat"])
-    for value, heliostat in sorted(((value, of) for value, of in told if value is not None), reverse=True)[:most]:
+    known = sorted(((value, of) for value, of in told if value is not None), reverse=not is_better_high)
+    for value, heliostat in known[:most]:
         family.add_metric([heliostat], value)
     return family
 

@@ -2,7 +2,7 @@
 // is brought into view.
 "use strict";
 (() => {
-  const ways = { azimuth_deg: "position", elevation_deg: "position", moment: "time" };
+  const ways = { azimuth_deg: "position", elevation_deg: "position", moment: "time", sun_by: null };
 
   const tell = (form) => {
     const output = form.querySelector("[data-zone]"), moment = form.querySelector("[name=moment]").value;
@@ -16,10 +16,12 @@
   };
 
   document.addEventListener("input", (event) => {
-    const form = event.target.form, way = ways[event.target.name];
-    if (!form || !way) return;
+    const form = event.target.form;
+    if (!form || !(event.target.name in ways)) return;
+    const way = ways[event.target.name] || event.target.value;
     form.querySelector(`[name=sun_by][value=${way}]`).checked = true;
-    if (way === "time") tell(form);
+    if (way === "position") form.querySelector("[name=moment]").value = "";  // both at once are refused
+    tell(form);
   });
 
   document.addEventListener("htmx:afterSettle", (event) => {

@@ -1,6 +1,8 @@
 """The job `imports`: a measurement folder into the store."""
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from pydantic import Field
 
@@ -12,7 +14,7 @@ from service.base.settings import Settings
 from service.jobs.kind import Context, Kind, Result
 from service.sources.files import require_regular
 from service.sources.folder import read_folder
-from service.twin.importing import import_folder
+from service.twin.importing import Imported, import_folder
 
 
 class ImportIn(Model):
@@ -65,7 +67,21 @@ def import_allowed(context: Context, payload: ImportIn) -> Result:
     folder = read_folder(allowed_folder(allowed_root(context.runtime.settings), payload.folder))
     images = [len(item.images) for name in folder.plant.heliostats for item in folder.measurements(name, False)]
     steps = Steps(len(folder.plant.heliostats) + sum(images), context.report)
-    return Result(import_folder(context.runtime, folder, steps, context.created_by))
+    made = Imported()
+    with context.keeping("import", made.to_json):
+        return Result(import_folder(context.runtime, folder, steps, context.created_by, made))
 
 
-KIND = Kind("imports", ImportIn, import_allowed, "Load a measurement folder into the store.", require=_require_root)
+def _until_then(steps: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """What a cancelled import had done: it is one step."""
+    return next((dict(step) for step in steps.values()), {})
+
+
+KIND = Kind(
+    "imports",
+    ImportIn,
+    import_allowed,
+    "Load a measurement folder into the store.",
+    so_far=_until_then,
+    require=_require_root,
+)

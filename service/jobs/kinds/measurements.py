@@ -1,7 +1,7 @@
 """The job `measurements`: stored photographs measured anew, by today's cameras and as this version measures."""
 
-from collections import Counter
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 from pydantic import Field
@@ -33,7 +33,9 @@ def measure_many(context: Context, payload: MeasurementsIn) -> Result:
     for index, name in enumerate(names):
         context.report(index / len(names), name)
         if name not in done:
-            step = _measure_step(context, name, payload.reason, index / len(names))
+            step: dict[str, Any] = {"measured": 0, "changed": 0, "gone": 0, "skipped": {}}
+            with context.keeping(name, partial(dict, step)):
+                _measure_step(context, name, payload.reason, index / len(names), step)
             with context.runtime.database.writing() as session:
                 context.keep(session, name, step)
     made = counts(context.steps())
@@ -43,28 +45,27 @@ def measure_many(context: Context, payload: MeasurementsIn) -> Result:
 
 def counts(steps: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """How many photographs were measured, changed, or have no image any more; what was skipped, and why."""
-    total = {kind: sum(step.get(kind, 0) for step in steps.values()) for kind in ("measured", "changed", "gone")}
+    total = {kind: sum(step[kind] for step in steps.values()) for kind in ("measured", "changed", "gone")}
     return total | {"skipped": {name: why for step in steps.values() for name, why in step["skipped"].items()}}
 
 
-def _measure_step(context: Context, name: str, reason: str, progress: float) -> dict[str, Any]:
-    """What came of a heliostat's photographs."""
-    found, skipped = Counter[str](), dict[str, str]()
+def _measure_step(context: Context, name: str, reason: str, progress: float, step: dict[str, Any]) -> None:
+    """Measure a heliostat's photographs; what came of each is counted in ``step``."""
     try:
         with context.runtime.database.reading() as session:
             identifiers = store.list_identifiers(session, store.get_heliostat(session, name))
     except SKIPPED as error:
-        return {"skipped": {name: str(error)}}
+        step["skipped"][name] = str(error)
+        return
     for identifier in identifiers:
         context.report(progress, f"{name} {identifier}")
         try:
-            found["changed"] += measure_anew(context.runtime, name, identifier, reason, context.created_by)
-            found["measured"] += 1
+            step["changed"] += measure_anew(context.runtime, name, identifier, reason, context.created_by)
+            step["measured"] += 1
         except GoneError:
-            found["gone"] += 1
+            step["gone"] += 1
         except SKIPPED as error:
-            skipped[f"{name} {identifier}"] = str(error)
-    return {"skipped": skipped, **found}
+            step["skipped"][f"{name} {identifier}"] = str(error)
 
 
 KIND = Kind(

@@ -18,7 +18,7 @@ from service.twin.runtime import Runtime
 class PredictionsIn(Model):
     """Predict the surfaces of many heliostats, each from its newest accepted measurements.
 
-    A new surface becomes today's where it forecasts photographs no worse than the one that is.
+    A new surface becomes today's unless the one that is forecasts unseen photographs better, or is better founded.
     """
 
     heliostats: Heliostats = None

@@ -35,6 +35,7 @@ class AttentionOut(BaseModel):
     since: datetime
     what: str
     todo: str = Field(description="What to do.")
+    photographs: list[str] = Field(description="Ids of the heliostat's measurements to look at, where there are some.")
     acknowledged_by: str | None = Field(description="Name of the key; null where nobody has.")
     acknowledged_at: datetime | None
 

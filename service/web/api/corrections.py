@@ -95,7 +95,7 @@ def patch_measurement(
         CorrectionIn, Body(examples=[{"sun_azimuth": -41.2, "reason": "the clock was an hour ahead", "remake": True}])
     ],
 ) -> CorrectedOut:
-    """Correct what is known of a photograph, or exclude it; its history is kept.
+    """Correct what is known of a photograph, or exclude it, in all its images; its history is kept.
 
     With another target it is measured anew. What was made from it stays, and is named here; with `remake` a job makes
     the heliostat's surface anew.

@@ -36,6 +36,9 @@ class FieldLine(BaseModel):
     misfit: float | None = Field(description="What the surface leaves unexplained of its photographs [%].")
     age: float | None = Field(description="Of the surface [days].")
     pointing: float | None = Field(description="How far off light lands by the calibrated mount [mrad].")
+    sun_span: float | None = Field(
+        description="Largest angle between the suns of the photographs that the surface was made from [deg]."
+    )
     surface: int | None = Field(description="Version of today's surface.")
     source: Source | None
     trusted: bool | None = Field(description="Null for what is measured, or before surfaces were judged.")

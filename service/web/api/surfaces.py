@@ -266,7 +266,7 @@ def put_current_surface(
 
 @router.post("/undo", responses=problems(404, 409), dependencies=[OPERATE])
 def undo_decision(name: NamePath, runtime: RuntimeDep, identity: IdentityDep) -> DecisionOut:
-    """Take back the last decision: the surface that was today's before it is so again."""
+    """Take back the last decision that changed today's surface: the one before it is so again."""
     with runtime.database.writing() as session:
         return decision_out(decisions.undo(session, store.get_heliostat(session, name), identity.name))
 

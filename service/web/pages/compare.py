@@ -10,7 +10,7 @@ import numpy as np
 from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import HTMLResponse
 from pydantic import model_validator
-from sqlalchemy import select
+from sqlalchemy import func, select
 from sqlalchemy.orm import Session, undefer
 
 from model.errors import ModelError
@@ -43,7 +43,8 @@ _RESOLUTION = (128, 128)
 class CompareQuery(Model):
     """What is compared: a version each of one heliostat or two, under a sun on a target; ``since`` and ``until`` days.
 
-    Without versions they are today's and, of the same heliostat, the one before it.
+    Without versions they are today's and, of the same heliostat, the one that was made before it; or, where today's is
+    the first, the newest.
     """
 
     heliostat: Name | None = None
@@ -107,20 +108,15 @@ _MOST_VERSIONS = 40
 _MOST_MOUNTS = 40
 
 
-def _side(session: Session, name: str, version: int | None, before: SurfaceRow | None = None) -> Side:
-    """A heliostat's surface of this version, else today's; of those but ``before`` the newest, where that is given."""
+def _side(session: Session, name: str, version: int | None) -> Side:
+    """A heliostat's surface of this version, else today's."""
     heliostat = store.get_heliostat(session, name)
     query = select(SurfaceRow).where(SurfaceRow.heliostat_id == heliostat.id).options(undefer(SurfaceRow.arrays))
     versions = list(session.scalars(query.order_by(SurfaceRow.version.desc()).limit(_MOST_VERSIONS)))
-    if version is not None:
-        surface = store.get_surface(session, heliostat, version)
-    elif before is None:
+    if version is None:
         surface = store.get_surface_at(session, heliostat)
     else:
-        others = [row for row in versions if row.id != before.id]
-        if not others:
-            raise NotFoundError(f"heliostat {name} has one surface only; name another heliostat")
-        surface = others[0]
+        surface = store.get_surface(session, heliostat, version)
     made = mounts.list_mounts(session, heliostat, _MOST_MOUNTS)
     return Side(heliostat, surface, versions[::-1], made, unpack(surface.arrays)["z"].astype(np.float64))
 
@@ -128,10 +124,17 @@ def _side(session: Session, name: str, version: int | None, before: SurfaceRow |
 def _sides(session: Session, query: CompareQuery) -> tuple[Side, Side]:
     """The two; where versions are not said, the newer one comes second."""
     assert query.heliostat is not None
-    if query.other is None or query.other == query.heliostat:
-        second = _side(session, query.heliostat, query.other_version)
-        return _side(session, query.heliostat, query.version, second.surface), second
-    return _side(session, query.heliostat, query.version), _side(session, query.other, query.other_version)
+    second = _side(session, query.other or query.heliostat, query.other_version)
+    if query.version is not None or second.heliostat.name != query.heliostat:
+        return _side(session, query.heliostat, query.version), second
+    of_heliostat = select(func.max(SurfaceRow.version)).where(SurfaceRow.heliostat_id == second.heliostat.id)
+    before = session.scalar(of_heliostat.where(SurfaceRow.version < second.surface.version))
+    if before is not None:
+        return _side(session, query.heliostat, before), second
+    after = session.scalar(of_heliostat.where(SurfaceRow.version > second.surface.version))
+    if after is None:
+        raise NotFoundError(f"heliostat {query.heliostat} has one surface only; name another heliostat")
+    return second, _side(session, query.heliostat, after)
 
 
 # --- maps -------------------------------------------------------------------------------------------------------------

@@ -65,6 +65,8 @@ class ForecastForm(Model):
     def _says_when_or_where(self) -> Self:
         if self.sun_by == "time" and self.moment is None:
             raise ValueError("moment: say when")
+        if self.sun_by == "position" and self.moment is not None:
+            raise ValueError("moment: a time and a position are both given; choose by the time, or empty the time")
         if self.sun_by == "position" and (self.azimuth_deg is None or self.elevation_deg is None):
             raise ValueError("azimuth_deg, elevation_deg: say where the sun stands")
         return self
@@ -129,7 +131,7 @@ def _recent(session: Session) -> list[Made]:
 def _filled(**known: Any) -> dict[str, Any]:
     """What stands in the form: what is ``known``, and else what is likely."""
     likely = {"target": None, "surface": "current", "dni_w_m2": 1000.0}
-    return {**likely, "sun_by": "position", "moment": now().replace(second=0), **known}
+    return {**likely, "sun_by": "position", "moment": None, **known}
 
 
 @router.get("/forecast/heliostats", dependencies=[READ])
@@ -233,7 +235,7 @@ def get_forecast_page(
         sun_by="position" if row.sun_at is None else "time",
         azimuth_deg=round(row.sun_azimuth_deg, 3),
         elevation_deg=round(row.sun_elevation_deg, 3),
-        moment=row.sun_at or now(),
+        moment=row.sun_at,
         surface="ideal" if row.surface is None else "current",
         dni_w_m2=row.dni_w_m2,
     )

@@ -172,6 +172,7 @@ class _Read:
     surface: SurfaceRow | None
     surfaces: list[SurfaceRow]
     decided: Sequence[DecisionRow]
+    undoable: DecisionRow | None
     shots: list[Shot]
     verdict: PhotographVerdict | None
     mount: MountRow | None
@@ -195,6 +196,7 @@ def _read(
         surface = today if version is None else store.get_surface(session, row, version)
         surfaces = _newest_surfaces(session, row)
         decided = decisions.list_decisions(session, row, _MOST_DECISIONS)
+        undoable = decisions.find_undoable(session, row)
         shots = list_shots(session, row, _MOST_PHOTOGRAPHS, photographs)
         mount = mounts.find_mount_at(session, row)
         shown, (line,) = book.read(session, row, surface), read_lines(session, row.id)
@@ -202,7 +204,7 @@ def _read(
     compared = Compared() if shown is None else book.wait_for(shown) or _UNDER_WAY
     line = field.with_pointing(line)
     best = None if line.pointing is None else best_slot(runtime, name)
-    return _Read(row, today, surface, surfaces, decided, shots, photographs, mount, line, best, compared)
+    return _Read(row, today, surface, surfaces, decided, undoable, shots, photographs, mount, line, best, compared)
 
 
 @router.get("/heliostats/{name}")
@@ -218,6 +220,7 @@ def get_heliostat_page(request: Request, read: Annotated[_Read, Depends(_read)],
         today=read.today,
         versions=listed,
         decided=read.decided,
+        undoable=read.undoable,
         histories=_histories(listed) if listed else [],
         comparisons=comparison_figures(comparisons),
         trouble=read.compared.trouble,

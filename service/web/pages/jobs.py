@@ -1,5 +1,6 @@
 """Jobs: what is under way, what became of the rest, and the buttons that start and stop them."""
 
+from datetime import datetime
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Form, Path, Query, Request, Response
@@ -78,12 +79,40 @@ def _plain(value: Any) -> bool:
     return isinstance(value, str | int | float | bool)
 
 
-def _asked(payload: dict[str, Any]) -> dict[str, Any]:
-    """What was asked, long lists by their length."""
-    given = {name: value for name, value in payload.items() if value not in (None, {}, [])}
-    long = {name: len(value) for name, value in given.items() if isinstance(value, list | dict) and len(value) > _SHOWN}
-    short = {name: in_words(value) for name, value in given.items() if name not in long}
-    return short | {name: f"{count} entries" for name, count in long.items()}
+# What fields are called whose names do not say it, and the units that names end in.
+_LABELS = {
+    "dni_w_m2": "direct normal irradiance",
+    "neighbours": "mirrors shade and block each other",
+    "model_version": "version of the model",
+    "aim_point": "aim point, east, north, up [m]",
+    "aim_points": "aim points, east, north, up [m]",
+    "aim_offsets": "aims, right and up of the middle [m]",
+    "images": "photographs of each heliostat",
+}
+_UNITS = {"_w_m2": "\N{NO-BREAK SPACE}W/m²", "_deg": "°", "_minutes": "\N{NO-BREAK SPACE}min"}
+
+
+def _told(name: str, value: Any) -> tuple[str, str]:
+    """A field of what was asked as a person says it: what it is, and its value with its unit."""
+    ending = next((ending for ending in _UNITS if name.endswith(ending)), "")
+    label = _LABELS.get(name, name.removesuffix(ending).replace("_", " "))
+    if isinstance(value, list | dict) and len(value) > _SHOWN:
+        return label, f"{len(value)} entries"
+    if name == "resolution":
+        return label, f"{' × '.join(map(str, value))} pixels"
+    if isinstance(value, dict):
+        return label, ", ".join(" ".join(_told(inner, of)) for inner, of in value.items())
+    if isinstance(value, list):
+        return label, ", ".join(_told("", one)[1] for one in value)
+    if name in ("at", "begin", "end"):
+        return label, f"{datetime.fromisoformat(value):%Y-%m-%d %H:%M UTC}"
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return label, f"{value:.10g}{_UNITS.get(ending, '')}" if is_number else in_words(value)
+
+
+def _asked(payload: dict[str, Any]) -> dict[str, str]:
+    """What was asked, in words and with units, long lists by their length."""
+    return dict(_told(name, value) for name, value in payload.items() if value not in (None, {}, []))
 
 
 @router.get("/jobs/{number}", dependencies=[READ, DRAWS])
@@ -106,8 +135,9 @@ def get_job_page(number: Number, request: Request, runtime: RuntimeDep, kinds: K
         is_live=is_live,
         asked=asked,
         flux=flux,
+        has_changed=any(result.values()),
         light=result if row.kind == "forecasts" and "peak_w_m2" in result else None,
-        target=asked.get("target") if asked else None,
+        target=row.payload.get("target") if asked else None,
         facts={name: value for name, value in result.items() if _plain(value)},
         counts=result.get("counts", {}),
         surfaces=result.get("surfaces", {}),

@@ -14,9 +14,10 @@ from service import store
 from service.base.faults import NotFoundError, ServiceError
 from service.base.fields import AZIMUTH, ELEVATION, FormMoment, Model, Name
 from service.drawing.pictures import photograph_picture
-from service.store.corrections import EXCLUDED, list_corrections, made_from
-from service.store.measurements import images_of_shot
-from service.store.tables import MeasurementRow, TargetRow
+from service.drawing.templates import in_words
+from service.store.corrections import list_corrections, made_from
+from service.store.measurements import EXCLUDED, images_of_shot
+from service.store.tables import CorrectionRow, MeasurementRow, TargetRow
 from service.twin.correcting import Changes, correct
 from service.twin.runtime import Runtime
 from service.twin.viewing import compare_one, look_at, pixels_of
@@ -51,6 +52,22 @@ class CorrectionForm(Model):
     taken_at: FormMoment | None = None
     excluded: bool = False
     remake: bool = False
+
+
+def told(correction: CorrectionRow) -> list[str]:
+    """What a correction changed, in words."""
+    said = []
+    for field, value in correction.after.items():
+        if field == "excluded":
+            said.append("excluded" if value else "no longer excluded")
+        elif field == "flux":
+            said.append("its light was measured anew")
+        else:
+            before, after = (
+                "not told" if known is None else in_words(known) for known in (correction.before[field], value)
+            )
+            said.append(f"{field.replace('_', ' ')}: {before} → {after}")
+    return said
 
 
 # Longest sides of a thumbnail and of what is shown larger [px]: the file itself has them all.
@@ -126,7 +143,7 @@ def get_photograph_page(
         comparisons=comparison_figures(compared),
         trouble=trouble,
         is_excluded=row.reason == EXCLUDED,
-        corrections=corrections,
+        corrections=[(row, told(row)) for row in corrections],
         made=made,
         targets=targets,
     )

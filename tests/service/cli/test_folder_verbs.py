@@ -243,6 +243,7 @@ def test_forecast_for_a_sun_and_a_plane_needs_no_photographs(made_plant, tmp_pat
         (("--target", "calibration_target"), "--sun, --at: give one"),
         (("--sun", 0, 95, "--target", "calibration_target"), "--sun: elevation_deg"),
         (("--at", "2026-06-21T00:00", "--target", "calibration_target"), "--at: the sun is"),
+        (("--at", "0001-06-21T11:30", "--target", "calibration_target"), "--at: give a year from 1970 on"),
         (("--sun", 0, 45, "--target", "nowhere"), "--target: there is no target nowhere; known: calibration_target"),
         (("--sun", 0, 45, "--target", "calibration_target", "--heliostat", "ZZ"), "--heliostat: there is no"),
     ],

@@ -5,6 +5,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, get_args
 
+import numpy as np
 import pytest
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
@@ -16,6 +17,7 @@ from service.store import keys, queue
 from service.store.columns import now
 from service.store.job_tables import AuditRow, JobRow
 from service.store.tables import DriftRow, HeliostatRow, MeasurementRow
+from service.twin.accuracy import fall_of
 from service.twin.attention import REASONS, Reason
 from service.web.app import create_app
 from tests.service.conftest import (
@@ -134,6 +136,59 @@ def test_poor_forecasts_until_one_is_good_again(blind: TestClient):
     assert returned["acknowledged_by"] is None
     with runtime.database.reading() as session:
         assert session.scalars(select(DriftRow.poor_since)).one() == datetime.fromisoformat(returned["since"])
+
+
+class Worn(FakeOperations):
+    """Forecasts with an accuracy of ``accuracy`` [1]."""
+
+    accuracy = 0.95
+
+    def render(self, *arguments: Any, **options: Any) -> Any:
+        shown = super().render(*arguments, **options)
+        elsewhere = np.zeros_like(shown)
+        elsewhere[..., 0, 0] = shown.sum(axis=(-2, -1))
+        share = (1 - self.accuracy) / 2  # it is missed where it is, and too much where it is not
+        return (1 - share) * shown + share * elsewhere
+
+
+def test_accuracy_that_fell_above_the_least(tmp_path: Path):
+    """From 95 to 80 %: no photograph is poor, and yet the mirror changed."""
+    operations = Worn()
+    with client_of(create_app(Settings(data_dir=tmp_path, **QUIET), operations)) as client:
+        client.put("/v1/plant", json=tower_document())
+        client.put("/v1/heliostats/AA39", json=properties_document())
+        post = poster(client)
+        post(png(1), id="1")
+        client.post("/v1/heliostats/AA39/surfaces", json={"method": "network"})
+        for number in range(2, 20):
+            operations.accuracy = (0.95 if number < 15 else 0.80) + 0.01 * (number % 3)
+            post(png(number), id=str(number))
+        (item,) = items(client)
+        assert item["reason"] == "fell"
+        assert "with an accuracy of 81% in the median when they came, 96% before" in item["what"]
+        assert "Accuracy fell" in client.get("/attention", headers=HTML).text
+        # A photograph that was excluded says nothing of the mirror.
+        for number in range(15, 20):
+            path = f"/v1/heliostats/AA39/measurements/{number}"
+            assert client.patch(path, json={"reason": "a cloud", "excluded": True}).status_code == 200
+        operations.accuracy = 0.95
+        post(png(20), id="20")
+        assert items(client) == []
+
+
+@pytest.mark.parametrize(
+    ("newest", "before", "fell"),
+    [
+        ([0.80, 0.81, 0.79, 0.80, 0.82], [0.95, 0.94, 0.96] * 4, True),
+        ([0.80, 0.81, 0.79, 0.80, 0.82], [0.95, 0.94, 0.96], None),  # too few before
+        ([0.93, 0.80, 0.95, 0.94, 0.93], [0.95, 0.94, 0.96] * 4, False),  # one alone
+        ([0.80, 0.95, 0.70, 0.90, 0.85], [0.95, 0.70, 0.85, 0.80, 0.90] * 4, False),  # they scatter so
+        ([0.95] * 5, [0.80] * 12, False),
+    ],
+)
+def test_a_fall_is_more_than_chance(newest: list[float], before: list[float], fell: bool | None):
+    fall = fall_of([*newest, *before])
+    assert (None if fall is None else fall.low > 0.05) is fell
 
 
 def test_doubts_are_acknowledged_once_on_either_page(tmp_path: Path):

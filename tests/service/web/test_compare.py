@@ -56,6 +56,17 @@ def test_versions_stand_side_by_side_with_what_they_forecast(pages: TestClient, 
     assert re.search(r'Forecast accuracy</th>(<td class="number">100\.0\s*%</td>){2}', page)
 
 
+def test_todays_stands_beside_the_one_before_it(pages: TestClient):
+    """Whatever waits aside is newer, and would turn the difference round."""
+    assert pages.post("/v1/heliostats/AA39/surfaces", json={"measurements": ["103"]}).status_code == 201
+    for todays, pair in ((2, (1, 2)), (1, (1, 3))):
+        choice = {"version": todays, "reason": "it stays"}
+        assert pages.put("/v1/heliostats/AA39/surfaces/current", json=choice).status_code == 200
+        page = settled(pages, "/compare?heliostat=AA39")
+        assert f"AA39, version {pair[0]} with AA39, version {pair[1]}" in page
+    assert "version 2 with AA39, version 3" in settled(pages, "/compare?heliostat=AA39&other_version=3")
+
+
 def test_time_range_of_the_link_bounds_what_is_shown(pages: TestClient):
     def dots(path: str) -> int:
         charts = settled(pages, path).partition("Over time")[2]

@@ -81,6 +81,34 @@ def test_excluded_photograph_is_not_used(known: TestClient):
     assert known.get(f"{BASE}/1/flux").status_code == 200
 
 
+def test_correction_is_of_the_photograph_in_all_its_images(known: TestClient, post: Post):
+    """Else the next prediction would use the same photograph as another kind of image shows it."""
+    for seed, kind in ((3, "flux-centered"), (4, "cropped")):
+        assert post(png(seed, refused=kind == "cropped"), id="1", kind=kind, sun_azimuth=20.0).status_code == 201
+    siblings = ("1", "1-flux-centered", "1-cropped")
+    # Asked of an image that nothing was made from.
+    body = known.patch(
+        f"{BASE}/1-flux-centered", json={"reason": "clock", "sun_azimuth": 30.0, "excluded": True}
+    ).json()
+    assert (body["measurement"]["id"], body["surfaces"]) == ("1-flux-centered", [1])
+    for identifier in siblings:
+        row = known.get(f"{BASE}/{identifier}").json()
+        assert (row["sun_azimuth"], row["accepted"], row["reason"]) == (30.0, False, "excluded")
+        (kept,) = known.get(f"{BASE}/{identifier}/corrections").json()
+        assert kept["before"] == {"sun_azimuth": 20.0, "excluded": False}
+    assert known.post("/v1/heliostats/AA39/surfaces", json={}).json()["measurements"] == ["2"]
+    excluded = known.get("/heliostats/AA39?photographs=excluded", headers=HTML).text
+    assert "/heliostats/AA39/photographs/1" in excluded
+    assert "/heliostats/AA39/photographs/2" not in excluded
+    # An image of it that comes later is excluded too.
+    late = post(png(5), id="1", kind="raw", sun_azimuth=30.0).json()
+    assert (late["accepted"], late["reason"]) == (False, "excluded")
+    assert patch(known, excluded=False).status_code == 200
+    accepted = {name: known.get(f"{BASE}/{name}").json()["accepted"] for name in (*siblings, "1-raw")}
+    assert accepted == {"1": True, "1-flux-centered": True, "1-cropped": False, "1-raw": True}
+    assert known.get(f"{BASE}/1-cropped").json()["reason"] == "no_spot"
+
+
 def test_what_was_made_from_it_is_made_anew_on_request(known: TestClient):
     job = patch(known, sun_azimuth=30.0, remake=True).json()["job"]
     asked = known.get(f"/v1/jobs/{job}").json()
@@ -122,3 +150,6 @@ def test_page_corrects_and_excludes(known: TestClient):
     answer = known.post(path, data=form, headers=HTML, follow_redirects=False)
     assert answer.headers["Location"] == "/jobs/1"
     assert "excluded" in known.get("/heliostats/AA39", headers=HTML).text
+    history = known.get(path, headers=HTML).text
+    assert "<td>excluded</td>" in history
+    assert "True" not in history

@@ -3,6 +3,7 @@
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -31,10 +32,12 @@ class Mirrors(FakeOperations):
     def __init__(self) -> None:
         super().__init__()
         self.bends = {"network": 2.0, "refined": 1.0}
+        self.doubts: tuple[str, ...] = ()
 
     def predict(self, heliostat: Heliostat, *rest: Any, **more: Any) -> SurfacePrediction:
         made = super().predict(heliostat, *rest, **more)
-        return replace(made, z=np.full((4, 8, 8), self.bends[made.method] / 1e3))
+        z = np.full((4, 8, 8), self.bends[made.method] / 1e3)
+        return replace(made, z=z, doubts=self.doubts)
 
     def render(self, heliostat: Heliostat, observations: list[Observation], z: Any, *rest: Any, **more: Any) -> Any:
         right = super().render(heliostat, observations, z, *rest, **more)
@@ -54,10 +57,15 @@ def client(tmp_path: Path, mirrors: Mirrors) -> Iterator[TestClient]:
     with client_of(create_app(Settings(data_dir=tmp_path, **QUIET), mirrors)) as client:
         client.put("/v1/plant", json=tower_document())
         client.put("/v1/heliostats/AA39", json=properties_document())
-        post = poster(client)
-        for number in range(3):
-            post(png(number), id=str(number), sun_azimuth=10.0 * number, taken_at=f"2024-05-0{number + 1}T10:00:00Z")
+        photograph(client, 0, 1, 2)
         yield client
+
+
+def photograph(client: TestClient, *numbers: int) -> None:
+    """Post photographs of these numbers, each on its day of May."""
+    for number in numbers:
+        told = {"id": str(number), "sun_azimuth": 10.0 * number, "taken_at": f"2024-05-0{number + 1}T10:00:00Z"}
+        assert poster(client)(png(number), **told).status_code == 201
 
 
 def predict(client: TestClient, method: str, *measurements: str) -> Any:
@@ -78,7 +86,8 @@ def test_worse_surface_waits_aside(client: TestClient):
     assert (decision["version"], decision["taken"], decision["previous"]) == (2, False, 1)
     assert decision["accuracy_before"] == pytest.approx(0.9, abs=0.01)
     assert decision["accuracy_after"] == pytest.approx(0.8, abs=0.01)
-    assert "forecasts worse than version 1" in decision["reason"]
+    assert "photographs that neither has seen: 0," in decision["reason"]
+    assert "version 1 is refined, this one is the network's alone" in decision["reason"]
 
 
 def test_better_surface_becomes_todays_and_is_taken_back(client: TestClient):
@@ -91,6 +100,31 @@ def test_better_surface_becomes_todays_and_is_taken_back(client: TestClient):
     assert client.post(f"{BASE}/undo").status_code == 200  # undone again it is as it was
     assert current(client) == 2
     assert client.get(f"{BASE}/2").json()["set_aside"] is False
+
+
+def test_undo_is_of_the_last_decision_that_changed_todays(client: TestClient, mirrors: Mirrors):
+    """Not of what was set aside since, which changed nothing."""
+    predict(client, "network")
+    predict(client, "refined")
+    mirrors.bends["network"] = 3.0
+    assert predict(client, "network")["set_aside"] is True
+    client.put(f"{BASE}/current", json={"version": 2, "reason": "it stays"})  # nor of what left it in its place
+    assert "Undo: back to version 1" in page_of(client, "/heliostats/AA39")
+    undone = client.post(f"{BASE}/undo")
+    assert (undone.status_code, undone.json()["previous"], current(client)) == (200, 2, 1)
+    assert "Undo: back to version 2" in page_of(client, "/heliostats/AA39")
+    assert client.get(f"{BASE}/3").json()["set_aside"] is True
+
+
+def test_what_came_since_is_not_undone(client: TestClient):
+    """A surface that was measured is today's without a decision: no earlier decision says what was before it."""
+    predict(client, "network")
+    predict(client, "refined")
+    measure(client, 4e-3)
+    assert current(client) == 3
+    assert client.post(f"{BASE}/undo").status_code == 409
+    assert "Undo: back" not in page_of(client, "/heliostats/AA39")
+    assert current(client) == 3
 
 
 def test_somebody_decides_otherwise(client: TestClient):
@@ -115,27 +149,45 @@ def test_nothing_to_undo(client: TestClient):
     assert "choose a version" in answer.json()["detail"]
 
 
-def test_photographs_that_neither_has_seen_judge(client: TestClient):
-    predict(client, "network", "0", "2")
-    predict(client, "refined", "2")
+def test_photographs_that_neither_has_seen_judge(client: TestClient, mirrors: Mirrors):
+    photograph(client, 3, 4, 5, 6)
+    predict(client, "refined", "0")
+    mirrors.bends["network"] = 0.0
+    predict(client, "network", "1")
     (decision,) = client.get(f"{BASE}/decisions").json()
-    assert (decision["photographs"], decision["taken"]) == (1, True)
-    assert "that neither has seen" in decision["reason"]
+    assert (decision["photographs"], decision["taken"]) == (5, True)
+    assert "forecasts better than version 1 on 5 photographs that neither has seen, by" in decision["reason"]
 
 
-def test_measured_surface_stays_unless_an_unseen_photograph_speaks(client: TestClient):
-    app: Any = client.app
-    with app.state.runtime.database.writing() as session:
-        z = np.full((4, 8, 8), 5e-3)
-        heliostat = store.get_heliostat(session, "AA39")
-        store.add_surface(session, heliostat, store.NewSurface("measured", z, 0 * z, np.stack([z] * 3, -1)))
-    with app.state.runtime.database.writing() as session:
-        measured = store.find_surface_at(session, store.get_heliostat(session, "AA39"))
-        measured.valid_from = measured.valid_from.replace(year=1970)
-    assert predict(client, "refined")["set_aside"] is True  # it has seen all
-    assert "was measured" in client.get(f"{BASE}/decisions").json()[0]["reason"]
+def test_a_few_unseen_photographs_judge_nothing(client: TestClient, mirrors: Mirrors):
+    """One alone would have put the network's surface in the refined one's place."""
+    predict(client, "refined", "0")
+    mirrors.bends["network"] = 0.0
+    assert predict(client, "network", "1")["set_aside"] is True
+    reason = client.get(f"{BASE}/decisions").json()[0]["reason"]
+    assert "photographs that neither has seen: 1, to judge takes 5" in reason
+
+
+def test_surface_of_corrected_photographs_gives_way(client: TestClient):
+    """What was made anew of the same photographs takes its place, however well the wrong one forecasts them."""
+    predict(client, "refined")
+    told = {"reason": "the clock was wrong", "sun_azimuth": 59.0}
+    assert client.patch("/v1/heliostats/AA39/measurements/2", json=told).status_code == 200
+    assert predict(client, "network")["set_aside"] is False
+    assert "corrected since" in client.get(f"{BASE}/decisions").json()[0]["reason"]
+
+
+def test_measured_surface_stays_unless_unseen_photographs_speak(client: TestClient, mirrors: Mirrors):
+    photograph(client, 3, 4, 5, 6)
+    measure(client, 5e-3, datetime(1970, 1, 1, tzinfo=UTC))
+    assert predict(client, "refined")["set_aside"] is True  # four are left that it has not seen
+    assert "version 1 was measured" in client.get(f"{BASE}/decisions").json()[0]["reason"]
+    mirrors.doubts = ("a facet sends no light",)
+    assert predict(client, "refined", "5")["set_aside"] is True
+    assert "only somebody puts it in its place" in client.get(f"{BASE}/decisions").json()[0]["reason"]
+    mirrors.doubts = ()
     assert predict(client, "refined", "2")["set_aside"] is False
-    assert current(client) == 3
+    assert current(client) == 4
 
 
 def test_nothing_new_makes_no_version(client: TestClient):
@@ -152,6 +204,15 @@ def test_surface_of_earlier_photographs_is_history(client: TestClient):
     assert predict(client, "refined", "0")["set_aside"] is False
     assert current(client) == 1
     assert client.get(f"{BASE}/decisions").json() == []
+
+
+def measure(client: TestClient, bend_m: float, valid_from: datetime | None = None) -> None:
+    """Store a surface that was measured: it bends by so much."""
+    app: Any = client.app
+    with app.state.runtime.database.writing() as session:
+        z = np.full((4, 8, 8), bend_m)
+        new = store.NewSurface("measured", z, 0 * z, np.stack([z] * 3, -1), valid_from)
+        store.add_surface(session, store.get_heliostat(session, "AA39"), new)
 
 
 def page_of(client: TestClient, path: str) -> str:

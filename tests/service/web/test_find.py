@@ -165,6 +165,7 @@ def test_rest_has_the_same_field(large: TestClient):
         "deviation": pytest.approx(0.24),
         "uncertainty": None,
         "misfit": None,
+        "sun_span": 40.0,
         "age": pytest.approx(0, abs=1),
         "pointing": None,
         "surface": 1,

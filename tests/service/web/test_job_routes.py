@@ -28,6 +28,7 @@ from service.store.columns import now
 from service.store.images import digest
 from service.store.job_tables import JobRow
 from service.store.tables import ImageRow
+from service.twin import importing
 from service.web.app import create_app
 from tests.service.conftest import QUIET, FakeOperations, Post, client_of, png, serving, until
 from tests.service.job_kinds import TEST_KINDS
@@ -154,6 +155,53 @@ def test_photographs_are_measured_anew(
     assert client.get(f"{path}/2/corrections").json() == []
     nobody = finish(client, client.post("/v1/jobs/measurements", json={"heliostats": ["ZZ99"]}))
     assert (nobody["state"], "ZZ99" in nobody["reason"]) == ("failed", True)
+
+
+def test_cancelled_measuring_says_what_it_changed(
+    client: TestClient, operations: FakeOperations, post: Post, monkeypatch: pytest.MonkeyPatch
+):
+    """Also of the heliostat that it was at: its first photograph is changed for good."""
+    monkeypatch.setattr("service.jobs.kind._REPORT_EVERY_S", 0.0)
+    for number in (1, 2):
+        assert post(png(number), id=str(number)).status_code == 201
+    measure = operations.measure
+
+    def cancelling(*arguments: Any, **options: Any) -> Any:
+        newest = client.get("/v1/jobs").json()["items"][0]["id"]
+        client.post(f"/v1/jobs/{newest}/cancel")
+        taken = measure(*arguments, **options)
+        return replace(taken, center_of_mass=np.zeros(2), flux=2 * taken.flux)
+
+    monkeypatch.setattr(operations, "measure", cancelling)
+    job = finish(client, client.post("/v1/jobs/measurements", json={}))
+    assert (job["state"], job["result"]) == ("cancelled", {"measured": 1, "changed": 1, "gone": 0, "skipped": {}})
+    page = client.get(f"/jobs/{job['id']}", headers={"Accept": "text/html"}).text
+    assert "What it had changed until then" in page
+    assert "<dt>Changed</dt>" in page
+
+
+def test_cancelled_import_says_what_it_stored(
+    bare: TestClient, settings: Settings, tower: Any, properties: Any, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("service.jobs.kind._REPORT_EVERY_S", 0.0)
+    assert settings.import_root is not None
+    (settings.import_root / "WRI1030197-tower-measurements.json").write_text(json.dumps(tower))
+    for name in ("AA39", "AB01"):
+        (settings.import_root / name / "Properties").mkdir(parents=True)
+        document = settings.import_root / name / "Properties" / f"{name}-heliostat-properties.json"
+        document.write_text(json.dumps(properties))
+    put = importing._put_heliostat
+
+    def cancelling(*arguments: Any) -> Any:
+        newest = bare.get("/v1/jobs").json()["items"][0]["id"]
+        bare.post(f"/v1/jobs/{newest}/cancel")
+        return put(*arguments)
+
+    monkeypatch.setattr(importing, "_put_heliostat", cancelling)
+    job = finish(bare, bare.post("/v1/jobs/imports", json={"folder": "."}))
+    assert (job["state"], job["result"]["counts"]["heliostats new"]) == ("cancelled", 1)
+    page = bare.get(f"/jobs/{job['id']}", headers={"Accept": "text/html"}).text
+    assert "<dt>heliostats new</dt><dd>1</dd>" in page
 
 
 def test_fleet_forecast_is_the_sum_of_its_heliostats(client: TestClient, properties: Any):

@@ -212,7 +212,7 @@ def test_field_shows_every_figure_as_colour_and_as_number(shown: TestClient, met
 def test_surface_made_from_all_photographs_is_not_yet_judged(pages: TestClient):
     """What it was made from proves nothing of it."""
     assert 'data-told="not yet judged"' not in settled(pages)
-    pages.post("/v1/heliostats/AA39/surfaces", json={"images": 2})
+    pages.post("/v1/heliostats/AA39/surfaces", json={"method": "refined", "images": 2})
     page = settled(pages)
     assert 'data-names="AA39" data-told="not yet judged"' in page
     assert '<small class="short">not yet judged</small>' in page
@@ -243,7 +243,8 @@ def test_accuracy_is_worked_out_once_for_each_surface(pages: TestClient, operati
     assert rendered > 0
     settled(pages)
     assert operations.rendered == rendered
-    assert pages.post("/v1/heliostats/AA39/surfaces", json={"measurements": ["102"]}).status_code == 201
+    wanted = {"method": "refined", "measurements": ["102"]}
+    assert pages.post("/v1/heliostats/AA39/surfaces", json=wanted).status_code == 201
     settled(pages)
     assert operations.rendered == rendered + 3  # both surfaces to judge the new one, then today's
 
@@ -315,6 +316,7 @@ def test_forecast_page_keeps_what_was_asked(pages: TestClient):
     assert "2026-06-21 11:36 UTC" in page
     by_position = text_of(pages, "/forecasts/1")
     assert 'value="position" checked' in by_position
+    assert field_of(by_position, "moment") == ""  # what stands there is what was asked
     assert (field_of(by_position, "azimuth_deg"), field_of(by_position, "elevation_deg")) == ("-20.0", "45.0")
 
 
@@ -332,8 +334,12 @@ def test_times_are_told_by_the_plants_clocks_too(tmp_path: Path, operations: Fak
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"sun_by": "time", "moment": "0001-01-01T12:00"}, "moment"),
-        ({"sun_by": "time", "moment": "0001-01-01T12:00+14:00"}, "moment"),
+        ({"sun_by": "time", "moment": "0001-01-01T12:00"}, "moment: give a year from 1970 on"),
+        ({"sun_by": "time", "moment": "0001-01-01T12:00+14:00"}, "moment: give a year from 1970 on"),
+        ({"sun_by": "time", "moment": "9000-01-01T12:00"}, "moment: give a year before 9000"),
+        # Without JavaScript the choice stands where it stood when the time was typed.
+        ({"sun_by": "position", "moment": "2026-06-21T11:36"}, "moment: a time and a position are both given"),
+        ({"moment": "2026-06-21T11:36"}, "moment: a time and a position are both given"),
         ({"sun_by": "time", "moment": "2026-06-21T00:00"}, "below the horizon"),
         ({"sun_by": "time"}, "say when"),
         ({"azimuth_deg": "", "elevation_deg": ""}, "say where the sun stands"),
@@ -368,6 +374,15 @@ def test_forecast_of_all_heliostats_shows_its_light(app: FastAPI, pages: TestCli
     for told in ("Power on lower", "Reflected by the mirrors", "62.5° high", "Flux of 1 heliostats together"):
         assert told in page
     assert 'href="data:image/png' in page
+    told = dict(re.findall("<dt>([^<]*)</dt><dd>([^<]*)</dd>", page.partition("What was asked")[2]))
+    assert told == {
+        "target": "lower",
+        "mirrors shade and block each other": "yes",
+        "direct normal irradiance": "900\N{NO-BREAK SPACE}W/m²",
+        "resolution": "256 × 256 pixels",
+        "sun": "at 2026-06-21 11:36 UTC",
+        "surface": "current",
+    }
     assert "{" not in page.partition("<main")[2]  # nothing as Python writes it
     listed = text_of(pages, "/forecast")
     assert f'<a href="{path}">job' in listed

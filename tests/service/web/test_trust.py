@@ -1,5 +1,6 @@
 """Surfaces that do not trust themselves: pages, metrics and REST say so, with why, since when and who has seen it."""
 
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -56,15 +57,29 @@ def test_doubts_are_told_with_why_and_since_when(client: TestClient):
     assert body["doubts"][0] == "photograph 2 is not explained: 31% of it is missed"
     assert body["doubts"][1].startswith("the mirror is unlike those known: 2.4 ")
     assert body["sun_span_deg"] == pytest.approx(60)
+    (line,) = client.get("/v1/field", params={"metric": "sun_span", "low": 50}).json()["items"]
+    assert (line["trusted"], line["sun_span"]) == (False, pytest.approx(60))
+    assert client.get("/v1/field", params={"metric": "sun_span", "low": 61}).json()["items"] == []
+    header, row = client.get("/field.csv").text.splitlines()
+    assert float(row.split(",")[header.split(",").index("sun_span [°]")]) == pytest.approx(60)
     metrics = client.get("/metrics").text
     assert 'heliotwin_surfaces{trusted="no"} 1.0' in metrics
+    (span,) = re.findall(r'heliotwin_heliostat_sun_span_degrees{heliostat="AA39"} (.*)', metrics)
+    assert float(span) == pytest.approx(60)
     assert 'heliotwin_heliostat_doubted_since_seconds{heliostat="AA39",seen="no"} 1.' in metrics
     field, page = client.get("/", headers=HTML).text, client.get("/heliostats/AA39", headers=HTML).text
     assert 'class="doubted"' in field
+    assert "Span of suns [°]" in field
     assert "Seen by nobody yet" in field
     for told in (field, page):
         assert "hotograph 2 is not explained: 31% of it is missed" in told
     assert "I have seen it" in page
+    # Both lead to where the photograph is corrected or excluded.
+    (item,) = client.get("/v1/attention").json()["items"]
+    assert (item["photographs"], item["todo"][:20]) == (["2"], "look at photograph 2")
+    for told in (page, client.get("/attention", headers=HTML).text):
+        assert '<a href="/heliostats/AA39/photographs/2">2</a>' in told
+    assert "Excluded: nothing is made from it" in client.get("/heliostats/AA39/photographs/2", headers=HTML).text
 
 
 def test_who_has_seen_it_is_kept_while_the_doubts_are_the_same(client: TestClient):
