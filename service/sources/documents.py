@@ -280,9 +280,14 @@ def read_measurement(identifier: str, heliostat: str, data: Any, plant: Plant) -
     )
 
 
-def read_moment(item: Any, where: str) -> datetime:
-    """When a measurement was taken, of the contents of PAINT's STAC item; in UTC where it names no time zone."""
+def read_moment(item: Any, where: str) -> datetime | None:
+    """When a measurement was taken, of the contents of PAINT's STAC item; in UTC where it names no time zone.
+
+    None where the item gives but a period that it lies in.
+    """
     moment = get(item, where, "properties", "datetime")
+    if moment is None and "start_datetime" in item["properties"]:
+        return None
     try:
         taken_at = datetime.fromisoformat(moment)
     except (TypeError, ValueError):

@@ -20,8 +20,9 @@ from service.base.arrays import unpack
 from service.base.faults import StoreDamagedError
 from service.base.progress import Progress, quiet
 from service.sources.decode import decode_image
-from service.sources.paint_documents import measurement_json, stac_catalog, stac_item, tower_json
+from service.sources.paint_documents import CATALOGUE, When, measurement_json, stac_catalog, stac_item, tower_json
 from service.sources.photograph import Photograph
+from service.store.columns import EPOCH
 from service.store.corrections import EXCLUDED
 from service.store.models import declared_of, find_current
 from service.store.plant import receiver_cylinder
@@ -49,8 +50,8 @@ class _Writer:
     def json(self, path: str, document: Any, what: str) -> None:
         self.bytes(path, json.dumps(document, indent=1).encode(), what)
 
-    def item(self, path: str, identifier: str, moment: datetime, *about: Any, **more: Any) -> None:
-        self.json(path, stac_item(identifier, moment, *about, **more), "STAC items")
+    def item(self, path: str, identifier: str, when: When, *about: Any, **more: Any) -> None:
+        self.json(path, stac_item(path, identifier, when, *about, **more), "STAC items")
         self.items.append(path)
 
 
@@ -72,7 +73,7 @@ def export_folder(runtime: Runtime, root: Path, progress: Progress = quiet) -> d
     for name in names:
         progress(name)
         _write_heliostat(runtime, writer, plant, name)
-    writer.json("catalog.json", stac_catalog(plant.name, writer.items), "catalogues")
+    writer.json(CATALOGUE, stac_catalog(plant.name, writer.items), "catalogues")
     return {"counts": dict(sorted(writer.counts.items())), "skipped": writer.skipped}
 
 
@@ -102,23 +103,30 @@ def _write_heliostat(runtime: Runtime, writer: _Writer, plant: Plant, name: str)
     place, file = plant.to_wgs84([row.east_m, row.north_m, row.up_m]).tolist(), f"{name}-heliostat-properties"
     writer.json(f"{name}/Properties/{file}.json", row.properties, "heliostats")
     assets = {"properties": (f"{file}.json", "application/json")}
-    writer.item(f"{name}/Properties/{file}-item-stac.json", file, row.updated_at, place, assets)
+    about = {"heliotwin:heliostat": name}
+    writer.item(f"{name}/Properties/{file}-item-stac.json", file, row.updated_at, place, assets, **about)
     if measured is not None:
         _write_surface(writer, f"{name}/Deflectometry", row, measured, place)
     if today is not None and today.source != "measured":
         _write_surface(writer, f"surfaces/{name}/Deflectometry", row, today, place)
     for identifier, images in _photographs(writer, name, rows).items():
-        _write_photograph(runtime, writer, f"{name}/Calibration/{identifier}", identifier, images, place)
+        _write_photograph(runtime, writer, name, identifier, images, place)
 
 
 def _write_surface(writer: _Writer, folder: str, row: HeliostatRow, surface: SurfaceRow, place: list[float]) -> None:
     file, buffer = f"{row.name}-nurbs-surface.npz", io.BytesIO()
     np.savez_compressed(buffer, degrees=np.array([DEGREE, DEGREE]), **unpack(surface.arrays))  # type: ignore[arg-type]
     writer.bytes(f"{folder}/{file}", buffer.getvalue(), "surfaces")
-    about = {"heliotwin:source": surface.source, "heliotwin:version": surface.version}
+    about = {
+        "heliotwin:heliostat": row.name,
+        "heliotwin:source": surface.source,
+        "heliotwin:version": surface.version,
+    }
     identifier, assets = f"{row.name}-surface-{surface.version}", {"surface": (file, "application/x-npz")}
     path = f"{folder}/{row.name}-surface-item-stac.json"
-    writer.item(path, identifier, surface.valid_from, place, assets, **about)
+    since = surface.valid_from
+    when = since if since > EPOCH else (EPOCH, surface.created_at)
+    writer.item(path, identifier, when, place, assets, **about)
 
 
 def _photographs(
@@ -143,11 +151,12 @@ def _known(photograph: Photograph) -> tuple[Any, datetime | None]:
 def _write_photograph(
     runtime: Runtime,
     writer: _Writer,
-    path: str,
+    heliostat: str,
     identifier: str,
     images: list[tuple[MeasurementRow, Photograph]],
     place: list[float],
 ) -> None:
+    path = f"{heliostat}/Calibration/{identifier}"
     document, taken_at = _known(images[0][1])
     writer.json(f"{path}-calibration-properties.json", document, "measurements")
     assets = {"calibration-properties": (f"{identifier}-calibration-properties.json", "application/json")}
@@ -162,10 +171,17 @@ def _write_photograph(
             continue
         writer.bytes(f"{path}-{row.kind}.png", _png(data, row.image.media_type), "images")
         assets[row.kind] = (f"{identifier}-{row.kind}.png", PNG)
-    if taken_at is None:
-        writer.counts["measurements of unknown time, without an item"] += 1
-    else:
-        writer.item(f"{path}-calibration-item-stac.json", identifier, taken_at, place, assets)
+    # Of a photograph that does not tell its time it is sure that it was taken before it came.
+    when = taken_at or (EPOCH, min(row.created_at for row, _ in images))
+    row = images[0][0]
+    about = {
+        "heliotwin:heliostat": heliostat,
+        "heliotwin:target": row.target.name,
+        "heliotwin:sun_azimuth_deg": row.sun_azimuth_deg,
+        "heliotwin:sun_elevation_deg": row.sun_elevation_deg,
+    }
+    item = f"{path}-calibration-item-stac.json"
+    writer.item(item, f"{heliostat}-{identifier}", when, place, assets, **about)
 
 
 def _png(data: bytes, media_type: str) -> bytes:

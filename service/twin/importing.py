@@ -1,7 +1,6 @@
 """Loading a measurement folder into the store: ``heliotwin import DIR``. A second run changes nothing."""
 
 from collections import Counter
-from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
@@ -17,6 +16,7 @@ from service.sources.documents import IMAGE_KINDS, Measurement
 from service.sources.files import require_regular
 from service.sources.folder import MeasurementFolder, declared_json, measured_heights
 from service.store import audit
+from service.store.columns import EPOCH
 from service.store.keys import RESERVED
 from service.twin import geometry
 from service.twin.ingest import ingest
@@ -86,8 +86,8 @@ def _put_heliostat(
 
 def _measured(heliostat: Heliostat, measured: tuple[Any, int]) -> store.NewSurface:
     """A measured surface describes the mirror from before anything else is known of it."""
-    z, since = measured_heights(heliostat, measured), datetime(1970, 1, 1, tzinfo=UTC)
-    return store.NewSurface("measured", z, np.zeros_like(z), control_points(heliostat, z), valid_from=since)
+    z = measured_heights(heliostat, measured)
+    return store.NewSurface("measured", z, np.zeros_like(z), control_points(heliostat, z), valid_from=EPOCH)
 
 
 def _put_image(runtime: Runtime, folder: MeasurementFolder, measurement: Measurement, kind: ImageKind) -> str:

@@ -1,8 +1,8 @@
 """The store as a measurement folder: a round trip through it loses nothing that an import reads."""
 
 import json
-from collections.abc import Iterator
-from datetime import UTC, datetime
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,10 @@ import numpy as np
 import pytest
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
+from jsonschema import Draft7Validator
+from jsonschema.protocols import Validator
+from pystac.validation.local_validator import get_local_schema_cache
+from referencing import Registry
 
 from model.errors import InvalidInputError
 from model.surface import control_points
@@ -153,18 +157,55 @@ def test_predicted_surface_lies_apart_and_is_read_there(exported: tuple[Path, di
     assert found[0].shape == (4, 8, 8, 3)
 
 
-def test_items_are_stac(exported: tuple[Path, dict[str, Any]]):
-    folder, report = exported
+@pytest.fixture(scope="module")
+def stac() -> Callable[[str], Validator]:
+    """The validator of a kind of document: by the official schemas, which come with pystac."""
+    schemas = get_local_schema_cache()
+    registry: Registry[Any] = Registry().with_contents(schemas.items())
+    (version,) = {name.split("/")[3] for name in schemas if "stacspec" in name}
+
+    def of(kind: str) -> Validator:
+        schema = schemas[f"https://schemas.stacspec.org/{version}/{kind}-spec/json-schema/{kind}.json"]
+        return Draft7Validator(schema, registry=registry, format_checker=Draft7Validator.FORMAT_CHECKER)
+
+    return of
+
+
+def items_of(folder: Path) -> dict[str, dict[str, Any]]:
+    """The items that the catalogue links to, by their paths."""
     links = json.loads((folder / "catalog.json").read_text())["links"]
-    items = [folder / link["href"] for link in links if link["rel"] == "item"]
-    assert len(items) == report["counts"]["STAC items"] == 5  # properties, two surfaces, two photographs with a time
-    for path in items:
-        item = json.loads(path.read_text())
-        assert (item["type"], item["stac_version"]) == ("Feature", "1.0.0")
-        assert item["properties"]["datetime"].endswith("Z")
-        assert {"id", "geometry", "bbox", "links", "assets"} <= item.keys()
-        for asset in item["assets"].values():
-            assert (path.parent / asset["href"]).is_file()
+    return {link["href"]: json.loads((folder / link["href"]).read_text()) for link in links if link["rel"] == "item"}
+
+
+def test_catalogue_and_items_are_stac(exported: tuple[Path, dict[str, Any]], stac: Callable[[str], Validator]):
+    folder, report = exported
+    stac("catalog").validate(json.loads((folder / "catalog.json").read_text()))
+    items = items_of(folder)
+    assert len(items) == report["counts"]["STAC items"] == 7  # properties, two surfaces, four photographs
+    assert len({item["id"] for item in items.values()}) == 7
+    for path, item in items.items():
+        stac("item").validate(item)
+        beside = (folder / path).parent
+        for place in [*item["assets"].values(), *item["links"]]:
+            assert (beside / place["href"]).resolve().is_file()
+
+
+def test_items_say_whose_they_are(exported: tuple[Path, dict[str, Any]]):
+    told = items_of(exported[0])["./AA39/Calibration/2-calibration-item-stac.json"]["properties"]
+    assert told["heliotwin:heliostat"] == "AA39"
+    assert told["heliotwin:target"] == "lower"
+    assert (told["heliotwin:sun_azimuth_deg"], told["heliotwin:sun_elevation_deg"]) == (-33.25, 45.0)
+
+
+def test_unknown_times_are_periods(exported: tuple[Path, dict[str, Any]]):
+    items = items_of(exported[0])
+    whens = {path: item["properties"] for path, item in items.items() if item["properties"]["datetime"] is None}
+    measured = "./AA39/Deflectometry/AA39-surface-item-stac.json"
+    assert {*whens} >= {measured, "./AA39/Calibration/2-calibration-item-stac.json"}
+    for when in whens.values():  # before they came, and nothing else is sure
+        first, last = (datetime.fromisoformat(when[name]) for name in ("start_datetime", "end_datetime"))
+        assert first < datetime.now(UTC) - timedelta(days=365)
+        assert datetime.now(UTC) - timedelta(hours=1) < last < datetime.now(UTC)
 
 
 def test_folder_that_holds_something_is_left_alone(filled: TestClient, tmp_path: Path):
