@@ -33,6 +33,10 @@ IMAGE_KINDS: tuple[ImageKind, ...] = ("cropped", "raw", "flux", "flux-centered")
 """Kinds of image that a measurement may hold, the most worked-out one with a known place on the target first."""
 
 
+SUFFIXES = {"image/png": "png", "image/jpeg": "jpg", "image/tiff": "tif", "image/bmp": "bmp"}
+"""Of the files of images, by their media types; PAINT's are PNG."""
+
+
 @dataclass(frozen=True, eq=False)
 class Measurement:
     """One calibration measurement.

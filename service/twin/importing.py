@@ -1,24 +1,28 @@
 """Loading a measurement folder into the store: ``heliotwin import DIR``. A second run changes nothing."""
 
 from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from sqlalchemy.exc import IntegrityError
+from sqlalchemy.orm import Session
 
 from model.errors import ImageRefusedError, InvalidInputError
-from model.imaging import ImageKind
 from model.plant import Heliostat
 from model.surface import control_points
 from service import store
 from service.base.faults import ConflictError, TooLargeError, UnsupportedImageError
 from service.base.progress import Progress, quiet
-from service.sources.documents import IMAGE_KINDS, Measurement
+from service.sources.documents import IMAGE_KINDS
 from service.sources.files import require_regular
 from service.sources.folder import MeasurementFolder, declared_json, measured_heights
+from service.sources.photograph import Photograph
 from service.store import audit
 from service.store.columns import EPOCH
 from service.store.keys import RESERVED
-from service.twin import geometry
+from service.twin import geometry, history
 from service.twin.ingest import ingest
 from service.twin.runtime import Runtime
 
@@ -35,28 +39,81 @@ def import_folder(
     measured surfaces that cannot be read, are listed with the reason.
     """
     counts, skipped = _put_plant(runtime, folder, actor), dict[str, str]()
+    if (folder.root / history.PLANT).exists():
+        _restore(runtime, counts, skipped, "plant", lambda session: history.restore_plant(session, folder.root, actor))
     for name in folder.plant.heliostats:
         progress(name)
-        try:
-            measured = folder.measured_surface(name)
-        except InvalidInputError as error:
-            measured, skipped[f"{name} surface"] = None, str(error)
-        counts.update(_put_heliostat(runtime, folder, name, measured, actor))
-        for measurement in folder.measurements(name, with_images=False):
-            if not measurement.images:
-                skipped[measurement.key] = "no image"
-            for kind in sorted(measurement.images, key=IMAGE_KINDS.index):
-                progress(f"{measurement.key} {kind}")
-                try:
-                    counts[_put_image(runtime, folder, measurement, kind)] += 1
-                except UNREADABLE as error:
-                    skipped[f"{measurement.key} {kind}"] = str(error)
+        _import_heliostat(runtime, folder, name, counts, skipped, progress, actor)
     return {"counts": dict(sorted(counts.items())), "skipped": {**folder.skipped, **skipped}}
+
+
+def _import_heliostat(
+    runtime: Runtime,
+    folder: MeasurementFolder,
+    name: str,
+    counts: Counter[str],
+    skipped: dict[str, str],
+    progress: Progress,
+    actor: str,
+) -> None:
+    """A heliostat with its images and, where the folder came of an export, with its history, else its surface."""
+    measured, told = None, None
+    try:
+        told = history.load_heliostat(folder.root, name)
+    except InvalidInputError as error:
+        skipped[f"{name} history"] = str(error)
+    try:
+        measured = folder.measured_surface(name) if told is None else None
+    except InvalidInputError as error:
+        skipped[f"{name} surface"] = str(error)
+    counts.update(_put_heliostat(runtime, folder, name, measured, actor))
+
+    def put(what: str, photograph: Photograph, file: Path) -> None:
+        progress(what)
+        try:
+            counts[_put_image(runtime, name, photograph, file)] += 1
+        except UNREADABLE as error:
+            skipped[what] = str(error)
+
+    done = set[Path]()
+    for one in () if told is None else told.photographs:  # in the order in which they came
+        file = history.image_path(folder.root, name, one)
+        done.add(file)
+        put(f"{name}/{one.identifier} {one.kind}", history.photograph_of(one), file)
+    for measurement in folder.measurements(name, with_images=False):
+        if not measurement.images:
+            skipped[measurement.key] = "no image"
+        for kind in sorted(measurement.images, key=IMAGE_KINDS.index):
+            file = measurement.images[kind]
+            if file not in done:
+                put(f"{measurement.key} {kind}", measurement.photograph(kind, folder.plant), file)
+    if told is not None:
+
+        def restored(session: Session) -> bool:
+            row = store.get_heliostat(session, name)
+            return history.restore_heliostat(session, row, told, folder.root, actor)
+
+        _restore(runtime, counts, skipped, name, restored)
+
+
+def _restore(
+    runtime: Runtime, counts: Counter[str], skipped: dict[str, str], whose: str, deed: Callable[[Session], bool]
+) -> None:
+    """Bring back a history, all of it or nothing."""
+    try:
+        change = store.Change.NEW if runtime.database.written(deed) else store.Change.UNCHANGED
+    except InvalidInputError as error:
+        skipped[f"{whose} history"] = str(error)
+    except IntegrityError as error:
+        skipped[f"{whose} history"] = f"it contradicts itself or the store ({error.orig}); export it anew"
+    else:
+        counts[f"histories {change}"] += 1
 
 
 def _put_plant(runtime: Runtime, folder: MeasurementFolder, actor: str) -> Counter[str]:
     """The plant with its targets, receivers and declared model: one deed."""
-    plant, declared = folder.plant, declared_json(folder.root / "twin.json")
+    plant, is_told = folder.plant, (folder.root / history.PLANT).exists()
+    declared = None if is_told else declared_json(folder.root / "twin.json")
     targets, receivers = plant.targets.values(), plant.receivers.values()
     done = runtime.database.written(
         lambda session: geometry.set_plant(session, actor, plant.name, plant.origin, targets, receivers, declared)
@@ -90,9 +147,7 @@ def _measured(heliostat: Heliostat, measured: tuple[Any, int]) -> store.NewSurfa
     return store.NewSurface("measured", z, np.zeros_like(z), control_points(heliostat, z), valid_from=EPOCH)
 
 
-def _put_image(runtime: Runtime, folder: MeasurementFolder, measurement: Measurement, kind: ImageKind) -> str:
-    photograph = measurement.photograph(kind, folder.plant)
-    content = require_regular(measurement.images[kind]).read_bytes()
-    row, is_new = ingest(runtime, measurement.heliostat, photograph, content, is_live=False)
+def _put_image(runtime: Runtime, heliostat: str, photograph: Photograph, file: Path) -> str:
+    row, is_new = ingest(runtime, heliostat, photograph, require_regular(file).read_bytes(), is_live=False)
     state = "new" if is_new else "unchanged"
     return f"images {state}" if row.accepted else f"images {state}, refused"
