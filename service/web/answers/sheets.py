@@ -53,7 +53,7 @@ def sheet_answer(name: str, columns: Sequence[str], rows: Iterable[Sequence[Any]
 
 # A number that a filter wrote stands between the first and the last of these, its unit behind the second.
 _BEGIN, _UNIT, _END = "\x01", "\x02", "\x03"
-_WRITTEN = re.compile(rf"{_BEGIN}([-+.0-9a-z]+){_UNIT}([^{_END}]*){_END}")
+_WRITTEN = re.compile(rf"{_BEGIN}(-?(?:\d+(?:\.\d+)?(?:e[-+]?\d+)?|nan|inf)){_UNIT}([^{_END}]*){_END}")
 _DEGREES = "°"
 _NONE = "–"
 

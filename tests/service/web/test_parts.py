@@ -71,6 +71,12 @@ def test_text_around_numbers_stays_text():
     assert table_of(written(template), "a")[1] == [["2.5 m off, seen"]]
 
 
+def test_text_that_imitates_a_number_stays_text():
+    rows = "<tr><td>{{ text }}</td></tr><tr><td>{{ 1e-7 | figure }}</td></tr>"
+    template = f'<table id="a"><tr><th>What</th></tr>{rows}</table>'
+    assert table_of(written(template, text="\x011-e\x02\x03"), "a")[1] == [["\x011-e\x02\x03"], [1e-7]]
+
+
 def test_other_table_is_not_found():
     with pytest.raises(NotFoundError, match="no table 'b'"):
         table_of(written(TABLE, name="a", watts=1, sun=1, width=1), "b")
