@@ -2,9 +2,9 @@
 
 import base64
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, ClassVar, Protocol
 
 import cv2
 import matplotlib
@@ -14,11 +14,29 @@ from matplotlib.colors import to_hex
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from service.drawing.pictures import mirror_heights
+from service.drawing.pictures import map_picture, mirror_heights, series_picture
 
 Array = NDArray[np.floating]
 
 _dates: Any = matplotlib.dates  # it says nothing of its types
+
+
+Sheet = tuple[Sequence[str], Sequence[Sequence[Any]]]
+"""Columns and rows."""
+
+
+class Figure(Protocol):
+    """What is drawn under a ``title``, and the ``formats`` that it is offered in as a file.
+
+    ``csv`` takes ``sheet``, columns and rows; ``npz`` takes ``arrays`` by their names; ``png`` takes ``drawn()``.
+    """
+
+    formats: ClassVar[tuple[str, ...]]
+
+    @property
+    def title(self) -> str:
+        """What it shows."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -69,7 +87,7 @@ class Scale:
         return ticks(self.low, self.high)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class HeatMap:
     """A coloured map over a rectangle.
 
@@ -82,16 +100,33 @@ class HeatMap:
     width, height : float [m]
         Of the rectangle; its middle is the origin.
     scale : Scale
+    values : (rows, columns)
+        What it shows, rows from the top.
     outline : str
         What is outlined on it, as a data URL; empty where nothing is.
     """
+
+    formats: ClassVar[tuple[str, ...]] = ("npz", "png")
 
     title: str
     picture: str
     width: float
     height: float
     scale: Scale
+    values: Array = field(repr=False)
     outline: str = ""
+
+    @property
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """What it shows, in the unit of its scale, and its size [m]."""
+        size_m = np.array([self.width, self.height])
+        return {"values": self.values, "size_m": size_m, "unit": np.array(self.scale.label)}
+
+    def drawn(self) -> bytes:
+        """As PNG, with axes and a colour bar."""
+        scale = self.scale
+        size, bounds = (self.width, self.height), (scale.low, scale.high)
+        return map_picture(self.values, size, self.title, scale.colours, bounds, scale.label)
 
     @property
     def x_ticks(self) -> tuple[Tick, ...]:
@@ -111,7 +146,7 @@ def _data_url(pixels: NDArray[np.uint8]) -> str:
 
 def heat_map(title: str, values: Array, size: tuple[float, float], scale: Scale) -> HeatMap:
     """A map of ``values`` (rows from the top, columns) over ``size``, width and height [m]."""
-    return HeatMap(title, _data_url(scale.pixels(values)), *size, scale)
+    return HeatMap(title, _data_url(scale.pixels(values)), *size, scale, values)
 
 
 def flux_scale(top: float, unit: str) -> Scale:
@@ -181,12 +216,24 @@ class Dot:
 
 
 @dataclass(frozen=True)
+class Value:
+    """A number at a moment; hollow where it proves less than others."""
+
+    at: datetime
+    number: float
+    name: str = ""
+    is_hollow: bool = False
+
+
+@dataclass(frozen=True)
 class Timeline:
     """Series over time by their names, the first as a line and the second dashed; ``marks`` are upright lines.
 
-    ``when`` says what the labels of the moments leave out, as the year. ``limit`` is where a bound lies, 0 to 1 from
-    bottom to top, if there is one.
+    ``values`` are those of the series. ``when`` says what the labels of the moments leave out, as the year. ``limit``
+    is where a bound lies, 0 to 1 from bottom to top, if there is one.
     """
+
+    formats: ClassVar[tuple[str, ...]] = ("csv", "png")
 
     title: str
     unit: str
@@ -195,17 +242,19 @@ class Timeline:
     x_ticks: tuple[Tick, ...]
     y_ticks: tuple[Tick, ...]
     when: str
+    values: Mapping[str, Sequence[Value]]
     limit: float | None = None
 
+    @property
+    def sheet(self) -> Sheet:
+        """All values by series and moment."""
+        rows = [(name, one.at, one.name, one.number) for name, some in self.values.items() for one in some]
+        return ("series", "time", "name", f"{self.title} [{self.unit}]"), rows
 
-@dataclass(frozen=True)
-class Value:
-    """A number at a moment; hollow where it proves less than others."""
-
-    at: datetime
-    number: float
-    name: str = ""
-    is_hollow: bool = False
+    def drawn(self) -> bytes:
+        """As PNG, over the time in UTC."""
+        series = {name: ([one.at for one in v], [one.number for one in v]) for name, v in self.values.items()}
+        return series_picture(self.title, self.unit, series)
 
 
 def _share(low: float, high: float, value: float) -> float:
@@ -261,6 +310,7 @@ def timeline(
         tuple(Tick(_share(first, last, at), name) for at, name in zip(places, names, strict=True)),
         ticks(low, high, 4),
         f"{formatter.get_offset()} UTC".strip(),
+        {name: some for name, some in series.items() if some},
         None if limit is None else _share(low, high, limit),
     )
 
@@ -277,12 +327,25 @@ class Point:
 
 @dataclass(frozen=True)
 class History:
-    """Values in the order they came, for a line; ``ticks`` belong to the upright axis."""
+    """Values in the order they came, for a line; ``ticks`` belong to the upright axis, ``values`` have their names."""
+
+    formats: ClassVar[tuple[str, ...]] = ("csv", "png")
 
     title: str
     unit: str
     points: tuple[Point, ...]
     ticks: tuple[Tick, ...]
+    values: Sequence[tuple[str, float]]
+
+    @property
+    def sheet(self) -> Sheet:
+        """All values by their names."""
+        return ("name", f"{self.title} [{self.unit}]"), self.values
+
+    def drawn(self) -> bytes:
+        """As PNG."""
+        names, numbers = zip(*self.values, strict=True)
+        return series_picture(self.title, self.unit, {"": (names, numbers)})
 
 
 def history(title: str, unit: str, named: Sequence[tuple[str, float]], digits: int) -> History:
@@ -293,4 +356,4 @@ def history(title: str, unit: str, named: Sequence[tuple[str, float]], digits: i
         Point(index * step if len(named) > 1 else 0.5, value / top, f"{value:.{digits}f} {unit}", name)
         for index, (name, value) in enumerate(named)
     )
-    return History(title, unit, points, ticks(0.0, top, 4))
+    return History(title, unit, points, ticks(0.0, top, 4), named)

@@ -1,7 +1,8 @@
 """Pictures of flux maps and surfaces as PNG, drawn without a display and without matplotlib's global state."""
 
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import cv2
 import numpy as np
@@ -21,12 +22,54 @@ def _png(figure: Figure) -> bytes:
 
 def flux_picture(flux: NDArray[np.floating], size: tuple[float, float] | None, unit: str, title: str) -> bytes:
     """A flux map (rows, columns), coloured; ``size`` is its width and height [m], pixels where it is None."""
+    return map_picture(flux, size, title, "inferno", (0.0, None), unit)
+
+
+def map_picture(
+    values: NDArray[np.floating],
+    size: tuple[float, float] | None,
+    title: str,
+    colours: str,
+    bounds: tuple[float, float | None],
+    label: str,
+) -> bytes:
+    """A map (rows from the top, columns) in ``colours`` of matplotlib's between ``bounds``; None: its largest value."""
     figure = Figure(figsize=(6, 5), layout="constrained")
     axes = figure.subplots()
     extent = None if size is None else (-size[0] / 2, size[0] / 2, -size[1] / 2, size[1] / 2)
-    image = axes.imshow(flux, cmap="inferno", vmin=0, extent=extent, aspect="equal")
-    axes.set(title=title, xlabel="right [m]" if size else "column", ylabel="up [m]" if size else "row")
-    figure.colorbar(image, ax=axes, label=unit)
+    image = axes.imshow(values, cmap=colours, vmin=bounds[0], vmax=bounds[1], extent=extent, aspect="equal")
+    axes.set(xlabel="right [m]" if size else "column", ylabel="up [m]" if size else "row")
+    axes.set_title(title, wrap=True)
+    figure.colorbar(image, ax=axes, label=label)
+    return _png(figure)
+
+
+def places_picture(
+    places: NDArray[np.floating], values: NDArray[np.floating], title: str, colours: str, bounds: tuple[float, float]
+) -> bytes:
+    """Values at ``places`` (n, 2), east and north [m], as coloured dots; hollow where a value is not finite."""
+    figure = Figure(figsize=(7, 7), layout="constrained")
+    axes = figure.subplots()
+    known, (east, north) = np.isfinite(values), places.T
+    axes.scatter(east[~known], north[~known], s=14, facecolors="none", edgecolors="gray")
+    low, high = bounds
+    shown = axes.scatter(east[known], north[known], s=14, c=values[known], cmap=colours, vmin=low, vmax=high)
+    axes.set(xlabel="east of the tower [m]", ylabel="north [m]", aspect="equal")
+    figure.colorbar(shown, ax=axes, label=title)
+    return _png(figure)
+
+
+def series_picture(title: str, unit: str, series: Mapping[str, tuple[Sequence[Any], Sequence[float]]]) -> bytes:
+    """Values over moments or names, a line for each of ``series``."""
+    figure = Figure(figsize=(8, 4), layout="constrained")
+    axes = figure.subplots()
+    for name, (places, values) in series.items():
+        axes.plot(places, values, "o-", label=name)
+    axes.set(title=title, ylabel=unit)
+    axes.tick_params("x", rotation=30)
+    axes.grid(alpha=0.3)
+    if len(series) > 1:
+        axes.legend()
     return _png(figure)
 
 

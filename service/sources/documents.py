@@ -35,6 +35,10 @@ IMAGE_KINDS: tuple[ImageKind, ...] = ("cropped", "raw", "flux", "flux-centered")
 """Kinds of image that a measurement may hold, the most worked-out one with a known place on the target first."""
 
 
+SUFFIXES = {"image/png": "png", "image/jpeg": "jpg", "image/tiff": "tif", "image/bmp": "bmp"}
+"""Of the files of images, by their media types; PAINT's are PNG."""
+
+
 @dataclass(frozen=True, eq=False)
 class Measurement:
     """One calibration measurement.
@@ -300,9 +304,14 @@ def read_weather(data: Mapping[str, Any], where: str) -> Weather:
     return Weather(**found)
 
 
-def read_moment(item: Any, where: str) -> datetime:
-    """When a measurement was taken, of the contents of PAINT's STAC item; in UTC where it names no time zone."""
+def read_moment(item: Any, where: str) -> datetime | None:
+    """When a measurement was taken, of the contents of PAINT's STAC item; in UTC where it names no time zone.
+
+    None where the item gives but a period that it lies in.
+    """
     moment = get(item, where, "properties", "datetime")
+    if moment is None and "start_datetime" in item["properties"]:
+        return None
     try:
         taken_at = datetime.fromisoformat(moment)
     except (TypeError, ValueError):

@@ -9,7 +9,13 @@ import numpy as np
 from model.plant import Cylinder, Plant, TargetPlane
 from service.sources.photograph import Photograph
 
-STAC_VERSION = "1.0.0"
+STAC_VERSION = "1.1.0"
+"""Of https://github.com/radiantearth/stac-spec; its Item holds ``datetime`` or, for null, a period around it."""
+
+CATALOGUE = "catalog.json"
+
+When = datetime | tuple[datetime, datetime]
+"""A moment, or the first and the last that it may be."""
 
 
 def tower_json(plant: Plant, corners: Mapping[str, dict[str, Any] | None]) -> dict[str, Any]:
@@ -63,23 +69,36 @@ def measurement_json(photograph: Photograph) -> dict[str, Any]:
 
 
 def stac_item(
-    identifier: str, moment: datetime, wgs84: Iterable[float], assets: Mapping[str, tuple[str, str]], **more: Any
+    path: str, identifier: str, when: When, wgs84: Iterable[float], assets: Mapping[str, tuple[str, str]], **more: Any
 ) -> dict[str, Any]:
-    """A STAC item at a place, latitude [deg], longitude [deg], altitude [m].
+    """A STAC item at a place, latitude [deg], longitude [deg], altitude [m], to be written under ``path``.
 
-    ``assets`` are names with files beside the item and their media types, ``more`` its properties.
+    ``when`` is its moment or, where that is not known, the first and the last that it may be. ``assets`` are names with
+    files beside the item and their media types, ``more`` its properties.
     """
     latitude, longitude, altitude = wgs84
+    root = "../" * path.count("/") + CATALOGUE
     return {
         "type": "Feature",
         "stac_version": STAC_VERSION,
         "id": identifier,
         "geometry": {"type": "Point", "coordinates": [longitude, latitude, altitude]},
         "bbox": [longitude, latitude, altitude, longitude, latitude, altitude],
-        "properties": {"datetime": moment.isoformat().replace("+00:00", "Z"), **more},
-        "links": [],
+        "properties": {**_when_json(when), **more},
+        "links": [{"rel": rel, "href": root, "type": "application/json"} for rel in ("root", "parent")],
         "assets": {name: {"href": f"./{file}", "type": kind} for name, (file, kind) in assets.items()},
     }
+
+
+def _when_json(when: When) -> dict[str, str | None]:
+    if isinstance(when, datetime):
+        return {"datetime": _rfc3339(when)}
+    first, last = when
+    return {"datetime": None, "start_datetime": _rfc3339(first), "end_datetime": _rfc3339(last)}
+
+
+def _rfc3339(moment: datetime) -> str:
+    return moment.isoformat().replace("+00:00", "Z")
 
 
 def stac_catalog(name: str, items: Iterable[str]) -> dict[str, Any]:
@@ -90,5 +109,5 @@ def stac_catalog(name: str, items: Iterable[str]) -> dict[str, Any]:
         "stac_version": STAC_VERSION,
         "id": name,
         "description": f"Heliostats of {name}: photographs, properties and surfaces, as heliotwin keeps them.",
-        "links": [{"rel": "root", "href": "./catalog.json", "type": "application/json"}, *links],
+        "links": [{"rel": "root", "href": f"./{CATALOGUE}", "type": "application/json"}, *links],
     }

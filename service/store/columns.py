@@ -17,6 +17,9 @@ _NAMING = {
 # A missing JSON value is SQL's NULL, not the JSON text "null".
 _Json = JSON(none_as_null=True)
 
+EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+"""Since when something holds that holds from before anything is known of it."""
+
 
 def one_of(column: str, values: tuple[str, ...]) -> CheckConstraint:
     """A column holds one of these."""

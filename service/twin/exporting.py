@@ -8,8 +8,8 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
+from pydantic import BaseModel
 from sqlalchemy import select
 
 from model.errors import InvalidInputError
@@ -19,18 +19,18 @@ from service import store
 from service.base.arrays import unpack
 from service.base.faults import StoreDamagedError
 from service.base.progress import Progress, quiet
-from service.sources.decode import decode_image
-from service.sources.paint_documents import measurement_json, stac_catalog, stac_item, tower_json
+from service.sources.documents import SUFFIXES
+from service.sources.paint_documents import CATALOGUE, When, measurement_json, stac_catalog, stac_item, tower_json
 from service.sources.photograph import Photograph
+from service.store.columns import EPOCH
 from service.store.measurements import EXCLUDED
 from service.store.models import declared_of, find_current
 from service.store.plant import receiver_cylinder
 from service.store.tables import HeliostatRow, MeasurementRow, SurfaceRow
+from service.twin import history
 from service.twin.accuracy import name_of
-from service.twin.correcting import Changes
+from service.twin.photographs import photograph_of
 from service.twin.runtime import Runtime
-
-PNG = "image/png"
 
 
 class _Writer:
@@ -49,16 +49,20 @@ class _Writer:
     def json(self, path: str, document: Any, what: str) -> None:
         self.bytes(path, json.dumps(document, indent=1).encode(), what)
 
-    def item(self, path: str, identifier: str, moment: datetime, *about: Any, **more: Any) -> None:
-        self.json(path, stac_item(identifier, moment, *about, **more), "STAC items")
+    def model(self, path: str, document: BaseModel, what: str) -> None:
+        self.bytes(path, document.model_dump_json(indent=1).encode(), what)
+
+    def item(self, path: str, identifier: str, when: When, *about: Any, **more: Any) -> None:
+        self.json(path, stac_item(path, identifier, when, *about, **more), "STAC items")
         self.items.append(path)
 
 
 def export_folder(runtime: Runtime, root: Path, progress: Progress = quiet) -> dict[str, Any]:
-    """Write plant, heliostats, photographs and surfaces into a new folder; how many of each, and what is left out.
+    """Write all of the store that cannot be made again into a new folder; how many of each, and what is left out.
 
-    Excluded photographs are left out, for whoever reads the folder would use them. Surfaces that were predicted lie
-    apart, under ``surfaces``: in the place of measured ones they would be taken for such.
+    PAINT's layout has plant, heliostats, photographs as they came and the measured surface; what it has no place for,
+    `service.twin.history` has. Of surfaces that were predicted today's lies apart, under ``surfaces``: in the place of
+    a measured one it would be taken for such.
 
     Raises
     ------
@@ -72,7 +76,7 @@ def export_folder(runtime: Runtime, root: Path, progress: Progress = quiet) -> d
     for name in names:
         progress(name)
         _write_heliostat(runtime, writer, plant, name)
-    writer.json("catalog.json", stac_catalog(plant.name, writer.items), "catalogues")
+    writer.json(CATALOGUE, stac_catalog(plant.name, writer.items), "catalogues")
     return {"counts": dict(sorted(writer.counts.items())), "skipped": writer.skipped}
 
 
@@ -82,6 +86,7 @@ def _write_plant(runtime: Runtime, writer: _Writer) -> tuple[Plant, Sequence[str
         version = find_current(session)
         declared = declared_of(session, version) or {}
         names = session.scalars(select(HeliostatRow.name).order_by(HeliostatRow.name)).all()
+        told = history.plant_history(session)
     if version is not None and version.effects:  # what was adopted is believed, too
         declared = declared | {"effects": [*declared.get("effects", []), *version.effects]}
     planes = {target.name: store.target_plane(target) for target in targets}
@@ -89,6 +94,7 @@ def _write_plant(runtime: Runtime, writer: _Writer) -> tuple[Plant, Sequence[str
     plant = Plant(row.name, np.array(row.origin), planes, {}, cylinders)
     tower = tower_json(plant, {target.name: target.corners for target in targets})
     writer.json(f"{row.name}-tower-measurements.json", tower, "plants")
+    writer.model(history.PLANT, told, "histories")
     if declared:
         writer.json("twin.json", {"declared": declared}, "declared models")
     return plant, names
@@ -102,37 +108,53 @@ def _write_heliostat(runtime: Runtime, writer: _Writer, plant: Plant, name: str)
     place, file = plant.to_wgs84([row.east_m, row.north_m, row.up_m]).tolist(), f"{name}-heliostat-properties"
     writer.json(f"{name}/Properties/{file}.json", row.properties, "heliostats")
     assets = {"properties": (f"{file}.json", "application/json")}
-    writer.item(f"{name}/Properties/{file}-item-stac.json", file, row.updated_at, place, assets)
+    about = {"heliotwin:heliostat": name}
+    writer.item(f"{name}/Properties/{file}-item-stac.json", file, row.updated_at, place, assets, **about)
     if measured is not None:
         _write_surface(writer, f"{name}/Deflectometry", row, measured, place)
     if today is not None and today.source != "measured":
         _write_surface(writer, f"surfaces/{name}/Deflectometry", row, today, place)
-    for identifier, images in _photographs(writer, name, rows).items():
-        _write_photograph(runtime, writer, f"{name}/Calibration/{identifier}", identifier, images, place)
+    files: dict[str, str] = {}
+    for identifier, images in _photographs(rows).items():
+        files |= _write_photograph(runtime, writer, name, identifier, images, place)
+    for one in (one for one in rows if one.reason == EXCLUDED):
+        files |= _write_image(runtime, writer, name, f"{one.identifier}-{one.kind}", one)
+    _write_history(runtime, writer, name, files)
+
+
+def _write_history(runtime: Runtime, writer: _Writer, name: str, files: dict[str, str]) -> None:
+    folder = history.heliostat_folder(name)
+    with runtime.database.reading() as session:
+        row = store.get_heliostat(session, name)
+        writer.model(f"{folder}/{history.HISTORY}", history.heliostat_history(session, row, files), "histories")
+        for surface in store.list_surfaces(session, row, None, arrays=True):
+            writer.bytes(f"{folder}/{history.surface_file(surface.version)}", surface.arrays, "versions of surfaces")
 
 
 def _write_surface(writer: _Writer, folder: str, row: HeliostatRow, surface: SurfaceRow, place: list[float]) -> None:
     file, buffer = f"{row.name}-nurbs-surface.npz", io.BytesIO()
     np.savez_compressed(buffer, degrees=np.array([DEGREE, DEGREE]), **unpack(surface.arrays))  # type: ignore[arg-type]
     writer.bytes(f"{folder}/{file}", buffer.getvalue(), "surfaces")
-    about = {"heliotwin:source": surface.source, "heliotwin:version": surface.version}
+    about = {
+        "heliotwin:heliostat": row.name,
+        "heliotwin:source": surface.source,
+        "heliotwin:version": surface.version,
+    }
     identifier, assets = f"{row.name}-surface-{surface.version}", {"surface": (file, "application/x-npz")}
     path = f"{folder}/{row.name}-surface-item-stac.json"
-    writer.item(path, identifier, surface.valid_from, place, assets, **about)
+    since = surface.valid_from
+    when = since if since > EPOCH else (EPOCH, surface.created_at)
+    writer.item(path, identifier, when, place, assets, **about)
 
 
-def _photographs(
-    writer: _Writer, heliostat: str, rows: Sequence[MeasurementRow]
-) -> dict[str, list[tuple[MeasurementRow, Photograph]]]:
+def _photographs(rows: Sequence[MeasurementRow]) -> dict[str, list[tuple[MeasurementRow, Photograph]]]:
     """Images by the number under which they are written: those of which something else is known have their own."""
     found: dict[str, list[tuple[MeasurementRow, Photograph]]] = {}
     for row in rows:
-        if row.reason == EXCLUDED:
-            writer.skipped[f"{heliostat}/{row.identifier}"] = "excluded"
-            continue
-        photograph, name = Changes("").of(row), name_of(row)
-        fits = name not in found or _known(found[name][0][1]) == _known(photograph)
-        found.setdefault(name if fits else row.identifier, []).append((row, photograph))
+        if row.reason != EXCLUDED:
+            photograph, name = photograph_of(row), name_of(row)
+            fits = name not in found or _known(found[name][0][1]) == _known(photograph)
+            found.setdefault(name if fits else row.identifier, []).append((row, photograph))
     return found
 
 
@@ -143,34 +165,46 @@ def _known(photograph: Photograph) -> tuple[Any, datetime | None]:
 def _write_photograph(
     runtime: Runtime,
     writer: _Writer,
-    path: str,
+    heliostat: str,
     identifier: str,
     images: list[tuple[MeasurementRow, Photograph]],
     place: list[float],
-) -> None:
+) -> dict[str, str]:
+    """A photograph with its item; its images' files by the identifiers of their measurements."""
+    path = f"{heliostat}/Calibration/{identifier}"
     document, taken_at = _known(images[0][1])
     writer.json(f"{path}-calibration-properties.json", document, "measurements")
     assets = {"calibration-properties": (f"{identifier}-calibration-properties.json", "application/json")}
+    files: dict[str, str] = {}
     for row, _ in images:
-        if row.image.pruned_at is not None:
-            writer.skipped[f"{path} {row.kind}"] = f"image kept until {row.image.pruned_at:%Y-%m-%d}"
-            continue
-        try:
-            data = runtime.images.read(row.image_sha256)
-        except StoreDamagedError as error:
-            writer.skipped[f"{path} {row.kind}"] = str(error)
-            continue
-        writer.bytes(f"{path}-{row.kind}.png", _png(data, row.image.media_type), "images")
-        assets[row.kind] = (f"{identifier}-{row.kind}.png", PNG)
-    if taken_at is None:
-        writer.counts["measurements of unknown time, without an item"] += 1
-    else:
-        writer.item(f"{path}-calibration-item-stac.json", identifier, taken_at, place, assets)
+        written = _write_image(runtime, writer, heliostat, f"{identifier}-{row.kind}", row)
+        for file in written.values():
+            assets[row.kind] = file, row.image.media_type
+        files |= written
+    # Of a photograph that does not tell its time it is sure that it was taken before it came.
+    when = taken_at or (EPOCH, min(row.created_at for row, _ in images))
+    row = images[0][0]
+    about = {
+        "heliotwin:heliostat": heliostat,
+        "heliotwin:target": row.target.name,
+        "heliotwin:sun_azimuth_deg": row.sun_azimuth_deg,
+        "heliotwin:sun_elevation_deg": row.sun_elevation_deg,
+    }
+    item = f"{path}-calibration-item-stac.json"
+    writer.item(item, f"{heliostat}-{identifier}", when, place, assets, **about)
+    return files
 
 
-def _png(data: bytes, media_type: str) -> bytes:
-    """An image file as PNG, pixel by pixel the same."""
-    if media_type == PNG:
-        return data
-    pixels = decode_image(data)
-    return cv2.imencode(".png", pixels if pixels.ndim == 2 else pixels[..., ::-1])[1].tobytes()
+def _write_image(runtime: Runtime, writer: _Writer, heliostat: str, name: str, row: MeasurementRow) -> dict[str, str]:
+    """An image as it came, its file by the measurement's identifier; nothing where the store has it no longer."""
+    folder = history.image_folder(heliostat, row.reason == EXCLUDED)
+    file = f"{name}.{SUFFIXES[row.image.media_type]}"
+    if row.image.pruned_at is not None:
+        writer.skipped[f"{folder}/{name}"] = f"image kept until {row.image.pruned_at:%Y-%m-%d}"
+        return {}
+    try:
+        writer.bytes(f"{folder}/{file}", runtime.images.read(row.image_sha256), "images")
+    except StoreDamagedError as error:
+        writer.skipped[f"{folder}/{name}"] = str(error)
+        return {}
+    return {row.identifier: file}

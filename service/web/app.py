@@ -31,6 +31,7 @@ from service.web.middleware import (
     BodyLimitMiddleware,
     DoorMiddleware,
     HeadMiddleware,
+    PartMiddleware,
     RequestIdMiddleware,
     SecurityHeadersMiddleware,
     StoppingMiddleware,
@@ -125,6 +126,7 @@ def create_app(settings: Settings, operations: Operations | None = None, kinds: 
     security.require_declared_roles(app)
     problems.install(app)
     openapi.install(app)
+    app.add_middleware(PartMiddleware)
     app.add_middleware(StoppingMiddleware)
     app.add_middleware(BodyLimitMiddleware, settings=settings)
     app.add_middleware(DoorMiddleware, settings=settings)

@@ -23,6 +23,7 @@ from service.base.meters import REQUEST_SECONDS, REQUESTS
 from service.base.settings import Settings, is_loopback
 from service.twin.gate import STOPPING
 from service.web.answers import pages, problems
+from service.web.answers.parts import take_part
 from service.web.answers.problems import SECURITY_HEADERS, problem
 from service.web.door import security
 from service.web.door.limits import Buckets
@@ -123,6 +124,19 @@ class HeadMiddleware:
                 await self.app(scope, receive, send_head)
         finally:
             scope["method"] = "HEAD"
+
+
+class PartMiddleware:
+    """Takes from a page's query which part of it is asked for as a file."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """One ASGI call."""
+        if scope["type"] == "http":
+            take_part(scope)
+        await self.app(scope, receive, send)
 
 
 class SecurityHeadersMiddleware:

@@ -10,6 +10,7 @@ from model.plant import Heliostat, Plant
 from model.pointing import Weather
 from service.sources.documents import (
     IMAGE_KINDS,
+    SUFFIXES,
     Measurement,
     read_heliostat,
     read_json,
@@ -41,8 +42,11 @@ class PaintFolder(MeasurementFolder):
             except InvalidInputError as error:
                 self.skipped[f"{heliostat}/{identifier}"] = str(error)
                 continue
-            images = {kind: folder / f"{identifier}-{kind}.png" for kind in IMAGE_KINDS}
-            measurement.images.update({kind: file for kind, file in images.items() if file.is_file()})
+            for kind in IMAGE_KINDS:
+                files = [folder / f"{identifier}-{kind}.{suffix}" for suffix in SUFFIXES.values()]
+                found = next(filter(Path.is_file, files), None)
+                if found is not None:
+                    measurement.images[kind] = found
             yield measurement
 
 

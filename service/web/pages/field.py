@@ -3,18 +3,20 @@
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 from urllib.parse import urlencode
 
 import numpy as np
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import HTMLResponse
+from numpy.typing import NDArray
 from pydantic import Field
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from service.base.settings import Settings
 from service.drawing.charts import Scale
+from service.drawing.pictures import places_picture
 from service.store.job_tables import JobRow
 from service.store.tables import PlantRow, TargetRow
 from service.twin.field import Line
@@ -76,6 +78,38 @@ class Drawing:
     tower: tuple[float, float]
     per_metre: float
     bar_m: float
+
+
+@dataclass(frozen=True)
+class FieldMap:
+    """What the map shows, as a file."""
+
+    formats: ClassVar[tuple[str, ...]] = ("npz", "png")
+
+    lines: Sequence[Line]
+    metric: Metric
+    scale: Scale
+
+    @property
+    def title(self) -> str:
+        """The figure with its unit."""
+        return self.scale.label
+
+    @property
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Names, places east and north (n, 2) [m], and the figure, NaN where it is not known."""
+        values = [self.metric.value(line) for line in self.lines]
+        return {
+            "names": np.array([line.name for line in self.lines]),
+            "places_m": np.array([(line.east_m, line.north_m) for line in self.lines]).reshape(-1, 2),
+            "values": np.array([np.nan if value is None else value for value in values]),
+            "unit": np.array(self.metric.unit),
+        }
+
+    def drawn(self) -> bytes:
+        """As PNG, with axes and a colour bar."""
+        arrays, scale = self.arrays, self.scale
+        return places_picture(arrays["places_m"], arrays["values"], scale.label, scale.colours, (scale.low, scale.high))
 
 
 def _told(line: Line, metric: Metric) -> str:
@@ -214,6 +248,7 @@ def get_field(
         scale=scale,
         fine=runtime.settings.map_scales[view.metric][0],
         poor=runtime.settings.map_scales[view.metric][1],
+        field_map=FieldMap(found, chosen, scale),
         drawing=draw(lines, found, chosen, scale) if lines else None,
         pending=now.pending,
         is_behind=now.is_behind,

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from statistics import fmean
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from fastapi import APIRouter, Depends, Query, Request
@@ -20,7 +20,7 @@ from service.base.arrays import unpack
 from service.base.fields import Version
 from service.drawing import charts
 from service.drawing.charts import HeatMap, History, Scale
-from service.drawing.pictures import mirror_heights
+from service.drawing.pictures import comparison_picture, mirror_heights
 from service.store import decisions, mounts
 from service.store.measurements import PhotographVerdict, Shot, list_shots
 from service.store.tables import DecisionRow, HeliostatRow, MountRow, SurfaceRow
@@ -57,10 +57,27 @@ class Revision:
 class ComparisonFigure:
     """A comparison and its three pictures."""
 
+    formats: ClassVar[tuple[str, ...]] = ("npz", "png")
+
     comparison: Comparison
     measured: HeatMap
     forecast: HeatMap
     difference: HeatMap
+
+    @property
+    def title(self) -> str:
+        """What it shows."""
+        return f"Light and forecast of {self.comparison.measurement.identifier}"
+
+    @property
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """The three, in shares of the measured peak."""
+        return {name: getattr(self, name).values for name in ("measured", "forecast", "difference")}
+
+    def drawn(self) -> bytes:
+        """The three side by side, as PNG."""
+        title = f"{self.comparison.measurement.identifier}: accuracy {self.comparison.accuracy:.1%}"
+        return comparison_picture(self.measured.values, self.forecast.values, self.measured.width, title)
 
 
 def _newest_surfaces(session: Session, heliostat: HeliostatRow) -> list[SurfaceRow]:

@@ -1,5 +1,6 @@
 """The tables of the pages as CSV."""
 
+from dataclasses import fields
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Response
@@ -7,6 +8,7 @@ from fastapi import APIRouter, Query, Response
 from service import store
 from service.store.tables import MeasurementRow
 from service.twin.accuracy import name_of
+from service.twin.attention import Item, needs_attention
 from service.twin.field import PATIENCE_S, figures_of
 from service.twin.finding import METRICS, Wanted, find
 from service.web.answers.sheets import sheet_answer
@@ -28,6 +30,15 @@ def get_field_table(wanted: Annotated[Wanted, Query()], runtime: RuntimeDep, boo
     told = map(field_line, lines)
     rows = ([*line.position_m, *(getattr(line, name) for name in _FIELD), "; ".join(line.doubts)] for line in told)
     return sheet_answer("field", columns, rows)
+
+
+@router.get("/attention.csv")
+def get_attention_table(runtime: RuntimeDep, book: FieldBookDep) -> Response:
+    """All that needs attention, acknowledged or not."""
+    with runtime.database.reading() as session:
+        items, _ = needs_attention(session, book, runtime.settings)
+    columns = [one.name for one in fields(Item) if one.name != "mark"]
+    return sheet_answer("attention", columns, ([getattr(item, name) for name in columns] for item in items))
 
 
 _QUALITY = (
@@ -100,7 +111,7 @@ _SURFACE = (
     "created_at",
     "deviation [mm]",
     "uncertainty [mm]",
-    "misfit [1]",
+    "misfit [%]",
     "trusted",
     "doubts",
     "photographs",
@@ -129,7 +140,7 @@ def get_surfaces_table(name: NamePath, runtime: RuntimeDep) -> Response:
                 row.created_at,
                 figures.deviation_mm,
                 figures.uncertainty_mm,
-                row.misfit,
+                None if row.misfit is None else 100 * row.misfit,
                 row.trusted,
                 "; ".join(row.doubts or []),
                 " ".join(one.identifier for one in row.measurements),

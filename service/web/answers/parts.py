@@ -1,0 +1,28 @@
+"""A part of a page as a file: ``?table=NAME`` is its table as CSV, ``?figure=NAME&format=..`` its figure."""
+
+from dataclasses import dataclass
+from urllib.parse import parse_qsl, urlencode
+
+from starlette.types import Scope
+
+_NAMES = ("table", "figure", "format")
+
+
+@dataclass(frozen=True)
+class Part:
+    """What of a page is asked for: its ``table``, or its ``figure`` in a ``format``."""
+
+    table: str | None = None
+    figure: str | None = None
+    format: str = ""
+
+
+def take_part(scope: Scope) -> None:
+    """Take what is asked for as a part from the query into the request's state: routes know their own query only."""
+    if scope["path"].startswith("/v1/") or scope["method"] != "GET":
+        return
+    query = parse_qsl(scope["query_string"].decode("ascii", "replace"), keep_blank_values=True)
+    asked = {name: value for name, value in query if name in _NAMES}
+    if "table" in asked or "figure" in asked:
+        scope["query_string"] = urlencode([(name, value) for name, value in query if name not in _NAMES]).encode()
+        scope.setdefault("state", {})["part"] = Part(**asked)
