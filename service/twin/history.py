@@ -21,7 +21,6 @@ from model.imaging import ImageKind
 from service import store
 from service.base.arrays import unpack
 from service.sources.files import require_regular
-from service.sources.photograph import Photograph
 from service.store import audit
 from service.store.measurements import EXCLUDED, find_measurement_of_image
 from service.store.records import many, read, record
@@ -204,22 +203,6 @@ def image_path(root: Path, name: str, photograph: Any) -> Path:
     """Where a photograph's image is."""
     file: str = photograph.image
     return root / image_folder(name, photograph.excluded) / file
-
-
-def photograph_of(document: Any) -> Photograph:
-    """What is known of it, as it could be sent."""
-    motors = (document.motor_axis_1, document.motor_axis_2)
-    return Photograph(
-        target_name=document.target,
-        kind=document.kind,
-        sun_azimuth_deg=document.sun_azimuth_deg,
-        sun_elevation_deg=document.sun_elevation_deg,
-        external_id=document.external_id,
-        taken_at=document.taken_at,
-        motor_position=None if None in motors else motors,
-        focal_spot_wgs84=None if document.focal_spot_wgs84 is None else tuple(document.focal_spot_wgs84),
-        corners=None if document.corners_px is None else document.corners_px["corners"],
-    )
 
 
 def restore_heliostat(session: Session, row: HeliostatRow, given: Any, root: Path, actor: str) -> bool:

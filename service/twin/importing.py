@@ -25,6 +25,7 @@ from service.store.columns import EPOCH
 from service.store.keys import RESERVED
 from service.twin import geometry, history
 from service.twin.ingest import ingest
+from service.twin.photographs import photograph_with
 from service.twin.runtime import Runtime
 
 UNREADABLE = (InvalidInputError, ImageRefusedError, ConflictError, TooLargeError, UnsupportedImageError)
@@ -97,7 +98,7 @@ def _import_heliostat(
     for one in () if told is None else told.photographs:  # in the order in which they came
         file = history.image_path(folder.root, name, one)
         done.add(file)
-        put(f"{name}/{one.identifier} {one.kind}", history.photograph_of(one), file)
+        put(f"{name}/{one.identifier} {one.kind}", photograph_with(one, one.target), file)
     for measurement in folder.measurements(name, with_images=False):
         if not measurement.images:
             skipped[measurement.key] = "no image"

@@ -34,16 +34,22 @@ def values_of(row: MeasurementRow) -> dict[str, Any]:
 
 def photograph_of(row: MeasurementRow) -> Photograph:
     """A stored measurement's photograph, as it could be sent."""
-    motors = (row.motor_axis_1, row.motor_axis_2)
+    return photograph_with(row, row.target.name)
+
+
+def photograph_with(known: Any, target_name: str) -> Photograph:
+    """The same of what has a measurement's columns, or a record of them."""
+    motors = (known.motor_axis_1, known.motor_axis_2)
+    spot = known.focal_spot_wgs84
     return Photograph(
-        target_name=row.target.name,
-        kind=cast(ImageKind, row.kind),
-        sun_azimuth_deg=row.sun_azimuth_deg,
-        sun_elevation_deg=row.sun_elevation_deg,
-        external_id=row.external_id,
-        taken_at=row.taken_at,
+        target_name=target_name,
+        kind=cast(ImageKind, known.kind),
+        sun_azimuth_deg=known.sun_azimuth_deg,
+        sun_elevation_deg=known.sun_elevation_deg,
+        external_id=known.external_id,
+        taken_at=known.taken_at,
         motor_position=None if None in motors else cast(tuple[float, float], motors),
-        focal_spot_wgs84=cast(Any, row.focal_spot_wgs84),
-        corners=None if row.corners_px is None else row.corners_px["corners"],
-        weather=Weather(row.wind_speed_m_s, row.wind_from_deg, row.temperature_c),
+        focal_spot_wgs84=None if spot is None else tuple(spot),
+        corners=None if known.corners_px is None else known.corners_px["corners"],
+        weather=Weather(known.wind_speed_m_s, known.wind_from_deg, known.temperature_c),
     )
