@@ -24,7 +24,7 @@ from service.jobs.kinds.plans import PlanIn
 from service.store import queue
 from service.store.columns import now
 from service.store.job_tables import JobRow
-from service.web.answers.pages import go_to, render
+from service.web.answers.pages import leave_for, render
 from service.web.door.dependencies import DRAWS, OPERATE, READ, IdentityDep, RuntimeDep
 
 router = APIRouter(include_in_schema=False)
@@ -225,7 +225,15 @@ def get_plan_page(
 
 
 @router.post("/plans", dependencies=[OPERATE])
-def post_plan_form(form: Annotated[PlanForm, Form()], runtime: RuntimeDep, identity: IdentityDep) -> Response:
-    """Ask for a plan, and go to its page."""
-    row = ask_for(runtime, "plans", form.payload().model_dump(mode="json"), identity.name)
-    return go_to(f"/plans/{row.id}")
+def post_plan_form(
+    request: Request, form: Annotated[PlanForm, Form()], runtime: RuntimeDep, identity: IdentityDep
+) -> Response:
+    """Ask for a plan, and go to its page; what is wrong is told beside the form, which keeps what was typed."""
+    payload = form.payload()
+    with runtime.database.reading() as session:
+        chosen = payload.heliostats or []
+        known = store.get_heliostats(session, chosen)
+    if unknown := [name for name in chosen if name not in known]:
+        raise InvalidInputError(f"heliostats: there is no {unknown[0]} here; the field's page has the names")
+    row = ask_for(runtime, "plans", payload.model_dump(mode="json"), identity.name)
+    return leave_for(request, f"/plans/{row.id}")

@@ -120,12 +120,22 @@ def test_form_leads_to_the_plan_which_can_be_reopened(app: FastAPI, pages: TestC
         ({"heliostats": "AA39 nan 1"}, "aim_offsets"),
         ({"end": "2026-06-20T02:00"}, "after begin"),
         ({"begin": ""}, "begin"),
+        ({"heliostats": "AA39\nZZ99"}, "no ZZ99"),
     ],
 )
 def test_form_says_what_is_wrong(pages: TestClient, changes: dict[str, str], said: str):
     answer = pages.post("/plans", data=FORM | changes)
     assert answer.status_code == 422
     assert said in answer.text
+
+
+def test_what_is_wrong_is_told_beside_the_form(pages: TestClient):
+    """Which keeps what was typed: only the sentence is exchanged, or the browser goes on to the plan."""
+    by_htmx = {"HX-Request": "true"}
+    answer = pages.post("/plans", data=FORM | {"heliostats": "ZZ99"}, headers=by_htmx)
+    assert (answer.status_code, answer.headers["HX-Retarget"]) == (422, "#notice")
+    assert "<form" not in answer.text
+    assert pages.post("/plans", data=FORM, headers=by_htmx).headers["HX-Redirect"].startswith("/plans/")
 
 
 def test_plan_is_no_other_job(app: FastAPI, pages: TestClient):
