@@ -103,9 +103,9 @@ def list_measurements(
 
 
 def list_shots(
-    session: Session, heliostat: HeliostatRow, limit: int, verdict: PhotographVerdict | None = None
+    session: Session, heliostat: HeliostatRow, limit: int, verdict: PhotographVerdict | None = None, newer: int = 0
 ) -> list[Shot]:
-    """The photographs whose images came last, newest first, or those of one verdict."""
+    """The photographs whose images came last, newest first, but for so many ``newer`` ones; or those of one verdict."""
     name = func.coalesce(MeasurementRow.external_id, MeasurementRow.identifier).label("name")
     is_used = func.max(case((MeasurementRow.accepted, 1), else_=0))
     is_excluded = func.max(case((MeasurementRow.reason == EXCLUDED, 1), else_=0))
@@ -114,7 +114,7 @@ def list_shots(
         query = query.having(is_used == int(verdict == "used"))
     if verdict in ("refused", "excluded"):
         query = query.having(is_excluded == int(verdict == "excluded"))
-    names = session.scalars(query.order_by(func.max(MeasurementRow.id).desc()).limit(limit)).all()
+    names = session.scalars(query.order_by(func.max(MeasurementRow.id).desc()).offset(newer).limit(limit)).all()
     images: dict[str, list[MeasurementRow]] = {known: [] for known in names}
     for row in session.scalars(_measurements(heliostat).where(name.in_(names))):
         images[row.external_id or row.identifier].append(row)

@@ -66,7 +66,8 @@ def main() -> int:
         return 0
     years = read_folder(root)
     heliostat = years.plant.heliostats["AA39"]
-    taken = sorted((o for o in observations_of(years, "AA39")[0] if o.clipped_share < BRIGHT), key=day_of)
+    dated = [o for o in observations_of(years, "AA39")[0] if o.clipped_share < BRIGHT and o.taken_at is not None]
+    taken = sorted(dated, key=day_of)
     days = sorted({day_of(o) for o in taken})
     print(
         "| parted | judges | before: by their own side's surface / by the other's | after: likewise "

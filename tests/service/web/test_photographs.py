@@ -1,5 +1,6 @@
 """Photographs on the pages: one row each, whatever kinds came of it; small, outlined, and beside its light."""
 
+import html
 import re
 from typing import Any
 
@@ -11,6 +12,7 @@ from fastapi.testclient import TestClient
 from model.imaging import MeasuredFlux, Quality
 from service import store
 from service.store.measurements import list_shots
+from service.web.pages import heliostat
 from tests.service.conftest import FakeOperations, Post, png
 from tests.service.web.test_pages import HTML, text_of
 
@@ -49,6 +51,17 @@ def test_photographs_are_chosen_by_verdict(filled: TestClient, verdict: str, nam
     assert rows_of(page) == names
     assert re.search(rf'aria-current="true">{verdict}</a>', page)
     assert ("no spot" in page) == (verdict == "refused")
+
+
+def test_older_photographs_are_a_page_away(filled: TestClient, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(heliostat, "MOST_PHOTOGRAPHS", 2)
+    page = text_of(filled, "/heliostats/AA39")
+    assert rows_of(page) == ["3", "2"]
+    (older,) = re.findall(r'href="([^"]*newer=2)#', page)
+    page = text_of(filled, html.unescape(older))
+    assert rows_of(page) == ["1"]
+    assert "newer=0" in page
+    assert "newer=3" not in page
 
 
 def test_other_verdicts_are_refused(filled: TestClient):
