@@ -24,8 +24,8 @@ from tests.benchmarks.years import interval
 
 Array = NDArray[np.float64]
 
-IMAGES = 12
-PARTS = 4
+IMAGES = 8
+PARTS = 3
 
 
 def day_of(observation: Observation) -> str:
