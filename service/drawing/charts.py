@@ -280,7 +280,9 @@ def timeline(
     margin = 0.04 * (last - first) or 0.5
     first, last = first - margin, last + margin
     numbers = [value.number for value in values] + ([] if limit is None else [limit])
-    low = 0.0 if from_zero else min(numbers) - 0.1 * (max(numbers) - min(numbers))
+    # Less than half a percent of the value is nothing to be seen.
+    room = max(0.1 * (max(numbers) - min(numbers)), 0.005 * abs(max(numbers)))
+    low = 0.0 if from_zero else min(numbers) - room
     high = max(max(numbers) + 0.1 * (max(numbers) - low), low + 1e-9)
     locator = _dates.AutoDateLocator(minticks=3, maxticks=5, tz=UTC)
     places = [
