@@ -1,6 +1,7 @@
 """A photograph: its light against the forecast, the form that corrects or excludes it, and what was made from it."""
 
 from collections.abc import Callable
+from functools import partial
 from http import HTTPStatus
 from typing import Annotated, Literal
 
@@ -73,15 +74,16 @@ def told(correction: CorrectionRow) -> list[str]:
 # Longest sides of a thumbnail and of what is shown larger [px]: the file itself has them all.
 _THUMBNAIL = 192
 _SHOWN = 1000
+_LARGE = 6000  # side [px] of one to look at closely: no camera's frame is made smaller
 
 
 def _thumbnail(runtime: Runtime, _: str, row: MeasurementRow) -> bytes:
     return photograph_picture(pixels_of(runtime, row), _THUMBNAIL)
 
 
-def _outlined(runtime: Runtime, heliostat: str, row: MeasurementRow) -> bytes:
+def _outlined(runtime: Runtime, heliostat: str, row: MeasurementRow, most: int = _SHOWN) -> bytes:
     pixels, measured = look_at(runtime, heliostat, row)
-    return photograph_picture(pixels, _SHOWN, measured.corners)
+    return photograph_picture(pixels, most, measured.corners)
 
 
 def _crop(runtime: Runtime, heliostat: str, row: MeasurementRow) -> bytes:
@@ -94,6 +96,7 @@ def _crop(runtime: Runtime, heliostat: str, row: MeasurementRow) -> bytes:
 _VIEWS: dict[str, Callable[[Runtime, str, MeasurementRow], bytes]] = {
     "thumbnail": _thumbnail,
     "outlined": _outlined,
+    "large": partial(_outlined, most=_LARGE),
     "crop": _crop,
 }
 
@@ -102,7 +105,7 @@ _VIEWS: dict[str, Callable[[Runtime, str, MeasurementRow], bytes]] = {
 def get_view(
     name: NamePath,
     measurement: MeasurementPath,
-    view: Literal["thumbnail", "outlined", "crop"],
+    view: Literal["thumbnail", "outlined", "large", "crop"],
     runtime: RuntimeDep,
     if_none_match: Annotated[str | None, Header()] = None,
 ) -> Response:

@@ -111,6 +111,8 @@ class TestFound:
         ).astype(int)
         assert abs(outlined[16, 16] - 200).max() < 12
         assert abs(outlined[16, 8] - 200).max() > 40  # its left edge
+        assert f'href="{HERE}/1/large.jpg"' in text_of(client, f"{HERE}/1")
+        assert client.get(f"{HERE}/1/large.jpg").headers["Content-Type"] == "image/jpeg"
         crop = cv2.imdecode(np.frombuffer(client.get(f"{HERE}/1/crop.jpg").content, np.uint8), cv2.IMREAD_GRAYSCALE)
         assert crop.shape == (256, 256)
         assert abs(crop.astype(int) - 99).max() < 3
