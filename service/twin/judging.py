@@ -89,7 +89,7 @@ def decide(gains: Array, unseen: int, stood: Standing, comes: Standing, today: s
 
 
 def _too_few(unseen: int) -> str:
-    return f"photographs that neither has seen: {unseen}, to judge takes {LEAST_UNSEEN}"
+    return f"{unseen} photographs that neither has seen are too few to judge ({LEAST_UNSEEN} do)"
 
 
 def _accuracies(runtime: Runtime, twin: Twin, rows: Sequence[MeasurementRow], z: Array | None) -> Array:
