@@ -86,7 +86,7 @@ def test_worse_surface_waits_aside(client: TestClient):
     assert (decision["version"], decision["taken"], decision["previous"]) == (2, False, 1)
     assert decision["accuracy_before"] == pytest.approx(0.9, abs=0.01)
     assert decision["accuracy_after"] == pytest.approx(0.8, abs=0.01)
-    assert "photographs that neither has seen: 0," in decision["reason"]
+    assert "too few to judge" in decision["reason"]
     assert "version 1 is refined, this one is the network's alone" in decision["reason"]
 
 
