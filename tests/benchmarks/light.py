@@ -62,6 +62,8 @@ RATIOS = (0.005, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4)
 BLURS = (0.0, 0.03, 0.06, 0.09, 0.12)
 AMBIENTS = (0.40, 0.44, 0.48, 0.53, 0.58, 0.62, 0.66)
 CAMERAS = {"counts": Camera(LINEAR), "light": Camera()}
+LEFT_BY_SRGB = {0.55: "-", 0.70: "--"}
+"""Compression by sRGB over ln(total / ambient light): by its slopes at both, and as it fits a Gaussian spot best."""
 VIEW = View(256, 256, samples=24, padding=0.5, cones="facet")
 
 
@@ -356,13 +358,14 @@ def draw(cases: list[Case], path: Path) -> None:
     contrast, found = compressions(cases).T
     reach = np.array([0, contrast.max()])
     last.plot(contrast, found, ".", label=f"{len(found)} photographs")
-    last.plot(reach, 0.55 * reach, color="gray", linewidth=0.8, label="what sRGB leaves: 0.55 ln(total / ambient)")
+    for slope, style in LEFT_BY_SRGB.items():
+        last.plot(reach, slope * reach, style, color="gray", linewidth=0.8, label=f"{slope:.2f} ln(total / ambient)")
     last.set(xlabel="ln(total / ambient light)", ylabel="compression of the counts", title="a lit sheet's shoulder")
     last.legend(loc="upper left")
-    off = found - 0.55 * contrast
+    by_srgb = ", ".join(f"{slope * contrast.mean():.2f} by {slope:.2f} ln" for slope in LEFT_BY_SRGB)
     print(
-        f"compression of {len(found)} photographs: {found.mean():.2f}, by ambient light {0.55 * contrast.mean():.2f}; "
-        f"off by {off.mean():+.2f}, scattered by {off.std():.2f}, alone by {found.std():.2f}"
+        f"compression of {len(found)} photographs: {found.mean():.2f} (expected of sRGB: {by_srgb}); "
+        f"correlation with ln(total / ambient) {np.corrcoef(contrast, found)[0, 1]:.2f}"
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
