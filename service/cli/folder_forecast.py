@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from model.effects import Effect, effect_to_json, model_version
 from model.errors import InvalidInputError, ModelError
 from model.images import clipped_alike
-from model.metrics import accuracy_window, compare_on_target
+from model.imaging import MeasuredFlux
+from model.metrics import FluxComparison, accuracy_window, compare_on_target
+from model.plant import TargetPlane
 from service.base.progress import Progress, quiet
 from service.cli.folder import ROUGHEST_FIRST, check_surfaces, finish, measure, surface_of
 from service.cli.folder_pointing import Mounts, motors_of
@@ -72,13 +74,27 @@ def compare(
     measured = measure(folder, measurement)
     if measured.flux is None:
         return None
+    return asdict(agreement(measured, traced, folder.plant.targets[measurement.target], window))
+
+
+def agreement(
+    measured: MeasuredFlux, traced: compute.Forecast, plane: TargetPlane, window: float | None = None
+) -> FluxComparison:
+    """A forecast against the flux that was measured on a target; in a window [m] by the spot if none is given.
+
+    Raises
+    ------
+    InvalidInputError
+        Where the photograph was refused.
+    """
+    if measured.flux is None:
+        raise InvalidInputError(f"{measured.quality.reason}: {measured.quality.detail}")
     flux, forecast = measured.flux.astype(np.float64), traced.camera_view.astype(np.float64)
     if measured.clipped is not None:
         forecast = clipped_alike(forecast, flux, measured.clipped.astype(np.float64))
-    plane = folder.plant.targets[measurement.target]
     size = (plane.width, plane.height)
     window = window or accuracy_window([flux], [size], spill=SPILL, widest=WIDEST)
-    return asdict(compare_on_target(flux, forecast, size, window))
+    return compare_on_target(flux, forecast, size, window)
 
 
 def forecast_folder(

@@ -3,7 +3,8 @@
 Every crop of AA39 in ``../shared/stj-years`` is measured twice, its values taken for light (linear) and turned into
 light (sRGB), and held against the forecast by the measured surface, without any fitted number: Buie's sun with 0.02, a
 window of 4 m. Of each photograph it also tells which circumsolar ratio suits it best, which the photograph itself has
-chosen. Prints means and medians, and draws accuracy by date, brightness against forecast, and the pictures themselves.
+chosen. Prints means and medians, and draws accuracy by date, brightness against forecast, the compression that each
+photograph's counts show against how much brighter than the daylight its spot is, and the pictures themselves.
 
 What the other days and the day's other photographs tell of lens and sky is judged on photographs that told nothing of
 it: the blur of each target's camera by the other half of the days, the circumsolar ratio by the others of the same day.
@@ -30,6 +31,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
 
 from model.forecast import Setup, View, align
 from model.images import clipped_alike, normalized
@@ -60,6 +62,8 @@ RATIOS = (0.005, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4)
 BLURS = (0.0, 0.03, 0.06, 0.09, 0.12)
 AMBIENTS = (0.40, 0.44, 0.48, 0.53, 0.58, 0.62, 0.66)
 CAMERAS = {"counts": Camera(LINEAR), "light": Camera()}
+LEFT_BY_SRGB = {0.55: "-", 0.70: "--"}
+"""Compression by sRGB over ln(total / ambient light): by its slopes at both, and as it fits a Gaussian spot best."""
 VIEW = View(256, 256, samples=24, padding=0.5, cones="facet")
 
 
@@ -310,9 +314,34 @@ def _before(obstacles: torch.Tensor) -> Callable[[Scene], Scene]:
     return lambda scene: scene.with_(obstacles=obstacles.to(scene.sun))
 
 
+def compressions(cases: list[Case]) -> Array:
+    """Of each photograph (N, 2) with hardly a place cut off: ln(total / ambient light), and its counts' compression.
+
+    The shoulder of `model.effects.camera_shoulder` that suits the counts best, were they differences of light.
+    """
+
+    def shouldered(image: Array, compression: float) -> Array:
+        return -np.expm1(-compression * image / image.max())
+
+    def best(case: Case, flux: Array) -> float:
+        def missed(compression: float) -> float:
+            return -compare_on_target(flux, shouldered(case.forecasts[0.02], compression), case.target).accuracy
+
+        return float(minimize_scalar(missed, bounds=(1e-3, 5), method="bounded", options={"xatol": 0.01}).x)
+
+    taken = [(case, case.measured["counts"].flux, case.measured["light"].quality) for case in cases]
+    return np.array(
+        [
+            (np.log1p(quality.signal_to_background), best(case, flux.astype(float)))
+            for case, flux, quality in taken
+            if flux is not None and quality.accepted and quality.saturated_share < 0.02
+        ]
+    )
+
+
 def draw(cases: list[Case], path: Path) -> None:
-    """Accuracy by date under both laws, and of one bright photograph brightness against forecast, pixel by pixel."""
-    figure, (left, right) = plt.subplots(1, 2, figsize=(13, 5), layout="constrained")
+    """Accuracy by date under both laws, one photograph against its forecast pixel by pixel, compression by ambient."""
+    figure, (left, right, last) = plt.subplots(1, 3, figsize=(18, 5), layout="constrained")
     dated = [case for case in cases if case.taken_at is not None]
     shown = max(dated, key=lambda case: case.accuracy("light", 0.02))
     forecast = shown.forecasts[0.02] / shown.forecasts[0.02].sum()
@@ -326,6 +355,18 @@ def draw(cases: list[Case], path: Path) -> None:
     left.legend(loc="lower left")
     right.plot([0, 1], [0, 1], color="gray", linewidth=0.8)
     right.set(xlabel="forecast, of its peak", ylabel="photograph, the same", title=f"{shown.name}, pixel by pixel")
+    contrast, found = compressions(cases).T
+    reach = np.array([0, contrast.max()])
+    last.plot(contrast, found, ".", label=f"{len(found)} photographs")
+    for slope, style in LEFT_BY_SRGB.items():
+        last.plot(reach, slope * reach, style, color="gray", linewidth=0.8, label=f"{slope:.2f} ln(total / ambient)")
+    last.set(xlabel="ln(total / ambient light)", ylabel="compression of the counts", title="a lit sheet's shoulder")
+    last.legend(loc="upper left")
+    by_srgb = ", ".join(f"{slope * contrast.mean():.2f} by {slope:.2f} ln" for slope in LEFT_BY_SRGB)
+    print(
+        f"compression of {len(found)} photographs: {found.mean():.2f} (expected of sRGB: {by_srgb}); "
+        f"correlation with ln(total / ambient) {np.corrcoef(contrast, found)[0, 1]:.2f}"
+    )
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
     print(f"drawn: {path}")
