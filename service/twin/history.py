@@ -264,7 +264,7 @@ def _restore_photographs(session: Session, row: HeliostatRow, given: list[Any]) 
         measurement.identifier = f"-{measurement.id}"  # none that another one shall have
     session.flush()
     for document, measurement in known:
-        for name in ("identifier", "external_id", "created_at", "corrected_at"):
+        for name in ("identifier", "external_id", "created_at", "corrected_at", "forecast_accuracy"):
             setattr(measurement, name, getattr(document, name))
         if document.excluded:
             measurement.accepted, measurement.reason = False, EXCLUDED

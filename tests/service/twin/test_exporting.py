@@ -90,6 +90,7 @@ def filled(client: TestClient, tower: dict[str, Any]) -> TestClient:
     with client.app.state.runtime.database.writing() as session:  # type: ignore[attr-defined]
         row = store.get_heliostat(session, "AA39")
         store.mounts.add_mount(session, row, {"valid_from": "2024-06-03T11:30:00+00:00", "residual_mrad": [0.25]})
+        store.get_measurement(session, row, "1").forecast_accuracy = 0.875
     return client
 
 
