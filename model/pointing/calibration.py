@@ -123,14 +123,12 @@ def calibrate(chain: Chain, readings: Readings, noise: Noise | None = None, fiel
     return Calibrated(chain, prior, noise, believed, left)
 
 
-def calibrate_kinds(
-    chain: Chain, readings: Readings, noise: Noise | None = None
-) -> list[tuple[NDArray[np.intp], Calibrated]]:
+def calibrate_kinds(chain: Chain, readings: Readings, noise: Noise | None = None) -> list[Kind]:
     """Mounts of a field by the priors that its kinds of drives make: each kind's with its rows, the largest first.
 
     A kind of few heliostats with readings takes the spreads of the largest kind.
     """
-    done: list[tuple[NDArray[np.intp], Calibrated]] = []
+    done: list[Kind] = []
     for rows in chain.kinds():
         of_kind, own = chain.rows(rows), readings.of(rows)
         few = bool(done) and own.used.any(axis=1).sum() < _LEAST_OF_KIND

@@ -5,6 +5,7 @@ report that it also writes there. A verb fails only if nothing is left.
 """
 
 import json
+from collections.abc import Iterator
 from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
@@ -267,6 +268,19 @@ def check_surfaces(surfaces: str) -> None:
     """Refuse a choice of surfaces that is none of those that verbs know."""
     if surfaces not in ("measured", "ideal") and not Path(surfaces).is_dir():
         raise InvalidInputError(f"--surfaces must be 'measured', 'ideal' or a folder of predictions, got {surfaces!r}")
+
+
+def with_surfaces(
+    folder: MeasurementFolder, surfaces: str, skipped: dict[str, str]
+) -> Iterator[tuple[Heliostat, tuple[Array, int] | None]]:
+    """Heliostats with the surfaces to trace, as `surface_of` has them; ``skipped`` tells why others are left out."""
+    for name, heliostat in folder.plant.heliostats.items():
+        try:
+            surface = surface_of(folder, heliostat, surfaces)
+        except ModelError as error:
+            skipped[name] = str(error)
+        else:
+            yield heliostat, surface
 
 
 def surface_of(folder: MeasurementFolder, heliostat: Heliostat, surfaces: str) -> tuple[Array, int] | None:

@@ -15,7 +15,7 @@ from model.imaging.light import Measured, Srgb, Transfer
 from model.imaging.measured_law import LitSheet, fit_law, lit_sheet
 from model.plant import TargetPlane
 from service.base.progress import Progress, quiet
-from service.cli.folder import check_surfaces, finish, read_image, surface_of
+from service.cli.folder import check_surfaces, finish, read_image, with_surfaces
 from service.cli.folder_forecast import agreement, forecast_measurement
 from service.sources.documents import Measurement
 from service.sources.folder import MeasurementFolder
@@ -126,13 +126,8 @@ def _shots(
 ) -> tuple[list[_Shot], dict[str, str]]:
     """Photographs with their forecasts, and what was left out."""
     shots, skipped = [], dict[str, str]()
-    for name, heliostat in folder.plant.heliostats.items():
-        try:
-            surface = surface_of(folder, heliostat, surfaces)
-        except ModelError as error:
-            skipped[name] = str(error)
-            continue
-        for measurement in folder.measurements(name):
+    for heliostat, surface in with_surfaces(folder, surfaces, skipped):
+        for measurement in folder.measurements(heliostat.name):
             if targets and measurement.target not in targets:
                 continue
             progress(measurement.key)

@@ -15,7 +15,7 @@ from model.imaging import MeasuredFlux
 from model.metrics import FluxComparison, accuracy_window, compare_on_target
 from model.plant import TargetPlane
 from service.base.progress import Progress, quiet
-from service.cli.folder import ROUGHEST_FIRST, check_surfaces, finish, measure, surface_of
+from service.cli.folder import ROUGHEST_FIRST, check_surfaces, finish, measure, with_surfaces
 from service.cli.folder_pointing import Mounts, motors_of
 from service.sources.documents import Measurement, optics_to_json
 from service.sources.folder import MeasurementFolder
@@ -122,15 +122,10 @@ def forecast_folder(
         "measurements": {},
         "skipped": {},
     }
-    for name, heliostat in folder.plant.heliostats.items():
-        try:
-            surface = surface_of(folder, heliostat, surfaces)
-        except ModelError as error:
-            report["skipped"][name] = str(error)
-            continue
-        measurements = folder.measurements(name, with_images=False)
+    for heliostat, surface in with_surfaces(folder, surfaces, report["skipped"]):
+        measurements = folder.measurements(heliostat.name, with_images=False)
         if not measurements:
-            report["skipped"][name] = "no measurement"
+            report["skipped"][heliostat.name] = "no measurement"
         for measurement in measurements:
             progress(measurement.key)
             try:

@@ -10,7 +10,7 @@ from model.errors import InvalidInputError, ModelError
 from model.study import FluxImage, Study, StudyOptions, study
 from model.surface import DEGREE, control_points
 from service.base.progress import Progress, quiet
-from service.cli.folder import check_surfaces, clock_fault_of, evidence_of, surface_of
+from service.cli.folder import check_surfaces, clock_fault_of, evidence_of, with_surfaces
 from service.sources.documents import Measurement, read_json
 from service.sources.folder import MeasurementFolder
 
@@ -41,18 +41,13 @@ def photographs_of(folder: MeasurementFolder, surfaces: str = "measured") -> tup
     """What a folder gives a study, and what it does not: heliostats and measurements with the reasons."""
     photographs: list[FluxImage] = []
     skipped, seen = dict(folder.skipped), predicted_from(surfaces)
-    for name, heliostat in folder.plant.heliostats.items():
-        try:
-            surface = surface_of(folder, heliostat, surfaces)
-        except ModelError as error:
-            skipped[name] = str(error)
-            continue
+    for heliostat, surface in with_surfaces(folder, surfaces, skipped):
         points, degree = (control_points(heliostat), DEGREE) if surface is None else surface
-        for measurement in folder.measurements(name):
+        for measurement in folder.measurements(heliostat.name):
             try:
                 _require_on_target(folder, measurement)
-                evidence, was_used = evidence_of(folder, measurement), measurement.identifier in seen.get(name, ())
-                photographs.append(evidence.photograph(heliostat, points, degree, was_used))
+                was_used = measurement.identifier in seen.get(heliostat.name, ())
+                photographs.append(evidence_of(folder, measurement).photograph(heliostat, points, degree, was_used))
             except ModelError as error:
                 skipped[measurement.key] = str(error)
     return photographs, skipped

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -11,9 +12,17 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from model.errors import InvalidInputError
+
 # Tables and progress go to standard error, so that --json leaves standard output to the report.
 console = Console(stderr=True)
 AsJson = Annotated[bool, typer.Option("--json", help="Print the report as JSON on standard output.")]
+
+
+def require_file(path: Path) -> None:
+    """Refuse what names a folder where a report is to be written, before any work is done for it."""
+    if path.is_dir():
+        raise InvalidInputError(f"{path} is a folder; name a file to write to")
 
 
 @contextmanager

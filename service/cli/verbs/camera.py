@@ -5,8 +5,7 @@ from typing import Annotated
 
 import typer
 
-from model.errors import InvalidInputError
-from service.cli.output import AsJson, make_table, progress, show
+from service.cli.output import AsJson, make_table, progress, require_file, show
 from service.cli.verbs.photographs import Folder, Surfaces
 
 app = typer.Typer()
@@ -29,8 +28,7 @@ def camera(
     from service.cli.folder_camera import measure_camera
     from service.sources.folder import read_folder
 
-    if out.is_dir():
-        raise InvalidInputError(f"{out} is a folder; name a file to write to")
+    require_file(out)
     source = read_folder(folder)
     with progress(None, "camera") as step:
         report = measure_camera(source, out, surfaces, target or (), step)

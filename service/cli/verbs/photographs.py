@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.table import Table
 
-from model.errors import InvalidInputError
 from service.base.choices import Method
-from service.cli.output import AsJson, make_table, progress, show
+from service.cli.output import AsJson, make_table, progress, require_file, show
 
 if TYPE_CHECKING:  # what reads folders brings the tracer's libraries with it, which take seconds to load
     from service.sources.folder import MeasurementFolder
@@ -184,8 +183,7 @@ def study(
     from service.sources.folder import read_folder
 
     for path in filter(None, (out, page)):
-        if path.is_dir():
-            raise InvalidInputError(f"{path} is a folder; name a file to write to")
+        require_file(path)
     added = () if effects is None else read_effects(effects)
     source = read_folder(folder)
     source = Mounts(source, mounts, added).under(source)

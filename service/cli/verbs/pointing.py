@@ -5,17 +5,11 @@ from typing import Annotated
 
 import typer
 
-from model.errors import InvalidInputError
-from service.cli.output import AsJson, console, make_table, progress, show
+from service.cli.output import AsJson, console, make_table, progress, require_file, show
 
 app = typer.Typer()
 
 Folder = Annotated[Path, typer.Argument(help="Measurement folder in PAINT's layout.", metavar="DIR")]
-
-
-def _require_file(path: Path) -> None:
-    if path.is_dir():
-        raise InvalidInputError(f"{path} is a folder; name a file to write to")
 
 
 @app.command()
@@ -29,7 +23,7 @@ def calibrate(
     from service.cli.folder_pointing import calibrate_folder
     from service.sources.folder import read_folder
 
-    _require_file(out)
+    require_file(out)
     source = read_folder(folder)
     with progress(len(source.plant.heliostats), "calibrate") as step:
         report = calibrate_folder(source, out, step)
@@ -54,7 +48,7 @@ def spot(
     from service.cli.folder_pointing import spot_folder
     from service.sources.folder import read_folder
 
-    _require_file(out)
+    require_file(out)
     source = read_folder(folder)
     with progress(len(source.plant.heliostats), "spot") as step:
         report = spot_folder(source, mounts, out, step)
