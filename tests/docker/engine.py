@@ -80,10 +80,13 @@ def newest_revision() -> str:
 
 
 def before_newest_schema() -> str | None:
-    """The last commit whose schema is the one before the newest; None where the history does not reach so far."""
+    """The last commit whose schema is the one before the newest; None where the history does not reach so far.
+
+    Of the main line: a merge may have given a migration its number.
+    """
     (path,) = (ROOT / "migrations" / "versions").glob(f"{newest_revision()}_*.py")
     inside = str(path.relative_to(ROOT))
-    added = run("git", "log", "--diff-filter=A", "--format=%H", "--", inside).split()
+    added = run("git", "log", "--first-parent", "-m", "--diff-filter=A", "--format=%H", "--", inside).split()
     if not added:
         return None
     parent = ["git", "rev-parse", "--quiet", "--verify", f"{added[-1]}^"]
