@@ -148,20 +148,30 @@ class Superposition:
         return total
 
     def _trace(self, tile: Tile) -> FleetFlux:
-        there: Sequence[Effect] = light_effects(acting(self.effects, None))
-        if tile.obstacles is not None:
-            there = [effect for effect in there if not isinstance(effect, Blocking)]
-        optics = optics_under(there, self.optics)
         flux, power = torch.zeros(self.resolution, dtype=torch.float64), 0.0
         with torch.no_grad():
-            for group in align(tile.setups, there, latitude_deg=self.latitude_deg).groups:
-                scene = group.scene
-                if tile.obstacles is not None:
-                    scene = scene.with_(obstacles=torch.as_tensor(tile.obstacles[group.rows]).to(scene.sun))
-                for image, thrown in self._images(scene, group.aims, optics):
-                    flux += image
-                    power += thrown
+            for there, part in self._alike(tile):
+                optics = optics_under(there, self.optics)
+                for group in align(part.setups, there, latitude_deg=self.latitude_deg).groups:
+                    scene = group.scene
+                    if part.obstacles is not None:
+                        scene = scene.with_(obstacles=torch.as_tensor(part.obstacles[group.rows]).to(scene.sun))
+                    for image, thrown in self._images(scene, group.aims, optics):
+                        flux += image
+                        power += thrown
         return FleetFlux(flux.numpy(), power, len(tile))
+
+    def _alike(self, tile: Tile) -> Iterator[tuple[tuple[Effect, ...], Tile]]:
+        """The heliostats of a tile by the effects on light that act at them today."""
+        light: Sequence[Effect] = light_effects(self.effects)
+        if tile.obstacles is not None:
+            light = [effect for effect in light if not isinstance(effect, Blocking)]
+        rows: dict[tuple[Effect, ...], list[int]] = {}
+        for row, setup in enumerate(tile.setups):
+            rows.setdefault(acting(light, None, setup.heliostat.name), []).append(row)
+        for there, alike in rows.items():
+            obstacles = None if tile.obstacles is None else tile.obstacles[alike]
+            yield there, Tile([tile.setups[row] for row in alike], obstacles)
 
     def _images(self, scene: Scene, aims: Array, optics: Optics) -> Iterator[tuple[Tensor, float]]:
         """Maps (rows, columns) [W/m2] and power [W], of a few mirrors at a time."""
@@ -268,12 +278,13 @@ def aligned_field(
 
     Those whose mounts cannot turn there are left out.
     """
-    there = acting(effects, None)
-    true_sun = suns_under(there, np.asarray(sun, dtype=np.float64)[None], latitude_deg)
+    known = tuple(effects)
+    true_sun = suns_under(acting(known, None, None), np.asarray(sun, dtype=np.float64)[None], latitude_deg)
 
     def outlined(part: Sequence[tuple[Heliostat, ArrayLike]]) -> tuple[list[str], Array, Array]:
         heliostats, aims = [one for one, _ in part], np.array([aim for _, aim in part], dtype=np.float64)
-        return [one.name for one in heliostats], outlines(altered(heliostats, there), true_sun[0], aims), aims
+        standing = [there for one in heliostats for there in altered([one], acting(known, None, one.name))]
+        return [one.name for one in heliostats], outlines(standing, true_sun[0], aims), aims
 
     remaining, found = iter(field), []
     while some := list(islice(remaining, TILE)):

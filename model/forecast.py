@@ -174,8 +174,8 @@ class Group:
     rows : list of int
         Their places among all setups.
     planes : list of TargetPlane
-    moments : list of datetime or None
-        When they were photographed.
+    taken : list of (str, datetime or None)
+        Of which heliostats they are, and when they were photographed.
     scene : Scene
     angles : (B, 2) [rad]
     aims : (B, 3) [m]
@@ -186,7 +186,7 @@ class Group:
 
     rows: list[int]
     planes: list[TargetPlane]
-    moments: list[datetime | None]
+    taken: list[tuple[str, datetime | None]]
     scene: Scene
     angles: Array
     aims: Array
@@ -197,8 +197,8 @@ class Group:
     ) -> Iterator[tuple[Window, tuple[Effect, ...], list[int]]]:
         """Windows on the targets and the effects that act there, with the places of those that have them alike."""
         places: dict[tuple[Window, tuple[Effect, ...]], list[int]] = {}
-        for place, (window, moment) in enumerate(zip(windows, self.moments, strict=True)):
-            places.setdefault((window, acting(effects, moment)), []).append(place)
+        for place, (window, (heliostat, moment)) in enumerate(zip(windows, self.taken, strict=True)):
+            places.setdefault((window, acting(effects, moment, heliostat)), []).append(place)
         for (window, there), alike in places.items():
             yield window, there, alike
 
@@ -400,7 +400,7 @@ def align(
     ordered = in_light_order(of_stage(effects, "geometry"))
     kinds: dict[tuple[tuple[object, ...], tuple[Effect, ...]], list[int]] = {}
     for row, setup in enumerate(setups):
-        kinds.setdefault((setup.kind, acting(ordered, setup.taken_at)), []).append(row)
+        kinds.setdefault((setup.kind, acting(ordered, setup.taken_at, setup.heliostat.name)), []).append(row)
     aims = np.array([setup.goal for setup in setups]) if start is None else start.aims
     return Aligned(
         tuple(_align_group(setups, rows, there, latitude_deg, dtype, aims[rows]) for (_, there), rows in kinds.items())
@@ -438,7 +438,8 @@ def _align_group(
         angles, aims, scene, cut = align_scene(
             heliostats, points, suns, planes, goals, degree=degree, start=aims, alter=alter
         )
-    return Group(rows, planes, [setup.taken_at for setup in group], alter(scene.to(dtype)), angles, aims, cut)
+    taken = [(setup.heliostat.name, setup.taken_at) for setup in group]
+    return Group(rows, planes, taken, alter(scene.to(dtype)), angles, aims, cut)
 
 
 def altered(heliostats: Sequence[Heliostat], effects: Sequence[Effect]) -> list[Heliostat]:

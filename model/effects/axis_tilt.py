@@ -46,6 +46,7 @@ class AxisTilt(Effect):
     about: ClassVar[str] = "Axis tilt: the mount's foundation does not stand as surveyed."
     stage: ClassVar[Stage] = "geometry"
     scales_with: ClassVar[frozenset[Factor]] = frozenset({"roll"})
+    of_heliostats: ClassVar[bool] = True
 
     north_deg: float = parameter(0.0, -3.0, 3.0, "deg")
     up_deg: float = parameter(0.0, -3.0, 3.0, "deg")

@@ -110,8 +110,10 @@ class Effect:
         Whether images show only by how much a mirror's facets differ, and not what they share.
     comes : frozenset of {"since", "day"}
         How it may come, if it is not always there: at a date, to stay, or with each day anew.
+    of_heliostats : bool
+        Whether it is of mirror, mount or drive, so that one heliostat may have it alone; not of the sun or a camera.
     scope : Scope
-        When this one acts.
+        When and where this one acts.
     """
 
     name: ClassVar[str]
@@ -122,12 +124,19 @@ class Effect:
     prior_std: ClassVar[float] = 1.0
     relative: ClassVar[bool] = False
     comes: ClassVar[frozenset[Arrival]] = frozenset({"since"})
+    of_heliostats: ClassVar[bool] = False
 
     scope: Scope = field(default=Always(), kw_only=True)
 
     def __post_init__(self) -> None:
-        if isinstance(self.scope, ByDay) and not all(p.shared for p in self.parameters()):
-            raise InvalidInputError(f"effect {self.name}: what belongs to heliostats has no values by day")
+        if isinstance(self.scope, ByDay):
+            if not all(p.shared for p in self.parameters()):
+                raise InvalidInputError(f"effect {self.name}: what belongs to heliostats has no values by day")
+        elif self.scope.heliostats is not None and not self.of_heliostats:
+            raise InvalidInputError(
+                f"effect {self.name}: the sun and the camera are the same for all heliostats; "
+                "leave 'heliostats' out of its scope"
+            )
         for p in self.parameters():
             value = getattr(self, p.name)
             if p.shared:
@@ -145,16 +154,17 @@ class Effect:
 
     @property
     def heliostats(self) -> list[str] | None:
-        """Those that it names; None for what all have in common."""
+        """Those that its parameters name; None for what all have in common."""
         named = [getattr(self, p.name) for p in self.parameters() if not p.shared]
         return sorted({name for by_heliostat in named for name in by_heliostat}) if named else None
 
-    def at(self, taken_at: datetime | None) -> "Effect | None":
-        """What it is at a time, None where it does not act; of one day it is always the same object.
+    def at(self, taken_at: datetime | None, heliostat: str | None) -> "Effect | None":
+        """What it is at a time and a heliostat, None where it does not act; of one day it is always the same object.
 
-        What is of no known time is of today: what has changed stays so, and the day is as days usually are.
+        What is of no known time is of today: what has changed stays so, and the day is as days usually are. What is of
+        no heliostat, as the sun, has only what all have.
         """
-        phase = self.scope.phase(taken_at)
+        phase = self.scope.phase(taken_at, heliostat)
         return self._days[phase] if isinstance(phase, date) else self if phase else None
 
     @cached_property
@@ -184,9 +194,9 @@ class Effect:
         return images
 
 
-def acting(effects: Iterable[Effect], taken_at: datetime | None) -> tuple[Effect, ...]:
-    """The effects that act at a time, as they are then; the same objects wherever the same act."""
-    return tuple(there for effect in effects if (there := effect.at(taken_at)) is not None)
+def acting(effects: Iterable[Effect], taken_at: datetime | None, heliostat: str | None) -> tuple[Effect, ...]:
+    """The effects that act at a time and a heliostat, as they are then; the same objects wherever the same act."""
+    return tuple(there for effect in effects if (there := effect.at(taken_at, heliostat)) is not None)
 
 
 def quadrature(first: Scalar, second: Scalar) -> Scalar:

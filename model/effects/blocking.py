@@ -45,6 +45,7 @@ class Blocking(Effect):
     about: ClassVar[str] = "Blocking: a neighbour in front hides the lower part of the mirror."
     stage: ClassVar[Stage] = "geometry"
     scales_with: ClassVar[frozenset[Factor]] = frozenset({"heliostat", "elevation"})
+    of_heliostats: ClassVar[bool] = True
 
     lower_fraction: ByHeliostat = parameter(0.0, 0.0, 0.6, "1", "heliostat")
 

@@ -9,7 +9,7 @@ import numpy as np
 from torch import Tensor
 
 from model.effects.base import Effect, Parameter
-from model.effects.scope import Always, ByDay, Since, day_from_json, scope_from_json
+from model.effects.scope import Always, ByDay, day_from_json, scope_from_json
 from model.errors import InvalidInputError
 
 ORDER = (
@@ -97,11 +97,11 @@ def effect_from_json(data: object) -> Effect:
     if isinstance(scope, ByDay):
         scope = ByDay(_by_day(name, known, given))
     effect = CATALOGUE[name](**values, scope=scope)
-    named = data["scope"].get("heliostats") if isinstance(scope, Since) else None
-    if named is not None and (not isinstance(named, list) or sorted(map(str, named)) != effect.heliostats):
+    named = None if isinstance(scope, ByDay) else scope.heliostats
+    if named is not None and effect.heliostats not in (None, list(named)):
         raise InvalidInputError(
             f"effect {name}: the scope's 'heliostats' must be those that its parameters name, or null, "
-            f"got {str(named)[:80]}"
+            f"got {', '.join(named)[:80]}"
         )
     return effect
 
@@ -138,7 +138,7 @@ def _bare(data: Any) -> Any:
 def effect_to_json(effect: Effect) -> dict[str, Any]:
     """An effect as JSON; `effect_from_json` reads it back."""
     plain = {p.name: _plain(getattr(effect, p.name)) for p in effect.parameters()}
-    if isinstance(effect.scope, Always):
+    if effect.scope == Always():
         return {"name": effect.name, "parameters": plain}
     if isinstance(effect.scope, ByDay):
         days = {day.isoformat(): values for day, values in sorted(effect.scope.by_day.items())}

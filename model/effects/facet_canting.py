@@ -46,6 +46,7 @@ class FacetCanting(Effect):
     about: ClassVar[str] = "Canting error: facets that lean against the pose they are known in."
     stage: ClassVar[Stage] = "geometry"
     scales_with: ClassVar[frozenset[Factor]] = frozenset({"distance", "heliostat", "roll"})
+    of_heliostats: ClassVar[bool] = True
     prior_std: ClassVar[float] = 0.1
     relative: ClassVar[bool] = True  # the mount takes back what a mirror's facets share
 

@@ -60,6 +60,7 @@ class GravityBending(Effect):
     about: ClassVar[str] = "Gravity bending: the mirror sags under its own weight, the more the flatter it lies."
     stage: ClassVar[Stage] = "geometry"
     scales_with: ClassVar[frozenset[Factor]] = frozenset({"distance", "elevation"})
+    of_heliostats: ClassVar[bool] = True
 
     amplitude_mm: Scalar = parameter(0.0, -8.0, 8.0, "mm")
 

@@ -1,7 +1,8 @@
-"""When an effect acts: always, since a date, or on each day by values of its own.
+"""When and where an effect acts: always, since a date, or on each day by values of its own; everywhere or not.
 
 A mirror is canted anew, a camera is set anew: from that date on the plant is another one. Haze and wind come and go:
-each day has its own. Days are those of the photographs' times, in the zone that these are recorded in.
+each day has its own. Days are those of the photographs' times, in the zone that these are recorded in. What mirror and
+drive do, one heliostat may have alone.
 """
 
 from collections.abc import Mapping
@@ -14,30 +15,35 @@ from model.errors import InvalidInputError
 
 @dataclass(frozen=True)
 class Always:
-    """The whole set."""
+    """The whole set, or all photographs of some ``heliostats``; None for all."""
 
-    def phase(self, taken_at: datetime | None) -> date | bool:
+    heliostats: tuple[str, ...] | None = None
+
+    def phase(self, taken_at: datetime | None, heliostat: str | None) -> date | bool:
         """What photographs must share for the effect to be the same in them; False where it does not act."""
-        return True
+        return self.heliostats is None or heliostat in self.heliostats
 
     def to_json(self) -> dict[str, Any]:
-        """As DESIGN.md, section 7, has it."""
-        return {"kind": "set"}
+        """As DESIGN.md, section 7, has it; without ``heliostats`` where all have it."""
+        return {"kind": "set"} | ({} if self.heliostats is None else {"heliostats": list(self.heliostats)})
 
 
 @dataclass(frozen=True)
 class Since:
-    """From the first photograph of ``since`` on; what is of no known time is of today."""
+    """From the first photograph of ``since`` on, of some ``heliostats`` or all; what is of no time is of today."""
 
     since: date
+    heliostats: tuple[str, ...] | None = None
 
-    def phase(self, taken_at: datetime | None) -> date | bool:
+    def phase(self, taken_at: datetime | None, heliostat: str | None) -> date | bool:
         """As `Always.phase`."""
-        return taken_at is None or taken_at.date() >= self.since
+        theirs = self.heliostats is None or heliostat in self.heliostats
+        return theirs and (taken_at is None or taken_at.date() >= self.since)
 
     def to_json(self) -> dict[str, Any]:
-        """As DESIGN.md, section 7, has it, but for the heliostats, which the effect knows."""
-        return {"kind": "since", "since": self.since.isoformat()}
+        """As DESIGN.md, section 7, has it; null where all heliostats, or the camera, have it."""
+        named = None if self.heliostats is None else list(self.heliostats)
+        return {"kind": "since", "since": self.since.isoformat(), "heliostats": named}
 
 
 @dataclass(frozen=True)
@@ -52,7 +58,7 @@ class ByDay:
 
     by_day: Mapping[date, Mapping[str, float]] = field(default_factory=dict)
 
-    def phase(self, taken_at: datetime | None) -> date | bool:
+    def phase(self, taken_at: datetime | None, heliostat: str | None) -> date | bool:
         """As `Always.phase`."""
         day = None if taken_at is None else taken_at.date()
         return day if day is not None and day in self.by_day else True
@@ -73,18 +79,31 @@ def scope_from_json(data: object, effect: str) -> Scope:
     InvalidInputError
         Where it is none.
     """
-    kind = "set" if data is None else data.get("kind") if isinstance(data, Mapping) else None
-    if kind == "set":
-        return Always()
-    if kind == "day":
-        return ByDay()
-    if kind == "since":
-        assert isinstance(data, Mapping)
-        return Since(day_from_json(data.get("since"), effect))
-    raise InvalidInputError(
-        f'effect {effect}: \'scope\' must be {{"kind": "set"}}, {{"kind": "since", "since": DATE}} or '
-        f'{{"kind": "day"}}, got {str(data)[:80]}'
-    )
+    given = {"kind": "set"} if data is None else data
+    if not isinstance(given, Mapping) or given.get("kind") not in ("set", "since", "day"):
+        raise InvalidInputError(
+            f'effect {effect}: \'scope\' must be {{"kind": "set"}}, {{"kind": "since", "since": DATE}} or '
+            f'{{"kind": "day"}}, got {str(data)[:80]}'
+        )
+    heliostats = _heliostats_from_json(given.get("heliostats"), effect)
+    if given["kind"] == "set":
+        return Always(heliostats)
+    if given["kind"] == "since":
+        return Since(day_from_json(given.get("since"), effect), heliostats)
+    if heliostats is not None:
+        raise InvalidInputError(f"effect {effect}: a scope by day is of all heliostats; leave its 'heliostats' out")
+    return ByDay()
+
+
+def _heliostats_from_json(data: object, effect: str) -> tuple[str, ...] | None:
+    """Names, sorted; None for all."""
+    if data is None:
+        return None
+    if not isinstance(data, list) or not data or not all(isinstance(name, str) for name in data):
+        raise InvalidInputError(
+            f"effect {effect}: the scope's 'heliostats' must be a list of names, or null for all, got {str(data)[:80]}"
+        )
+    return tuple(sorted(set(data)))
 
 
 def day_from_json(data: object, effect: str) -> date:

@@ -41,6 +41,7 @@ class SlopeError(Effect):
     about: ClassVar[str] = "Slope error: waviness of the mirror too fine for the surface's control points."
     stage: ClassVar[Stage] = "optics"
     scales_with: ClassVar[frozenset[Factor]] = frozenset({"distance", "heliostat"})
+    of_heliostats: ClassVar[bool] = True
 
     sigma_mrad: Scalar = parameter(0.0, 0.0, 4.0, "mrad")
 

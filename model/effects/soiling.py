@@ -43,6 +43,7 @@ class Soiling(Effect):
     about: ClassVar[str] = "Soiling: facets that reflect less than the best of their heliostat."
     stage: ClassVar[Stage] = "geometry"
     scales_with: ClassVar[frozenset[Factor]] = frozenset({"heliostat"})
+    of_heliostats: ClassVar[bool] = True
 
     reflectivity_ratio: ByHeliostat = parameter(1.0, 0.0, 1.0, "1", "facet")
 

@@ -44,6 +44,7 @@ class TrackingJitter(Effect):
     )
     stage: ClassVar[Stage] = "optics"
     scales_with: ClassVar[frozenset[Factor]] = frozenset({"distance", "roll", "weather"})
+    of_heliostats: ClassVar[bool] = True
     comes: ClassVar[frozenset[Arrival]] = frozenset({"day"})
 
     sigma_mrad: Scalar = parameter(0.0, 0.0, 4.0, "mrad")

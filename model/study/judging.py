@@ -115,11 +115,11 @@ USUAL, USUAL_SCATTER = 2, 0.01
 """What is known beforehand of the standard deviation of gains from image to image, and from how many, as it were."""
 
 
-def few_gain(differences: Array) -> Gain:
+def few_gain(differences: Array, among: int = 1) -> Gain:
     """The mean of a few differences (N,) with its 95 % interval by a moderated t; fewer than two gain nothing.
 
     How much few images scatter is hardly known from themselves, and counts as if `USUAL` images had shown their usual
-    scatter besides.
+    scatter besides. The interval holds for all ``among`` gains that are looked at at once (Bonferroni).
 
     Source: Smyth, *Linear models and empirical Bayes methods*, Stat. Appl. Genet. Mol. Biol. 3 (2004), section 4.
     """
@@ -129,7 +129,7 @@ def few_gain(differences: Array) -> Gain:
     mean, freedom = float(differences.mean()), count - 1 + USUAL
     variance = (((differences - mean) ** 2).sum() + USUAL * USUAL_SCATTER**2) / freedom
     error = float(variance / count) ** 0.5
-    reach = float(t.ppf(0.975, freedom)) * error
+    reach = float(t.ppf(1 - 0.025 / among, freedom)) * error
     return Gain(mean, mean - reach, mean + reach, mean / error)
 
 

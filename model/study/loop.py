@@ -7,7 +7,7 @@ from datetime import date
 import numpy as np
 from numpy.typing import NDArray
 
-from model.effects import CATALOGUE, Effect, Since
+from model.effects import CATALOGUE, Always, ByDay, Effect
 from model.errors import InvalidInputError
 from model.forecast import View
 from model.images import FLUX_SIZE
@@ -16,7 +16,7 @@ from model.study.fitting import Fitter
 from model.study.flux_images import FluxImage, Forecaster, spot_window
 from model.study.judging import Gain, Rows, Split, few_gain, paired_gain, split
 from model.study.report import Candidate, Found, Study
-from model.study.scopes import OF_THE_BEST, SCREENED, STRENGTHS, Promise, change, days_of, promises
+from model.study.scopes import OF_THE_BEST, SCREENED, STRENGTHS, Promise, alone, change, days_of, promises
 from model.study.unknowns import Term, Unknowns
 from model.tracing import Optics
 
@@ -187,17 +187,20 @@ class _Loop:
     # --- scopes -------------------------------------------------------------------------------------------------------
 
     def scoped(self, trials: dict[Term, Trial], current: Trial) -> dict[Term, Trial]:
-        """Effects that are not always there, fitted: those of the most promising scopes."""
-        rows, days = self._dated(self.split.fitted)
-        found: list[Promise] = []
+        """Effects that are not always there, or not everywhere, fitted: those of the most promising scopes."""
+        rows, heliostats = self.split.fitted, self.all_heliostats[self.split.fitted]
+        dated, days = self._dated(rows)
+        known = np.isin(rows, dated)
+        of_time: list[Promise] = []
+        of_one: list[Promise] = []
         before = self._costs(rows, current.unknowns, current.values[None])
         for term, trial in trials.items():
-            saved = before - self._costs_without_scope(trial, term, rows, STRENGTHS)
-            found += promises(term.kind, saved, days, self.all_heliostats[rows])
-        found = [promise for promise in found if promise.term not in current.unknowns.terms]
-        found.sort(key=lambda promise: -promise.saved)
-        best = [promise.term for promise in found[:SCREENED] if promise.saved > OF_THE_BEST * found[0].saved]
-        return dict(self._settled(term, current, rows) for term in best)
+            if self.days is not None or term.kind.of_heliostats:
+                saved = before - self._costs_without_scope(trial, term, rows, STRENGTHS)
+                of_time += promises(term.kind, saved[:, known], days, heliostats[known])
+                of_one += alone(term.kind, saved, heliostats)
+        best = [term for found in (of_time, of_one) for term in _screened(found, current.unknowns.terms)]
+        return dict(self._settled(term, current, dated) for term in best)
 
     def _costs(self, rows: Rows, unknowns: Unknowns, trials: Array) -> Array:
         """What each of some images (M, n) costs under trials (M, P)."""
@@ -231,7 +234,7 @@ class _Loop:
 
     def _dated(self, rows: Rows) -> tuple[Rows, list[date]]:
         """Those of some images whose day is known, and the days."""
-        days = self.days or []
+        days = self.days or [None] * len(self.flux_images)
         known = [(row, day) for row in rows.tolist() if (day := days[row]) is not None]
         return np.array([row for row, _ in known], dtype=np.int64), [day for _, day in known]
 
@@ -256,11 +259,14 @@ class _Loop:
         """What an effect gains where it acts: on the held-out images whose forecast it changes.
 
         One that is not always there acts on few of them. So it is fitted once more to those, and judged by the images
-        that it was fitted to first: every image that it changes judges once, by a fit that did not see it.
+        that it was fitted to first: every image that it changes judges once, by a fit that did not see it. But where
+        those chose a heliostat among many, only images that had no say in that judge, and they judge several choices.
         """
         if term.whole:
             return self.gain(after, before)
         held_out = _changes(self.measured, before.cuts, after.cuts)
+        if term.always:
+            return few_gain(held_out, among=SCREENED)
         if not held_out.sum() > 0:
             return few_gain(held_out)
         return few_gain(np.concatenate([held_out, self._crossed(term, after, before)]))
@@ -326,9 +332,16 @@ def _changes(measured: Array, before: Array, after: Array) -> Array:
     return np.asarray((flux_accuracies(measured, after) - flux_accuracies(measured, before))[differ])
 
 
+def _screened(found: Sequence[Promise], known: Sequence[Term]) -> list[Term]:
+    """The most promising ones that are not known yet."""
+    new = sorted((one for one in found if one.term not in known), key=lambda promise: -promise.saved)
+    return [promise.term for promise in new[:SCREENED] if promise.saved > OF_THE_BEST * new[0].saved]
+
+
 def _complexity(term: Term, trial: Trial) -> int:
-    """How many numbers a term takes, a date among them."""
-    return sum(u.term == term for u in trial.unknowns.all) + (term.since is not None)
+    """How many numbers a term takes; a date is one, and so is a heliostat's name."""
+    numbers = sum(u.term == term for u in trial.unknowns.all)
+    return numbers + (term.since is not None) + (term.heliostats is not None)
 
 
 def study(
@@ -367,8 +380,8 @@ def study(
     if len({p.key for p in flux_images}) < len(flux_images):
         raise InvalidInputError("photographs of a study must have identifiers of their own")
     loop = _Loop(flux_images, optics, effects, options, latitude_deg)
-    # What has changed once may change again.
-    declared = {effect.name for effect in effects if not isinstance(effect.scope, Since)}
+    # What has changed once may change again, and what one heliostat has others may have.
+    declared = {effect.name for effect in effects if effect.scope == Always() or isinstance(effect.scope, ByDay)}
     before = current = loop.trial([])
     found: dict[Term, Found] = {}
     candidates: list[Candidate] = []
@@ -380,9 +393,8 @@ def study(
         for term in left:
             progress(term.kind.name)
             trials[term] = loop.added(term, current)
-        if loop.days is not None:
-            progress("changes and days")
-            trials |= loop.scoped(trials, current)
+        progress("changes, days and single heliostats")
+        trials |= loop.scoped(trials, current)
         trials = loop.refitted(trials)
         candidates = candidates or [
             Candidate(term.kind.name, float(t.accuracy.mean()), loop.gain(t, before))

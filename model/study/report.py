@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from model.effects import Always, ByDay, Effect, Since
+from model.effects import Always, Effect
 from model.metrics import flux_accuracies
 from model.study.advice import told_apart_by
 from model.study.covariates import covariates_of
@@ -95,10 +95,8 @@ class Found:
         name, scope = _plain(self.name), self.scope
         if scope["kind"] == "day":
             return f"{name} by day (most on {_listed([day.isoformat() for day in self.days])})"
-        if scope["kind"] == "since":
-            of = f" of {_listed(scope['heliostats'])}" if scope["heliostats"] else ""
-            return f"{name}{of} since {scope['since']}"
-        return name
+        of = f" of {_listed(scope['heliostats'])}" if scope.get("heliostats") else ""
+        return f"{name}{of}" + (f" since {scope['since']}" if scope["kind"] == "since" else "")
 
 
 def _fitted(value: Any, ci95: Any, unit: str, term: Term) -> dict[str, Any]:
@@ -111,14 +109,10 @@ def _fitted(value: Any, ci95: Any, unit: str, term: Term) -> dict[str, Any]:
 
 
 def _scope(term: Term, unknowns: Unknowns) -> dict[str, Any]:
-    """When an effect acts, as DESIGN.md, section 7, has it."""
-    if term.days:
-        return ByDay().to_json()
-    if term.since is None:
-        return Always().to_json()
-    alone = [name for name, _ in unknowns.facets] if term.own and len(unknowns.facets) == 1 else None
-    named = alone if term.heliostats is None else list(term.heliostats)
-    return {**Since(term.since).to_json(), "heliostats": named}
+    """When and where an effect acts, as DESIGN.md, section 7, has it."""
+    if term.since is not None and term.own and len(unknowns.facets) == 1:
+        term = replace(term, heliostats=tuple(name for name, _ in unknowns.facets))
+    return term.scope.to_json()
 
 
 def _listed(names: Sequence[str]) -> str:

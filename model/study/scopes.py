@@ -1,7 +1,8 @@
-"""Which scope an effect may have: since when a mirror or a camera is another one, which days differ from the others.
+"""Which scope an effect may have: since when a mirror or a camera is another one, which days or mirrors differ.
 
 Found by what every photograph gains from an effect at a few strengths: the photographs after a change gain, those
-before it lose. What looks best is then fitted in earnest, and judged by photographs that had no say in it.
+before it lose; those of one heliostat gain, those of others lose. What looks best is then fitted in earnest, and
+judged by photographs that had no say in it.
 """
 
 from collections.abc import Iterator, Sequence
@@ -62,6 +63,22 @@ def promises(kind: type[Effect], saved: Array, days: Sequence[date], heliostats:
         total = float(sum(each.values()))
         if total > BEYOND * max(0.0, saved.sum(axis=1).max()):
             yield Promise(Term(kind, days=tuple(each)), total)
+
+
+def alone(kind: type[Effect], saved: Array, heliostats: NDArray[np.str_]) -> Iterator[Promise]:
+    """One heliostat, where an effect of mirror or drive is its own, in the photographs as in `promises`.
+
+    What all share in kind and size must save clearly more there alone. What every heliostat has values of its own for
+    is one's where the others' save next to nothing.
+    """
+    names = sorted(set(heliostats.tolist()))
+    if not kind.of_heliostats or len(names) < 2:
+        return
+    least = max(0.0, saved.sum(axis=1).max()) * (1 / BEYOND if Term(kind).own else BEYOND)
+    for name in names:
+        total = float(saved[:, heliostats == name].sum(axis=1).max())
+        if total > least:
+            yield Promise(Term(kind, heliostats=(name,)), total)
 
 
 def change(saved: Array, days: Sequence[date]) -> tuple[date, float] | None:

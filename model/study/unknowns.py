@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from model.effects import Always, ByDay, Effect, Parameter, Since
+from model.effects import Always, ByDay, Effect, Parameter, Scope, Since
 
 Array = NDArray[np.float64]
 
@@ -29,7 +29,7 @@ class Term:
     days : tuple of date
         Those that have values of their own; empty for the other scopes.
     heliostats : tuple of str or None
-        Those that it is sought at, of a kind whose parameters belong to heliostats; None for all.
+        Those that it is sought at, of a kind of mirror or drive; None for all.
     """
 
     kind: type[Effect]
@@ -40,18 +40,30 @@ class Term:
     @property
     def whole(self) -> bool:
         """Whether it acts always and everywhere."""
-        return self.since is None and not self.days and self.heliostats is None
+        return self.always and self.heliostats is None
+
+    @property
+    def always(self) -> bool:
+        """Whether it acts always, perhaps not everywhere."""
+        return self.since is None and not self.days
 
     @property
     def own(self) -> bool:
-        """Whether all its parameters belong to heliostats."""
-        return not any(p.shared for p in self.kind.parameters())
+        """Whether all its parameters belong to heliostats, or it does to some."""
+        return self.heliostats is not None or not any(p.shared for p in self.kind.parameters())
+
+    @property
+    def scope(self) -> Scope:
+        """When and where it acts, but for the values of days."""
+        if self.days:
+            return ByDay()
+        return Always(self.heliostats) if self.since is None else Since(self.since, self.heliostats)
 
     def touches(self, heliostat: str, taken_at: datetime | None) -> bool:
         """Whether a photograph may change with it."""
         if self.heliostats is not None and heliostat not in self.heliostats:
             return False
-        if self.since is None and not self.days:
+        if self.always:
             return True
         if taken_at is None:  # of today, as `Since` has it
             return self.since is not None
@@ -108,9 +120,9 @@ class Unknowns:
         return tuple(u for term in self.terms for p in term.kind.parameters() for u in self._of(term, p))
 
     def _of(self, term: Term, parameter: Parameter) -> list[Unknown]:
-        if parameter.shared:
-            return [Unknown(term, parameter, day=day) for day in term.days or (None,)]
         facets = [(name, count) for name, count in self.facets if term.heliostats is None or name in term.heliostats]
+        if parameter.shared:
+            return [Unknown(term, parameter, day=day) for day in term.days or (None,) if facets]
         if parameter.owner == "heliostat":
             return [Unknown(term, parameter, name) for name, _ in facets]
         return [Unknown(term, parameter, name, facet) for name, count in facets for facet in range(count)]
@@ -180,7 +192,7 @@ class Unknowns:
     def _effect(self, term: Term, values: Sequence[float]) -> Effect:
         parameters: dict[str, Any] = _arrays(self.nested(term, values))
         if not term.days:
-            return term.kind(**parameters, scope=Always() if term.since is None else Since(term.since))
+            return term.kind(**parameters, scope=term.scope)
         by_day = {
             day: {name: float(of_days[day.isoformat()]) for name, of_days in parameters.items()} for day in term.days
         }
@@ -241,12 +253,15 @@ def _copied_term(term: Term, count: int) -> Term:
 
 def copied(effect: Effect, count: int) -> Effect:
     """An effect whose heliostats are there ``count`` times."""
+    scope = effect.scope
+    if not isinstance(scope, ByDay) and scope.heliostats is not None:
+        scope = replace(scope, heliostats=tuple(copy_name(h, m) for m in range(count) for h in scope.heliostats))
     changes: dict[str, Any] = {
         p.name: {copy_name(h, m): v for m in range(count) for h, v in getattr(effect, p.name).items()}
         for p in effect.parameters()
         if not p.shared
     }
-    return replace(effect, **changes)
+    return replace(effect, **changes, scope=scope)
 
 
 def _arrays(parameters: Mapping[str, object]) -> dict[str, Any]:

@@ -233,6 +233,9 @@ class StudyReport(BaseModel):
     after: AccuracyOut = Field(description="With the effects that were found.")
     noise_floor: float = Field(description="Error that the photographs' noise alone makes [1].")
     unexplained_share: float = Field(description="Share of the error beyond the noise that is left [1].")
-    effects: list[dict[str, Any]] = Field(description="What was found: parameters with 95 % intervals, gain.")
+    effects: list[dict[str, Any]] = Field(
+        description="What was found: parameters with 95 % intervals, scope (when, and whose where "
+        "it names `heliostats`), gain."
+    )
     candidates: list[dict[str, Any]] = Field(description="Every effect tried by itself, the best first.")
     skipped: dict[str, str] = Field(default={}, description="What was left out, with the reasons.")

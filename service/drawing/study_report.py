@@ -53,12 +53,13 @@ class Finding:
     def of(cls, found: Found) -> "Finding":
         """An effect as the page shows it."""
         kind = CATALOGUE[found.name]
-        parameters = [row for p in kind.parameters() for row in _rows(p, found.parameters[p.name])]
+        of = ", ".join(found.scope.get("heliostats") or ["all images"])
+        parameters = [row for p in kind.parameters() for row in _rows(p, found.parameters[p.name], of)]
         return cls(found, kind.about, parameters, {name: told_apart_by(found.name, name) for name in found.lookalikes})
 
 
-def _rows(parameter: Parameter, fitted: Mapping[str, Any]) -> list[Fitted]:
-    """A line for each owner of a parameter's values."""
+def _rows(parameter: Parameter, fitted: Mapping[str, Any], of: str) -> list[Fitted]:
+    """A line for each owner of a parameter's values; one value is ``of`` what the effect's scope names."""
     value, ci95 = fitted["value"], fitted["ci95"]
     if "by_day" in fitted:
         value, ci95 = (
@@ -66,7 +67,7 @@ def _rows(parameter: Parameter, fitted: Mapping[str, Any]) -> list[Fitted]:
             for usual, by_day in ((value, fitted["by_day"]), (ci95, fitted["ci95_by_day"]))
         )
     elif parameter.shared:
-        value, ci95 = {"all images": value}, {"all images": ci95}
+        value, ci95 = {of: value}, {of: ci95}
     if parameter.owner != "facet":
         value, ci95 = ({owner: [one] for owner, one in given.items()} for given in (value, ci95))
     values = {

@@ -209,7 +209,7 @@ def camera_view(session: Session, row: ForecastRow) -> NDArray[np.float32]:
     size = row.window_m or row.plane["width"], row.window_m or row.plane["height"]
     effects = of_stage(get_model(session, int(row.model_version.partition(":")[0])).effects, "image")
     with torch.no_grad():
-        shown = images_under(acting(effects, row.sun_at), light[None], Window(*size, *light.shape))[0]
+        shown = images_under(acting(effects, row.sun_at, None), light[None], Window(*size, *light.shape))[0]
         return shown.clamp(min=0).numpy()
 
 

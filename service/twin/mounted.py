@@ -56,14 +56,14 @@ class StoredMount:
 
         Raises `UnreachableError` where no attitude does, or a drive would go beyond an end of its travel.
         """
-        (standing,) = altered([self.turned(moment)], acting(self.effects, moment))
+        (standing,) = altered([self.turned(moment)], acting(self.effects, moment, self.heliostat.name))
         angles = standing.mount.align(standing.position, self.sun(recorded, moment), aim)
         return standing.mount.motors_from_angles(angles)
 
 
 def true_sun(effects: Iterable[Effect], recorded: Array, moment: datetime | None, latitude_deg: float) -> Array:
     """Where the sun (3,) stood at a moment by a model's effects, of where it was ``recorded`` (3,)."""
-    return np.asarray(suns_under(acting(effects, moment), recorded[None], latitude_deg)[0])
+    return np.asarray(suns_under(acting(effects, moment, None), recorded[None], latitude_deg)[0])
 
 
 def load_mount(

@@ -163,7 +163,7 @@ def study_store(runtime: Runtime, request: StudyRequest, report: Report = lambda
     options = StudyOptions()
     if request.candidates is not None:
         options = replace(options, candidates=tuple(request.candidates))
-    steps = Steps(len(options.candidates) * options.most, report)
+    steps = Steps((len(options.candidates) + 1) * options.most, report)  # scopes are sought after the effects
 
     def step(name: str) -> None:
         """Tell it, and let others at the model before it is done: a study is long."""

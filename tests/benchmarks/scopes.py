@@ -97,7 +97,7 @@ def scoped(r: Record) -> bool:
 
 
 def whose(r: Record) -> bool:
-    """Whether the change is said to be of the right heliostats."""
+    """Whether it is said to be of the right heliostats."""
     return scoped(r) and (
         not r["truth"] or _scope(r["truth"]).get("heliostats") == _scope(r["effects"]).get("heliostats")
     )
@@ -169,7 +169,9 @@ def summary(records: Sequence[Record]) -> Iterator[str]:
     yield f"Effects that come and go: {len(changed)} sets, all right in {percent([right(r) for r in changed])} %,"
     yield f"by strength {by_strength(changed, right, percent) if changed else '-'} %."
     always = [r for r in records if r["truth"] and _scope(r["truth"])["kind"] == "set"]
-    yield f"Effects of the whole set: {len(always)} sets, right in {percent([right(r) for r in always])} %."
+    for what, named in (("Effects of the whole set", False), ("Effects of one heliostat", True)):
+        some = [r for r in always if ("heliostats" in _scope(r["truth"])) == named]
+        yield f"{what}: {len(some)} sets, right in {percent([right(r) for r in some])} %."
     calm = [r for r in records if r["name"] == "calm"]
     quiet = [r["verdict"] == "none" for r in calm]
     yield f"Calm seasons: {len(calm)}, false alarms {percent([not right(r) for r in calm])} %, none {percent(quiet)} %."
@@ -179,7 +181,10 @@ def summary(records: Sequence[Record]) -> Iterator[str]:
 
 def column(r: Record) -> str:
     """The first effect with its kind of scope, or the verdict where there is none."""
-    return f"{r['effects'][0]['name']}, {_scope(r['effects'])['kind']}" if r["effects"] else r["verdict"]
+    if not r["effects"]:
+        return str(r["verdict"])
+    scope = _scope(r["effects"])
+    return f"{r['effects'][0]['name']}, {'one' if scope['kind'] == 'set' and 'heliostats' in scope else scope['kind']}"
 
 
 def matrix(records: Sequence[Record]) -> Figure:

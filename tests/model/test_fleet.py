@@ -1,11 +1,14 @@
 """The light of many heliostats on one receiver."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
+from model.effects import Always, Effect
+from model.effects.axis_tilt import AxisTilt
 from model.effects.blocking import Blocking
 from model.effects.camera_blur import CameraBlur
 from model.effects.camera_response import CameraResponse
@@ -60,6 +63,29 @@ def test_fleet_is_the_sum_of_its_mirrors_however_it_is_tiled():
     for size in (1, 2):
         again = superpose(task, tiles(some, size=size))
         np.testing.assert_allclose(again.irradiance, whole.irradiance, atol=1e-6 * whole.irradiance.max())
+
+
+def test_an_effect_of_one_heliostat_is_in_its_light_only():
+    """Of a mirror that leans as well as of one that is rough; neighbours stand as they do."""
+    heliostats, plane = field(1, 2, (20.0, 20.0), 60.0), target(10.0)
+    effects = SlopeError(2.0, scope=Always(("H1",))), AxisTilt(3.0, scope=Always(("H1",)))
+    everywhere = tuple(replace(effect, scope=Always()) for effect in effects)
+
+    def light(names: slice, there: Sequence[Effect]) -> np.ndarray:
+        task = Superposition(plane, (48, 64), OPTICS, tuple(there), latitude_deg=JUELICH_LATITUDE)
+        return superpose(task, tiles(setups(heliostats[names]))).irradiance
+
+    whole, apart = light(slice(2), effects), light(slice(1), ()) + light(slice(1, 2), everywhere)
+    np.testing.assert_allclose(whole, apart, atol=2e-3 * whole.max())  # ripples below zero are cut off once, or twice
+    assert np.abs(whole - light(slice(2), ())).max() > 0.1 * whole.max()
+    standing, square, leaning = (
+        aligned_field([(one, (0.0, 0.0, 40.0)) for one in heliostats], SUN, there, latitude_deg=JUELICH_LATITUDE)
+        for there in (effects, (), everywhere)
+    )
+    for name, alike, other in (("H0", square, leaning), ("H1", leaning, square)):
+        row = standing.rows[name]
+        np.testing.assert_array_equal(standing.rectangles[row], alike.rectangles[row])
+        assert np.abs(standing.rectangles[row] - other.rectangles[row]).max() > 0.01
 
 
 @pytest.mark.parametrize("distance", [150.0, 600.0])

@@ -1,15 +1,18 @@
 """Effects that come and go: they act when they should, and studies find when."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import UTC, date, datetime, timedelta
 
 import numpy as np
 import pytest
 
 from model.effects import Always, ByDay, Effect, Since, acting, effect_from_json, effect_to_json
+from model.effects.axis_tilt import AxisTilt
 from model.effects.blocking import Blocking
 from model.effects.camera_response import CameraResponse
 from model.effects.facet_canting import FacetCanting
+from model.effects.slope_error import SlopeError
 from model.effects.sun_shape import SunShapeEffect
 from model.errors import InvalidInputError
 from model.forecast import Setup, View, forecast_setups
@@ -17,19 +20,21 @@ from model.frames import sun_direction
 from model.plant import JUELICH_LATITUDE, Heliostat
 from model.study import FluxImage, Study, StudyOptions, study
 from model.study.judging import few_gain, split
-from model.study.scopes import change, promises
+from model.study.scopes import alone, change, promises
 from model.study.unknowns import Term, Unknowns, copied
 from model.surface import control_points
 from model.tracing import Optics
+from service.drawing.study_report import study_page
 from tests.conftest import target
 
 FIRST = datetime(2024, 6, 1, 12, tzinfo=UTC)
 CHANGE = date(2024, 6, 16)
 HAZY = {date(2024, 6, 7): {"circumsolar_ratio": 0.15}, date(2024, 6, 16): {"circumsolar_ratio": 0.2}}
 PLACES = {"near": (-8.0, 45.0, 1.8), "far": (35.0, 110.0, 1.8), "middle": (-40.0, 75.0, 1.8)}
-CANTED = FacetCanting(
-    {"far": np.array([0.5, -0.3, 0.0, -0.2])}, {"far": np.array([-0.4, 0.4, 0.2, -0.2])}, scope=Since(CHANGE)
-)
+TILTS = {"far": np.array([0.5, -0.3, 0.0, -0.2])}, {"far": np.array([-0.4, 0.4, 0.2, -0.2])}
+CANTED = FacetCanting(*TILTS, scope=Since(CHANGE, ("far",)))
+ROUGH = SlopeError(1.0, scope=Always(("far",)))
+LEANING = AxisTilt(2.0, scope=Always(("near",)))
 
 
 def photographs(effects: Sequence[Effect] = (), days: int = 8) -> list[FluxImage]:
@@ -56,33 +61,49 @@ def found_in(effects: Sequence[Effect], *candidates: str) -> Study:
 
 def test_an_effect_acts_since_its_day_and_in_the_plant_of_today():
     since = SunShapeEffect(0.1, scope=Since(date(2024, 6, 2)))
-    assert acting([since], datetime(2024, 6, 1, 23, tzinfo=UTC)) == ()
-    assert acting([since], datetime(2024, 6, 2, 0, tzinfo=UTC)) == (since,)
-    assert acting([since], None) == (since,)
+    assert acting([since], datetime(2024, 6, 1, 23, tzinfo=UTC), "far") == ()
+    assert acting([since], datetime(2024, 6, 2, 0, tzinfo=UTC), "far") == (since,)
+    assert acting([since], None, "far") == acting([since], None, None) == (since,)
+
+
+def test_an_effect_of_one_heliostat_acts_at_no_other():
+    assert acting([ROUGH], FIRST, "far") == acting([ROUGH], None, "far") == (ROUGH,)
+    assert acting([ROUGH], FIRST, "near") == acting([ROUGH], None, None) == ()
+    worn = SlopeError(1.0, scope=Since(CHANGE, ("far",)))
+    assert acting([worn], FIRST, "far") == acting([worn], None, "near") == ()
+    assert acting([worn], None, "far") == (worn,)
 
 
 def test_an_effect_by_day_has_values_of_its_own_on_some_days():
     hazy = SunShapeEffect(0.03, scope=ByDay(HAZY))
-    (there,) = acting([hazy], datetime(2024, 6, 7, 9, tzinfo=UTC))
+    (there,) = acting([hazy], datetime(2024, 6, 7, 9, tzinfo=UTC), "far")
     assert isinstance(there, SunShapeEffect)
     assert there.circumsolar_ratio == 0.15
-    assert acting([hazy], datetime(2024, 6, 7, 15, tzinfo=UTC)) == (there,)
-    assert acting([hazy], datetime(2024, 6, 8, 9, tzinfo=UTC)) == acting([hazy], None) == (hazy,)
+    assert acting([hazy], datetime(2024, 6, 7, 15, tzinfo=UTC), "near") == (there,)
+    assert acting([hazy], datetime(2024, 6, 8, 9, tzinfo=UTC), "far") == acting([hazy], None, None) == (hazy,)
 
 
-@pytest.mark.parametrize("effect", [CANTED, SunShapeEffect(0.03, scope=ByDay(HAZY)), CameraResponse(1.1)])
-def test_forecasts_hold_each_effect_when_it_acts(effect: Effect):
+@pytest.mark.parametrize(
+    "effect",
+    [CANTED, SunShapeEffect(0.03, scope=ByDay(HAZY)), CameraResponse(1.1), ROUGH, LEANING],
+    ids=lambda e: e.name,
+)
+def test_forecasts_hold_each_effect_when_and_where_it_acts(effect: Effect):
     """All photographs at once are what each is with the effects of its time."""
     setups = [p.setup for p in photographs(days=6)]
     view = View(24, 24, samples=8)
     together = forecast_setups(setups, None, [effect], view, latitude_deg=JUELICH_LATITUDE)
     for setup, image in zip(setups, together, strict=True):
-        (alone,) = forecast_setups([setup], None, acting([effect], setup.taken_at), view, latitude_deg=JUELICH_LATITUDE)
+        there = acting([effect], setup.taken_at, setup.heliostat.name)
+        there = tuple(replace(one, scope=Always()) for one in there)
+        (alone,) = forecast_setups([setup], None, there, view, latitude_deg=JUELICH_LATITUDE)
         np.testing.assert_allclose(image, alone, rtol=1e-3, atol=1e-3 * float(alone.max()))
 
 
 def test_scopes_survive_json():
-    assert effect_from_json(effect_to_json(CANTED)).scope == Since(CHANGE)
+    for effect in (CANTED, ROUGH, SlopeError(1.0, scope=Since(CHANGE, ("far",)))):
+        assert effect_from_json(effect_to_json(effect)).scope == effect.scope
+    assert effect_to_json(ROUGH)["scope"] == {"kind": "set", "heliostats": ["far"]}
     hazy = effect_from_json(effect_to_json(SunShapeEffect(0.03, scope=ByDay(HAZY))))
     assert hazy.scope == ByDay(HAZY)
     assert isinstance(effect_from_json(effect_to_json(CameraResponse(1.1))).scope, Always)
@@ -95,6 +116,10 @@ def test_scopes_survive_json():
         ({"kind": "sometimes"}, "'scope' must be"),
         ({"kind": "since", "since": "June"}, "a day must be a date such as 2024-06-02, got June"),
         ({"kind": "since"}, "a day must be a date"),
+        ({"kind": "set", "heliostats": "far"}, "must be a list of names, or null for all, got far"),
+        ({"kind": "set", "heliostats": []}, "must be a list of names"),
+        ({"kind": "day", "heliostats": ["far"]}, "a scope by day is of all heliostats"),
+        ({"kind": "set", "heliostats": ["far"]}, "sun_shape: the sun and the camera are the same for all heliostats"),
     ],
 )
 def test_a_malformed_scope_is_refused(scope: object, says: str):
@@ -103,12 +128,11 @@ def test_a_malformed_scope_is_refused(scope: object, says: str):
 
 
 def test_a_scope_names_no_other_heliostats_than_the_parameters():
-    canted = {**effect_to_json(CANTED), "scope": {"kind": "since", "since": "2024-06-16", "heliostats": ["far"]}}
-    assert effect_from_json(canted).heliostats == ["far"]
-    haze = {"name": "sun_shape", "scope": canted["scope"]}
-    for wrong in (haze, {**canted, "scope": {**canted["scope"], "heliostats": ["near"]}}):
-        with pytest.raises(InvalidInputError, match="must be those that its parameters name"):
-            effect_from_json(wrong)
+    canted = effect_to_json(CANTED)
+    assert canted["scope"] == {"kind": "since", "since": "2024-06-16", "heliostats": ["far"]}
+    assert effect_from_json({**canted, "scope": {"kind": "set"}}).heliostats == ["far"]
+    with pytest.raises(InvalidInputError, match="must be those that its parameters name, or null, got near"):
+        effect_from_json({**canted, "scope": {**canted["scope"], "heliostats": ["near"]}})
 
 
 @pytest.mark.parametrize("by_day", [{"June": 0.1}, {"2024-06-02": 7}, 3, {"2024-06-02": "x"}])
@@ -126,7 +150,8 @@ def test_what_belongs_to_heliostats_has_no_values_by_day():
 def test_copies_keep_the_scope():
     both = copied(CANTED, 2)
     assert both.heliostats == ["far#0", "far#1"]
-    assert both.scope == CANTED.scope
+    assert both.scope == Since(CHANGE, ("far#0", "far#1"))
+    assert copied(ROUGH, 2).scope == Always(("far#0", "far#1"))
 
 
 # --- unknowns with a scope --------------------------------------------------------------------------------------------
@@ -163,6 +188,29 @@ def test_the_day_of_a_change_is_the_one_after_which_most_is_saved():
     assert by_day.term == Term(CameraResponse, days=tuple(days[:2]))
 
 
+def test_one_heliostat_is_promising_where_the_others_lose_or_save_nothing():
+    """What all share must save clearly more at one; what is each one's own, hardly less there than everywhere."""
+    names = np.array(["far", "far", "near", "near"])
+    (found,) = alone(SlopeError, np.array([[1.0, 1.0, -0.5, 0.0], [2.0, 3.0, -2.0, -3.0]]), names)
+    assert (found.term, found.saved) == (Term(SlopeError, heliostats=("far",)), 5.0)
+    assert not list(alone(SlopeError, np.array([[1.0, 1.0, 0.1, 0.0]]), names))
+    assert not list(alone(SunShapeEffect, np.array([[1.0, 1.0, -0.5, 0.0]]), names))
+    (found,) = alone(FacetCanting, np.array([[1.0, 1.0, 0.1, 0.0]]), names)
+    assert found.term == Term(FacetCanting, heliostats=("far",))
+    assert not list(alone(FacetCanting, np.array([[1.0, 1.0, 0.5, 0.0]]), names))
+    assert not list(alone(SlopeError, np.array([[1.0, 1.0]]), names[:2]))
+
+
+def test_what_one_heliostat_has_is_fitted_to_its_photographs():
+    term = Term(SlopeError, heliostats=("far",))
+    unknowns = Unknowns((Term(SunShapeEffect), term), (("near", 4), ("far", 4)))
+    assert [u.term for u in unknowns.own.all] == [term]
+    assert [u.term.kind for u in unknowns.of(["near"]).all] == [SunShapeEffect]
+    _, rough = unknowns.effects(np.array([0.02, 1.0]))
+    assert effect_to_json(rough) == effect_to_json(ROUGH)
+    assert {p.heliostat for p in photographs(days=1) if term.touches(p.heliostat, p.taken_at)} == {"far"}
+
+
 def test_few_gains_are_worth_less():
     assert few_gain(np.array([0.05])).low <= 0
     assert few_gain(np.array([0.05, 0.01])).low < 0
@@ -194,7 +242,7 @@ def test_a_mirror_that_was_canted_anew_is_found_with_its_date():
     assert report["verdict"] == "effect"
     tilts = np.array(found["parameters"]["y_mrad"]["value"]["far"])
     np.testing.assert_allclose(tilts, CANTED.y_mrad["far"], atol=0.15)
-    assert effect_from_json(found).scope == Since(CHANGE)
+    assert effect_from_json(found).scope == Since(CHANGE, ("far",))
 
 
 def test_a_camera_that_was_set_anew_is_found_with_its_date():
@@ -212,6 +260,37 @@ def test_hazy_days_are_found_and_named():
     for day, truth in HAZY.items():
         by_day = found["parameters"]["circumsolar_ratio"]["by_day"]
         assert by_day[day.isoformat()] == pytest.approx(truth["circumsolar_ratio"], abs=0.03)
+
+
+@pytest.mark.parametrize("is_dated", [True, False])
+def test_a_rough_mirror_is_found_by_name(is_dated: bool):
+    taken = photographs([ROUGH])
+    taken = taken if is_dated else [replace(p, setup=replace(p.setup, taken_at=None)) for p in taken]
+    options = StudyOptions(("slope_error", "camera_blur"))
+    found = study(taken, Optics(), options=options, latitude_deg=JUELICH_LATITUDE)
+    (effect,) = found.to_json()["effects"]
+    assert effect["scope"] == {"kind": "set", "heliostats": ["far"]}
+    assert effect["parameters"]["sigma_mrad"]["value"] == pytest.approx(1.0, abs=0.05)
+    assert "demand slope error of far: accuracy" in found.conclusion()
+    assert effect_from_json(effect).scope == found.effects[0].scope == Always(("far",))
+    assert "<td>far</td>" in study_page(found, "a plant")
+
+
+def test_what_one_heliostat_is_known_to_have_another_may_have():
+    """The declared one is not sought again, and the other one's is found beside it."""
+    both = [ROUGH, SlopeError(1.5, scope=Always(("near",)))]
+    options = StudyOptions(("slope_error", "camera_blur"))
+    found = study(photographs(both), Optics(), [ROUGH], options, latitude_deg=JUELICH_LATITUDE)
+    (effect,) = found.to_json()["effects"]
+    assert effect["scope"] == {"kind": "set", "heliostats": ["near"]}
+    assert effect["parameters"]["sigma_mrad"]["value"] == pytest.approx(1.5, abs=0.1)
+
+
+def test_a_mirror_that_is_canted_otherwise_is_found_by_name():
+    report = found_in([replace(CANTED, scope=Always())], "facet_canting", "slope_error").to_json()
+    (found,) = report["effects"]
+    assert found["scope"] == {"kind": "set", "heliostats": ["far"]}
+    assert list(found["parameters"]["x_mrad"]["value"]) == ["far"]
 
 
 def test_what_is_always_there_is_not_dated():

@@ -38,6 +38,21 @@ def always(name: str) -> Change:
     return change
 
 
+def of_one(name: str) -> Change:
+    """An effect that one heliostat's mirror or drive has always, and no other's."""
+
+    def change(level: int, plans: Sequence[Plan], rng: np.random.Generator) -> Changing:
+        names = _names(plans)
+        fields, parameters = CATALOGUE[name](level, names, rng)
+        chosen = names[rng.integers(len(names))]
+        changed = World(**fields)
+        worlds = [changed if plan.heliostat.name == chosen else World() for plan in plans]
+        own = {key: _of([chosen], value) for key, value in parameters.items()}
+        return worlds, [_truth(name, own, {"kind": "set", "heliostats": [chosen]})]
+
+    return change
+
+
 def since(name: str, of_one: bool = False) -> Change:
     """An effect that begins before some day's first photograph, perhaps of one heliostat only."""
 
@@ -96,6 +111,8 @@ CHANGES: dict[str, Change] = {
     "canting_of_all_since": since("facet_canting"),
     "soiling_since": since("soiling", of_one=True),
     "two_cameras": two_cameras,
+    "slope_error_of_one": of_one("slope_error"),
+    "jitter_of_one": of_one("tracking_jitter"),
     **{f"{name}_always": always(name) for name in ("sun_shape", "slope_error", "facet_canting", "camera_response")},
 }
 

@@ -23,7 +23,7 @@ class ModelOut(BaseModel):
     number: int = Field(description="Ask for it as `model_version`.")
     version: str = Field(description="Number and names of its effects.", examples=["2:camera_response"])
     is_current: bool = Field(description="Whether forecasts and predictions are made by it.")
-    effects: list[dict[str, Any]] = Field(description="Its effects with their parameters, but for declared ones.")
+    effects: list[dict[str, Any]] = Field(description="Its effects with parameters and scopes, but for declared ones.")
     declared: dict[str, Any] | None = Field(
         description="What was declared when it was made, as in twin.json; null: Buie's sun with a ratio of 0.02."
     )

@@ -143,7 +143,8 @@ def get_plant(runtime: RuntimeDep) -> PlantOut:
 def put_plant(document: TowerMeasurements, runtime: RuntimeDep, identity: IdentityDep) -> PlantOut:
     """Set the tower base, all planar targets and receivers from PAINT's tower measurements; again changes nothing.
 
-    What is `declared` of the plant's model comes with them, where it is given.
+    What is `declared` of the plant's model comes with them, where it is given. An effect's `scope` says when it acts
+    and at which `heliostats`: `{"kind": "set", "heliostats": ["AB12"]}` is of one mirror; without it all have it.
     """
     origin, targets = read_targets(document.raw)
     receivers = read_receivers(document.raw)

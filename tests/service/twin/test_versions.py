@@ -11,7 +11,7 @@ from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from sqlalchemy import URL, select, text
 
-from model.effects import CATALOGUE, model_version
+from model.effects import CATALOGUE, acting, model_version
 from model.sunshape import Gaussian
 from service import store
 from service.base.faults import ConflictError, NotFoundError
@@ -111,6 +111,13 @@ def test_declared_sun_and_effects_are_part_of_every_version(database: Database):
     assert [effect.name for effect in second.effects] == ["camera_response", "slope_error"]
     with database.writing() as session, pytest.raises(ConflictError, match="studies were made with it"):
         put_declared(session, {})
+
+
+def test_what_is_found_of_one_heliostat_is_adopted_for_it_alone(database: Database):
+    assert adopt(database, add(database, SLOPE | {"scope": {"kind": "set", "heliostats": ["AA39"]}})) == "2:slope_error"
+    with database.reading() as session:
+        effects = versions.get_model(session).effects
+    assert [len(acting(effects, None, name)) for name in ("AA39", "AB01")] == [1, 0]
 
 
 def test_what_is_declared_otherwise_is_another_version(database: Database):

@@ -211,6 +211,20 @@ def test_names_fit_the_pattern(refusing: TestClient, properties: dict[str, Any],
         assert answer.headers["Content-Type"] == "application/problem+json"
 
 
+def test_declared_effects_may_be_of_one_heliostat(client: TestClient, tower: dict[str, Any]):
+    rough = {
+        "name": "slope_error",
+        "parameters": {"sigma_mrad": 1.0},
+        "scope": {"kind": "set", "heliostats": ["AA39"]},
+    }
+    declared = {"effects": [rough]}
+    assert client.put("/v1/plant", json=tower | {"declared": declared}).json()["declared"] == declared
+    hazy = {"name": "sun_shape", "parameters": {"circumsolar_ratio": 0.1}, "scope": rough["scope"]}
+    refused = client.put("/v1/plant", json=tower | {"declared": {"effects": [hazy]}})
+    assert refused.status_code == 422
+    assert "sun_shape: the sun and the camera are the same for all heliostats" in refused.json()["detail"]
+
+
 def test_declared_optics_make_the_light_of_forecasts(client: TestClient, tower: dict[str, Any], operations: Any):
     request = {
         "heliostat": "AA39",
