@@ -37,6 +37,7 @@ from tests.benchmarks.study import (
     upper_bound,
 )
 from tests.undeclared.adapter import write_folder
+from tests.undeclared.camera import empty_targets
 from tests.undeclared.changes import CHANGES
 from tests.undeclared.generator import generate_season
 
@@ -73,6 +74,7 @@ def answer(case: Case) -> Record:
         "effects": report["effects"],
         "candidates": report["candidates"][:4],
         "truth": made.truth,
+        "sheet": "real" if empty_targets() else "drawn",
         "calendar": [[plan.day.isoformat(), plan.heliostat.name] for plan in made.plans],
         "skipped": found.skipped,
         "seconds": round(process_time() - start, 1),
@@ -176,6 +178,8 @@ def summary(records: Sequence[Record]) -> Iterator[str]:
     quiet = [r["verdict"] == "none" for r in calm]
     yield f"Calm seasons: {len(calm)}, false alarms {percent([not right(r) for r in calm])} %, none {percent(quiet)} %."
     if records:
+        sheets = sorted({r.get("sheet", "drawn") for r in records})
+        yield f"Sheets of photographs: {' and '.join(sheets)} (real where ../shared/stj/empty-targets is there)."
         yield f"A study takes {np.median([r['seconds'] for r in records]):.0f} s of one core."
 
 

@@ -4,14 +4,17 @@ A photograph shows a white sheet by daylight, with its seams, marks and stains, 
 camera is exposed as cameras are, encodes light for human eyes, clips what is too bright and keeps 8 bits.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
+from pathlib import Path
 from zlib import crc32
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from tests.benchmarks import data_folder
 from tests.undeclared.plant import Target
 from tests.undeclared.world import World
 
@@ -26,6 +29,9 @@ READ_NOISE = 0.3
 
 WELL = 2e4
 """Electrons that make the largest count."""
+
+AVERAGED = 30
+"""Photographs that a real sheet is averaged of: what is left of their own noise is 0.4 %."""
 
 DAYLIGHT, EXPOSURE = (0.2, 0.34), (0.5, 0.95)
 """Light of the sheet by day, and of the spot's peak over it, in shares of what the camera can tell."""
@@ -112,9 +118,50 @@ def _encoded(light: Array) -> Array:
     return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
 
 
+def _decoded(counts: Array) -> Array:
+    """Light of 8-bit counts, the inverse of `_encoded`."""
+    encoded = counts / 255
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+
+
+# --- the sheet --------------------------------------------------------------------------------------------------------
+
+
+def empty_targets() -> list[Path]:
+    """Real photographs of the empty lower target of Juelich, where the data are there."""
+    return sorted((data_folder() / "empty-targets").glob("*.png"))
+
+
 @lru_cache(maxsize=8)
 def sheet(target: str) -> Array:
-    """Reflectance (256, 256) of a target's sheet: panels, seams with rivets, stains, grain, marks at the corners.
+    """Reflectance (256, 256) of a target's sheet: that of Juelich, or a drawn one where the data are not there."""
+    crops = empty_targets()
+    return real_sheet(target, crops) if crops else drawn_sheet(target)
+
+
+def real_sheet(target: str, crops: Sequence[Path]) -> Array:
+    """Reflectance (256, 256) of the sheet on photographs: the mean of their light, each without its daylight.
+
+    There are such of one target only: the other has its pattern too, the other way round.
+    """
+    chosen = crops[:: -(-len(crops) // AVERAGED)]
+    lights = _decoded(np.stack([cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in chosen]).astype(np.float64))
+    paint = np.mean([light / _daylight(light) for light in lights], axis=0)
+    paint /= np.median(paint)
+    return paint[:, ::-1] if target == "upper" else paint
+
+
+def _daylight(light: Array) -> Array:
+    """The smooth light on a photograph (256, 256) of an empty target: a square's best fit to what is no mark."""
+    y, x = np.mgrid[-1 : 1 : 1j * PIXELS, -1 : 1 : 1j * PIXELS]
+    terms = np.stack([x**0, x, y, x * x, x * y, y * y])
+    sheet = light > 0.8 * np.median(light)
+    weights, *_ = np.linalg.lstsq(terms[:, sheet].T, light[sheet], rcond=None)
+    return np.tensordot(weights, terms, 1)
+
+
+def drawn_sheet(target: str) -> Array:
+    """Reflectance (256, 256) of panels, seams with rivets, stains, grain, marks at the corners.
 
     As strong as on 300 photographs of the empty targets of Juelich: grain and stains 1 to 2 %, seams 5 to 30 %.
     """

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from model.ephemeris import sun_angles_at
 from model.forecast import View, forecast_setups
@@ -20,7 +21,7 @@ from service.cli.folder_study import photographs_of
 from service.sources.folder import MeasurementFolder, read_folder
 from tests.undeclared import changes, sky
 from tests.undeclared.adapter import effects_of, write_folder
-from tests.undeclared.camera import sheet
+from tests.undeclared.camera import drawn_sheet, empty_targets, real_sheet, sheet
 from tests.undeclared.generator import MeasurementSet, generate_season
 from tests.undeclared.plan import Plan, season
 from tests.undeclared.rays import Sun, throw
@@ -75,11 +76,25 @@ def test_rays_carry_what_the_mirror_collects():
         assert light == pytest.approx(4 * 1.605 * 1.275 * cosine, rel=0.008)
 
 
-def test_a_sheet_is_white_but_for_its_marks():
-    paint = sheet("lower")
-    assert np.median(paint) == pytest.approx(1, abs=0.05)
-    assert paint.min() > 0.05
-    assert 0.005 < (paint < 0.5).mean() < 0.03
+def test_a_drawn_sheet_is_as_real_ones_are(stj: Path):
+    """White but for its marks, with seams, stains and grain of their strength."""
+    sheets = drawn_sheet("lower"), real_sheet("lower", empty_targets())
+    for paint in sheets:
+        assert np.median(paint) == pytest.approx(1, abs=0.05)
+        assert 0 < paint.min() < 0.2
+        assert 0.005 < (paint < 0.5).mean() < 0.03
+    inner = [paint[20:180, 20:-20] for paint in sheets]  # where spots are, and no marks
+    for size in (0.0, 2.0, 14.0):
+        drawn, real = (gaussian_filter(paint, size).std() for paint in inner)
+        assert 0.5 < drawn / real < 1.5
+    assert (real_sheet("upper", empty_targets()) == sheets[1][:, ::-1]).all()
+
+
+def test_a_sheet_is_drawn_where_there_are_no_photographs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("HELIOTWIN_STJ", str(tmp_path))
+    sheet.cache_clear()
+    assert (sheet("lower") == drawn_sheet("lower")).all()
+    sheet.cache_clear()
 
 
 def test_times_agree_with_the_sun(a_season):
