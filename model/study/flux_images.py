@@ -82,13 +82,18 @@ class FluxImage:
         return float(np.linalg.norm(self.setup.heliostat.position - self.setup.plane.center))
 
     def noise_share(self, window: float) -> float:
-        """The error (one minus accuracy) that this image's noise alone makes, in a cut of side ``window`` [m]."""
+        """The error (one minus accuracy) that grain and sheet alone make, in a cut of side ``window`` [m]."""
         images, planes = np.stack([self.image, black_lift(self.image)]), [self.setup.plane] * 2
         seen, lift = windows(images, planes, centers(images[:1], planes[:1]).repeat(2, axis=0), window, FLUX_SIZE)
         # A lift of the dark takes from the light's share of the sum.
         lifted = lift - seen * lift.sum() / seen.sum()
         grain = np.sqrt(2 / np.pi * grain_variance(seen))
-        return float(np.hypot(lifted, grain).sum() / seen.sum())
+        return float(np.hypot(np.hypot(lifted, grain).sum() / seen.sum(), self.sheet_share))
+
+
+def noise_floor(flux_images: Sequence[FluxImage], window: float) -> float:
+    """The mean error that even the truth leaves, in cuts of side ``window`` [m]."""
+    return float(np.mean([p.noise_share(window) for p in flux_images]))
 
 
 def spot_window(flux_images: Sequence[FluxImage]) -> float:

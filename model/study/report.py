@@ -13,7 +13,7 @@ from model.effects import Always, Effect
 from model.metrics import flux_accuracies
 from model.study.advice import told_apart_by
 from model.study.covariates import covariates_of
-from model.study.flux_images import FluxImage
+from model.study.flux_images import FluxImage, noise_floor
 from model.study.judging import Gain, rank_correlation
 from model.study.pattern import Pattern, pattern_of
 from model.study.unknowns import Term, Unknowns
@@ -167,7 +167,7 @@ class Study:
     @cached_property
     def noise_floor(self) -> float:
         """Mean error that the images' noise and the sheets behind the spots make alone."""
-        return float(np.mean([np.hypot(p.noise_share(self.window), p.sheet_share) for p in self.images]))
+        return noise_floor(self.images, self.window)
 
     @property
     def unexplained_share(self) -> float:

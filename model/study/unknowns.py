@@ -59,6 +59,12 @@ class Term:
             return ByDay()
         return Always(self.heliostats) if self.since is None else Since(self.since, self.heliostats)
 
+    def is_apart_from(self, other: "Term") -> bool:
+        """Whether no heliostat has both."""
+        if self.heliostats is None or other.heliostats is None:
+            return False
+        return not set(self.heliostats) & set(other.heliostats)
+
     def touches(self, heliostat: str, taken_at: datetime | None) -> bool:
         """Whether a photograph may change with it."""
         if self.heliostats is not None and heliostat not in self.heliostats:

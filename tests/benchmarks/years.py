@@ -5,6 +5,9 @@ days are dealt out to two halves. A study sees one half only: it chooses effects
 other half's days, which had no say in anything, judge them; then the halves change places. Intervals are over days:
 photographs of a day err together. What comes by day cannot be carried to other days: it is judged by photographs of the
 same days, as the study itself does it, and its usual value by the others.
+
+What each of the best effects gives alone, and all of them jointly, is fitted to each half and judged by the other; only
+which these are was chosen by all photographs.
 """
 
 import argparse
@@ -15,11 +18,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from model.effects import Effect, effect_to_json
+from model.effects import CATALOGUE, Effect, effect_to_json
 from model.metrics import flux_accuracies
 from model.plant import JUELICH_LATITUDE
 from model.study import FluxImage, Study, StudyOptions, study
+from model.study.fitting import Fitter
 from model.study.flux_images import Forecaster
+from model.study.unknowns import Term, Unknowns
 from model.tracing import Optics
 from service.cli.folder_study import photographs_of
 from service.sources.folder import read_folder
@@ -28,6 +33,9 @@ from tests.benchmarks import data_folder
 Array = NDArray[np.float64]
 
 WINDOW = 4.0
+
+FEW = 4
+"""How many of the best effects are fitted alone and jointly."""
 
 
 def photographs() -> list[FluxImage]:
@@ -65,6 +73,26 @@ def halves(taken: Sequence[FluxImage]) -> list[list[FluxImage]]:
     return [[p for p in taken if days.index(day_of(p)) % 2 == half] for half in (0, 1)]
 
 
+def fitted(taken: Sequence[FluxImage], names: Sequence[str]) -> list[Effect]:
+    """Effects that are always there, fitted to photographs together."""
+    views = StudyOptions().fit_view, StudyOptions().view
+    pair = [Forecaster(taken, Optics(), [], WINDOW, view, latitude_deg=JUELICH_LATITUDE) for view in views]
+    facets = tuple(sorted({(p.heliostat, len(p.setup.control_points)) for p in taken}))
+    unknowns = Unknowns(tuple(Term(CATALOGUE[name]) for name in names), facets)
+    return unknowns.effects(Fitter(*pair).fit(unknowns, unknowns.neutral).values)
+
+
+def gains(both: Sequence[Sequence[FluxImage]], names: Sequence[str]) -> str:
+    """What effects give together on the days that they were not fitted to, over both halves."""
+    changes = [
+        accuracies(unseen, fitted(seen, names)) - accuracies(unseen, [])
+        for seen, unseen in (tuple(both), tuple(reversed(both)))
+    ]
+    gain = np.concatenate(changes)
+    low, high = interval(gain, [day_of(p) for half in reversed(both) for p in half])
+    return f"{gain.mean():+.4f} [{low:+.4f}, {high:+.4f}]"
+
+
 def described(found: Study) -> str:
     """The effects of a study in one line."""
     names = [f"{f.described} ({f.gain.mean:.3f} [{f.gain.low:.3f}, {f.gain.high:.3f}])" for f in found.found]
@@ -81,12 +109,16 @@ def main() -> None:
     print(f"{len(taken)} photographs on {len({day_of(p) for p in taken})} days: {whole.conclusion()}")
     before, after = whole.accuracy_before.mean(), whole.accuracy_after.mean()
     print(f"found: {described(whole)}; without effects {before:.4f}, with {after:.4f}")
-    print("alone: " + ", ".join(f"{c.name} {c.gain.mean:+.4f}" for c in whole.candidates[:6]), flush=True)
+    both, best = halves(taken), [c.name for c in whole.candidates[:FEW]]
+    print("| the best effects | gain on the days that they were not fitted to, 95 % over days |")
+    print("| --- | --- |")
+    for names in ([name] for name in best):
+        print(f"| {names[0]} alone | {gains(both, names)} |", flush=True)
+    print(f"| {' and '.join(best)} jointly | {gains(both, best)} |", flush=True)
     if options.out:
         options.out.write_text(json.dumps(whole.to_json(), indent=1), encoding="utf-8")
     print("| a study of | finds | photographs of the other days | before | after | gain, 95 % over days |")
     print("| --- | --- | --- | --- | --- | --- |")
-    both = halves(taken)
     for name, seen, unseen in (("even days", *both), ("odd days", *reversed(both))):
         found = study(seen, Optics(), options=asked, latitude_deg=JUELICH_LATITUDE)
         before, after = accuracies(unseen, []), accuracies(unseen, found.effects)

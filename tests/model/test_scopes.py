@@ -209,13 +209,15 @@ def test_what_one_heliostat_has_is_fitted_to_its_photographs():
     _, rough = unknowns.effects(np.array([0.02, 1.0]))
     assert effect_to_json(rough) == effect_to_json(ROUGH)
     assert {p.heliostat for p in photographs(days=1) if term.touches(p.heliostat, p.taken_at)} == {"far"}
+    assert term.is_apart_from(Term(FacetCanting, since=CHANGE, heliostats=("near",)))
+    assert not term.is_apart_from(Term(FacetCanting)) and not term.is_apart_from(term)
 
 
 def test_few_gains_are_worth_less():
     assert few_gain(np.array([0.05])).low <= 0
     assert few_gain(np.array([0.05, 0.01])).low < 0
     assert few_gain(np.array([0.05, 0.04])).low > 0
-    assert few_gain(np.array([0.05, 0.01, 0.03])).low > 0
+    assert few_gain(np.array([0.05, 0.01, 0.03])).low > 0 > few_gain(np.array([0.05, 0.01, 0.03]), among=5).low
 
 
 def test_of_every_day_some_photographs_are_fitted_and_some_judge():

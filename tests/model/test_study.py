@@ -310,7 +310,7 @@ def test_an_effect_is_found_with_its_parameter_and_what_it_buys(hazy):
     assert report["images"] == {"fit": 4, "held_out": 4}
     assert [c["name"] for c in report["candidates"]] == ["sun_shape", "gravity_bending"]
     assert report["candidates"][0]["accuracy_gain"] == gain
-    assert set(told) == {"sun_shape", "gravity_bending"}
+    assert set(told) == {"sun_shape", "gravity_bending", "changes, days and single heliostats"}
 
 
 def test_what_no_candidate_explains_is_said(hazy):
