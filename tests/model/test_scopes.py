@@ -163,7 +163,7 @@ def test_unknowns_of_days_are_moved_at_once_and_become_one_effect():
     assert list(unknowns.groups.values()) == [[0, 1]]
     (effect,) = unknowns.effects(np.array([0.1, 0.2]))
     assert effect_to_json(effect)["parameters"]["circumsolar_ratio"]["value"] == pytest.approx(0.15)
-    (there,) = acting([effect], datetime(2024, 6, 16, 9, tzinfo=UTC))
+    (there,) = acting([effect], datetime(2024, 6, 16, 9, tzinfo=UTC), None)
     assert isinstance(there, SunShapeEffect)
     assert there.circumsolar_ratio == 0.2
 
