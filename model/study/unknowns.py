@@ -38,11 +38,6 @@ class Term:
     heliostats: tuple[str, ...] | None = None
 
     @property
-    def whole(self) -> bool:
-        """Whether it acts always and everywhere."""
-        return self.since is None and not self.days and self.heliostats is None
-
-    @property
     def own(self) -> bool:
         """Whether all its parameters belong to heliostats."""
         return not any(p.shared for p in self.kind.parameters())

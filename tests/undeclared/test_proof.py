@@ -26,6 +26,14 @@ OPTIONS = StudyOptions(
 """Some of the catalogue, look-alikes among them: enough to be wrong, and few enough for a test."""
 
 
+MOVING = StudyOptions(
+    candidates=("axis_tilt", "sun_position", "pylon_bending", "encoder_offset"),
+    most=1,
+    fit_view=View(24, 24, samples=4, padding=0.125),
+    view=View(48, 48, samples=8),
+)
+
+
 @cache
 def measured(case: str) -> MeasurementSet:
     """A small set with few rays."""
@@ -82,6 +90,23 @@ def test_canting_is_found_facet_by_facet():
         for heliostat, tilts in truth["parameters"][axis].items():
             value = np.array(found[0]["parameters"][axis]["value"][heliostat])
             np.testing.assert_allclose(value - value.mean(), tilts, atol=0.1)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("case", world.MOVING)
+def test_what_moves_spots_is_named_by_spot_and_shape_and_not_by_shape_alone(case, seed):
+    made = generate(case, STRONG, seed, heliostats=3, setups=10, side=24, fan=4)
+    name, _ = world.MOVING[case]
+    reports = [
+        study(flux_images(made, said), Optics(), options=MOVING, latitude_deg=JUELICH_LATITUDE).to_json()
+        for said in (made.encoders(seed), None)
+    ]
+    by_both, by_shape = reports
+    assert [(effect["name"], effect["lookalikes"]) for effect in by_both["effects"]] == [(name, [])]
+    assert by_both["verdict"] == "effect"
+    assert by_both["before"]["position_error_mrad"] > 5 * by_both["after"]["position_error_mrad"]
+    assert by_shape["effects"] == []
+    assert "position_error_mrad" not in by_shape["before"]
 
 
 def test_what_no_effect_describes_is_not_taken_for_nothing():
