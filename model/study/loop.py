@@ -205,7 +205,8 @@ class _Loop:
 
     def whole(self, kind: type[Effect]) -> Term:
         """An effect as long as it could act: always, on calibrated mounts since the first photograph thereafter."""
-        return Term(kind, since=self.since if kind.on_mount is not Effect.on_mount else None)
+        moves = kind.on_mount is not Effect.on_mount or kind.on_sun is not Effect.on_sun
+        return Term(kind, since=self.since if moves else None)
 
     def is_whole(self, term: Term) -> bool:
         """Whether an effect acts as long as it could, everywhere."""

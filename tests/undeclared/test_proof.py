@@ -1,5 +1,7 @@
 """A small part of ``python -m tests.benchmarks.study``: effects that the model does not declare are found."""
 
+from dataclasses import replace
+from datetime import timedelta
 from functools import cache
 from typing import Any
 
@@ -107,6 +109,23 @@ def test_what_moves_spots_is_named_by_spot_and_shape_and_not_by_shape_alone(case
     assert by_both["before"]["position_error_mrad"] > 5 * by_both["after"]["position_error_mrad"]
     assert by_shape["effects"] == []
     assert "position_error_mrad" not in by_shape["before"]
+
+
+def test_a_drive_that_lost_steps_since_its_calibration_is_named_with_its_day():
+    """Mounts were calibrated before the first photograph: what is found came thereafter, and of one heliostat."""
+    made = generate_season("encoder_since", STRONG, 1, days=(8, 8), side=24, fan=4)
+    until, images = made.plans[0].day - timedelta(days=30), []
+    for plan, image in zip(made.plans, flux_images(made, made.encoders(1)), strict=True):
+        heliostat = image.setup.heliostat
+        mount = replace(heliostat.mount, is_calibrated=True, calibrated_until=until)
+        setup = replace(image.setup, heliostat=replace(heliostat, mount=mount), taken_at=plan.moment)
+        images.append(replace(image, setup=setup))
+    found = study(images, Optics(), options=MOVING, latitude_deg=JUELICH_LATITUDE).to_json()["effects"]
+    assert [(effect["name"], effect["scope"]) for effect in found] == [(t["name"], t["scope"]) for t in made.truth]
+    (heliostat,) = made.truth[0]["scope"]["heliostats"]
+    for axis in ("first_deg", "second_deg"):
+        value = found[0]["parameters"][axis]["value"][heliostat]
+        assert value == pytest.approx(made.truth[0]["parameters"][axis][heliostat], abs=0.05)
 
 
 def test_what_no_effect_describes_is_not_taken_for_nothing():

@@ -186,9 +186,9 @@ def study(
         require_file(path)
     added = () if effects is None else read_effects(effects)
     source = read_folder(folder)
-    source = Mounts(source, mounts, added).under(source)
+    known = Mounts(source, mounts, added)
     with progress(None, "study") as step:
-        done = study_folder(source, surfaces, effects=added, progress=step)
+        done = study_folder(source, surfaces, effects=added, progress=step, mounts=known)
     report = done.to_json()
     write_json(out, report)
     if page is not None:
