@@ -234,7 +234,7 @@ class Study:
 
         Of deviations of standard deviation ``depth`` the mean magnitude is 0.8 of that.
         """
-        left = self._excess(self.accuracy_after)
+        left = self._left
         return left > 0 and self.pattern.is_targets and 0.8 * self.pattern.depth >= left / 2
 
     @property
@@ -294,13 +294,15 @@ class Study:
                 f"The declared model explains the images: accuracy {before:.1%}, no effect improves it significantly."
             )
         part = f"; {names} explains part of it ({after:.1%})" if names else ""
-        return f"Something is missing that no effect of the catalogue explains: accuracy {before:.1%}{part}."
+        said = f"accuracy {before:.1%}{part}{self._said_of_place()}"
+        return f"Something is missing that no effect of the catalogue explains: {said}."
 
     def _said_of_place(self) -> str:
         if self.position_error_mrad is None:
             return ""
         before, after = self.position_error_mrad
-        return f", and the light lies {after:.1f} mrad from where motors sent it, {before:.1f} mrad before"
+        change = f", {before:.1f} mrad before" if self.found else ""
+        return f", and the light lies {after:.1f} mrad from where motors sent it{change}"
 
     def to_json(self) -> dict[str, Any]:
         """The report of DESIGN.md, section 7."""

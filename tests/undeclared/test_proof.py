@@ -15,6 +15,7 @@ from model.plant import JUELICH_LATITUDE
 from model.study import StudyOptions, study
 from model.tracing import Optics
 from service.cli.folder_study import study_folder
+from service.drawing.study_report import study_page
 from service.sources.folder import read_folder
 from tests.undeclared import world
 from tests.undeclared.adapter import effects_of, flux_images, setups_of, write_folder
@@ -120,7 +121,10 @@ def test_a_drive_that_lost_steps_since_its_calibration_is_named_with_its_day():
         mount = replace(heliostat.mount, is_calibrated=True, calibrated_until=until)
         setup = replace(image.setup, heliostat=replace(heliostat, mount=mount), taken_at=plan.moment)
         images.append(replace(image, setup=setup))
-    found = study(images, Optics(), options=MOVING, latitude_deg=JUELICH_LATITUDE).to_json()["effects"]
+    done = study(images, Optics(), options=MOVING, latitude_deg=JUELICH_LATITUDE)
+    found, page = done.to_json()["effects"], study_page(done, "season")
+    assert "Light from where motors sent it" in page
+    assert "mrad from where motors sent it" in page
     assert [(effect["name"], effect["scope"]) for effect in found] == [(t["name"], t["scope"]) for t in made.truth]
     (heliostat,) = made.truth[0]["scope"]["heliostats"]
     for axis in ("first_deg", "second_deg"):
