@@ -21,7 +21,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from model.effects import Effect, Stage, acting, in_light_order
+from model.effects import Effect, Since, Stage, acting, in_light_order
 from model.images import FLUX_SIZE, FLUX_WINDOW, normalized
 from model.mount import Mount
 from model.plant import Heliostat, TargetPlane
@@ -50,7 +50,8 @@ class Setup:
     spot : (3,) [m] or None
         Where the spot's centre of mass lies, in ENU: the heliostat is turned until it does.
     angles : (2,) [rad] or None
-        The mount's axis angles, where no spot is given.
+        Where the mount's axes stand, as its motors say: where no spot is given, there they are; beside a spot they tell
+        how far it lies from where the motors sent it.
     aim : (3,) [m] or None
         Where the ray from the mirror's centre goes, where neither is given; the plane's centre without it.
     degree : int
@@ -182,6 +183,9 @@ class Group:
         Where their mirrors' centres aim.
     cut : bool (B,)
         Whether their spots run over their targets' edges.
+    displaced : (B, 2) [rad]
+        Sidewards and upwards as seen from their mirrors, from where their motors sent the light to where it lies; NaN
+        where either is not known.
     """
 
     rows: list[int]
@@ -191,6 +195,7 @@ class Group:
     angles: Array
     aims: Array
     cut: NDArray[np.bool_]
+    displaced: Array
 
     def parts(
         self, windows: Sequence[Window], effects: Sequence[Effect]
@@ -223,6 +228,11 @@ class Aligned:
     def angles(self) -> Array:
         """Axis angles (B, 2) [rad], in the setups' order."""
         return _in_order([group.angles for group in self.groups], self.groups)
+
+    @property
+    def displaced(self) -> Array:
+        """How far (B, 2) [rad] spots lie from where motors sent them, in the setups' order, as `Group.displaced`."""
+        return _in_order([group.displaced for group in self.groups], self.groups)
 
     def deformed(self, changes: Tensor) -> "Aligned":
         """The same setups, all alike in their splines, deformed: control points changed by (B, F, 3, I, J) [m].
@@ -439,29 +449,69 @@ def _align_group(
             heliostats, points, suns, planes, goals, degree=degree, start=aims, alter=alter
         )
     taken = [(setup.heliostat.name, setup.taken_at) for setup in group]
-    return Group(rows, planes, taken, alter(scene.to(dtype)), angles, aims, cut)
+    displaced = _displaced(group, heliostats, suns, aims)
+    return Group(rows, planes, taken, alter(scene.to(dtype)), angles, aims, cut, displaced)
 
 
 def altered(heliostats: Sequence[Heliostat], effects: Sequence[Effect]) -> list[Heliostat]:
     """The heliostats on their mounts as the effects leave them; one that comes twice stays one.
 
-    A calibrated mount stays as it is: what effects say of a surveyed one, the calibration has found in it.
+    What effects say of a surveyed mount, a calibration has found in it by the photographs that it saw: only what came
+    later acts on a calibrated one.
     """
     altered: dict[int, Heliostat] = {}
     for heliostat in heliostats:
         if id(heliostat) not in altered:
             mount = heliostat.mount
-            for effect in () if mount.is_calibrated else effects:
-                mount = effect.on_mount(mount)
+            for effect in effects:
+                if not mount.is_calibrated or _came_later(effect, mount):
+                    mount = effect.on_mount(mount, heliostat.name)
             altered[id(heliostat)] = replace(heliostat, mount=mount)
     return [altered[id(heliostat)] for heliostat in heliostats]
 
 
+def _came_later(effect: Effect, mount: Mount) -> bool:
+    """Whether an effect began after the newest photograph that a mount was calibrated by."""
+    known = mount.calibrated_until
+    return known is not None and isinstance(effect.scope, Since) and effect.scope.since > known
+
+
+def _by_motors(setups: Sequence[Setup], heliostats: Sequence[Heliostat]) -> Array:
+    """Where axes (B, 2) [rad] stand by the motors, on mounts as effects leave them; NaN where setups do not say."""
+    said = [(np.nan, np.nan) if setup.angles is None else setup.angles for setup in setups]
+    moved = [
+        np.subtract(heliostat.mount.axis_zero, setup.heliostat.mount.axis_zero)
+        for setup, heliostat in zip(setups, heliostats, strict=True)
+    ]
+    return np.array(said, dtype=np.float64) + moved
+
+
+def _displaced(setups: Sequence[Setup], heliostats: Sequence[Heliostat], suns: Array, aims: Array) -> Array:
+    """As `Group.displaced`, for mirrors whose light lies where it was measured when their centres aim at ``aims``.
+
+    A calibrated mount sends not its centre's ray but the light to where it says: its mirror's tilt is in it.
+    """
+    displaced, angles = np.full((len(setups), 2), np.nan), _by_motors(setups, heliostats)
+    told = [row for row, setup in enumerate(setups) if setup.spot is not None and setup.angles is not None]
+    if told:
+        mount = Mount.stack([heliostats[row].mount for row in told])
+        attitude = mount.attitude(angles[told])
+        centers = mount.mirror_center([heliostats[row].position for row in told], attitude)
+        normal, sun = attitude[..., 2], suns[told]
+        light = 2 * (normal * sun).sum(axis=-1, keepdims=True) * normal - sun
+        way = np.array([setups[row].goal if heliostats[row].mount.is_calibrated else aims[row] for row in told])
+        way -= centers
+        way /= np.linalg.norm(way, axis=-1, keepdims=True)
+        sidewards = np.cross([0.0, 0.0, 1.0], way)
+        sidewards /= np.linalg.norm(sidewards, axis=-1, keepdims=True)
+        seen = np.stack([sidewards, np.cross(way, sidewards)], axis=-2)
+        displaced[told] = -(seen @ light[..., None])[..., 0]
+    return displaced
+
+
 def _given_angles(setups: Sequence[Setup], heliostats: Sequence[Heliostat], suns: Array) -> Array:
     """Axis angles (B, 2) [rad] of setups without a spot: as given, or by the aim of the mirror's centre."""
-    angles = np.array(
-        [(np.nan, np.nan) if setup.angles is None else setup.angles for setup in setups], dtype=np.float64
-    )
+    angles = _by_motors(setups, heliostats)
     aimed = [row for row, setup in enumerate(setups) if setup.angles is None]
     if aimed:
         mount = Mount.stack([heliostats[row].mount for row in aimed])

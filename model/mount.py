@@ -15,6 +15,7 @@ mirror of a batch by a mount of its own.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from datetime import date
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,6 +27,14 @@ Array = NDArray[np.float64]
 # Mirror coordinates (x right seen from the front, y up the mirror, z normal) to ENU for a mirror standing upright and
 # facing south: R_east(90 deg).
 _UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+
+_UP = np.array([0.0, 0.0, 1.0])
+
+# Lever below which a mirror faces the zenith and its pylon does not lean.
+_LEAST_LEVER = 1e-9
+
+# Each round leaves a hundredth of the error for a lean of 10 mrad.
+_LEAN_ROUNDS = 6
 
 # Steps by which a motor's position may lie beyond an end for rounding alone.
 _ROUNDING = 0.5
@@ -143,6 +152,11 @@ class Mount:
         What is added to the actuators' angles to give the axis angles.
     is_calibrated : bool
         Whether its axes are as they were found standing, not as surveyed: no tilt is missing in them.
+    calibrated_until : date or None
+        The day of the newest photograph that it was calibrated by, where that is known.
+    lean : (...) [rad]
+        By how much the pylon leans towards where the mirror faces, for a mirror that stands upright; it goes with the
+        lever of the mirror's weight, the horizontal part of its normal.
     """
 
     first_axis: Array
@@ -153,6 +167,8 @@ class Mount:
     actuators: tuple[LinearActuator, LinearActuator] | None = None
     axis_zero: tuple[float, float] = (0.0, 0.0)
     is_calibrated: bool = False
+    calibrated_until: date | None = None
+    lean: float | Array = 0.0
 
     @classmethod
     def juelich(
@@ -194,6 +210,7 @@ class Mount:
             zero_attitude=np.array([mount.zero_attitude for mount in mounts]),
             joint=np.array([mount.joint for mount in mounts]),
             mirror_offset=np.array([mount.mirror_offset for mount in mounts]),
+            lean=np.array([mount.lean for mount in mounts]),
         )
 
     def tilted(self, attitude: ArrayLike) -> "Mount":
@@ -209,9 +226,28 @@ class Mount:
     def attitude(self, angles: ArrayLike) -> Array:
         """Mirror coordinates to ENU (..., 3, 3) at axis angles (..., 2) [rad]."""
         t = np.asarray(angles, dtype=np.float64)
-        return np.asarray(
-            rotation(self.first_axis, t[..., 0]) @ rotation(self.second_axis, t[..., 1]) @ self.zero_attitude
-        )
+        turned = rotation(self.first_axis, t[..., 0]) @ rotation(self.second_axis, t[..., 1]) @ self.zero_attitude
+        if not np.any(self.lean):
+            return np.asarray(turned)
+        sideways = np.cross(_UP, turned[..., 2])
+        lever = np.maximum(np.linalg.norm(sideways, axis=-1), _LEAST_LEVER)
+        return np.asarray(rotation(sideways / lever[..., None], self.lean * lever) @ turned)
+
+    def _before_lean(self, normal: Array) -> Array:
+        """The unit normal (..., 3) to which the axes must turn the mirror for the lean to make it ``normal`` (..., 3).
+
+        The lean is a turn by ``lean * cos(elevation)`` about a horizontal axis at right angles to the normal: it lowers
+        the elevation by so much, and leaves the azimuth.
+        """
+        if not np.any(self.lean):
+            return normal
+        level = np.linalg.norm(normal[..., :2], axis=-1)
+        true = np.arctan2(normal[..., 2], level)
+        elevation = true
+        for _ in range(_LEAN_ROUNDS):
+            elevation = true + self.lean * np.cos(elevation)
+        ahead = normal[..., :2] / np.maximum(level, _LEAST_LEVER)[..., None]
+        return np.concatenate([ahead * np.cos(elevation)[..., None], np.sin(elevation)[..., None]], axis=-1)
 
     def angles_from_motors(self, steps: ArrayLike) -> Array:
         """Axis angles (..., 2) [rad] at motor positions (..., 2) [steps]."""
@@ -241,7 +277,7 @@ class Mount:
             Where no pair of angles reaches the normal (axes that are not perpendicular).
         """
         goal = np.asarray(normal, dtype=np.float64)
-        goal = goal / np.linalg.norm(goal, axis=-1, keepdims=True)
+        goal = self._before_lean(goal / np.linalg.norm(goal, axis=-1, keepdims=True))
         zero = self.zero_attitude[..., 2]
         first, second = self.first_axis, self.second_axis
         along = _dot(zero, second)[..., None] * second

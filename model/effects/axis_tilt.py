@@ -25,8 +25,8 @@ What it is confused with
     - Wrong sun positions: roll the image too, and change the incidence; compare morning with afternoon, where a clock
       error changes its sense.
     - Canting: changes the image in the mirror's own frame.
-    Without spots to align by, a tilt of a degree moves the spot by metres, which is how kinematic calibration finds
-    it.
+    Where the motors are known, a tilt of a degree moves the spot by metres, by another way under each sun, which tells
+    it from a clock, a pylon that leans and encoders that are off.
 """
 
 from dataclasses import dataclass
@@ -51,7 +51,7 @@ class AxisTilt(Effect):
     north_deg: float = parameter(0.0, -3.0, 3.0, "deg")
     up_deg: float = parameter(0.0, -3.0, 3.0, "deg")
 
-    def on_mount(self, mount: Mount) -> Mount:
+    def on_mount(self, mount: Mount, heliostat: str) -> Mount:
         """Turn both axes and the mirror with them."""
         about_north = rotation([0.0, 1.0, 0.0], np.radians(float(self.north_deg)))
         about_up = rotation([0.0, 0.0, 1.0], np.radians(float(self.up_deg)))

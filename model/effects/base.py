@@ -108,6 +108,8 @@ class Effect:
         images cannot tell.
     relative : bool
         Whether images show only by how much a mirror's facets differ, and not what they share.
+    only_moves : bool
+        Whether it leaves the light's shape and moves its centre alone: photographs without motors say nothing of it.
     comes : frozenset of {"since", "day"}
         How it may come, if it is not always there: at a date, to stay, or with each day anew.
     of_heliostats : bool
@@ -123,6 +125,7 @@ class Effect:
     guesses: ClassVar[tuple[dict[str, float], ...]] = ()
     prior_std: ClassVar[float] = 1.0
     relative: ClassVar[bool] = False
+    only_moves: ClassVar[bool] = False
     comes: ClassVar[frozenset[Arrival]] = frozenset({"since"})
     of_heliostats: ClassVar[bool] = False
 
@@ -177,8 +180,8 @@ class Effect:
         """Unit vectors (B, 3) towards the sun, as they were recorded, to where it really stood."""
         return suns
 
-    def on_mount(self, mount: Mount) -> Mount:
-        """A mount as it was surveyed to how it really stands."""
+    def on_mount(self, mount: Mount, heliostat: str) -> Mount:
+        """The mount of a heliostat of that name as it was surveyed to how it really stands."""
         return mount
 
     def on_scene(self, scene: Scene, heliostats: Sequence[Heliostat]) -> Scene:

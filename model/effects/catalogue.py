@@ -15,6 +15,8 @@ from model.errors import InvalidInputError
 ORDER = (
     "sun_position",
     "axis_tilt",
+    "pylon_bending",
+    "encoder_offset",
     "facet_canting",
     "gravity_bending",
     "soiling",

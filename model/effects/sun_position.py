@@ -22,8 +22,8 @@ What it scales with
 What it is confused with
     - Axis tilt: belongs to a mount and does not follow the sun's path.
     - Canting and gravity: change astigmatism too, but stay with the mirror, or follow its elevation.
-    Without spots to align by, a minute moves the spot by 4 mrad times the slant range, and motor positions find the
-    error at once.
+    Where the motors are known, a minute moves the spot by 4 mrad times the slant range, as far for all heliostats,
+    along the image of the sun's path: spots tell a minute at once.
 """
 
 from dataclasses import dataclass

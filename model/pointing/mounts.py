@@ -1,7 +1,8 @@
 """A calibrated mount: where its light lands at a time, how sure that is, and the steps that send it to a place."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from datetime import date, timedelta
 from itertools import pairwise
 
 import numpy as np
@@ -187,7 +188,21 @@ class CalibratedMount:
         """The mount as calibrated, of that which the properties have, at a day; by default as newly measured."""
         parameters = self.parameters.copy()
         parameters[ZEROS] += self.zeros_at(day)[0]
-        return calibrated(nominal, parameters)
+        return replace(calibrated(nominal, parameters), calibrated_until=self.until)
+
+    @property
+    def until(self) -> date | None:
+        """The day of the newest measurement; None where there was none."""
+        return date(1970, 1, 1) + timedelta(days=float(self.days[-1])) if len(self.days) else None
+
+    @property
+    def usual_rad(self) -> float:
+        """Standard deviation [rad] per direction of what measurements leave: robust, from the median of their angles.
+
+        The median angle of two equal normal components is sqrt(2 ln 2) deviations.
+        """
+        off = self.off[~self.foreign]
+        return float(np.median(off) / np.sqrt(2 * np.log(2))) if len(off) else self.noise.spot_rad
 
     def light(self, heliostat: Heliostat, motors: Array, suns: Array, days: Array) -> tuple[Array, Array]:
         """Mirror centres (N, 3) [m] and directions (N, 3) of their light at motor positions (N, 2) [steps]."""

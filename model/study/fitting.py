@@ -2,7 +2,7 @@
 
 Images are compared in shares of their peak. Their residuals are far larger than their grain as long as the model lacks
 something, so that all pixels count alike (`PIXEL_NOISE`); intervals come from how the images disagree, not from the
-pixels.
+pixels. Where a spot lies beside where its motors sent it is two more residuals (`model.study.position`).
 """
 
 from collections.abc import Sequence
@@ -22,6 +22,9 @@ Array = NDArray[np.float64]
 
 PIXEL_NOISE = 0.03
 """Standard deviation of a pixel [of the peak] that fits count with, beside the unknowns' ``prior_std``."""
+
+RESIDUALS = COARSE_SIZE**2 + 2
+"""R, those of one photograph: its pixels, and where its spot lies."""
 
 STARTS = (-0.4, -0.15, -0.05, 0.05, 0.15, 0.4)
 """Where fits of an unknown begin, in shares of its range away from neutral."""
@@ -72,14 +75,14 @@ class Fitter:
         self.peaks = self.measured.max(axis=(1, 2))
 
     def residuals(self, unknowns: Unknowns, values: Array) -> Array:
-        """Measured minus forecast (N, COARSE_SIZE**2) in units of `PIXEL_NOISE`; infinite where the model fails."""
+        """Measured minus forecast (N, R) in standard deviations; infinite where the model fails, 0 if not known."""
         return np.asarray(self.residuals_of(unknowns, values[None])[0])
 
     def residuals_of(self, unknowns: Unknowns, trials: Array) -> Array:
-        """Residuals (M, N, COARSE_SIZE**2) of many trials (M, P), traced at once where only mirrors differ in them."""
+        """Residuals (M, N, R) of many trials (M, P), traced at once where only mirrors differ in them."""
         shared = np.array([unknown.shared for unknown in unknowns.all], dtype=bool)
         _, group = np.unique(trials[:, shared], axis=0, return_inverse=True)
-        residuals = np.empty((len(trials), len(self.measured), COARSE_SIZE**2))
+        residuals = np.empty((len(trials), len(self.measured), RESIDUALS))
         for one in np.unique(group):
             rows = np.flatnonzero(group == one)
             for part in np.array_split(rows, -(-len(rows) // AT_ONCE)):
@@ -87,20 +90,22 @@ class Fitter:
         return residuals
 
     def _residuals_alike(self, unknowns: Unknowns, trials: Array) -> Array:
-        """Residuals (M, N, COARSE_SIZE**2) of trials (M, P) with the same shared unknowns."""
+        """Residuals (M, N, R) of trials (M, P) with the same shared unknowns."""
         count = len(trials)
         copies, values = unknowns.copies(trials)
         fixed = [copied(effect, count) for effect in self.fixed]
+        forecaster, model = self.forecaster.copies(count), [*fixed, *copies.effects(values)]
         try:
-            forecast = self.forecaster.copies(count).cuts([*fixed, *copies.effects(values)], COARSE_SIZE)
+            forecast, off = forecaster.cuts(model, COARSE_SIZE), forecaster.off(model)
         except (UnreachableError, InvalidInputError):
             if count > 1:
                 return np.concatenate([self._residuals_alike(unknowns, trial[None]) for trial in trials])
             # A clock an hour off puts low suns below the horizon, and all light may be blocked: as wrong as can be.
-            return np.full((1, len(self.measured), COARSE_SIZE**2), np.inf)
+            return np.full((1, len(self.measured), RESIDUALS), np.inf)
         difference = self.measured - forecast.reshape(count, *self.measured.shape)
         shares = difference / self.peaks[:, None, None] / PIXEL_NOISE
-        return np.asarray(shares.reshape(count, len(self.measured), -1))
+        parts = (shares, np.nan_to_num(off))
+        return np.concatenate([part.reshape(count, len(self.measured), -1) for part in parts], axis=-1)
 
     def _take_off_grid(self, unknowns: Unknowns, begin: Array) -> None:
         """Add to the measured images what the coarse forecast of ``begin`` differs by from the fine one."""
@@ -115,7 +120,7 @@ class Fitter:
         return float((residuals**2).sum() + away @ unknowns.prior_precision @ away) / 2
 
     def jacobian(self, unknowns: Unknowns, values: Array, residuals: Array) -> Array:
-        """Derivatives of the residuals (P, N, COARSE_SIZE**2); a group is changed at once."""
+        """Derivatives of the residuals (P, N, R); a group is changed at once."""
         low, high = unknowns.bounds
         steps = STEP * (high - low)
         steps = np.where(values + steps > high, -steps, steps)
@@ -212,7 +217,7 @@ class Fitter:
 
 @dataclass(frozen=True, eq=False)
 class _Point:
-    """Values (P,) of unknowns and the residuals (N, COARSE_SIZE**2) there."""
+    """Values (P,) of unknowns and the residuals (N, R) there."""
 
     values: Array
     residuals: Array

@@ -17,6 +17,7 @@ from model.imaging.window import overlap_matrix
 from model.metrics import accuracy_window
 from model.plant import TargetPlane
 from model.study.noise import black_lift, grain_variance
+from model.study.position import USUAL_RAD
 from model.study.unknowns import copied, copy_name
 from model.tracing import Optics
 
@@ -39,6 +40,9 @@ class FluxImage:
         Where the camera's range cut the light off, where it did.
     sheet_share : float [1]
         Share of the light that the pattern of the sheet behind the spot moves about (`model.imaging.Quality`).
+    spot_std_rad : float [rad]
+        Standard deviation per direction of its spot about where a right model sends it; of account where
+        ``setup.angles`` says where the mount stood (`model.study.position`).
     """
 
     setup: Setup
@@ -46,6 +50,7 @@ class FluxImage:
     seen: bool = False
     clipped: NDArray[np.bool_] | None = None
     sheet_share: float = 0.0
+    spot_std_rad: float = USUAL_RAD
 
     def __post_init__(self) -> None:
         if self.image.ndim != 2 or not np.isfinite(self.image).all() or not self.image.sum() > 0:
@@ -177,6 +182,7 @@ class Forecaster:
         self.window, self.view, self.latitude_deg = window, view, latitude_deg
         self.setups = [p.setup for p in flux_images]
         self.planes = [setup.plane for setup in self.setups]
+        self.spot_std_rad = np.array([p.spot_std_rad for p in flux_images])
         self.cameras = np.array([p.image.shape for p in flux_images])
         self._aligned: dict[str, Aligned] = {}
         self._flux: dict[str, torch.Tensor] = {}
@@ -235,6 +241,14 @@ class Forecaster:
                 self._within_range(rows, in_pixels(images[rows], *camera)), planes, self.window, resolution
             )
         return cuts
+
+    def off(self, effects: Sequence[Effect]) -> Array:
+        """How far spots lie (N, 2) from where their motors sent them under the declared effects and these.
+
+        In each one's standard deviations, NaN where motors are not known. Raises as `cuts`.
+        """
+        aligned, _ = self._traced([*self.declared, *effects])
+        return np.asarray(aligned.displaced / self.spot_std_rad[:, None])
 
     def _within_range(self, rows: NDArray[np.intp], forecasts: Array) -> Array:
         """Forecasts (n, R, C) of the photographs ``rows`` (n,), cut off where the camera's range cut those off."""

@@ -15,6 +15,7 @@ from model.metrics import flux_accuracies
 from model.study.fitting import Fitter
 from model.study.flux_images import FluxImage, Forecaster, noise_floor, spot_window
 from model.study.judging import Gain, Rows, Split, few_gain, paired_gain, split
+from model.study.position import EXPECTED, NAT, loss
 from model.study.report import Candidate, Found, Study
 from model.study.scopes import OF_THE_BEST, SCREENED, STRENGTHS, Promise, alone, change, days_of, promises
 from model.study.unknowns import Term, Unknowns
@@ -37,6 +38,9 @@ CHANGED = 0.002
 LEAST_ALONE = 0.01
 """Accuracy that an effect which one heliostat has alone must gain there: some mirrors of undeclared sets that have none
 gain up to 0.008, where two tracers, surfaces of finite resolution or what 8 bits leave of faint light differ."""
+
+MOVED = 0.5
+"""Standard deviations that an effect must move a spot by for its photograph to say something of it."""
 
 LEAST_DIFFERENCE = 0.001
 """Accuracy that one effect must gain more than another on the same images to be told from it."""
@@ -71,6 +75,8 @@ class Trial:
         Forecasts of the held-out images.
     accuracy : (H,)
         Of those.
+    off : (H, 2)
+        How far the held-out spots lie from where motors sent them, in standard deviations; NaN where not known.
     """
 
     unknowns: Unknowns
@@ -78,6 +84,16 @@ class Trial:
     spread: Array
     cuts: Array
     accuracy: Array
+    off: Array
+
+    @property
+    def score(self) -> Array:
+        """Accuracy (H,) of the held-out images, less the loss by where they lie."""
+        return self.scored(place=True)
+
+    def scored(self, place: bool) -> Array:
+        """`score`, or accuracy alone."""
+        return self.accuracy - place * NAT * loss(self.off)
 
     @property
     def effects(self) -> list[Effect]:
@@ -112,7 +128,10 @@ class _Loop:
         self.judge = self._forecaster(self.split.held_out, options.view)
         self.measured = self.judge.measured(FLUX_SIZE)
         self.heliostats = self.all_heliostats[self.split.held_out]
-        self.noise = noise_floor([flux_images[row] for row in self.split.held_out], self.window)
+        held_out = [flux_images[row] for row in self.split.held_out]
+        known = [p.setup.angles is not None for p in held_out]
+        self.noise = noise_floor(held_out, self.window) + NAT * EXPECTED * float(np.mean(known))
+        self.since = _first_uncalibrated(flux_images)
         self._pairs: dict[bytes, tuple[Forecaster, Forecaster]] = {}
 
     def _forecaster(self, rows: Rows, view: View) -> Forecaster:
@@ -140,7 +159,7 @@ class _Loop:
         All of them, unless ``joint`` is false: then those that ``start`` knows stay as they are.
         """
         whole = Unknowns(tuple(terms), self.facets)
-        trial = Trial(whole, whole.neutral, np.zeros(len(whole.all)), np.empty(0), np.empty(0))
+        trial = Trial(whole, whole.neutral, np.zeros(len(whole.all)), *(np.empty(0) for _ in range(3)))
         known: set[Term] = set()
         if start is not None:
             values, spread = (start.unknowns.put(v, whole) for v in (start.values, start.spread))
@@ -161,8 +180,8 @@ class _Loop:
 
     def judged(self, trial: Trial) -> Trial:
         """The trial with its forecasts of the held-out images."""
-        cuts = self.judge.cuts(trial.effects)
-        return replace(trial, cuts=cuts, accuracy=flux_accuracies(self.measured, cuts))
+        cuts, off = self.judge.cuts(trial.effects), self.judge.off(trial.effects)
+        return replace(trial, cuts=cuts, accuracy=flux_accuracies(self.measured, cuts), off=off)
 
     def _fitted(self, trial: Trial, rows: Rows, unknowns: Unknowns, known: set[Term]) -> Trial:
         """The trial with those unknowns fitted that some photographs can tell of."""
@@ -184,9 +203,18 @@ class _Loop:
 
     def refitted(self, trials: dict[Term, Trial]) -> dict[Term, Trial]:
         """Trials, the best of them fitted once more from where they are, jointly with what was known before."""
-        best = sorted(trials, key=lambda term: -trials[term].accuracy.mean())[:REFITTED]
+        best = sorted(trials, key=lambda term: -trials[term].score.mean())[:REFITTED]
         joint = {term: self.trial(trials[term].unknowns.terms, trials[term]) for term in best}
         return trials | joint
+
+    def whole(self, kind: type[Effect]) -> Term:
+        """An effect as long as it could act: always, on calibrated mounts since the first photograph thereafter."""
+        moves = kind.on_mount is not Effect.on_mount or kind.on_sun is not Effect.on_sun
+        return Term(kind, since=self.since if moves else None)
+
+    def is_whole(self, term: Term) -> bool:
+        """Whether an effect acts as long as it could, everywhere."""
+        return term == self.whole(term.kind)
 
     # --- scopes -------------------------------------------------------------------------------------------------------
 
@@ -212,11 +240,14 @@ class _Loop:
 
     def _costs_without_scope(self, trial: Trial, term: Term, rows: Rows, strengths: Sequence[float]) -> Array:
         """What each of some images costs (strengths, n) if an effect were always there, at multiples of its fit."""
-        terms = tuple(replace(term, since=None) if one == term else one for one in trial.unknowns.terms)
+        terms = tuple(self._from_the_first(term) if one == term else one for one in trial.unknowns.terms)
         unknowns, moved = Unknowns(terms, self.facets), np.array([u.term == term for u in trial.unknowns.all])
         away = np.where(moved, trial.values - trial.unknowns.neutral, 0.0)
         tried = [np.clip(trial.values + (s - 1) * away, *unknowns.bounds) for s in strengths]
         return self._costs(rows, unknowns, np.array(tried))
+
+    def _from_the_first(self, term: Term) -> Term:
+        return replace(term, since=self.whole(term.kind).since)
 
     def _settled(self, term: Term, current: Trial, rows: Rows) -> tuple[Term, Trial]:
         """An effect in its scope, fitted; one since a day since that from which on its fit saves most."""
@@ -231,7 +262,7 @@ class _Loop:
 
     def _changed(self, term: Term, trial: Trial, current: Trial, rows: Rows) -> date | None:
         """The day from which on photographs among some save most by an effect as it was fitted."""
-        rows, days = self._dated(self.touched(rows, [replace(term, since=None)]))
+        rows, days = self._dated(self.touched(rows, [self._from_the_first(term)]))
         before = self._costs(rows, current.unknowns, current.values[None])
         found = change(before - self._costs_without_scope(trial, term, rows, (1.0,)), days)
         return None if found is None else found[0]
@@ -244,7 +275,8 @@ class _Loop:
 
     def dated(self, term: Term, trial: Trial, current: Trial) -> tuple[Term, Trial]:
         """An effect that was judged since the day that all photographs name, also those that judged it."""
-        day = None if term.since is None else self._changed(term, trial, current, np.arange(len(self.flux_images)))
+        comes = term.since is not None and not self.is_whole(term)
+        day = self._changed(term, trial, current, np.arange(len(self.flux_images))) if comes else None
         if day is None or day == term.since or replace(term, since=day) in current.unknowns.terms:
             return term, trial
         return replace(term, since=day), trial.redated(term, day)
@@ -253,30 +285,30 @@ class _Loop:
 
     def worth_adding_to(self, current: Trial) -> bool:
         """Whether even the truth, which leaves the images' noise, could bring the gain that an effect must bring."""
-        return 1 - float(current.accuracy.mean()) - self.noise >= self.options.least_gain
+        return 1 - float(current.score.mean()) - self.noise >= self.options.least_gain
 
-    def gain(self, after: Trial, before: Trial) -> Gain:
-        """What ``after`` is better by on held-out images."""
-        return paired_gain(after.accuracy - before.accuracy, self.heliostats)
+    def gain(self, after: Trial, before: Trial, place: bool = True) -> Gain:
+        """What ``after`` is better by on held-out images, by their shapes alone unless ``place``."""
+        return paired_gain(after.scored(place) - before.scored(place), self.heliostats)
 
-    def own_gain(self, term: Term, after: Trial, before: Trial) -> Gain:
+    def own_gain(self, term: Term, after: Trial, before: Trial, place: bool = True) -> Gain:
         """What an effect gains where it acts: on the held-out images whose forecast it changes.
 
         One that is not always there acts on few of them. So it is fitted once more to those, and judged by the images
         that it was fitted to first: every image that it changes judges once, by a fit that did not see it. But where
         those chose a heliostat among many, only images that had no say in that judge, and they judge several choices.
         """
-        if term.whole:
-            return self.gain(after, before)
-        held_out = _changes(self.measured, before.cuts, after.cuts)
+        if self.is_whole(term):
+            return self.gain(after, before, place)
+        held_out = _changes(self.measured, (before.cuts, before.off), (after.cuts, after.off), place)
         if term.always:
             return few_gain(held_out, among=SCREENED)
-        if not held_out.sum() > 0:
+        if place and not held_out.sum() > 0:
             return few_gain(held_out)
-        return few_gain(np.concatenate([held_out, self._crossed(term, after, before)]))
+        return few_gain(np.concatenate([held_out, self._crossed(term, after, before, place)]))
 
-    def _crossed(self, term: Term, after: Trial, before: Trial) -> Array:
-        """Changes of accuracy (n,) of images that were fitted, by an effect fitted to those held out."""
+    def _crossed(self, term: Term, after: Trial, before: Trial, place: bool) -> Array:
+        """Changes of score (n,) of images that were fitted, by an effect fitted to those held out."""
         crossed = replace(after, values=before.unknowns.put(before.values, after.unknowns))
         moving = Unknowns((term,), self.facets)
         crossed = self._fitted(crossed, self.touched(self.split.held_out, [term]), moving, set())
@@ -284,11 +316,12 @@ class _Loop:
         if not len(rows):
             return np.empty(0)
         judge = self._pair(rows)[1]
-        return _changes(judge.measured(FLUX_SIZE), judge.cuts(before.effects), judge.cuts(crossed.effects))
+        first, second = ((judge.cuts(trial.effects), judge.off(trial.effects)) for trial in (before, crossed))
+        return _changes(judge.measured(FLUX_SIZE), first, second, place)
 
     def counts(self, term: Term, gain: Gain) -> bool:
         """Whether a gain by an effect is both significant and worth having."""
-        least = LEAST_ALONE if term.always and not term.whole else 0.0
+        least = LEAST_ALONE if term.always and term.heliostats is not None else 0.0
         return gain.low > 0 and gain.mean >= max(least, self.options.least_gain)
 
     @staticmethod
@@ -306,15 +339,15 @@ class _Loop:
         significant = {term: t for term, t in trials.items() if self.counts(term, gains[term])}
         if not significant:
             return None
-        best = max(significant, key=lambda term: significant[term].accuracy.mean())
+        best = max(significant, key=lambda term: significant[term].score.mean())
         alike = [
             term
             for term, t in significant.items()
             if term == best or not (term.is_apart_from(best) or self.distinguishes(self.gain(significant[best], t)))
         ]
-        alike.sort(key=lambda term: (_complexity(term, significant[term]), -significant[term].accuracy.mean()))
+        alike.sort(key=lambda term: (_complexity(term, significant[term]), -significant[term].score.mean()))
         chosen, *others = alike
-        gain = gains[chosen] if not chosen.whole else self._nested_gain(significant, current)
+        gain = gains[chosen] if not self.is_whole(chosen) else self._nested_gain(significant, current)
         return (chosen, gain, others) if self.counts(chosen, gain) else None
 
     def _nested_gain(self, trials: dict[Term, Trial], current: Trial) -> Gain:
@@ -322,8 +355,8 @@ class _Loop:
         second = np.arange(len(self.heliostats)) % 2 == 1
         differences = np.empty(len(second))
         for half in (second, ~second):
-            best = max(trials.values(), key=lambda t: t.accuracy[~half].mean() if (~half).any() else 0.0)
-            differences[half] = (best.accuracy - current.accuracy)[half]
+            best = max(trials.values(), key=lambda t: t.score[~half].mean() if (~half).any() else 0.0)
+            differences[half] = (best.score - current.score)[half]
         return paired_gain(differences, self.heliostats)
 
     def without_idle(self, current: Trial) -> Trial:
@@ -336,10 +369,22 @@ class _Loop:
         return current
 
 
-def _changes(measured: Array, before: Array, after: Array) -> Array:
-    """Changes of accuracy (n,) of the images whose forecasts differ."""
-    differ = 1 - flux_accuracies(before, after) > CHANGED
-    return np.asarray((flux_accuracies(measured, after) - flux_accuracies(measured, before))[differ])
+def _changes(measured: Array, before: tuple[Array, Array], after: tuple[Array, Array], place: bool) -> Array:
+    """Changes of score (n,) of the images whose forecasts, cuts and how far spots lie off, differ."""
+    moved = np.nan_to_num(np.linalg.norm(after[1] - before[1], axis=-1))
+    differ = (1 - flux_accuracies(before[0], after[0]) > CHANGED) | (moved > MOVED)
+    first, second = (flux_accuracies(measured, cuts) - place * NAT * loss(off) for cuts, off in (before, after))
+    return np.asarray((second - first)[differ])
+
+
+def _first_uncalibrated(flux_images: Sequence[FluxImage]) -> date | None:
+    """The day of the first photograph with motors after all that mounts were calibrated by; None without such."""
+    mounts = [p.setup.heliostat.mount for p in flux_images]
+    if not any(mount.is_calibrated for mount in mounts):
+        return None
+    until = [mount.calibrated_until for mount in mounts if mount.calibrated_until is not None]
+    told = [p.taken_at.date() for p in flux_images if p.setup.angles is not None and p.taken_at is not None]
+    return min((day for day in told if day > max(until, default=date.max)), default=None)
 
 
 def _screened(found: Sequence[Promise], known: Sequence[Term]) -> list[Term]:
@@ -395,7 +440,9 @@ def study(
     before = current = loop.trial([])
     found: dict[Term, Found] = {}
     candidates: list[Candidate] = []
-    left = [Term(CATALOGUE[name]) for name in options.candidates if name not in declared]
+    told = any(p.setup.angles is not None for p in flux_images)
+    kinds = [CATALOGUE[name] for name in options.candidates if name not in declared]
+    left = [loop.whole(kind) for kind in kinds if told or not kind.only_moves]
     for _ in range(options.most):
         if found and not loop.worth_adding_to(current):
             break
@@ -407,16 +454,17 @@ def study(
         trials |= loop.scoped(trials, current)
         trials = loop.refitted(trials)
         candidates = candidates or [
-            Candidate(term.kind.name, float(t.accuracy.mean()), loop.gain(t, before))
+            Candidate(term.kind.name, float(t.accuracy.mean()), loop.gain(t, before), loop.gain(t, before, place=False))
             for term, t in trials.items()
-            if term.whole
+            if loop.is_whole(term)
         ]
         chosen = loop.choose(trials, current)
         if chosen is None:
             break
         term, gain, others = chosen
         dated, trial = loop.dated(term, trials[term], current)
-        found[dated] = Found(term.kind.name, gain, _names(term, others))
+        shape = loop.own_gain(term, trials[term], current, place=False) if told else gain
+        found[dated] = Found(term.kind.name, gain, shape, _names(term, others))
         current = loop.without_idle(loop.judged(trial) if dated != term else trial)
         found = {known: one for known, one in found.items() if known in current.unknowns.terms}
         left = [one for one in left if one.kind is not term.kind or term.heliostats is not None]
@@ -428,8 +476,10 @@ def study(
         measured=loop.measured,
         before=loop.judge.cuts([]),
         after=loop.judge.cuts(current.effects),
+        off_before=before.off,
+        off_after=current.off,
         found=[one.fitted(term, current.unknowns, current.values, current.spread) for term, one in found.items()],
-        candidates=sorted(candidates, key=lambda c: -c.accuracy_after),
+        candidates=sorted(candidates, key=lambda c: -c.gain.mean),
         effects=current.effects,
         latitude_deg=latitude_deg,
     )

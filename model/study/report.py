@@ -16,6 +16,7 @@ from model.study.covariates import covariates_of
 from model.study.flux_images import FluxImage, noise_floor
 from model.study.judging import Gain, rank_correlation
 from model.study.pattern import Pattern, pattern_of
+from model.study.position import EXPECTED, NAT, is_known, loss
 from model.study.unknowns import Term, Unknowns
 
 Array = NDArray[np.float64]
@@ -42,11 +43,12 @@ LISTED = 4
 
 @dataclass(frozen=True)
 class Candidate:
-    """One effect of the catalogue, fitted alone: mean accuracy of held-out images and its gain."""
+    """One effect of the catalogue, fitted alone: mean accuracy of held-out images, its gain, and that of accuracy."""
 
     name: str
     accuracy_after: float
     gain: Gain
+    accuracy_gain: Gain
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,8 @@ class Found:
     ----------
     name : str
     gain : Gain
+        That it was added for: of accuracy, and by where spots lie (`model.study.position`).
+    accuracy_gain : Gain
     lookalikes : list of str
     parameters : dict
         Nested as in the report: name, then heliostat where it belongs to one, then a list over facets.
@@ -68,6 +72,7 @@ class Found:
 
     name: str
     gain: Gain
+    accuracy_gain: Gain
     lookalikes: list[str]
     parameters: dict[str, Any] = field(default_factory=dict)
     scope: dict[str, Any] = field(default_factory=lambda: Always().to_json())
@@ -134,6 +139,8 @@ class Study:
         Side of the squares that were compared.
     measured, before, after : (H, 64, 64)
         Cuts of sum one: photographs, forecasts of the declared model, forecasts with the effects found.
+    off_before, off_after : (H, 2)
+        How far their spots lie from where motors sent them, in standard deviations; NaN where motors are not known.
     found : list of Found
     candidates : list of Candidate
         Every effect alone, the best first.
@@ -149,6 +156,8 @@ class Study:
     measured: Array
     before: Array
     after: Array
+    off_before: Array
+    off_after: Array
     found: list[Found]
     candidates: list[Candidate]
     effects: list[Effect]
@@ -164,6 +173,20 @@ class Study:
         """Accuracy (H,) with the effects found."""
         return flux_accuracies(self.measured, self.after)
 
+    @property
+    def placed(self) -> NDArray[np.bool_]:
+        """Which images (H,) tell how far their spots lie from where motors sent them."""
+        return is_known(self.off_before)
+
+    @property
+    def position_error_mrad(self) -> tuple[float, float] | None:
+        """Median angle [mrad] at the heliostat of those, before and after; None where there is none."""
+        if not self.placed.any():
+            return None
+        std_mrad = 1e3 * np.array([p.spot_std_rad for p in self.images])
+        before, after = (np.linalg.norm(off, axis=-1) * std_mrad for off in (self.off_before, self.off_after))
+        return float(np.median(before[self.placed])), float(np.median(after[self.placed]))
+
     @cached_property
     def noise_floor(self) -> float:
         """Mean error that the images' noise and the sheets behind the spots make alone."""
@@ -172,12 +195,20 @@ class Study:
     @property
     def unexplained_share(self) -> float:
         """Share of the error beyond noise that the effects found leave; zero where there is none to speak of."""
-        first, last = (self._excess(accuracy) for accuracy in (self.accuracy_before, self.accuracy_after))
-        return min(1.0, last / first) if first > TOLERANCE else 0.0
+        first = self._excess(self.accuracy_before) + self._excess_of_place(self.off_before)
+        return min(1.0, self._left / first) if first > TOLERANCE else 0.0
+
+    @property
+    def _left(self) -> float:
+        return self._excess(self.accuracy_after) + self._excess_of_place(self.off_after)
 
     def _excess(self, accuracy: Array) -> float:
         """Mean error beyond noise."""
         return max(0.0, 1 - float(accuracy.mean()) - self.noise_floor)
+
+    def _excess_of_place(self, off: Array) -> float:
+        """The same of where spots lie."""
+        return max(0.0, NAT * float((loss(off) - EXPECTED * self.placed).mean()))
 
     @property
     def verdict(self) -> Verdict:
@@ -197,7 +228,7 @@ class Study:
 
         Of deviations of standard deviation ``depth`` the mean magnitude is 0.8 of that.
         """
-        left = self._excess(self.accuracy_after)
+        left = self._left
         return left > 0 and self.pattern.is_targets and 0.8 * self.pattern.depth >= left / 2
 
     @property
@@ -208,7 +239,7 @@ class Study:
     @property
     def incomplete(self) -> bool:
         """Whether more error than noise makes is left, whatever was found."""
-        return self._excess(self.accuracy_after) > TOLERANCE
+        return self._left > TOLERANCE
 
     def covariates(self) -> dict[str, float]:
         """Rank correlation of the error that is left with what may drive it, the strongest first."""
@@ -249,15 +280,23 @@ class Study:
                 f"; {self.unexplained_share:.0%} of the error beyond noise stays unexplained" if self.incomplete else ""
             )
             return (
-                f"The images demand {names}: accuracy on held-out images rises from {before:.1%} to {after:.1%}"
-                f"{doubt}{rest}."
+                f"The images demand {names}: accuracy on held-out images {'rises' if after > before else 'goes'} from "
+                f"{before:.1%} to {after:.1%}{self._said_of_place()}{doubt}{rest}."
             )
         if self.verdict == "none":
             return (
                 f"The declared model explains the images: accuracy {before:.1%}, no effect improves it significantly."
             )
         part = f"; {names} explains part of it ({after:.1%})" if names else ""
-        return f"Something is missing that no effect of the catalogue explains: accuracy {before:.1%}{part}."
+        said = f"accuracy {before:.1%}{part}{self._said_of_place()}"
+        return f"Something is missing that no effect of the catalogue explains: {said}."
+
+    def _said_of_place(self) -> str:
+        if self.position_error_mrad is None:
+            return ""
+        before, after = self.position_error_mrad
+        change = f", {before:.1f} mrad before" if self.found else ""
+        return f", and the light lies {after:.1f} mrad from where motors sent it{change}"
 
     def to_json(self) -> dict[str, Any]:
         """The report of DESIGN.md, section 7."""
@@ -268,19 +307,21 @@ class Study:
                 "fit": self.fitted,
                 "held_out": len(self.images),
                 **({"held_out_but_predicted_from": self.flattered} if self.flattered else {}),
+                **({"held_out_with_motors": int(self.placed.sum())} if self.placed.any() else {}),
             },
             "window_m": self.window,
-            "before": self._summary(self.accuracy_before),
-            "after": self._summary(self.accuracy_after),
+            "before": self._summary(self.accuracy_before) | self._place(0),
+            "after": self._summary(self.accuracy_after) | self._place(1),
             "noise_floor": round(self.noise_floor, 5),
             "unexplained_share": round(self.unexplained_share, 4),
-            "effects": [_effect(f) for f in self.found],
+            "effects": [_effect(f) | self._gain_of_all(f) for f in self.found],
             "candidates": [
                 {
                     "name": c.name,
                     "accuracy_after": round(c.accuracy_after, 5),
                     "score": round(c.gain.score, 2),
-                    "accuracy_gain": _gain(c.gain),
+                    "accuracy_gain": _gain(c.accuracy_gain),
+                    **self._gain_of_all(c),
                 }
                 for c in self.candidates
             ],
@@ -295,6 +336,14 @@ class Study:
                 "mean_map_8x8": self.residual_map().reshape(8, 8, 8, 8).mean(axis=(1, 3)).round(4).tolist(),
             },
         }
+
+    def _place(self, when: int) -> dict[str, float]:
+        known = self.position_error_mrad
+        return {} if known is None else {"position_error_mrad": round(known[when], 3)}
+
+    def _gain_of_all(self, one: Candidate | Found) -> dict[str, Any]:
+        """The gain by shape and place, which is that of accuracy where no place is known."""
+        return {"gain": _gain(one.gain)} if self.placed.any() else {}
 
     def _summary(self, accuracy: Array) -> dict[str, Any]:
         return {
@@ -317,7 +366,7 @@ def _effect(found: Found) -> dict[str, Any]:
         "name": found.name,
         "scope": found.scope,
         "parameters": found.parameters,
-        "accuracy_gain": _gain(found.gain),
+        "accuracy_gain": _gain(found.accuracy_gain),
         "lookalikes": found.lookalikes,
         "told_apart_by": {name: told_apart_by(found.name, name) for name in found.lookalikes},
     }

@@ -38,11 +38,6 @@ class Term:
     heliostats: tuple[str, ...] | None = None
 
     @property
-    def whole(self) -> bool:
-        """Whether it acts always and everywhere."""
-        return self.always and self.heliostats is None
-
-    @property
     def always(self) -> bool:
         """Whether it acts always, perhaps not everywhere."""
         return self.since is None and not self.days

@@ -219,6 +219,9 @@ class AccuracyOut(BaseModel):
     accuracy_mean: float = Field(description="[1]")
     accuracy_median: float = Field(description="[1]")
     per_image: dict[str, float] = Field(description="By heliostat and measurement, `H/ID` [1].")
+    position_error_mrad: float | None = Field(
+        default=None, description="Median angle from where motors sent the light to where it lies; null: not known."
+    )
 
 
 class StudyReport(BaseModel):

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,8 @@ from model.effects import Effect
 from model.errors import InvalidInputError, ModelError
 from model.plant import Heliostat
 from model.pointing import CalibratedMount, Reading, calibrate_field
-from model.pointing.report import field_to_json, mount_from_json, sun_to_json
+from model.pointing.report import day_of, field_to_json, mount_from_json, sun_to_json
+from model.study import FluxImage
 from service.base.progress import Progress, quiet
 from service.cli.folder import clock_fault_of, write_json
 from service.sources.documents import Measurement, get, read_json
@@ -23,8 +25,12 @@ from service.twin.pointing import days_of
 Array = NDArray[np.float64]
 
 
-def calibrate_folder(folder: MeasurementFolder, out: Path, progress: Progress = quiet) -> dict[str, Any]:
+def calibrate_folder(
+    folder: MeasurementFolder, out: Path, progress: Progress = quiet, until: datetime | None = None
+) -> dict[str, Any]:
     """Mounts of a folder's heliostats from their motors, suns and spots; MOUNTS.json.
+
+    With ``until`` only from measurements before: a study can then say what has changed since (`Mounts.photograph`).
 
     Raises
     ------
@@ -32,6 +38,9 @@ def calibrate_folder(folder: MeasurementFolder, out: Path, progress: Progress = 
         Where no heliostat has a measurement with motors and a spot.
     """
     readings, clocks = read_readings(folder, progress)
+    if until is not None:
+        earlier = {name: [one for one in own if one.day < day_of(until)] for name, own in readings.items()}
+        readings = {name: own for name, own in earlier.items() if own}
     skipped = folder.skipped
     if not readings:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in list(skipped.items())[:3])
@@ -137,6 +146,23 @@ class Mounts:
             return heliostat
         day = np.nan if measurement is None else self._days[measurement.key]
         return replace(heliostat, mount=mount.mount(heliostat.mount, day))
+
+    def photograph(self, nominal: Heliostat, measurement: Measurement, taken: FluxImage) -> FluxImage:
+        """A photograph of a measurement with what its motors say, where it is newer than all its mount has seen.
+
+        ``nominal`` is the heliostat as its properties have it. What a mount was calibrated by speaks for it anyway.
+        """
+        mount, moment = self._known.get(nominal.name), measurement.taken_at
+        if mount is None or mount.until is None or moment is None or moment.date() <= mount.until:
+            return taken
+        if measurement.motor_position is None or taken.setup.spot is None:
+            return taken
+        motors, day = motors_of(nominal, measurement), self._days[measurement.key]
+        told = (motors[None], taken.setup.sun[None], taken.setup.spot[None], np.array([day]))
+        forecast_rad = float(np.sqrt(np.trace(mount.covariance_at(nominal, *told)[0]) / 2))
+        angles = self.stand(nominal, measurement).mount.angles_from_motors(motors)
+        setup = replace(taken.setup, angles=angles)
+        return replace(taken, setup=setup, spot_std_rad=max(mount.usual_rad, forecast_rad))
 
     def under(self, folder: MeasurementFolder) -> MeasurementFolder:
         """The folder, its heliostats as newly measured: zeros of drives matter only to who turns them by motors."""

@@ -11,6 +11,7 @@ from model.study import FluxImage, Study, StudyOptions, study
 from model.surface import DEGREE, control_points
 from service.base.progress import Progress, quiet
 from service.cli.folder import check_surfaces, clock_fault_of, evidence_of, with_surfaces
+from service.cli.folder_pointing import Mounts
 from service.sources.documents import Measurement, read_json
 from service.sources.folder import MeasurementFolder
 
@@ -37,17 +38,25 @@ class FolderStudy:
         }
 
 
-def photographs_of(folder: MeasurementFolder, surfaces: str = "measured") -> tuple[list[FluxImage], dict[str, str]]:
-    """What a folder gives a study, and what it does not: heliostats and measurements with the reasons."""
+def photographs_of(
+    folder: MeasurementFolder, surfaces: str = "measured", mounts: Mounts | None = None
+) -> tuple[list[FluxImage], dict[str, str]]:
+    """What a folder gives a study, and what it does not: heliostats and measurements with the reasons.
+
+    On calibrated ``mounts`` photographs that these have not seen say, besides, where their motors sent the light.
+    """
+    known = mounts or Mounts(folder, None)
     photographs: list[FluxImage] = []
     skipped, seen = dict(folder.skipped), predicted_from(surfaces)
-    for heliostat, surface in with_surfaces(folder, surfaces, skipped):
+    for nominal, surface in with_surfaces(folder, surfaces, skipped):
+        heliostat = known.stand(nominal)
         points, degree = (control_points(heliostat), DEGREE) if surface is None else surface
         for measurement in folder.measurements(heliostat.name):
             try:
                 _require_on_target(folder, measurement)
                 was_used = measurement.identifier in seen.get(heliostat.name, ())
-                photographs.append(evidence_of(folder, measurement).photograph(heliostat, points, degree, was_used))
+                taken = evidence_of(folder, measurement).photograph(heliostat, points, degree, was_used)
+                photographs.append(known.photograph(nominal, measurement, taken))
             except ModelError as error:
                 skipped[measurement.key] = str(error)
     return photographs, skipped
@@ -77,8 +86,11 @@ def study_folder(
     options: StudyOptions | None = None,
     effects: Sequence[Effect] = (),
     progress: Progress = quiet,
+    mounts: Mounts | None = None,
 ) -> FolderStudy:
     """Which effect a folder's photographs demand beyond its declared model and ``effects``, at its plant's latitude.
+
+    Heliostats stand on calibrated ``mounts`` where there are any.
 
     Raises
     ------
@@ -86,7 +98,7 @@ def study_folder(
         Where too few photographs have a surface; it says what was left out.
     """
     check_surfaces(surfaces)
-    photographs, skipped = photographs_of(folder, surfaces)
+    photographs, skipped = photographs_of(folder, surfaces, mounts)
     known = [*folder.effects, *effects]
     try:
         latitude_deg = float(folder.plant.origin[0])

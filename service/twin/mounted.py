@@ -145,4 +145,5 @@ def standing(row: HeliostatRow, kept: MountRow | None, origin: Iterable[float], 
     if kept is None or heliostat.mount.actuators is None or _changed(row, kept, effects) is not None:
         return heliostat
     parameters = parameters_from_json(kept.document, f"mount {kept.version} of {row.name}")
-    return replace(heliostat, mount=calibrated(heliostat.mount, parameters))
+    until = datetime.fromisoformat(kept.document["history"]["at"][-1]).date()
+    return replace(heliostat, mount=replace(calibrated(heliostat.mount, parameters), calibrated_until=until))

@@ -1,24 +1,36 @@
 """Effects on sun, mount, mirror and optics, against geometry and the Monte Carlo tracer; and effects as data."""
 
 import json
+from dataclasses import replace
+from datetime import date
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from model.effects import CATALOGUE, effect_from_json, effect_to_json, effects_from_json, in_light_order, model_version
+from model.effects import (
+    CATALOGUE,
+    Since,
+    effect_from_json,
+    effect_to_json,
+    effects_from_json,
+    in_light_order,
+    model_version,
+)
 from model.effects.axis_tilt import AxisTilt
 from model.effects.blocking import Blocking
+from model.effects.encoder_offset import EncoderOffset
 from model.effects.facet_canting import FacetCanting
 from model.effects.gravity_bending import ALONG, REFERENCE, GravityBending
+from model.effects.pylon_bending import PylonBending
 from model.effects.slope_error import SlopeError
 from model.effects.soiling import Soiling
 from model.effects.sun_position import SunPosition
 from model.effects.sun_shape import SunShapeEffect
 from model.effects.tracking_jitter import TrackingJitter
 from model.errors import InvalidInputError
-from model.forecast import Setup, View, align, forecast_setups
+from model.forecast import Setup, View, align, altered, forecast_setups
 from model.frames import sun_direction, sun_direction_at
 from model.mount import Mount
 from model.plant import JUELICH_LATITUDE
@@ -58,12 +70,14 @@ def test_the_catalogue_is_the_contract():
         name: {p.name: (p.low, p.high, p.unit, p.owner) for p in effect.parameters()}
         for name, effect in CATALOGUE.items()
     }
-    assert len(bounds) == 15
+    assert len(bounds) == 17
     assert bounds["sun_shape"] == {"circumsolar_ratio": (0, 0.5, "1", "set")}
     assert bounds["slope_error"] == bounds["tracking_jitter"] == {"sigma_mrad": (0, 4, "mrad", "set")}
     assert bounds["facet_canting"] == dict.fromkeys(("x_mrad", "y_mrad"), (-5, 5, "mrad", "facet"))
     assert bounds["gravity_bending"] == {"amplitude_mm": (-8, 8, "mm", "set")}
     assert bounds["axis_tilt"] == dict.fromkeys(("north_deg", "up_deg"), (-3, 3, "deg", "set"))
+    assert bounds["pylon_bending"] == {"amplitude_mrad": (-20, 20, "mrad", "set")}
+    assert bounds["encoder_offset"] == dict.fromkeys(("first_deg", "second_deg"), (-6, 6, "deg", "heliostat"))
     assert bounds["sun_position"] == {"minutes": (-90, 90, "min", "set")}
     assert bounds["soiling"] == {"reflectivity_ratio": (0, 1, "1", "facet")}
     assert bounds["blocking"] == {"lower_fraction": (0, 0.6, "1", "heliostat")}
@@ -163,16 +177,16 @@ def test_what_is_left_of_a_tilt_is_a_roll_of_the_mirror(tilt):
     upright, tilted = (scene_of(setup(sun_direction(50.0, 25.0)), *effects) for effects in ([], [tilt]))
     normals = upright.attitude[0, :, 2], tilted.attitude[0, :, 2]
     np.testing.assert_allclose(*normals, atol=1e-4)
-    axis = tilt.on_mount(Mount.juelich()).first_axis
+    axis = tilt.on_mount(Mount.juelich(), "flat").first_axis
     assert float(tilted.attitude[0, :, 1] @ torch.as_tensor(axis)) == pytest.approx(0, abs=1e-12)
     roll = np.degrees(np.arccos(float(upright.attitude[0, :, 1] @ tilted.attitude[0, :, 1])))
     assert 0.5 < roll < 4
 
 
 def test_axis_tilt_turns_both_axes_right_handed():
-    mount = AxisTilt(up_deg=2.0).on_mount(Mount.juelich())
+    mount = AxisTilt(up_deg=2.0).on_mount(Mount.juelich(), "flat")
     np.testing.assert_allclose(mount.first_axis, [np.cos(np.radians(2)), np.sin(np.radians(2)), 0], atol=1e-12)
-    mount = AxisTilt(north_deg=2.0).on_mount(Mount.juelich())
+    mount = AxisTilt(north_deg=2.0).on_mount(Mount.juelich(), "flat")
     np.testing.assert_allclose(mount.first_axis, [np.cos(np.radians(2)), 0, -np.sin(np.radians(2))], atol=1e-12)
 
 
@@ -204,6 +218,55 @@ def test_gravity_follows_the_mirrors_attitude():
         sag.append(float(edge) / (float(scenes[0].attitude[0, 2, 2]) - REFERENCE))
     assert sag[0] == pytest.approx(sag[1], rel=1e-6)
     assert sag[0] == pytest.approx(5e-3 * (1 + ALONG), rel=1e-3)
+
+
+# --- where light goes by the motors -----------------------------------------------------------------------------------
+
+
+def displaced(one: Setup, *effects) -> np.ndarray:
+    return align([one], effects, latitude_deg=JUELICH_LATITUDE).displaced[0]
+
+
+def on_its_motors(one: Setup, *effects) -> Setup:
+    """The setup with what its motors say when its spot lies where it does."""
+    return replace(one, angles=align([one], effects, latitude_deg=JUELICH_LATITUDE).angles[0])
+
+
+def test_where_motors_send_the_light_nothing_is_displaced():
+    for effects in ([], [AxisTilt(1.0, -2.0), SunPosition(12.0), GravityBending(5.0)], [PylonBending(9.0)]):
+        one = on_its_motors(setup(z=waves()), *effects)
+        np.testing.assert_allclose(displaced(one, *effects), 0.0, atol=1e-6)
+    assert np.isnan(displaced(setup())).all()
+
+
+def test_an_encoder_moves_the_spot_by_twice_its_offset():
+    """Of a mirror that faces south: the first axis turns it up or down, the second sidewards."""
+    one = on_its_motors(setup(sun_direction(0.0, 20.0), (0.0, 70.0, 1.8)))
+    up = displaced(one, EncoderOffset(first_deg={"flat": 0.1}))
+    np.testing.assert_allclose(np.degrees(up), [0.0, 0.2], atol=5e-4)
+    aside = displaced(one, EncoderOffset(second_deg={"flat": 0.1}))
+    assert abs(np.degrees(aside[0])) == pytest.approx(0.2, rel=0.1)
+    np.testing.assert_array_equal(displaced(one, EncoderOffset(first_deg={"other": 0.1})), displaced(one))
+
+
+def test_a_forecast_by_motors_has_the_offsets_of_encoders():
+    one, offset = on_its_motors(setup()), EncoderOffset(first_deg={"flat": 0.1})
+    by_motors = align([replace(one, spot=None)], [offset], latitude_deg=JUELICH_LATITUDE)
+    np.testing.assert_allclose(by_motors.angles[0], one.angles + np.radians([0.1, 0.0]))
+
+
+@pytest.mark.parametrize(
+    ("until", "acts"), [(None, False), (date(2026, 5, 30), True), (date(2026, 6, 1), False)], ids=str
+)
+def test_on_a_calibrated_mount_acts_what_came_after_its_photographs(until, acts):
+    mount = replace(Mount.juelich(), is_calibrated=True, calibrated_until=until)
+    (standing,) = altered([flat_heliostat(mount=mount)], [AxisTilt(up_deg=2.0, scope=Since(date(2026, 6, 1)))])
+    assert (standing.mount.first_axis[1] != 0) == acts
+    (standing,) = altered([flat_heliostat(mount=mount)], [AxisTilt(up_deg=2.0)])
+    assert standing.mount.first_axis[1] == 0
+
+
+# --- mirror -----------------------------------------------------------------------------------------------------------
 
 
 def test_canting_of_one_heliostat_leaves_the_others_alone():

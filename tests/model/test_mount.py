@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -99,3 +101,16 @@ def test_aim_straight_away_from_the_sun_is_refused():
     sun = sun_direction(0.0, 45.0)
     with pytest.raises(UnreachableError, match="away from the sun"):
         Mount.juelich(mirror_offset=(0, 0, 0)).align(np.zeros(3), sun, -sun * 100)
+
+
+def test_a_pylon_leans_towards_where_its_mirror_faces():
+    """The normal's elevation sinks by lean * cos(elevation), its azimuth stays, and angles lead back to it."""
+    straight, leaning = Mount.juelich(), replace(Mount.juelich(), lean=0.012)
+    angles = np.radians([[-20.0, 30.0], [-60.0, -15.0], [-5.0, 0.0], [-90.0, 0.0]])
+    before, after = (mount.attitude(angles)[..., 2] for mount in (straight, leaning))
+    elevation, lower = np.arcsin(before[:, 2]), np.arcsin(after[:, 2])
+    np.testing.assert_allclose(elevation - lower, 0.012 * np.cos(elevation), atol=1e-12)
+    east, north = after[:3, :2].T
+    np.testing.assert_allclose(np.arctan2(east, north), np.arctan2(*before[:3, :2].T), atol=1e-12)
+    np.testing.assert_allclose(leaning.angles_from_normal(after[:3]), angles[:3], atol=1e-12)
+    np.testing.assert_allclose(Mount.stack([straight, leaning]).attitude(angles[:2])[1], leaning.attitude(angles[1]))

@@ -385,7 +385,7 @@ def test_a_tilt_is_in_the_calibrated_mount_and_not_applied_again(world):
     own = series(field["H03"], leaning, np.linspace(0, 365, 30), np.random.default_rng(6))
     mount = calibrate({"H03": field["H03"]}, {"H03": own}).mounts["H03"].mount(field["H03"].mount)
     tilt, found = AxisTilt(1.0, -2.0), replace(field["H03"], mount=mount)
-    np.testing.assert_allclose(found.mount.first_axis, tilt.on_mount(field["H03"].mount).first_axis, atol=5e-3)
+    np.testing.assert_allclose(found.mount.first_axis, tilt.on_mount(field["H03"].mount, "H03").first_axis, atol=5e-3)
     for reading in own[:5]:
         distance = np.linalg.norm(reading.spot - found.position)
         off = [np.linalg.norm(by_motors(one, reading, [tilt]) - reading.spot) for one in (found, field["H03"])]

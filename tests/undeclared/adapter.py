@@ -4,6 +4,8 @@ Of all modules of the generator only this one knows the product.
 """
 
 import json
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -72,9 +74,11 @@ def setups_of(made: MeasurementSet) -> list[Setup]:
     ]
 
 
-def flux_images(made: MeasurementSet) -> list[FluxImage]:
-    """Images of light alone, without times."""
-    return [FluxImage(setup, image) for setup, image in zip(setups_of(made), made.images, strict=True)]
+def flux_images(made: MeasurementSet, encoders: Sequence[Array] | None = None) -> list[FluxImage]:
+    """Images of light alone, without times, and with what encoders said where that is given."""
+    said = encoders or [None] * len(made.plans)
+    setups = [replace(setup, angles=angles) for setup, angles in zip(setups_of(made), said, strict=True)]
+    return [FluxImage(setup, image) for setup, image in zip(setups, made.images, strict=True)]
 
 
 # --- a folder ---------------------------------------------------------------------------------------------------------

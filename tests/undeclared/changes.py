@@ -116,13 +116,16 @@ CHANGES: dict[str, Change] = {
     **{f"{name}_always": always(name) for name in ("sun_shape", "slope_error", "facet_canting", "camera_response")},
 }
 
-WITHOUT_SHEET = ("background_by_day",)
+MOVED: dict[str, Change] = {"encoder_since": since("encoder_offset", of_one=True)}
+"""Changes that motors tell, and shapes do not."""
+
+WITHOUT_SHEET = ("background_by_day", *MOVED)
 """Changes that a sheet's own light would hide: their images are of light alone."""
 
 
 def changing(case: str, level: int, plans: Sequence[Plan], rng: np.random.Generator) -> Changing:
     """The worlds of a season's photographs, and the truth."""
-    return CHANGES[case](level, plans, rng)
+    return {**CHANGES, **MOVED}[case](level, plans, rng)
 
 
 def _names(plans: Sequence[Plan]) -> list[str]:

@@ -18,6 +18,9 @@ from tests.undeclared.plan import Plan, scattered, season
 from tests.undeclared.rays import Sun, throw
 from tests.undeclared.world import World, disturb
 
+PLAY = 0.4e-3
+"""Standard deviation [rad] of an axis beside what its encoder says: spots of Juelich scatter by some 0.8 mrad."""
+
 
 @dataclass(frozen=True, eq=False)
 class MeasurementSet:
@@ -33,6 +36,12 @@ class MeasurementSet:
     light: list[NDArray[np.float64]]
     images: list[NDArray[Any]]
     on_sheet: bool
+
+    def encoders(self, seed: int) -> list[NDArray[np.float64]]:
+        """What the encoders (2,) [rad] of each photograph's mount said, with the play of real drives."""
+        rng = np.random.default_rng((seed, crc32(b"encoders")))
+        exposures = [plan.exposure(world) for plan, world in zip(self.plans, self.worlds, strict=True)]
+        return [exposure.encoders(exposure.stand()) + PLAY * rng.standard_normal(2) for exposure in exposures]
 
     @property
     def identifiers(self) -> list[str]:

@@ -149,9 +149,24 @@ class Exposure:
         return np.broadcast_to(array[self.index] if array.ndim else array, shape)
 
     @property
+    def ground(self) -> Rotation:
+        """How the ground is turned: about north, then about up."""
+        return Rotation.from_euler("yz", self.world.tilt_deg, degrees=True)
+
+    @property
     def first_axis(self) -> Array:
-        """Where the first axis, east by the plans, really points: the ground is turned about north, then about up."""
-        return Rotation.from_euler("yz", self.world.tilt_deg, degrees=True).apply([1.0, 0.0, 0.0])
+        """Where the first axis, east by the plans, really points, but for the pylon's lean."""
+        return self.ground.apply([1.0, 0.0, 0.0])
+
+    def leaning(self, normal: Array) -> Rotation:
+        """How a mirror that faces ``normal`` (3,), which hangs before its pylon, pulls that over."""
+        return Rotation.from_rotvec(1e-3 * self.world.pylon_mrad * np.cross([0.0, 0.0, 1.0], normal))
+
+    def encoders(self, pose: "Pose") -> Array:
+        """What the encoders of both axes (2,) [rad] say; zeros where the mirror faces south by the plans, upright."""
+        normal = pose.attitude[:, 2]
+        east, north, up = self.ground.inv().apply(self.leaning(normal).inv().apply(normal))
+        return np.array([np.arctan2(-up, -north), np.arcsin(east)]) - np.radians(self._own(self.world.encoder_deg, 2))
 
     def facing(self, aim: Array) -> "Pose":
         """The mirror turned so that its centre sends the sun to ``aim`` (3,) [m]."""
@@ -160,7 +175,7 @@ class Exposure:
             normal = unit(self.sun + unit(aim - center))
             center = self.heliostat.position + PIVOT * normal
         # The second axis, perpendicular to the first, is the mirror's own upward direction.
-        upward = unit(np.cross(normal, self.first_axis))
+        upward = unit(np.cross(normal, self.leaning(normal).apply(self.first_axis)))
         return Pose(np.column_stack([np.cross(upward, normal), upward, normal]), center)
 
     def sagging(self, points: Points, pose: "Pose") -> Points:

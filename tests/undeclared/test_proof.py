@@ -1,5 +1,7 @@
 """A small part of ``python -m tests.benchmarks.study``: effects that the model does not declare are found."""
 
+from dataclasses import replace
+from datetime import timedelta
 from functools import cache
 from typing import Any
 
@@ -13,6 +15,7 @@ from model.plant import JUELICH_LATITUDE
 from model.study import StudyOptions, study
 from model.tracing import Optics
 from service.cli.folder_study import study_folder
+from service.drawing.study_report import study_page
 from service.sources.folder import read_folder
 from tests.undeclared import world
 from tests.undeclared.adapter import effects_of, flux_images, setups_of, write_folder
@@ -24,6 +27,14 @@ OPTIONS = StudyOptions(
     candidates=("sun_shape", "slope_error", "camera_response", "camera_blur", "background", "facet_canting"), most=2
 )
 """Some of the catalogue, look-alikes among them: enough to be wrong, and few enough for a test."""
+
+
+MOVING = StudyOptions(
+    candidates=("axis_tilt", "sun_position", "pylon_bending", "encoder_offset"),
+    most=1,
+    fit_view=View(24, 24, samples=4, padding=0.125),
+    view=View(48, 48, samples=8),
+)
 
 
 @cache
@@ -82,6 +93,43 @@ def test_canting_is_found_facet_by_facet():
         for heliostat, tilts in truth["parameters"][axis].items():
             value = np.array(found[0]["parameters"][axis]["value"][heliostat])
             np.testing.assert_allclose(value - value.mean(), tilts, atol=0.1)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("case", world.MOVING)
+def test_what_moves_spots_is_named_by_spot_and_shape_and_not_by_shape_alone(case, seed):
+    made = generate(case, STRONG, seed, heliostats=3, setups=10, side=24, fan=4)
+    name, _ = world.MOVING[case]
+    reports = [
+        study(flux_images(made, said), Optics(), options=MOVING, latitude_deg=JUELICH_LATITUDE).to_json()
+        for said in (made.encoders(seed), None)
+    ]
+    by_both, by_shape = reports
+    assert [(effect["name"], effect["lookalikes"]) for effect in by_both["effects"]] == [(name, [])]
+    assert by_both["verdict"] == "effect"
+    assert by_both["before"]["position_error_mrad"] > 5 * by_both["after"]["position_error_mrad"]
+    assert by_shape["effects"] == []
+    assert "position_error_mrad" not in by_shape["before"]
+
+
+def test_a_drive_that_lost_steps_since_its_calibration_is_named_with_its_day():
+    """Mounts were calibrated before the first photograph: what is found came thereafter, and of one heliostat."""
+    made = generate_season("encoder_since", STRONG, 1, days=(8, 8), side=24, fan=4)
+    until, images = made.plans[0].day - timedelta(days=30), []
+    for plan, image in zip(made.plans, flux_images(made, made.encoders(1)), strict=True):
+        heliostat = image.setup.heliostat
+        mount = replace(heliostat.mount, is_calibrated=True, calibrated_until=until)
+        setup = replace(image.setup, heliostat=replace(heliostat, mount=mount), taken_at=plan.moment)
+        images.append(replace(image, setup=setup))
+    done = study(images, Optics(), options=MOVING, latitude_deg=JUELICH_LATITUDE)
+    found, page = done.to_json()["effects"], study_page(done, "season")
+    assert "Light from where motors sent it" in page
+    assert "mrad from where motors sent it" in page
+    assert [(effect["name"], effect["scope"]) for effect in found] == [(t["name"], t["scope"]) for t in made.truth]
+    (heliostat,) = made.truth[0]["scope"]["heliostats"]
+    for axis in ("first_deg", "second_deg"):
+        value = found[0]["parameters"][axis]["value"][heliostat]
+        assert value == pytest.approx(made.truth[0]["parameters"][axis][heliostat], abs=0.05)
 
 
 def test_what_no_effect_describes_is_not_taken_for_nothing():

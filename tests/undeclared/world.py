@@ -23,13 +23,16 @@ class World:
     """Disturbances of sky, mount, mirror and camera; the defaults are the declared world, in which there are none.
 
     Those of mirrors are one value for all, or arrays (heliostat,), (heliostat, facet) or, for ``canting_mrad``,
-    (heliostat, facet, 2). ``gamma``, ``saturation`` and ``compression`` bend the mirror's light alone, ``law`` that of
-    sheet and mirror together, on photographs. The last block is in no catalogue.
+    (heliostat, facet, 2); ``encoder_deg`` (heliostat, 2) is what axes stand at beyond what encoders say. ``gamma``,
+    ``saturation`` and ``compression`` bend the mirror's light alone, ``law`` that of sheet and mirror together, on
+    photographs. The last block is in no catalogue.
     """
 
     circumsolar_ratio: float = 0.02
     clock_minutes: float = 0.0
     tilt_deg: tuple[float, float] = (0.0, 0.0)
+    pylon_mrad: float = 0.0
+    encoder_deg: Values = 0.0
     first_axis_mrad: float = 0.0
     roughness_mrad: float = 0.0
     canting_mrad: Values = 0.0
@@ -91,6 +94,18 @@ def axis_tilt(level: int, names: Sequence[str], rng: np.random.Generator) -> Dra
     size, turn = (1.0, 2.0, 3.0)[level], rng.uniform(0, 2 * np.pi)
     north, up = round(size * np.cos(turn), 3), round(size * np.sin(turn), 3)
     return {"tilt_deg": (north, up)}, {"north_deg": north, "up_deg": up}
+
+
+def pylon_bending(level: int, names: Sequence[str], rng: np.random.Generator) -> Drawn:
+    lean = _sign(rng) * (4.0, 8.0, 16.0)[level]
+    return {"pylon_mrad": lean}, {"amplitude_mrad": lean}
+
+
+def encoder_offset(level: int, names: Sequence[str], rng: np.random.Generator) -> Drawn:
+    off = np.round((0.15, 0.3, 0.6)[level] * rng.standard_normal((len(names), 2)), 4)
+    return {"encoder_deg": off}, {
+        f"{axis}_deg": _by_name(names, off[:, i]) for i, axis in enumerate(("first", "second"))
+    }
 
 
 def sun_position(level: int, names: Sequence[str], rng: np.random.Generator) -> Drawn:
@@ -174,6 +189,18 @@ def barrel_distortion(level: int, names: Sequence[str], rng: np.random.Generator
     return {"barrel": (0.1, 0.2, 0.35)[level]}, {}
 
 
+def slight_tilt(level: int, names: Sequence[str], rng: np.random.Generator) -> Drawn:
+    """Of a size that motors tell and shapes do not, as the next."""
+    size, turn = (0.1, 0.2, 0.4)[level], rng.uniform(0, 2 * np.pi)
+    north, up = round(size * np.cos(turn), 4), round(size * np.sin(turn), 4)
+    return {"tilt_deg": (north, up)}, {"north_deg": north, "up_deg": up}
+
+
+def slow_clock(level: int, names: Sequence[str], rng: np.random.Generator) -> Drawn:
+    minutes = _sign(rng) * (1.0, 2.0, 4.0)[level]
+    return {"clock_minutes": minutes}, {"minutes": minutes}
+
+
 Draw = Callable[[int, Sequence[str], np.random.Generator], Drawn]
 
 CATALOGUE: dict[str, Draw] = {
@@ -185,6 +212,8 @@ CATALOGUE: dict[str, Draw] = {
         facet_canting,
         gravity_bending,
         axis_tilt,
+        pylon_bending,
+        encoder_offset,
         sun_position,
         soiling,
         blocking,
@@ -202,6 +231,15 @@ OUTSIDE: dict[str, Draw] = {
 }
 
 
+MOVING: dict[str, tuple[str, Draw]] = {
+    "slight_tilt": ("axis_tilt", slight_tilt),
+    "slow_clock": ("sun_position", slow_clock),
+    "pylon_bending": ("pylon_bending", pylon_bending),
+    "encoder_offset": ("encoder_offset", encoder_offset),
+}
+"""What motors tell, and its effect of the catalogue."""
+
+
 def disturb(
     case: str, level: int, names: Sequence[str], rng: np.random.Generator
 ) -> tuple[World, list[dict[str, Any]]]:
@@ -209,8 +247,9 @@ def disturb(
     fields: dict[str, Any] = {}
     truth = []
     for name in [] if case == "clean" else case.split("+"):
-        changed, parameters = {**CATALOGUE, **OUTSIDE}[name](level, names, rng)
+        effect, draw = MOVING.get(name) or (name, {**CATALOGUE, **OUTSIDE}[name])
+        changed, parameters = draw(level, names, rng)
         fields |= changed
-        if name in CATALOGUE:
-            truth.append({"name": name, "parameters": parameters})
+        if effect in CATALOGUE:
+            truth.append({"name": effect, "parameters": parameters})
     return World(**fields), truth

@@ -186,9 +186,9 @@ def study(
         require_file(path)
     added = () if effects is None else read_effects(effects)
     source = read_folder(folder)
-    source = Mounts(source, mounts, added).under(source)
+    known = Mounts(source, mounts, added)
     with progress(None, "study") as step:
-        done = study_folder(source, surfaces, effects=added, progress=step)
+        done = study_folder(source, surfaces, effects=added, progress=step, mounts=known)
     report = done.to_json()
     write_json(out, report)
     if page is not None:
@@ -206,7 +206,7 @@ def _study_table(report: dict[str, Any]) -> Table:
     table = make_table(f"Study: {report['verdict']}", "effect", "accuracy", "gain, 95 %", "score", "")
     found = {effect["name"] for effect in report["effects"]}
     for candidate in report["candidates"]:
-        low, high = candidate["accuracy_gain"]["ci95"]
+        low, high = candidate.get("gain", candidate["accuracy_gain"])["ci95"]
         accuracy, score = f"{candidate['accuracy_after']:.3f}", f"{candidate['score']:.1f}"
         mark = "found" if candidate["name"] in found else ""
         table.add_row(candidate["name"], accuracy, f"{low:.3f} to {high:.3f}", score, mark)

@@ -1,5 +1,6 @@
 """The verbs on a folder's mounts: calibrate, spot."""
 
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
 
@@ -16,6 +17,12 @@ Folder = Annotated[Path, typer.Argument(help="Measurement folder in PAINT's layo
 def calibrate(
     folder: Folder,
     out: Annotated[Path, typer.Option("--out", help="JSON file to write the mounts to.", metavar="MOUNTS.json")],
+    until: Annotated[
+        datetime | None,
+        typer.Option(
+            help="Only by those before this day: study --mounts says what changed since.", formats=["%Y-%m-%d"]
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Mounts from motors, sun and spots, with uncertainties, steps, drift and named outliers: MOUNTS.json."""
@@ -26,7 +33,7 @@ def calibrate(
     require_file(out)
     source = read_folder(folder)
     with progress(len(source.plant.heliostats), "calibrate") as step:
-        report = calibrate_folder(source, out, step)
+        report = calibrate_folder(source, out, step, None if until is None else until.replace(tzinfo=UTC))
     if report["clock"] is not None:
         console.print(f"clock: {clock_in_words(report['clock'])}", style="yellow", highlight=False)
     table = make_table("Mounts", "heliostat", "measurements", "residual [mrad]", "90 %", "steps", "outliers")

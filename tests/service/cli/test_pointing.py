@@ -3,6 +3,7 @@
 import json
 import shutil
 from copy import deepcopy
+from datetime import UTC, date, datetime
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +11,15 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from model.effects import Since
+from model.effects.encoder_offset import EncoderOffset
 from model.errors import InvalidInputError, ModelError
+from model.forecast import Setup, align
 from model.imaging import center_of_mass
 from model.pointing import Weather, calibrate_field
-from service.cli.folder_pointing import calibrate_folder, read_readings, spot_folder
+from model.study import FluxImage
+from model.surface import control_points
+from service.cli.folder_pointing import Mounts, calibrate_folder, read_readings, spot_folder
 from service.cli.main import app
 from service.sources.folder import read_folder
 from tests.benchmarks import data_folder
@@ -89,6 +95,35 @@ def test_what_cannot_be_used_is_listed_and_costs_nothing_else(folder: Path, tmp_
     assert days[1].startswith("2024-05-02T12:00:00")  # by its number, between two that have times
     assert set(report["parameters"]) == set(report["heliostats"]["AA39"]["parameters"])
     assert {entry["unit"] for entry in report["parameters"].values()} == {"m", "rad"}
+
+
+def test_photographs_that_a_mount_has_not_seen_say_where_motors_sent_the_light(tmp_path: Path):
+    """The first drive stepped by 4 mrad on the ninth day: mounts that were calibrated before do not know it."""
+    root = tmp_path / "plant"
+    write(root / "P-tower-measurements.json", tower_document())
+    write(root / "AA39" / "Properties" / "AA39-heliostat-properties.json", properties_document())
+    for number, one in enumerate(photographs(tower_document(), properties_document(), step_mrad=4.0)):
+        write_measurement(root, "AA39", 100 + number, one)
+        item = {"properties": {"datetime": one["taken_at"]}}
+        write(root / "AA39" / "Calibration" / f"{100 + number}-calibration-item-stac.json", item)
+    source, file = read_folder(root), tmp_path / "mounts.json"
+    report = calibrate_folder(source, file, until=datetime(2024, 5, 9, tzinfo=UTC))
+    assert report["heliostats"]["AA39"]["measurements"] == 8
+    mounts, heliostat = Mounts(source, file), source.plant.heliostats["AA39"]
+    standing = mounts.stand(heliostat)
+    assert standing.mount.calibrated_until == date(2024, 5, 8)
+    taken = []
+    for one in source.measurements("AA39", with_images=False):
+        given = (one.sun, source.plant.targets[one.target], one.spot)
+        setup = Setup(standing, control_points(standing), *given, identifier=one.key, taken_at=one.taken_at)
+        taken.append(mounts.photograph(heliostat, one, FluxImage(setup, np.ones((8, 8)))))
+    assert [one.setup.angles is not None for one in taken] == [False] * 8 + [True] * 8
+    setups, latitude_deg = [one.setup for one in taken[8:]], float(source.plant.origin[0])
+    before = align(setups, latitude_deg=latitude_deg).displaced
+    assert np.linalg.norm(before, axis=-1).min() > 6e-3
+    stepped = EncoderOffset(first_deg={"AA39": float(np.degrees(4e-3))}, scope=Since(date(2024, 5, 9)))
+    after = align(setups, [stepped], latitude_deg=latitude_deg).displaced
+    assert (np.abs(after) < 3 * np.array([one.spot_std_rad for one in taken[8:]])[:, None]).all()
 
 
 def test_spots_need_no_focal_spot(folder: Path, tmp_path: Path):

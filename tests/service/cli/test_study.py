@@ -28,6 +28,8 @@ from service.sources.folder import read_folder
 
 HELIOSTATS = ("AD34", "AR18")
 
+GAIN = Gain(0.02, 0.01, 0.03, 4.0)
+
 
 @pytest.fixture(scope="module")
 def few(undeclared, tmp_path_factory) -> Path:
@@ -107,7 +109,8 @@ def test_the_report_keeps_the_contract_and_serves_forecasts(few, tmp_path, helio
         assert set(effect["told_apart_by"]) == set(effect["lookalikes"])
     accuracies = [candidate["accuracy_after"] for candidate in report["candidates"]]
     assert accuracies == sorted(accuracies, reverse=True)
-    assert {candidate["name"] for candidate in report["candidates"]} == set(CATALOGUE)
+    shaped = {name for name, kind in CATALOGUE.items() if not kind.only_moves}
+    assert {candidate["name"] for candidate in report["candidates"]} == shaped
     assert "skipped" not in report
     assert report["conclusion"] in text((tmp_path / "new" / "r.html").read_text(encoding="utf-8"))
 
@@ -255,7 +258,7 @@ def test_parameters_of_facets_stand_in_columns(hazy):
     term = Term(FacetCanting)
     unknowns = Unknowns((term,), (("AD34", 4), ("AR18", 4)))
     values = np.linspace(-1, 1, 16)
-    found = Found("facet_canting", Gain(0.02, 0.01, 0.03, 4.0), []).fitted(term, unknowns, values, np.full(16, 0.1))
+    found = Found("facet_canting", GAIN, GAIN, []).fitted(term, unknowns, values, np.full(16, 0.1))
     page = study_page(replace(hazy.study, found=[found]), "few")
     assert "Facet 4" in text(page)
     assert page.count("<code>x_mrad</code>") == page.count("<code>y_mrad</code>") == 2
@@ -266,7 +269,7 @@ def test_parameters_of_facets_stand_in_columns(hazy):
 def test_what_comes_and_goes_is_shown_by_day(hazy):
     days = date(2024, 6, 7), date(2024, 6, 9)
     term = Term(SunShapeEffect, days=days)
-    found = Found("sun_shape", Gain(0.02, 0.01, 0.03, 4.0), []).fitted(
+    found = Found("sun_shape", GAIN, GAIN, []).fitted(
         term, Unknowns((term,), (("AD34", 4),)), np.array([0.02, 0.2]), np.full(2, 0.01)
     )
     words = text(study_page(replace(hazy.study, found=[found]), "few"))
