@@ -214,16 +214,29 @@ class CalibratedMount:
 
     def covariance_at(self, heliostat: Heliostat, motors: Array, suns: Array, spots: Array, days: Array) -> Array:
         """Covariances (N, 2, 2) [rad2], sidewards and upwards, of spots measured at motor positions (N, 2) [steps]."""
-        days = np.asarray(days, dtype=np.float64)
-        readings = Readings(motors[None], suns[None], spots[None], days[None], np.ones((1, len(days)), dtype=bool))
-        zeros = self.zeros_at(days)
-        slope = residuals(Chain.of([heliostat]), readings, self.parameters[None], zeros[None])[1][0]
+        slope = self._slope(heliostat, motors, suns, spots, days)
         of_zeros = slope[..., ZEROS]
         return np.asarray(
             slope @ self.covariance @ slope.swapaxes(1, 2)
             + (of_zeros * self.zeros_variance_at(days)[:, None]) @ of_zeros.swapaxes(1, 2)
             + self.noise.spot_rad**2 * np.eye(2)
         )
+
+    def doubts_at(self, heliostat: Heliostat, motors: Array, suns: Array, spots: Array, days: Array) -> Array:
+        """What P independent deviations of the mount move such spots by (N, 2, P) [rad], one standard deviation each.
+
+        Their products are the first part of `covariance_at`, and what spots of several measurements have in common.
+        """
+        sizes, vectors = np.linalg.eigh(self.covariance)
+        slope = self._slope(heliostat, motors, suns, spots, days)
+        return np.asarray(slope @ (vectors * np.sqrt(sizes.clip(min=0))))
+
+    def _slope(self, heliostat: Heliostat, motors: Array, suns: Array, spots: Array, days: Array) -> Array:
+        """Derivatives (N, 2, P) of residuals by the parameters."""
+        days = np.asarray(days, dtype=np.float64)
+        readings = Readings(motors[None], suns[None], spots[None], days[None], np.ones((1, len(days)), dtype=bool))
+        chain, zeros = Chain.of([heliostat]), self.zeros_at(days)
+        return np.asarray(residuals(chain, readings, self.parameters[None], zeros[None])[1][0])
 
     def spot(
         self, heliostat: Heliostat, plane: TargetPlane, motors: ArrayLike, sun: ArrayLike, day: float = np.nan

@@ -138,7 +138,7 @@ class Fitter:
     def _affected(self, unknowns: Unknowns, place: int) -> NDArray[np.bool_]:
         """Which images (N,) an unknown changes."""
         unknown = unknowns.all[place]
-        return np.array([unknown.touches(p.heliostat, p.taken_at) for p in self.forecaster.flux_images])
+        return np.array([unknown.owns(p.heliostat, p.taken_at) for p in self.forecaster.flux_images])
 
     def starts(self, unknowns: Unknowns, begin: Array, free: NDArray[np.bool_]) -> tuple[list[Array], list[float]]:
         """Values to begin with and their costs, the best first: ``begin``, and its ``free`` unknowns elsewhere.

@@ -4,6 +4,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -17,7 +18,7 @@ from model.imaging.window import overlap_matrix
 from model.metrics import accuracy_window
 from model.plant import TargetPlane
 from model.study.noise import black_lift, grain_variance
-from model.study.position import USUAL_RAD
+from model.study.position import USUAL_RAD, whitened
 from model.study.unknowns import copied, copy_name
 from model.tracing import Optics
 
@@ -43,6 +44,9 @@ class FluxImage:
     spot_std_rad : float [rad]
         Standard deviation per direction of its spot about where a right model sends it; of account where
         ``setup.angles`` says where the mount stood (`model.study.position`).
+    spot_doubts_rad : (2, K) [rad] or None
+        What each of K independent deviations of the mount's calibration moves its spot by, sidewards and upwards; they
+        are the same for all photographs of a heliostat.
     """
 
     setup: Setup
@@ -51,6 +55,7 @@ class FluxImage:
     clipped: NDArray[np.bool_] | None = None
     sheet_share: float = 0.0
     spot_std_rad: float = USUAL_RAD
+    spot_doubts_rad: Array | None = None
 
     def __post_init__(self) -> None:
         if self.image.ndim != 2 or not np.isfinite(self.image).all() or not self.image.sum() > 0:
@@ -242,13 +247,31 @@ class Forecaster:
             )
         return cuts
 
-    def off(self, effects: Sequence[Effect]) -> Array:
-        """How far spots lie (N, 2) from where their motors sent them under the declared effects and these.
+    def displaced(self, effects: Sequence[Effect]) -> Array:
+        """How far spots lie (N, 2) [rad] from where their motors sent them under the declared effects and these.
 
-        In each one's standard deviations, NaN where motors are not known. Raises as `cuts`.
+        NaN where motors are not known. Raises as `cuts`.
         """
-        aligned, _ = self._traced([*self.declared, *effects])
-        return np.asarray(aligned.displaced / self.spot_std_rad[:, None])
+        return self._traced([*self.declared, *effects])[0].displaced
+
+    def off(self, effects: Sequence[Effect]) -> Array:
+        """The same (N, 2) in standard deviations, independent of each other (`model.study.position.whitened`)."""
+        off = self.displaced(effects) / self.spot_std_rad[:, None]
+        for rows, doubts in self._doubts:
+            off[rows] = whitened(off[rows], doubts)
+        return np.asarray(off)
+
+    @cached_property
+    def _doubts(self) -> list[tuple[NDArray[np.intp], Array]]:
+        """Rows (n,) of each heliostat whose photographs share doubts, and these (n, 2, K) in standard deviations."""
+        told = [p.setup.angles is not None and p.spot_doubts_rad is not None for p in self.flux_images]
+        names = np.where(told, [p.heliostat for p in self.flux_images], "")
+        found = []
+        for name in sorted(set(names.tolist()) - {""}):
+            rows = np.flatnonzero(names == name)
+            doubts = np.array([self.flux_images[row].spot_doubts_rad for row in rows.tolist()])
+            found.append((rows, doubts / self.spot_std_rad[rows, None, None]))
+        return found
 
     def _within_range(self, rows: NDArray[np.intp], forecasts: Array) -> Array:
         """Forecasts (n, R, C) of the photographs ``rows`` (n,), cut off where the camera's range cut those off."""

@@ -76,7 +76,8 @@ class Trial:
     accuracy : (H,)
         Of those.
     off : (H, 2)
-        How far the held-out spots lie from where motors sent them, in standard deviations; NaN where not known.
+        How far the held-out spots lie from where motors sent them, in independent standard deviations; NaN where not
+        known.
     """
 
     unknowns: Unknowns
@@ -478,6 +479,8 @@ def study(
         after=loop.judge.cuts(current.effects),
         off_before=before.off,
         off_after=current.off,
+        displaced_before=loop.judge.displaced([]),
+        displaced_after=loop.judge.displaced(current.effects),
         found=[one.fitted(term, current.unknowns, current.values, current.spread) for term, one in found.items()],
         candidates=sorted(candidates, key=lambda c: -c.gain.mean),
         effects=current.effects,

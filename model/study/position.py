@@ -7,6 +7,10 @@ photographs *of another time*. A calibration has axes, zeros and drives of its o
 the spots that it saw; so those photographs must not be given angles, or they would speak twice, and on calibrated
 mounts effects are sought only since the first photograph thereafter (`model.forecast.altered`).
 
+What a calibration leaves open moves the spots of all photographs of its mount together, and would pass for an effect
+that begins with the first of them. So residuals are whitened by the covariance that the mount's own parameters give
+them (`whitened`): what these could have done speaks for nothing else.
+
 Fits count the residual [rad] in its standard deviations beside the pixels. Judges count what is left by the likelihood
 of Student's t, for real spots are now and then another heliostat's, and weigh it against accuracy by `NAT`.
 """
@@ -30,6 +34,18 @@ With it the least gain that studies ask for is a displacement of about one stand
 
 EXPECTED = 1.084
 """Loss [nat] of residuals that are normal: (TAILS / 2 + 1) E ln(1 + x / TAILS), with x chi-squared of two degrees."""
+
+
+def whitened(off: Array, doubts: Array) -> Array:
+    """Residuals (n, 2) of one mount, of unit variance beside doubts (n, 2, K) that they share, made independent.
+
+    ``doubts`` are what each of K independent deviations of the mount's parameters moves them by, in the same units.
+    The symmetric root of the precision leaves each residual as nearly as can be what it was.
+    """
+    shared = doubts.reshape(off.size, -1)
+    vectors, sizes, _ = np.linalg.svd(shared, full_matrices=False)
+    flat = off.ravel()
+    return np.asarray((flat + vectors @ ((1 / np.hypot(1, sizes) - 1) * (vectors.T @ flat))).reshape(off.shape))
 
 
 def loss(off: Array) -> Array:

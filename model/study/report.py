@@ -140,7 +140,10 @@ class Study:
     measured, before, after : (H, 64, 64)
         Cuts of sum one: photographs, forecasts of the declared model, forecasts with the effects found.
     off_before, off_after : (H, 2)
-        How far their spots lie from where motors sent them, in standard deviations; NaN where motors are not known.
+        How far their spots lie from where motors sent them, in independent standard deviations; NaN where motors are
+        not known.
+    displaced_before, displaced_after : (H, 2) [rad]
+        The same as it was measured.
     found : list of Found
     candidates : list of Candidate
         Every effect alone, the best first.
@@ -158,6 +161,8 @@ class Study:
     after: Array
     off_before: Array
     off_after: Array
+    displaced_before: Array
+    displaced_after: Array
     found: list[Found]
     candidates: list[Candidate]
     effects: list[Effect]
@@ -183,9 +188,9 @@ class Study:
         """Median angle [mrad] at the heliostat of those, before and after; None where there is none."""
         if not self.placed.any():
             return None
-        std_mrad = 1e3 * np.array([p.spot_std_rad for p in self.images])
-        before, after = (np.linalg.norm(off, axis=-1) * std_mrad for off in (self.off_before, self.off_after))
-        return float(np.median(before[self.placed])), float(np.median(after[self.placed]))
+        both = (self.displaced_before[self.placed], self.displaced_after[self.placed])
+        before, after = (1e3 * float(np.median(np.linalg.norm(displaced, axis=-1))) for displaced in both)
+        return before, after
 
     @cached_property
     def noise_floor(self) -> float:

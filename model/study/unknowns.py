@@ -96,9 +96,15 @@ class Unknown:
 
     def touches(self, heliostat: str, taken_at: datetime | None) -> bool:
         """Whether a photograph may change with it."""
+        return self.owns(heliostat, taken_at) and self.term.touches(heliostat, taken_at)
+
+    def owns(self, heliostat: str, taken_at: datetime | None) -> bool:
+        """Whether a photograph is of its heliostat and day, where it has such: others of its group leave that alone.
+
+        Photographs from before an effect began are among them: where a mount's doubts are shared, they change as well.
+        """
         theirs = self.heliostat is None or self.heliostat == heliostat
-        days = self.day is None or (taken_at is not None and taken_at.date() == self.day)
-        return theirs and days and self.term.touches(heliostat, taken_at)
+        return theirs and (self.day is None or (taken_at is not None and taken_at.date() == self.day))
 
 
 @dataclass(frozen=True)

@@ -159,10 +159,12 @@ class Mounts:
             return taken
         motors, day = motors_of(nominal, measurement), self._days[measurement.key]
         told = (motors[None], taken.setup.sun[None], taken.setup.spot[None], np.array([day]))
-        forecast_rad = float(np.sqrt(np.trace(mount.covariance_at(nominal, *told)[0]) / 2))
+        doubts = mount.doubts_at(nominal, *told)[0]
+        alone = mount.covariance_at(nominal, *told)[0] - doubts @ doubts.T
+        std_rad = max(mount.usual_rad, float(np.sqrt(np.trace(alone) / 2)))
         angles = self.stand(nominal, measurement).mount.angles_from_motors(motors)
         setup = replace(taken.setup, angles=angles)
-        return replace(taken, setup=setup, spot_std_rad=max(mount.usual_rad, forecast_rad))
+        return replace(taken, setup=setup, spot_std_rad=std_rad, spot_doubts_rad=doubts)
 
     def under(self, folder: MeasurementFolder) -> MeasurementFolder:
         """The folder, its heliostats as newly measured: zeros of drives matter only to who turns them by motors."""

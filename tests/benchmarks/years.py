@@ -8,12 +8,16 @@ same days, as the study itself does it, and its usual value by the others.
 
 What each of the best effects gives alone, and all of them jointly, is fitted to each half and judged by the other; only
 which these are was chosen by all photographs.
+
+With ``--moved DATE`` instead what has moved spots since a calibration by the photographs before that day.
 """
 
 import argparse
 import json
 from collections.abc import Sequence
+from datetime import UTC, datetime
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +30,7 @@ from model.study.fitting import Fitter
 from model.study.flux_images import Forecaster
 from model.study.unknowns import Term, Unknowns
 from model.tracing import Optics
+from service.cli.folder_pointing import Mounts, calibrate_folder
 from service.cli.folder_study import photographs_of
 from service.sources.folder import read_folder
 from tests.benchmarks import data_folder
@@ -99,11 +104,37 @@ def described(found: Study) -> str:
     return "; ".join(names) or "none"
 
 
+MOVING = ("axis_tilt", "sun_position", "pylon_bending", "encoder_offset")
+
+
+def moved(until: datetime) -> None:
+    """Print what has moved AA39's spots since a mount was calibrated by its photographs before a day."""
+    folder = read_folder(data_folder().parent / "stj-years")
+    with TemporaryDirectory() as root:
+        report = calibrate_folder(folder, Path(root) / "mounts.json", until=until)
+        mounts = Mounts(folder, Path(root) / "mounts.json")
+    taken, _ = photographs_of(folder, mounts=mounts)
+    newer = [p for p in taken if p.setup.angles is not None]
+    doubts = [np.linalg.norm(p.spot_doubts_rad) for p in newer if p.spot_doubts_rad is not None]
+    print(f"{report['heliostats']['AA39']['measurements']} measurements before {until.date()}, {len(newer)} newer;")
+    print(f"their spots: {1e3 * np.median([p.spot_std_rad for p in newer]):.1f} mrad each,", end=" ")
+    print(f"{1e3 * np.median(doubts) / 2**0.5:.1f} mrad in common by what the calibration leaves open", flush=True)
+    options = StudyOptions(candidates=MOVING, window=WINDOW)
+    found = study(taken, Optics(), options=options, latitude_deg=JUELICH_LATITUDE)
+    print(f"{found.conclusion()}\nfound: {described(found)}; from motors [mrad]: {found.position_error_mrad}")
+    print(f"  {json.dumps([effect_to_json(e) for e in found.effects])[:400]}")
+    print("alone: " + ", ".join(f"{c.name} {c.gain.mean:+.4f}" for c in found.candidates))
+
+
 def main() -> None:
     """Print what the whole says, and what each half of the days finds for the other."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, help="write the report of the whole there")
+    parser.add_argument("--moved", metavar="DATE", help="only what has moved spots since a calibration up to that day")
     options = parser.parse_args()
+    if options.moved:
+        moved(datetime.fromisoformat(options.moved).replace(tzinfo=UTC))
+        return
     taken, asked = photographs(), StudyOptions(window=WINDOW)
     whole = study(taken, Optics(), options=asked, latitude_deg=JUELICH_LATITUDE)
     print(f"{len(taken)} photographs on {len({day_of(p) for p in taken})} days: {whole.conclusion()}")

@@ -27,6 +27,7 @@ from model.study.fitting import Fitter
 from model.study.flux_images import Forecaster, cut, in_pixels, spot_window
 from model.study.judging import paired_gain, rank_correlation, split
 from model.study.noise import grain_variance
+from model.study.position import whitened
 from model.study.unknowns import Term, Unknowns
 from model.surface import control_points
 from model.tracing import Optics
@@ -370,6 +371,18 @@ def test_too_few_photographs_or_two_of_one_name_are_refused(clean):
 def test_a_photograph_that_holds_no_image_is_named(clean, image):
     with pytest.raises(InvalidInputError, match="photograph near/0"):
         FluxImage(clean[0].setup, image)
+
+
+def test_what_a_mounts_own_doubts_could_have_done_weighs_little():
+    """Residuals of unit variance with a doubt in common: whitened, their squares are the exact quadratic form."""
+    rng = np.random.default_rng(0)
+    off, doubts = rng.normal(size=(6, 2)), 5 * rng.normal(size=(6, 2, 3))
+    shared = doubts.reshape(12, 3)
+    precision = np.linalg.inv(np.eye(12) + shared @ shared.T)
+    assert (whitened(off, doubts) ** 2).sum() == pytest.approx(off.ravel() @ precision @ off.ravel())
+    common = doubts[..., 0]
+    assert (whitened(common, doubts) ** 2).sum() < 0.02 * (common**2).sum()
+    np.testing.assert_allclose(whitened(off, 0 * doubts), off)
 
 
 # --- advice -----------------------------------------------------------------------------------------------------------

@@ -123,7 +123,8 @@ def test_photographs_that_a_mount_has_not_seen_say_where_motors_sent_the_light(t
     assert np.linalg.norm(before, axis=-1).min() > 6e-3
     stepped = EncoderOffset(first_deg={"AA39": float(np.degrees(4e-3))}, scope=Since(date(2024, 5, 9)))
     after = align(setups, [stepped], latitude_deg=latitude_deg).displaced
-    assert (np.abs(after) < 3 * np.array([one.spot_std_rad for one in taken[8:]])[:, None]).all()
+    doubts = np.array([np.hypot(one.spot_std_rad, np.linalg.norm(one.spot_doubts_rad, axis=1)) for one in taken[8:]])
+    assert (np.abs(after) < 3 * doubts).all()
 
 
 def test_spots_need_no_focal_spot(folder: Path, tmp_path: Path):
