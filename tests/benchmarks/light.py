@@ -323,7 +323,7 @@ def _best_of_all(case: Case, counts: list[int]) -> list[float]:
     )
     forecast = case.forecasts[case.best("light")]
     cut = flux_window(forecast, case.target, center_of_mass(forecast, case.target)).astype(np.float64)
-    cut /= cut.max()
+    cut = cut / cut.max()
 
     def accuracy(values: Array) -> float:
         blur, exponent, ambient, right, down, turn, scale = np.pad(values, (0, len(FITTED) - len(values)))
