@@ -17,6 +17,9 @@ photograph tells less. They are estimated from what is left of the images and fr
 (MacKay 1992, doi:10.1162/neco.1992.4.3.415). Errors that look like a bent mirror weigh more than that: how far apart
 the images pull the surface tells by how much (the overdispersion of quasi-likelihoods, Wedderburn 1974,
 doi:10.1093/biomet/61.3.439). An image that the others contradict is left out.
+
+All that is of one place: where images tell mirrors apart by little, their errors decide which of several mirrors is
+found, and no curvature at one of them shows the others. Halves of the images, each fitted anew, do (`_half_samples`).
 """
 
 from collections.abc import Sequence
@@ -118,6 +121,21 @@ def _nuisance(image: Array, options: RefinementOptions) -> Array:
             np.exp(-relative / options.black) * peak * options.background,
         ]
     )
+
+
+def _half_samples(suns: Array) -> list[tuple[list[int], list[int]]]:
+    """Ways to halve M images by their suns (M, 3): fewer than four in one way, others in three balanced ones.
+
+    Four groups of like suns, along the direction in which suns lie widest apart, are joined to halves in each way there
+    is: halves then differ on average as much as four groups would, and are each half of all (balanced half-samples,
+    McCarthy 1969, *Pseudo-replication: half samples*, Review of the International Statistical Institute 37).
+    """
+    around = suns - suns.mean(axis=0)
+    order = np.argsort(around @ np.linalg.svd(around)[2][0], kind="stable").tolist()
+    if len(order) < CONSENSUS:
+        return [(order[: len(order) // 2], order[len(order) // 2 :])]
+    first, *others = (part.tolist() for part in np.array_split(order, 4))
+    return [(first + others[i], others[i - 2] + others[i - 1]) for i in range(3)]
 
 
 class _Weights:
@@ -244,6 +262,35 @@ class _Posterior:
             state, jacobian = found.state, found.jacobian
         return state, jacobian, belief
 
+    def covariance(self, state: _State, fit: "_Fit") -> Array:
+        """Covariance (K, K) of the coefficients of a state, as far apart as halves of the images find the mirror.
+
+        Each half is fitted anew, from blurred to sharp, as the whole was. By as much as halves differ more than their
+        errors should make them, group by group of the prior's directions, the part that comes of errors grows; what the
+        prior leaves open stays. Halves do not show errors that all images share: `_Fit.cautious` allows for those.
+        """
+        cautious, suns = fit.cautious(self.options.grain), np.array([o.sun for o in self.observations])
+        if len(suns) < 2:
+            return cautious
+        unlike = np.mean([self._unlike(halves, state, fit) for halves in _half_samples(suns)], axis=0)
+        growth = np.sqrt(np.maximum(1 / self.prior.precision(np.sqrt(unlike), np.zeros_like(unlike)), 1))
+        return np.asarray(cautious + fit.of_errors * (np.outer(growth, growth) - 1))
+
+    def _unlike(self, halves: Sequence[Sequence[int]], state: _State, fit: "_Fit") -> Array:
+        """Squared difference (K,) of what two halves of the images find, over its variance by the images' errors."""
+        found = [self._half(half, state, fit) for half in halves]
+        apart, variance = found[0][0] - found[1][0], found[0][1] + found[1][1]
+        return np.asarray(apart**2 / variance)
+
+    def _half(self, images: Sequence[int], state: _State, fit: "_Fit") -> tuple[Array, Array]:
+        """Coefficients (K,) that some of the images find, and their variance (K,) by the images' errors."""
+        model = self.prior, self.optics, self.effects, self.latitude_deg, self.options
+        half = _Posterior(self.heliostat, [self.observations[i] for i in images], *model)
+        start, jacobian, _ = half.settled(half.state(state.c))
+        belief = replace(fit.belief, sigma=fit.belief.sigma[list(images)])
+        found = half.optimum(start, belief, jacobian)
+        return found.state.c, np.diag(half.fit(found.state, found.jacobian, belief).of_errors)
+
     def estimated(self, state: _State, jacobian: NDArray[Any], belief: "_Belief") -> tuple[_State, "_Fit"]:
         """The state of the highest density near another, with errors of the images as they turn out."""
         for left in reversed(range(self.options.rounds)):
@@ -277,6 +324,11 @@ class _Fit:
     def covariance(self) -> Array:
         """Covariance (K, K) of the coefficients."""
         return self._covariance(np.ones((1, len(BANDS))))
+
+    @cached_property
+    def of_errors(self) -> Array:
+        """The part of the covariance (K, K) that comes of the images' errors; the rest is what the prior leaves."""
+        return np.asarray(self.covariance - (self.covariance * self.belief.precision) @ self.covariance)
 
     def _covariance(self, share: Array) -> Array:
         """Covariance (K, K), where bands tell a ``share`` (M, 5) or (1, 5) of what they seem to."""
@@ -431,7 +483,7 @@ def refine(
     ]
     return SurfacePrediction(
         z=z,
-        z_std=prior.deviation(fit.cautious(options.grain)),
+        z_std=prior.deviation(posterior.covariance(state, fit)),
         control_points=control_points(heliostat, z),
         method="refined",
         weights=prior.name,

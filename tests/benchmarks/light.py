@@ -14,7 +14,8 @@ Of the photographs under low suns it asks whether neighbours shaded the mirror: 
 
 ``--consensus`` tells instead which photographs contradict the others, without a measured surface, and what surfaces
 gain by leaving them out; ``--differences`` compares the differences of counts that PAINT publishes (``../shared/stj``)
-through the camera's law, with each one's ambient light by all others and by itself.
+through the camera's law, with each one's ambient light, and exposure, by all others and by itself. ``--ceiling`` fits
+sky, lens, law, ambient light and place to each photograph itself: what no honest row can exceed with this surface.
 """
 
 import argparse
@@ -31,13 +32,14 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
+from scipy.optimize import minimize, minimize_scalar
 
 from model.forecast import Setup, View, align
-from model.images import clipped_alike, normalized
+from model.images import FLUX_SIZE, FLUX_WINDOW, clipped_alike, normalized
 from model.imaging import Camera, MeasuredFlux, center_of_mass, flux_window, measure
 from model.imaging.light import LINEAR
-from model.metrics import compare_on_target
+from model.imaging.window import share_window
+from model.metrics import compare_on_target, flux_accuracy
 from model.neighbours import Neighbours, outlines
 from model.network.architecture import MAX_IMAGES
 from model.observation import misfits
@@ -61,6 +63,7 @@ Array = NDArray[np.float64]
 RATIOS = (0.005, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4)
 BLURS = (0.0, 0.03, 0.06, 0.09, 0.12)
 AMBIENTS = (0.40, 0.44, 0.48, 0.53, 0.58, 0.62, 0.66)
+PEAKS = (0.7, 0.8, 0.9, 1.0)
 CAMERAS = {"counts": Camera(LINEAR), "light": Camera()}
 LEFT_BY_SRGB = {0.55: "-", 0.70: "--"}
 """Compression by sRGB over ln(total / ambient light): by its slopes at both, and as it fits a Gaussian spot best."""
@@ -246,30 +249,105 @@ def consensus(folder: MeasurementFolder, heliostat: str) -> None:
 
 def differences() -> None:
     """PAINT's differences of counts, through the law: as light, by a usual ambient, by all others', by their own."""
-    rows: dict[str, dict[float, float]] = {}
+    rows: dict[str, dict[tuple[float, float], float]] = {}
     plain: dict[str, float] = {}
     folder = read_folder(data_folder(), ["AA39", "AC43"])
+    exposures = [(ambient, peak) for ambient in AMBIENTS for peak in PEAKS if peak > ambient]
     for heliostat in folder.plant.heliostats:
         surface = folder.measured_surface(heliostat)
         assert surface is not None
         for one in (m for m in folder.measurements(heliostat) if "flux" in m.images):
             plane, image = folder.plant.targets[one.target], decode_image(one.images["flux"].read_bytes())
-            cameras = {ambient: Camera(ambient=ambient) for ambient in AMBIENTS}
-            taken = {str(a): measure(image, "flux", plane, camera=camera) for a, camera in cameras.items()}
+            cameras = {exposure: Camera(ambient=exposure[0], peak_counts=exposure[1]) for exposure in exposures}
+            taken = {str(e): measure(image, "flux", plane, camera=camera) for e, camera in cameras.items()}
             taken["counts"] = measure(image, "flux", plane)
             forecast = {0.02: _forecasts(folder, one, *surface, ratios=(0.02,))[0.02]}
             case = Case(one.identifier, plane, one.taken_at, taken, forecast)
-            rows[one.key] = {ambient: case.accuracy(str(ambient), 0.02) for ambient in AMBIENTS}
+            rows[one.key] = {exposure: case.accuracy(str(exposure), 0.02) for exposure in exposures}
             plain[one.key] = case.accuracy("counts", 0.02)
-    print("| photograph | counts | ambient 0.53 | ambient by the others | its own ambient |")
-    print("| --- | --- | --- | --- | --- |")
+    stretched = [exposure for exposure in exposures if exposure[1] == 1]
+
+    def by_others(name: str, among: list[tuple[float, float]]) -> tuple[float, float]:
+        return max(among, key=lambda e: np.mean([row[e] for key, row in rows.items() if key != name]))
+
+    print(
+        "| photograph | counts | ambient 0.53 | ambient by the others | and peak by the others | its own ambient "
+        "| its own ambient and peak |\n| --- | --- | --- | --- | --- | --- | --- |"
+    )
     table = []
-    for name, by_ambient in rows.items():
-        others = max(AMBIENTS, key=lambda a: np.mean([row[a] for key, row in rows.items() if key != name]))
-        own = max(AMBIENTS, key=lambda a: by_ambient[a])
-        table.append((plain[name], by_ambient[0.53], by_ambient[others], by_ambient[own]))
-        print(f"| {name} | {' | '.join(f'{value:.3f}' for value in table[-1])} ({own:.2f}) |")
+    for name, row in rows.items():
+        own, both = (max(among, key=lambda e: row[e]) for among in (stretched, exposures))
+        others = [row[by_others(name, among)] for among in (stretched, exposures)]
+        table.append((plain[name], row[0.53, 1.0], *others, row[own], row[both]))
+        figures = " | ".join(f"{value:.3f}" for value in table[-1][:-1])
+        print(f"| {name} | {figures} ({own[0]:.2f}) | {row[both]:.3f} ({both[0]:.2f}, {both[1]:.2f}) |")
     print(f"| mean | {' | '.join(f'{value:.3f}' for value in np.mean(table, axis=0))} |")
+
+
+FITTED = {
+    "blur [m]": (0.0, 0.2),
+    "exponent of the law, less one": (-0.3, 0.4),
+    "ambient light [of the peak]": (-0.05, 0.05),
+    "shift to the right [m]": (-0.1, 0.1),
+    "shift down [m]": (-0.1, 0.1),
+    "turn [rad]": (-0.05, 0.05),
+    "scale, less one": (-0.05, 0.05),
+}
+"""What `ceiling` fits to each photograph beside the circumsolar ratio, and within which bounds."""
+
+
+def ceiling(cases: list[Case], apart: Collection[str]) -> None:
+    """Accuracies in light after all that is a photograph's own was fitted to it, a part after the other."""
+    used = [case for case in cases if case.measured["light"].flux is not None]
+    stages = {"the ratio and blur": 1, "and the law's exponent and ambient light": 3, "and shift, turn and scale": 7}
+    found = {case.name: _best_of_all(case, list(stages.values())) for case in used}
+    agreed = [case for case in used if case.name not in apart]
+    print("| fitted to each photograph itself | mean (95 % by days) | median | by target |")
+    print("| --- | --- | --- | --- |")
+    for index, label in enumerate(stages):
+        row = {name: values[index] for name, values in found.items()}
+        _print_row(label, used, row)
+        _print_row(f"{label}; the {len(agreed)} that agree", agreed, row)
+
+
+def _best_of_all(case: Case, counts: list[int]) -> list[float]:
+    """Accuracy with the first so many of `FITTED`, those fitted before being a start, at the ratio that suits best."""
+    taken = case.measured["light"]
+    assert taken.flux is not None
+    center = center_of_mass(taken.flux, case.target)
+    seen = flux_window(taken.flux, case.target, center).astype(np.float64)
+    clipped = (
+        np.zeros(seen.shape)
+        if taken.clipped is None
+        else share_window(taken.clipped, case.target, center).astype(float)
+    )
+    forecast = case.forecasts[case.best("light")]
+    cut = flux_window(forecast, case.target, center_of_mass(forecast, case.target)).astype(np.float64)
+    cut = cut / cut.max()
+
+    def accuracy(values: Array) -> float:
+        blur, exponent, ambient, right, down, turn, scale = np.pad(values, (0, len(FITTED) - len(values)))
+        image = cv2.GaussianBlur(cut, (0, 0), blur * FLUX_SIZE / FLUX_WINDOW) if blur > 1e-3 else cut
+        middle = (FLUX_SIZE - 1) / 2
+        moved = cv2.getRotationMatrix2D((middle, middle), float(np.degrees(turn)), 1 + scale)
+        moved[:, 2] += np.array([right, down]) * FLUX_SIZE / FLUX_WINDOW
+        image = cv2.warpAffine(image, moved, cut.shape, borderMode=cv2.BORDER_REPLICATE)
+        image = (image.clip(0) ** (1 + exponent) + ambient).clip(0)
+        return flux_accuracy(seen, clipped_alike(image, seen, clipped))
+
+    best, values = [], np.zeros(0)
+    for count in counts:
+        start = np.concatenate([values, np.zeros(count - len(values))])
+        fit = minimize(
+            lambda v: -accuracy(v),
+            start,
+            method="Powell",
+            bounds=list(FITTED.values())[:count],
+            options={"maxfev": 60 * count, "xtol": 1e-2, "ftol": 1e-4},
+        )
+        values = fit.x if -fit.fun > accuracy(start) else start
+        best.append(accuracy(values))
+    return best
 
 
 def shadows(folder: MeasurementFolder, heliostat: str, cases: list[Case]) -> None:
@@ -400,6 +478,7 @@ def main(arguments: list[str]) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("out/light"))
     parser.add_argument("--consensus", action="store_true", help="photographs that contradict the others")
+    parser.add_argument("--ceiling", action="store_true", help="all that is a photograph's own fitted to it")
     parser.add_argument("--differences", action="store_true", help="PAINT's differences of counts, through the law")
     options = parser.parse_args(arguments)
     root = data_folder().parent / "stj-years"
@@ -413,10 +492,13 @@ def main(arguments: list[str]) -> None:
     if options.differences or options.consensus:
         return
     cases = read_cases(folder, "AA39")
-    table(cases)
     model = folder.optics, folder.effects
     mirror, usable = folder.plant.heliostats["AA39"], observations_of(folder, "AA39")[0]
     _, apart = agreeing(compute, mirror, usable, *model, latitude_deg=float(folder.plant.origin[0]))
+    if options.ceiling:
+        ceiling(cases, apart)
+        return
+    table(cases)
     left_out(cases, apart)
     shadows(folder, "AA39", cases)
     draw(cases, options.out / "light.png")

@@ -7,6 +7,10 @@ traced by Monte Carlo with one per cent of noise; by the network and refined, fr
 Real: AA39 of two years, from sets of its photographs, some of which contradict the others; flux accuracy on
 photographs that no set holds. Errors are those of the control heights, the mirror's tilt and canting counted. AC43 is
 STJ-012 of the surfaces that the prior was estimated from, and no test of it.
+
+``--only photographs``: what AA39's surfaces gain by photographs that the camera's range clipped or the target cut, and
+whether photographs of other days take its deflectometry nearer to those of a day. Days are dealt out to two halves;
+surfaces from photographs of either are judged by all photographs of the other.
 """
 
 import argparse
@@ -22,14 +26,23 @@ from numpy.typing import NDArray
 from model.images import FLUX_SHAPE, normalized
 from model.metrics import surface_error
 from model.network.predictor import default_predictor
-from model.observation import Observation, SurfacePrediction, misfits, scene_of, spread_suns
+from model.observation import (
+    Observation,
+    SurfacePrediction,
+    align_observations,
+    misfits,
+    scene_of,
+    spread_suns,
+)
 from model.plant import JUELICH_LATITUDE, Heliostat
+from model.prior import default_prior
 from model.refinement import refine
 from model.tracing import Window
 from model.tracing.montecarlo import trace_montecarlo
 from service.cli.folder import observations_of, surface_errors
 from service.sources.folder import MeasurementFolder, measured_heights, read_folder
 from tests.benchmarks import data_folder
+from tests.benchmarks.years import interval
 
 Array = NDArray[np.float64]
 
@@ -159,18 +172,84 @@ def real(years: MeasurementFolder) -> None:
         )
 
 
+def day_of(observation: Observation) -> str:
+    """The day of a photograph; one of no known time has one of its own."""
+    taken_at = observation.taken_at
+    return observation.identifier if taken_at is None else taken_at.date().isoformat()
+
+
+def whole(heliostat: Heliostat, z: Array, taken: list[Observation]) -> list[Observation]:
+    """Photographs of which neither the camera's range nor the target's edge takes anything."""
+    cut = {
+        row
+        for group in align_observations(heliostat, taken, z, latitude_deg=JUELICH_LATITUDE).groups
+        for row, over_edge in zip(group.rows, group.cut, strict=True)
+        if over_edge
+    }
+    return [o for i, o in enumerate(taken) if i not in cut and o.clipped_share == 0]
+
+
+def photographs(years: MeasurementFolder) -> None:
+    """Print what surfaces from all photographs are worth beside those from whole ones, by other days' photographs."""
+    heliostat, truth = truth_of(years, "AA39")
+    taken = observations_of(years, "AA39")[0]
+    days = sorted({day_of(o) for o in taken})
+    sides = [[o for o in taken if days.index(day_of(o)) % 2 == half] for half in (0, 1)]
+    faultless = whole(heliostat, truth, taken)
+    corrected = replace(default_prior(), mean=truth)
+
+    def found(chosen: list[Observation]) -> Array:
+        start = default_predictor().predict(heliostat, spread(chosen, IMAGES), latitude_deg=JUELICH_LATITUDE)
+        return refine(heliostat, chosen, start.z, latitude_deg=JUELICH_LATITUDE).z
+
+    ways: dict[str, Callable[[list[Observation]], Array]] = {
+        f"{IMAGES} whole ones": lambda side: found(spread([o for o in side if o in faultless], IMAGES)),
+        f"{IMAGES} of all": lambda side: found(spread(side, IMAGES)),
+        f"{2 * IMAGES} of all": lambda side: found(spread(side, 2 * IMAGES)),
+        "none: deflectometry": lambda side: truth,
+        f"{2 * IMAGES} of all, about deflectometry": lambda side: (
+            refine(heliostat, spread(side, 2 * IMAGES), truth, prior=corrected, latitude_deg=JUELICH_LATITUDE).z
+        ),
+    }
+    print(
+        f"AA39: {len(faultless)} of {len(taken)} photographs are whole; {len(days)} days\n"
+        "| surfaces from | error [mm] | accuracy on the other days' photographs, mean | median | "
+        "gain over whole ones, 95 % over days |\n| --- | --- | --- | --- | --- |"
+    )
+    judges = [o for side in reversed(sides) for o in side]
+    first: Array | None = None
+    for name, way in ways.items():
+        surfaces = [way(side) for side in sides]
+        missed = [
+            misfits(heliostat, judged, z, latitude_deg=JUELICH_LATITUDE)
+            for z, judged in zip(surfaces, reversed(sides), strict=True)
+        ]
+        accuracy = 1 - np.concatenate(missed)
+        first = accuracy if first is None else first
+        low, high = interval(accuracy - first, [day_of(o) for o in judges])
+        errors = ", ".join(f"{1e3 * surface_error(z, truth):.3f}" for z in surfaces)
+        print(
+            f"| {name} | {errors} | {accuracy.mean():.3f} | {np.median(accuracy):.3f} | "
+            f"{(accuracy - first).mean():+.4f} [{low:+.4f}, {high:+.4f}] |",
+            flush=True,
+        )
+
+
 def main(arguments: list[str]) -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rays", type=int, default=3_000_000)
     parser.add_argument("--scaling", action="store_true")
-    parser.add_argument("--only", choices=("rendered", "real"))
+    parser.add_argument("--only", choices=("rendered", "real", "photographs"))
     options = parser.parse_args(arguments)
     root: Path = data_folder()
     if not (root.parent / "stj-years").is_dir():
         print(f"surfaces: no real measurements at {root}; set HELIOTWIN_STJ")
         return
     folder, years = read_folder(root), read_folder(root.parent / "stj-years")
+    if options.only == "photographs":
+        photographs(years)
+        return
     if options.only != "real":
         rendered(folder, years, options.rays)
     if options.scaling:

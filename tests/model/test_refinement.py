@@ -13,7 +13,7 @@ from model.metrics import surface_error
 from model.observation import Observation, misfits, render_observations
 from model.plant import JUELICH_LATITUDE, Heliostat
 from model.prior import GROUPS, default_prior
-from model.refinement import RefinementOptions, refine
+from model.refinement import RefinementOptions, _half_samples, refine
 from tests.conftest import flat_heliostat, target
 from tests.rendered import observe
 
@@ -76,6 +76,29 @@ def test_the_uncertainty_covers_the_error(refined, truth):
     assert (refined.z_std > 0).all()
     assert refined.contradicting == ()
     assert 0.8 < np.mean(error < 1.645 * refined.z_std) <= 1
+
+
+def test_intervals_hold_what_photographs_disagree_about(refined, heliostat, truth):
+    """Under eastern suns the facets stand canted otherwise: no surface is right, and the answer says so."""
+    slope = np.linspace(-1, 1, 8)[:, None] * np.ones(8)
+    other = truth + 3e-4 * np.array([1, -1, -1, 1])[:, None, None] * slope
+    of_truth, of_other = images(heliostat, truth), images(heliostat, other)
+    mixed = [b if b.sun[0] > 0 else a for a, b in zip(of_truth, of_other, strict=True)]
+    assert 0 < sum(o.sun[0] > 0 for o in mixed) < len(mixed)
+    found = refine(heliostat, mixed, latitude_deg=JUELICH_LATITUDE)
+    assert found.z_std.mean() > 1.2 * refined.z_std.mean()
+    assert np.mean(np.abs(found.z - (truth + other) / 2) < 1.645 * found.z_std) > 0.8
+
+
+@pytest.mark.parametrize("count", [2, 3, 4, 5, 8])
+def test_half_samples_are_balanced(count):
+    """Each image is in one half of each pair; two images of different groups are apart in two pairs of three."""
+    suns = sun_direction_at(np.full(count, 10.0), np.linspace(-60, 60, count), 50.9)
+    pairs = _half_samples(suns)
+    assert all(sorted(a + b) == list(range(count)) and a and b for a, b in pairs)
+    if count == 4:
+        apart = [sum((i in a) != (j in a) for a, _ in pairs) for i in range(4) for j in range(i)]
+        assert apart == [2] * 6
 
 
 def test_no_image_narrows_the_tilt_of_the_whole_mirror(refined):
