@@ -16,6 +16,7 @@ from model.frames import sun_direction
 from model.plant import TargetPlane
 from service.base.fields import Plane, Sun, moment_of
 from service.base.progress import Progress, quiet
+from service.base.wording import told
 from service.cli.folder import check_surfaces, finish, surface_of
 from service.sources.documents import optics_to_json, read_json
 from service.sources.folder import MeasurementFolder
@@ -65,7 +66,7 @@ def _sun(folder: MeasurementFolder, sun: tuple[float, float] | None, at: datetim
     try:
         return Sun(azimuth_deg=sun[0], elevation_deg=sun[1])
     except ValidationError as error:
-        raise InvalidInputError(f"--sun: {error.errors()[0]['loc'][0]}: {error.errors()[0]['msg']}") from None
+        raise InvalidInputError(f"--sun: {told(error)}") from None
 
 
 def _plane(folder: MeasurementFolder, target: str | None, plane: Path | None) -> TargetPlane:
@@ -73,8 +74,7 @@ def _plane(folder: MeasurementFolder, target: str | None, plane: Path | None) ->
         try:
             return Plane.model_validate(read_json(plane)).named("plane")
         except ValidationError as error:
-            first = error.errors()[0]
-            raise InvalidInputError(f"{plane}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+            raise InvalidInputError(f"{plane}: {told(error)}") from None
     if target not in folder.plant.targets:
         raise InvalidInputError(f"--target: there is no target {target}; known: {', '.join(folder.plant.targets)}")
     return folder.plant.targets[target]

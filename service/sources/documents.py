@@ -23,6 +23,7 @@ from model.plant import Cylinder, Facet, Heliostat, Plant, TargetPlane
 from model.pointing import Weather
 from model.sunshape import SHAPES, SunShape
 from model.tracing import Optics
+from service.base.wording import not_json, place_of
 from service.sources.files import require_regular
 from service.sources.photograph import Photograph
 
@@ -133,13 +134,17 @@ def read_json(path: Path) -> Any:
     """Parsed JSON of a file; one that is missing, no regular file, too large or not JSON is named."""
     try:
         return json.loads(require_regular(path).read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InvalidInputError(f"{path}: not valid JSON ({error})") from None
+    except json.JSONDecodeError as error:
+        raise InvalidInputError(f"{path}: {not_json(place_of(error))}") from None
+    except UnicodeDecodeError:
+        raise InvalidInputError(f"{path}: {not_json('a byte that is no UTF-8')}") from None
 
 
 def _actuators(kinematics: Any, where: str) -> tuple[LinearActuator, LinearActuator] | None:
     entries = get(kinematics, where, "actuators")
-    if not isinstance(entries, list) or len(entries) != 2 or any(e.get("type_axis") != "linear" for e in entries):
+    if not isinstance(entries, list) or len(entries) != 2:
+        return None
+    if any(get(entry, where, "type_axis") != "linear" for entry in entries):
         return None
     first, second = (
         LinearActuator(
@@ -274,8 +279,8 @@ def read_measurement(identifier: str, heliostat: str, data: Any, plant: Plant) -
     if not isinstance(data, dict):
         raise InvalidInputError(f"{where}: must be a JSON object")
     target = get(data, where, "target_name")
-    if target not in plant.targets:
-        raise InvalidInputError(f"{where}: 'target_name' {target!r} is none of {', '.join(plant.targets)}")
+    if not isinstance(target, str) or target not in plant.targets:
+        raise InvalidInputError(f"{where}: 'target_name' {str(target)[:80]!r} is none of {', '.join(plant.targets)}")
     elevation = _number(data, where, "sun_elevation")
     if not 0 < elevation <= 90:
         raise InvalidInputError(f"{where}: 'sun_elevation' must lie in (0, 90] degrees, got {elevation}")
