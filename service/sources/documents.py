@@ -51,7 +51,9 @@ class Measurement:
     azimuth_deg, elevation_deg : float [deg]
         The sun, azimuth from south and positive to the east.
     spot : (3,) [m] or None
-        Measured centre of mass in ENU.
+        Measured centre of mass in ENU: PAINT's UTIS, else HeliOS.
+    helios_spot : (3,) [m] or None
+        That of HeliOS.
     motor_position : (2,) [steps] or None
     images : dict
         Files by kind.
@@ -67,6 +69,7 @@ class Measurement:
     azimuth_deg: float
     elevation_deg: float
     spot: Array | None = None
+    helios_spot: Array | None = None
     motor_position: Array | None = None
     images: dict[ImageKind, Path] = field(default_factory=dict)
     taken_at: datetime | None = None
@@ -85,7 +88,6 @@ class Measurement:
     def photograph(self, kind: ImageKind, plant: Plant) -> Photograph:
         """What it says of its image of one kind."""
         motors = None if self.motor_position is None else self.motor_position.tolist()
-        spot = None if self.spot is None else plant.to_wgs84(self.spot).tolist()
         return Photograph(
             target_name=self.target,
             kind=kind,
@@ -94,9 +96,17 @@ class Measurement:
             external_id=self.identifier,
             taken_at=self.taken_at,
             motor_position=None if motors is None else (motors[0], motors[1]),
-            focal_spot_wgs84=None if spot is None else (spot[0], spot[1], spot[2]),
+            focal_spot_wgs84=_wgs84(self.spot, plant),
+            helios_spot_wgs84=_wgs84(self.helios_spot, plant),
             weather=self.weather,
         )
+
+
+def _wgs84(place: Array | None, plant: Plant) -> tuple[float, float, float] | None:
+    if place is None:
+        return None
+    latitude, longitude, altitude = plant.to_wgs84(place).tolist()
+    return latitude, longitude, altitude
 
 
 def get(data: Any, where: str, *keys: str | int) -> Any:
@@ -257,13 +267,16 @@ def _receiver(name: str, entry: Any, where: str, plant: Plant) -> Cylinder:
     return Cylinder(name, chord + bulge, normal, up, radius, float(np.linalg.norm(up)), opening)
 
 
-def _spot(data: Any, where: str, plant: Plant) -> Array | None:
-    """Measured centre of mass in ENU: PAINT's UTIS, else HeliOS."""
-    spots = data.get("focal_spot") or {}
-    for source in ("UTIS", "HeliOS"):
-        if isinstance(spots, dict) and spots.get(source) is not None:
-            return plant.to_enu(_numbers(spots, where, source, count=3))
-    return None
+def _spots(data: Any, where: str, plant: Plant) -> tuple[Array | None, Array | None]:
+    """Measured centres of mass in ENU by PAINT's two methods, UTIS and HeliOS."""
+    spots = data.get("focal_spot")
+    if not isinstance(spots, dict):
+        return None, None
+    utis, helios = (
+        None if spots.get(method) is None else plant.to_enu(_numbers(spots, where, method, count=3))
+        for method in ("UTIS", "HeliOS")
+    )
+    return utis, helios
 
 
 def _motors(data: Any, where: str) -> Array | None:
@@ -284,13 +297,15 @@ def read_measurement(identifier: str, heliostat: str, data: Any, plant: Plant) -
     elevation = _number(data, where, "sun_elevation")
     if not 0 < elevation <= 90:
         raise InvalidInputError(f"{where}: 'sun_elevation' must lie in (0, 90] degrees, got {elevation}")
+    utis, helios = _spots(data, where, plant)
     return Measurement(
         identifier=identifier,
         heliostat=heliostat,
         target=target,
         azimuth_deg=_number(data, where, "sun_azimuth"),
         elevation_deg=elevation,
-        spot=_spot(data, where, plant),
+        spot=helios if utis is None else utis,
+        helios_spot=helios,
         motor_position=_motors(data, where),
         weather=read_weather(data, where),
     )

@@ -23,11 +23,10 @@ from service.base.fields import (
     Name,
     Number,
     Rows,
-    Wgs84,
 )
 from service.drawing.pictures import flux_picture
 from service.sources.photograph import Photograph
-from service.sources.schema import paint_motors, paint_spot
+from service.sources.schema import FocalSpot, FocalSpots, paint_motors
 from service.store.tables import MeasurementRow
 from service.twin.ingest import ingest
 from service.twin.runtime import Runtime
@@ -71,7 +70,7 @@ class MeasurementIn(Model):
     motor_position: Motors | None = Field(
         default=None, description="Motor positions of both axes [steps], as a pair or as PAINT's object."
     )
-    focal_spot: Annotated[Wgs84, BeforeValidator(paint_spot)] | None = Field(
+    focal_spot: FocalSpot | None = Field(
         default=None,
         description="Known centre of mass: latitude [deg], longitude [deg], altitude [m], or PAINT's object (UTIS is "
         "preferred).",
@@ -101,8 +100,9 @@ class MeasurementOut(BaseModel):
     motor_position: tuple[float, float] | None = Field(description="[steps]")
     taken_at: datetime | None
     focal_spot: tuple[float, float, float] | None = Field(
-        description="As given: latitude [deg], longitude [deg], altitude [m]."
+        description="As given, UTIS's, else HeliOS's: latitude [deg], longitude [deg], altitude [m]."
     )
+    helios_spot: tuple[float, float, float] | None = Field(description="HeliOS's, where it was given.")
     wind_speed_m_s: float | None = Field(description="[m/s]")
     wind_from_deg: float | None = Field(description="From north, over east [deg].")
     temperature_c: float | None = Field(description="[°C]")
@@ -144,6 +144,7 @@ def measurement_out(heliostat_name: str, row: MeasurementRow) -> MeasurementOut:
             "motor_position": pair(row.motor_axis_1, row.motor_axis_2),
             "taken_at": row.taken_at,
             "focal_spot": row.focal_spot_wgs84,
+            "helios_spot": row.helios_spot_wgs84,
             "wind_speed_m_s": row.wind_speed_m_s,
             "wind_from_deg": row.wind_from_deg,
             "temperature_c": row.temperature_c,
@@ -198,6 +199,8 @@ _METADATA_EXAMPLE = (
 
 
 def _photograph(metadata: MeasurementIn) -> Photograph:
+    spot = metadata.focal_spot
+    utis, helios = (spot.UTIS, spot.HeliOS) if isinstance(spot, FocalSpots) else (spot, None)
     return Photograph(
         target_name=metadata.target_name,
         kind=metadata.kind,
@@ -206,7 +209,8 @@ def _photograph(metadata: MeasurementIn) -> Photograph:
         external_id=metadata.id,
         taken_at=metadata.taken_at,
         motor_position=metadata.motor_position,
-        focal_spot_wgs84=metadata.focal_spot,
+        focal_spot_wgs84=helios if utis is None else utis,
+        helios_spot_wgs84=helios,
         corners=metadata.corners,
         weather=Weather(metadata.wind_speed_m_s, metadata.wind_from_deg, metadata.temperature_c),
     )
