@@ -82,7 +82,7 @@ class Heliotwin:
         return self.call("GET", path)
 
     def call(self, method: str, path: str, body: bytes | None = None, kind: str = "") -> dict[str, Any]:
-        """One request until it is answered; `RejectedError` where that is no, `StoppedError` where it always would be."""
+        """One request until it is answered; `RejectedError` where that is no, `StoppedError` where it stays so."""
         until, pause_s = time.monotonic() + self.patience_s, 0.5
         while True:
             try:

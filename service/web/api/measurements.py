@@ -55,6 +55,11 @@ Motors = Annotated[
 Pixel = tuple[Annotated[Number, Field(ge=-1e5, le=1e5)], Annotated[Number, Field(ge=-1e5, le=1e5)]]
 
 
+WindSpeed = Annotated[Number, Field(ge=0, le=100, description="Of the wind then [m/s].")]
+WindFrom = Annotated[Number, Field(ge=0, le=360, description="Where the wind came from, from north, over east [deg].")]
+Temperature = Annotated[Number, Field(ge=-90, le=60, description="Of the air then [°C].")]
+
+
 class MeasurementIn(Model):
     """What is known of a photograph; PAINT's ``calibration-properties.json`` with ``kind`` (and ``id``) added fits."""
 
@@ -80,11 +85,9 @@ class MeasurementIn(Model):
         description="Positions (x, y) [px] of the target's upper left, upper right, lower left and lower right "
         "corners in a raw frame; without them they are searched.",
     )
-    wind_speed_m_s: float | None = Field(default=None, ge=0, le=100, description="Of the wind then [m/s].")
-    wind_from_deg: float | None = Field(
-        default=None, ge=0, le=360, description="Where the wind came from, from north, over east [deg]."
-    )
-    temperature_c: float | None = Field(default=None, ge=-90, le=60, description="Of the air then [°C].")
+    wind_speed_m_s: WindSpeed | None = None
+    wind_from_deg: WindFrom | None = None
+    temperature_c: Temperature | None = None
 
 
 class MeasurementOut(BaseModel):
