@@ -103,7 +103,7 @@ def told(error: ValidationError, whole: str = "document") -> str:
 
 def not_json(place: str) -> str:
     """That a text is no JSON from a ``place`` on."""
-    return f"is no JSON{place and f', wrong at {place}'}; send one JSON document"
+    return f"is no JSON{place and f', wrong at {place}'}; make it one JSON document"
 
 
 def place_of(error: json.JSONDecodeError) -> str:

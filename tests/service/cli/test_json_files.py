@@ -104,8 +104,8 @@ def test_whatever_is_wrong_is_told(name: str):
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        (b"", "is no JSON, wrong at line 1, column 1; send one JSON document"),
-        (b'{"a": 1,\n "b" 2}', "is no JSON, wrong at line 2, column 6; send one JSON document"),
+        (b"", "is no JSON, wrong at line 1, column 1; make it one JSON document"),
+        (b'{"a": 1,\n "b" 2}', "is no JSON, wrong at line 2, column 6; make it one JSON document"),
         (b"\xff\xfe", "is no JSON, wrong at a byte that is no UTF-8"),
     ],
 )

@@ -189,7 +189,7 @@ def test_unready_without_weights(bare: TestClient, monkeypatch: pytest.MonkeyPat
 def test_problem_names_its_kind_the_field_and_the_remedy(refusing: TestClient):
     broken = refusing.post("/v1/forecasts", content='{"heliostat": oops}', headers={"Content-Type": "application/json"})
     assert broken.json()["type"] == "urn:heliotwin:problem:invalid"
-    assert broken.json()["detail"].startswith("body: is no JSON, wrong at character 14; send")
+    assert broken.json()["detail"].startswith("body: is no JSON, wrong at character 14; make it")
     unknown = refusing.post("/v1/heliostats/AA39/surfaces", json={"metod": "network"}).json()
     assert unknown["errors"] == [
         {"field": "metod", "message": "is not known here; leave it out, or check its spelling"}

@@ -118,4 +118,4 @@ def test_what_is_no_json_is_told_in_plain_words(refusing: TestClient, body: str)
     answer = refusing.post("/v1/forecasts", content=body.encode("latin-1"), headers=headers)
     assert answer.status_code in (400, 422)
     assert not RAW.search(answer.text)
-    assert "send" in answer.json()["detail"]
+    assert re.search("; (make it one JSON document|send it)", answer.json()["detail"])
