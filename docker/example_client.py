@@ -4,9 +4,9 @@
 
 SPOOL/HELIOSTAT/NAME.png, .jpg or .jpeg with its metadata in NAME.json beside it is sent, and moved to SPOOL/sent when
 the service has acknowledged it; what the service cannot take is moved to SPOOL/rejected with the reason in NAME.reason.
-An image that is not written to its end yet, or whose metadata are not, is left for the next time. Ended at any moment
-and started again, it loses nothing; what it sends twice is stored once, for the same image again is the same
-measurement.
+An image that is not written to its end yet, or whose metadata are not, is left for the next time; so is all where the
+key is wrong or no heliotwin answers, which ends it. Ended at any moment and started again, it loses nothing; what it
+sends twice is stored once, for the same image again is the same measurement.
 With --predict (a key of role operate) each heliostat that got a photograph gets a new surface, and a forecast.
 """
 
@@ -15,6 +15,7 @@ import json
 import sys
 import time
 import urllib.error
+import urllib.parse
 import urllib.request
 import uuid
 from pathlib import Path
@@ -22,6 +23,8 @@ from typing import Any
 
 # Answers after which the same request may succeed later.
 AGAIN = (408, 429, 500, 502, 503, 504, 507)
+# Answers that are about what was sent; any other, 401 say, is about whoever sends, and holds for all that comes.
+ABOUT_THIS = (404, 409, 413, 415, 422)
 LONGEST_PAUSE_S = 60.0
 
 
@@ -31,6 +34,10 @@ ENDS = {".png": b"IEND\xaeB`\x82", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
 
 class RejectedError(Exception):
     """The service understood the request and does not take it; trying again would find the same."""
+
+
+class StoppedError(Exception):
+    """Nothing goes until somebody acts: the key is wrong, or this is no heliotwin."""
 
 
 class Heliotwin:
@@ -54,13 +61,12 @@ class Heliotwin:
             for name, kind, content in parts
         )
         body += b"--%b--\r\n" % boundary.encode()
-        return self.call(
-            "POST", f"/v1/heliostats/{heliostat}/measurements", body, f"multipart/form-data; boundary={boundary}"
-        )
+        path = f"/v1/heliostats/{urllib.parse.quote(heliostat, safe='')}/measurements"
+        return self.call("POST", path, body, f"multipart/form-data; boundary={boundary}")
 
     def predict(self, heliostat: str) -> dict[str, Any]:
         """A new version of the heliostat's surface from its newest photographs."""
-        return self.post(f"/v1/heliostats/{heliostat}/surfaces", {"method": "network"})
+        return self.post(f"/v1/heliostats/{urllib.parse.quote(heliostat, safe='')}/surfaces", {"method": "network"})
 
     def forecast(self, heliostat: str, target: str, azimuth_deg: float, elevation_deg: float) -> dict[str, Any]:
         """The flux of the current surface on a target, its peak [W/m2] and power [W] among others."""
@@ -76,16 +82,20 @@ class Heliotwin:
         return self.call("GET", path)
 
     def call(self, method: str, path: str, body: bytes | None = None, kind: str = "") -> dict[str, Any]:
-        """One request until it is answered; `RejectedError` where the answer is no."""
+        """One request until it is answered; `RejectedError` where that is no, `StoppedError` where it stays so."""
         until, pause_s = time.monotonic() + self.patience_s, 0.5
         while True:
             try:
                 return self._ask(method, path, body, kind)
             except urllib.error.HTTPError as error:
-                reason = _reason(error)
-                if error.code not in AGAIN:
+                reason, is_ours = _reason(error)
+                if error.code in ABOUT_THIS and is_ours:
                     raise RejectedError(reason) from error
+                if error.code not in AGAIN:
+                    raise StoppedError(f"{self.url}: {reason}") from error
                 wait_s = max(pause_s, float(error.headers.get("Retry-After") or 0))
+            except ValueError as error:  # no address, or an answer that is no JSON
+                raise StoppedError(f"{self.url}: this is no heliotwin ({error})") from error
             except OSError as error:  # no connection, or it broke: nobody knows whether the request arrived
                 reason, wait_s = str(error), pause_s
             if time.monotonic() + wait_s > until:
@@ -106,13 +116,13 @@ class Heliotwin:
             return document
 
 
-def _reason(error: urllib.error.HTTPError) -> str:
-    """What a problem document says, with the id that the service's log knows the request by."""
+def _reason(error: urllib.error.HTTPError) -> tuple[str, bool]:
+    """What a problem document says, with the id that the service's log knows the request by; and whether it is one."""
     try:
         document = json.load(error)
-        return f"{error.code}: {document['detail']} (request {document['request_id']})"
-    except (ValueError, KeyError):  # a proxy's answer
-        return f"{error.code} {error.reason}"
+        return f"{error.code}: {document['detail']} (request {document['request_id']})", True
+    except (ValueError, KeyError, TypeError):  # a proxy's answer
+        return f"{error.code} {error.reason}", False
 
 
 def _move(image: Path, spool: Path, to: str) -> Path:
@@ -128,16 +138,22 @@ def _whole(image: Path) -> tuple[bytes, dict[str, Any]] | None:
     try:
         content = image.read_bytes()
         metadata = json.loads(image.with_suffix(".json").read_text(encoding="utf-8"))
-    except (FileNotFoundError, ValueError):
+    except (OSError, ValueError):
         return None
     return (content, metadata) if ENDS[image.suffix.lower()] in content[-64:] else None
 
 
 def send_all(service: Heliotwin, spool: Path) -> dict[str, str]:
-    """Send what lies in the spool, oldest first; the heliostats that got an accepted photograph, with its target."""
+    """Send what lies in the spool, oldest first; the heliostats that got an accepted photograph, with its target.
+
+    Files that are neither photographs nor their metadata are named, and stay.
+    """
     touched = {}
     folders = [folder for folder in spool.iterdir() if folder.is_dir() and folder.name not in ("sent", "rejected")]
-    images = [path for folder in folders for path in folder.iterdir() if path.suffix.lower() in ENDS]
+    files = [path for folder in folders for path in folder.iterdir()]
+    images = [path for path in files if path.suffix.lower() in ENDS]
+    for path in (path for path in files if path.suffix.lower() not in (*ENDS, ".json")):
+        print(f"{path.parent.name}/{path.name}: left, it is neither {', '.join(ENDS)} nor .json", file=sys.stderr)
     for image in sorted(images, key=lambda path: path.stat().st_mtime):
         heliostat, read = image.parent.name, _whole(image)
         if read is None:
@@ -159,6 +175,21 @@ def send_all(service: Heliotwin, spool: Path) -> dict[str, str]:
     return touched
 
 
+def forecast_all(service: Heliotwin, touched: dict[str, str]) -> bool:
+    """A new surface and a forecast on its target of each heliostat; whether all of them came about."""
+    is_whole = True
+    for heliostat, target in touched.items():
+        try:
+            surface = service.predict(heliostat)
+            forecast = service.forecast(heliostat, target, azimuth_deg=0.0, elevation_deg=45.0)
+        except RejectedError as refusal:
+            print(f"{heliostat}: no forecast, {refusal}", file=sys.stderr)
+            is_whole = False
+            continue
+        print(f"{heliostat}: surface {surface['version']}, forecast peak {forecast['peak_w_m2']:.0f} W/m2")
+    return is_whole
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Send the spool once."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -168,22 +199,19 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--patience", type=float, default=3600.0, help="how long to try a request [s]")
     parser.add_argument("--predict", action="store_true")
     options = parser.parse_args(arguments)
+    if options.key_file and not options.key_file.is_file():
+        parser.error(f"there is no file {options.key_file}; write the key into it, or name another one")
     key = options.key_file.read_text(encoding="utf-8").strip() if options.key_file else ""
     service = Heliotwin(options.url, key, options.patience)
     if not options.spool.is_dir():
         parser.error(f"there is no folder {options.spool}; make it, with a folder for each heliostat in it")
-    touched = send_all(service, options.spool)
-    failed = False
-    for heliostat, target in touched.items() if options.predict else ():
-        try:
-            surface = service.predict(heliostat)
-            forecast = service.forecast(heliostat, target, azimuth_deg=0.0, elevation_deg=45.0)
-        except RejectedError as refusal:
-            print(f"{heliostat}: no forecast, {refusal}", file=sys.stderr)
-            failed = True
-            continue
-        print(f"{heliostat}: surface {surface['version']}, forecast peak {forecast['peak_w_m2']:.0f} W/m2")
-    if failed:
+    try:
+        touched = send_all(service, options.spool)
+        is_whole = forecast_all(service, touched) if options.predict else True
+    except (StoppedError, TimeoutError) as error:
+        print(f"stopped, the rest is left for the next time: {error}", file=sys.stderr)
+        sys.exit(1)
+    if not is_whole:
         sys.exit(1)
 
 

@@ -63,6 +63,8 @@ def explain(
         taken += [series[place] for place in told]
         most = _CUT * np.median(np.linalg.norm(off[told], axis=-1)) if told else 0.0
         found.append(np.clip(off[told], -most, most))
+    if not taken:  # one measurement, say, which leaves nothing to be left out of
+        return dict.fromkeys(COVARIATES, Explained(0, {}, {}))
     heliostat = np.repeat(np.arange(len(found)), [len(off) for off in found])
     cut = np.concatenate(found)
     return {name: _explained(terms(taken, latitude_deg), cut, heliostat) for name, terms in COVARIATES.items()}

@@ -125,7 +125,8 @@ def parameters_from_json(document: Any, where: str) -> Array:
 
 
 def _no_mount(where: str, error: Exception) -> InvalidInputError:
-    return InvalidInputError(f"{where}: no calibrated mount as `heliotwin calibrate` writes it ({error})")
+    what = f"{error} is missing" if isinstance(error, KeyError) else "a field of it has another form"
+    return InvalidInputError(f"{where}: no calibrated mount as `heliotwin calibrate` writes it; {what}")
 
 
 def mount_from_json(document: Any, where: str, noise: Noise | None = None) -> CalibratedMount:
@@ -153,7 +154,8 @@ def mount_from_json(document: Any, where: str, noise: Noise | None = None) -> Ca
             )
             for step in document["steps"]
         )
-        finite = all(np.isfinite(value).all() for value in (*values.values(), parameters, covariance))
+        drifted = 1e-3 * np.array(document["drift"]["std_mrad"], dtype=np.float64).reshape(2)
+        finite = all(np.isfinite(value).all() for value in (*values.values(), parameters, covariance, drifted))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise _no_mount(where, error) from None
     if not finite:
@@ -163,7 +165,7 @@ def mount_from_json(document: Any, where: str, noise: Noise | None = None) -> Ca
         covariance=covariance,
         spread=spread,
         prior_spread=prior,
-        drifted_std=1e-3 * np.array(document["drift"]["std_mrad"], dtype=np.float64),
+        drifted_std=drifted,
         days=days,
         foreign=foreign,
         steps=steps,

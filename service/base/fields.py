@@ -22,7 +22,7 @@ from pydantic import (
 
 from model.plant import Cylinder, TargetPlane
 from service.base.choices import Method as Method  # one of these types, and a choice of the command line
-from service.base.names import IDENTIFIER, NAME
+from service.base.names import IDENTIFIER, MEASUREMENT, NAME
 
 Name = Annotated[
     str,
@@ -38,7 +38,7 @@ Identifier = Annotated[
 
 MeasurementName = Annotated[
     str,
-    StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,95}$"),
+    StringConstraints(pattern=MEASUREMENT),
     Field(description="The `id` of a measurement, as the service gave it.", examples=["205363"]),
 ]
 

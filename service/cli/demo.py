@@ -281,10 +281,11 @@ def _print(console: Console, results: list[Result], out: Path, store: Path) -> N
         table.add_row(*_row(result))
     console.print(table)
     console.print(f"pictures and report: {out / 'report.html'}", highlight=False)
-    # As one line that can be pasted: the command may lie in an environment that is not on the path.
+    # The last line can be pasted as it stands: the command may lie in an environment that is not on the path.
     beside = str(Path(sys.executable).with_name("heliotwin"))
     command = "heliotwin" if shutil.which("heliotwin") else shlex.quote(beside)
-    said = f"next: HELIOTWIN_DATA_DIR={shlex.quote(str(store))} {command} serve"
+    console.print("next, the service on what was made:", highlight=False)
+    said = f"HELIOTWIN_DATA_DIR={shlex.quote(str(store))} {command} serve"
     console.print(said, highlight=False, markup=False, soft_wrap=True)
 
 

@@ -11,6 +11,7 @@ from typer.core import TyperGroup
 from model.errors import InvalidInputError, ModelError
 from service.base.discovery import modules_of
 from service.base.faults import ServiceError
+from service.base.wording import told
 
 
 class _Group(TyperGroup):
@@ -68,9 +69,7 @@ def main() -> None:
     except InvalidInputError as error:
         _fail(error, 2)
     except ValidationError as error:
-        first = error.errors()[0]
-        said = first["msg"].removeprefix("Value error, ")
-        _fail(f"setting {'.'.join(map(str, first['loc'])) or 'combination'}: {said}", 2)
+        _fail(f"setting {told(error, 'combination')}", 2)
     except (ModelError, ServiceError, OSError) as error:
         _fail(error, 1)
     except _database_errors() as error:

@@ -23,6 +23,7 @@ from model.plant import Cylinder, Facet, Heliostat, Plant, TargetPlane
 from model.pointing import Weather
 from model.sunshape import SHAPES, SunShape
 from model.tracing import Optics
+from service.base.wording import not_json, place_of
 from service.sources.files import require_regular
 from service.sources.photograph import Photograph
 
@@ -50,7 +51,9 @@ class Measurement:
     azimuth_deg, elevation_deg : float [deg]
         The sun, azimuth from south and positive to the east.
     spot : (3,) [m] or None
-        Measured centre of mass in ENU.
+        Measured centre of mass in ENU: PAINT's UTIS, else HeliOS.
+    helios_spot : (3,) [m] or None
+        That of HeliOS.
     motor_position : (2,) [steps] or None
     images : dict
         Files by kind.
@@ -66,6 +69,7 @@ class Measurement:
     azimuth_deg: float
     elevation_deg: float
     spot: Array | None = None
+    helios_spot: Array | None = None
     motor_position: Array | None = None
     images: dict[ImageKind, Path] = field(default_factory=dict)
     taken_at: datetime | None = None
@@ -84,7 +88,6 @@ class Measurement:
     def photograph(self, kind: ImageKind, plant: Plant) -> Photograph:
         """What it says of its image of one kind."""
         motors = None if self.motor_position is None else self.motor_position.tolist()
-        spot = None if self.spot is None else plant.to_wgs84(self.spot).tolist()
         return Photograph(
             target_name=self.target,
             kind=kind,
@@ -93,9 +96,17 @@ class Measurement:
             external_id=self.identifier,
             taken_at=self.taken_at,
             motor_position=None if motors is None else (motors[0], motors[1]),
-            focal_spot_wgs84=None if spot is None else (spot[0], spot[1], spot[2]),
+            focal_spot_wgs84=_wgs84(self.spot, plant),
+            helios_spot_wgs84=_wgs84(self.helios_spot, plant),
             weather=self.weather,
         )
+
+
+def _wgs84(place: Array | None, plant: Plant) -> tuple[float, float, float] | None:
+    if place is None:
+        return None
+    latitude, longitude, altitude = plant.to_wgs84(place).tolist()
+    return latitude, longitude, altitude
 
 
 def get(data: Any, where: str, *keys: str | int) -> Any:
@@ -133,13 +144,17 @@ def read_json(path: Path) -> Any:
     """Parsed JSON of a file; one that is missing, no regular file, too large or not JSON is named."""
     try:
         return json.loads(require_regular(path).read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InvalidInputError(f"{path}: not valid JSON ({error})") from None
+    except json.JSONDecodeError as error:
+        raise InvalidInputError(f"{path}: {not_json(place_of(error))}") from None
+    except UnicodeDecodeError:
+        raise InvalidInputError(f"{path}: {not_json('a byte that is no UTF-8')}") from None
 
 
 def _actuators(kinematics: Any, where: str) -> tuple[LinearActuator, LinearActuator] | None:
     entries = get(kinematics, where, "actuators")
-    if not isinstance(entries, list) or len(entries) != 2 or any(e.get("type_axis") != "linear" for e in entries):
+    if not isinstance(entries, list) or len(entries) != 2:
+        return None
+    if any(get(entry, where, "type_axis") != "linear" for entry in entries):
         return None
     first, second = (
         LinearActuator(
@@ -252,13 +267,16 @@ def _receiver(name: str, entry: Any, where: str, plant: Plant) -> Cylinder:
     return Cylinder(name, chord + bulge, normal, up, radius, float(np.linalg.norm(up)), opening)
 
 
-def _spot(data: Any, where: str, plant: Plant) -> Array | None:
-    """Measured centre of mass in ENU: PAINT's UTIS, else HeliOS."""
-    spots = data.get("focal_spot") or {}
-    for source in ("UTIS", "HeliOS"):
-        if isinstance(spots, dict) and spots.get(source) is not None:
-            return plant.to_enu(_numbers(spots, where, source, count=3))
-    return None
+def _spots(data: Any, where: str, plant: Plant) -> tuple[Array | None, Array | None]:
+    """Measured centres of mass in ENU by PAINT's two methods, UTIS and HeliOS."""
+    spots = data.get("focal_spot")
+    if not isinstance(spots, dict):
+        return None, None
+    utis, helios = (
+        None if spots.get(method) is None else plant.to_enu(_numbers(spots, where, method, count=3))
+        for method in ("UTIS", "HeliOS")
+    )
+    return utis, helios
 
 
 def _motors(data: Any, where: str) -> Array | None:
@@ -274,18 +292,20 @@ def read_measurement(identifier: str, heliostat: str, data: Any, plant: Plant) -
     if not isinstance(data, dict):
         raise InvalidInputError(f"{where}: must be a JSON object")
     target = get(data, where, "target_name")
-    if target not in plant.targets:
-        raise InvalidInputError(f"{where}: 'target_name' {target!r} is none of {', '.join(plant.targets)}")
+    if not isinstance(target, str) or target not in plant.targets:
+        raise InvalidInputError(f"{where}: 'target_name' {str(target)[:80]!r} is none of {', '.join(plant.targets)}")
     elevation = _number(data, where, "sun_elevation")
     if not 0 < elevation <= 90:
         raise InvalidInputError(f"{where}: 'sun_elevation' must lie in (0, 90] degrees, got {elevation}")
+    utis, helios = _spots(data, where, plant)
     return Measurement(
         identifier=identifier,
         heliostat=heliostat,
         target=target,
         azimuth_deg=_number(data, where, "sun_azimuth"),
         elevation_deg=elevation,
-        spot=_spot(data, where, plant),
+        spot=helios if utis is None else utis,
+        helios_spot=helios,
         motor_position=_motors(data, where),
         weather=read_weather(data, where),
     )

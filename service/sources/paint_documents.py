@@ -62,8 +62,10 @@ def measurement_json(photograph: Photograph) -> dict[str, Any]:
     if photograph.motor_position is not None:
         motors = zip((1, 2), photograph.motor_position, strict=True)
         document["motor_position"] = {f"axis_{axis}_motor_position": position for axis, position in motors}
-    if photograph.focal_spot_wgs84 is not None:
-        document["focal_spot"] = {"UTIS": list(photograph.focal_spot_wgs84)}
+    used, helios = photograph.focal_spot_wgs84, photograph.helios_spot_wgs84
+    spots = {"UTIS": None if used == helios else used, "HeliOS": helios}
+    if used is not None:
+        document["focal_spot"] = {method: list(spot) for method, spot in spots.items() if spot is not None}
     weather = vars(photograph.weather)
     return document | {name: value for name, value in weather.items() if value is not None}
 

@@ -1,10 +1,19 @@
 """The form of PAINT's documents, as far as it is checked when they come in over HTTP."""
 
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ModelWrapValidatorHandler, PrivateAttr, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    ModelWrapValidatorHandler,
+    PrivateAttr,
+    Tag,
+    model_validator,
+)
 
-from service.base.fields import Extent, Name, Wgs84
+from service.base.fields import Extent, Model, Name, Wgs84
 
 # Nesting that no document of PAINT's reaches, far below Python's recursion limit.
 _MAX_DEPTH = 32
@@ -111,8 +120,24 @@ def paint_motors(value: Any) -> Any:
     return value
 
 
-def paint_spot(value: Any) -> Any:
-    """One position out of PAINT's ``focal_spot`` object: UTIS, else HeliOS."""
-    if isinstance(value, dict) and value and set(value) <= {"UTIS", "HeliOS"}:
-        return value.get("UTIS") or value.get("HeliOS")
-    return value
+class FocalSpots(Model):
+    """PAINT's ``focal_spot``: where two methods found the centre of mass; UTIS is preferred."""
+
+    UTIS: Wgs84 | None = None
+    HeliOS: Wgs84 | None = None
+
+    @model_validator(mode="after")
+    def _some(self) -> Self:
+        if self.UTIS is None and self.HeliOS is None:
+            raise ValueError("give UTIS, HeliOS, or both; else leave it out")
+        return self
+
+
+def _spot_by(told: Any) -> str:
+    """Whether a spot is given as a position, or as PAINT has it."""
+    return "(methods)" if isinstance(told, dict | FocalSpots) else "(position)"
+
+
+FocalSpot = Annotated[
+    Annotated[Wgs84, Tag("(position)")] | Annotated[FocalSpots, Tag("(methods)")], Discriminator(_spot_by)
+]

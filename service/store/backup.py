@@ -26,6 +26,7 @@ from model.errors import InvalidInputError
 from service.base.faults import ConflictError, StoreDamagedError
 from service.base.progress import Progress, quiet
 from service.base.settings import Settings
+from service.base.wording import not_json, place_of
 from service.store.database import Database
 from service.store.images import ImageStore
 
@@ -195,11 +196,18 @@ def restore(settings: Settings, folder: Path, step: Progress = quiet) -> dict[st
 
 def _read_manifest(folder: Path) -> dict[str, Any]:
     try:
-        manifest: dict[str, Any] = json.loads((folder / _MANIFEST).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        manifest = json.loads((folder / _MANIFEST).read_text(encoding="utf-8"))
+    except json.JSONDecodeError as error:
+        raise InvalidInputError(f"{folder} is no back-up: its {_MANIFEST} {not_json(place_of(error))}") from error
+    except (OSError, UnicodeDecodeError) as error:
         raise InvalidInputError(f"{folder} is no back-up: its {_MANIFEST} cannot be read ({error})") from error
+    if not isinstance(manifest, dict):
+        raise InvalidInputError(f"{folder} is no back-up: its {_MANIFEST} must be a JSON object")
     if manifest.get("format") != _FORMAT:
         raise InvalidInputError(f"{folder}: format {manifest.get('format')!r} is not {_FORMAT}; use a newer heliotwin")
+    lacking = [name for name in ("engine", "revision", "images", "damaged", "files") if name not in manifest]
+    if lacking:
+        raise InvalidInputError(f"{folder} is no back-up: its {_MANIFEST} has no {', '.join(lacking)}")
     return manifest
 
 

@@ -164,6 +164,7 @@ class MeasurementRow(Base):
     motor_axis_2: Mapped[float | None]
     taken_at: Mapped[datetime | None]
     focal_spot_wgs84: Mapped[list[float] | None]
+    helios_spot_wgs84: Mapped[list[float] | None]
     corners_px: Mapped[dict[str, Any] | None]
     wind_speed_m_s: Mapped[float | None]
     wind_from_deg: Mapped[float | None]

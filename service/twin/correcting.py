@@ -1,12 +1,13 @@
 """Correcting what is known of a photograph, or excluding it, in all its images: with a reason, its history kept."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, fields, replace
 from datetime import datetime
 from typing import Any
 
 from sqlalchemy.orm import Session
 
 from model.imaging.light import camera_at
+from model.pointing import Weather
 from service import store
 from service.base.faults import ConflictError, GoneError
 from service.sources.photograph import Photograph
@@ -23,6 +24,7 @@ from service.twin.runtime import Runtime
 
 # What another sun, time or pair of motor positions changes, and what is measured anew with another target or camera.
 _TOLD = ("sun_azimuth_deg", "sun_elevation_deg", "taken_at", "motor_axis_1", "motor_axis_2", "quality")
+_WEATHER = tuple(weather.name for weather in fields(Weather))
 _MEASURED = ("target_id", "accepted", "reason", "center_right_m", "center_up_m", "arrays")
 
 
@@ -36,14 +38,16 @@ class Changes:
     sun_elevation_deg: float | None = None
     taken_at: datetime | None = None
     motor_position: tuple[float, float] | None = None
+    weather: Weather = field(default_factory=Weather)
     excluded: bool | None = None
 
     def of(self, row: MeasurementRow) -> Photograph:
         """The photograph as it shall be known."""
         names = ("target_name", "sun_azimuth_deg", "sun_elevation_deg", "taken_at", "motor_position")
-        return replace(
-            photograph_of(row), **{name: value for name in names if (value := getattr(self, name)) is not None}
-        )
+        known = photograph_of(row)
+        weather = {name: value for name, value in vars(self.weather).items() if value is not None}
+        told = {name: value for name in names if (value := getattr(self, name)) is not None}
+        return replace(known, weather=replace(known.weather, **weather), **told)
 
 
 def correct(runtime: Runtime, heliostat: str, identifier: str, changes: Changes, actor: str) -> MeasurementRow:
@@ -110,10 +114,11 @@ def _keep(
     apart = [name for name, value in after.items() if value != before[name]]
     if not apart:
         return False
-    row.corrected_at = now()
+    if not set(apart) <= set(_WEATHER):  # which nothing is made from but the next calibration
+        row.corrected_at = now()
+        forget_drift(session, row)
     old, new = ({name: state[name] for name in apart} for state in (before, after))
     session.add(CorrectionRow(measurement_id=row.id, made_by=actor, reason=changes.reason, before=old, after=new))
-    forget_drift(session, row)
     store.use_image(session, row.image, row.accepted, False)
     about = {"reason": changes.reason, "before": old, "after": new}
     audit.record(session, actor, "measurement.corrected", f"heliostat {heliostat} {row.identifier}", **about)
@@ -123,7 +128,8 @@ def _keep(
 def _state(row: MeasurementRow) -> dict[str, Any]:
     """What is known of a photograph, and by their hash its flux images."""
     flux = None if row.arrays is None else digest(row.arrays)[:12]
-    return values_of(row) | {"excluded": row.reason == EXCLUDED, "flux": flux}
+    weather = {name: getattr(row, name) for name in _WEATHER}
+    return values_of(row) | weather | {"excluded": row.reason == EXCLUDED, "flux": flux}
 
 
 def _fresh(
@@ -141,6 +147,7 @@ def _fresh(
             "motor_axis_1": motors[0],
             "motor_axis_2": motors[1],
             "quality": {**row.quality, "clock": clock_of(photograph, twin)},
+            **vars(photograph.weather),
         }
     return _measured(runtime, twin, row, photograph, target)
 
@@ -156,7 +163,7 @@ def _measured(
         )
     _, measured = measure_stored(runtime, row, photograph, twin, store.target_plane(target))
     made = row_of(photograph, measured, target.id, clock_of(photograph, twin))
-    return {name: getattr(made, name) for name in (*_TOLD, *_MEASURED)}
+    return {name: getattr(made, name) for name in (*_TOLD, *_WEATHER, *_MEASURED)}
 
 
 def _write(row: MeasurementRow, fresh: dict[str, Any], excluded: bool | None) -> None:

@@ -20,6 +20,7 @@ from model.errors import InvalidInputError
 from model.imaging import ImageKind
 from service import store
 from service.base.arrays import unpack
+from service.base.wording import told
 from service.sources.files import require_regular
 from service.store import audit
 from service.store.measurements import EXCLUDED, find_measurement_of_image
@@ -73,9 +74,7 @@ def _load(path: Path, kind: Any) -> Any:
     try:
         return kind.model_validate_json(require_regular(path).read_bytes())
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(map(str, first["loc"]))
-        raise InvalidInputError(f"{path}: {where}: {first['msg']}; export the folder anew") from None
+        raise InvalidInputError(f"{path}: {told(error)}; export the folder anew") from None
 
 
 # --- the plant's model ------------------------------------------------------------------------------------------------

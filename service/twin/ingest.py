@@ -196,6 +196,7 @@ def row_of(photograph: Photograph, measured: MeasuredFlux, target_id: int, clock
     if measured.clipped is not None:
         kept["clipped"] = measured.clipped
     motors = photograph.motor_position or (None, None)
+    spot, helios = photograph.focal_spot_wgs84, photograph.helios_spot_wgs84
     right, up = (None, None) if measured.center_of_mass is None else measured.center_of_mass.tolist()
     return MeasurementRow(
         external_id=photograph.external_id,
@@ -206,7 +207,8 @@ def row_of(photograph: Photograph, measured: MeasuredFlux, target_id: int, clock
         motor_axis_1=motors[0],
         motor_axis_2=motors[1],
         taken_at=photograph.taken_at,
-        focal_spot_wgs84=None if photograph.focal_spot_wgs84 is None else list(photograph.focal_spot_wgs84),
+        focal_spot_wgs84=None if spot is None else list(spot),
+        helios_spot_wgs84=None if helios is None else list(helios),
         corners_px=None if photograph.corners is None else {"corners": plain(photograph.corners)},
         **asdict(photograph.weather),
         accepted=bool(measured.quality.accepted),

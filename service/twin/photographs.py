@@ -40,7 +40,7 @@ def photograph_of(row: MeasurementRow) -> Photograph:
 def photograph_with(known: Any, target_name: str) -> Photograph:
     """The same of what has a measurement's columns, or a record of them."""
     motors = (known.motor_axis_1, known.motor_axis_2)
-    spot = known.focal_spot_wgs84
+    spot, helios = known.focal_spot_wgs84, known.helios_spot_wgs84
     return Photograph(
         target_name=target_name,
         kind=cast(ImageKind, known.kind),
@@ -50,6 +50,7 @@ def photograph_with(known: Any, target_name: str) -> Photograph:
         taken_at=known.taken_at,
         motor_position=None if None in motors else cast(tuple[float, float], motors),
         focal_spot_wgs84=None if spot is None else tuple(spot),
+        helios_spot_wgs84=None if helios is None else tuple(helios),
         corners=None if known.corners_px is None else known.corners_px["corners"],
         weather=Weather(known.wind_speed_m_s, known.wind_from_deg, known.temperature_c),
     )

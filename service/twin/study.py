@@ -21,6 +21,7 @@ from service.base.arrays import plain
 from service.base.faults import SKIPPED, ConflictError, NotFoundError
 from service.base.fields import StudyReport
 from service.base.progress import Report, Steps
+from service.base.wording import told
 from service.drawing.study_report import study_page
 from service.store.tables import HeliostatRow, MeasurementRow, StudyRow, SurfaceRow
 from service.twin import versions
@@ -242,8 +243,7 @@ def row_of_report(document: Any, name: str, model: PlantModel, actor: str) -> St
     try:
         report = StudyReport.model_validate(document)
     except ValidationError as error:
-        first = error.errors()[0]
-        raise InvalidInputError(f"{name}: {'.'.join(map(str, first['loc'])) or 'report'}: {first['msg']}") from None
+        raise InvalidInputError(f"{name}: {told(error, 'report')}") from None
     effects_from_json(report.effects)
     return StudyRow(
         created_by=actor,

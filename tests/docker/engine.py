@@ -28,6 +28,18 @@ USER heliotwin
 """
 
 
+# As the official images start: their program, its configuration, where it keeps what it knows, and as whom.
+_MONITOR = """
+FROM python:3.11-slim
+COPY program /bin/{name}
+COPY share /usr/share/prometheus
+RUN mkdir -p /{name} && chown 65534:65534 /{name}
+USER 65534
+VOLUME /{name}
+ENTRYPOINT ["/bin/{name}", "--config.file=/etc/{name}/{name}.yml", "--storage.{kind}=/{name}"]
+"""
+
+
 def absent() -> str | None:
     """Why no composition can run here; None where it can."""
     if shutil.which("docker") is None:
@@ -72,6 +84,16 @@ def build(context: Path, dockerfile: Path, image: str) -> str:
     command = ["docker", "build", "--quiet", "--network", "host", *arguments, "-f", str(dockerfile), "-t", image]
     run(*command, str(context), environment={"DOCKER_BUILDKIT": "0"})
     return image
+
+
+def build_monitor(program: str, name: str, kind: str, folder: Path, image: str) -> str:
+    """A stand-in for an official image, ``prometheus`` or ``alertmanager``, with this machine's program of a Debian."""
+    folder.mkdir()
+    shutil.copy2(program, folder / "program")
+    shutil.copytree("/usr/share/prometheus", folder / "share")  # a Debian's has its templates there
+    dockerfile = folder / "Dockerfile"
+    dockerfile.write_text(_MONITOR.format(name=name, kind=kind), encoding="utf-8")
+    return build(folder, dockerfile, image)
 
 
 def newest_revision() -> str:
@@ -120,6 +142,8 @@ class Composition:
             "HELIOTWIN_PUBLISHED_PORT": str(self.port),
             "HELIOTWIN_PASSWORD_FILE": str(password),
             "HELIOTWIN_IMPORT_FOLDER": str(imports),
+            "HELIOTWIN_PROMETHEUS_PORT": str(free_port()),
+            "HELIOTWIN_ALERTMANAGER_PORT": str(free_port()),
         }
         self._command = self._of_this_engine()
 
@@ -135,6 +159,13 @@ class Composition:
     def __call__(self, *arguments: str) -> str:
         """What a command of compose prints."""
         return run(*self._command, *arguments, folder=self.folder.parent, environment=self.environment)
+
+    def instead(self, images: Mapping[str, str]) -> None:
+        """Start services from other images than the file names."""
+        file = self.folder / f".{self.project}-images.yaml"
+        services = {name: {"image": image} for name, image in images.items()}
+        file.write_text(json.dumps({"version": "3.9", "services": services}), encoding="utf-8")
+        self._command += ["-f", str(file)]
 
     def verb(self, *words: str, mounted: Path | None = None) -> str:
         """What ``heliotwin WORDS`` prints in a container of its own; ``mounted`` is its /backup."""

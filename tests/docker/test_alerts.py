@@ -12,7 +12,7 @@ import shutil
 import subprocess
 import threading
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ import yaml
 from sqlalchemy import update
 
 from service.base.settings import Settings
+from service.store import queue
 from service.store.columns import now
 from service.store.tables import HeliostatRow
 from service.web.app import create_app
@@ -31,11 +32,14 @@ from tests.service.conftest import (
     QUIET,
     FakeOperations,
     free_port,
+    png,
+    poster,
     properties_document,
     serving,
     tower_document,
     until,
 )
+from tests.service.spots import photographs
 
 DOCKER = Path(__file__).parents[2] / "docker"
 
@@ -150,3 +154,59 @@ def test_alert_is_delivered_and_ends_when_it_is_acknowledged(tmp_path: Path):
         (item,) = service.get("/v1/attention").json()["items"]
         service.post("/v1/attention/acknowledgements", json={"ids": [item["id"]]})
         until(lambda: bool(of("resolved")), 60)
+
+
+def fill(service: httpx.Client) -> None:
+    """Some of everything that the dashboard draws: photographs, a surface that is judged, a mount, jobs."""
+    service.put("/v1/plant", json=tower_document())
+    service.put("/v1/heliostats/AA39", json=properties_document())
+    send = poster(service)
+    taken = photographs(tower_document(), properties_document())
+    for number, one in enumerate(taken[:12]):
+        assert send(png(number), **one).status_code == 201
+    send(png(90, refused=True), id="refused")
+    assert service.post("/v1/heliostats/AA39/surfaces", json={"measurements": ["0", "1"]}).status_code == 201
+    for kind in ("calibrations", "predictions"):
+        path = service.post(f"/v1/jobs/{kind}", json={}).headers["Location"]
+        until(lambda path=path: service.get(path).json()["state"] in ("done", "failed"))  # type: ignore[misc]
+    for number, one in enumerate(taken[12:], 12):
+        assert send(png(number), **one).status_code == 201
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(180)
+def test_each_panel_of_the_dashboard_draws_something(tmp_path: Path):
+    """Of a live service, as a real Prometheus has it."""
+    program, port = binary("prometheus"), free_port()
+    settings = Settings(data_dir=tmp_path / "data", image_quota_gb=1.0, **QUIET | {"job_workers": 1})
+    with ExitStack() as stack:
+        app = create_app(settings, FakeOperations())
+        address = stack.enter_context(serving(app))
+        service = stack.enter_context(httpx.Client(base_url=address))
+        fill(service)
+        with app.state.runtime.database.writing() as session:
+            queue.add_job(session, "other", {}, "tester")  # no worker takes it: it waits
+        configure(tmp_path, address.removeprefix("http://"), free_port(), free_port())
+        asks = ("--config.file=prometheus.yml", "--storage.tsdb.path=series")
+        stack.enter_context(running(tmp_path, program, *asks, f"--web.listen-address=127.0.0.1:{port}"))
+        prometheus = stack.enter_context(httpx.Client(base_url=f"http://127.0.0.1:{port}"))
+
+        def drawn(expression: str) -> bool:
+            try:
+                answer = prometheus.get("/api/v1/query", params={"query": expression})
+            except httpx.TransportError:  # it is starting
+                return False
+            if answer.status_code == 503:
+                return False
+            assert answer.json()["status"] == "success", (expression, answer.text)
+            return bool(answer.json()["data"]["result"])
+
+        empty = set(drawn_expressions())
+
+        def all_drawn() -> bool:
+            empty.difference_update([expression for expression in empty if drawn(expression)])
+            return not empty
+
+        with suppress(AssertionError):
+            until(all_drawn, 60)
+        assert not empty

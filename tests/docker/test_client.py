@@ -108,6 +108,41 @@ def test_what_is_not_whole_waits_and_the_others_go(store: Store, service: Proces
     assert not list(root.glob("H*/*.*"))
 
 
+def test_one_bad_photograph_or_folder_keeps_no_other(store: Store, service: Process, tmp_path: Path):
+    key, root = make_key(store, tmp_path, "ingest"), spool(tmp_path, 4, first=40)
+    first = root / "H0" / "40"
+    for heliostat in ("H 0", "H%2F0", "Hé"):
+        shutil.copytree(root / "H1", root / heliostat)
+    (root / "H0" / "folder.png").mkdir()
+    (root / "H0" / "lists.json").write_text("[1, 2]")
+    shutil.copy(first.with_suffix(".png"), root / "H0" / "lists.png")
+    (root / "H0" / "50.tif").write_bytes(b"II*")
+    done = run(service.base, key, root)
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    assert "H0/50.tif: left, it is neither .png" in done.stderr
+    assert "H0/folder: left for the next time" in done.stdout
+    assert {path.name for path in (root / "sent").glob("*/*.png")} == {"40.png", "42.png", "43.png"}
+    reasons = {f"{path.parent.name}/{path.stem}": path.read_text() for path in (root / "rejected").glob("*/*.reason")}
+    assert len(reasons) == 8
+    assert all(name.split("/")[0] in ("H 0", "H%2F0", "Hé") or name in ("H0/lists", "H1/41") for name in reasons)
+
+
+def test_wrong_key_or_address_leaves_all_where_it_is(store: Store, service: Process, tmp_path: Path):
+    make_key(store, tmp_path, "ingest")
+    root, wrong = spool(tmp_path, 2, first=60), tmp_path / "wrong.key"
+    wrong.write_text("nonsense")
+    for base, says in ((service.base, "401"), ("127.0.0.1", "no heliotwin")):
+        done = run(base, wrong, root, "--patience", "5")
+        assert done.returncode == 1
+        assert says in done.stderr
+        assert "stopped, the rest is left for the next time" in done.stderr
+        assert len(done.stderr.splitlines()) == 1
+    assert len(list(root.glob("H*/*.png"))) == 2
+    missing = run(service.base, tmp_path / "none.key", root)
+    assert (missing.returncode, f"there is no file {tmp_path / 'none.key'}" in missing.stderr) == (2, True)
+
+
 def test_missing_spool_is_named(tmp_path: Path):
     key = tmp_path / "no.key"
     key.write_text("x")
@@ -137,5 +172,6 @@ def test_patience_ends(tmp_path: Path):
     key.write_text("x")
     done = run("http://127.0.0.1:9", key, root, "--patience", "0.1")
     assert done.returncode == 1
-    assert "TimeoutError" in done.stderr
+    assert "stopped, the rest is left for the next time: POST /v1/heliostats/H" in done.stderr
+    assert "Traceback" not in done.stderr
     assert len(list(root.glob("H*/*.png"))) == 2

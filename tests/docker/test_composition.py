@@ -12,12 +12,14 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 
 from tests.faults.harness import until
 
 from . import engine
 from .engine import Client, Composition
+from .test_alerts import binary
 
 # One worker of pytest-xdist does all of this file: its tests share an image, and two compositions would be no faster.
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200), pytest.mark.xdist_group("containers")]
@@ -210,3 +212,63 @@ def test_upgrade_from_the_previous_image(start: Start, version: str, previous: s
         assert still_says(now, before), (now, before)
         assert "images new" not in imported(client, stj)
         predicts_and_forecasts(client)
+
+
+@pytest.fixture(scope="module")
+def monitors(checkout: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
+    """Images with real Prometheus and Alertmanager, by the services that they are for."""
+    programs = {
+        "prometheus": (binary("prometheus"), "tsdb.path"),
+        "alertmanager": (binary("alertmanager", "prometheus-alertmanager"), "path"),
+    }
+    folder = tmp_path_factory.mktemp("monitors")
+    images = {
+        name: engine.build_monitor(program, name, kind, folder / name, f"heliotwin-test-{name}")
+        for name, (program, kind) in programs.items()
+    }
+    yield images
+    engine.run("docker", "rmi", "--force", *images.values())
+
+
+def test_monitoring_watches_service_and_worker_and_tells_when_one_is_away(
+    start: Start, version: str, monitors: dict[str, str]
+):
+    """The composition's profile as it is, but for the images, and Grafana, which there is no program of in Debian."""
+    plant = start(version)
+    plant.instead(monitors)
+    plant.up()
+    plant("--profile", "monitoring", "up", "-d", *monitors)
+    base = {name: f"http://127.0.0.1:{plant.environment[f'HELIOTWIN_{name.upper()}_PORT']}" for name in monitors}
+
+    def asked(name: str, path: str) -> Any:
+        try:
+            answer = httpx.get(base[name] + path)
+        except httpx.TransportError:
+            return None
+        return answer.json() if answer.is_success else None
+
+    def up() -> set[str]:
+        found = asked("prometheus", "/api/v1/targets")
+        targets = found["data"]["activeTargets"] if found else []
+        return {target["labels"]["job"] for target in targets if target["health"] == "up"}
+
+    until(lambda: up() == {"heliotwin", "heliotwin-worker"}, "service and worker are watched", 60)
+    rules = asked("prometheus", "/api/v1/rules")["data"]["groups"]
+    assert [rule["health"] in ("ok", "unknown") for group in rules for rule in group["rules"]] == [True] * 15
+    until(lambda: asked("prometheus", "/api/v1/alertmanagers")["data"]["activeAlertmanagers"], "alerts have a way", 60)
+
+    rules_file = plant.folder / "prometheus-rules.yml"
+    patient = rules_file.read_text(encoding="utf-8")
+    try:
+        rules_file.write_text(re.sub(r"for: \d+[mh]", "for: 0s", patient), encoding="utf-8")  # in place: it is mounted
+        plant("kill", "-s", "HUP", "prometheus")
+        plant("stop", "service")
+        until(
+            lambda: (
+                "HeliotwinDown" in {one["labels"]["alertname"] for one in asked("alertmanager", "/api/v2/alerts") or ()}
+            ),
+            "somebody is told that the service is away",
+            150,
+        )
+    finally:
+        rules_file.write_text(patient, encoding="utf-8")

@@ -209,6 +209,14 @@ def test_weather_that_is_not_stored_is_not_asked(world):
     assert covariates["temperature"] == {"measurements": 80, "share": None}  # of two heliostats
 
 
+def test_nothing_is_explained_of_a_measurement_that_is_foreign(world):
+    field, _, readings = world
+    (one,) = readings["H00"][:1]
+    done = calibrate({"H00": field["H00"]}, {"H00": [replace(one, motors=one.motors + 2e4)]})
+    assert done.mounts["H00"].foreign.all()
+    assert {one.measurements for one in done.covariates.values()} == {0}
+
+
 def recorded_by(clock_minutes: float, since: float, readings: dict[str, list[Reading]]) -> dict[str, list[Reading]]:
     """Readings whose suns are computed by a clock that goes so many minutes fast from a day on."""
     return {

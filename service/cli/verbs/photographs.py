@@ -112,7 +112,9 @@ def forecast(
         datetime | None,
         typer.Option(help="The sun at a time, in UTC unless it has a zone.", metavar="TIME", formats=_TIMES),
     ] = None,
-    target: Annotated[str | None, typer.Option(help="With --sun or --at: the folder's target to aim at.")] = None,
+    target: Annotated[
+        str | None, typer.Option(help="With --sun or --at: the folder's target or receiver to aim at.")
+    ] = None,
     plane: Annotated[
         Path | None,
         typer.Option(help="With --sun or --at: JSON with center, normal, width, height [m].", metavar="FILE"),

@@ -7,7 +7,7 @@ class FieldProblem(BaseModel):
     """What is wrong with one field of the request."""
 
     field: str = Field(examples=["sun.elevation_deg"])
-    message: str = Field(examples=["Input should be less than or equal to 90"])
+    message: str = Field(examples=["must be 90 or less"])
 
 
 class Problem(BaseModel):
@@ -19,7 +19,7 @@ class Problem(BaseModel):
     )
     title: str = Field(examples=["Unprocessable Content"])
     status: int = Field(examples=[422])
-    detail: str = Field(examples=["sun.elevation_deg: Input should be less than or equal to 90"])
+    detail: str = Field(examples=["sun.elevation_deg: must be 90 or less"])
     instance: str = Field(examples=["/v1/forecasts"])
     request_id: str = Field(description="Quote it when reporting a fault; it stands in the service's log.")
     errors: list[FieldProblem] | None = Field(

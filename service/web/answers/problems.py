@@ -4,7 +4,7 @@ import errno
 import json
 import logging
 import sqlite3
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from http import HTTPStatus
 from typing import Any
 
@@ -17,6 +17,7 @@ from starlette.types import Scope
 
 from model.errors import ImageRefusedError, InvalidInputError, ModelError, UnreachableError
 from service.base import faults
+from service.base.wording import field_of, sentence_of
 from service.store.database import is_deadlock
 from service.web.answers import pages
 
@@ -67,16 +68,8 @@ _RETRY_AFTER_S: dict[type[Exception], str] = {
 # PostgreSQL's code for a disk without room.
 _DISK_FULL = "53100"
 
-# What the caller may do about an error that comes without a sentence of its own.
-_REMEDY_OF = {
-    "missing": "send it",
-    "extra_forbidden": "leave it out, or check its spelling",
-    "string_pattern_mismatch": "see /docs for the form of a name",
-    "timezone_aware": "add the zone, such as Z or +02:00",
-}
-
 _REMEDIES = {
-    400: "the request could not be read; check its body",
+    400: "the body could not be read; send it whole, in the form that Content-Type says",
     404: "there is nothing at this path; see /docs for the paths",
     405: "this path does not take this method; see the Allow header",
 }
@@ -130,14 +123,6 @@ def problem(
     )
 
 
-def _field(location: Sequence[int | str]) -> str:
-    """A field's name without the part of the request that it stands in."""
-    inner = location[1:] if location and location[0] in ("body", "path", "query", "header") else location
-    # Where a body may be one of several, the alternative that was taken stands in brackets.
-    inner = [part for part in inner if not str(part).startswith("(")]
-    return ".".join(str(part) for part in inner) or "body"
-
-
 def _on_known(request: Request, error: Exception) -> Response:
     status = next(STATUS[kind] for kind in type(error).__mro__ if kind in STATUS)
     if isinstance(error, faults.StoreDamagedError):
@@ -149,19 +134,12 @@ def _on_known(request: Request, error: Exception) -> Response:
 
 
 def _field_problem(entry: Mapping[str, Any]) -> dict[str, str]:
-    """Which field is wrong, and what to do about it."""
-    field, message = _field(entry["loc"]), str(entry["msg"]).removeprefix("Value error, ")
-    if entry["type"] == "json_invalid":
-        # The place of the fault stands where a field's name would.
-        field = "body" if isinstance(entry["loc"][-1], int) else field
-        where = f" at character {entry['loc'][-1]}" if isinstance(entry["loc"][-1], int) else ""
-        return {"field": field, "message": f"is no JSON{where}: {_why(entry)}; send one JSON document"}
-    remedy = _REMEDY_OF.get(entry["type"])
-    return {"field": field, "message": f"{message}; {remedy}" if remedy else message}
-
-
-def _why(entry: Mapping[str, Any]) -> str:
-    return str(entry.get("ctx", {}).get("error", entry["msg"])).rstrip(".")
+    """Which field is wrong, without the part of the request that it stands in, and what to do about it."""
+    location = entry["loc"]
+    inner = location[1:] if location and location[0] in ("body", "path", "query", "header") else location
+    if entry["type"] == "json_invalid" and isinstance(location[-1], int):
+        inner = ()  # the place of the fault stands where a field's name would
+    return {"field": field_of(inner) or "body", "message": sentence_of(entry)}
 
 
 def _on_validation(request: Request, error: Exception) -> Response:
@@ -174,7 +152,8 @@ def _on_validation(request: Request, error: Exception) -> Response:
 def _on_http(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
     phrase = HTTPStatus(error.status_code).phrase
-    plain = str(error.detail) in ("", phrase)
+    # What a body could not be read for is told by its reader, in words that are not ours.
+    plain = str(error.detail) in ("", phrase) or error.status_code == HTTPStatus.BAD_REQUEST
     detail = _REMEDIES.get(error.status_code, phrase) if plain else str(error.detail)
     return problem(request.scope, error.status_code, detail, error.headers)
 

@@ -6,6 +6,7 @@ from typing import Annotated, Any, Self
 from fastapi import APIRouter, Body, Depends
 from pydantic import BaseModel, Field, model_validator
 
+from model.pointing import Weather
 from service import store
 from service.base.fields import Azimuth, Elevation, Flag, Model, Moment, Name
 from service.jobs.asking import ask_for
@@ -15,7 +16,7 @@ from service.store.tables import CorrectionRow, MeasurementRow
 from service.twin.correcting import Changes, correct
 from service.twin.runtime import Runtime
 from service.web.answers.openapi import problems
-from service.web.api.measurements import MeasurementOut, Motors, measurement_out
+from service.web.api.measurements import MeasurementOut, Motors, Temperature, WindFrom, WindSpeed, measurement_out
 from service.web.door.dependencies import (
     COMPUTES,
     OPERATE,
@@ -37,6 +38,9 @@ class CorrectionIn(Model):
     sun_elevation: Elevation | None = Field(default=None, description="[deg]")
     taken_at: Moment | None = None
     motor_position: Motors | None = Field(default=None, description="Of both axes [steps].")
+    wind_speed_m_s: WindSpeed | None = Field(default=None, description="[m/s]")
+    wind_from_deg: WindFrom | None = Field(default=None, description="From north, over east [deg].")
+    temperature_c: Temperature | None = Field(default=None, description="[°C]")
     excluded: Flag | None = Field(default=None, description="Whether nothing shall be made from it any more.")
     remake: Flag = Field(default=False, description="Begin a job that makes the heliostat's surface anew.")
 
@@ -98,7 +102,7 @@ def patch_measurement(
     """Correct what is known of a photograph, or exclude it, in all its images; its history is kept.
 
     With another target it is measured anew. What was made from it stays, and is named here; with `remake` a job makes
-    the heliostat's surface anew.
+    the heliostat's surface anew. Another weather outdates no surface: only calibrations ask for it.
     """
     changes = Changes(
         reason=correction.reason,
@@ -107,6 +111,7 @@ def patch_measurement(
         sun_elevation_deg=correction.sun_elevation,
         taken_at=correction.taken_at,
         motor_position=correction.motor_position,
+        weather=Weather(correction.wind_speed_m_s, correction.wind_from_deg, correction.temperature_c),
         excluded=correction.excluded,
     )
     row = correct(runtime, name, measurement, changes, identity.name)

@@ -43,6 +43,17 @@ from service.web.api.jobs import IdempotencyKey, JobOut, job_out
 from service.web.door.dependencies import COMPUTES, OPERATE, READ, IdentityDep, Limit, RuntimeDep, require_json
 
 
+def _surface_by(told: Any) -> str:
+    """Whether a surface is named by a word or by its version."""
+    return "(word)" if isinstance(told, str) else "(version)"
+
+
+Surface = Annotated[
+    Annotated[Literal["current", "ideal"], Tag("(word)")] | Annotated[VersionIn, Tag("(version)")],
+    Discriminator(_surface_by),
+]
+
+
 class ForecastIn(Model):
     """A flux map to compute."""
 
@@ -59,7 +70,7 @@ class ForecastIn(Model):
         "in `sun`, else the newest, says where they send the light, or the heliostat's properties where it was never "
         "calibrated.",
     )
-    surface: Literal["current", "ideal"] | VersionIn = Field(
+    surface: Surface = Field(
         default="current", description="The heliostat's current surface, the ideal one, or a version."
     )
     dni_w_m2: Number = Field(default=1000.0, gt=0, le=2000, description="Direct normal irradiance [W/m2].")

@@ -23,11 +23,10 @@ from service.base.fields import (
     Name,
     Number,
     Rows,
-    Wgs84,
 )
 from service.drawing.pictures import flux_picture
 from service.sources.photograph import Photograph
-from service.sources.schema import paint_motors, paint_spot
+from service.sources.schema import FocalSpot, FocalSpots, paint_motors
 from service.store.tables import MeasurementRow
 from service.twin.ingest import ingest
 from service.twin.runtime import Runtime
@@ -56,6 +55,11 @@ Motors = Annotated[
 Pixel = tuple[Annotated[Number, Field(ge=-1e5, le=1e5)], Annotated[Number, Field(ge=-1e5, le=1e5)]]
 
 
+WindSpeed = Annotated[Number, Field(ge=0, le=100, description="Of the wind then [m/s].")]
+WindFrom = Annotated[Number, Field(ge=0, le=360, description="Where the wind came from, from north, over east [deg].")]
+Temperature = Annotated[Number, Field(ge=-90, le=60, description="Of the air then [°C].")]
+
+
 class MeasurementIn(Model):
     """What is known of a photograph; PAINT's ``calibration-properties.json`` with ``kind`` (and ``id``) added fits."""
 
@@ -71,7 +75,7 @@ class MeasurementIn(Model):
     motor_position: Motors | None = Field(
         default=None, description="Motor positions of both axes [steps], as a pair or as PAINT's object."
     )
-    focal_spot: Annotated[Wgs84, BeforeValidator(paint_spot)] | None = Field(
+    focal_spot: FocalSpot | None = Field(
         default=None,
         description="Known centre of mass: latitude [deg], longitude [deg], altitude [m], or PAINT's object (UTIS is "
         "preferred).",
@@ -81,11 +85,9 @@ class MeasurementIn(Model):
         description="Positions (x, y) [px] of the target's upper left, upper right, lower left and lower right "
         "corners in a raw frame; without them they are searched.",
     )
-    wind_speed_m_s: float | None = Field(default=None, ge=0, le=100, description="Of the wind then [m/s].")
-    wind_from_deg: float | None = Field(
-        default=None, ge=0, le=360, description="Where the wind came from, from north, over east [deg]."
-    )
-    temperature_c: float | None = Field(default=None, ge=-90, le=60, description="Of the air then [°C].")
+    wind_speed_m_s: WindSpeed | None = None
+    wind_from_deg: WindFrom | None = None
+    temperature_c: Temperature | None = None
 
 
 class MeasurementOut(BaseModel):
@@ -101,8 +103,9 @@ class MeasurementOut(BaseModel):
     motor_position: tuple[float, float] | None = Field(description="[steps]")
     taken_at: datetime | None
     focal_spot: tuple[float, float, float] | None = Field(
-        description="As given: latitude [deg], longitude [deg], altitude [m]."
+        description="As given, UTIS's, else HeliOS's: latitude [deg], longitude [deg], altitude [m]."
     )
+    helios_spot: tuple[float, float, float] | None = Field(description="HeliOS's, where it was given.")
     wind_speed_m_s: float | None = Field(description="[m/s]")
     wind_from_deg: float | None = Field(description="From north, over east [deg].")
     temperature_c: float | None = Field(description="[°C]")
@@ -144,6 +147,7 @@ def measurement_out(heliostat_name: str, row: MeasurementRow) -> MeasurementOut:
             "motor_position": pair(row.motor_axis_1, row.motor_axis_2),
             "taken_at": row.taken_at,
             "focal_spot": row.focal_spot_wgs84,
+            "helios_spot": row.helios_spot_wgs84,
             "wind_speed_m_s": row.wind_speed_m_s,
             "wind_from_deg": row.wind_from_deg,
             "temperature_c": row.temperature_c,
@@ -198,6 +202,8 @@ _METADATA_EXAMPLE = (
 
 
 def _photograph(metadata: MeasurementIn) -> Photograph:
+    spot = metadata.focal_spot
+    utis, helios = (spot.UTIS, spot.HeliOS) if isinstance(spot, FocalSpots) else (spot, None)
     return Photograph(
         target_name=metadata.target_name,
         kind=metadata.kind,
@@ -206,7 +212,8 @@ def _photograph(metadata: MeasurementIn) -> Photograph:
         external_id=metadata.id,
         taken_at=metadata.taken_at,
         motor_position=metadata.motor_position,
-        focal_spot_wgs84=metadata.focal_spot,
+        focal_spot_wgs84=helios if utis is None else utis,
+        helios_spot_wgs84=helios,
         corners=metadata.corners,
         weather=Weather(metadata.wind_speed_m_s, metadata.wind_from_deg, metadata.temperature_c),
     )
@@ -221,6 +228,13 @@ def get_row(name: str, measurement: str, runtime: Runtime) -> MeasurementRow:
 def _text(part: Any) -> Any:
     """A part of the form; browsers send JSON as if it were a file."""
     return part.file.read(_MOST_METADATA + 1) if isinstance(part, UploadFile | StarletteUploadFile) else part
+
+
+def _file(part: Any) -> Any:
+    """A part of the form that is a file; the framework's own words for another name its classes."""
+    if not isinstance(part, StarletteUploadFile):
+        raise ValueError("must be a file; send it as a part with a filename")
+    return part
 
 
 def _bytes(upload: UploadFile, limit: int) -> bytes:
@@ -241,7 +255,7 @@ def _bytes(upload: UploadFile, limit: int) -> bytes:
 )
 def post_measurement(
     name: NamePath,
-    image: Annotated[UploadFile, File(description="A PNG, JPEG, TIFF or BMP file.")],
+    image: Annotated[UploadFile, BeforeValidator(_file), File(description="A PNG, JPEG, TIFF or BMP file.")],
     metadata: Annotated[
         Json[MeasurementIn], BeforeValidator(_text), Form(description="JSON", examples=[_METADATA_EXAMPLE])
     ],

@@ -7,13 +7,16 @@ import socket
 import sqlite3
 import subprocess
 import sys
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
+from rich.console import Console
 
 from service.base.settings import Settings
+from service.cli import demo
 from service.cli import folder as verbs
 from service.cli.demo_plant import write_plant
 from service.sources.folder import read_folder
@@ -141,6 +144,23 @@ def test_what_listens_says_where_and_answers(tmp_path: Path):
         try:
             url = json.loads(process.stdout.readline())["url"]
             assert httpx.get(f"{url}/livez").status_code == 200
+        finally:
+            process.terminate()
+
+
+def test_the_last_line_of_the_demonstration_starts_the_service(tmp_path: Path):
+    """As it is printed, whatever the folder is called."""
+    printed = StringIO()
+    demo._print(Console(file=printed, width=40), [], tmp_path, tmp_path / "a store's folder")
+    line, port = printed.getvalue().splitlines()[-1], free_port()
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    command = ["bash", "-c", f"exec env {line} --port {port} --json"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment) as process:
+        assert process.stdout is not None
+        try:
+            url = json.loads(process.stdout.readline())["url"]
+            assert httpx.get(f"{url}/livez").status_code == 200
+            assert (tmp_path / "a store's folder" / "heliotwin.sqlite").is_file()
         finally:
             process.terminate()
 

@@ -1,6 +1,7 @@
 """The command line on measurement folders: DESIGN.md, section 6, on a made plant and on the real ones."""
 
 import json
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -10,8 +11,10 @@ import numpy as np
 import pytest
 
 from model.effects.gravity_bending import GravityBending
+from model.plant import Cylinder
 from service.cli.folder_forecast import forecast_folder
 from service.sources.folder import read_folder
+from service.sources.paint_documents import tower_json
 
 
 def heliotwin(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
@@ -225,6 +228,32 @@ def test_forecast_for_a_sun_and_a_plane_needs_no_photographs(made_plant, tmp_pat
     sun = ("--sun", by_time["sun"]["azimuth_deg"], by_time["sun"]["elevation_deg"], "--plane", tmp_path / "plane.json")
     by_sun = succeeds("forecast", made_plant, "--out", tmp_path / "b", *wanted, *sun)
     assert by_sun["heliostats"][name]["power_w"] == pytest.approx(by_time["heliostats"][name]["power_w"], rel=0.02)
+
+
+def test_forecast_on_a_receiver_by_its_name(made_plant, tmp_path):
+    """Its map is unrolled, and holds the power that the mirror throws on a plane in its place."""
+    root = tmp_path / "plant"
+    shutil.copytree(made_plant, root)
+    (file,) = root.glob("*tower-measurements.json")
+    plant = read_folder(root).plant
+    middle = plant.targets["calibration_target"].center + [0.0, 0.0, 12.0]
+    drum = Cylinder("drum", middle, np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]), 8.0, 14.0, 120.0)
+    tower = tower_json(replace(plant, receivers={"drum": drum}), {})
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"drum": tower["drum"]}))
+    name, *_ = sorted(plant.heliostats)
+    wanted = ("--surfaces", "ideal", "--heliostat", name, "--sun", "0", "45")
+    on_drum = succeeds("forecast", root, "--out", tmp_path / "drum", *wanted, "--target", "drum")
+    plane = {"center": middle.tolist(), "normal": [0.0, 1.0, 0.0], "width": 14.0, "height": 14.0}
+    (tmp_path / "plane.json").write_text(json.dumps(plane))
+    beside = succeeds("forecast", root, "--out", tmp_path / "plane", *wanted, "--plane", tmp_path / "plane.json")
+    entry = on_drum["heliostats"][name]
+    assert on_drum["target"] == "drum"
+    assert entry["power_w"] == pytest.approx(beside["heliostats"][name]["power_w"], rel=0.02)
+    with np.load(tmp_path / "drum" / name / "forecast.npz") as maps:
+        assert set(maps) == {"flux"}
+        pixel = drum.width * drum.height / maps["flux"].size
+        assert maps["flux"].sum() * pixel == pytest.approx(entry["power_w"], rel=0.01)
+        assert maps["flux"].max() == pytest.approx(entry["peak_w_m2"])
 
 
 @pytest.mark.parametrize(

@@ -107,7 +107,7 @@ def test_declared_effects(tmp_path):
 @pytest.mark.parametrize(
     ("content", "says"),
     [
-        ("{", "not valid JSON"),
+        ("{", "is no JSON"),
         ("{}", "'declared' is missing"),
         ('{"declared": {"sun": {"shape": "square"}}}', "'shape' must be"),
         ('{"declared": {"sun": {"shape": "buie", "circumsolar_ratio": NaN}}}', "finite number"),

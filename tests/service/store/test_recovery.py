@@ -205,6 +205,14 @@ def test_back_up_of_another_engine_or_a_newer_schema_is_refused(runtime: Runtime
         (folder / "manifest.json").write_text(json.dumps(document | change))
         with pytest.raises(InvalidInputError):
             restore(elsewhere, folder)
+    for text, says in (
+        ("{", "is no JSON, wrong at line 1, column 2"),
+        ("[]", "must be a JSON object"),
+        (json.dumps({"format": document["format"]}), "has no engine, revision"),
+    ):
+        (folder / "manifest.json").write_text(text)
+        with pytest.raises(InvalidInputError, match=says):
+            restore(elsewhere, folder)
 
 
 def test_back_up_of_an_older_schema_comes_back_and_is_upgraded(runtime: Runtime, elsewhere: Settings, tmp_path: Path):

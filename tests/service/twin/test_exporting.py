@@ -62,12 +62,14 @@ def jpeg(seed: int) -> bytes:
 def filled(client: TestClient, tower: dict[str, Any]) -> TestClient:
     """Photographs with all that is known of them, a measured surface and a predicted one, a receiver, a model."""
     send, spot = poster(client), [50.9136, 6.3879, 123.0]
-    known = {"taken_at": "2024-06-03T11:30:00Z", "motor_position": [31234.0, 45012.5], "focal_spot": spot}
+    both = {"UTIS": spot, "HeliOS": [50.9137, 6.3878, 123.5]}
+    known = {"taken_at": "2024-06-03T11:30:00Z", "motor_position": [31234.0, 45012.5], "focal_spot": both}
     known |= {"wind_speed_m_s": 3.5, "wind_from_deg": 210.0, "temperature_c": -2.25}
     send(png(1), id="1", **known)
     send(png(2), id="1", kind="cropped", **known)
     send(png(3, refused=True), id="2", sun_azimuth=-33.25)
-    send(jpeg(4), id="3", kind="raw", target_name="upper", taken_at="2024-06-04T09:00:00.25Z")
+    helios = {"HeliOS": spot}
+    send(jpeg(4), id="3", kind="raw", target_name="upper", taken_at="2024-06-04T09:00:00.25Z", focal_spot=helios)
     send(png(5))
     send(png(6), id="bad")
     client.patch("/v1/heliostats/AA39/measurements/bad", json={"excluded": True, "reason": "a bird"})

@@ -43,6 +43,21 @@ def test_same_image_with_other_values_is_a_conflict(known: TestClient, post: Pos
     assert known.get(f"{BASE}/1").json()["sun_azimuth"] == 20.0
 
 
+def test_weather_is_corrected_and_outdates_nothing(known: TestClient, operations: FakeOperations):
+    measured = operations.measured
+    body = patch(known, wind_speed_m_s=4.5, wind_from_deg=210.0).json()
+    now_known = {name: body["measurement"][name] for name in ("wind_speed_m_s", "wind_from_deg", "temperature_c")}
+    assert now_known == {"wind_speed_m_s": 4.5, "wind_from_deg": 210.0, "temperature_c": None}
+    assert patch(known, temperature_c=-3.0, wind_from_deg=30).json()["measurement"]["wind_speed_m_s"] == 4.5
+    first, second = known.get(f"{BASE}/1/corrections").json()
+    assert first["before"] == {"wind_speed_m_s": None, "wind_from_deg": None}
+    assert (second["before"]["wind_from_deg"], second["after"]["wind_from_deg"]) == (210.0, 30.0)
+    assert patch(known, temperature_c=-3.0).status_code == 409
+    assert patch(known, temperature_c=90.0).json()["detail"] == "temperature_c: must be 60 or less"
+    assert operations.measured == measured
+    assert known.get("/v1/heliostats/AA39/surfaces/1").json()["outdated"] == []
+
+
 def test_photograph_is_corrected_and_its_history_kept(known: TestClient, post: Post, operations: FakeOperations):
     measured = operations.measured
     answer = patch(known, sun_azimuth=30.0)

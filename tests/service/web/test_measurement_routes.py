@@ -36,7 +36,7 @@ def test_measurement_is_stored_and_read_back(client: TestClient, post: Post):
     assert body["id"] == body["external_id"] == "205363"
     assert (body["accepted"], body["reason"], body["center_of_mass"]) == (True, None, [0.5, -0.25])
     assert body["motor_position"] == [30076, 37935]
-    assert body["focal_spot"] == [50.9, 6.38, 122.0]
+    assert (body["focal_spot"], body["helios_spot"]) == ([50.9, 6.38, 122.0], [50.9, 6.38, 122.1])
     assert body["taken_at"] == "2024-05-01T08:00:00Z"
     assert body["quality"]["accepted"] is True
     assert client.get(f"{BASE}/205363").json() == body

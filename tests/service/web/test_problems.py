@@ -189,13 +189,13 @@ def test_unready_without_weights(bare: TestClient, monkeypatch: pytest.MonkeyPat
 def test_problem_names_its_kind_the_field_and_the_remedy(refusing: TestClient):
     broken = refusing.post("/v1/forecasts", content='{"heliostat": oops}', headers={"Content-Type": "application/json"})
     assert broken.json()["type"] == "urn:heliotwin:problem:invalid"
-    assert broken.json()["detail"].startswith("body: is no JSON at character 14: Expecting value")
+    assert broken.json()["detail"].startswith("body: is no JSON, wrong at character 14; make it")
     unknown = refusing.post("/v1/heliostats/AA39/surfaces", json={"metod": "network"}).json()
     assert unknown["errors"] == [
-        {"field": "metod", "message": "Extra inputs are not permitted; leave it out, or check its spelling"}
+        {"field": "metod", "message": "is not known here; leave it out, or check its spelling"}
     ]
     missing = refusing.post("/v1/forecasts", json={"heliostat": "AA39", "target": "lower"}).json()
-    assert missing["detail"] == "sun: Field required; send it"
+    assert missing["detail"] == "sun: is missing; send it"
     assert refusing.get("/v1/nothing").json()["type"] == "urn:heliotwin:problem:not-found"
 
 
