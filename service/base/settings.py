@@ -39,6 +39,17 @@ MAP_SCALES: dict[str, tuple[float, float]] = {
 }
 """What is fine and what is poor of the figures that the field's map shows, unless the settings say otherwise."""
 
+FIGURE_SCALES: dict[str, float] = {
+    "heights": 2.0,
+    "height_change": 1.0,
+    "height_std": 0.5,
+    "flux_difference": 0.3,
+    "mean_difference": 0.1,
+}
+"""Where the colours of maps end, on both sides of zero, unless the settings say otherwise: heights of a mirror, their
+change and their standard deviation [mm]; forecast minus photograph, of one and in the mean [of the measured peak].
+"""
+
 
 def is_loopback(host: str) -> bool:
     """Whether only this machine can reach a server that listens on ``host``."""
@@ -228,6 +239,13 @@ class Settings(BaseSettings):
         "[%], deviation, uncertainty [mm], misfit [%], age [days], pointing [mrad] and sun_span [deg], such as "
         '{"accuracy": [95, 80]}.',
     )
+    figure_scales: dict[str, float] = Field(
+        default_factory=dict,
+        validate_default=True,
+        description="JSON: where the colours of maps end, on all pages alike, of heights, height_change and height_std "
+        "[mm], flux_difference and mean_difference [share of the measured peak], such as "
+        '{"heights": 3}; what lies beyond has the end colours, and is said.',
+    )
     attention_accuracy: float = Field(
         default=0.75, ge=0, le=1, description="Forecast accuracy below which a heliostat needs attention [1]."
     )
@@ -288,6 +306,17 @@ class Settings(BaseSettings):
             if (poor < fine) is not fine_is_high or fine == poor or not math.isfinite(fine - poor):
                 raise ValueError(f"{name}: give what is fine, then what is poor, not {fine:g}, {poor:g}")
         return MAP_SCALES | value
+
+    @field_validator("figure_scales")
+    @classmethod
+    def _all_ends(cls, value: dict[str, float]) -> dict[str, float]:
+        unknown = sorted(set(value) - set(FIGURE_SCALES))
+        if unknown:
+            raise ValueError(f"there is no scale {', '.join(unknown)}; name {', '.join(FIGURE_SCALES)}")
+        for name, end in value.items():
+            if not 0 < end < math.inf:
+                raise ValueError(f"{name}: give where the colours end, more than 0, not {end:g}")
+        return FIGURE_SCALES | value
 
     @field_validator("time_zone")
     @classmethod

@@ -2,7 +2,7 @@
 
 import itertools
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from statistics import fmean
@@ -78,7 +78,8 @@ class ComparisonFigure:
     def drawn(self) -> bytes:
         """The three side by side, as PNG."""
         title = f"{self.comparison.measurement.identifier}: accuracy {self.comparison.accuracy:.1%}"
-        return comparison_picture(self.measured.values, self.forecast.values, self.measured.width, title)
+        bounds = self.measured.scale.high, self.difference.scale.high
+        return comparison_picture(self.measured.values, self.forecast.values, self.measured.width, title, bounds)
 
 
 def _newest_surfaces(session: Session, heliostat: HeliostatRow) -> list[SurfaceRow]:
@@ -105,27 +106,31 @@ def _histories(listed: Sequence[Revision]) -> list[History]:
     return [*drawn, charts.history("Change from the version before", "mm", changes, 3)] if changes else drawn
 
 
-def space_view(z: NDArray[Any], size: tuple[float, float]) -> str:
-    """What `surface3d.js` draws: heights [mm] of each facet on an even grid, the mirror's size [m], and colours."""
+def space_view(z: NDArray[Any], size: tuple[float, float], bound: float) -> str:
+    """What `surface3d.js` draws: heights [mm] of each facet on an even grid, the mirror's size [m], and colours.
+
+    Those end at ``bound`` [mm], as on the map.
+    """
     heights = mirror_heights(z, _SPACE_SAMPLES)
     colours = Scale("RdBu_r", 0, 1, "").names(np.linspace(0, 1, 33).tolist())
-    return json.dumps({"size": size, "facets": np.round(heights, 4).tolist(), "colours": colours})
+    return json.dumps({"size": size, "bound": bound, "facets": np.round(heights, 4).tolist(), "colours": colours})
 
 
 @dataclass(frozen=True)
 class ComparisonFigures:
-    """All comparisons, and the two scales that they share."""
+    """All comparisons, and the two scales that they share; ``beyond`` is the largest difference, where it lies so."""
 
     figures: list[ComparisonFigure]
     flux: Scale
     difference: Scale
+    beyond: float | None
 
 
-def comparison_figures(comparisons: Sequence[Comparison]) -> ComparisonFigures:
-    """Pictures in shares of each photograph's measured peak, as in the report of a study."""
+def comparison_figures(comparisons: Sequence[Comparison], bound: float) -> ComparisonFigures:
+    """Pictures in shares of each photograph's measured peak, as in a study's report; ``bound`` ends differences."""
     pairs = [(c.measured / c.measured.max(), c.forecast / c.measured.max()) for c in comparisons]
     top = max((float(image.max()) for pair in pairs for image in pair), default=1.0)
-    bound = max((float(np.abs(forecast - measured).max()) for measured, forecast in pairs), default=0.0)
+    largest = max((float(np.abs(forecast - measured).max()) for measured, forecast in pairs), default=0.0)
     flux, difference = charts.flux_scale(top, _OF_PEAK), charts.difference_scale(bound, _OF_PEAK)
     figures = []
     for comparison, (measured, forecast) in zip(comparisons, pairs, strict=True):
@@ -137,7 +142,7 @@ def comparison_figures(comparisons: Sequence[Comparison]) -> ComparisonFigures:
         name = comparison.measurement.identifier
         maps = [charts.heat_map(f"{what} flux of {name}", image, _WINDOW, scale) for what, image, scale in shown]
         figures.append(ComparisonFigure(comparison, *maps))
-    return ComparisonFigures(figures, flux, difference)
+    return ComparisonFigures(figures, flux, difference, largest if largest > bound else None)
 
 
 async def _book(request: Request) -> ComparisonBook:
@@ -150,17 +155,18 @@ ComparisonBookDep = Annotated[ComparisonBook, Depends(_book)]
 _UNDER_WAY = Compared(trouble="The forecasts of its photographs are being worked out; look again in a moment.")
 
 
-def _surface_context(surface: SurfaceRow, size: tuple[float, float]) -> dict[str, Any]:
+def _surface_context(surface: SurfaceRow, size: tuple[float, float], ends: Mapping[str, float]) -> dict[str, Any]:
     arrays = unpack(surface.arrays)
     shown = figures_of(surface.arrays)
     title = f"Surface {surface.version}: deviation from the ideal mirror, seen from the front"
-    deviation = charts.surface_map(title, arrays["z"], size)
-    uncertainty = charts.uncertainty_map("Standard deviation of the surface", arrays["z_std"], size)
+    deviation = charts.surface_map(title, arrays["z"], size, ends["heights"])
+    std = "Standard deviation of the surface"
+    uncertainty = charts.uncertainty_map(std, arrays["z_std"], size, ends["height_std"])
     return {
         "figures": shown,
         "surface_map": deviation,
         "uncertainty_map": uncertainty if shown.uncertainty_mm else None,
-        "space": space_view(arrays["z"], size),
+        "space": space_view(arrays["z"], size, ends["heights"]),
     }
 
 
@@ -230,8 +236,11 @@ def _read(
 
 
 @router.get("/heliostats/{name}")
-def get_heliostat_page(request: Request, read: Annotated[_Read, Depends(_read)], _turn: Turn) -> HTMLResponse:
+def get_heliostat_page(
+    request: Request, runtime: RuntimeDep, read: Annotated[_Read, Depends(_read)], _turn: Turn
+) -> HTMLResponse:
     """A heliostat with its current surface, or an earlier ``version``; nobody waits in his turn for comparisons."""
+    ends = runtime.settings.figure_scales
     listed, comparisons = versions(read.surfaces), read.compared.comparisons
     return render(
         request,
@@ -244,7 +253,7 @@ def get_heliostat_page(request: Request, read: Annotated[_Read, Depends(_read)],
         decided=read.decided,
         undoable=read.undoable,
         histories=_histories(listed) if listed else [],
-        comparisons=comparison_figures(comparisons),
+        comparisons=comparison_figures(comparisons, ends["flux_difference"]),
         trouble=read.compared.trouble,
         recent=RECENT,
         shots=read.shots[:MOST_PHOTOGRAPHS],
@@ -257,5 +266,5 @@ def get_heliostat_page(request: Request, read: Annotated[_Read, Depends(_read)],
         line=read.line,
         best=read.best,
         pointing=None if read.mount is None else _mount_context(read.mount),
-        **(_surface_context(read.surface, _size(read.row)) if read.surface is not None else {}),
+        **(_surface_context(read.surface, _size(read.row), ends) if read.surface is not None else {}),
     )

@@ -48,7 +48,7 @@ def test_versions_stand_side_by_side_with_what_they_forecast(pages: TestClient, 
     page = settled(pages, "/compare?heliostat=AA39")
     assert "AA39, version 1 with AA39, version 2" in page
     assert page.count('<svg class="figure" viewBox="0 0 430') == 6
-    assert "Deviation of AA39, version 2; from -1 to 1 mm" in page
+    assert "Deviation of AA39, version 2; from -2 to 2 mm" in page
     assert [made["resolution"] for made in operations.forecasts[-2:]] == [(128, 128)] * 2
     assert "they agree by 100.0" in page
     # Only the third photograph has been seen by neither.
