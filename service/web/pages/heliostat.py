@@ -22,7 +22,7 @@ from service.drawing import charts
 from service.drawing.charts import HeatMap, History, Scale
 from service.drawing.pictures import comparison_picture, mirror_heights
 from service.store import decisions, mounts
-from service.store.measurements import PhotographVerdict, Shot, list_shots
+from service.store.shots import PhotographVerdict, Shot, Wanted, list_shots
 from service.store.tables import DecisionRow, HeliostatRow, MountRow, SurfaceRow
 from service.twin.accuracy import RECENT, Compared, Comparison, ComparisonBook, rank_of
 from service.twin.field import Figures, Line, figures_of, read_lines
@@ -35,7 +35,7 @@ router = APIRouter(include_in_schema=False, dependencies=[READ])
 # Newest surfaces and photographs that the page lists.
 _MOST_SURFACES = 40
 MOST_PHOTOGRAPHS = 60
-"""Of a page."""
+"""Those beyond are on the page of all photographs."""
 # Last decisions on which surface is today's that the page tells.
 _MOST_DECISIONS = 5
 # Points along each side of a facet in the view in space.
@@ -199,7 +199,6 @@ class _Read:
     undoable: DecisionRow | None
     shots: list[Shot]
     verdict: PhotographVerdict | None
-    newer: int
     mount: MountRow | None
     line: Line
     best: Slot | None
@@ -213,7 +212,6 @@ def _read(
     field: FieldBookDep,
     version: Annotated[Version | None, Query()] = None,
     photographs: Annotated[PhotographVerdict | None, Query()] = None,
-    newer: Annotated[int, Query(ge=0, le=1_000_000, description="Newer photographs, which are left out.")] = 0,
 ) -> _Read:
     """A heliostat with its current surface, or an earlier ``version``; waits for what is compared elsewhere."""
     with runtime.database.reading() as session:
@@ -223,16 +221,14 @@ def _read(
         surfaces = _newest_surfaces(session, row)
         decided = decisions.list_decisions(session, row, _MOST_DECISIONS)
         undoable = decisions.find_undoable(session, row)
-        shots = list_shots(session, row, MOST_PHOTOGRAPHS + 1, photographs, newer)
+        shots = list_shots(session, Wanted(row, verdict=photographs), MOST_PHOTOGRAPHS + 1)
         mount = mounts.find_mount_at(session, row)
         shown, (line,) = book.read(session, row, surface), read_lines(session, row.id)
     # The rest of the page does not depend on them.
     compared = Compared() if shown is None else book.wait_for(shown) or _UNDER_WAY
     line = field.with_pointing(line)
     best = None if line.pointing is None else best_slot(runtime, name)
-    return _Read(
-        row, today, surface, surfaces, decided, undoable, shots, photographs, newer, mount, line, best, compared
-    )
+    return _Read(row, today, surface, surfaces, decided, undoable, shots, photographs, mount, line, best, compared)
 
 
 @router.get("/heliostats/{name}")
@@ -258,8 +254,7 @@ def get_heliostat_page(
         recent=RECENT,
         shots=read.shots[:MOST_PHOTOGRAPHS],
         verdict=read.verdict,
-        newer=read.newer,
-        older=read.newer + MOST_PHOTOGRAPHS if len(read.shots) > MOST_PHOTOGRAPHS else None,
+        older=read.shots[MOST_PHOTOGRAPHS - 1].mark if len(read.shots) > MOST_PHOTOGRAPHS else None,
         rank=rank_of(comparisons),
         accuracy_seen=fmean(seen) if (seen := [c.accuracy for c in comparisons if c.was_used]) else None,
         mount=read.mount,
