@@ -202,7 +202,10 @@ class Settings(BaseSettings):
         default=None, description="Folder whose subfolders jobs may import; without it no job imports."
     )
     job_retention_days: float = Field(
-        default=90.0, ge=0, le=36500, description="Jobs that ended so long ago [days] are deleted; 0 keeps all."
+        default=90.0,
+        ge=0,
+        le=36500,
+        description="Jobs that ended so long ago [days] are deleted, but for plans that are done; 0 keeps all.",
     )
     forecast_retention_days: float = Field(
         default=365.0, ge=0, le=36500, description="Forecasts made so long ago [days] are deleted; 0 keeps all."

@@ -11,7 +11,7 @@ from service.base.arrays import unpack
 from service.base.faults import NotFoundError
 from service.base.fields import Rows, State, Version
 from service.drawing.pictures import flux_picture
-from service.jobs.asking import ask_for, cancel_for
+from service.jobs.asking import ask_for, cancel_for, forget_for
 from service.jobs.kind import Kind, Kinds, result_of
 from service.store import queue
 from service.store.job_tables import JobRow
@@ -212,6 +212,12 @@ def get_job_events(
     """The job in short each time it changes, as server-sent events, until it ends."""
     watcher = Watcher(number, identity.name, presented)
     return stream(watchers, runtime, watcher, last_event_id, stopping)
+
+
+@router.delete("/{number}", responses=problems(404, 409), dependencies=[OPERATE])
+def delete_job(number: Number, runtime: RuntimeDep, identity: IdentityDep) -> JobOut:
+    """Delete a plan that is done: its result goes, and the job then ends as any other. Other jobs go by their age."""
+    return job_out(forget_for(runtime, number, identity.name))
 
 
 @router.post("/{number}/cancel", responses=problems(404, 409), dependencies=[OPERATE])

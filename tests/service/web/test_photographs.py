@@ -1,6 +1,8 @@
 """Photographs on the pages: one row each, whatever kinds came of it; small, outlined, and beside its light."""
 
+import csv
 import html
+import io
 import re
 from typing import Any
 
@@ -116,9 +118,11 @@ def test_pages_of_photographs_meet(field: TestClient, monkeypatch: pytest.Monkey
 
 
 def test_photographs_are_a_table_for_spreadsheets(field: TestClient):
-    lines = field.get("/photographs?verdict=used&table=photographs").text.splitlines()
-    assert lines[0].startswith("Photograph,Heliostat,Judged,Taken,Target,Sun azimuth [°],Sun elevation [°]")
-    assert [line.split(",")[1] for line in lines[1:]] == ["AA39", "AB01"]
+    rows = list(csv.DictReader(io.StringIO(field.get("/photographs?verdict=used&table=photographs").text)))
+    assert [(row["Heliostat"], row["Target"], float(row["Sun elevation [°]"])) for row in rows] == [
+        ("AA39", "lower", 45.0),
+        ("AB01", "upper", 45.0),
+    ]
 
 
 @pytest.mark.parametrize(
