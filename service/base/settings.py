@@ -268,6 +268,21 @@ class Settings(BaseSettings):
     attention_photograph_days: float = Field(
         default=30.0, gt=0, le=36500, description="So long after its last accepted photograph it does [days]."
     )
+    attention_camera_ratio: float = Field(
+        default=1.5,
+        gt=1,
+        le=100,
+        description="A camera changed where its photographs' signal, noise or sheet is that many times what it was.",
+    )
+    attention_camera_certainty: float = Field(
+        default=6.0, gt=0, le=100, description="How sure that must be [standard deviations, from day to day]."
+    )
+    attention_camera_days: int = Field(
+        default=5,
+        ge=2,
+        le=30,
+        description="Days with photographs since the change, and at least twice as many before it, that tell it.",
+    )
     attention_queue_s: float = Field(
         default=1800.0, gt=0, le=1e7, description="The queue is stuck where a job has waited for so long [s]."
     )
