@@ -21,7 +21,7 @@ SCHEMES: dict[str, Literal["light", "dark"]] = {"": "light", "-dark": "dark"}
 
 DARK = ("field", "heliostat", "plan")
 
-HIGHEST = 4000
+HIGHEST = 3200
 """What of a long page is taken [px]."""
 
 
@@ -64,7 +64,7 @@ def main() -> None:
         "photograph": f"{heliostat}/photographs/{options.photograph}",
         "compare": f"/compare?heliostat={options.heliostat}",
         "attention": "/attention",
-        "calibration-plan": "/calibration-plan",
+        "calibration-plan": "/calibration-plan?at=2026-06-21T10:00",
         "jobs": "/jobs",
         "studies": "/studies",
         "plant": "/plant",
@@ -92,7 +92,7 @@ def main() -> None:
                     file = options.out / f"{name}-{label}{suffix}.jpg"
                     height = min(page.evaluate("document.documentElement.scrollHeight"), HIGHEST)
                     clip = {"x": 0, "y": 0, "width": size["width"], "height": height}
-                    page.screenshot(path=file, full_page=True, clip=clip, type="jpeg", quality=35)
+                    page.screenshot(path=file, full_page=True, clip=clip, type="jpeg", quality=30)
                     width = page.evaluate("document.documentElement.scrollWidth")
                     print(f"{name}, {label}{suffix}: {answer.status}, {width} px wide", flush=True)
                 page.close()
