@@ -20,6 +20,9 @@ Array = NDArray[np.floating]
 
 _dates: Any = matplotlib.dates  # it says nothing of its types
 
+# From tick to tick at the most, in each unit of time.
+_LONGEST = {_dates.MONTHLY: 12, _dates.DAILY: 31, _dates.HOURLY: 24, _dates.MINUTELY: 60, _dates.SECONDLY: 60}
+
 
 Sheet = tuple[Sequence[str], Sequence[Sequence[Any]]]
 """Columns and rows."""
@@ -288,14 +291,11 @@ def timeline(
     low = 0.0 if from_zero else min(numbers) - room
     high = max(max(numbers) + 0.1 * (max(numbers) - low), low + 1e-9)
     locator = _dates.AutoDateLocator(minticks=3, maxticks=5, tz=UTC)
-    for unit_of_time, longest in (
-        (_dates.DAILY, 31),
-        (_dates.HOURLY, 24),
-        (_dates.MINUTELY, 60),
-        (_dates.SECONDLY, 60),
-    ):
-        # Its own steps end too early for five ticks over a little less than three of the next larger unit.
-        locator.intervald[unit_of_time] = [*locator.intervald[unit_of_time], longest]
+    for (
+        of_time,
+        longest,
+    ) in _LONGEST.items():  # its own steps end too early for five ticks over almost three of the next
+        locator.intervald[of_time] = [*locator.intervald[of_time], longest]
     places = [
         place for place in locator.tick_values(_dates.num2date(first), _dates.num2date(last)) if first <= place <= last
     ]
