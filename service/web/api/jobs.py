@@ -111,12 +111,13 @@ def creators(kinds: Kinds) -> APIRouter:
     asking = APIRouter(prefix="/jobs", tags=["jobs"])
     for kind in kinds.values():
         add_creator(asking, kind, f"/{kind.name}", f"post_{kind.name}_job")
-        asking.get(f"/{kind.name}", include_in_schema=False, dependencies=[READ])(_only_post)
+        for other in (asking.get, asking.delete):
+            other(f"/{kind.name}", include_in_schema=False, dependencies=[READ])(_only_post)
     return asking
 
 
 async def _only_post() -> None:
-    """There is nothing to read where jobs are asked for."""
+    """There is nothing to read, or to delete, where jobs are asked for."""
     raise HTTPException(status.HTTP_405_METHOD_NOT_ALLOWED, headers={"Allow": "POST"})
 
 
