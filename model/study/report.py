@@ -254,9 +254,9 @@ class Study:
         return dict(sorted(found.items(), key=lambda item: -abs(item[1])))
 
     def residual_map(self) -> Array:
-        """Mean of measured minus forecast (64, 64) with the effects found, in shares of the measured peaks."""
+        """Mean of forecast minus measured (64, 64) with the effects found, in shares of the measured peaks."""
         peaks = self.measured.max(axis=(1, 2), keepdims=True)
-        return np.asarray(((self.measured - self.after) / peaks).mean(axis=0))
+        return np.asarray(((self.after - self.measured) / peaks).mean(axis=0))
 
     def conclusion(self) -> str:
         """One plain sentence, and others where a pattern is left, or the images that judge are not independent."""
@@ -338,6 +338,7 @@ class Study:
                     "on_spot": round(float(self.pattern.on_spot), 4),
                     "depth": round(float(self.pattern.depth), 5),
                 },
+                "sign": "forecast minus photograph",
                 "mean_map_8x8": self.residual_map().reshape(8, 8, 8, 8).mean(axis=(1, 3)).round(4).tolist(),
             },
         }

@@ -39,6 +39,17 @@ MAP_SCALES: dict[str, tuple[float, float]] = {
 }
 """What is fine and what is poor of the figures that the field's map shows, unless the settings say otherwise."""
 
+FIGURE_SCALES: dict[str, float] = {
+    "heights": 2.0,
+    "height_change": 1.0,
+    "height_std": 0.5,
+    "flux_difference": 0.3,
+    "mean_difference": 0.1,
+}
+"""Where the colours of maps end, on both sides of zero, unless the settings say otherwise: heights of a mirror, their
+change and their standard deviation [mm]; forecast minus photograph, of one and in the mean [of the measured peak].
+"""
+
 
 def is_loopback(host: str) -> bool:
     """Whether only this machine can reach a server that listens on ``host``."""
@@ -191,7 +202,10 @@ class Settings(BaseSettings):
         default=None, description="Folder whose subfolders jobs may import; without it no job imports."
     )
     job_retention_days: float = Field(
-        default=90.0, ge=0, le=36500, description="Jobs that ended so long ago [days] are deleted; 0 keeps all."
+        default=90.0,
+        ge=0,
+        le=36500,
+        description="Jobs that ended so long ago [days] are deleted, but for plans that are done; 0 keeps all.",
     )
     forecast_retention_days: float = Field(
         default=365.0, ge=0, le=36500, description="Forecasts made so long ago [days] are deleted; 0 keeps all."
@@ -228,6 +242,13 @@ class Settings(BaseSettings):
         "[%], deviation, uncertainty [mm], misfit [%], age [days], pointing [mrad] and sun_span [deg], such as "
         '{"accuracy": [95, 80]}.',
     )
+    figure_scales: dict[str, float] = Field(
+        default_factory=dict,
+        validate_default=True,
+        description="JSON: where the colours of maps end, on all pages alike, of heights, height_change and height_std "
+        "[mm], flux_difference and mean_difference [share of the measured peak], such as "
+        '{"heights": 3}; what lies beyond has the end colours, and is said.',
+    )
     attention_accuracy: float = Field(
         default=0.75, ge=0, le=1, description="Forecast accuracy below which a heliostat needs attention [1]."
     )
@@ -246,6 +267,21 @@ class Settings(BaseSettings):
     )
     attention_photograph_days: float = Field(
         default=30.0, gt=0, le=36500, description="So long after its last accepted photograph it does [days]."
+    )
+    attention_camera_ratio: float = Field(
+        default=1.5,
+        gt=1,
+        le=100,
+        description="A camera changed where its photographs' signal, noise or sheet is that many times what it was.",
+    )
+    attention_camera_certainty: float = Field(
+        default=6.0, gt=0, le=100, description="How sure that must be [standard deviations, from day to day]."
+    )
+    attention_camera_days: int = Field(
+        default=5,
+        ge=2,
+        le=30,
+        description="Days with photographs since the change, and at least twice as many before it, that tell it.",
     )
     attention_queue_s: float = Field(
         default=1800.0, gt=0, le=1e7, description="The queue is stuck where a job has waited for so long [s]."
@@ -288,6 +324,17 @@ class Settings(BaseSettings):
             if (poor < fine) is not fine_is_high or fine == poor or not math.isfinite(fine - poor):
                 raise ValueError(f"{name}: give what is fine, then what is poor, not {fine:g}, {poor:g}")
         return MAP_SCALES | value
+
+    @field_validator("figure_scales")
+    @classmethod
+    def _all_ends(cls, value: dict[str, float]) -> dict[str, float]:
+        unknown = sorted(set(value) - set(FIGURE_SCALES))
+        if unknown:
+            raise ValueError(f"there is no scale {', '.join(unknown)}; name {', '.join(FIGURE_SCALES)}")
+        for name, end in value.items():
+            if not 0 < end < math.inf:
+                raise ValueError(f"{name}: give where the colours end, more than 0, not {end:g}")
+        return FIGURE_SCALES | value
 
     @field_validator("time_zone")
     @classmethod

@@ -24,11 +24,11 @@ from model.observation import Observation
 from model.plant import Heliostat
 from service.base.arrays import unpack
 from service.base.choices import Method
-from service.base.settings import Settings
+from service.base.settings import FIGURE_SCALES, Settings
 from service.cli.demo_plant import write_plant
 from service.cli.folder import observations_of, surface_errors, write_json
 from service.cli.output import make_table
-from service.drawing.pictures import comparison_picture, flux_bounds, mirror_heights, of_peak, surface_picture
+from service.drawing.pictures import comparison_picture, of_peak, surface_picture
 from service.drawing.templates import ASSETS, TEMPLATES
 from service.sources.folder import MeasurementFolder, measured_heights, read_folder
 from service.twin import compute
@@ -225,23 +225,22 @@ def _forecast(
 
 def _drawn(out: Path, made: Sequence[_Made]) -> list[Result]:
     """The results with the pictures drawn for them, all on the same scales."""
-    heights = [mirror_heights(z) for one in made for z in one.surfaces.values() if z is not None]
-    bound_mm = max(float(np.abs(some).max()) for some in heights)
     pairs = [of_peak(o.flux, flux) for one in made for o, flux in zip(one.judged, one.forecasts, strict=True)]
-    bounds = flux_bounds(pairs)
-    return [replace(one.result, pictures=_draw(out, one, bound_mm, bounds)) for one in made]
+    top = max(float(image.max()) for pair in pairs for image in pair)
+    return [replace(one.result, pictures=_draw(out, one, top)) for one in made]
 
 
-def _draw(out: Path, made: _Made, bound_mm: float, bounds: tuple[float, float]) -> tuple[str, ...]:
+def _draw(out: Path, made: _Made, top: float) -> tuple[str, ...]:
     """Surface maps, and measured beside forecast for every judged image; gives back their paths under ``out``."""
     name = made.result.heliostat
     drawn = {
-        f"surfaces/{name}-{key}.png": surface_picture(z, f"{name}, {key}", bound_mm)
+        f"surfaces/{name}-{key}.png": surface_picture(z, f"{name}, {key}", FIGURE_SCALES["heights"])
         for key, z in made.surfaces.items()
         if z is not None
     }
     for observation, flux in zip(made.judged, made.forecasts, strict=True):
         title = f"{name}/{observation.identifier}: accuracy {flux_accuracy(observation.flux, flux):.1%}"
+        bounds = top, FIGURE_SCALES["flux_difference"]
         picture = comparison_picture(observation.flux, flux, FLUX_WINDOW, title, bounds)
         drawn[f"flux/{name}-{observation.identifier}.png"] = picture
     for path, content in drawn.items():

@@ -20,6 +20,9 @@ Array = NDArray[np.floating]
 
 _dates: Any = matplotlib.dates  # it says nothing of its types
 
+# From tick to tick at the most, in each unit of time.
+_LONGEST = {_dates.MONTHLY: 12, _dates.DAILY: 31, _dates.HOURLY: 24, _dates.MINUTELY: 60, _dates.SECONDLY: 60}
+
 
 Sheet = tuple[Sequence[str], Sequence[Sequence[Any]]]
 """Columns and rows."""
@@ -117,6 +120,13 @@ class HeatMap:
     outline: str = ""
 
     @property
+    def beyond(self) -> tuple[float, float] | None:
+        """The least and the largest value, where any lies beyond the scale and has one of its end colours."""
+        least, most = float(np.nanmin(self.values)), float(np.nanmax(self.values))
+        slack = 1e-6 * (self.scale.high - self.scale.low)
+        return (least, most) if least < self.scale.low - slack or most > self.scale.high + slack else None
+
+    @property
     def arrays(self) -> dict[str, NDArray[Any]]:
         """What it shows, in the unit of its scale, and its size [m]."""
         size_m = np.array([self.width, self.height])
@@ -156,7 +166,6 @@ def flux_scale(top: float, unit: str) -> Scale:
 
 def difference_scale(bound: float, unit: str) -> Scale:
     """Of differences, forecast minus photograph: white where there is none, red where the forecast is brighter."""
-    bound = max(bound, 1e-9)
     return Scale("RdBu_r", -bound, bound, unit)
 
 
@@ -176,9 +185,9 @@ def outlined(drawn: HeatMap, mask: NDArray[np.bool_]) -> HeatMap:
     return replace(drawn, outline=_data_url(pixels))
 
 
-def difference_map(title: str, difference: Array, size: tuple[float, float], unit: str) -> HeatMap:
-    """A map of differences, white where there is none."""
-    return heat_map(title, difference, size, difference_scale(float(np.abs(difference).max()), unit))
+def difference_map(title: str, difference: Array, size: tuple[float, float], unit: str, bound: float) -> HeatMap:
+    """A map of differences, white where there is none; ``bound`` ends its scale on both sides."""
+    return heat_map(title, difference, size, difference_scale(bound, unit))
 
 
 def mirror_image(heights: Array) -> Array:
@@ -192,17 +201,14 @@ def mirror_image(heights: Array) -> Array:
     return np.vstack([rows[0], np.full((1, rows[0].shape[1]), np.nan), rows[1]])
 
 
-def surface_map(title: str, z: Array, size: tuple[float, float], bound: float | None = None) -> HeatMap:
-    """A surface of control heights (4, 8, 8) [m] in mm; ``bound`` [mm] ends its scale, else its own largest height."""
-    heights = mirror_heights(z)
-    bound = max(float(np.abs(heights).max()) if bound is None else bound, 1e-3)
-    return heat_map(title, mirror_image(heights), size, Scale("RdBu_r", -bound, bound, "mm"))
+def surface_map(title: str, z: Array, size: tuple[float, float], bound: float) -> HeatMap:
+    """A surface of control heights (4, 8, 8) [m] in mm, red where it is higher; ``bound`` [mm] ends its scale."""
+    return heat_map(title, mirror_image(mirror_heights(z)), size, Scale("RdBu_r", -bound, bound, "mm"))
 
 
-def uncertainty_map(title: str, z_std: Array, size: tuple[float, float]) -> HeatMap:
-    """Standard deviations (4, 8, 8) [m] in mm."""
-    heights = mirror_heights(z_std)
-    return heat_map(title, mirror_image(heights), size, Scale("viridis_r", 0.0, max(float(heights.max()), 1e-3), "mm"))
+def uncertainty_map(title: str, z_std: Array, size: tuple[float, float], top: float) -> HeatMap:
+    """Standard deviations (4, 8, 8) [m] in mm; ``top`` [mm] ends their scale."""
+    return heat_map(title, mirror_image(mirror_heights(z_std)), size, Scale("viridis_r", 0.0, top, "mm"))
 
 
 @dataclass(frozen=True)
@@ -285,6 +291,11 @@ def timeline(
     low = 0.0 if from_zero else min(numbers) - room
     high = max(max(numbers) + 0.1 * (max(numbers) - low), low + 1e-9)
     locator = _dates.AutoDateLocator(minticks=3, maxticks=5, tz=UTC)
+    for (
+        of_time,
+        longest,
+    ) in _LONGEST.items():  # its own steps end too early for five ticks over almost three of the next
+        locator.intervald[of_time] = [*locator.intervald[of_time], longest]
     places = [
         place for place in locator.tick_values(_dates.num2date(first), _dates.num2date(last)) if first <= place <= last
     ]

@@ -20,6 +20,12 @@ def _png(figure: Figure) -> bytes:
     return buffer.getvalue()
 
 
+def _extend(values: NDArray[np.floating], low: float, high: float) -> str:
+    """How a colour bar says on which sides values lie beyond it, in matplotlib's words."""
+    is_below, is_above = bool(np.nanmin(values) < low), bool(np.nanmax(values) > high)
+    return {(True, True): "both", (True, False): "min", (False, True): "max"}.get((is_below, is_above), "neither")
+
+
 def flux_picture(flux: NDArray[np.floating], size: tuple[float, float] | None, unit: str, title: str) -> bytes:
     """A flux map (rows, columns), coloured; ``size`` is its width and height [m], pixels where it is None."""
     return map_picture(flux, size, title, "inferno", (0.0, None), unit)
@@ -37,10 +43,11 @@ def map_picture(
     figure = Figure(figsize=(6, 5), layout="constrained")
     axes = figure.subplots()
     extent = None if size is None else (-size[0] / 2, size[0] / 2, -size[1] / 2, size[1] / 2)
-    image = axes.imshow(values, cmap=colours, vmin=bounds[0], vmax=bounds[1], extent=extent, aspect="equal")
+    low, high = bounds[0], float(np.nanmax(values)) if bounds[1] is None else bounds[1]
+    image = axes.imshow(values, cmap=colours, vmin=low, vmax=high, extent=extent, aspect="equal")
     axes.set(xlabel="right [m]" if size else "column", ylabel="up [m]" if size else "row")
     axes.set_title(title, wrap=True)
-    figure.colorbar(image, ax=axes, label=label)
+    figure.colorbar(image, ax=axes, label=label, extend=_extend(values, low, high))
     return _png(figure)
 
 
@@ -100,21 +107,21 @@ def mirror_heights(z: NDArray[np.floating], samples: int = 48) -> NDArray[np.flo
     return across @ np.asarray(z, dtype=np.float64) @ along.T * 1e3
 
 
-def surface_picture(z: NDArray[np.floating], title: str, bound: float | None = None) -> bytes:
+def surface_picture(z: NDArray[np.floating], title: str, bound: float) -> bytes:
     """A surface of control heights (4, 8, 8) [m] as a map in mm, its facets as they are seen from the front.
 
-    ``bound`` [mm] ends the scale, else the largest height does.
+    ``bound`` [mm] ends the scale on both sides; heights beyond have its end colours.
     """
     figure = Figure(figsize=(6.4, 5), layout="constrained")
     panes = figure.subplots(2, 2).ravel()
     heights = mirror_heights(z)
-    bound = max(float(np.abs(heights).max()) if bound is None else bound, 1e-3)
     for pane, facet, name in zip(panes, heights, _FACETS, strict=True):
         # i runs with x and j with y, so columns are i and rows, from below, are j
         image = pane.imshow(facet.T, cmap="RdBu_r", vmin=-bound, vmax=bound, origin="lower", aspect=0.8)
         pane.set(xticks=[], yticks=[], title=name)
     figure.suptitle(title)
-    figure.colorbar(image, ax=panes.tolist(), label="deviation from the ideal facet [mm]")
+    extend = _extend(heights, -bound, bound)
+    figure.colorbar(image, ax=panes.tolist(), label="deviation from the ideal facet [mm]", extend=extend)
     return _png(figure)
 
 
@@ -127,21 +134,13 @@ def of_peak(measured: Array, forecast: Array) -> tuple[Array, Array]:
     return a / a.max(), b / a.max()
 
 
-def flux_bounds(pairs: Sequence[tuple[Array, Array]]) -> tuple[float, float]:
-    """The largest share of the measured peak, and the largest difference, of pairs as `of_peak` gives them."""
-    top = max(float(image.max()) for pair in pairs for image in pair)
-    return top, max(max(float(np.abs(b - a).max()) for a, b in pairs), 1e-9)
+def comparison_picture(measured: Array, forecast: Array, side: float, title: str, bounds: tuple[float, float]) -> bytes:
+    """Measured and forecast flux (n, n) over ``side`` [m], scaled to one sum, and forecast minus measured.
 
-
-def comparison_picture(
-    measured: Array, forecast: Array, side: float, title: str, bounds: tuple[float, float] | None = None
-) -> bytes:
-    """Measured and forecast flux (n, n) over ``side`` [m], scaled to one sum, and their difference.
-
-    ``bounds`` end the two scales, else those of this pair do.
+    ``bounds`` end the scale of the fluxes and that of the difference [of the measured peak].
     """
     a, b = of_peak(np.asarray(measured), np.asarray(forecast))
-    top, bound = flux_bounds([(a, b)]) if bounds is None else bounds
+    top, bound = bounds
     figure = Figure(figsize=(10, 3.4), layout="constrained")
     panes = figure.subplots(1, 3)
     extent = (-side / 2, side / 2, -side / 2, side / 2)
@@ -151,6 +150,6 @@ def comparison_picture(
     figure.colorbar(shown, ax=panes[:2].tolist(), label="of the measured peak")
     shown = panes[2].imshow(b - a, cmap="RdBu_r", vmin=-bound, vmax=bound, extent=extent)
     panes[2].set(title="forecast - measured", xlabel="right [m]")
-    figure.colorbar(shown, ax=panes[2], label="of the measured peak")
+    figure.colorbar(shown, ax=panes[2], label="of the measured peak", extend=_extend(b - a, -bound, bound))
     figure.suptitle(title)
     return _png(figure)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from model.study import FluxImage, Study
 from model.study.covariates import covariates_of
 from model.study.judging import rank_correlation
-from service.drawing.charts import HeatMap, Scale, Tick, heat_map, ticks
+from service.drawing.charts import HeatMap, Scale, Tick, difference_scale, flux_scale, heat_map, ticks
 
 Array = NDArray[np.float64]
 
@@ -66,41 +66,44 @@ class Row:
 
 @dataclass(frozen=True)
 class Pictures:
-    """Rows of squares of ``window`` [m], and the two scales that all of them share."""
+    """Rows of squares of ``window`` [m], and the two scales that all of them share.
+
+    ``beyond`` is the largest difference, where it lies beyond its scale.
+    """
 
     rows: list[Row]
     window: float
     flux: Scale
     residual: Scale
+    beyond: float | None
 
 
-def pictures(study: Study, images: Sequence[Image]) -> Pictures:
+def pictures(study: Study, images: Sequence[Image], bound: float) -> Pictures:
     """The worst, the median and the best image of the declared model, in shares of each one's measured peak.
 
-    What an effect changes is shown where one was found.
+    What an effect changes is shown where one was found. ``bound`` ends the scale of the differences.
     """
     order = sorted(images, key=lambda image: image.before)
     chosen = {"Worst": order[0], "Median": order[len(order) // 2], "Best": order[-1]}
     fluxes = [_fluxes(study, image.photograph) for image in chosen.values()]
     top = max(float(flux.max()) for flux in fluxes)
-    bound = max(float(np.abs(flux[0] - flux[1:]).max()) for flux in fluxes)
-    flux_scale = Scale("inferno", 0.0, top, "of the measured peak")
-    residual_scale = Scale("RdBu_r", -bound, bound, "of the measured peak")
+    largest = max(float(np.abs(flux[0] - flux[1 : 2 + bool(study.found)]).max()) for flux in fluxes)
+    shares, differences = flux_scale(top, "of the measured peak"), difference_scale(bound, "of the measured peak")
 
     def row(rank: str, image: Image, flux: Array) -> Row:
         measured, before, after = flux
-        shown = {"measured": (measured, flux_scale), "forecast before": (before, flux_scale)}
+        shown = {"measured": (measured, shares), "forecast before": (before, shares)}
         if study.found:
-            shown["forecast after"] = (after, flux_scale)
-        shown["difference before"] = (before - measured, residual_scale)
+            shown["forecast after"] = (after, shares)
+        shown["difference before"] = (before - measured, differences)
         if study.found:
-            shown["difference after"] = (after - measured, residual_scale)
+            shown["difference after"] = (after - measured, differences)
         name = image.photograph.key
         squares = {what: heat_map(f"{name}, {what}", v, (study.window,) * 2, s) for what, (v, s) in shown.items()}
         return Row(rank, image, squares)
 
     rows = [row(rank, image, flux) for (rank, image), flux in zip(chosen.items(), fluxes, strict=True)]
-    return Pictures(rows, study.window, flux_scale, residual_scale)
+    return Pictures(rows, study.window, shares, differences, largest if largest > bound else None)
 
 
 def _fluxes(study: Study, photograph: FluxImage) -> Array:

@@ -82,18 +82,21 @@ def _value(parameter: Parameter, value: float, ci95: tuple[float, float]) -> Val
     return Value(value, low, high, not low <= parameter.neutral <= high)
 
 
-def study_page(study: Study, title: str, skipped: Mapping[str, str] | None = None) -> str:
+def study_page(study: Study, title: str, ends: Mapping[str, float], skipped: Mapping[str, str] | None = None) -> str:
     """The report of a study as one self-contained HTML page.
 
     Parameters
     ----------
     title : str
         What was studied: a folder, a plant.
+    ends : mapping
+        Where the colours of ``flux_difference`` and ``mean_difference`` end [of the measured peak].
     skipped : mapping
         What was left out, with the reasons.
     """
     chart, sides = accuracy_chart(study), (study.window, study.window)
-    left = difference_map("Mean of forecast minus photograph", -study.residual_map(), sides, "of peak")
+    mean = "Mean of forecast minus photograph"
+    left = difference_map(mean, study.residual_map(), sides, "of peak", ends["mean_difference"])
     # The style is a file of our own, and `>` must stay what it is.
     style = Markup(ASSETS.joinpath("app.css").read_text(encoding="utf-8"))
     return TEMPLATES.get_template("study.html").render(
@@ -103,7 +106,7 @@ def study_page(study: Study, title: str, skipped: Mapping[str, str] | None = Non
         verdict=VERDICTS[study.verdict],
         findings=[Finding.of(found) for found in study.found],
         chart=chart,
-        pictures=pictures(study, chart.images),
+        pictures=pictures(study, chart.images, ends["flux_difference"]),
         scatters=scatters(study),
         residual_map=left,
         chance=1.96 / max(len(study.images) - 1, 1) ** 0.5,

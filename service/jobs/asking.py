@@ -6,7 +6,7 @@ from service.jobs.kind import Kinds
 from service.store import audit
 from service.store.job_tables import JobRow
 from service.store.keys import ITSELF
-from service.store.queue import add_job, cancel
+from service.store.queue import add_job, cancel, forget
 from service.twin.runtime import Runtime
 
 
@@ -35,6 +35,14 @@ def begin_due(runtime: Runtime, kinds: Kinds) -> None:
                 row, is_new = add_job(session, kind.name, {}, ITSELF, key)
                 if is_new:
                     audit.record(session, ITSELF, "job.created", f"job {row.id}", kind=kind.name)
+
+
+def forget_for(runtime: Runtime, number: int, actor: str) -> JobRow:
+    """Delete a plan as `forget` does, with its entry in the audit trail."""
+    with runtime.database.writing() as session:
+        row = forget(session, number, actor)
+        audit.record(session, actor, "plan.deleted", f"job {number}", name=str(row.payload.get("name", "")))
+        return row
 
 
 def cancel_for(runtime: Runtime, number: int, actor: str) -> JobRow:

@@ -42,10 +42,10 @@ from service.store.results import (
     get_study,
     has_study_page,
     list_forecasts,
+    list_plans,
     list_studies,
     recent_field_forecasts,
     recent_forecasts,
-    recent_plans,
 )
 from service.store.rows import Change, insert, one_at_a_time
 from service.store.surfaces import (
@@ -100,6 +100,7 @@ __all__ = [
     "list_heliostats",
     "list_identifiers",
     "list_measurements",
+    "list_plans",
     "list_receivers",
     "list_studies",
     "list_surfaces",
@@ -114,7 +115,6 @@ __all__ = [
     "recent_field_forecasts",
     "recent_forecasts",
     "recent_measurements",
-    "recent_plans",
     "remove_heliostat",
     "remove_receiver",
     "remove_target",

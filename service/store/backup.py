@@ -145,7 +145,11 @@ def _tables(connection: Connection) -> dict[str, list[str]]:
     """All tables with their columns, those first that others refer to."""
     inspector = inspect(connection)
     names = [name for name, _ in inspector.get_sorted_table_and_fkc_names() if name not in (None, "alembic_version")]
-    return {name: [column["name"] for column in inspector.get_columns(name)] for name in names if name is not None}
+    return {  # what the database works out by itself it does not take
+        name: [column["name"] for column in inspector.get_columns(name) if "computed" not in column]
+        for name in names
+        if name is not None
+    }
 
 
 def _statement(template: str, name: str, columns: Sequence[str]) -> sql.Composed:

@@ -1,11 +1,9 @@
 """Images and measurements, as they are kept and found again."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from datetime import datetime
-from typing import Literal
 
-from sqlalchemy import Select, case, func, select
+from sqlalchemy import Select, select
 from sqlalchemy.orm import Session, undefer
 
 from service.base import names
@@ -21,28 +19,6 @@ PREFERENCE = ("flux", "cropped", "raw", "flux-centered")
 
 EXCLUDED = "excluded"
 """Why a photograph is not accepted that somebody excluded."""
-
-PhotographVerdict = Literal["used", "refused", "excluded"]
-
-
-@dataclass(frozen=True)
-class Shot:
-    """One photograph: its images, in the order of `PREFERENCE`, accepted ones first."""
-
-    name: str
-    images: tuple[MeasurementRow, ...]
-
-    @property
-    def best(self) -> MeasurementRow:
-        """The image that the photograph is judged by."""
-        return self.images[0]
-
-    @property
-    def verdict(self) -> PhotographVerdict:
-        """Whether any of its images is used; else whether somebody excluded it."""
-        if self.best.accepted:
-            return "used"
-        return "excluded" if any(row.reason == EXCLUDED for row in self.images) else "refused"
 
 
 def _measurements(heliostat: HeliostatRow) -> Select[MeasurementRow]:
@@ -102,28 +78,6 @@ def list_measurements(
     return session.scalars(query).all()
 
 
-def list_shots(
-    session: Session, heliostat: HeliostatRow, limit: int, verdict: PhotographVerdict | None = None, newer: int = 0
-) -> list[Shot]:
-    """The photographs whose images came last, newest first, but for so many ``newer`` ones; or those of one verdict."""
-    name = func.coalesce(MeasurementRow.external_id, MeasurementRow.identifier).label("name")
-    is_used = func.max(case((MeasurementRow.accepted, 1), else_=0))
-    is_excluded = func.max(case((MeasurementRow.reason == EXCLUDED, 1), else_=0))
-    query = select(name).where(MeasurementRow.heliostat_id == heliostat.id).group_by(name)
-    if verdict is not None:
-        query = query.having(is_used == int(verdict == "used"))
-    if verdict in ("refused", "excluded"):
-        query = query.having(is_excluded == int(verdict == "excluded"))
-    names = session.scalars(query.order_by(func.max(MeasurementRow.id).desc()).offset(newer).limit(limit)).all()
-    images: dict[str, list[MeasurementRow]] = {known: [] for known in names}
-    for row in session.scalars(_measurements(heliostat).where(name.in_(names))):
-        images[row.external_id or row.identifier].append(row)
-    return [
-        Shot(known, tuple(sorted(rows, key=lambda row: (not row.accepted, PREFERENCE.index(row.kind)))))
-        for known, rows in images.items()
-    ]
-
-
 def images_of_shot(session: Session, row: MeasurementRow, arrays: bool = False) -> dict[str, MeasurementRow]:
     """The images of the photograph that ``row`` is one of, by kind, with their ``arrays`` where wanted."""
     if row.external_id is None:
@@ -151,7 +105,7 @@ def recent_measurements(
     until: datetime | None = None,
 ) -> list[MeasurementRow]:
     """The newest accepted measurements, one image of each, by when they were taken or else came."""
-    moment = func.coalesce(MeasurementRow.taken_at, MeasurementRow.created_at)
+    moment = MeasurementRow.moment
     query = _measurements(heliostat).where(MeasurementRow.accepted, MeasurementRow.arrays.is_not(None))
     if since is not None:
         query = query.where(moment >= since)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Any
 
-from sqlalchemy import Select, and_, delete, func, or_, select
+from sqlalchemy import Select, and_, delete, func, not_, or_, select
 from sqlalchemy.orm import Session, defer, undefer
 
 from model.errors import InvalidInputError
@@ -293,17 +293,42 @@ def release(session: Session, lease: Lease) -> None:
     _requeue(row, clock(session))
 
 
+KEPT = "plans"
+"""The kind of job whose results are kept until somebody deletes them: they have names, and are opened again."""
+
+
 def purge(session: Session, age: timedelta, most: int = 500) -> int:
-    """Delete up to ``most`` jobs that ended longer than ``age`` ago, and say how many.
+    """Delete up to ``most`` jobs that ended longer than ``age`` ago, and say how many; none that is `KEPT`.
 
     The newest job stays, so that no number is given twice.
     """
     newest = select(func.max(JobRow.id)).scalar_subquery()
     ended = select(JobRow.id).where(JobRow.state.in_(ENDED), JobRow.finished_at < clock(session) - age)
-    numbers = session.scalars(ended.where(JobRow.id < newest).order_by(JobRow.id).limit(most)).all()
+    ended = ended.where(JobRow.id < newest, not_((JobRow.kind == KEPT) & (JobRow.state == "done")))
+    numbers = session.scalars(ended.order_by(JobRow.id).limit(most)).all()
     session.execute(delete(JobStepRow).where(JobStepRow.job_id.in_(numbers)))
     session.execute(delete(JobRow).where(JobRow.id.in_(numbers)))
     return len(numbers)
+
+
+def forget(session: Session, number: int, by: str) -> JobRow:
+    """Give up the result of a job that is `KEPT`: from then on it is one that ended as any other.
+
+    Raises
+    ------
+    NotFoundError
+    ConflictError
+        Where the job is no such one, or has no result.
+    """
+    row = session.get(JobRow, number, with_for_update=True)
+    if row is None:
+        raise NotFoundError(f"job {number} is not known")
+    if row.kind != KEPT or row.state != "done":
+        raise ConflictError(f"job {number}: only plans that are done can be deleted; cancel what is under way")
+    row.state, row.reason = "cancelled", _text(f"deleted by {by}", 1000)
+    row.result = row.arrays = None
+    row.revision += 1
+    return row
 
 
 def _requeue(row: JobRow, not_before: datetime) -> None:

@@ -13,14 +13,19 @@ from service.store.columns import Base
 def record(table: type[Base], without: tuple[str, ...] = (), **more: Any) -> Any:
     """The documents of a table's rows, a pydantic model: `read` makes one of a row, its ``model_dump`` the columns.
 
-    ``without`` are columns that it leaves out, beside keys that only this database knows, and arrays; ``more`` are
-    fields that it has beside them, each its type and default as `pydantic.create_model` takes them.
+    ``without`` are columns that it leaves out, beside arrays, keys that only this database knows, and what it works
+    out; ``more`` are fields that it has beside them, each its type and default as `pydantic.create_model` takes them.
     """
     hints: dict[str, Any] = get_type_hints(table)
     fields: dict[str, Any] = {}
     for column in inspect(table).columns:
         is_key = column.key == "id" or any(key.column.name == "id" for key in column.foreign_keys)
-        if not is_key and column.key not in without and not isinstance(column.type, LargeBinary):
+        if (
+            not is_key
+            and column.computed is None
+            and column.key not in without
+            and not isinstance(column.type, LargeBinary)
+        ):
             (kind,) = get_args(hints[column.key])
             fields[column.key] = (_aware(kind), None if column.nullable else ...)
     return create_model(table.__name__, __config__=ConfigDict(extra="forbid"), **{**fields, **more})

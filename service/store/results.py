@@ -11,6 +11,7 @@ from sqlalchemy.orm import Session, joinedload, lazyload, load_only, undefer
 from service.base.faults import NotFoundError
 from service.store.columns import Base
 from service.store.job_tables import JobRow
+from service.store.queue import KEPT
 from service.store.rows import hold
 from service.store.tables import ForecastRow, HeliostatRow, ImageRow, MeasurementRow, StudyRow, SurfaceRow, TargetRow
 
@@ -97,8 +98,8 @@ class Plan:
     created_by: str
 
 
-def recent_plans(session: Session, limit: int) -> list[Plan]:
-    """The newest ``limit`` plans, the newest first, those under way too."""
+def list_plans(session: Session, limit: int, after: int | None = None) -> list[Plan]:
+    """Up to ``limit`` plans, the newest first, those before the job ``after``; not what was deleted or cancelled."""
     payload = JobRow.payload
     query = select(
         JobRow.id,
@@ -109,7 +110,9 @@ def recent_plans(session: Session, limit: int) -> list[Plan]:
         JobRow.result["peak_w_m2"].as_float(),
         JobRow.created_at,
         JobRow.created_by,
-    ).where(JobRow.kind == "plans")
+    ).where(JobRow.kind == KEPT, JobRow.state != "cancelled")
+    if after is not None:
+        query = query.where(JobRow.id < after)
     return [Plan(*row) for row in session.execute(query.order_by(JobRow.id.desc()).limit(limit))]
 
 

@@ -11,6 +11,7 @@ from sqlalchemy import (
     BigInteger,
     CheckConstraint,
     Column,
+    Computed,
     ForeignKey,
     Index,
     LargeBinary,
@@ -140,7 +141,8 @@ class MeasurementRow(Base):
     ``arrays`` holds npz ``flux`` and ``centered``; a refused image has neither and keeps its ``reason``.
     ``center_right_m``, ``center_up_m``: centre of mass from the target's centre. ``corrected_at``: since when it stands
     as it does, where it was corrected (`CorrectionRow`); an excluded one is not accepted for the reason `excluded`.
-    ``forecast_accuracy`` [1]: how the surface of its day forecast it when it came, which had not seen it.
+    ``forecast_accuracy`` [1]: how the surface of its day forecast it when it came, which had not seen it. ``moment`` is
+    when it was taken or else came; the database works it out.
     """
 
     __tablename__ = "measurements"
@@ -148,6 +150,10 @@ class MeasurementRow(Base):
         UniqueConstraint("heliostat_id", "image_sha256", "kind"),
         UniqueConstraint("heliostat_id", "identifier"),
         Index(None, "heliostat_id", "accepted"),
+        Index(None, "heliostat_id", "external_id"),
+        Index(None, "moment", "id"),
+        Index(None, "accepted", "moment", "id"),
+        Index(None, "target_id", "moment", "id"),
         one_of("kind", KINDS),
     )
 
@@ -157,7 +163,7 @@ class MeasurementRow(Base):
     external_id: Mapped[str | None] = mapped_column(String(64))
     image_sha256: Mapped[str] = mapped_column(ForeignKey("images.sha256"), index=True)
     kind: Mapped[str] = mapped_column(String(16))
-    target_id: Mapped[int] = mapped_column(ForeignKey("targets.id"), index=True)
+    target_id: Mapped[int] = mapped_column(ForeignKey("targets.id"))
     sun_azimuth_deg: Mapped[float]
     sun_elevation_deg: Mapped[float]
     motor_axis_1: Mapped[float | None]
@@ -178,6 +184,7 @@ class MeasurementRow(Base):
     created_at: Mapped[datetime] = mapped_column(default=now)
     corrected_at: Mapped[datetime | None]
     forecast_accuracy: Mapped[float | None]
+    moment: Mapped[datetime] = mapped_column(Computed("coalesce(taken_at, created_at)", True), nullable=True)
 
     target: Mapped[TargetRow] = relationship(lazy="joined", innerjoin=True)
     image: Mapped[ImageRow] = relationship(lazy="joined", innerjoin=True)

@@ -11,7 +11,8 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from datetime import datetime, timedelta
+from datetime import UTC, datetime, timedelta
+from datetime import time as clock
 from itertools import pairwise
 from typing import Literal
 
@@ -28,6 +29,7 @@ from service.store.columns import now
 from service.store.job_tables import AcknowledgementRow, JobRow
 from service.store.tables import DriftRow, HeliostatRow, MeasurementRow, ModelRow, MountRow, PlantRow, StudyRow
 from service.twin import versions
+from service.twin.cameras import FIGURES, Change
 from service.twin.field import PATIENCE_S, Current, FieldBook, Line
 from service.twin.pointing_errors import Moved, Pointing
 from service.twin.runtime import Runtime
@@ -80,13 +82,13 @@ class Item:
 def needs_attention(session: Session, book: FieldBook, settings: Settings) -> tuple[list[Item], int]:
     """All that does, the most urgent reason first, the newest of each first; and how many heliostats are pending."""
     field = book.read(session, PATIENCE_S)
-    return of_lines(session, field.lines, settings), field.pending
+    return of_lines(session, field.lines, settings, book.cameras.changes(session, settings)), field.pending
 
 
-def of_lines(session: Session, lines: Sequence[Line], settings: Settings) -> list[Item]:
-    """The same of heliostats with their pointing errors."""
+def of_lines(session: Session, lines: Sequence[Line], settings: Settings, cameras: Sequence[Change]) -> list[Item]:
+    """The same of heliostats with their pointing errors, and of changes of cameras."""
     at = now()
-    found = [*_queue(session, settings), *_camera(session), *_clock(session)]
+    found = [*_queue(session, settings), *_camera(session), *_watched(session, cameras), *_clock(session)]
     found += [*_accuracies(session, settings), *_falls(session, settings)]
     found += _without_photograph(session, timedelta(days=settings.attention_photograph_days), at)
     for line in lines:
@@ -253,6 +255,24 @@ def _camera(session: Session) -> Iterator[Item]:
             "measure the stored photographs anew (POST /v1/jobs/measurements), and predict surfaces anew",
             f"version {declared.number}",
         )
+
+
+def _watched(session: Session, cameras: Sequence[Change]) -> Iterator[Item]:
+    """What photographs show by themselves, until a camera is declared anew."""
+    declared = _declared_anew(session) if cameras else None
+    for change in cameras:
+        since = datetime.combine(change.day, clock(), UTC)
+        if declared is None or since > declared.adopted_at:
+            way, times = "up" if change.ratio > 1 else "down", f"{change.ratio:.2f} times what it was"
+            yield Item(
+                "camera",
+                None,
+                since,
+                f"on {change.target} {FIGURES[change.figure]} is {times}, in the median of "
+                f"{change.days[1]} days against {change.days[0]} before, from photographs of {change.day} on",
+                "look at the camera's exposure, focus and lens; study the photographs, or declare the camera anew",
+                f"{change.target} {change.figure} {way} {change.day:%Y-%m}",
+            )
 
 
 def _clock(session: Session) -> Iterator[Item]:

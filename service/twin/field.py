@@ -23,6 +23,7 @@ from service.store.tables import HeliostatRow, MeasurementRow, MountRow, Surface
 from service.twin import versions
 from service.twin.accuracy import AccuracyBook, Rank, State
 from service.twin.book import Book
+from service.twin.cameras import CameraWatch
 from service.twin.pointing_errors import Mounted, Pointing, PointingBook
 from service.twin.runtime import Runtime
 
@@ -304,6 +305,7 @@ class FieldBook:
         self._figures: Book[int, Figures | None] = Book(self._figures_of, None, "figures", _MOST)
         self._readings: Book[tuple[Marks, int], _Reading | None] = Book(self._read, None, "field", 1)
         self._last: _Reading | None = None
+        self.cameras = CameraWatch()
 
     def close(self) -> None:
         """End what is under way."""

@@ -1,6 +1,6 @@
 """Studies of what is stored: photographs and surfaces out of the store, a report into it."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from typing import Any, Literal
@@ -190,8 +190,13 @@ def _require_enough(material: Material) -> None:
         )
 
 
-def study_row(studied: Studied, title: str, options: dict[str, Any], actor: str) -> StudyRow:
-    """The study as it is kept, with its page; ``options`` are those that were asked for, as JSON."""
+def study_row(
+    studied: Studied, title: str, options: dict[str, Any], actor: str, scales: Mapping[str, float]
+) -> StudyRow:
+    """The study as it is kept, with its page; ``options`` are those that were asked for, as JSON.
+
+    ``scales`` say where the colours of the page's maps end (`Settings.figure_scales`).
+    """
     material, report = studied.material, plain(studied.study.to_json())
     taken_from, taken_to = material.span
     return StudyRow(
@@ -206,7 +211,7 @@ def study_row(studied: Studied, title: str, options: dict[str, Any], actor: str)
         conclusion=report["conclusion"],
         report=report,
         skipped=material.skipped,
-        html=study_page(studied.study, title, material.skipped),
+        html=study_page(studied.study, title, scales, material.skipped),
     )
 
 

@@ -22,6 +22,7 @@ from service.store import queue, sizes
 from service.store.job_tables import JobRow
 from service.store.tables import DriftRow, HeliostatRow
 from service.twin.attention import REASONS, Item, of_lines
+from service.twin.cameras import Change
 from service.twin.field import PATIENCE_S, FieldBook, Line
 from service.twin.runtime import Runtime
 
@@ -47,7 +48,9 @@ class StoreCollector(Collector):
             with self._runtime.database.reading() as session:
                 found = [*_queue(session), *_sizes(session, self._runtime.settings)]
                 lines = self._book.read(session, PATIENCE_S).lines
-                found.append(_attention(of_lines(session, lines, self._runtime.settings)))
+                cameras = self._book.cameras.changes(session, self._runtime.settings)
+                found.append(_attention(of_lines(session, lines, self._runtime.settings, cameras)))
+                found.append(_cameras(cameras))
                 found += [*_trust(lines, most), *_pointing(lines, most), _drift(session, most)]
         except SQLAlchemyError as error:
             logger.warning("metrics of the store are missing: %s", error)
@@ -81,6 +84,17 @@ def _sizes(session: Session, settings: Settings) -> Iterator[Metric]:
     quota = "Most that images may take [B]; 0 without a bound."
     yield GaugeMetricFamily("heliotwin_image_quota_bytes", quota, settings.image_quota_gb * 1e9)
     yield GaugeMetricFamily("heliotwin_database_bytes", "Size of the database [B].", held.database_bytes)
+
+
+def _cameras(changes: Sequence[Change]) -> Metric:
+    ratios = GaugeMetricFamily(
+        "heliotwin_camera_change_ratio",
+        "Of targets whose camera changed: what of its photographs is how many times what it was.",
+        labels=["target", "figure"],
+    )
+    for change in changes:
+        ratios.add_metric([change.target, change.figure], change.ratio)
+    return ratios
 
 
 def _attention(items: Sequence[Item]) -> Metric:

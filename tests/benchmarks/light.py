@@ -465,7 +465,7 @@ def draw_pictures(cases: list[Case], path: Path) -> None:
         peak = seen.max()
         for axis, image in zip(column, (seen, forecast), strict=False):
             axis.imshow(image, vmin=0, vmax=peak)
-        column[2].imshow(seen - forecast, vmin=-0.3 * peak, vmax=0.3 * peak, cmap="RdBu")
+        column[2].imshow(forecast - seen, vmin=-0.3 * peak, vmax=0.3 * peak, cmap="RdBu_r")
         column[0].set_title(f"{case.name}\n{case.accuracy('light', 0.02):.3f}", fontsize=9)
     for axis in axes.flat:
         axis.axis("off")

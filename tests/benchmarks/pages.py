@@ -21,6 +21,9 @@ SCHEMES: dict[str, Literal["light", "dark"]] = {"": "light", "-dark": "dark"}
 
 DARK = ("field", "heliostat", "plan")
 
+HIGHEST = 3200
+"""What of a long page is taken [px]."""
+
 
 def done(client: httpx.Client, kind: str, asked: dict[str, Any]) -> dict[str, Any]:
     """A job that is asked for, once it has ended."""
@@ -57,10 +60,11 @@ def main() -> None:
     pages = {
         "field": "/",
         "heliostat": heliostat,
+        "photographs": "/photographs",
         "photograph": f"{heliostat}/photographs/{options.photograph}",
         "compare": f"/compare?heliostat={options.heliostat}",
         "attention": "/attention",
-        "calibration-plan": "/calibration-plan",
+        "calibration-plan": "/calibration-plan?at=2026-06-21T10:00",
         "jobs": "/jobs",
         "studies": "/studies",
         "plant": "/plant",
@@ -70,6 +74,8 @@ def main() -> None:
         "login": "/login",
     }
     with httpx.Client(base_url=options.url, timeout=120) as client:
+        while "being worked out" in client.get("/", headers={"Accept": "text/html"}).text:
+            time.sleep(1)
         pages |= asked_for(client, options.heliostat)
     options.out.mkdir(parents=True, exist_ok=True)
     with sync_playwright() as playwright:
@@ -84,7 +90,9 @@ def main() -> None:
                     page.evaluate("for (const one of document.images) one.loading = 'eager'")
                     page.wait_for_function("[...document.images].every(one => one.complete)")
                     file = options.out / f"{name}-{label}{suffix}.jpg"
-                    page.screenshot(path=file, full_page=True, type="jpeg", quality=50)
+                    height = min(page.evaluate("document.documentElement.scrollHeight"), HIGHEST)
+                    clip = {"x": 0, "y": 0, "width": size["width"], "height": height}
+                    page.screenshot(path=file, full_page=True, clip=clip, type="jpeg", quality=30)
                     width = page.evaluate("document.documentElement.scrollWidth")
                     print(f"{name}, {label}{suffix}: {answer.status}, {width} px wide", flush=True)
                 page.close()

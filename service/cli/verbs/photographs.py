@@ -194,10 +194,12 @@ def study(
     report = done.to_json()
     write_json(out, report)
     if page is not None:
+        from service.base.settings import FIGURE_SCALES
         from service.drawing.study_report import study_page
 
         page.parent.mkdir(parents=True, exist_ok=True)
-        page.write_text(study_page(done.study, folder.resolve().name, done.skipped), encoding="utf-8")
+        drawn = study_page(done.study, folder.resolve().name, FIGURE_SCALES, done.skipped)
+        page.write_text(drawn, encoding="utf-8")
     show(report, as_json, _study_table(report))
     if not as_json:
         typer.echo(done.study.conclusion())

@@ -2,10 +2,10 @@
 "use strict";
 (() => {
   const view = (canvas) => {
-    const { size, facets, colours } = JSON.parse(canvas.dataset.surface);
+    const { size, bound, facets, colours } = JSON.parse(canvas.dataset.surface);
     const context = canvas.getContext("2d"), said = document.querySelector("[data-exaggeration]");
-    const bound = Math.max(...facets.flat(2).map(Math.abs), 1e-3);
-    let azimuth = -0.6, tilt = 0.9, factor = 0.12 * size[0] * 1000 / bound; // mm as metres, highest at a tenth of the width
+    const highest = Math.max(...facets.flat(2).map(Math.abs), 1e-3);
+    let azimuth = -0.6, tilt = 0.9, factor = 0.12 * size[0] * 1000 / highest; // mm as metres, highest at a tenth of the width
 
     // Facets in PAINT's order: upper left, upper right, lower left, lower right; i runs with x, j with y.
     const quads = facets.flatMap((heights, facet) => {
@@ -34,7 +34,7 @@
         context.beginPath();
         corners.forEach(([x, y], k) => (k ? context.lineTo(x, y) : context.moveTo(x, y)));
         context.closePath();
-        context.fillStyle = colours[Math.round((mean / bound + 1) / 2 * (colours.length - 1))];
+        context.fillStyle = colours[Math.round((Math.min(Math.max(mean / bound, -1), 1) + 1) / 2 * (colours.length - 1))];
         context.strokeStyle = "rgba(28, 41, 46, 0.28)";
         context.fill();
         context.stroke();

@@ -48,7 +48,8 @@ def make_study(context: Context, payload: StudyIn) -> Result:
     if "study" not in context.steps():
         studied = study_store(context.runtime, StudyRequest(**payload.model_dump()), context.report)
         options = payload.model_dump(mode="json")
-        row = study_row(studied, f"Study of job {context.lease.job_id}", options, context.created_by)
+        title, scales = f"Study of job {context.lease.job_id}", context.runtime.settings.figure_scales
+        row = study_row(studied, title, options, context.created_by, scales)
         with context.runtime.database.writing() as session:
             store.add_study(session, row)
             about = {"study": row.id, "verdict": row.verdict, "conclusion": row.conclusion, "skipped": row.skipped}

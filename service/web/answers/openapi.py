@@ -38,7 +38,8 @@ _TAGS = [
     {"name": "forecasts", "description": "Flux maps of one heliostat on any plane, or of a field on any receiver."},
     {
         "name": "studies",
-        "description": "What photographs demand and the model lacks: find it, adopt it into the model, withdraw it.",
+        "description": "What photographs demand and the model lacks: find it, adopt it into the model, withdraw it. "
+        "Differences, as `residual.mean_map_8x8` [of the measured peak], are forecast minus photograph.",
     },
     {"name": "jobs", "description": "Work that outlives a request: ask for it, follow it, cancel it."},
     {"name": "audit", "description": "Who did what when."},

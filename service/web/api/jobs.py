@@ -11,7 +11,7 @@ from service.base.arrays import unpack
 from service.base.faults import NotFoundError
 from service.base.fields import Rows, State, Version
 from service.drawing.pictures import flux_picture
-from service.jobs.asking import ask_for, cancel_for
+from service.jobs.asking import ask_for, cancel_for, forget_for
 from service.jobs.kind import Kind, Kinds, result_of
 from service.store import queue
 from service.store.job_tables import JobRow
@@ -111,12 +111,13 @@ def creators(kinds: Kinds) -> APIRouter:
     asking = APIRouter(prefix="/jobs", tags=["jobs"])
     for kind in kinds.values():
         add_creator(asking, kind, f"/{kind.name}", f"post_{kind.name}_job")
-        asking.get(f"/{kind.name}", include_in_schema=False, dependencies=[READ])(_only_post)
+        for other in (asking.get, asking.delete):
+            other(f"/{kind.name}", include_in_schema=False, dependencies=[READ])(_only_post)
     return asking
 
 
 async def _only_post() -> None:
-    """There is nothing to read where jobs are asked for."""
+    """There is nothing to read, or to delete, where jobs are asked for."""
     raise HTTPException(status.HTTP_405_METHOD_NOT_ALLOWED, headers={"Allow": "POST"})
 
 
@@ -212,6 +213,12 @@ def get_job_events(
     """The job in short each time it changes, as server-sent events, until it ends."""
     watcher = Watcher(number, identity.name, presented)
     return stream(watchers, runtime, watcher, last_event_id, stopping)
+
+
+@router.delete("/{number}", responses=problems(404, 409), dependencies=[OPERATE])
+def delete_job(number: Number, runtime: RuntimeDep, identity: IdentityDep) -> JobOut:
+    """Delete a plan that is done: its result goes, and the job then ends as any other. Other jobs go by their age."""
+    return job_out(forget_for(runtime, number, identity.name))
 
 
 @router.post("/{number}/cancel", responses=problems(404, 409), dependencies=[OPERATE])

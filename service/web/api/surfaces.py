@@ -10,6 +10,7 @@ from pydantic import BaseModel, Field
 from service import store
 from service.base.arrays import unpack
 from service.base.fields import MeasurementName, Method, Model, ModelVersion, Moment, Source, Version, VersionIn, Whole
+from service.base.settings import Settings
 from service.drawing.pictures import surface_picture
 from service.store import decisions
 from service.store.decisions import Grounds
@@ -159,13 +160,14 @@ def surface_out(heliostat_name: str, row: SurfaceRow) -> SurfaceOut:
     return SurfaceOut.model_validate({**surface_summary(heliostat_name, row).model_dump(), **arrays})
 
 
-def surface_answer(heliostat_name: str, row: SurfaceRow, media_type: str) -> Response:
+def surface_answer(heliostat_name: str, row: SurfaceRow, media_type: str, settings: Settings) -> Response:
     """A surface as the client wants it."""
     arrays = unpack(row.arrays)
     if media_type == formats.JSON:
         return json_answer(surface_summary(heliostat_name, row), **arrays)
     name, title = f"{heliostat_name}-surface-{row.version}", f"{heliostat_name}, surface {row.version} ({row.source})"
-    return maps_answer(Maps(name, title, arrays, partial(surface_picture, arrays["z"]), row.arrays), media_type)
+    picture = partial(surface_picture, arrays["z"], bound=settings.figure_scales["heights"])
+    return maps_answer(Maps(name, title, arrays, picture, row.arrays), media_type)
 
 
 router = APIRouter(prefix="/heliostats/{name}/surfaces", tags=["surfaces"])
@@ -235,7 +237,7 @@ def list_surfaces(
 def _at(runtime: Runtime, name: str, moment: datetime | None, media_type: str) -> Response:
     with runtime.database.reading() as session:
         row = store.get_surface_at(session, store.get_heliostat(session, name), moment)
-    return surface_answer(name, row, media_type)
+    return surface_answer(name, row, media_type, runtime.settings)
 
 
 @router.get(
@@ -293,7 +295,7 @@ def get_surface(
     """A version of the surface."""
     with runtime.database.reading() as session:
         row = store.get_surface(session, store.get_heliostat(session, name), version)
-    return surface_answer(name, row, media_type)
+    return surface_answer(name, row, media_type, runtime.settings)
 
 
 @router.post("/{version}/seen", responses=problems(404, 409), dependencies=[OPERATE])

@@ -21,7 +21,6 @@ from service.base.faults import NotFoundError
 from service.base.fields import AZIMUTH, ELEVATION, Model, Name, Version, filled
 from service.drawing import charts
 from service.drawing.charts import HeatMap, Timeline, Value
-from service.drawing.pictures import mirror_heights
 from service.store import mounts
 from service.store.tables import HeliostatRow, MountRow, PlantRow, SurfaceRow, TargetRow
 from service.twin.accuracy import Compared, Comparison, Span
@@ -149,11 +148,12 @@ class Trio:
     difference: HeatMap
 
 
-def _surfaces(first: Side, second: Side) -> Trio:
-    bound = max(float(np.abs(mirror_heights(side.z)).max()) for side in (first, second))
-    one, other = (charts.surface_map(f"Deviation of {side.name}", side.z, side.size, bound) for side in (first, second))
+def _surfaces(first: Side, second: Side, ends: Mapping[str, float]) -> Trio:
+    one, other = (
+        charts.surface_map(f"Deviation of {side.name}", side.z, side.size, ends["heights"]) for side in (first, second)
+    )
     title = f"{second.name} minus {first.name}"
-    return Trio(one, other, charts.surface_map(title, second.z - first.z, second.size))
+    return Trio(one, other, charts.surface_map(title, second.z - first.z, second.size, ends["height_change"]))
 
 
 @dataclass(frozen=True)
@@ -188,7 +188,8 @@ def _forecasts(runtime: Runtime, sides: tuple[Side, Side], target: str, sun: tup
         charts.flux_map(f"Flux of {side.name} on {target}", made.flux, size, "W/m²", top)
         for side, made in zip(sides, (one, other), strict=True)
     )
-    difference = charts.difference_map("Second minus first", other.flux - one.flux, size, "W/m²")
+    bound = max(runtime.settings.figure_scales["flux_difference"] * top, 1e-9)
+    difference = charts.difference_map("Second minus first", other.flux - one.flux, size, "W/m²", bound)
     return Forecasts(Trio(first, second, difference), one, other, flux_accuracy(one.flux, other.flux))
 
 
@@ -319,7 +320,7 @@ def get_compare_page(
         "compare.html",
         **filled,
         sides=read.sides,
-        surfaces=_surfaces(*read.sides),
+        surfaces=_surfaces(*read.sides, runtime.settings.figure_scales),
         change_mm=1e3 * float(np.sqrt(np.mean((read.sides[1].z - read.sides[0].z) ** 2))),
         forecasts=forecasts,
         trouble=trouble,

@@ -2,7 +2,7 @@
 
 import itertools
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from statistics import fmean
@@ -22,7 +22,7 @@ from service.drawing import charts
 from service.drawing.charts import HeatMap, History, Scale
 from service.drawing.pictures import comparison_picture, mirror_heights
 from service.store import decisions, mounts
-from service.store.measurements import PhotographVerdict, Shot, list_shots
+from service.store.shots import PhotographVerdict, Shot, Wanted, list_shots
 from service.store.tables import DecisionRow, HeliostatRow, MountRow, SurfaceRow
 from service.twin.accuracy import RECENT, Compared, Comparison, ComparisonBook, rank_of
 from service.twin.field import Figures, Line, figures_of, read_lines
@@ -35,7 +35,7 @@ router = APIRouter(include_in_schema=False, dependencies=[READ])
 # Newest surfaces and photographs that the page lists.
 _MOST_SURFACES = 40
 MOST_PHOTOGRAPHS = 60
-"""Of a page."""
+"""Those beyond are on the page of all photographs."""
 # Last decisions on which surface is today's that the page tells.
 _MOST_DECISIONS = 5
 # Points along each side of a facet in the view in space.
@@ -78,7 +78,8 @@ class ComparisonFigure:
     def drawn(self) -> bytes:
         """The three side by side, as PNG."""
         title = f"{self.comparison.measurement.identifier}: accuracy {self.comparison.accuracy:.1%}"
-        return comparison_picture(self.measured.values, self.forecast.values, self.measured.width, title)
+        bounds = self.measured.scale.high, self.difference.scale.high
+        return comparison_picture(self.measured.values, self.forecast.values, self.measured.width, title, bounds)
 
 
 def _newest_surfaces(session: Session, heliostat: HeliostatRow) -> list[SurfaceRow]:
@@ -105,27 +106,31 @@ def _histories(listed: Sequence[Revision]) -> list[History]:
     return [*drawn, charts.history("Change from the version before", "mm", changes, 3)] if changes else drawn
 
 
-def space_view(z: NDArray[Any], size: tuple[float, float]) -> str:
-    """What `surface3d.js` draws: heights [mm] of each facet on an even grid, the mirror's size [m], and colours."""
+def space_view(z: NDArray[Any], size: tuple[float, float], bound: float) -> str:
+    """What `surface3d.js` draws: heights [mm] of each facet on an even grid, the mirror's size [m], and colours.
+
+    Those end at ``bound`` [mm], as on the map.
+    """
     heights = mirror_heights(z, _SPACE_SAMPLES)
     colours = Scale("RdBu_r", 0, 1, "").names(np.linspace(0, 1, 33).tolist())
-    return json.dumps({"size": size, "facets": np.round(heights, 4).tolist(), "colours": colours})
+    return json.dumps({"size": size, "bound": bound, "facets": np.round(heights, 4).tolist(), "colours": colours})
 
 
 @dataclass(frozen=True)
 class ComparisonFigures:
-    """All comparisons, and the two scales that they share."""
+    """All comparisons, and the two scales that they share; ``beyond`` is the largest difference, where it lies so."""
 
     figures: list[ComparisonFigure]
     flux: Scale
     difference: Scale
+    beyond: float | None
 
 
-def comparison_figures(comparisons: Sequence[Comparison]) -> ComparisonFigures:
-    """Pictures in shares of each photograph's measured peak, as in the report of a study."""
+def comparison_figures(comparisons: Sequence[Comparison], bound: float) -> ComparisonFigures:
+    """Pictures in shares of each photograph's measured peak, as in a study's report; ``bound`` ends differences."""
     pairs = [(c.measured / c.measured.max(), c.forecast / c.measured.max()) for c in comparisons]
     top = max((float(image.max()) for pair in pairs for image in pair), default=1.0)
-    bound = max((float(np.abs(forecast - measured).max()) for measured, forecast in pairs), default=0.0)
+    largest = max((float(np.abs(forecast - measured).max()) for measured, forecast in pairs), default=0.0)
     flux, difference = charts.flux_scale(top, _OF_PEAK), charts.difference_scale(bound, _OF_PEAK)
     figures = []
     for comparison, (measured, forecast) in zip(comparisons, pairs, strict=True):
@@ -137,7 +142,7 @@ def comparison_figures(comparisons: Sequence[Comparison]) -> ComparisonFigures:
         name = comparison.measurement.identifier
         maps = [charts.heat_map(f"{what} flux of {name}", image, _WINDOW, scale) for what, image, scale in shown]
         figures.append(ComparisonFigure(comparison, *maps))
-    return ComparisonFigures(figures, flux, difference)
+    return ComparisonFigures(figures, flux, difference, largest if largest > bound else None)
 
 
 async def _book(request: Request) -> ComparisonBook:
@@ -150,17 +155,18 @@ ComparisonBookDep = Annotated[ComparisonBook, Depends(_book)]
 _UNDER_WAY = Compared(trouble="The forecasts of its photographs are being worked out; look again in a moment.")
 
 
-def _surface_context(surface: SurfaceRow, size: tuple[float, float]) -> dict[str, Any]:
+def _surface_context(surface: SurfaceRow, size: tuple[float, float], ends: Mapping[str, float]) -> dict[str, Any]:
     arrays = unpack(surface.arrays)
     shown = figures_of(surface.arrays)
     title = f"Surface {surface.version}: deviation from the ideal mirror, seen from the front"
-    deviation = charts.surface_map(title, arrays["z"], size)
-    uncertainty = charts.uncertainty_map("Standard deviation of the surface", arrays["z_std"], size)
+    deviation = charts.surface_map(title, arrays["z"], size, ends["heights"])
+    std = "Standard deviation of the surface"
+    uncertainty = charts.uncertainty_map(std, arrays["z_std"], size, ends["height_std"])
     return {
         "figures": shown,
         "surface_map": deviation,
         "uncertainty_map": uncertainty if shown.uncertainty_mm else None,
-        "space": space_view(arrays["z"], size),
+        "space": space_view(arrays["z"], size, ends["heights"]),
     }
 
 
@@ -193,7 +199,6 @@ class _Read:
     undoable: DecisionRow | None
     shots: list[Shot]
     verdict: PhotographVerdict | None
-    newer: int
     mount: MountRow | None
     line: Line
     best: Slot | None
@@ -207,7 +212,6 @@ def _read(
     field: FieldBookDep,
     version: Annotated[Version | None, Query()] = None,
     photographs: Annotated[PhotographVerdict | None, Query()] = None,
-    newer: Annotated[int, Query(ge=0, le=1_000_000, description="Newer photographs, which are left out.")] = 0,
 ) -> _Read:
     """A heliostat with its current surface, or an earlier ``version``; waits for what is compared elsewhere."""
     with runtime.database.reading() as session:
@@ -217,21 +221,22 @@ def _read(
         surfaces = _newest_surfaces(session, row)
         decided = decisions.list_decisions(session, row, _MOST_DECISIONS)
         undoable = decisions.find_undoable(session, row)
-        shots = list_shots(session, row, MOST_PHOTOGRAPHS + 1, photographs, newer)
+        shots = list_shots(session, Wanted(row, verdict=photographs), MOST_PHOTOGRAPHS + 1)
         mount = mounts.find_mount_at(session, row)
         shown, (line,) = book.read(session, row, surface), read_lines(session, row.id)
     # The rest of the page does not depend on them.
     compared = Compared() if shown is None else book.wait_for(shown) or _UNDER_WAY
     line = field.with_pointing(line)
     best = None if line.pointing is None else best_slot(runtime, name)
-    return _Read(
-        row, today, surface, surfaces, decided, undoable, shots, photographs, newer, mount, line, best, compared
-    )
+    return _Read(row, today, surface, surfaces, decided, undoable, shots, photographs, mount, line, best, compared)
 
 
 @router.get("/heliostats/{name}")
-def get_heliostat_page(request: Request, read: Annotated[_Read, Depends(_read)], _turn: Turn) -> HTMLResponse:
+def get_heliostat_page(
+    request: Request, runtime: RuntimeDep, read: Annotated[_Read, Depends(_read)], _turn: Turn
+) -> HTMLResponse:
     """A heliostat with its current surface, or an earlier ``version``; nobody waits in his turn for comparisons."""
+    ends = runtime.settings.figure_scales
     listed, comparisons = versions(read.surfaces), read.compared.comparisons
     return render(
         request,
@@ -244,18 +249,17 @@ def get_heliostat_page(request: Request, read: Annotated[_Read, Depends(_read)],
         decided=read.decided,
         undoable=read.undoable,
         histories=_histories(listed) if listed else [],
-        comparisons=comparison_figures(comparisons),
+        comparisons=comparison_figures(comparisons, ends["flux_difference"]),
         trouble=read.compared.trouble,
         recent=RECENT,
         shots=read.shots[:MOST_PHOTOGRAPHS],
         verdict=read.verdict,
-        newer=read.newer,
-        older=read.newer + MOST_PHOTOGRAPHS if len(read.shots) > MOST_PHOTOGRAPHS else None,
+        older=read.shots[MOST_PHOTOGRAPHS - 1].mark if len(read.shots) > MOST_PHOTOGRAPHS else None,
         rank=rank_of(comparisons),
         accuracy_seen=fmean(seen) if (seen := [c.accuracy for c in comparisons if c.was_used]) else None,
         mount=read.mount,
         line=read.line,
         best=read.best,
         pointing=None if read.mount is None else _mount_context(read.mount),
-        **(_surface_context(read.surface, _size(read.row)) if read.surface is not None else {}),
+        **(_surface_context(read.surface, _size(read.row), ends) if read.surface is not None else {}),
     )

@@ -143,7 +143,7 @@ def get_photograph_page(
         row=row,
         images=images,
         kept={kind: image for kind, image in images.items() if image.image.pruned_at is None},
-        comparisons=comparison_figures(compared),
+        comparisons=comparison_figures(compared, runtime.settings.figure_scales["flux_difference"]),
         trouble=trouble,
         is_excluded=row.reason == EXCLUDED,
         corrections=[(row, told(row)) for row in corrections],

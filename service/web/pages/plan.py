@@ -19,17 +19,18 @@ from service.base.fields import FormMoment, Model, Name, Version
 from service.drawing import charts
 from service.drawing.charts import HeatMap, Timeline, Value
 from service.drawing.templates import in_zone
-from service.jobs.asking import ask_for
+from service.jobs.asking import ask_for, forget_for
 from service.jobs.kinds.plans import PlanIn
 from service.store import queue
 from service.store.columns import now
 from service.store.job_tables import JobRow
-from service.web.answers.pages import leave_for, render
+from service.web.answers.pages import go_to, leave_for, render
 from service.web.door.dependencies import DRAWS, OPERATE, READ, IdentityDep, RuntimeDep
 
 router = APIRouter(include_in_schema=False)
 
-_LISTED = 20
+LISTED = 20
+"""Plans on a page of the list."""
 
 
 class PlanForm(Model):
@@ -181,33 +182,40 @@ def _day(row: JobRow, asked: PlanIn, at: int | None) -> Day:
 # --- pages ------------------------------------------------------------------------------------------------------------
 
 
-def _choices(session: Session) -> dict[str, Any]:
-    receivers = [row.name for row in store.list_receivers(session)]
+def _choices(session: Session, after: int | None) -> dict[str, Any]:
+    receivers, plans = [row.name for row in store.list_receivers(session)], store.list_plans(session, LISTED + 1, after)
     return {
         "targets": [*receivers, *(row.name for row in store.list_targets(session))],
-        "plans": store.recent_plans(session, _LISTED),
+        "plans": plans[:LISTED],
+        "after": after,
+        "older": plans[LISTED - 1].job if len(plans) > LISTED else None,
     }
 
 
+After = Annotated[Version | None, Query(description="The last plan of the page before.")]
+Number = Annotated[Version, Path(description="Id of the plan's job.")]
+
+
 @router.get("/plans", dependencies=[READ])
-def get_plans_page(request: Request, runtime: RuntimeDep) -> HTMLResponse:
+def get_plans_page(request: Request, runtime: RuntimeDep, after: After = None) -> HTMLResponse:
     """The form, and the plans that were made."""
     with runtime.database.reading() as session:
-        choices = _choices(session)
+        choices = _choices(session, after)
     zone = in_zone(runtime.settings.time_zone)
     return render(request, "plan.html", **choices, filled=_likely(choices["targets"]), job=None, day=None, in_zone=zone)
 
 
 @router.get("/plans/{number}", dependencies=[READ, DRAWS])
 def get_plan_page(
-    number: Annotated[Version, Path(description="Id of the plan's job.")],
+    number: Number,
     request: Request,
     runtime: RuntimeDep,
+    after: After = None,
     at: Annotated[int | None, Query(ge=0, le=1000, description="Which time's maps.")] = None,
 ) -> HTMLResponse:
     """A plan, followed until it is done, with the form as it was asked for."""
     with runtime.database.reading() as session:
-        row, choices = queue.get_job(session, number, arrays=True), _choices(session)
+        row, choices = queue.get_job(session, number, arrays=True), _choices(session, after)
     if row.kind != "plans":
         raise NotFoundError(f"job {number} is no plan")
     asked = PlanIn.model_validate(row.payload)
@@ -222,6 +230,13 @@ def get_plan_page(
         day=None if row.result is None else _day(row, asked, at),
         in_zone=in_zone(runtime.settings.time_zone),
     )
+
+
+@router.post("/plans/{number}/delete", dependencies=[OPERATE])
+def post_deletion_form(number: Number, runtime: RuntimeDep, identity: IdentityDep) -> Response:
+    """Delete a plan, and go back to the others."""
+    forget_for(runtime, number, identity.name)
+    return go_to("/plans")
 
 
 @router.post("/plans", dependencies=[OPERATE])

@@ -21,6 +21,7 @@ from model.study import StudyOptions
 from model.study.judging import Gain
 from model.study.report import Found
 from model.study.unknowns import Term, Unknowns
+from service.base.settings import FIGURE_SCALES
 from service.cli.folder_study import FolderStudy, study_folder
 from service.cli.main import main
 from service.drawing.study_report import study_page
@@ -167,7 +168,7 @@ def test_a_spot_off_its_target_is_skipped_by_name(few, tmp_path):
     assert list(done.skipped) == [key]
     assert f"{key}: 'focal_spot' lies off its target" in done.skipped[key]
     assert done.to_json()["skipped"] == done.skipped
-    assert key in text(study_page(done.study, "few", done.skipped))
+    assert key in text(study_page(done.study, "few", FIGURE_SCALES, done.skipped))
 
 
 # --- the page ---------------------------------------------------------------------------------------------------------
@@ -206,7 +207,7 @@ def text(page: str) -> str:
 
 
 def test_accuracies_are_in_percent_as_on_all_pages(hazy):
-    page = text(study_page(hazy.study, "few"))
+    page = text(study_page(hazy.study, "few", FIGURE_SCALES))
     before, after = (100 * float(values.mean()) for values in (hazy.study.accuracy_before, hazy.study.accuracy_after))
     assert f"{before:.1f} % → {after:.1f} %" in page
     assert f"rises from {before:.1f}% to {after:.1f}%" in hazy.study.conclusion()
@@ -215,7 +216,7 @@ def test_accuracies_are_in_percent_as_on_all_pages(hazy):
 
 
 def test_the_page_stands_alone(hazy):
-    page = study_page(hazy.study, "few")
+    page = study_page(hazy.study, "few", FIGURE_SCALES)
     reader = read(page)
     assert not {"script", "link", "iframe", "object", "form"} & set(reader.tags)
     assert all(address.startswith("data:image/png;base64,") for address in reader.addresses)
@@ -226,7 +227,7 @@ def test_the_page_stands_alone(hazy):
 
 
 def test_the_page_says_what_was_found(hazy):
-    page = study_page(hazy.study, "few")
+    page = study_page(hazy.study, "few", FIGURE_SCALES)
     words = text(page)
     assert hazy.study.conclusion() in words
     assert words.index(hazy.study.conclusion()) < words.index("Mean accuracy")
@@ -239,7 +240,7 @@ def test_the_page_says_what_was_found(hazy):
 
 
 def test_the_page_of_a_complete_model_shows_no_after(clean):
-    words = text(study_page(clean.study, "few"))
+    words = text(study_page(clean.study, "few", FIGURE_SCALES))
     assert clean.study.verdict == "none"
     assert "Nothing missing" in words
     assert "forecast after" not in words
@@ -249,7 +250,7 @@ def test_the_page_of_a_complete_model_shows_no_after(clean):
 def test_look_alikes_come_with_the_photographs_that_decide(hazy):
     (found,) = hazy.study.found
     doubtful = replace(hazy.study, found=[replace(found, lookalikes=["slope_error"])])
-    words = text(study_page(doubtful, "few"))
+    words = text(study_page(doubtful, "few", FIGURE_SCALES))
     assert "Slope error would do as well. To decide, photograph several heliostats within the same hour" in words
     assert "Before the effect is adopted" in words
 
@@ -259,7 +260,7 @@ def test_parameters_of_facets_stand_in_columns(hazy):
     unknowns = Unknowns((term,), (("AD34", 4), ("AR18", 4)))
     values = np.linspace(-1, 1, 16)
     found = Found("facet_canting", GAIN, GAIN, []).fitted(term, unknowns, values, np.full(16, 0.1))
-    page = study_page(replace(hazy.study, found=[found]), "few")
+    page = study_page(replace(hazy.study, found=[found]), "few", FIGURE_SCALES)
     assert "Facet 4" in text(page)
     assert page.count("<code>x_mrad</code>") == page.count("<code>y_mrad</code>") == 2
     telling = [abs(v) > 0.196 for v in values]
@@ -272,7 +273,7 @@ def test_what_comes_and_goes_is_shown_by_day(hazy):
     found = Found("sun_shape", GAIN, GAIN, []).fitted(
         term, Unknowns((term,), (("AD34", 4),)), np.array([0.02, 0.2]), np.full(2, 0.01)
     )
-    words = text(study_page(replace(hazy.study, found=[found]), "few"))
+    words = text(study_page(replace(hazy.study, found=[found]), "few", FIGURE_SCALES))
     assert "Sun shape by day (most on 2024-06-09)" in words
     assert all(row in words for row in ("other days", "2024-06-07", "2024-06-09"))
 
@@ -283,7 +284,7 @@ def test_names_are_text_wherever_they_come_from(hazy):
         replace(p, setup=replace(p.setup, identifier=f"{evil}/{n}", heliostat=replace(p.setup.heliostat, name=evil)))
         for n, p in enumerate(hazy.study.images)
     ]
-    page = study_page(replace(hazy.study, images=photographs), evil, {evil: evil})
+    page = study_page(replace(hazy.study, images=photographs), evil, FIGURE_SCALES, {evil: evil})
     assert "<script" not in page
     assert "script" not in read(page).tags
     assert evil in "".join(read(page).words)

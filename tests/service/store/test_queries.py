@@ -410,7 +410,7 @@ def test_plans_are_listed_newest_first_under_way_or_done(database: Database):
         queue.add_job(session, "predictions", {}, "tester", None)
         queue.add_job(session, "plans", payload | {"name": "July"}, "tester", None)
     with database.reading() as session:
-        plans = store.recent_plans(session, 10)
+        plans = store.list_plans(session, 10)
     assert [(plan.name, plan.state, plan.peak_w_m2) for plan in plans] == [
         ("July", "queued", None),
         ("June", "done", 1.5),

@@ -2,6 +2,7 @@
 
 import re
 import time
+from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from model.surface import greville
+from service.drawing.charts import Value, timeline
 from service.twin.field import shape_of
 from tests.service.conftest import FakeOperations, Post, png
 from tests.service.web.test_pages import HTML, text_of
@@ -48,7 +50,7 @@ def test_versions_stand_side_by_side_with_what_they_forecast(pages: TestClient, 
     page = settled(pages, "/compare?heliostat=AA39")
     assert "AA39, version 1 with AA39, version 2" in page
     assert page.count('<svg class="figure" viewBox="0 0 430') == 6
-    assert "Deviation of AA39, version 2; from -1 to 1 mm" in page
+    assert "Deviation of AA39, version 2; from -2 to 2 mm" in page
     assert [made["resolution"] for made in operations.forecasts[-2:]] == [(128, 128)] * 2
     assert "they agree by 100.0" in page
     # Only the third photograph has been seen by neither.
@@ -117,3 +119,12 @@ def test_tilted_facets_are_canting_and_no_waviness():
     shape = shape_of(np.stack([1e-3 * (x + y)] * 4), (4.0, 2.0))
     assert shape.canting_mrad == pytest.approx(2**0.5, rel=1e-9)
     assert shape.waviness_mm == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("span_s", [1e-3, 1.0, 100.0, 170.0, 7200.0, 10_000.0, 80_000.0, 2e5, 7.7e6, 8e6, 9e7, 9e8])
+def test_time_has_ticks_whatever_its_span(span_s: float):
+    begin = datetime(2024, 5, 1, 7, 3, tzinfo=UTC)
+    values = [Value(begin, 1.0), Value(begin + timedelta(seconds=span_s), 2.0)]
+    chart = timeline("", "", {"": values}, 1)
+    assert chart is not None
+    assert 1 <= len(chart.x_ticks) <= 8

@@ -56,12 +56,13 @@ FLAGS = [
     "--disable-sync",
 ]
 SCHEMES = ("light", "dark")
-DESK, PHONE = {"width": 1280, "height": 900}, {"width": 390, "height": 844}
+DESK, PHONE = {"width": 1440, "height": 900}, {"width": 390, "height": 844}
 PATHS = (
     "/",
     "/heliostats/AA39",
     "/heliostats/AA39/photographs/100",
     "/heliostats/AB01",
+    "/photographs",
     "/forecast",
     "/forecasts/1",
     "/studies",
@@ -346,8 +347,9 @@ def test_dark_is_dark(page: Any):
 
 
 # What a finger shall meet and is less than 40 px high; links within a sentence may be lower.
-LOW = """() => [...document.querySelectorAll("button, select, input, summary, .choice, nav a, .button, .brand, th a")]
-    .filter((e) => !e.matches("[type=hidden], [type=radio], [type=checkbox], .note") && e.getClientRects().length)
+LOW = """() => [...document.querySelectorAll(
+        "button, select, input, textarea, summary, .choice, .button, .brand, nav a, table a, .files a, a.note")]
+    .filter((e) => !e.matches("[type=hidden], [type=radio], [type=checkbox]") && e.getClientRects().length)
     .filter((e) => e.getBoundingClientRect().height < 39.5).map((e) => e.outerHTML.slice(0, 80))"""
 
 

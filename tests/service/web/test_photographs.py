@@ -1,6 +1,8 @@
 """Photographs on the pages: one row each, whatever kinds came of it; small, outlined, and beside its light."""
 
+import csv
 import html
+import io
 import re
 from typing import Any
 
@@ -11,9 +13,12 @@ from fastapi.testclient import TestClient
 
 from model.imaging import MeasuredFlux, Quality
 from service import store
-from service.store.measurements import list_shots
-from service.web.pages import heliostat
-from tests.service.conftest import FakeOperations, Post, png
+from service.store.columns import now
+from service.store.database import Database
+from service.store.shots import Wanted, list_shots, page_of_shots
+from service.store.tables import TargetRow
+from service.web.pages import heliostat, photographs
+from tests.service.conftest import FakeOperations, Post, png, poster
 from tests.service.web.test_pages import HTML, text_of
 
 HERE = "/heliostats/AA39/photographs"
@@ -57,11 +62,88 @@ def test_older_photographs_are_a_page_away(filled: TestClient, monkeypatch: pyte
     monkeypatch.setattr(heliostat, "MOST_PHOTOGRAPHS", 2)
     page = text_of(filled, "/heliostats/AA39")
     assert rows_of(page) == ["3", "2"]
-    (older,) = re.findall(r'href="([^"]*newer=2)#', page)
+    (older,) = re.findall(r'href="(/photographs[^"]*before=\d+)"', page)
     page = text_of(filled, html.unescape(older))
     assert rows_of(page) == ["1"]
-    assert "newer=0" in page
-    assert "newer=3" not in page
+    assert 'href="/photographs?heliostat=AA39">Newest' in page
+
+
+def names_of(page: str) -> list[str]:
+    found = re.findall(r'<th scope="row"><a href="/heliostats/(\w+)/photographs/[\w-]+">(\w+)</a>', page)
+    return [f"{heliostat} {name}" for heliostat, name in found]
+
+
+@pytest.fixture
+def field(filled: TestClient, properties: dict[str, Any]) -> TestClient:
+    """The same with another heliostat's on another target, of a day long ago."""
+    assert filled.put("/v1/heliostats/AB01", json=properties).status_code == 201
+    send = poster(filled)
+    answer = send(png(31), heliostat="AB01", id="4", target_name="upper", taken_at="2024-06-01T11:30:00Z")
+    assert answer.status_code == 201
+    return filled
+
+
+OF_FIELD = ["AA39 3", "AA39 2", "AA39 1", "AB01 4"]
+
+
+@pytest.mark.parametrize(
+    ("asked", "shown"),
+    [
+        ("", [0, 1, 2, 3]),
+        ("heliostat=AB01&verdict=&target=&since=&until=", [3]),
+        ("verdict=used", [2, 3]),
+        ("verdict=refused", [1]),
+        ("verdict=excluded", [0]),
+        ("target=lower", [0, 1, 2]),
+        ("target=upper&verdict=used", [3]),
+        ("since=2024-06-01&until=2024-06-01", [3]),
+        ("until=2024-05-31", []),
+        ("since=2024-06-02&heliostat=AA39&verdict=used", [2]),
+    ],
+)
+def test_photographs_of_the_field_are_found(field: TestClient, asked: str, shown: list[int]):
+    assert names_of(text_of(field, f"/photographs?{asked}")) == [OF_FIELD[at] for at in shown]
+
+
+def test_pages_of_photographs_meet(field: TestClient, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(photographs, "LISTED", 1)
+    path, seen = "/photographs?since=2024-01-01", []
+    while path:
+        page = text_of(field, path)
+        seen += names_of(page)
+        path = "".join(map(html.unescape, re.findall(r'rel="next" href="([^"]*)"', page)))
+    assert seen == OF_FIELD
+    assert field.get("/photographs?before=999").status_code == 404
+    assert field.get("/photographs?heliostat=XX99").status_code == 404
+
+
+def test_photographs_are_a_table_for_spreadsheets(field: TestClient):
+    rows = list(csv.DictReader(io.StringIO(field.get("/photographs?verdict=used&table=photographs").text)))
+    assert [(row["Heliostat"], row["Target"], float(row["Sun elevation [°]"])) for row in rows] == [
+        ("AA39", "lower", 45.0),
+        ("AB01", "upper", 45.0),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("wanted", "index"),
+    [
+        (Wanted(), "ix_measurements_moment_id"),
+        (Wanted(verdict="used"), "ix_measurements_accepted_moment_id"),
+        (Wanted(verdict="refused"), "ix_measurements_accepted_moment_id"),
+        (Wanted(verdict="excluded"), "ix_measurements_accepted_moment_id"),
+        (Wanted(target=TargetRow(id=1)), "ix_measurements_target_id_moment_id"),
+        (Wanted(since=now(), until=now()), "ix_measurements_moment_id"),
+    ],
+)
+def test_page_is_read_in_the_order_of_an_index(client: TestClient, wanted: Wanted, index: str):
+    database: Database = client.app.state.runtime.database  # type: ignore[attr-defined]
+    with database.engine.connect() as connection:
+        query = page_of_shots(wanted, 50, (now(), 7)).compile(connection, compile_kwargs={"literal_binds": True})
+        told = connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {query}").all()
+    plan = " ".join(row[-1] for row in told)
+    assert index in plan
+    assert "TEMP B-TREE" not in plan
 
 
 def test_other_verdicts_are_refused(filled: TestClient):
@@ -72,7 +154,7 @@ def test_one_image_that_is_used_makes_a_photograph_used(client: TestClient, post
     post(png(1, refused=True), id="1", kind="raw")
     post(png(2), id="1", kind="flux")
     with client.app.state.runtime.database.reading() as session:  # type: ignore[attr-defined]
-        (shot,) = list_shots(session, store.get_heliostat(session, "AA39"), 10)
+        (shot,) = list_shots(session, Wanted(store.get_heliostat(session, "AA39")), 10)
     assert (shot.name, shot.verdict, [row.kind for row in shot.images]) == ("1", "used", ["flux", "raw"])
 
 

@@ -2,18 +2,25 @@
 
 import re
 import threading
+from datetime import timedelta
 from typing import Any
 
 import numpy as np
 import pytest
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
+from sqlalchemy import update
 
 from model.fleet import FleetFlux
 from model.plant import Cylinder, TargetPlane
 from service.jobs.kinds import KINDS
 from service.jobs.kinds.plans import aim_on, load_of
 from service.jobs.worker import Worker
+from service.store import queue
+from service.store.columns import now
+from service.store.job_tables import JobRow
+from service.store.retention import prune_jobs
+from service.web.pages import plan
 from tests.service.conftest import FakeOperations, Post, png
 from tests.service.web.test_pages import HTML, make_key, text_of
 
@@ -161,3 +168,42 @@ def test_load_is_what_lands_and_what_is_too_much():
     load = load_of(FleetFlux(np.array([[3.0, 1.0], [0.0, 0.0]]), power=8.0, heliostats=1), plane, 2.0)
     assert (load["power_w"], load["intercept"], load["spillage"], load["exceeded_m2"]) == (4.0, 0.5, 0.5, 1.0)
     assert load_of(FleetFlux(np.zeros((2, 2))), plane, None)["intercept"] is None
+
+
+def aged(app: FastAPI) -> None:
+    """All jobs ended a year ago; a newer one stands behind them."""
+    with app.state.runtime.database.writing() as session:
+        session.execute(update(JobRow).values(finished_at=now() - timedelta(days=365)))
+        queue.add_job(session, "prunings", {}, "tester")
+
+
+def purge(app: FastAPI) -> int:
+    with app.state.runtime.database.writing() as session:
+        return prune_jobs(session, timedelta(days=90))
+
+
+def test_plans_are_kept_until_somebody_deletes_them(app: FastAPI, pages: TestClient):
+    job = planned(app, pages, name="kept")
+    aged(app)
+    assert purge(app) == 0
+    assert ">kept</a>" in text_of(pages, "/plans")
+    assert pages.get(f"/v1/jobs/{job['id']}/flux?format=npz").status_code == 200
+    assert pages.post(f"/plans/{job['id']}/delete", follow_redirects=False).headers["Location"] == "/plans"
+    assert ">kept</a>" not in text_of(pages, "/plans")
+    document = pages.get(f"/v1/jobs/{job['id']}").json()
+    assert (document["state"], document["result"], document["reason"]) == ("cancelled", None, "deleted by local")
+    (entry,) = [one for one in pages.get("/v1/audit").json()["items"] if one["action"] == "plan.deleted"]
+    assert (entry["actor"], entry["detail"]) == ("local", {"name": "kept"})
+    assert pages.delete(f"/v1/jobs/{job['id']}").status_code == 409  # it is gone
+    assert pages.delete("/v1/jobs/999").status_code == 404
+    assert purge(app) == 1
+
+
+def test_all_plans_are_listed(app: FastAPI, pages: TestClient, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(plan, "LISTED", 2)
+    for number in range(3):
+        pages.post("/v1/jobs/plans", json=DAY | {"name": f"plan {number}"})
+    page = text_of(pages, "/plans")
+    assert re.findall(r">(plan \d)</a>", page) == ["plan 2", "plan 1"]
+    (older,) = re.findall(r'rel="next" href="([^"]*)"', page)
+    assert re.findall(r">(plan \d)</a>", text_of(pages, older)) == ["plan 0"]

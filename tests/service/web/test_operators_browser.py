@@ -1,0 +1,221 @@
+"""What operators decide, in a real browser at a desk and on a phone: trust, correct, compare, find, export, plan."""
+
+import threading
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from model.imaging import MeasuredFlux
+from service import store
+from service.base.settings import Settings
+from service.jobs.kinds import KINDS
+from service.jobs.worker import Worker
+from service.web.app import create_app
+from tests.service.conftest import (
+    QUIET,
+    client_of,
+    free_port,
+    png,
+    poster,
+    properties_document,
+    serving,
+    tower_document,
+)
+from tests.service.twin.test_versions import SLOPE, study_row
+from tests.service.web.test_pages_browser import DESK, PHONE, GatedOperations, Served, browser, expect, follow, page
+
+assert (browser, page) is not None  # fixtures of this module, too
+
+SIZES = pytest.mark.parametrize("size", [DESK, PHONE], ids=["desk", "phone"])
+
+
+class Operations(GatedOperations):
+    """Finds the target of raw photographs; explains none under a sun in the east; forecasts too little on the left."""
+
+    def measure(self, image: Any, kind: str, plane: Any, **more: Any) -> MeasuredFlux:
+        made = super().measure(image, kind, plane, **more)
+        if kind != "raw" or not made.quality.accepted:
+            return made
+        corners = np.array([[8.0, 8], [24, 8], [8, 24], [24, 24]])
+        crop = np.full((256, 256), 99, np.uint8)
+        return MeasuredFlux(made.quality, made.flux, made.centered, made.center_of_mass, 4.0, crop, corners)
+
+    def predict(self, heliostat: Any, observations: Any, *rest: Any, **more: Any) -> Any:
+        made = super().predict(heliostat, observations, *rest, **more)
+        return replace(made, misfits=tuple(0.31 if one.sun[0] > 0.5 else 0.05 for one in observations))
+
+    def render(self, *arguments: Any, **options: Any) -> Any:
+        forecast = super().render(*arguments, **options).copy()
+        forecast[..., :32] *= 0.5
+        return forecast
+
+
+def fill(settings: Settings) -> None:
+    app = create_app(settings, Operations())
+    with client_of(app) as client:
+        client.put("/v1/plant", json=tower_document())
+        for name in ("AA39", "AB01"):
+            client.put(f"/v1/heliostats/{name}", json=properties_document())
+        send = poster(client)
+        for number in range(1, 4):
+            sun = {"sun_azimuth": -20.0 * number, "taken_at": f"2026-06-0{number}T11:30:00Z"}
+            assert send(png(number), id=str(number), kind="raw", **sun).status_code == 201
+        assert send(png(9, refused=True), id="9").status_code == 201
+        for used in (["1"], ["1", "2"]):
+            assert client.post("/v1/heliostats/AA39/surfaces", json={"measurements": used}).status_code == 201
+        for number, azimuth in ((1, 0.0), (2, 90.0)):
+            assert send(png(20 + number), "AB01", id=str(number), sun_azimuth=azimuth).status_code == 201
+        assert client.post("/v1/heliostats/AB01/surfaces", json={"method": "refined"}).status_code == 201
+        sun = {"azimuth_deg": -20, "elevation_deg": 45}
+        assert client.post("/v1/forecasts", json={"target": "lower", "sun": sun}).status_code == 202
+        worker = Worker(app.state.runtime, KINDS, "tester", threading.Event())
+        while worker.work():
+            pass
+        with app.state.runtime.database.writing() as session:
+            store.add_study(session, study_row(SLOPE))
+            store.add_study(session, study_row(verdict="none"))
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    settings = Settings(data_dir=tmp_path_factory.mktemp("operators"), port=free_port(), **QUIET)
+    fill(settings)
+    operations = Operations()
+    app = create_app(settings, operations)
+    with serving(app, settings.port, ws="none") as address:
+        yield Served(app, address, operations)
+
+
+@pytest.fixture
+def seen(page: Any, size: dict[str, int]) -> Any:
+    page.set_viewport_size(size)
+    return page
+
+
+@SIZES
+def test_what_is_todays_is_decided_and_taken_back(seen: Any):
+    seen.goto("/heliostats/AA39")
+    todays = seen.locator("tr:has(.state.done) th", has_text="today's")
+    expect(todays).to_have_text("2 today's")
+    follow(seen, "text=Make it today's")
+    expect(todays).to_have_text("1 today's")
+    follow(seen, "text=Undo: back to version 2")
+    expect(todays).to_have_text("2 today's")
+    expect(seen.locator(".decided")).to_contain_text("in place of")
+
+
+@SIZES
+def test_what_is_not_trusted_nor_judged_says_so(seen: Any):
+    seen.goto("/?show=doubted")
+    expect(seen.locator("tbody th")).to_have_text(["AB01"])
+    expect(seen.locator("tbody")).to_contain_text("not yet judged")
+    follow(seen, "tbody th a")
+    expect(seen.locator("#doubts-title")).to_contain_text("not trusted since")
+    expect(seen.locator(".tiles")).to_contain_text("not yet judged")
+    if seen.locator("text=I have seen it").count():
+        follow(seen, "text=I have seen it")
+    expect(seen.locator("section:has(#doubts-title)")).to_contain_text("Seen by local")
+
+
+@SIZES
+def test_photograph_is_found_looked_at_and_corrected(seen: Any, size: dict[str, int]):
+    seen.goto("/")
+    follow(seen, "nav >> text=Photographs")
+    expect(seen.locator("tbody th[scope=row]")).to_have_count(6)
+    small = "[...document.images].filter((e) => e.className == 'thumbnail')"
+    seen.evaluate("document.querySelectorAll('.thumbnail').forEach((e) => (e.loading = 'eager'))")
+    seen.wait_for_function(f"{small}.every((e) => e.complete && e.naturalWidth)")
+    seen.select_option("[name=verdict]", "refused")
+    follow(seen, "text=Find")
+    expect(seen.locator("tbody th[scope=row]")).to_have_count(1)
+    seen.select_option("[name=verdict]", "used")
+    seen.fill("[name=heliostat]", "AA39")
+    seen.fill("[name=since]", "2026-06-03")
+    seen.fill("[name=until]", "2026-06-03")
+    follow(seen, "text=Find")
+    follow(seen, "tbody th a >> nth=0")
+    expect(seen.locator("h1")).to_have_text("Photograph 3 of AA39")
+    for shown in ("outlined", "crop"):
+        expect(seen.locator(f"img[src$='{shown}.jpg']")).to_be_visible()
+    expect(seen.locator(".sides figcaption")).to_contain_text(["photograph", "target", "its light", "forecast", "diff"])
+    expect(seen.locator("main")).to_contain_text("red where the forecast is brighter")
+    azimuth = f"{-60 - size['width'] / 1e4:g}"
+    seen.fill("[name=sun_azimuth]", azimuth)
+    seen.fill("[name=reason]", "by hand")
+    seen.check("[name=excluded]")
+    follow(seen, "button >> text=Correct")
+    expect(seen.locator("#known-title")).to_have_text("excluded")
+    expect(seen.locator("#corrections")).to_contain_text(f"→ {azimuth}; excluded")
+    seen.fill("[name=reason]", "it was right")
+    seen.uncheck("[name=excluded]")
+    follow(seen, "button >> text=Correct")
+    expect(seen.locator("#known-title")).to_have_text("accepted")
+
+
+@SIZES
+def test_maps_of_all_versions_have_one_scale(seen: Any):
+    told = []
+    for version in (1, 2):
+        seen.goto(f"/heliostats/AA39?version={version}")
+        told.append(seen.locator("#deviation-title").text_content().rpartition("; ")[2])
+    assert told == ["from -2 to 2 mm"] * 2
+    expect(seen.locator("svg.scale").last).to_have_attribute(
+        "aria-label", "Colours from -0.3 to 0.3 of the measured peak"
+    )
+    seen.goto("/compare?heliostat=AA39&version=1&other_version=2")
+    expect(seen.locator("#compared .columns figure")).to_have_count(6)
+    expect(seen.locator("#compared [role=status]")).to_have_count(0)
+    assert seen.locator("#surface-first-title").text_content().endswith(told[0])
+
+
+@SIZES
+def test_study_says_what_matters_and_adopting_what_is_of_before(seen: Any):
+    seen.goto("/studies/2")
+    expect(seen.locator("#verdict-title")).to_have_text("nothing missing")
+    expect(seen.locator("section p >> nth=1")).to_contain_text("of the light falls elsewhere than forecast")
+    seen.goto("/studies/1")
+    follow(seen, "button >> text=Adopt")
+    expect(seen.locator("main")).to_contain_text("2 were made by another version of the model")
+    expect(seen.locator("form[action='/studies/remake'] button")).to_be_visible()
+    follow(seen, "text=Withdraw it")
+    expect(seen.locator("button >> text=Adopt")).to_be_visible()
+
+
+@SIZES
+def test_light_of_the_field_is_told_in_units(seen: Any):
+    seen.goto("/jobs/1")
+    expect(seen.locator(".tiles").nth(1)).to_contain_text("Reflected by the mirrors")
+    expect(seen.locator("figure svg image")).to_be_visible()
+    text = seen.locator("main").inner_text()
+    assert "{" not in text
+    assert "reflected_w" not in text
+
+
+@SIZES
+def test_tables_and_figures_are_taken_along(seen: Any):
+    seen.goto("/heliostats/AA39")
+    for suffix in ("npz", "png"):
+        with seen.expect_download() as taken:
+            seen.click(f"a[href*='figure=deviation&format={suffix}']")
+        assert taken.value.suggested_filename.endswith(f"deviation.{suffix}")
+    seen.goto("/photographs?verdict=used")
+    with seen.expect_download() as taken:
+        seen.click("text=CSV")
+    assert taken.value.suggested_filename.endswith("photographs.csv")
+
+
+@SIZES
+def test_plan_is_deleted_by_who_asked_twice(seen: Any, served: Served):
+    day = {"begin": "2026-06-21T08:00:00Z", "end": "2026-06-21T10:00:00Z"}
+    job = seen.request.post("/v1/jobs/plans", data=day | {"name": "to go", "target": "lower"}).json()["id"]
+    worker = Worker(served.app.state.runtime, KINDS, "tester", threading.Event())
+    while worker.work():
+        pass
+    seen.goto(f"/plans/{job}")
+    seen.click("summary >> text=Delete this plan")
+    follow(seen, "text=Delete to go for good")
+    assert seen.url.endswith("/plans")
+    expect(seen.locator("#plans-title + p")).to_contain_text("None yet")
