@@ -111,8 +111,8 @@ def creators(kinds: Kinds) -> APIRouter:
     asking = APIRouter(prefix="/jobs", tags=["jobs"])
     for kind in kinds.values():
         add_creator(asking, kind, f"/{kind.name}", f"post_{kind.name}_job")
-        for other in (asking.get, asking.delete):
-            other(f"/{kind.name}", include_in_schema=False, dependencies=[READ])(_only_post)
+        for other, role in ((asking.get, READ), (asking.delete, OPERATE)):
+            other(f"/{kind.name}", include_in_schema=False, dependencies=[role])(_only_post)
     return asking
 
 
