@@ -171,7 +171,7 @@ def _on_receiver(
         receiver,
         [tile_of([shot])],
         optics=folder.optics,
-        effects=acting(effects, wanted.at),
+        effects=acting(effects, wanted.at, heliostat.name),
         latitude_deg=float(folder.plant.origin[0]),
     )
     if made.skipped:

@@ -24,6 +24,7 @@ from model.study.scopes import alone, change, promises
 from model.study.unknowns import Term, Unknowns, copied
 from model.surface import control_points
 from model.tracing import Optics
+from service.base.settings import FIGURE_SCALES
 from service.drawing.study_report import study_page
 from tests.conftest import target
 
@@ -276,7 +277,7 @@ def test_a_rough_mirror_is_found_by_name(is_dated: bool):
     assert effect["parameters"]["sigma_mrad"]["value"] == pytest.approx(1.0, abs=0.05)
     assert "demand slope error of far: accuracy" in found.conclusion()
     assert effect_from_json(effect).scope == found.effects[0].scope == Always(("far",))
-    assert "<td>far</td>" in study_page(found, "a plant")
+    assert "<td>far</td>" in study_page(found, "a plant", FIGURE_SCALES)
 
 
 def test_what_one_heliostat_is_known_to_have_another_may_have():

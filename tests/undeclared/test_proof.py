@@ -14,6 +14,7 @@ from model.metrics import compare_on_target
 from model.plant import JUELICH_LATITUDE
 from model.study import StudyOptions, study
 from model.tracing import Optics
+from service.base.settings import FIGURE_SCALES
 from service.cli.folder_study import study_folder
 from service.drawing.study_report import study_page
 from service.sources.folder import read_folder
@@ -122,7 +123,7 @@ def test_a_drive_that_lost_steps_since_its_calibration_is_named_with_its_day():
         setup = replace(image.setup, heliostat=replace(heliostat, mount=mount), taken_at=plan.moment)
         images.append(replace(image, setup=setup))
     done = study(images, Optics(), options=MOVING, latitude_deg=JUELICH_LATITUDE)
-    found, page = done.to_json()["effects"], study_page(done, "season")
+    found, page = done.to_json()["effects"], study_page(done, "season", FIGURE_SCALES)
     assert "Light from where motors sent it" in page
     assert "mrad from where motors sent it" in page
     assert [(effect["name"], effect["scope"]) for effect in found] == [(t["name"], t["scope"]) for t in made.truth]
