@@ -1,7 +1,7 @@
 """How far the figures depend on which mirrors are held out: ``python -m training.crossvalidate``.
 
 The measured surfaces are few. Every heliostat is held out in one fold; mean surface and prior are estimated from the
-others, and refinement starts from that mean. Networks take hours each: they are cross-validated only where all folds
+others, and refinement starts from that mean. Networks take an hour each: they are cross-validated only where all folds
 have been trained, fold K by::
 
     python -m training.train --config training/configs/best.json --fold K --folds 5 --run runs/fold-K

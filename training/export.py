@@ -117,8 +117,8 @@ def evaluation(run: Run, path: Path, count: int = 128) -> dict[str, Any]:
     return {name: asdict(Figures.of(found, outcomes["ideal surface"])) for name, found in outcomes.items()}
 
 
-def model_card(run: Run, path: Path, difference: float, commit: str) -> dict[str, Any]:
-    """What the weights are, what they were trained on, by which ``commit``, and how well they do."""
+def model_card(run: Run, path: Path, difference: float) -> dict[str, Any]:
+    """What the weights are, what they were trained on and by which commit, and how well they do."""
     network = run.average
     return {
         "name": path.stem,
@@ -132,7 +132,7 @@ def model_card(run: Run, path: Path, difference: float, commit: str) -> dict[str
             "images": "convolution-traced flux with random cameras, suns of the year, field positions of Juelich",
             "steps": run.step,
             "samples": run.step * run.config.batch,
-            "commit": commit,
+            "commit": run.commit,
         },
         "config": asdict(run.config),
         "onnx_parity_mm": difference,
@@ -153,7 +153,7 @@ def main() -> None:
     difference = parity(network, arguments.out)
     if not math.isfinite(difference) or difference > PARITY_MM:
         raise SystemExit(f"ONNX differs from torch by {difference:.2e} mm, more than {PARITY_MM:.0e}")
-    card = model_card(run, arguments.out, difference, run.commit)
+    card = model_card(run, arguments.out, difference)
     arguments.out.with_suffix(".json").write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
     print(json.dumps(card["evaluation"], indent=1))
     print(f"{arguments.out}: {arguments.out.stat().st_size / 1e6:.1f} MB, parity {difference:.1e} mm")

@@ -12,6 +12,7 @@ import argparse
 import copy
 import json
 import math
+import shutil
 import subprocess
 import time
 from collections.abc import Sequence
@@ -43,7 +44,9 @@ def loss_terms(heights: Tensor, spread: Tensor, truth: Tensor, weight: Tensor) -
 
 
 def commit_of(folder: Path) -> str:
-    """The repository's commit, with ``+`` where tracked files differ from it; "unknown" outside of one."""
+    """The repository's commit, ``+`` where tracked files differ from it; "unknown" outside of one or without git."""
+    if shutil.which("git") is None:
+        return "unknown"
     asked = ["git", "describe", "--always", "--abbrev=12", "--dirty=+", "--exclude=*"]
     done = subprocess.run(asked, cwd=folder, capture_output=True, text=True, check=False)
     return done.stdout.strip() or "unknown"
@@ -75,7 +78,7 @@ class Run:
         self.optimizer = torch.optim.AdamW(
             self.network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay, betas=(0.9, 0.98)
         )
-        self.step, self.commit = 0, commit_of(Path(__file__).parent)
+        self.step, self.commit = 0, ""
         if (folder / "checkpoint.pt").is_file():
             self._resume()
 
@@ -90,15 +93,7 @@ class Run:
         self.average.load_state_dict(state["average"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.step = state["step"]
-        # A run that goes on by other code than it began with says so.
-        self.commit = " ".join(dict.fromkeys([*state["commit"].split(), self.commit]))
-
-    def start_from(self, checkpoint: Path) -> None:
-        """Begin with the averaged weights of another run of the same network; a run that has begun goes on instead."""
-        if self.step == 0:
-            state = torch.load(checkpoint, map_location=self.device, weights_only=True)
-            self.network.load_state_dict(state["average"])
-            self.average.load_state_dict(state["average"])
+        self.commit = state["commit"]
 
     def save(self) -> None:
         """Write the config and the checkpoint; a crash while writing leaves the old one."""
@@ -200,6 +195,8 @@ class Run:
     def train(self, minutes: float, every: int = 250) -> None:
         """Train to the last step, or until the time is up."""
         end = time.monotonic() + 60 * minutes
+        # A run that goes on by other code than it began with says so.
+        self.commit = " ".join(dict.fromkeys([*self.commit.split(), commit_of(Path(__file__).parent)]))
         errors: list[float] = []
         while self.step < self.config.steps and not parallel.agreed(time.monotonic() >= end, self.device):
             errors.append(self.train_step())
@@ -247,17 +244,13 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=float("inf"), help="stop after so many minutes")
     parser.add_argument("--fold", type=int, help="which heliostats to keep back, for a cross-validation")
     parser.add_argument("--folds", type=int, default=5)
-    parser.add_argument("--start", type=Path, help="checkpoint of another run, whose weights to begin with")
     parser.add_argument("--device", help="a GPU where there is one, unless given")
     arguments = parser.parse_args()
     config = TrainConfig.read(arguments.config) if arguments.config else TrainConfig()
     if arguments.fold is not None:
         config = replace(config, fold=arguments.fold, folds=arguments.folds)
     with parallel.team(arguments.device) as device:
-        run = Run(config, arguments.run, device)
-        if arguments.start is not None:
-            run.start_from(arguments.start)
-        run.train(arguments.minutes)
+        Run(config, arguments.run, device).train(arguments.minutes)
 
 
 if __name__ == "__main__":

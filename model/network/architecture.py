@@ -131,14 +131,11 @@ class SurfaceNetwork(nn.Module):
         self.blocks = nn.Sequential(*[Perceptron(config.features) for _ in range(config.depth)])
         self.pooling = Pooling(config)
         self.norm = nn.LayerNorm(config.features)
-        self.decoder = nn.Sequential(
-            nn.Linear(config.features + 2 * POINTS, config.hidden),
-            nn.GELU(),
-            nn.Linear(config.hidden, 2 * POINTS),
-        )
+        to_heights = nn.Linear(config.hidden, 2 * POINTS)
+        self.decoder = nn.Sequential(nn.Linear(config.features + 2 * POINTS, config.hidden), nn.GELU(), to_heights)
         # What is nearly linear in the images passes by.
         self.bypass = nn.Linear(config.features + POINTS, POINTS)
-        for last in (self.decoder[-1], self.bypass):  # the first answer is the guess
+        for last in (to_heights, self.bypass):  # the first answer is the guess
             nn.init.zeros_(last.weight)
             nn.init.zeros_(last.bias)
 
