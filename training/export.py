@@ -1,4 +1,4 @@
-"""Export a run's averaged weights to ONNX, calibrate their spread, check them against torch, write the model card.
+"""Export a run's averaged weights to ONNX, check them against torch, write the model card.
 
 ``python -m training.export --run runs/best``
 """
@@ -20,10 +20,10 @@ from model.network.architecture import CONDITIONS, MAX_IMAGES
 from model.network.predictor import INPUTS, WEIGHTS, SurfacePredictor
 from model.surface import COLUMNS, FACETS, ROWS
 from training.cases import make_cases
-from training.figures import WITHIN_90, Figures, outcomes_of
+from training.figures import Figures, outcomes_of
 from training.methods import always, by_onnx
 from training.render import CleanCamera
-from training.surfaces import load_part, load_surfaces
+from training.surfaces import load_part
 from training.train import Run
 
 PARITY_MM = 1e-4
@@ -58,34 +58,6 @@ def export(network: nn.Module, path: Path) -> None:
         verbose=False,
     )
     store_in_half(path)
-
-
-def calibration(run: Run, path: Path, places: int = 4) -> float:
-    """By which share to multiply the spread, so that 90 % of heights lie within their 90 % intervals.
-
-    A look in training errs by more than the product's last: by weights that jump about their average, and in one world
-    only (`model.network.predictor.mirrored_inputs`). Measured on the mirrors that the network learnt from, under new
-    suns, from one to eight images of clean and of imperfect cameras.
-    """
-    surfaces, names = load_surfaces(Path(run.config.data))
-    learnt, method = [names.index(name) for name in run.learnt], by_onnx(SurfacePredictor(path))
-    ratios = []
-    for camera in (CleanCamera(), run.config.camera):
-        cases = make_cases(surfaces[learnt], run.learnt, run.field, places * len(learnt), camera, seed=200)
-        for number, case in enumerate(cases):
-            z, z_std = method(case, 1 + number % MAX_IMAGES)
-            ratios.append(np.abs(z - case.truth) / z_std)
-    return round(float(np.quantile(ratios, 0.9)) / WITHIN_90, 3)
-
-
-def calibrate(path: Path, share: float) -> None:
-    """Multiply the spread of an ONNX file by a share."""
-    model = onnx.load(path)
-    for node in model.graph.node:
-        node.output[:] = ["uncalibrated" if name == "spread" else name for name in node.output]
-    model.graph.initializer.append(onnx.numpy_helper.from_array(np.array(share, dtype=np.float32), "share"))
-    model.graph.node.append(onnx.helper.make_node("Mul", ["uncalibrated", "share"], ["spread"]))
-    onnx.save(model, path)
 
 
 def rounded(network: nn.Module) -> nn.Module:
@@ -145,7 +117,7 @@ def evaluation(run: Run, path: Path, count: int = 128) -> dict[str, Any]:
     return {name: asdict(Figures.of(found, outcomes["ideal surface"])) for name, found in outcomes.items()}
 
 
-def model_card(run: Run, path: Path, difference: float, share: float) -> dict[str, Any]:
+def model_card(run: Run, path: Path, difference: float) -> dict[str, Any]:
     """What the weights are, what they were trained on and by which commit, and how well they do."""
     network = run.average
     return {
@@ -163,7 +135,6 @@ def model_card(run: Run, path: Path, difference: float, share: float) -> dict[st
             "commit": run.commit,
         },
         "config": asdict(run.config),
-        "spread_times": share,
         "onnx_parity_mm": difference,
         "evaluation": evaluation(run, path),
         "limits": "Four-facet mirrors of the Juelich kind, flux in 4 m x 4 m windows; other mirrors are out of domain.",
@@ -179,12 +150,10 @@ def main() -> None:
     run = Run.open(arguments.run)
     network = rounded(run.average.to(memory_format=torch.contiguous_format))
     export(network, arguments.out)
-    share = calibration(run, arguments.out)
-    calibrate(arguments.out, share)
     difference = parity(network, arguments.out)
     if not math.isfinite(difference) or difference > PARITY_MM:
         raise SystemExit(f"ONNX differs from torch by {difference:.2e} mm, more than {PARITY_MM:.0e}")
-    card = model_card(run, arguments.out, difference, share)
+    card = model_card(run, arguments.out, difference)
     arguments.out.with_suffix(".json").write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
     print(json.dumps(card["evaluation"], indent=1))
     print(f"{arguments.out}: {arguments.out.stat().st_size / 1e6:.1f} MB, parity {difference:.1e} mm")

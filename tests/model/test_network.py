@@ -21,7 +21,7 @@ from model.tracing import Scene
 from model.tracing.convolution import central_rays
 from service.twin import compute
 from tests.conftest import flat_heliostat, target
-from training.export import PARITY_MM, calibrate, example, export, parity, rounded
+from training.export import PARITY_MM, example, export, parity, rounded
 from training.render import Photographs, Setups, Situations
 
 SMALL = NetworkConfig(channels=(8, 16, 16), features=32, hidden=32)
@@ -66,12 +66,8 @@ def test_the_answer_keeps_facet_means_and_its_spread_is_positive(network):
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning", "ignore:# The axis name")
 def test_onnx_equals_torch_at_every_batch_and_number_of_images(network, tmp_path):
-    path, inputs = tmp_path / "small.onnx", {n: t.numpy() for n, t in zip(INPUTS, example(1, 4), strict=True)}
-    export(network, path)
-    _, z_std = SurfacePredictor(path).look(inputs)
-    calibrate(path, 0.5)
-    assert parity(network, path) <= PARITY_MM
-    np.testing.assert_allclose(SurfacePredictor(path).look(inputs)[1], z_std / 2, rtol=1e-6)
+    export(network, tmp_path / "small.onnx")
+    assert parity(network, tmp_path / "small.onnx") <= PARITY_MM
 
 
 def test_conditions_say_how_slopes_and_places_move_light():
