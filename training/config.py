@@ -1,6 +1,7 @@
 """What decides a training run."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -8,7 +9,7 @@ from typing import Any
 from model.network.architecture import NetworkConfig
 from model.network.catalogue import NETWORKS, sizes_of
 from training.render import Camera, Situations
-from training.surfaces import Augmentation
+from training.surfaces import Augmentation, fold_of, split
 
 
 @dataclass(frozen=True)
@@ -17,17 +18,19 @@ class TrainConfig:
 
     ``architecture`` is a name of `model.network.catalogue`, and ``network`` has its sizes. ``looks`` is how often the
     network sees its own guess.
-    ``fold`` counts which ``held_out`` heliostats are kept back; ``batch`` is shared among processes.
+    ``learns_from`` are parts of `training.surfaces.SPLIT`; where ``folds`` are counted, the network learns from all
+    heliostats but those of one ``fold``. ``batch`` is shared among processes.
     """
 
     data: str = "../shared/stj"
     seed: int = 7
-    held_out: int = 8
+    learns_from: tuple[str, ...] = ("training",)
+    folds: int = 0
     fold: int = 0
     steps: int = 20000
-    batch: int = 32
-    learning_rate: float = 3e-4
-    warmup: int = 300
+    batch: int = 16
+    learning_rate: float = 5e-4
+    warmup: int = 100
     weight_decay: float = 0.02
     slope_weight: float = 0.5
     spread_weight: float = 0.1
@@ -40,11 +43,19 @@ class TrainConfig:
     situations: Situations = field(default_factory=Situations)
     camera: Camera = field(default_factory=Camera)
 
+    def parts(self, names: Sequence[str]) -> tuple[list[int], list[int]]:
+        """Indices of the heliostats in ``names`` to learn from, and of those that judge while it learns, if any."""
+        if self.folds:
+            return fold_of(names, self.fold, self.folds)
+        parts = split(names)
+        judges = [] if "validation" in self.learns_from else parts["validation"]
+        return sorted(i for part in self.learns_from for i in parts[part]), judges
+
     @classmethod
     def read(cls, path: Path) -> "TrainConfig":
         """A config from JSON; keys that are left out keep their defaults.
 
-        Another network may be named by its sizes alone, as in ``{"paper": {}}``.
+        Another network may be named by its sizes alone, as in ``{"ours": {}}``.
         """
         values = json.loads(path.read_text(encoding="utf-8"))
         for name in NETWORKS:
@@ -56,4 +67,6 @@ class TrainConfig:
         for name, part in {"augmentation": Augmentation, "situations": Situations, "camera": Camera}.items():
             if values.get(name) is not None:
                 values[name] = part(**{k: tuple(v) if isinstance(v, list) else v for k, v in values[name].items()})
+        if "learns_from" in values:
+            values["learns_from"] = tuple(values["learns_from"])
         return cls(**values)

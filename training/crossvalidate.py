@@ -1,10 +1,10 @@
 """How far the figures depend on which mirrors are held out: ``python -m training.crossvalidate``.
 
 The measured surfaces are few. Every heliostat is held out in one fold; mean surface and prior are estimated from the
-others, and refinement starts from that mean. Networks take hours each: they are cross-validated only where all folds
+others, and refinement starts from that mean. Networks take an hour each: they are cross-validated only where all folds
 have been trained, fold K by::
 
-    python -m training.train --config training/configs/best.json --fold K --run runs/fold-K
+    python -m training.train --config training/configs/best.json --fold K --folds 5 --run runs/fold-K
 """
 
 import argparse
@@ -21,7 +21,7 @@ from training.figures import Figures, markdown, outcomes_of
 from training.methods import Method, always, by_network, by_refinement, held_out_of
 from training.prior import estimate
 from training.render import CleanCamera, load_field
-from training.surfaces import load_surfaces, split_by_heliostat
+from training.surfaces import fold_of, load_surfaces
 
 Array = NDArray[np.float64]
 
@@ -44,14 +44,13 @@ def methods_of(surfaces: Array, network: Path | None) -> dict[str, Method]:
     return {**methods, "refinement from the mean": by_refinement(always(mean), estimate(surfaces))}
 
 
-def validate(data: Path, fold: int, places: int, network: Path | None) -> dict[str, Figures]:
-    """Figures of each method on one fold, each of its mirrors at so many places of the field."""
-    config = TrainConfig()
+def validate(data: Path, fold: int, folds: int, places: int, network: Path | None) -> dict[str, Figures]:
+    """Figures of each method on one of so many folds, each of its mirrors at so many places of the field."""
     surfaces, names = load_surfaces(data)
-    train, held_out = split_by_heliostat(len(surfaces), config.held_out, config.seed, fold)
+    train, held_out = fold_of(names, fold, folds)
     apart = [names[i] for i in held_out]
-    if network is not None and held_out_of(network) != apart:
-        raise SystemExit(f"{network} was trained with other surfaces held out than fold {fold}")
+    if network is not None and (seen := set(apart) - set(held_out_of(network))):
+        raise SystemExit(f"{network} has learnt from {', '.join(sorted(seen))}, which fold {fold} holds out")
     count = places * len(held_out)
     cases = make_cases(surfaces[held_out], apart, load_field(data), count, CleanCamera(), seed=1000 + fold)
     outcomes = {name: outcomes_of(m, cases) for name, m in methods_of(surfaces[train], network).items()}
@@ -72,16 +71,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, default=Path(TrainConfig().data))
     parser.add_argument("--runs", type=Path, default=Path("runs"), help="where the networks' fold-K lie")
+    parser.add_argument("--folds", type=int, default=5)
     parser.add_argument("--places", type=int, default=1, help="in the field, for each mirror")
     arguments = parser.parse_args()
-    count = -(-len(load_surfaces(arguments.data)[1]) // TrainConfig().held_out)
+    count = arguments.folds
     networks: list[Path | None] = [arguments.runs / f"fold-{fold}" for fold in range(count)]
     if not all(run is not None and (run / "checkpoint.pt").is_file() for run in networks):
         networks = [None] * count
     folds = []
     for fold, network in enumerate(networks):
         print(f"fold {fold} ...", file=sys.stderr, flush=True)
-        folds.append(validate(arguments.data, fold, arguments.places, network))
+        folds.append(validate(arguments.data, fold, count, arguments.places, network))
     print(table(folds))
     print("Cross-validated: mean surface, prior, refinement" + ("." if networks[0] is None else ", network."))
     if networks[0] is None:

@@ -23,6 +23,7 @@ from training.cases import make_cases
 from training.figures import Figures, outcomes_of
 from training.methods import always, by_onnx
 from training.render import CleanCamera
+from training.surfaces import load_part
 from training.train import Run
 
 PARITY_MM = 1e-4
@@ -100,10 +101,10 @@ def parity(network: nn.Module, path: Path) -> float:
 
 
 def evaluation(run: Run, path: Path, count: int = 128) -> dict[str, Any]:
-    """Figures of the exported network, and of the surfaces that it must beat, on ``count`` held-out mirrors."""
+    """Figures of the exported network, and of the surfaces that it must beat, on ``count`` test mirrors."""
+    surfaces, names = load_part(Path(run.config.data), "test")
     clean, imperfect = (
-        make_cases(run.held_out, run.held_out_names, run.field, count, camera)
-        for camera in (CleanCamera(), run.config.camera)
+        make_cases(surfaces, names, run.field, count, camera) for camera in (CleanCamera(), run.config.camera)
     )
     network, mean = by_onnx(SurfacePredictor(path)), run.mean.double().numpy()
     outcomes = {
@@ -116,20 +117,22 @@ def evaluation(run: Run, path: Path, count: int = 128) -> dict[str, Any]:
     return {name: asdict(Figures.of(found, outcomes["ideal surface"])) for name, found in outcomes.items()}
 
 
-def model_card(run: Run, path: Path, difference: float, note: str) -> dict[str, Any]:
-    """What the weights are, what they were trained on and how well they do; ``note`` tells what the config does not."""
+def model_card(run: Run, path: Path, difference: float) -> dict[str, Any]:
+    """What the weights are, what they were trained on and by which commit, and how well they do."""
     network = run.average
     return {
         "name": path.stem,
+        "weights": SurfacePredictor(path).name,
         "task": "mirror surface (4 x 8 x 8 control heights) from 1 to 8 flux images of one heliostat",
         "parameters": sum(p.numel() for p in network.parameters()),
         "trained_on": {
             "surfaces": f"{len(run.surfaces)} measured surfaces of the Solar Tower Juelich (surfaces.npz), augmented",
-            "held_out": run.held_out_names,
+            "learnt": run.learnt,
+            "held_out": [name for name in run.names if name not in run.learnt],
             "images": "convolution-traced flux with random cameras, suns of the year, field positions of Juelich",
             "steps": run.step,
             "samples": run.step * run.config.batch,
-            "note": note,
+            "commit": run.commit,
         },
         "config": asdict(run.config),
         "onnx_parity_mm": difference,
@@ -143,7 +146,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--run", type=Path, default=Path("runs/best"))
     parser.add_argument("--out", type=Path, default=WEIGHTS)
-    parser.add_argument("--note", default="", help="what happened in the run that its config does not tell")
     arguments = parser.parse_args()
     run = Run.open(arguments.run)
     network = rounded(run.average.to(memory_format=torch.contiguous_format))
@@ -151,7 +153,7 @@ def main() -> None:
     difference = parity(network, arguments.out)
     if not math.isfinite(difference) or difference > PARITY_MM:
         raise SystemExit(f"ONNX differs from torch by {difference:.2e} mm, more than {PARITY_MM:.0e}")
-    card = model_card(run, arguments.out, difference, arguments.note)
+    card = model_card(run, arguments.out, difference)
     arguments.out.with_suffix(".json").write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
     print(json.dumps(card["evaluation"], indent=1))
     print(f"{arguments.out}: {arguments.out.stat().st_size / 1e6:.1f} MB, parity {difference:.1e} mm")

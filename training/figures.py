@@ -1,7 +1,8 @@
 """What predicted surfaces are worth: outcomes of single cases, figures of many, tables of them."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,16 +68,18 @@ class Figures:
     """What the outcomes of one method come to.
 
     Accuracies are means unless they say otherwise; ``worse_than_ideal`` is the share of cases whose accuracy lies below
-    that of the ideal surface.
+    that of the ideal surface. ``median_90`` and ``covered_90`` are `interval`, over mirrors.
     """
 
     cases: int
     mae_mm: dict[str, float]
+    median_90: tuple[float, float]
     flux_accuracy: float
     flux_accuracy_median: float
     flux_accuracy_elsewhere: float
     worse_than_ideal: float
     covered: float | None
+    covered_90: tuple[float, float] | None
 
     @classmethod
     def of(cls, outcomes: Sequence[Outcome], ideal: Sequence[Outcome]) -> "Figures":
@@ -85,16 +88,34 @@ class Figures:
         quantiles = dict(zip(("min", "q1", "median", "q3", "max"), np.quantile(errors, np.arange(5) / 4), strict=True))
         accuracies = [o.accuracy for o in outcomes]
         worse = [o.accuracy < i.accuracy for o, i in zip(outcomes, ideal, strict=False)]
-        covered = [o.covered for o in outcomes if o.covered is not None]
+        covered = np.array([o.covered for o in outcomes if o.covered is not None])
         return cls(
             cases=len(outcomes),
+            median_90=_over_mirrors(np.median, errors, outcomes),
             mae_mm={name: round(float(v), 4) for name, v in {**quantiles, "mean": errors.mean()}.items()},
             flux_accuracy=round(float(np.mean(accuracies)), 4),
             flux_accuracy_median=round(float(np.median(accuracies)), 4),
             flux_accuracy_elsewhere=round(float(np.mean([o.accuracy_elsewhere for o in outcomes])), 4),
             worse_than_ideal=round(float(np.mean(worse)), 4),
-            covered=round(float(np.mean(covered)), 4) if covered else None,
+            covered=round(float(np.mean(covered)), 4) if len(covered) else None,
+            covered_90=_over_mirrors(np.mean, covered, outcomes) if len(covered) else None,
         )
+
+
+def _over_mirrors(statistic: Callable[[Array], Any], values: Array, outcomes: Sequence[Outcome]) -> tuple[float, float]:
+    """`interval` of a statistic of the outcomes' values (N,)."""
+    mirrors = np.array([o.surface for o in outcomes])
+    groups = [values[mirrors == mirror] for mirror in np.unique(mirrors)]
+    low, high = interval(lambda drawn: float(statistic(np.concatenate([groups[i] for i in drawn]))), len(groups))
+    return round(low, 4), round(high, 4)
+
+
+def interval(statistic: Callable[[NDArray[np.int64]], float], mirrors: int, draws: int = 2000) -> tuple[float, float]:
+    """90 % bootstrap interval of a ``statistic`` of mirrors' indices (mirrors,), which are drawn anew each time."""
+    rng = np.random.default_rng(0)
+    drawn = [statistic(rng.integers(mirrors, size=mirrors)) for _ in range(draws)]
+    low, high = np.quantile(drawn, (0.05, 0.95))
+    return float(low), float(high)
 
 
 def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -103,6 +124,8 @@ def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 
 
-def shown(value: float | None, form: str = ".3f") -> str:
-    """A number for a table; nothing for what is not known."""
-    return "" if value is None or np.isnan(value) else format(value, form)
+def shown(value: float | None, form: str = ".3f", between: tuple[float, float] | None = None) -> str:
+    """A number for a table, with its interval if there is one; nothing for what is not known."""
+    if value is None or np.isnan(value):
+        return ""
+    return format(value, form) + ("" if between is None else f" [{between[0]:{form}}, {between[1]:{form}}]")

@@ -8,12 +8,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from model.images import FLUX_SHAPE
 from model.network.predictor import LOOKS, SurfacePredictor
 from model.plant import JUELICH_LATITUDE
 from model.prior import SurfacePrior
 from model.refinement import refine
 from training.cases import Case
-from training.render import Setups
+from training.render import Photographs, Setups
 from training.train import Run
 
 Array = NDArray[np.float64]
@@ -45,10 +46,13 @@ def by_run(run: Run, looks: int | None = None) -> Method:
     def method(case: Case, images: int) -> tuple[Array, Array | None]:
         used = case.observations[:images]
         suns, aims = np.array([o.sun for o in used]), np.array([o.center_of_mass for o in used])
-        flux = torch.as_tensor(np.array([o.flux for o in used]))
-        return run.predict(flux[None], Setups.of([case.heliostat], suns, aims, run.device), looks)[
-            0
-        ].double().numpy(), None
+        nothing = np.zeros(FLUX_SHAPE, np.float32)
+        flux, clipped = (
+            torch.as_tensor(np.array(images))[None]
+            for images in ([o.flux for o in used], [nothing if o.clipped is None else o.clipped for o in used])
+        )
+        seen = Photographs(Setups.of([case.heliostat], suns, aims, run.device), flux, clipped)
+        return run.predict(seen, looks)[0].double().numpy(), None
 
     return method
 
@@ -79,6 +83,7 @@ def by_network(path: Path, looks: int | None = None) -> Method:
 def held_out_of(path: Path) -> list[str]:
     """The heliostats that the network of a run's folder, or of an ONNX file with its card, has not learnt from."""
     if path.is_dir():
-        return Run.open(path).held_out_names
+        run = Run.open(path)
+        return [name for name in run.names if name not in run.learnt]
     card = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
     return list(card["trained_on"]["held_out"])

@@ -51,14 +51,14 @@ def mirror(z: Array, points: int = 40) -> Array:
 
 
 def learning_curves(runs: Sequence[Path]) -> Figure:
-    """Errors of runs' ``curve.jsonl`` over their steps: on training samples, and on held-out surfaces by look."""
+    """Errors of runs' ``curve.jsonl`` over their steps: on training samples, and on validation surfaces by look."""
     series: dict[str, Line] = {}
     for run in runs:
         curve = [json.loads(line) for line in (run / "curve.jsonl").read_text(encoding="utf-8").splitlines()]
         steps = [line["step"] for line in curve]
         series[f"{run.name}, training"] = (steps, [line["train_mae_mm"] for line in curve])
-        for look, errors in enumerate(zip(*(line["held_out_mae_mm"] for line in curve), strict=True), start=1):
-            series[f"{run.name}, held out, look {look}"] = (steps, errors)
+        for look, errors in enumerate(zip(*(line["validation_mae_mm"] for line in curve), strict=True), start=1):
+            series[f"{run.name}, validation, look {look}"] = (steps, errors)
     return lines(series, "step", "mean error of control heights [mm]")
 
 

@@ -4,7 +4,6 @@
 """
 
 import argparse
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from scipy.special import gammaln
 
 from model.prior import FREEDOM, GROUPS, PRIOR, SurfacePrior
 from training.config import TrainConfig
-from training.surfaces import load_surfaces, split_by_heliostat, tilt_modes, untilted, with_symmetries
+from training.surfaces import load_surfaces, split, tilt_modes, untilted, with_symmetries
 
 Array = NDArray[np.float64]
 
@@ -142,14 +141,14 @@ def main() -> None:
     arguments = parser.parse_args()
     if arguments.compare is not None:
         surfaces, names = load_surfaces(arguments.compare)
-        apart = json.loads((arguments.compare / "surfaces-apart.json").read_text(encoding="utf-8"))
-        chosen = [i for i, name in enumerate(names) if name not in apart]
-        print(f"{len(chosen)} measured mirrors, each left out in turn; without {', '.join(apart)}")
+        apart = split(names)["apart"]
+        chosen = [i for i in range(len(names)) if i not in apart]
+        print(f"{len(chosen)} measured mirrors, each left out in turn; without {', '.join(names[i] for i in apart)}")
         print(compare(surfaces[chosen]))
         return
     config = TrainConfig.read(arguments.run / "config.json")
-    surfaces, _ = load_surfaces(Path(config.data))
-    train, _ = split_by_heliostat(len(surfaces), config.held_out, config.seed, config.fold)
+    surfaces, names = load_surfaces(Path(config.data))
+    train, _ = config.parts(names)
     prior = estimate(surfaces[train])
     arrays = {name: getattr(prior, name).astype(np.float32) for name in ("mean", "basis", "hidden")}
     np.savez_compressed(arguments.out, **arrays)

@@ -20,7 +20,8 @@ from model.effects.sun_shape import SunShapeEffect
 from model.effects.target_registration import TargetRegistration
 from model.forecast import images_under, optics_under
 from model.frames import sun_direction_at
-from model.images import COARSE_SIZE, FLUX_SHAPE, FLUX_SIZE, normalized
+from model.images import COARSE_SIZE, FLUX_SHAPE, FLUX_SIZE, binned, clipped_alike, normalized
+from model.imaging.light import Srgb
 from model.network.architecture import CONDITIONS
 from model.network.inputs import DESCENT_SAMPLES, GUESS_SAMPLES, conditions, descents
 from model.observation import Observation, scene_of
@@ -35,6 +36,9 @@ TOWER_TOP = (0.0, 0.0, 55.0)
 
 CLEAREST_SKY, CLEAR_SKY = 1e-3, 0.02
 """Circumsolar ratios: the least that is drawn, and the model's own, which the best camera still sees."""
+
+LAW = Srgb()
+"""From light to counts, for the cameras that are drawn."""
 
 TENSORS = ("control_points", "attitude", "center", "sun", "plane_center", "plane_axes")
 """What a scene holds for each mirror."""
@@ -142,10 +146,6 @@ class Setups:
         flux = trace(self.scene(z), window, samples=samples, padding=0.25).irradiance
         return normalized(flux.clamp(min=0)).view(-1, self.images, size, size)
 
-    def descents(self, z: Tensor, flux: Tensor, basis: Tensor) -> Tensor:
-        """`model.network.inputs.descents` (B, images, 4, 8, 8) [m] from surfaces ``z`` (B, 4, 8, 8) [m]."""
-        return descents(lambda dz: self.trace(z[:, None] + dz, DESCENT_SAMPLES, COARSE_SIZE), flux, basis)
-
     def conditions(self) -> Tensor:
         """What the network is told of each image (B, images, 12)."""
         return conditions(self.ideal).view(-1, self.images, CONDITIONS)
@@ -158,15 +158,49 @@ class Setups:
         return Setups(self.ideal.with_(**parts), self.lift[rows], self.images)
 
 
+@dataclass(frozen=True, eq=False)
+class Photographs:
+    """Images of B heliostats, as many of each.
+
+    Attributes
+    ----------
+    setups : Setups
+    flux : Tensor (B, images, 64, 64)
+        Sum 100.
+    clipped : Tensor (B, images, 64, 64) [1]
+        Share of each pixel that the camera's range cut off.
+    """
+
+    setups: Setups
+    flux: Tensor
+    clipped: Tensor
+
+    def trace(self, z: Tensor, samples: int = GUESS_SAMPLES, size: int = FLUX_SIZE) -> Tensor:
+        """What surfaces ``z`` as `Setups.scene` takes them would show (B, images, size, size), sum 100."""
+        clipped = binned(self.clipped, size) * (size / FLUX_SIZE) ** 2
+        return normalized(clipped_alike(self.setups.trace(z, samples, size), binned(self.flux, size), clipped))
+
+    def descents(self, z: Tensor, basis: Tensor) -> Tensor:
+        """`model.network.inputs.descents` (B, images, 4, 8, 8) [m] from surfaces ``z`` (B, 4, 8, 8) [m]."""
+        return descents(lambda dz: self.trace(z[:, None] + dz, DESCENT_SAMPLES, COARSE_SIZE), self.flux, basis)
+
+    def __getitem__(self, rows: slice) -> "Photographs":
+        """Those of some of the heliostats."""
+        return Photographs(self.setups[rows], self.flux[rows], self.clipped[rows])
+
+
 @dataclass(frozen=True)
 class Camera:
     """What separates photographs from traced flux: effects of the catalogue, and noise.
 
     Photographs are taken in ``worlds`` of differing haze, roughness and camera, at random. Every other value is the
-    limit or scale of a random draw: circumsolar ratio and slope error [mrad] act on the light, gamma and compression on
-    the camera's response, ``warp`` [of the window] on registration and centring; ``background`` and ``noise`` are
-    shares of the peak. Good worlds are common and bad ones rare: each has a uniform random number to the power of
-    ``ease`` of all these limits.
+    limit or scale of a random draw: circumsolar ratio and slope error [mrad] act on the light, gamma and compression
+    are what the camera's law leaves, ``warp`` [of the window] acts on registration and centring; ``background`` [of the
+    peak] is daylight that was not taken off, ``noise`` [of the range] is the counts'. Good worlds are common and bad
+    ones rare: each has a uniform random number to the power of ``ease`` of all these limits.
+
+    Counts are those of sRGB in 8 bits, of a sheet that daylight lights up to ``ambient`` of the range; the peak reaches
+    a share ``exposure`` of the light that fits above it. What exceeds the range is cut off.
     """
 
     circumsolar_ratio: float = 0.15
@@ -178,15 +212,17 @@ class Camera:
     noise: float = 0.02
     ease: float = 2.0
     worlds: int = 8
+    ambient: tuple[float, float] = (0.44, 0.66)
+    exposure: tuple[float, float] = (0.5, 1.2)
 
-    def photograph(self, scene: Scene, device: torch.device, rng: np.random.Generator) -> Tensor:
-        """Flux images (B, 64, 64), sum 100, 4 m about the spot's centre."""
-        images = torch.empty(scene.batch, FLUX_SIZE, FLUX_SIZE, device=device)
+    def photograph(self, scene: Scene, device: torch.device, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
+        """Flux images (B, 64, 64), sum 100, 4 m about the spot's centre, and which share of each pixel is cut off."""
+        images = torch.empty(2, scene.batch, FLUX_SIZE, FLUX_SIZE, device=device)
         for rows in np.array_split(rng.permutation(scene.batch), min(self.worlds, scene.batch)):
             share = rng.uniform() ** self.ease
             seen = self._seen(scene.subset(rows.tolist()), self.effects(share, rng))
-            images[rows] = self._developed(seen, share, rng)
-        return normalized(images)
+            images[:, rows] = self._developed(seen, share, rng)
+        return normalized(images[0]), images[1]
 
     def effects(self, share: float, rng: np.random.Generator) -> list[Effect]:
         """Those of one world, drawn up to a ``share`` of the limits."""
@@ -214,19 +250,25 @@ class Camera:
         return images_under(effects, flux.clamp(min=0), window)
 
     def _developed(self, images: Tensor, share: float, rng: np.random.Generator) -> Tensor:
-        """Errors of centring, noise and 8-bit rounding of images (B, R, C), in shares of their peaks."""
+        """Light (B, R, C) as the camera's counts tell it, and which of it was cut off: (2, B, R, C)."""
         count, device = len(images), images.device
 
         def draw(low: float, high: float, *shape: int) -> Tensor:
-            return torch.as_tensor(share * rng.uniform(low, high, (count, *shape)), dtype=images.dtype, device=device)
+            return torch.as_tensor(rng.uniform(low, high, (count, *shape)), dtype=images.dtype, device=device)
 
-        shift = torch.cat([torch.eye(2, device=device).expand(count, 2, 2), draw(-self.warp, self.warp, 2, 1)], dim=2)
+        off_centre = share * draw(-self.warp, self.warp, 2, 1)
+        shift = torch.cat([torch.eye(2, device=device).expand(count, 2, 2), off_centre], dim=2)
         grid = functional.affine_grid(shift, [count, 1, *images.shape[1:]], align_corners=False)
         image = functional.grid_sample(images[:, None], grid, align_corners=False)[:, 0]
         image = image / image.amax(dim=(1, 2), keepdim=True).clamp(min=1e-9)
+        daylight = torch.as_tensor(LAW.light(rng.uniform(*self.ambient, (count, 1, 1)))).to(image)
+        light = daylight + (1 - daylight) * draw(*self.exposure, 1, 1) * image
         seed = torch.Generator(device=device).manual_seed(int(rng.integers(2**31)))
-        noise = torch.randn(image.shape, generator=seed, device=device)
-        return torch.round((image + noise * draw(0, self.noise, 1, 1)).clamp(0, 1) * 255) / 255
+        noise = share * draw(0, self.noise, 1, 1) * torch.randn(image.shape, generator=seed, device=device)
+        counts = (torch.as_tensor(LAW.counts(light.cpu().numpy())).to(image) + noise).clamp(0, 1) * 255
+        levels = torch.as_tensor(LAW.light(np.arange(256) / 255)).to(image)
+        counts = counts.round().long()
+        return torch.stack([(levels[counts] - daylight).clamp(min=0), (counts == 255).to(image)])
 
 
 @dataclass(frozen=True)
@@ -235,12 +277,12 @@ class CleanCamera:
 
     noise: float = 0.01
 
-    def photograph(self, scene: Scene, device: torch.device, rng: np.random.Generator) -> Tensor:
-        """Flux images (B, 64, 64), sum 100, 4 m about the spot's centre."""
+    def photograph(self, scene: Scene, device: torch.device, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
+        """Flux images (B, 64, 64), sum 100, 4 m about the spot's centre, nothing of which is cut off."""
         flux = trace(scene, Window(on_spot=True), samples=48).irradiance
         noise = torch.as_tensor(rng.normal(0, self.noise, flux.shape), dtype=flux.dtype, device=device)
         image = flux / flux.amax(dim=(1, 2), keepdim=True) + noise
-        return normalized(torch.round(image.clamp(0, 1) * 255))
+        return normalized(torch.round(image.clamp(0, 1) * 255)), torch.zeros_like(flux)
 
 
 def places(suns: Array, planes: Sequence[TargetPlane]) -> list[Observation]:
@@ -258,14 +300,17 @@ def observe(
 ) -> list[Observation]:
     """What a camera sees of a heliostat with heights ``z`` (4, 8, 8) [m] at `places`."""
     with torch.no_grad():
-        images = camera.photograph(scene_of(heliostat, setups, [z]), torch.device("cpu"), rng).numpy()
-    return [replace(setup, flux=image) for setup, image in zip(setups, images, strict=True)]
+        images, cut = camera.photograph(scene_of(heliostat, setups, [z]), torch.device("cpu"), rng)
+    return [
+        replace(setup, flux=image, clipped=clipped)
+        for setup, image, clipped in zip(setups, images.numpy(), cut.numpy(), strict=True)
+    ]
 
 
 def render(
     z: Array, images: int, field: Array, situations: Situations, camera: Camera | None, device: torch.device, seed: int
-) -> tuple[Tensor, Setups]:
-    """Flux (B, images, 64, 64) of surfaces ``z`` (B, 4, 8, 8) [m] in random situations, and the setups.
+) -> Photographs:
+    """Photographs of surfaces ``z`` (B, 4, 8, 8) [m] in random situations.
 
     Without a camera the flux is traced for the default sun and nothing else.
     """
@@ -273,6 +318,7 @@ def render(
     setups = situations.setups(field, len(z), images, rng, device)
     surfaces = torch.as_tensor(z, dtype=torch.float32, device=device)
     if camera is None:
-        return setups.trace(surfaces, samples=24), setups
-    flux = camera.photograph(setups.scene(surfaces), device, rng)
-    return flux.view(len(z), images, *flux.shape[1:]), setups
+        flux = setups.trace(surfaces, samples=24)
+        return Photographs(setups, flux, torch.zeros_like(flux))
+    seen = camera.photograph(setups.scene(surfaces), device, rng)
+    return Photographs(setups, *(values.view(len(z), images, *values.shape[1:]) for values in seen))

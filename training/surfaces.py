@@ -1,14 +1,24 @@
 """Surfaces to learn from: the measured ones, split by heliostat, and what augmentation makes of them."""
 
+import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from model.errors import InvalidInputError
+from model.prior import FREEDOM
 from model.surface import greville, mirrored, split_canting
 
 Array = NDArray[np.float64]
+
+SPLIT = Path(__file__).parent / "split.json"
+"""Which measured heliostats the network learns from, which choose among networks, which judge the one that was chosen.
+
+Those of ``surfaces-apart.json`` take no part: their photographs are kept for tests, or show a mirror of these tests.
+"""
 
 
 def load_surfaces(root: Path) -> tuple[Array, list[str]]:
@@ -17,21 +27,45 @@ def load_surfaces(root: Path) -> tuple[Array, list[str]]:
         return data["z"].astype(np.float64), [str(name) for name in data["names"]]
 
 
-def split_by_heliostat(
-    count: int, held_out: int, seed: int, fold: int = 0
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Indices of the training and the held-out heliostats; every heliostat is held out in one fold.
+def split(names: Sequence[str]) -> dict[str, list[int]]:
+    """Indices of heliostats in ``names`` by their part: "training", "validation" (chooses), "test" (judges once).
+
+    `SPLIT` tells them by name. It also tells which are "apart": their photographs judge elsewhere.
+
+    Raises
+    ------
+    InvalidInputError
+        Where a heliostat has not exactly one part.
+    """
+    parts: dict[str, list[str]] = json.loads(SPLIT.read_text(encoding="utf-8"))
+    told = [name for part in parts.values() for name in part]
+    unsure = {name for name in names if told.count(name) != 1}
+    if unsure:
+        raise InvalidInputError(f"{SPLIT.name} must name {', '.join(sorted(unsure))} once")
+    return {part: [i for i, name in enumerate(names) if name in own] for part, own in parts.items()}
+
+
+def load_part(root: Path, part: str) -> tuple[Array, list[str]]:
+    """Surfaces (N, 4, 8, 8) [m] and names of the heliostats of one part of the `split`."""
+    surfaces, names = load_surfaces(root)
+    chosen = split(names)[part]
+    return surfaces[chosen], [names[i] for i in chosen]
+
+
+def fold_of(names: Sequence[str], fold: int, folds: int) -> tuple[list[int], list[int]]:
+    """Indices of heliostats to learn from and of those held out in one of so many folds; none that are apart.
 
     Raises
     ------
     ValueError
-        Where the fold leaves no heliostat to hold out.
+        Where there is no such fold.
     """
-    order = np.random.default_rng(seed).permutation(count)
-    apart = order[fold * held_out : (fold + 1) * held_out]
-    if fold < 0 or not len(apart):
-        raise ValueError(f"fold must lie in [0, {-(-count // held_out)}), got {fold}")
-    return np.setdiff1d(order, apart), np.sort(apart)
+    if not 0 <= fold < folds:
+        raise ValueError(f"fold must lie in [0, {folds}), got {fold}")
+    apart = split(names)["apart"]
+    used = [i for i in np.random.default_rng(7).permutation(len(names)).tolist() if i not in apart]
+    held_out = used[fold::folds]
+    return sorted(set(used) - set(held_out)), sorted(held_out)
 
 
 def rotated(z: Array) -> Array:
@@ -51,17 +85,18 @@ class Augmentation:
 
     ``average`` is the share of samples that mix two or three heliostats, ``exchange`` the share whose facets come from
     different ones, ``fresh`` the share that is partly or wholly drawn from a Gaussian of the measured covariance, half
-    of it facet by facet: some forty mirrors and their mixtures could be learnt by heart. ``canting`` and ``waviness``
-    scale the two parts of the surface apart by up to that factor either way, ``tilt_mrad`` adds canting at random,
-    ``focus_mrad`` canting towards another focus: the measured heliostats AA28 and AA39 lie off the others there, by
-    what their properties call ideal.
+    of it facet by facet: some forty mirrors and their mixtures could be learnt by heart. Canting and waviness are
+    scaled about the mean surface, each by a factor of its own, whose inverse square has a chi-squared distribution of
+    ``freedom`` degrees as the prior's scales have (`model.prior`), ``roughest`` at most. ``tilt_mrad`` adds canting at
+    random, ``focus_mrad`` canting towards another focus: the measured heliostats AA28 and AA39 lie off the others
+    there, by what their properties call ideal.
     """
 
     average: float = 0.6
     exchange: float = 0.3
     fresh: float = 0.6
-    canting: float = 1.4
-    waviness: float = 1.3
+    freedom: float = FREEDOM
+    roughest: float = 4.0
     tilt_mrad: float = 0.15
     focus_mrad: float = 0.4
 
@@ -71,11 +106,13 @@ class Augmentation:
         other = self._averaged(surfaces, count, rng)
         exchanged = (rng.random((count, 1, 1, 1)) < self.exchange) & (rng.random((count, 4, 1, 1)) < 0.5)
         z = self._freshened(np.where(exchanged, other, z), surfaces, rng)
-        canting, waviness = split_canting(z)
-        scale_canting, scale_waviness = (
-            np.exp(rng.uniform(-1, 1, (count, 1, 1, 1)) * np.log(limit)) for limit in (self.canting, self.waviness)
-        )
-        return untilted(canting * scale_canting + waviness * scale_waviness + self._tilts(count, rng))
+        mean = surfaces.mean(axis=0)
+        rough = sum(part * self._scales(count, rng) for part in split_canting(z - mean))
+        return untilted(mean + rough + self._tilts(count, rng))
+
+    def _scales(self, count: int, rng: np.random.Generator) -> Array:
+        scales = np.sqrt(self.freedom / rng.chisquare(self.freedom, (count, 1, 1, 1)))
+        return np.asarray(scales.clip(max=self.roughest))
 
     def _averaged(self, surfaces: Array, count: int, rng: np.random.Generator) -> Array:
         """Weighted averages of up to three surfaces, their spread about the mean restored."""

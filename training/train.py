@@ -1,7 +1,7 @@
 """Train the surface network: ``python -m training.train --config training/configs/best.json``.
 
-Images are rendered as the training goes, so that no surface is seen twice under the same sun. Half of each batch starts
-from the mean surface, half from what the network has just said of it. A run keeps everything in one folder: its config,
+Images are rendered as the training goes, so that no surface is seen twice under the same sun. Each batch is looked at
+from the mean surface, then from what the network has just said of it. A run keeps everything in one folder: its config,
 a checkpoint to resume from, its curve, and the weights of the exponential moving average.
 
 On several GPUs, or CPU processes, which share every batch:
@@ -12,7 +12,10 @@ import argparse
 import copy
 import json
 import math
+import shutil
+import subprocess
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -25,45 +28,57 @@ from model.network.catalogue import build
 from training import parallel
 from training.config import TrainConfig
 from training.prior import estimate
-from training.render import Setups, load_field, render
-from training.surfaces import load_surfaces, split_by_heliostat
+from training.render import Photographs, load_field, render
+from training.surfaces import load_surfaces
 
 
-def loss_terms(heights: Tensor, spread: Tensor, truth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def loss_terms(heights: Tensor, spread: Tensor, truth: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Mean absolute height error [mm] and slope error [mm per control spacing], and the spread's neg. log-likelihood.
 
-    The spread learns from the error but does not pull at the heights.
+    Mirrors count by their ``weight`` (B,). The spread learns from the error but does not pull at the heights.
     """
     error = heights - truth
-    slopes = error.diff(dim=-1).abs().mean() + error.diff(dim=-2).abs().mean()
+    slopes = error.diff(dim=-1).abs().mean(dim=(1, 2, 3)) + error.diff(dim=-2).abs().mean(dim=(1, 2, 3))
     likelihood = (error.detach().abs() / spread + torch.log(spread)).mean()
-    return error.abs().mean(), slopes, likelihood
+    return (weight * error.abs().mean(dim=(1, 2, 3))).mean(), (weight * slopes).mean(), likelihood
+
+
+def commit_of(folder: Path) -> str:
+    """The repository's commit, ``+`` where tracked files differ from it; "unknown" outside of one or without git."""
+    if shutil.which("git") is None:
+        return "unknown"
+    asked = ["git", "describe", "--always", "--abbrev=12", "--dirty=+", "--exclude=*"]
+    done = subprocess.run(asked, cwd=folder, capture_output=True, text=True, check=False)
+    return done.stdout.strip() or "unknown"
 
 
 class Run:
-    """One training run in its folder."""
+    """One training run in its folder, of the config's network unless another is given."""
 
-    def __init__(self, config: TrainConfig, folder: Path, device: torch.device) -> None:
+    def __init__(
+        self, config: TrainConfig, folder: Path, device: torch.device, network: nn.Module | None = None
+    ) -> None:
         if config.batch % parallel.size():
             raise ValueError(f"batch {config.batch} cannot be shared evenly among {parallel.size()} processes")
         self.config, self.folder, self.device = config, folder, device
         surfaces, self.names = load_surfaces(Path(config.data))
-        train, held_out = split_by_heliostat(len(surfaces), config.held_out, config.seed, config.fold)
-        self.surfaces, self.held_out = surfaces[train], surfaces[held_out]
-        self.held_out_names = [self.names[i] for i in held_out]
+        train, judges = config.parts(self.names)
+        self.surfaces, self.validation = surfaces[train], surfaces[judges]
+        self.learnt = [self.names[i] for i in train]
         self.field = load_field(Path(config.data))
         prior = estimate(self.surfaces)
         self.mean, self.basis = (
             torch.as_tensor(values, dtype=torch.float32, device=device) for values in (prior.mean, prior.basis)
         )
+        self.usual = float(np.abs(self.surfaces - prior.mean).mean()) * 1e3
         torch.manual_seed(config.seed)
-        network = build(config.architecture, config.network)
+        network = network or build(config.architecture, config.network)
         self.network = network.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.average = copy.deepcopy(self.network).requires_grad_(False)
         self.optimizer = torch.optim.AdamW(
             self.network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay, betas=(0.9, 0.98)
         )
-        self.step = 0
+        self.step, self.commit = 0, ""
         if (folder / "checkpoint.pt").is_file():
             self._resume()
 
@@ -78,13 +93,7 @@ class Run:
         self.average.load_state_dict(state["average"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.step = state["step"]
-
-    def start_from(self, checkpoint: Path) -> None:
-        """Begin with the averaged weights of another run of the same network; a run that has begun goes on instead."""
-        if self.step == 0:
-            state = torch.load(checkpoint, map_location=self.device, weights_only=True)
-            self.network.load_state_dict(state["average"])
-            self.average.load_state_dict(state["average"])
+        self.commit = state["commit"]
 
     def save(self) -> None:
         """Write the config and the checkpoint; a crash while writing leaves the old one."""
@@ -97,6 +106,7 @@ class Run:
             "average": self.average.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "step": self.step,
+            "commit": self.commit,
         }
         torch.save(state, self.folder / "checkpoint.tmp")
         (self.folder / "checkpoint.tmp").replace(self.folder / "checkpoint.pt")
@@ -109,46 +119,50 @@ class Run:
         progress = min(1.0, (self.step - c.warmup) / max(1, c.steps - c.warmup))
         return c.learning_rate * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * progress)))
 
-    def look(self, network: nn.Module, flux: Tensor, setups: Setups, guess: Tensor) -> tuple[Tensor, Tensor]:
-        """Heights and spread (B, 4, 8, 8) [mm] after one look at flux (B, M, 64, 64), from guesses (B, 4, 8, 8) [m]."""
+    def shown(self, photographs: Photographs, guess: Tensor) -> tuple[Tensor, ...]:
+        """What the network is shown of photographs of B mirrors, beside guesses (B, 4, 8, 8) [m]."""
         # Geometry does not bear sixteen bits: all of it stays outside of autocast.
         with torch.no_grad():
-            guess_flux, conditions = setups.trace(guess), setups.conditions()
-            descent = setups.descents(guess, flux, self.basis)
-        mask = torch.ones(flux.shape[:2], device=self.device)
-        with torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=self.config.bfloat16 and network.training):
-            heights, spread = network(flux, conditions, mask, guess_flux, guess * 1e3, descent * 1e3)
+            guess_flux, conditions = photographs.trace(guess), photographs.setups.conditions()
+            descent = photographs.descents(guess, self.basis)
+        mask = torch.ones(guess_flux.shape[:2], device=self.device)
+        return photographs.flux, conditions, mask, guess_flux, guess * 1e3, descent * 1e3
+
+    def answer(self, shown: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+        """Heights and spread (B, 4, 8, 8) [mm] that the network in training says of what it is shown."""
+        with torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=self.config.bfloat16):
+            heights, spread = self.network.train()(*shown)
         return heights.float(), spread.float()
 
     @torch.no_grad()
-    def predict(self, flux: Tensor, setups: Setups, looks: int | None = None) -> Tensor:
-        """Surfaces (B, 4, 8, 8) [m] that the averaged network sees in flux (B, M, 64, 64) after all its looks."""
-        guess = self.mean.expand(len(flux), -1, -1, -1)
+    def predict(self, photographs: Photographs, looks: int | None = None) -> Tensor:
+        """Surfaces (B, 4, 8, 8) [m] that the averaged network sees after all its looks."""
+        guess = self.mean.expand(len(photographs.flux), -1, -1, -1)
         for _ in range(self.config.looks if looks is None else looks):
-            guess = self.look(self.average.eval(), flux, setups, guess)[0] * 1e-3
+            guess = self.average.eval()(*self.shown(photographs, guess))[0] * 1e-3
         return guess
 
-    def _guesses(self, flux: Tensor, setups: Setups) -> Tensor:
-        """Guesses (B, 4, 8, 8) [m]: the mean surface, and for an equal share of the batch the later looks' guesses."""
-        guess = self.mean.expand(len(flux), -1, -1, -1).clone()
-        for look in range(1, self.config.looks):
-            rows = slice(0, len(flux) * (self.config.looks - look) // self.config.looks)
-            with torch.no_grad():
-                guess[rows] = self.look(self.network, flux[rows], setups[rows], guess[rows])[0] * 1e-3
-        return guess
-
-    def train_step(self) -> float:
-        """Render a batch, descend once, return the height error [mm]."""
+    def batch(self) -> tuple[Photographs, Tensor]:
+        """Photographs of the step's mirrors, and their true heights (B, 4, 8, 8) [mm]."""
         c = self.config
         rng = np.random.default_rng((c.seed, self.step, parallel.rank()))
         z = c.augmentation.sample(self.surfaces, c.batch // parallel.size(), rng)
         images = int(rng.integers(1, MAX_IMAGES + 1))
         with torch.no_grad():
-            flux, setups = render(z, images, self.field, c.situations, c.camera, self.device, int(rng.integers(2**31)))
+            seen = render(z, images, self.field, c.situations, c.camera, self.device, int(rng.integers(2**31)))
         truth = torch.as_tensor(z * 1e3, dtype=torch.float32, device=self.device)
-        truth = truth - truth.mean(dim=(2, 3), keepdim=True)
-        heights, spread = self.look(self.network.train(), flux, setups, self._guesses(flux, setups))
-        error, slopes, likelihood = loss_terms(heights, spread, truth)
+        return seen, truth - truth.mean(dim=(2, 3), keepdim=True)
+
+    def train_step(self) -> float:
+        """Render a batch, learn from each look at it; return the last look's height error [mm]."""
+        return train_steps([self])[0]
+
+    def descend(self, heights: Tensor, spread: Tensor, truth: Tensor) -> float:
+        """Change the weights once for the network's answers to be true; return the height error [mm]."""
+        c = self.config
+        rough = (truth - 1e3 * self.mean).abs().mean(dim=(1, 2, 3))
+        # Rough mirrors err by more; they would else have the others' share of the network.
+        error, slopes, likelihood = loss_terms(heights, spread, truth, (self.usual / rough).clamp(max=1))
         self.optimizer.param_groups[0]["lr"] = self._learning_rate()
         self.optimizer.zero_grad()
         loss = error + c.slope_weight * slopes + c.spread_weight * likelihood
@@ -159,8 +173,7 @@ class Run:
         if torch.isfinite(norm):
             self.optimizer.step()
             self._update_average()
-        self.step += 1
-        return float(error.detach())
+        return float((heights.detach() - truth).abs().mean())
 
     def _update_average(self) -> None:
         decay = min(self.config.ema, (1 + self.step) / (10 + self.step))
@@ -169,17 +182,21 @@ class Run:
                 mean.lerp_(current, 1 - decay)
 
     def validate(self, repeats: int = 8) -> list[float]:
-        """Mean absolute height error [mm] on held-out heliostats, eight clean images each, after each look."""
-        z = self.held_out.repeat(repeats, axis=0)
-        flux, setups = render(z, MAX_IMAGES, self.field, self.config.situations, None, self.device, seed=0)
+        """Mean absolute height error [mm] on validation mirrors, eight clean images each, after each look."""
+        if not len(self.validation):
+            return []
+        z = self.validation.repeat(repeats, axis=0)
+        seen = render(z, MAX_IMAGES, self.field, self.config.situations, None, self.device, seed=0)
         truth = torch.as_tensor(z, dtype=torch.float32, device=self.device)
         truth = truth - truth.mean(dim=(2, 3), keepdim=True)
-        guesses = [self.predict(flux, setups, looks) for looks in range(1, self.config.looks + 1)]
+        guesses = [self.predict(seen, looks) for looks in range(1, self.config.looks + 1)]
         return [round(float((guess - truth).abs().mean()) * 1e3, 4) for guess in guesses]
 
     def train(self, minutes: float, every: int = 250) -> None:
         """Train to the last step, or until the time is up."""
         end = time.monotonic() + 60 * minutes
+        # A run that goes on by other code than it began with says so.
+        self.commit = " ".join(dict.fromkeys([*self.commit.split(), commit_of(Path(__file__).parent)]))
         errors: list[float] = []
         while self.step < self.config.steps and not parallel.agreed(time.monotonic() >= end, self.device):
             errors.append(self.train_step())
@@ -193,10 +210,29 @@ class Run:
         self.save()
         if parallel.rank() > 0:
             return
-        line = {"step": self.step, "train_mae_mm": round(error, 4), "held_out_mae_mm": self.validate()}
+        line = {"step": self.step, "train_mae_mm": round(error, 4), "validation_mae_mm": self.validate()}
         with (self.folder / "curve.jsonl").open("a", encoding="utf-8") as file:
             file.write(json.dumps(line) + "\n")
         print(json.dumps(line), flush=True)
+
+
+def train_steps(runs: Sequence[Run]) -> list[float]:
+    """One step of runs side by side, on the same images: those of the first; their last looks' height errors [mm].
+
+    A batch is looked at several times, from the mean surface first and then from what the first run has just said, and
+    each look changes the weights.
+    """
+    leading = runs[0]
+    photographs, truth = leading.batch()
+    guess = leading.mean.expand(len(truth), -1, -1, -1)
+    for _ in range(leading.config.looks):
+        shown = leading.shown(photographs, guess)
+        answers = [run.answer(shown) for run in runs]
+        errors = [run.descend(*answer, truth) for run, answer in zip(runs, answers, strict=True)]
+        guess = answers[0][0].detach() * 1e-3
+    for run in runs:
+        run.step += 1
+    return errors
 
 
 def main() -> None:
@@ -207,17 +243,14 @@ def main() -> None:
     parser.add_argument("--run", "--folder", type=Path, default=Path("runs/best"), help="folder of the run")
     parser.add_argument("--minutes", type=float, default=float("inf"), help="stop after so many minutes")
     parser.add_argument("--fold", type=int, help="which heliostats to keep back, for a cross-validation")
-    parser.add_argument("--start", type=Path, help="checkpoint of another run, whose weights to begin with")
+    parser.add_argument("--folds", type=int, default=5)
     parser.add_argument("--device", help="a GPU where there is one, unless given")
     arguments = parser.parse_args()
     config = TrainConfig.read(arguments.config) if arguments.config else TrainConfig()
     if arguments.fold is not None:
-        config = replace(config, fold=arguments.fold)
+        config = replace(config, fold=arguments.fold, folds=arguments.folds)
     with parallel.team(arguments.device) as device:
-        run = Run(config, arguments.run, device)
-        if arguments.start is not None:
-            run.start_from(arguments.start)
-        run.train(arguments.minutes)
+        Run(config, arguments.run, device).train(arguments.minutes)
 
 
 if __name__ == "__main__":

@@ -4,17 +4,13 @@ Beside each image it sees what a guess of the surface would throw there, traced,
 have to change for the image to come out as measured; it says how far and where else. The first guess is the mean
 surface; its own answer is the next guess, so that it may look again.
 
-Each pair of images passes the same convolutional encoder, whose weights are modulated by that image's geometry and
-demodulated as in StyleGAN2; attention pools any number of images, in any order, into one vector; a StyleGAN2 decoder
-grows its styles w+ into the control heights of the facets. Read it from top to bottom.
+Each pair of images passes the same convolutional encoder, is told its geometry and its descent, and becomes one
+vector; a weighted mean makes one vector of any number of images, in any order; a perceptron decodes it into the control
+heights of the facets. Read it from top to bottom.
 
-Source: Lewen et al. 2024, *Inverse Deep Learning Ray Tracing for Heliostat Surface Prediction* (the idea: encoder with
-weight demodulation, w+, StyleGAN2 decoder); Karras et al. 2020, *Analyzing and Improving the Image Quality of StyleGAN*
-(modulation and demodulation). Ours differs in that images are encoded one by one and pooled, instead of stacked as
-channels (`model.network.paper`), which makes their number and order free, and in the guess and its descent, which turn
-the question "what mirror is this?" into the easier "what is wrong with this mirror?". What to make of a descent is
-learnt as in learned gradient schemes (Adler and Oktem 2017, *Solving ill-posed inverse problems using iterative deep
-neural networks*).
+Source: Lewen et al. 2024, *Inverse Deep Learning Ray Tracing for Heliostat Surface Prediction* (the idea); Zaheer et
+al. 2017, *Deep Sets* (encode one by one, pool, decode); Adler and Oktem 2017, *Solving ill-posed inverse problems using
+iterative deep neural networks* (what to make of a descent is learnt).
 """
 
 from dataclasses import dataclass
@@ -31,63 +27,37 @@ MAX_IMAGES = 8
 CONDITIONS = 12
 """Numbers that describe the geometry of one image (`model.network.inputs.conditions`)."""
 
+POINTS = FACETS * ROWS * COLUMNS
+"""Control heights of a mirror."""
+
 
 @dataclass(frozen=True)
 class NetworkConfig:
     """Sizes of the network; the names are those used below."""
 
-    encoder_channels: tuple[int, int, int] = (64, 128, 256)
+    channels: tuple[int, int, int] = (32, 64, 128)
     features: int = 256
-    heads: int = 4
-    depth: int = 3
-    style_layers: int = 3
-    style_features: int = 32
-    decoder_channels: int = 128
-
-
-def activate(x: Tensor) -> Tensor:
-    """Leaky rectifier with the gain that keeps the variance (Karras et al. 2020)."""
-    return functional.leaky_relu(x, 0.2) * 2**0.5
-
-
-class ModulatedConv(nn.Module):
-    """A 3x3 convolution whose weights are scaled per sample by a style and normalised again.
-
-    Scaling the input channels by s and the output by 1/sqrt(sum (w s)^2) equals convolving with the modulated and
-    demodulated weights (Karras et al. 2020, eqs. 1 and 3), and needs no grouped convolution.
-    """
-
-    def __init__(self, inputs: int, outputs: int, style: int, stride: int = 1, demodulate: bool = True) -> None:
-        super().__init__()
-        self.weight = nn.Parameter(torch.randn(outputs, inputs, 3, 3) / (3 * inputs**0.5))
-        self.bias = nn.Parameter(torch.zeros(outputs))
-        self.to_scale = nn.Linear(style, inputs)
-        nn.init.ones_(self.to_scale.bias)
-        self.stride, self.demodulate = stride, demodulate
-
-    def forward(self, x: Tensor, style: Tensor) -> Tensor:
-        """(N, inputs, H, W) and (N, style) to (N, outputs, H / stride, W / stride)."""
-        scale = self.to_scale(style)  # (N, inputs)
-        x = functional.conv2d(x * scale[:, :, None, None], self.weight, stride=self.stride, padding=1)
-        if self.demodulate:
-            energy = scale.square() @ self.weight.square().sum(dim=(2, 3)).T  # (N, outputs)
-            x = x * torch.rsqrt(energy + 1e-8)[:, :, None, None]
-        return x + self.bias[:, None, None]
+    hidden: int = 512
+    depth: int = 2
 
 
 class EncoderBlock(nn.Module):
-    """Two modulated convolutions with a skip; the first halves the resolution where ``stride`` is two."""
+    """Two convolutions with a skip, told the geometry; the first halves the resolution where ``stride`` is two."""
 
-    def __init__(self, inputs: int, outputs: int, style: int, stride: int) -> None:
+    def __init__(self, inputs: int, outputs: int, stride: int) -> None:
         super().__init__()
-        self.first = ModulatedConv(inputs, outputs, style, stride)
-        self.second = ModulatedConv(outputs, outputs, style)
+        self.first = nn.Conv2d(inputs, outputs, 3, stride, padding=1)
+        self.second = nn.Conv2d(outputs, outputs, 3, padding=1)
         self.skip = nn.Conv2d(inputs, outputs, kernel_size=stride, stride=stride)
+        self.from_conditions = nn.Linear(CONDITIONS, outputs)
+        for layer in (self.first, self.second, self.skip):
+            nn.init.kaiming_normal_(layer.weight, a=0.2)
 
-    def forward(self, x: Tensor, style: Tensor) -> Tensor:
+    def forward(self, x: Tensor, conditions: Tensor) -> Tensor:
         """(N, inputs, H, W) to (N, outputs, H / stride, W / stride)."""
-        y = activate(self.first(x, style))  # (N, outputs, H / stride, W / stride)
-        return activate((self.second(y, style) + self.skip(x)) * 0.5**0.5)
+        y = self.first(x) + self.from_conditions(conditions)[:, :, None, None]
+        y = self.second(functional.leaky_relu(y, 0.2))
+        return functional.leaky_relu((y + self.skip(x)) * 0.5**0.5, 0.2)
 
 
 class Encoder(nn.Module):
@@ -95,102 +65,56 @@ class Encoder(nn.Module):
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
-        fine, middle, coarse = config.encoder_channels
-        self.style = nn.Sequential(
-            nn.Linear(CONDITIONS, 128), nn.LeakyReLU(0.2), nn.Linear(128, 128), nn.LeakyReLU(0.2)
-        )
+        fine, middle, coarse = config.channels
         self.fold = nn.PixelUnshuffle(4)
         self.blocks = nn.ModuleList(
-            [
-                EncoderBlock(4 * 16, fine, 128, stride=1),
-                EncoderBlock(fine, middle, 128, stride=2),
-                EncoderBlock(middle, coarse, 128, stride=2),
-            ]
+            [EncoderBlock(4 * 16, fine, 1), EncoderBlock(fine, middle, 2), EncoderBlock(middle, coarse, 2)]
         )
-        self.to_features = nn.Sequential(nn.Linear(coarse * 16 + 128, config.features), nn.LayerNorm(config.features))
+        self.to_features = nn.Linear(coarse * 16, config.features)
 
     def forward(self, flux: Tensor, guess_flux: Tensor, conditions: Tensor) -> Tensor:
         """Fluxes (N, 64, 64) of sum 100 and conditions (N, 12) to features (N, features)."""
-        style = self.style(conditions)  # (N, 128)
-        x = torch.cat([_channels(flux), _channels(guess_flux)], dim=1)  # (N, 4, 64, 64)
+        x = torch.stack([flux, guess_flux], dim=1)  # (N, 2, 64, 64)
+        # The root brings out the faint wings, where the mirror's edges show.
+        x = torch.cat([x * 8, torch.sqrt(x.clamp(min=0) * 8)], dim=1)  # (N, 4, 64, 64)
         x = self.fold(x)  # (N, 64, 16, 16)
         for block in self.blocks:
-            x = block(x, style)  # (N, fine, 16, 16), (N, middle, 8, 8), (N, coarse, 4, 4)
-        features: Tensor = self.to_features(torch.cat([x.flatten(1), style], dim=1))  # (N, features)
+            x = block(x, conditions)  # (N, fine, 16, 16), (N, middle, 8, 8), (N, coarse, 4, 4)
+        features: Tensor = self.to_features(x.flatten(1))  # (N, features)
         return features
 
 
-def _channels(flux: Tensor) -> Tensor:
-    """Flux (N, 64, 64) and its root (N, 2, 64, 64), which brings out the faint wings, where the mirror's edges show."""
-    return torch.stack([flux * 8, torch.sqrt(flux.clamp(min=0) * 8)], dim=1)
+class Perceptron(nn.Module):
+    """A residual block of a hidden layer."""
 
-
-class Attention(nn.Module):
-    """A heliostat's images look at one another: a transformer's block, masked for missing images."""
-
-    def __init__(self, width: int, heads: int) -> None:
+    def __init__(self, width: int) -> None:
         super().__init__()
-        self.heads = heads
-        self.norm = nn.LayerNorm(width)
-        self.to_qkv = nn.Linear(width, 3 * width)
-        self.mix = nn.Linear(width, width)
-        self.mlp = nn.Sequential(
+        self.layers = nn.Sequential(
             nn.LayerNorm(width), nn.Linear(width, 2 * width), nn.GELU(), nn.Linear(2 * width, width)
         )
 
-    def forward(self, features: Tensor, hidden: Tensor) -> Tensor:
-        """(B, M, width) to the same; ``hidden`` (B, M) is zero, very negative where there is no image."""
-        batch, images, width = features.shape
-        qkv = self.to_qkv(self.norm(features)).view(batch, images, 3, self.heads, width // self.heads)
-        q, k, v = qkv.permute(2, 0, 3, 1, 4)  # (B, heads, M, width / heads) each
-        scores = q @ k.transpose(-1, -2) * (width // self.heads) ** -0.5  # (B, heads, M, M)
-        scores = scores + hidden[:, None, None, :]
-        mixed = (scores.softmax(dim=-1) @ v).transpose(1, 2).reshape(batch, images, width)  # (B, M, width)
-        features = features + self.mix(mixed)
-        features = features + self.mlp(features)  # (B, M, width)
-        return features
+    def forward(self, x: Tensor) -> Tensor:
+        """(..., width) to the same."""
+        y: Tensor = x + self.layers(x)
+        return y
 
 
 class Pooling(nn.Module):
-    """Attention among a heliostat's images, then one vector for all; blind to order.
+    """One vector of a heliostat's images, a weighted mean; blind to order.
 
     Each feature has its own weights: one image may tell most of one facet, another of the next.
     """
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
-        self.blocks = nn.ModuleList([Attention(config.features, config.heads) for _ in range(config.depth)])
         self.to_weights = nn.Linear(config.features, config.features)
 
     def forward(self, features: Tensor, mask: Tensor) -> Tensor:
         """(B, M, features) and mask (B, M), one where there is an image, to (B, features)."""
-        hidden = (mask - 1) * 1e4  # (B, M)
-        for block in self.blocks:
-            features = block(features, hidden)  # (B, M, features)
-        weights = (self.to_weights(features) + hidden[..., None]).softmax(dim=1)  # (B, M, features)
+        hidden = (mask - 1)[..., None] * 1e4  # (B, M, 1)
+        weights = (self.to_weights(features) + hidden).softmax(dim=1)  # (B, M, features)
         pooled: Tensor = (features * weights).sum(dim=1)  # (B, features)
         return pooled
-
-
-class Decoder(nn.Module):
-    """Styles w+ to the heights and their uncertainty, one channel a facet (StyleGAN2 without noise inputs)."""
-
-    def __init__(self, config: NetworkConfig) -> None:
-        super().__init__()
-        channels, style = config.decoder_channels, config.style_features
-        self.seed = nn.Parameter(torch.randn(channels, ROWS // 2, COLUMNS // 2))
-        self.convs = nn.ModuleList([ModulatedConv(channels, channels, style) for _ in range(config.style_layers)])
-        self.to_heights = ModulatedConv(channels, 2 * FACETS, style, demodulate=False)
-
-    def forward(self, styles: Tensor) -> tuple[Tensor, Tensor]:
-        """(B, layers, style) to heights and log spreads, each (B, 4, 8, 8)."""
-        x = self.seed.expand(styles.shape[0], -1, -1, -1)  # (B, channels, 4, 4)
-        for layer, conv in enumerate(self.convs):
-            if layer == 1:
-                x = functional.interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=False)
-            x = activate(conv(x, styles[:, layer]))  # (B, channels, 4, 4), then (B, channels, 8, 8)
-        heights, log_spread = self.to_heights(x, styles[:, -1]).chunk(2, dim=1)  # (B, 4, 8, 8) each
-        return heights, log_spread
 
 
 class SurfaceNetwork(nn.Module):
@@ -202,23 +126,18 @@ class SurfaceNetwork(nn.Module):
     def __init__(self, config: NetworkConfig, scale: float = 0.35) -> None:
         super().__init__()
         self.config, self.scale = config, scale
-        points = FACETS * ROWS * COLUMNS
         self.encoder = Encoder(config)
-        self.from_descent = nn.Linear(points, config.features)
+        self.from_geometry = nn.Linear(CONDITIONS + POINTS, config.features)
+        self.blocks = nn.Sequential(*[Perceptron(config.features) for _ in range(config.depth)])
         self.pooling = Pooling(config)
-        self.from_guess = nn.Linear(points, config.features)
-        self.from_step = nn.Linear(points, config.features)
-        self.to_styles = nn.Sequential(
-            nn.LayerNorm(config.features),
-            nn.Linear(config.features, config.features),
-            nn.LeakyReLU(0.2),
-            nn.Linear(config.features, config.style_layers * config.style_features),
-        )
-        self.decoder = Decoder(config)
-        # What is nearly linear in the images passes by the narrow styles.
-        self.bypass = nn.Linear(config.features + points, points)
-        nn.init.zeros_(self.bypass.weight)
-        nn.init.zeros_(self.bypass.bias)
+        self.norm = nn.LayerNorm(config.features)
+        to_heights = nn.Linear(config.hidden, 2 * POINTS)
+        self.decoder = nn.Sequential(nn.Linear(config.features + 2 * POINTS, config.hidden), nn.GELU(), to_heights)
+        # What is nearly linear in the images passes by.
+        self.bypass = nn.Linear(config.features + POINTS, POINTS)
+        for last in (to_heights, self.bypass):  # the first answer is the guess
+            nn.init.zeros_(last.weight)
+            nn.init.zeros_(last.bias)
 
     def forward(
         self, flux: Tensor, conditions: Tensor, mask: Tensor, guess_flux: Tensor, guess: Tensor, descent: Tensor
@@ -246,17 +165,17 @@ class SurfaceNetwork(nn.Module):
         """
         shares = descent.flatten(2) / self.scale  # (B, M, points)
         step = shares.sum(dim=1)  # (B, points)
+        alone = shares * mask.sum(dim=1)[:, None, None]  # (B, M, points)
         each = (images.flatten(0, 1) for images in (flux, guess_flux, conditions))  # (B M, ...)
         features = self.encoder(*each).view(*mask.shape, -1)  # (B, M, features)
-        alone = shares * mask.sum(dim=1)[:, None, None]  # (B, M, points)
-        pooled = self.pooling(features + self.from_descent(alone), mask)  # (B, features)
-        pooled = pooled + self.from_guess(guess.flatten(1) / self.scale) + self.from_step(step)  # (B, features)
-        styles = self.to_styles(pooled)  # (B, layers * style)
-        styles = styles.view(-1, self.config.style_layers, self.config.style_features)  # (B, layers, style)
-        heights, log_spread = self.decoder(styles)  # (B, 4, 8, 8) each
+        features = features + self.from_geometry(torch.cat([conditions, alone], dim=2))  # (B, M, features)
+        pooled = self.norm(self.pooling(self.blocks(features), mask))  # (B, features)
+        known = torch.cat([pooled, guess.flatten(1) / self.scale, step], dim=1)  # (B, features + 2 points)
+        heights, log_spread = self.decoder(known).view(-1, 2, *guess.shape[1:]).unbind(1)  # (B, 4, 8, 8) each
         heights = heights + self.bypass(torch.cat([pooled, step], dim=1)).view_as(heights)  # (B, 4, 8, 8)
         heights = heights - heights.mean(dim=(2, 3), keepdim=True)
         return guess + self.scale * heights, self.scale * torch.exp(log_spread.clamp(-6, 2))
 
 
 SIZES, NETWORK = NetworkConfig, SurfaceNetwork
+"""The networks that a training may have, by name."""

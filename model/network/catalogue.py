@@ -11,7 +11,6 @@ from model.errors import InvalidInputError
 
 NETWORKS = {
     "ours": "architecture",
-    "paper": "paper",
 }
 """The name in a training's config, and the file of this package, with its `SIZES` and `NETWORK`."""
 

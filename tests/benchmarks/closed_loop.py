@@ -30,7 +30,7 @@ from service.cli.folder_study import photographs_of, study_folder
 from service.sources.folder import measured_heights, read_folder
 from tests.benchmarks import data_folder
 from training.render import CleanCamera, Situations, load_field, places
-from training.surfaces import load_surfaces, split_by_heliostat
+from training.surfaces import load_part
 
 HELIOSTATS = ["AA39", "AC43"]
 COMBINATIONS = (
@@ -200,17 +200,16 @@ def left_out_accuracy(
 
 def simulated_surfaces(root: Path, effects: Sequence[Effect], count: int) -> None:
     """Held-out surfaces photographed by a camera that has the effects, predicted and refined with and without them."""
-    surfaces, _ = load_surfaces(root)
-    _, held_out = split_by_heliostat(len(surfaces), 8, 7)
+    surfaces, _ = load_part(root, "test")
     field, rng = load_field(root), np.random.default_rng(11)
     found: dict[str, list[dict[str, float]]] = {}
-    for index in held_out[:count]:
+    for truth in surfaces[:count]:
         position = field[rng.integers(len(field))]
         heliostat = Heliostat.juelich("synthetic", position, float(np.linalg.norm(position - [0, 0, 55])))
-        images = photograph(heliostat, surfaces[index], effects, rng)
+        images = photograph(heliostat, truth, effects, rng)
         for method, surface in METHODS.items():
             for label, model in (("without", []), ("with", list(effects))):
-                errors = surface_errors(surface(heliostat, images, model), surfaces[index])
+                errors = surface_errors(surface(heliostat, images, model), truth)
                 found.setdefault(f"{method} | {label}", []).append(errors)
     for label, own in found.items():
         mean = {key: float(np.mean([errors[key] for errors in own])) for key in own[0]}

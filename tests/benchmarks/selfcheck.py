@@ -16,7 +16,6 @@ import numpy as np
 from model.effects.soiling import Soiling
 from model.images import normalized
 from model.metrics import surface_error
-from model.network.predictor import WEIGHTS
 from model.observation import SurfacePrediction, render_observations
 from model.plant import JUELICH_LATITUDE
 from service.cli.folder import observations_of
@@ -26,9 +25,8 @@ from service.twin.evidence import choose
 from tests.benchmarks import data_folder
 from tests.benchmarks.surfaces import IMAGES
 from training.cases import Case, make_cases
-from training.methods import held_out_of
 from training.render import CleanCamera, load_field
-from training.surfaces import load_surfaces, tilt_modes
+from training.surfaces import load_part, tilt_modes
 
 NOISE = 0.01
 """Standard deviation of a pixel, of the peak."""
@@ -129,10 +127,8 @@ def line(label: str, cases: list[Case], predictions: list[SurfacePrediction]) ->
 
 def rendered(count: int) -> None:
     """Print a line for each fault."""
-    surfaces, names = load_surfaces(data_folder())
-    held_out = [names.index(name) for name in held_out_of(WEIGHTS)]
-    apart = [names[i] for i in held_out]
-    cases = make_cases(surfaces[held_out], apart, load_field(data_folder()), count, CleanCamera(NOISE), seed=300)
+    surfaces, names = load_part(data_folder(), "test")
+    cases = make_cases(surfaces, names, load_field(data_folder()), count, CleanCamera(NOISE), seed=300)
     for label, fault in FAULTS.items():
         pairs = zip(cases, cases[1:] + cases[:1], strict=True)
         wrong = [fault(case, other, np.random.default_rng((301, i))) for i, (case, other) in enumerate(pairs)]

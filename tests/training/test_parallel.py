@@ -13,7 +13,7 @@ from training import parallel
 from training.config import TrainConfig
 from training.train import Run
 
-SMALL = NetworkConfig(encoder_channels=(4, 8, 8), features=16, heads=2, style_features=8, decoder_channels=8)
+SMALL = NetworkConfig(channels=(4, 8, 8), features=16, hidden=32)
 
 
 def member(rank: int, data: str, folder: Path, port: int) -> None:
