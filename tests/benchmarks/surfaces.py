@@ -6,7 +6,7 @@ traced by Monte Carlo with one per cent of noise; by the network and refined, fr
 
 Real: AA39 of two years, from sets of its photographs, some of which contradict the others; flux accuracy on
 photographs that no set holds. Errors are those of the control heights, the mirror's tilt and canting counted. AC43 is
-STJ-012 of the surfaces that the prior was estimated from, and no test of it.
+STJ-012 of the measured surfaces, from which neither network nor prior has learnt.
 
 ``--only photographs``: what AA39's surfaces gain by photographs that the camera's range clipped or the target cut, and
 whether photographs of other days take its deflectometry nearer to those of a day. Days are dealt out to two halves;
