@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import date, timedelta
+from datetime import date, datetime, timedelta
 from itertools import pairwise
 
 import numpy as np
@@ -237,6 +237,27 @@ class CalibratedMount:
         readings = Readings(motors[None], suns[None], spots[None], days[None], np.ones((1, len(days)), dtype=bool))
         chain, zeros = Chain.of([heliostat]), self.zeros_at(days)
         return np.asarray(residuals(chain, readings, self.parameters[None], zeros[None])[1][0])
+
+    def is_before(self, moment: datetime | None) -> bool:
+        """Whether all that it was calibrated by was taken before the day of a moment; never where that is not known."""
+        return self.until is not None and moment is not None and moment.date() > self.until
+
+    def told(
+        self, heliostat: Heliostat, motors: Array, sun: Array, spot: Array, day: float
+    ) -> tuple[Array, float, Array]:
+        """Angles (2,) [rad] of the axes at a measurement, as its motors (2,) [steps] say, and how sure that is.
+
+        Beside them the standard deviation [rad] per direction by which its ``spot`` (3,) [m] lies about where that
+        sends the light of the ``sun`` (3,), and what the calibration leaves open of it (2, P) [rad], as `doubts_at`.
+        ``heliostat`` is as its properties have it.
+        """
+        for position, drive in zip(motors, heliostat.mount.actuators or (), strict=True):
+            drive.require_within(position)
+        one = motors[None], sun[None], spot[None], np.array([day])
+        doubts = self.doubts_at(heliostat, *one)[0]
+        alone = self.covariance_at(heliostat, *one)[0] - doubts @ doubts.T
+        std_rad = max(self.usual_rad, float(np.sqrt(np.trace(alone) / 2)))
+        return self.mount(heliostat.mount, day).angles_from_motors(motors), std_rad, doubts
 
     def spot(
         self, heliostat: Heliostat, plane: TargetPlane, motors: ArrayLike, sun: ArrayLike, day: float = np.nan

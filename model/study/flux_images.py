@@ -91,6 +91,11 @@ class FluxImage:
         """Distance [m] from the heliostat to its target."""
         return float(np.linalg.norm(self.setup.heliostat.position - self.setup.plane.center))
 
+    def sent(self, angles: Array, std_rad: float, doubts_rad: Array) -> "FluxImage":
+        """It with where its motors sent the light, as `model.pointing.CalibratedMount.told` has it."""
+        setup = replace(self.setup, angles=angles)
+        return replace(self, setup=setup, spot_std_rad=std_rad, spot_doubts_rad=doubts_rad)
+
     def noise_share(self, window: float) -> float:
         """The error (one minus accuracy) that grain and sheet alone make, in a cut of side ``window`` [m]."""
         images, planes = np.stack([self.image, black_lift(self.image)]), [self.setup.plane] * 2

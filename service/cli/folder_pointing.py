@@ -152,19 +152,11 @@ class Mounts:
 
         ``nominal`` is the heliostat as its properties have it. What a mount was calibrated by speaks for it anyway.
         """
-        mount, moment = self._known.get(nominal.name), measurement.taken_at
-        if mount is None or mount.until is None or moment is None or moment.date() <= mount.until:
+        mount, motors = self._known.get(nominal.name), measurement.motor_position
+        sun, spot = taken.setup.sun, taken.setup.spot
+        if mount is None or motors is None or spot is None or not mount.is_before(measurement.taken_at):
             return taken
-        if measurement.motor_position is None or taken.setup.spot is None:
-            return taken
-        motors, day = motors_of(nominal, measurement), self._days[measurement.key]
-        told = (motors[None], taken.setup.sun[None], taken.setup.spot[None], np.array([day]))
-        doubts = mount.doubts_at(nominal, *told)[0]
-        alone = mount.covariance_at(nominal, *told)[0] - doubts @ doubts.T
-        std_rad = max(mount.usual_rad, float(np.sqrt(np.trace(alone) / 2)))
-        angles = self.stand(nominal, measurement).mount.angles_from_motors(motors)
-        setup = replace(taken.setup, angles=angles)
-        return replace(taken, setup=setup, spot_std_rad=std_rad, spot_doubts_rad=doubts)
+        return taken.sent(*mount.told(nominal, motors, sun, spot, self._days[measurement.key]))
 
     def under(self, folder: MeasurementFolder) -> MeasurementFolder:
         """The folder, its heliostats as newly measured: zeros of drives matter only to who turns them by motors."""

@@ -127,6 +127,12 @@ def mount_of(row: HeliostatRow, kept: MountRow, effects: Iterable[Effect]) -> Ca
     return mount_from_json(kept.document, f"mount {kept.version} of {row.name}")
 
 
+def holding_mount(session: Session, row: HeliostatRow) -> StoredMount | None:
+    """The newest calibrated mount of a heliostat, where it has one that holds."""
+    kept, effects = mounts.find_mount_at(session, row), versions.get_model(session).effects
+    return None if kept is None or _changed(row, kept, effects) is not None else stored_mount(session, row, kept)
+
+
 def _changed(row: HeliostatRow, kept: MountRow, effects: Iterable[Effect]) -> str | None:
     if row.updated_at > kept.created_at:
         return f"the properties of {row.name} changed since it was calibrated"

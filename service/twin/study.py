@@ -6,6 +6,7 @@ from datetime import datetime
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import ValidationError
 from sqlalchemy import select
 from sqlalchemy.orm import Session
@@ -13,6 +14,7 @@ from sqlalchemy.orm import Session
 from model.effects import effects_from_json
 from model.errors import InvalidInputError, UnreachableError
 from model.forecast import align
+from model.pointing.report import day_of
 from model.study import FluxImage, Study, StudyOptions
 from model.study.loop import LEAST_IMAGES
 from model.surface import control_points
@@ -26,8 +28,11 @@ from service.drawing.study_report import study_page
 from service.store.tables import HeliostatRow, MeasurementRow, StudyRow, SurfaceRow
 from service.twin import versions
 from service.twin.evidence import choose_measurements, evidence_of, heights_of, load_twin
+from service.twin.mounted import StoredMount, holding_mount
 from service.twin.runtime import Runtime
 from service.twin.versions import PlantModel
+
+Array = NDArray[np.float64]
 
 Surfaces = Literal["measured", "current"]
 
@@ -125,15 +130,27 @@ def _surface(session: Session, heliostat: HeliostatRow, surfaces: Surfaces) -> S
 def _gather_heliostat(session: Session, row: HeliostatRow, request: StudyRequest, material: Material) -> None:
     twin, surface = load_twin(session, row.name), _surface(session, row, request.surfaces)
     points, seen = control_points(twin.heliostat, heights_of(surface)), {m.identifier for m in surface.measurements}
+    stored = holding_mount(session, row)
     chosen = choose_measurements(session, row, request.images, request.since, request.until)
     for measurement in store.get_measurements(session, row, [found.identifier for found in chosen], arrays=True):
         try:
             evidence = evidence_of(measurement, twin.origin)
             photograph = evidence.photograph(twin.heliostat, points, seen=measurement.identifier in seen)
+            if stored is not None:
+                photograph = _sent(photograph, stored, evidence.motor_position)
         except SKIPPED as error:
             material.skipped[f"{row.name}/{measurement.identifier}"] = str(error)
             continue
         material.photographs.append(photograph)
+
+
+def _sent(photograph: FluxImage, stored: StoredMount, motors: Array | None) -> FluxImage:
+    """A photograph with what its motors (2,) [steps] say, where it is newer than all that calibrated its mount."""
+    setup = photograph.setup
+    if motors is None or setup.spot is None or not stored.mount.is_before(setup.taken_at):
+        return photograph
+    told = stored.mount.told(stored.heliostat, motors, setup.sun, setup.spot, day_of(setup.taken_at))
+    return photograph.sent(*told)
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,6 +18,7 @@ from model.surface import control_points
 from model.tracing.convolution import central_rays
 from service.base.settings import Settings
 from service.sources.documents import read_heliostat
+from service.twin.study import StudyRequest, gather
 from tests.service.conftest import ORIGIN, QUIET, FakeOperations, Post, png, until
 from tests.service.spots import photographs
 
@@ -180,6 +181,26 @@ def test_all_that_is_forecast_stands_on_the_calibrated_mount(
         np.testing.assert_allclose(mount.first_axis, east[:, 0], atol=1e-9, err_msg=name)
     client.put("/v1/heliostats/AA39", json=properties | {"height": 2.5})
     assert not any(mount.is_calibrated for mount in mounts().values())
+
+
+def test_photographs_newer_than_a_mount_say_to_a_study_where_motors_sent_the_light(
+    client: TestClient, post: Post, tower: Any, properties: Any
+):
+    taken = [one | {"kind": "flux"} for one in photographs(tower, properties)]
+    for number, one in enumerate(taken[:14]):
+        post(png(number), **one)
+    calibrate(client)
+    for number, one in enumerate(taken[14:], 14):
+        post(png(number), **one)
+    client.post("/v1/heliostats/AA39/surfaces", json={})
+    with client.app.state.runtime.database.reading() as session:  # type: ignore[attr-defined]
+        material = gather(session, StudyRequest(heliostats=["AA39"], images=16))
+    told = [p for p in material.photographs if p.setup.angles is not None]
+    assert len(material.photographs) == 16
+    assert {p.key for p in told} == {"AA39/14", "AA39/15"}
+    off = align([p.setup for p in told], latitude_deg=ORIGIN[0]).displaced
+    assert np.abs(off).max() < 3e-3
+    assert all(p.spot_std_rad < 3e-3 and p.spot_doubts_rad is not None for p in told)
 
 
 def test_mounts_hold_under_the_sun_they_were_calibrated_under(
