@@ -287,7 +287,8 @@ class _Posterior:
         model = self.prior, self.optics, self.effects, self.latitude_deg, self.options
         half = _Posterior(self.heliostat, [self.observations[i] for i in images], *model)
         start, jacobian, _ = half.settled(half.state(state.c))
-        belief = replace(fit.belief, sigma=fit.belief.sigma[list(images)])
+        sigma = np.broadcast_to(fit.belief.sigma, (len(self.observations), len(BANDS)))[list(images)]
+        belief = replace(fit.belief, sigma=sigma)
         found = half.optimum(start, belief, jacobian)
         return found.state.c, np.diag(half.fit(found.state, found.jacobian, belief).of_errors)
 

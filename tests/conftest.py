@@ -6,6 +6,7 @@ import os
 for _library in ("OMP", "OPENBLAS", "MKL"):
     os.environ.setdefault(f"{_library}_NUM_THREADS", "1")
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +16,17 @@ import torch
 from model.mount import Mount
 from model.plant import Heliostat, TargetPlane
 from tests.benchmarks import data_folder
+from tests.undeclared import camera
 
 torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def drawn_sheets() -> Iterator[None]:
+    """The generator's sets are the same with or without the real data: their sheets are drawn."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(camera, "sheet", camera.drawn_sheet)
+        yield
 
 
 @pytest.fixture(scope="session")

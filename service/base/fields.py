@@ -220,7 +220,8 @@ class AccuracyOut(BaseModel):
     accuracy_median: float = Field(description="[1]")
     per_image: dict[str, float] = Field(description="By heliostat and measurement, `H/ID` [1].")
     position_error_mrad: float | None = Field(
-        default=None, description="Median angle from where motors sent the light to where it lies; null: not known."
+        default=None,
+        description="Median angle from where motors sent the light to where it lies [mrad]; null: not known.",
     )
 
 

@@ -123,8 +123,8 @@ def paint_motors(value: Any) -> Any:
 class FocalSpots(Model):
     """PAINT's ``focal_spot``: where two methods found the centre of mass; UTIS is preferred."""
 
-    UTIS: Wgs84 | None = None
-    HeliOS: Wgs84 | None = None
+    UTIS: Wgs84 | None = Field(default=None, description="Latitude [deg], longitude [deg], altitude [m].")
+    HeliOS: Wgs84 | None = Field(default=None, description="Likewise [deg, deg, m].")
 
     @model_validator(mode="after")
     def _some(self) -> Self:

@@ -55,9 +55,9 @@ Motors = Annotated[
 Pixel = tuple[Annotated[Number, Field(ge=-1e5, le=1e5)], Annotated[Number, Field(ge=-1e5, le=1e5)]]
 
 
-WindSpeed = Annotated[Number, Field(ge=0, le=100, description="Of the wind then [m/s].")]
-WindFrom = Annotated[Number, Field(ge=0, le=360, description="Where the wind came from, from north, over east [deg].")]
-Temperature = Annotated[Number, Field(ge=-90, le=60, description="Of the air then [°C].")]
+WindSpeed = Annotated[Number, Field(ge=0, le=100)]
+WindFrom = Annotated[Number, Field(ge=0, le=360)]
+Temperature = Annotated[Number, Field(ge=-90, le=60)]
 
 
 class MeasurementIn(Model):
@@ -85,9 +85,9 @@ class MeasurementIn(Model):
         description="Positions (x, y) [px] of the target's upper left, upper right, lower left and lower right "
         "corners in a raw frame; without them they are searched.",
     )
-    wind_speed_m_s: WindSpeed | None = None
-    wind_from_deg: WindFrom | None = None
-    temperature_c: Temperature | None = None
+    wind_speed_m_s: WindSpeed | None = Field(default=None, description="Of the wind then [m/s].")
+    wind_from_deg: WindFrom | None = Field(default=None, description="Where it came from, from north, over east [deg].")
+    temperature_c: Temperature | None = Field(default=None, description="Of the air then [°C].")
 
 
 class MeasurementOut(BaseModel):
@@ -105,7 +105,9 @@ class MeasurementOut(BaseModel):
     focal_spot: tuple[float, float, float] | None = Field(
         description="As given, UTIS's, else HeliOS's: latitude [deg], longitude [deg], altitude [m]."
     )
-    helios_spot: tuple[float, float, float] | None = Field(description="HeliOS's, where it was given.")
+    helios_spot: tuple[float, float, float] | None = Field(
+        description="HeliOS's, where it was given: likewise [deg, deg, m]."
+    )
     wind_speed_m_s: float | None = Field(description="[m/s]")
     wind_from_deg: float | None = Field(description="From north, over east [deg].")
     temperature_c: float | None = Field(description="[°C]")

@@ -155,7 +155,7 @@ def test_one_forecast_or_those_of_the_field(client: TestClient, operations: Fake
         (body | {"resolution": 4096}, "resolution.0: "),
         (body | {"heliostat": "AA39", "receiver": {}}, "receiver: "),
         ({"sun": SUN}, "give either target or plane, or receiver"),
-        ([], "field"),
+        ([], "body: must be a JSON object"),
     ):
         answer = client.post("/v1/forecasts", json=wrong)
         assert answer.status_code == 422
