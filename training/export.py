@@ -80,6 +80,8 @@ def store_in_half(path: Path) -> None:
             name, values = tensor.name, onnx.numpy_helper.to_array(tensor).astype(np.float16)
             tensor.CopyFrom(onnx.numpy_helper.from_array(values, f"{name}_half"))
             casts.append(onnx.helper.make_node("Cast", [f"{name}_half"], [name], to=onnx.TensorProto.FLOAT))
+    for told in (model.graph, *model.graph.node, *model.graph.value_info):
+        del told.metadata_props[:]  # the exporter's stack traces, with paths of the machine
     nodes = [*casts, *model.graph.node]
     del model.graph.node[:]
     model.graph.node.extend(nodes)

@@ -41,3 +41,7 @@ def test_the_card_is_of_the_shipped_weights_and_of_the_training_that_the_reposit
     for part in ("test", "apart"):
         assert set(load_part(stj, part)[1]) <= set(card["trained_on"]["held_out"])
     assert set(card["trained_on"]["learnt"]).isdisjoint(card["trained_on"]["held_out"])
+
+
+def test_it_tells_no_path_of_the_machine_that_exported_it():
+    assert b'File "' not in WEIGHTS.read_bytes()
