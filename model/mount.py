@@ -249,6 +249,11 @@ class Mount:
         ahead = normal[..., :2] / np.maximum(level, _LEAST_LEVER)[..., None]
         return np.concatenate([ahead * np.cos(elevation)[..., None], np.sin(elevation)[..., None]], axis=-1)
 
+    def require_within(self, motors: Array) -> None:
+        """`UnreachableError` where one of the motor positions (2,) [steps] lies beyond its drive's travel."""
+        for position, drive in zip(motors, self.actuators or (), strict=True):
+            drive.require_within(position)
+
     def angles_from_motors(self, steps: ArrayLike) -> Array:
         """Axis angles (..., 2) [rad] at motor positions (..., 2) [steps]."""
         if self.actuators is None:

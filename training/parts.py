@@ -224,27 +224,7 @@ class PartsNetwork(nn.Module):
     def forward(
         self, flux: Tensor, conditions: Tensor, mask: Tensor, guess_flux: Tensor, guess: Tensor, descent: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Predict.
-
-        Parameters
-        ----------
-        flux : Tensor (B, M, 64, 64)
-            4 m x 4 m about the centre of mass, sum 100; anything where there is no image.
-        conditions : Tensor (B, M, 12)
-        mask : Tensor (B, M)
-            One where there is an image, zero elsewhere.
-        guess_flux : Tensor (B, M, 64, 64)
-            What the guessed surface throws there, likewise.
-        guess : Tensor (B, 4, 8, 8) [mm]
-        descent : Tensor (B, M, 4, 8, 8) [mm]
-            Each image's share in a step of steepest descent from the guess (`model.network.inputs.descents`), zero
-            where there is no image.
-
-        Returns
-        -------
-        heights, spread : Tensor (B, 4, 8, 8) [mm]
-            Facet mean zero; the spread is the scale of a Laplace distribution of the error.
-        """
+        """As `model.network.architecture.SurfaceNetwork.forward`."""
         shares = descent.flatten(2) / self.scale  # (B, M, points)
         step = shares.sum(dim=1)  # (B, points)
         each = (images.flatten(0, 1) for images in (flux, guess_flux, conditions))  # (B M, ...)

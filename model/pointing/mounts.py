@@ -251,8 +251,7 @@ class CalibratedMount:
         sends the light of the ``sun`` (3,), and what the calibration leaves open of it (2, P) [rad], as `doubts_at`.
         ``heliostat`` is as its properties have it.
         """
-        for position, drive in zip(motors, heliostat.mount.actuators or (), strict=True):
-            drive.require_within(position)
+        heliostat.mount.require_within(motors)
         one = motors[None], sun[None], spot[None], np.array([day])
         doubts = self.doubts_at(heliostat, *one)[0]
         alone = self.covariance_at(heliostat, *one)[0] - doubts @ doubts.T

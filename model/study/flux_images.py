@@ -16,7 +16,8 @@ from model.forecast import Aligned, Setup, View, align
 from model.images import FLUX_SIZE, clipped_alike
 from model.imaging.window import overlap_matrix
 from model.metrics import accuracy_window
-from model.plant import TargetPlane
+from model.plant import Heliostat, TargetPlane
+from model.pointing.mounts import CalibratedMount
 from model.study.noise import black_lift, grain_variance
 from model.study.position import USUAL_RAD, whitened
 from model.study.unknowns import copied, copy_name
@@ -91,8 +92,15 @@ class FluxImage:
         """Distance [m] from the heliostat to its target."""
         return float(np.linalg.norm(self.setup.heliostat.position - self.setup.plane.center))
 
-    def sent(self, angles: Array, std_rad: float, doubts_rad: Array) -> "FluxImage":
-        """It with where its motors sent the light, as `model.pointing.CalibratedMount.told` has it."""
+    def sent(self, nominal: Heliostat, mount: CalibratedMount, motors: Array | None, day: float) -> "FluxImage":
+        """It with where its motors (2,) [steps] sent the light, where it is newer than all that calibrated its mount.
+
+        ``nominal`` is the heliostat as its properties have it, ``day`` as `model.pointing.Reading` counts it [d].
+        """
+        spot = self.setup.spot
+        if motors is None or spot is None or not mount.is_before(self.taken_at):
+            return self
+        angles, std_rad, doubts_rad = mount.told(nominal, motors, self.setup.sun, spot, day)
         setup = replace(self.setup, angles=angles)
         return replace(self, setup=setup, spot_std_rad=std_rad, spot_doubts_rad=doubts_rad)
 

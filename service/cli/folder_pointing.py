@@ -153,10 +153,7 @@ class Mounts:
         ``nominal`` is the heliostat as its properties have it. What a mount was calibrated by speaks for it anyway.
         """
         mount, motors = self._known.get(nominal.name), measurement.motor_position
-        sun, spot = taken.setup.sun, taken.setup.spot
-        if mount is None or motors is None or spot is None or not mount.is_before(measurement.taken_at):
-            return taken
-        return taken.sent(*mount.told(nominal, motors, sun, spot, self._days[measurement.key]))
+        return taken if mount is None else taken.sent(nominal, mount, motors, self._days[measurement.key])
 
     def under(self, folder: MeasurementFolder) -> MeasurementFolder:
         """The folder, its heliostats as newly measured: zeros of drives matter only to who turns them by motors."""
@@ -197,8 +194,7 @@ def motors_of(heliostat: Heliostat, measurement: Measurement) -> Array:
     """Motor positions (2,) [steps] within the drives' travel."""
     if measurement.motor_position is None:
         raise InvalidInputError("no 'motor_position'")
-    for position, drive in zip(measurement.motor_position, heliostat.mount.actuators or (), strict=True):
-        drive.require_within(position)
+    heliostat.mount.require_within(measurement.motor_position)
     return measurement.motor_position
 
 

@@ -175,8 +175,7 @@ def _trace(
 ) -> Forecast:
     model, angles = twin.model, None
     if request.motors is not None:
-        for position, drive in zip(request.motors, twin.heliostat.mount.actuators or (), strict=True):
-            drive.require_within(position)
+        twin.heliostat.mount.require_within(np.asarray(request.motors))
         angles = twin.heliostat.mount.angles_from_motors(request.motors)
     with runtime.computing("forecast") as operations:
         return operations.forecast(

@@ -147,8 +147,7 @@ def _reading(
             "its spot runs over the target's edge, and where the centre of all of it lies is unseen"
         )
     motors = np.array([row.motor_axis_1, row.motor_axis_2])
-    for position, drive in zip(motors, heliostat.mount.actuators or (), strict=True):
-        drive.require_within(position)
+    heliostat.mount.require_within(motors)
     sun = true_sun(effects, sun_direction(row.sun_azimuth_deg, row.sun_elevation_deg), row.taken_at, origin[0])
     return Reading(row.identifier, plane.name, motors, sun, spot, day, photograph_of(row).weather)
 

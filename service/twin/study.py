@@ -6,7 +6,6 @@ from datetime import datetime
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import ValidationError
 from sqlalchemy import select
 from sqlalchemy.orm import Session
@@ -28,11 +27,9 @@ from service.drawing.study_report import study_page
 from service.store.tables import HeliostatRow, MeasurementRow, StudyRow, SurfaceRow
 from service.twin import versions
 from service.twin.evidence import choose_measurements, evidence_of, heights_of, load_twin
-from service.twin.mounted import StoredMount, holding_mount
+from service.twin.mounted import holding_mount
 from service.twin.runtime import Runtime
 from service.twin.versions import PlantModel
-
-Array = NDArray[np.float64]
 
 Surfaces = Literal["measured", "current"]
 
@@ -137,20 +134,12 @@ def _gather_heliostat(session: Session, row: HeliostatRow, request: StudyRequest
             evidence = evidence_of(measurement, twin.origin)
             photograph = evidence.photograph(twin.heliostat, points, seen=measurement.identifier in seen)
             if stored is not None:
-                photograph = _sent(photograph, stored, evidence.motor_position)
+                motors, day = evidence.motor_position, day_of(evidence.taken_at)
+                photograph = photograph.sent(stored.heliostat, stored.mount, motors, day)
         except SKIPPED as error:
             material.skipped[f"{row.name}/{measurement.identifier}"] = str(error)
             continue
         material.photographs.append(photograph)
-
-
-def _sent(photograph: FluxImage, stored: StoredMount, motors: Array | None) -> FluxImage:
-    """A photograph with what its motors (2,) [steps] say, where it is newer than all that calibrated its mount."""
-    setup = photograph.setup
-    if motors is None or setup.spot is None or not stored.mount.is_before(setup.taken_at):
-        return photograph
-    told = stored.mount.told(stored.heliostat, motors, setup.sun, setup.spot, day_of(setup.taken_at))
-    return photograph.sent(*told)
 
 
 @dataclass(frozen=True, eq=False)
