@@ -233,7 +233,7 @@ class _Posterior:
     def fit(self, state: _State, jacobian: NDArray[Any], belief: "_Belief") -> "_Fit":
         """What there is to say of a state that was found with a belief."""
         weights = _Weights(state.images, belief.sigma, self.options)
-        return _Fit(belief, weights(jacobian), weights(self.measured - state.images), weights.bands)
+        return _Fit(belief, jacobian, weights(jacobian), weights(self.measured - state.images), weights.bands)
 
     def facet_light(self, state: _State, fit: "_Fit") -> tuple[Array, Array]:
         """By how much each facet sends more light than the others' mean (F,) [1], and its standard deviation.
@@ -253,10 +253,11 @@ class _Posterior:
             images = self.ranges.seen(aligned.flux_images(self.optics, self.effects, size=size, samples=samples))
         return np.asarray(images.double().numpy())
 
-    def settled(self, state: _State) -> tuple[_State, NDArray[Any], "_Belief"]:
+    def settled(
+        self, state: _State, jacobian: NDArray[Any], stages: Sequence[float]
+    ) -> tuple[_State, NDArray[Any], "_Belief"]:
         """The state near another at which large features are right, the Jacobian there and what it was found with."""
-        jacobian = self.jacobian(state)
-        for error in self.options.annealing:
+        for error in stages:
             belief = _Belief(np.full((1, len(BANDS)), error), np.ones(len(state.c)))
             found = self.optimum(state, belief, jacobian)
             state, jacobian = found.state, found.jacobian
@@ -265,9 +266,9 @@ class _Posterior:
     def covariance(self, state: _State, fit: "_Fit") -> Array:
         """Covariance (K, K) of the coefficients of a state, as far apart as halves of the images find the mirror.
 
-        Each half is fitted anew, from blurred to sharp, as the whole was. By as much as halves differ more than their
-        errors should make them, group by group of the prior's directions, the part that comes of errors grows; what the
-        prior leaves open stays. Halves do not show errors that all images share: `_Fit.cautious` allows for those.
+        Each half is fitted anew, from blurred to sharp. By as much as halves differ more than their errors should make
+        them, group by group of the prior's directions, the part that comes of errors grows; what the prior leaves open
+        stays. Halves do not show errors that all images share: `_Fit.cautious` allows for those.
         """
         cautious, suns = fit.cautious(self.options.grain), np.array([o.sun for o in self.observations])
         if len(suns) < 2:
@@ -286,7 +287,8 @@ class _Posterior:
         """Coefficients (K,) that some of the images find, and their variance (K,) by the images' errors."""
         model = self.prior, self.optics, self.effects, self.latitude_deg, self.options
         half = _Posterior(self.heliostat, [self.observations[i] for i in images], *model)
-        start, jacobian, _ = half.settled(half.state(state.c))
+        begun = half.state(state.c), fit.jacobian[:, list(images)]
+        start, jacobian, _ = half.settled(*begun, self.options.annealing[:1])
         sigma = np.broadcast_to(fit.belief.sigma, (len(self.observations), len(BANDS)))[list(images)]
         belief = replace(fit.belief, sigma=sigma)
         found = half.optimum(start, belief, jacobian)
@@ -314,9 +316,22 @@ class _Belief:
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """Derivatives (K, M, n) of weighed images, what is left of them (M, n), and the band (n,) of each mode."""
+    """What images tell of a state.
+
+    Attributes
+    ----------
+    belief : _Belief
+        What it was found with.
+    jacobian : (K, M, R, R)
+        Derivatives of the images.
+    white, left : (K, M, n), (M, n)
+        The same of weighed images, and what is left of those.
+    bands : (n,)
+        The band of each mode.
+    """
 
     belief: _Belief
+    jacobian: NDArray[Any]
     white: NDArray[Any]
     left: Array
     bands: NDArray[np.int64]
@@ -516,7 +531,8 @@ def _consensus(
         suns = np.array([observations[i].sun for i in kept])
         few = [kept[i] for i in sorted(spread_suns(suns, options.few))]
         whole = posterior(few)
-        state, jacobian, belief = whole.settled(whole.state(c))
+        state = whole.state(c)
+        state, jacobian, belief = whole.settled(state, whole.jacobian(state), options.annealing)
         if len(few) < len(kept):
             whole = posterior(kept)
             state = whole.state(state.c)

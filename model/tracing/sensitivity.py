@@ -8,7 +8,9 @@ Left out is what a height changes besides: the place where a ray starts, by a te
 a sample shows the sun, by a ten-thousandth. The mount keeps the spot's centre where it is.
 """
 
+import numpy as np
 import torch
+from scipy.sparse import csc_array
 from torch import Tensor
 
 from model.surface import canted, midpoint_basis
@@ -33,15 +35,16 @@ def sensitivity(scene: Scene, window: Window, optics: Optics, *, samples: int = 
     rays = central_rays(scene, samples)
     center = rays.spot if window.on_spot else torch.zeros_like(rays.spot)
     seen = raster(rays, center, window, optics, optics.irradiance(rays.slant_range), (padding, padding))
-    pushed = _moved(scene, rays, samples) / seen.x.new_tensor([window.pixel[0], -window.pixel[1]])[:, None, None, None]
-    changes = seen.blurred(_sharp(seen, pushed))
-    weight = seen.weight.view(scene.batch, 1, *pushed.shape[2:4], 1)
-    spot = (pushed * weight).sum(-2).flatten(2) / seen.weight.sum(-1)[:, None, None]
+    moved = _moved(scene, rays, samples) / seen.x.new_tensor([window.pixel[0], -window.pixel[1]])[:, None, None, None]
+    slopes = _slopes(scene, samples)
+    changes = seen.blurred(_sharp(seen, moved, slopes))
+    weight = (seen.weight / seen.weight.sum(-1, keepdim=True)).view(scene.batch, 1, -1, samples**2, 1)
+    spot = torch.einsum("bafns,sfnk->bafk", moved * weight, slopes).flatten(2)
     return changes[:-2] - torch.einsum("bak,abrc->kbrc", spot, changes[-2:])
 
 
 def _moved(scene: Scene, rays: Rays, samples: int) -> Tensor:
-    """Movement (B, 2, F, n**2, I * J) [m/m] on the plane of each sample's light with its facet's control heights."""
+    """Movement (B, 2, F, n**2, 2) [m] on the plane of each sample's light with its slopes along x and y."""
     facets = scene.control_points.shape[1]
     points = scene.control_points.expand(scene.batch, -1, -1, -1, -1)
     tilts = TILT * torch.eye(2, dtype=points.dtype, device=points.device)
@@ -50,40 +53,40 @@ def _moved(scene: Scene, rays: Rays, samples: int) -> Tensor:
         / TILT
         for tilt in tilts
     ]
-    moved = torch.zeros(())
-    for by, slopes in zip(by_slope, _slopes(points, scene.degree, samples), strict=True):
-        moved = moved + by.view(*by.shape[:2], facets, -1, 1) * slopes
-    return moved
+    return torch.stack(by_slope, dim=-1).view(scene.batch, 2, facets, -1, 2)
 
 
-def _slopes(points: Tensor, degree: int, samples: int) -> tuple[Tensor, Tensor]:
-    """Slope along x and y, each (1, 1, F, n**2, I * J) [1/m], that control heights make at a facet's samples."""
-    value_u, slope_u = midpoint_basis(points.shape[-2], degree, samples, points.dtype, points.device)
-    value_v, slope_v = midpoint_basis(points.shape[-1], degree, samples, points.dtype, points.device)
-    wide = (points[0, :, :, -1, 0] - points[0, :, :, 0, 0]).norm(dim=-1)
-    high = (points[0, :, :, 0, -1] - points[0, :, :, 0, 0]).norm(dim=-1)
-    shape = (1, 1, 1, samples**2, -1)
-    along_x = torch.einsum("ui,vj->uvij", slope_u, value_v).reshape(shape) / wide[:, None, None]
-    along_y = torch.einsum("ui,vj->uvij", value_u, slope_v).reshape(shape) / high[:, None, None]
-    return along_x, along_y
+def _slopes(scene: Scene, samples: int) -> Tensor:
+    """Slopes along x and y (2, F, n**2, I * J) [1/m] that control heights make at a facet's samples."""
+    points = scene.control_points[0]
+    value_u, slope_u = midpoint_basis(points.shape[-2], scene.degree, samples, points.dtype, points.device)
+    value_v, slope_v = midpoint_basis(points.shape[-1], scene.degree, samples, points.dtype, points.device)
+    wide = (points[:, :, -1, 0] - points[:, :, 0, 0]).norm(dim=-1)
+    high = (points[:, :, 0, -1] - points[:, :, 0, 0]).norm(dim=-1)
+    along_x = torch.einsum("ui,vj->uvij", slope_u, value_v).reshape(samples**2, -1)
+    along_y = torch.einsum("ui,vj->uvij", value_u, slope_v).reshape(samples**2, -1)
+    return torch.stack([along_x / wide[:, None, None], along_y / high[:, None, None]])
 
 
-def _sharp(seen: Raster, pushed: Tensor) -> Tensor:
-    """Change (F * K + 2, B, R, C) of sharp images with heights that push light (B, 2, F, N, K) [px], and by a pixel.
+def _sharp(seen: Raster, moved: Tensor, slopes: Tensor) -> Tensor:
+    """Change (F * K + 2, B, R, C) of sharp images with heights, and as all light moves by a pixel.
 
-    The last two are those of a push of all light along columns and along rows.
+    Heights make ``slopes`` (2, F, N, K) [1/m], and slopes move light (B, 2, F, N, 2) [px]. The last two changes are
+    those along columns and along rows. What slopes do to pixels is sparse: nine of them for a sample of each mirror.
     """
-    batch, _, facets, samples, count = pushed.shape
+    batch, _, facets, samples, _ = moved.shape
     index, along = _footprints(seen)
     along = (along * seen.weight[:, None]).view(2, batch, 9, facets, samples)
-    index = index.view(batch, 9, facets, samples)
-    images = seen.x.new_zeros(facets * count + 2, batch * seen.shape[0] * seen.shape[1])
-    for facet, place in enumerate(index.unbind(2)):
-        slope = along[:, :, :, facet]
-        changes = sum(by[..., None] * push[:, None, facet] for by, push in zip(slope, pushed.unbind(1), strict=True))
-        image = images.new_zeros(images.shape[1], count).index_add_(0, place.flatten(), changes.flatten(0, 2))
-        images[facet * count : (facet + 1) * count] = image.T
-        images[-2:].index_add_(1, place.flatten(), slope.flatten(1))
+    pixels, count = batch * seen.shape[0] * seen.shape[1], slopes.shape[-1]
+    images = seen.x.new_zeros(facets * count + 2, pixels)
+    images[-2:].index_add_(1, index.flatten(), along.flatten(1))
+    by_slope = torch.einsum("abpfn,bafns->sfnbp", along, moved).flatten(3)
+    places = index.view(batch, 9, facets, samples).permute(2, 3, 0, 1).flatten(2)
+    first = range(0, 2 * places[0].numel() + 1, places.shape[-1])
+    for facet, place in enumerate(places):
+        entries = by_slope[:, facet].flatten().numpy(), place.expand(2, -1, -1).flatten().numpy(), np.array(first)
+        change = csc_array(entries, shape=(pixels, 2 * samples)) @ slopes[:, facet].flatten(0, 1).numpy()
+        images[facet * count : (facet + 1) * count] = torch.from_numpy(change).T
     return images.view(-1, batch, *seen.shape)
 
 
