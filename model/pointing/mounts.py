@@ -215,21 +215,13 @@ class CalibratedMount:
     def covariance_at(self, heliostat: Heliostat, motors: Array, suns: Array, spots: Array, days: Array) -> Array:
         """Covariances (N, 2, 2) [rad2], sidewards and upwards, of spots measured at motor positions (N, 2) [steps]."""
         slope = self._slope(heliostat, motors, suns, spots, days)
+        return np.asarray(slope @ self.covariance @ slope.swapaxes(1, 2) + self._own_covariance(slope, days))
+
+    def _own_covariance(self, slope: Array, days: Array) -> Array:
+        """What each of N measurements adds to it by itself (N, 2, 2) [rad2]: its drives since, and its spot."""
         of_zeros = slope[..., ZEROS]
-        return np.asarray(
-            slope @ self.covariance @ slope.swapaxes(1, 2)
-            + (of_zeros * self.zeros_variance_at(days)[:, None]) @ of_zeros.swapaxes(1, 2)
-            + self.noise.spot_rad**2 * np.eye(2)
-        )
-
-    def doubts_at(self, heliostat: Heliostat, motors: Array, suns: Array, spots: Array, days: Array) -> Array:
-        """What P independent deviations of the mount move such spots by (N, 2, P) [rad], one standard deviation each.
-
-        Their products are the first part of `covariance_at`, and what spots of several measurements have in common.
-        """
-        sizes, vectors = np.linalg.eigh(self.covariance)
-        slope = self._slope(heliostat, motors, suns, spots, days)
-        return np.asarray(slope @ (vectors * np.sqrt(sizes.clip(min=0))))
+        moved = (of_zeros * self.zeros_variance_at(days)[:, None]) @ of_zeros.swapaxes(1, 2)
+        return np.asarray(moved + self.noise.spot_rad**2 * np.eye(2))
 
     def _slope(self, heliostat: Heliostat, motors: Array, suns: Array, spots: Array, days: Array) -> Array:
         """Derivatives (N, 2, P) of residuals by the parameters."""
@@ -248,13 +240,16 @@ class CalibratedMount:
         """Angles (2,) [rad] of the axes at a measurement, as its motors (2,) [steps] say, and how sure that is.
 
         Beside them the standard deviation [rad] per direction by which its ``spot`` (3,) [m] lies about where that
-        sends the light of the ``sun`` (3,), and what the calibration leaves open of it (2, P) [rad], as `doubts_at`.
-        ``heliostat`` is as its properties have it.
+        sends the light of the ``sun`` (3,), and what the calibration leaves open of it (2, P) [rad]: what P independent
+        deviations of the mount move the spot by, one standard deviation each, which spots of several measurements have
+        in common. ``heliostat`` is as its properties have it.
         """
         heliostat.mount.require_within(motors)
-        one = motors[None], sun[None], spot[None], np.array([day])
-        doubts = self.doubts_at(heliostat, *one)[0]
-        alone = self.covariance_at(heliostat, *one)[0] - doubts @ doubts.T
+        days = np.array([day])
+        slope = self._slope(heliostat, motors[None], sun[None], spot[None], days)
+        sizes, vectors = np.linalg.eigh(self.covariance)
+        doubts = slope[0] @ (vectors * np.sqrt(sizes.clip(min=0)))
+        alone = self._own_covariance(slope, days)[0]
         std_rad = max(self.usual_rad, float(np.sqrt(np.trace(alone) / 2)))
         return self.mount(heliostat.mount, day).angles_from_motors(motors), std_rad, doubts
 

@@ -38,6 +38,9 @@ TRIALS = 40
 # Times at which a clock is put wrong.
 CLOCK_TRIALS = 12
 
+# How often the last third is calibrated anew as it comes in.
+PARTS = 4
+
 Series = dict[str, list[Reading]]
 
 
@@ -142,10 +145,25 @@ def accuracy(plant: Plant) -> None:
         judged = {name: apart for name, (_, apart) in parts.items()}
         print(median_row(label, errors_mrad(plant, mounts, judged)))
         shares[label] = covered(plant, mounts, judged)
+    print(median_row(f"the last third, each of {PARTS} parts by all before it", as_it_comes(plant, many)))
     print(median_row("all but five in a row, prior of the others", five_only(plant, many)))
     print()
     for label, share in shares.items():
         print(f"within their 90 % interval, {label}: {100 * share:.0f} %")
+
+
+def as_it_comes(plant: Plant, many: Series) -> dict[str, Array]:
+    """Errors of the newest third by mounts that are calibrated anew before each of its parts."""
+    found: dict[str, list[Array]] = {name: [] for name in many}
+    for part in range(PARTS):
+        known, judged = dict(plant.readings), {}
+        for name, own in many.items():
+            first, last = (len(own) - len(own) // 3 + place * (len(own) // 3) // PARTS for place in (part, part + 1))
+            known[name], judged[name] = own[:first], own[first:last]
+        mounts, _ = plant.calibrate(known)
+        for name, errors in errors_mrad(plant, mounts, judged).items():
+            found[name].append(errors)
+    return {name: np.concatenate(errors) for name, errors in found.items()}
 
 
 def five_only(plant: Plant, many: Series) -> dict[str, Array]:

@@ -69,11 +69,15 @@ def _read(root: Path, heliostats: list[str] | None) -> PaintFolder:
     found: dict[str, Heliostat] = {}
     skipped: dict[str, str] = {}
     properties: dict[str, Any] = {}
-    for folder in sorted(root.glob("*/Properties")):
-        name, files = folder.parent.name, sorted(folder.glob("*heliostat-properties.json"))
-        if not files or (heliostats is not None and name not in heliostats):
+    for own in sorted(filter(Path.is_dir, root.iterdir())):
+        name, folder = own.name, own / "Properties"
+        files = sorted(folder.glob("*heliostat-properties.json"))
+        is_one = bool(files) or (own / "Calibration").is_dir()
+        if not is_one or (heliostats is not None and name not in heliostats):
             continue
         try:
+            if not files:
+                raise InvalidInputError(f"{folder}: no '{name}-heliostat-properties.json'; add it, or leave {name} out")
             if len(files) > 1:
                 names = ", ".join(entry.name for entry in files)
                 raise InvalidInputError(f"{folder}: more than one file of properties ({names}); leave the right one")

@@ -50,7 +50,7 @@ def write_measurement(root: Path, name: str, number: int, taken: dict[str, Any],
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """AA39 with 16 good measurements and some that are not; AB01 without drives; AB02 without a measurement."""
+    """AA39 with 16 good measurements and others; AB01 has no drives, AB02 no measurement, AB09 no properties."""
     root = tmp_path / "plant"
     write(root / "P-tower-measurements.json", tower_document())
     for name in ("AA39", "AB01", "AB02"):
@@ -71,6 +71,7 @@ def folder(tmp_path: Path) -> Path:
     write_measurement(root, "AA39", 203, taken[0], focal_spot={"UTIS": far})
     write_measurement(root, "AA39", 204, {**taken[0], "motor_position": [82519.0, 100.0]})
     write_measurement(root, "AB01", 300, taken[0])
+    write_measurement(root, "AB09", 400, taken[0])
     return root
 
 
@@ -87,6 +88,7 @@ def test_what_cannot_be_used_is_listed_and_costs_nothing_else(folder: Path, tmp_
         "AA39/204": "beyond the travel",
         "AB01": "no linear actuators",
         "AB02": "no measurement",
+        "AB09": "no 'AB09-heliostat-properties.json'",
     }
     assert set(report["skipped"]) == set(said)
     assert all(words in report["skipped"][key] for key, words in said.items())
@@ -139,7 +141,7 @@ def test_spots_need_no_focal_spot(folder: Path, tmp_path: Path):
         write(path, document)
     report = spot_folder(read_folder(folder), mounts, tmp_path / "spots.json")
     assert len(report["spots"]) == 18
-    assert set(report["skipped"]) == {"AA39/200", "AA39/202", "AA39/204", "AB01", "AB02"}
+    assert set(report["skipped"]) == {"AA39/200", "AA39/202", "AA39/204", "AB01", "AB02", "AB09"}
     entry = report["spots"]["AA39/105"]
     assert np.linalg.norm(np.array(entry["spot"]) - measured["AA39/105"]) < 0.2
     assert 0 < entry["std_m"] < 0.5
