@@ -116,8 +116,8 @@ def with_drives(row: HeliostatRow, origin: tuple[float, float, float]) -> Helios
     heliostat = read_heliostat(row.name, row.properties, np.array(origin))
     if heliostat.mount.actuators is None:
         raise ConflictError(
-            "its kinematics have no linear actuators, so motor positions say nothing of its angles; PUT properties that "
-            "have kinematics_properties.actuators"
+            "its kinematics have no linear actuators, so motor positions say nothing of its angles; "
+            "PUT properties that have kinematics_properties.actuators"
         )
     return heliostat
 
