@@ -401,6 +401,12 @@ def test_tables_show_that_they_scroll(page: Any):
     assert darkness[0] < darkness[1] - 20
 
 
+def test_what_is_decided_by_needs_no_scrolling_at_a_desk(page: Any):
+    page.goto("/heliostats/AA39")
+    history = page.locator("[aria-labelledby=history-title].scroll")
+    assert history.evaluate("e => e.scrollWidth - e.clientWidth") <= 0
+
+
 def test_legend_stands_below_the_map(page: Any):
     page.set_viewport_size(PHONE)
     page.goto("/?metric=deviation")
