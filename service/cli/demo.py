@@ -3,7 +3,7 @@
 import shlex
 import shutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from model.observation import Observation
 from model.plant import Heliostat
 from service.base.arrays import unpack
 from service.base.choices import Method
-from service.base.settings import FIGURE_SCALES, Settings
+from service.base.settings import Settings
 from service.cli.demo_plant import write_plant
 from service.cli.folder import observations_of, surface_errors, write_json
 from service.cli.output import make_table
@@ -87,7 +87,7 @@ def run_demo(data: Path | None, out: Path, console: Console, quiet: bool = False
     if not made:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in list(skipped.items())[:3])
         raise ModelError(f"{root}: no heliostat had an image that could be used ({reasons})")
-    results = _drawn(out, made)
+    results = _drawn(out, made, runtime.settings.figure_scales)
     report = {
         "data": str(root),
         "store": imported["counts"],
@@ -223,24 +223,24 @@ def _forecast(
     return flux_window(traced.camera_view, (wide, wide), center, FLUX_WINDOW, FLUX_SIZE)
 
 
-def _drawn(out: Path, made: Sequence[_Made]) -> list[Result]:
-    """The results with the pictures drawn for them, all on the same scales."""
+def _drawn(out: Path, made: Sequence[_Made], ends: Mapping[str, float]) -> list[Result]:
+    """The results with the pictures drawn for them, all on the same scales, whose ``ends`` are the settings'."""
     pairs = [of_peak(o.flux, flux) for one in made for o, flux in zip(one.judged, one.forecasts, strict=True)]
     top = max(float(image.max()) for pair in pairs for image in pair)
-    return [replace(one.result, pictures=_draw(out, one, top)) for one in made]
+    return [replace(one.result, pictures=_draw(out, one, top, ends)) for one in made]
 
 
-def _draw(out: Path, made: _Made, top: float) -> tuple[str, ...]:
+def _draw(out: Path, made: _Made, top: float, ends: Mapping[str, float]) -> tuple[str, ...]:
     """Surface maps, and measured beside forecast for every judged image; gives back their paths under ``out``."""
     name = made.result.heliostat
     drawn = {
-        f"surfaces/{name}-{key}.png": surface_picture(z, f"{name}, {key}", FIGURE_SCALES["heights"])
+        f"surfaces/{name}-{key}.png": surface_picture(z, f"{name}, {key}", ends["heights"])
         for key, z in made.surfaces.items()
         if z is not None
     }
     for observation, flux in zip(made.judged, made.forecasts, strict=True):
         title = f"{name}/{observation.identifier}: accuracy {flux_accuracy(observation.flux, flux):.1%}"
-        bounds = top, FIGURE_SCALES["flux_difference"]
+        bounds = top, ends["flux_difference"]
         picture = comparison_picture(observation.flux, flux, FLUX_WINDOW, title, bounds)
         drawn[f"flux/{name}-{observation.identifier}.png"] = picture
     for path, content in drawn.items():

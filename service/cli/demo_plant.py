@@ -4,6 +4,7 @@ The true mirrors are drawn from the surface prior, traced by the Monte Carlo tra
 predicts and forecasts, and photographed by a synthetic camera in perspective, with daylight, background and noise.
 """
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.frames import sun_angles, sun_direction_at
+from model.mount import LinearActuator, Mount
 from model.plant import Heliostat, Plant, TargetPlane
 from model.prior import default_prior
 from model.surface import control_points
@@ -34,8 +36,19 @@ POSITIONS = {
 TARGET = TargetPlane(
     "calibration_target", np.array([0.0, 0.0, 40.0]), np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]), 8.0, 7.0
 )
+# Spindles as the Juelich heliostats have them; they stand as surveyed, so that motors tell where mirrors point.
+DRIVES = (
+    LinearActuator(154166.6667, 0.0775, 0.338, 0.325, 0.039, clockwise=False, max_increment=80000.0),
+    LinearActuator(154166.6667, 0.0775, 0.338, 0.325, 0.944, clockwise=True, max_increment=80000.0),
+)
 IMAGES, RAYS, PIXELS = 8, 400_000, 112
 """Photographs of each heliostat, rays and pixels along each side of each."""
+
+
+def _actuator(drive: LinearActuator) -> dict[str, Any]:
+    document = asdict(drive)
+    clockwise = document.pop("clockwise")
+    return {"type_axis": "linear", "clockwise_axis_movement": int(clockwise), **document}
 
 
 def properties(mirror: Heliostat, plant: Plant) -> dict[str, Any]:
@@ -47,7 +60,7 @@ def properties(mirror: Heliostat, plant: Plant) -> dict[str, Any]:
         "width": mirror.width,
         "initial_orientation": [0.0, -1.0, 0.0],
         "kinematics_properties": {
-            "actuators": [{"type_axis": "ideal"}, {"type_axis": "ideal"}],
+            "actuators": [_actuator(one) for one in mirror.mount.actuators or ()] or [{"type_axis": "ideal"}] * 2,
             **translations,
             "concentrator_translation_e": 0.0,
             "concentrator_translation_n": float(mirror.mount.mirror_offset[2]),
@@ -90,18 +103,22 @@ def suns(count: int, rng: np.random.Generator) -> Array:
 
 def photographs(
     mirror: Heliostat, z: Array, count: int, rays: int, rng: np.random.Generator
-) -> tuple[Array, list[NDArray[np.uint8]]]:
-    """Suns (count, 3) and camera frames of one heliostat; its spot wanders about the target's centre."""
+) -> tuple[Array, Array, list[NDArray[np.uint8]]]:
+    """Suns (count, 3), motor positions (count, 2) [steps] and camera frames of one heliostat.
+
+    Its spot wanders about the target's centre.
+    """
     directions = suns(count, rng)
     spots = TARGET.to_enu(rng.uniform(-0.6, 0.6, (count, 2)))
     points, mirrors, planes = [control_points(mirror, z)] * count, [mirror] * count, [TARGET] * count
-    scene = Scene.build(mirrors, points, align_to_spots(mirrors, points, directions, planes, spots), directions, planes)
+    angles = align_to_spots(mirrors, points, directions, planes, spots)
+    scene = Scene.build(mirrors, points, angles, directions, planes)
     traced, _ = trace_montecarlo(scene, Window.of(TARGET, PIXELS, PIXELS), rays=rays, seed=int(rng.integers(2**31)))
     frames = [
         photograph(flux, TARGET, rng, CameraOptions(time_stamp=f"demo {mirror.name} image {index + 1}"))
         for index, flux in enumerate(traced)
     ]
-    return directions, frames
+    return directions, mirror.mount.motors_from_angles(angles), frames
 
 
 def write_plant(
@@ -113,7 +130,9 @@ def write_plant(
     write_json(root / "demo-tower-measurements.json", tower(plant))
     for number, (name, position) in enumerate(POSITIONS.items(), start=1):
         progress(name)
-        mirror = Heliostat.juelich(name, position, float(np.linalg.norm(position - TARGET.center)))
+        mirror = Heliostat.juelich(
+            name, position, float(np.linalg.norm(position - TARGET.center)), mount=Mount.juelich(DRIVES)
+        )
         z = prior.surface(rng.normal(0, 0.8, len(prior.basis)))
         write_json(root / name / "Properties" / f"{name}-heliostat-properties.json", properties(mirror, plant))
         (root / name / "Deflectometry").mkdir(parents=True, exist_ok=True)
@@ -122,9 +141,18 @@ def write_plant(
         np.savez_compressed(
             root / name / "Deflectometry" / f"{name}-nurbs-surface.npz", control_points=points, degrees=np.array([3, 3])
         )
-        for index, (sun, frame) in enumerate(zip(*photographs(mirror, z, images, rays, rng), strict=True), start=1):
+        taken = zip(*photographs(mirror, z, images, rays, rng), strict=True)
+        for index, (sun, motors, frame) in enumerate(taken, start=1):
             azimuth, elevation = sun_angles(sun)
             stem = root / name / "Calibration" / f"{number}{index:02d}"
-            about = {"target_name": TARGET.name, "sun_azimuth": float(azimuth), "sun_elevation": float(elevation)}
+            about = {
+                "target_name": TARGET.name,
+                "sun_azimuth": float(azimuth),
+                "sun_elevation": float(elevation),
+                "motor_position": {
+                    f"axis_{axis}_motor_position": round(float(steps))
+                    for axis, steps in zip((1, 2), motors, strict=True)
+                },
+            }
             write_json(stem.with_name(f"{stem.name}-calibration-properties.json"), about)
             cv2.imwrite(str(stem.with_name(f"{stem.name}-raw.png")), cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))

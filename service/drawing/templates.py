@@ -71,6 +71,13 @@ def in_words(value: Any) -> str:
     return {True: "yes", False: "no"}[value] if isinstance(value, bool) else str(value)
 
 
+def model_in_words(version: str) -> str:
+    """A version of the plant's model, ``2:sun_shape+soiling``, as people read it."""
+    number, _, effects = version.partition(":")
+    told = "no effects" if effects == "none" else ", ".join(effects.replace("_", " ").split("+"))
+    return f"version {number}, {told}"
+
+
 def environment(*packages: str) -> Environment:
     """Templates of these packages, the first one's first, with the filters above."""
     made = Environment(
@@ -88,6 +95,7 @@ def environment(*packages: str) -> Environment:
         irradiance=irradiance,
         storage=storage,
         in_words=in_words,
+        model_in_words=model_in_words,
         path=lambda value: quote(value, ""),
         words=lambda name: name.replace("_", " "),
     )

@@ -115,7 +115,10 @@ def with_drives(row: HeliostatRow, origin: tuple[float, float, float]) -> Helios
     """The heliostat as its properties have it; ConflictError where it has no drives."""
     heliostat = read_heliostat(row.name, row.properties, np.array(origin))
     if heliostat.mount.actuators is None:
-        raise ConflictError("its kinematics have no linear actuators, so motor positions say nothing of its angles")
+        raise ConflictError(
+            "its kinematics have no linear actuators, so motor positions say nothing of its angles; "
+            "PUT properties that have kinematics_properties.actuators"
+        )
     return heliostat
 
 

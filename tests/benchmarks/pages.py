@@ -1,7 +1,7 @@
 """Pictures of a running service's pages at a desk and on a phone: ``python -m tests.benchmarks.pages [--url URL]``.
 
-They are there to be looked at: ``results/pages`` has those of the demonstration's store, for which a plan, a forecast
-and a study are asked for first. Needs Chromium and playwright.
+They are there to be looked at: ``results/pages`` has those of the demonstration's store, for which a plan, a forecast,
+mounts and a study are asked for first. Needs Chromium and playwright.
 """
 
 import argparse
@@ -36,12 +36,13 @@ def done(client: httpx.Client, kind: str, asked: dict[str, Any]) -> dict[str, An
 
 
 def asked_for(client: httpx.Client, heliostat: str) -> dict[str, str]:
-    """Pages of a plan, a forecast and a study that are made for the pictures, by name."""
+    """Pages of a plan, a forecast and a study that are made for the pictures, by name; mounts are calibrated, too."""
     target = client.get("/v1/targets").raise_for_status().json()["items"][0]["name"]
     day = {"begin": "2026-06-21T06:00:00Z", "end": "2026-06-21T16:00:00Z", "step_minutes": 60}
     plan = done(client, "plans", {"name": "June", "target": target, "allowed_w_m2": 8000.0, **day})
     sun = {"azimuth_deg": -20.0, "elevation_deg": 45.0}
     forecast = client.post("/v1/forecasts", json={"heliostat": heliostat, "target": target, "sun": sun})
+    done(client, "calibrations", {})
     study = done(client, "studies", {})
     paths = {"plan": f"/plans/{plan['id']}", "forecast": f"/forecasts/{forecast.raise_for_status().json()['id']}"}
     found = client.get("/v1/studies").raise_for_status().json()["items"]
@@ -74,9 +75,9 @@ def main() -> None:
         "login": "/login",
     }
     with httpx.Client(base_url=options.url, timeout=120) as client:
+        pages |= asked_for(client, options.heliostat)
         while "being worked out" in client.get("/", headers={"Accept": "text/html"}).text:
             time.sleep(1)
-        pages |= asked_for(client, options.heliostat)
     options.out.mkdir(parents=True, exist_ok=True)
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])

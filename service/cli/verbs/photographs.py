@@ -178,6 +178,7 @@ def study(
     as_json: AsJson = False,
 ) -> None:
     """Which physical effect the photographs demand that the declared model lacks, and what it buys: REPORT.json."""
+    from service.base.settings import Settings
     from service.cli.folder import write_json
     from service.cli.folder_pointing import Mounts
     from service.cli.folder_study import study_folder
@@ -188,17 +189,16 @@ def study(
         require_file(path)
     added = () if effects is None else read_effects(effects)
     source = read_folder(folder)
-    known = Mounts(source, mounts, added)
+    known, scales = Mounts(source, mounts, added), Settings().figure_scales
     with progress(None, "study") as step:
         done = study_folder(source, surfaces, effects=added, progress=step, mounts=known)
     report = done.to_json()
     write_json(out, report)
     if page is not None:
-        from service.base.settings import FIGURE_SCALES
         from service.drawing.study_report import study_page
 
         page.parent.mkdir(parents=True, exist_ok=True)
-        drawn = study_page(done.study, folder.resolve().name, FIGURE_SCALES, done.skipped)
+        drawn = study_page(done.study, folder.resolve().name, scales, done.skipped)
         page.write_text(drawn, encoding="utf-8")
     show(report, as_json, _study_table(report))
     if not as_json:

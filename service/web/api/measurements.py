@@ -5,7 +5,7 @@ from functools import partial
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, File, Form, Header, Query, Response, UploadFile, status
-from pydantic import BaseModel, BeforeValidator, Field, Json
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, Json, JsonValue
 from starlette.datastructures import UploadFile as StarletteUploadFile
 
 from model.pointing import Weather
@@ -59,9 +59,20 @@ WindSpeed = Annotated[Number, Field(ge=0, le=100)]
 WindFrom = Annotated[Number, Field(ge=0, le=360)]
 Temperature = Annotated[Number, Field(ge=-90, le=60)]
 
+# What the documentation's form begins with.
+_EXAMPLE: dict[str, JsonValue] = {
+    "id": "205363",
+    "kind": "flux",
+    "target_name": "multi_focus_tower",
+    "sun_azimuth": -41.2,
+    "sun_elevation": 33.5,
+}
+
 
 class MeasurementIn(Model):
     """What is known of a photograph; PAINT's ``calibration-properties.json`` with ``kind`` (and ``id``) added fits."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [_EXAMPLE]})
 
     target_name: Name = Field(description="The target that the heliostat was aimed at.")
     sun_azimuth: Azimuth
@@ -198,10 +209,6 @@ router = APIRouter(prefix="/heliostats/{name}/measurements", tags=["measurements
 # Bytes of metadata that are read of a part that came as a file.
 _MOST_METADATA = 2**16
 
-_METADATA_EXAMPLE = (
-    '{"id": "205363", "kind": "flux", "target_name": "multi_focus_tower", "sun_azimuth": -41.2, "sun_elevation": 33.5}'
-)
-
 
 def _photograph(metadata: MeasurementIn) -> Photograph:
     spot = metadata.focal_spot
@@ -258,9 +265,7 @@ def _bytes(upload: UploadFile, limit: int) -> bytes:
 def post_measurement(
     name: NamePath,
     image: Annotated[UploadFile, BeforeValidator(_file), File(description="A PNG, JPEG, TIFF or BMP file.")],
-    metadata: Annotated[
-        Json[MeasurementIn], BeforeValidator(_text), Form(description="JSON", examples=[_METADATA_EXAMPLE])
-    ],
+    metadata: Annotated[Json[MeasurementIn], BeforeValidator(_text), Form(description="JSON")],
     runtime: RuntimeDep,
     response: Response,
 ) -> MeasurementOut:

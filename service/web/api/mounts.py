@@ -183,7 +183,8 @@ def get_plan(
 ) -> PlanOut:
     """Which photographs to take next: each of the heliostat that it is expected to tell most of.
 
-    A mount that was never measured, long ago, or under few suns tells most.
+    A mount that was never measured, long ago, or under few suns tells most. Heliostats without linear actuators in
+    their properties are left out: nobody knows where motors point them.
     """
     slots = make_plan(runtime, at, minutes, photographs)
     return PlanOut(items=[planned_out(slot) for slot in slots])

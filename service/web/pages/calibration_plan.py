@@ -26,7 +26,7 @@ def get_plan_page(
     try:
         slots, trouble = make_plan(runtime, at, minutes, photographs), None
     except InvalidInputError as error:
-        slots, trouble = [], str(error)
+        slots, trouble = [], str(error).removeprefix("at: ")  # the form calls it otherwise
     return render(
         request,
         "calibration_plan.html",

@@ -24,7 +24,7 @@ from service.drawing.pictures import comparison_picture, mirror_heights
 from service.store import decisions, mounts
 from service.store.shots import PhotographVerdict, Shot, Wanted, list_shots
 from service.store.tables import DecisionRow, HeliostatRow, MountRow, SurfaceRow
-from service.twin.accuracy import RECENT, Compared, Comparison, ComparisonBook, rank_of
+from service.twin.accuracy import Compared, Comparison, ComparisonBook, rank_of
 from service.twin.field import Figures, Line, figures_of, read_lines
 from service.twin.pointing import Slot, best_slot
 from service.web.answers.pages import render
@@ -251,7 +251,6 @@ def get_heliostat_page(
         histories=_histories(listed) if listed else [],
         comparisons=comparison_figures(comparisons, ends["flux_difference"]),
         trouble=read.compared.trouble,
-        recent=RECENT,
         shots=read.shots[:MOST_PHOTOGRAPHS],
         verdict=read.verdict,
         older=read.shots[MOST_PHOTOGRAPHS - 1].mark if len(read.shots) > MOST_PHOTOGRAPHS else None,

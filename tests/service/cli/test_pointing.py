@@ -17,14 +17,19 @@ from model.errors import InvalidInputError, ModelError
 from model.forecast import Setup, align
 from model.imaging import center_of_mass
 from model.pointing import Weather, calibrate_field
+from model.pointing.report import mount_to_json
 from model.study import FluxImage
 from model.surface import control_points
+from service.base.settings import Settings
 from service.cli.folder_pointing import Mounts, calibrate_folder, read_readings, spot_folder
 from service.cli.main import app
 from service.sources.folder import read_folder
+from service.twin.importing import import_folder
+from service.twin.pointing import calibrate_store, make_plan
+from service.twin.runtime import Runtime
 from tests.benchmarks import data_folder
 from tests.benchmarks.pointing import Plant, with_clock
-from tests.service.conftest import properties_document, tower_document
+from tests.service.conftest import QUIET, properties_document, tower_document
 from tests.service.spots import photographs
 
 
@@ -73,6 +78,21 @@ def folder(tmp_path: Path) -> Path:
     write_measurement(root, "AB01", 300, taken[0])
     write_measurement(root, "AB09", 400, taken[0])
     return root
+
+
+def test_the_demonstrations_motors_tell_where_its_mirrors_point(made_plant: Path, tmp_path: Path):
+    runtime = Runtime.from_settings(Settings(data_dir=tmp_path, **QUIET))
+    runtime.database.upgrade()
+    source = read_folder(made_plant)
+    import_folder(runtime, source)
+    plan = make_plan(runtime, datetime(2026, 6, 21, 10, tzinfo=UTC), minutes=60, photographs=12)
+    assert {slot.proposal.heliostat for slot in plan} == set(source.plant.heliostats)
+    calibrated = calibrate_store(runtime, list(source.plant.heliostats))
+    runtime.close()
+    assert calibrated.skipped == {}
+    for name, mount in calibrated.done.mounts.items():
+        document = mount_to_json(mount, calibrated.done.readings[name], calibrated.done.contradictions[name])
+        assert document["residual_mrad"]["median"] < 0.3, name
 
 
 def test_what_cannot_be_used_is_listed_and_costs_nothing_else(folder: Path, tmp_path: Path):

@@ -84,7 +84,9 @@ def heliotwin(monkeypatch, capsys) -> Callable[..., tuple[int, str, str]]:
     return run
 
 
-def test_the_report_keeps_the_contract_and_serves_forecasts(few, tmp_path, heliotwin):
+def test_the_report_keeps_the_contract_and_serves_forecasts(few, tmp_path, heliotwin, monkeypatch):
+    monkeypatch.setenv("HELIOTWIN_FIGURE_SCALES", '{"flux_difference": 0.2}')
+
     def report_of(*arguments: object) -> dict:
         code, said, trouble = heliotwin(*arguments, "--json")
         assert code == 0, trouble
@@ -113,7 +115,9 @@ def test_the_report_keeps_the_contract_and_serves_forecasts(few, tmp_path, helio
     shaped = {name for name, kind in CATALOGUE.items() if not kind.only_moves}
     assert {candidate["name"] for candidate in report["candidates"]} == shaped
     assert "skipped" not in report
-    assert report["conclusion"] in text((tmp_path / "new" / "r.html").read_text(encoding="utf-8"))
+    page = (tmp_path / "new" / "r.html").read_text(encoding="utf-8")
+    assert report["conclusion"] in text(page)
+    assert "Colours from -0.2 to 0.2 of the measured peak" in page
 
     plain = report_of("forecast", few, "--out", tmp_path / "plain")
     better = report_of("forecast", few, "--out", tmp_path / "better", "--effects", tmp_path / "new" / "r.json")

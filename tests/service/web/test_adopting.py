@@ -37,7 +37,7 @@ def test_adopting_names_the_surfaces_of_the_old_model(app: FastAPI, pages: TestC
     for path in ("/studies", f"/studies/{number}"):
         page = text_of(pages, path)
         assert "Of today's surfaces 2 were made by another version" in page
-        assert '<a href="/heliostats/AB01">AB01</a> (version 1, by <code>1:none</code>)' in page
+        assert '<a href="/heliostats/AB01">AB01</a> (version 1, by model version 1, no effects)' in page
         assert "Make these 2 anew" in page
     # Withdrawn, the old model is the current one again, and its surfaces are in order.
     assert pages.post(f"/studies/{number}/withdraw", follow_redirects=False).status_code == 303

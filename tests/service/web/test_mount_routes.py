@@ -295,7 +295,16 @@ def test_the_plan_asks_for_what_is_known_least(client: TestClient, post: Post, t
     page = client.get("/calibration-plan", params=asked, headers={"Accept": "text/html"}).text
     assert re.findall(r'<th scope="row"><a href="/heliostats/(\w+)"', page) == ["AB01", "AA39"]
     dark = client.get("/calibration-plan", params={"at": "2024-06-03T00:00"}, headers={"Accept": "text/html"}).text
-    assert "The sun is below the horizon then" in dark.replace("At: the", "The")
+    assert "The sun is below the horizon then; choose another time." in dark
+
+
+def test_the_plans_page_says_what_it_takes(client: TestClient, tower: Any, properties: Any):
+    client.put("/v1/plant", json=tower)
+    properties["kinematics_properties"]["actuators"] = [{"type_axis": "ideal"}] * 2
+    client.put("/v1/heliostats/AA39", json=properties)
+    page = client.get("/calibration-plan", params={"at": NOON}, headers={"Accept": "text/html"}).text
+    assert "No heliostat can be aimed at a target then" in page
+    assert "kinematics_properties.actuators" in page
 
 
 def test_changed_properties_ask_for_another_calibration(client: TestClient, post: Post, tower: Any, properties: Any):

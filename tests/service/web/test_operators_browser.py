@@ -164,6 +164,7 @@ def test_maps_of_all_versions_have_one_scale(seen: Any):
         seen.goto(f"/heliostats/AA39?version={version}")
         told.append(seen.locator("#deviation-title").text_content().rpartition("; ")[2])
     assert told == ["from -2 to 2 mm"] * 2
+    expect(seen.locator("#compare-title + p")).to_contain_text("3 photographs, the newest")
     expect(seen.locator("svg.scale").last).to_have_attribute(
         "aria-label", "Colours from -0.3 to 0.3 of the measured peak"
     )

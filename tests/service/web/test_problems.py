@@ -12,6 +12,7 @@ from fastapi.testclient import TestClient
 from service.base.faults import SchemaError
 from service.base.settings import Settings
 from service.web.answers.problem_schema import Problem
+from service.web.api.measurements import MeasurementIn
 from service.web.app import create_app
 from tests.service.conftest import client_of, metadata
 
@@ -200,7 +201,9 @@ def test_problem_names_its_kind_the_field_and_the_remedy(refusing: TestClient):
 
 
 def test_metadata_may_come_as_a_file_of_json(refusing: TestClient):
-    """So Swagger's page sends them."""
+    """So Swagger's page sends them, and what its form begins with is taken."""
+    schemas = refusing.get("/openapi.json").json()["components"]["schemas"]
+    MeasurementIn.model_validate(schemas["MeasurementIn"]["examples"][0])
     sent = {"metadata": ("blob", b"{", "application/json"), "image": ("spot.png", b"x", "image/png")}
     answer = refusing.post("/v1/heliostats/AA39/measurements", files=sent)
     assert answer.status_code == 422

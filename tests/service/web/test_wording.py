@@ -9,6 +9,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from service.base import wording
+from service.drawing.templates import model_in_words
 from service.web.answers import problems
 from tests.service.conftest import metadata, png
 from tests.service.wrong import RAW, wrong_everywhere
@@ -119,3 +120,8 @@ def test_what_is_no_json_is_told_in_plain_words(refusing: TestClient, body: str)
     assert answer.status_code in (400, 422)
     assert not RAW.search(answer.text)
     assert re.search("; (make it one JSON document|send it)", answer.json()["detail"])
+
+
+def test_versions_of_the_model_are_told_in_words():
+    told = [model_in_words(version) for version in ("1:none", "3:sun_shape+soiling")]
+    assert told == ["version 1, no effects", "version 3, sun shape, soiling"]
