@@ -430,6 +430,7 @@ def draw(cases: list[Case], path: Path) -> None:
         x, y = (image[::3, ::3].ravel() / forecast.max() for image in (forecast, flux / flux.sum()))
         right.plot(x, y, ".", markersize=1.5, color=colour, label=law)
     left.set(ylabel="accuracy of the forecast", ylim=(0.5, 1), title="AA39, measured surface, nothing fitted")
+    left.tick_params(axis="x", rotation=30)
     left.legend(loc="lower left")
     right.plot([0, 1], [0, 1], color="gray", linewidth=0.8)
     right.set(xlabel="forecast, of its peak", ylabel="photograph, the same", title=f"{shown.name}, pixel by pixel")
