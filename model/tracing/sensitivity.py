@@ -82,9 +82,9 @@ def _sharp(seen: Raster, moved: Tensor, slopes: Tensor) -> Tensor:
     images[-2:].index_add_(1, index.flatten(), along.flatten(1))
     by_slope = torch.einsum("abpfn,bafns->sfnbp", along, moved).flatten(3)
     places = index.view(batch, 9, facets, samples).permute(2, 3, 0, 1).flatten(2)
-    first = range(0, 2 * places[0].numel() + 1, places.shape[-1])
+    first = np.arange(0, 2 * places[0].numel() + 1, places.shape[-1])
     for facet, place in enumerate(places):
-        entries = by_slope[:, facet].flatten().numpy(), place.expand(2, -1, -1).flatten().numpy(), np.array(first)
+        entries = by_slope[:, facet].flatten().numpy(), place.expand(2, -1, -1).flatten().numpy(), first
         change = csc_array(entries, shape=(pixels, 2 * samples)) @ slopes[:, facet].flatten(0, 1).numpy()
         images[facet * count : (facet + 1) * count] = torch.from_numpy(change).T
     return images.view(-1, batch, *seen.shape)
