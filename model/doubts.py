@@ -14,19 +14,13 @@ from numpy.typing import ArrayLike, NDArray
 from model.images import FLUX_SIZE
 from model.observation import Observation
 from model.plant import Heliostat
-from model.prior import SurfacePrior
+from model.prior import MEASURED_FACET, SurfacePrior, of_measured_kind
 from model.surface import canting_rises
 
 Array = NDArray[np.float64]
 
 FARTHEST = 320.0
 """Distance [m] of a target up to which predictions have been judged."""
-
-FACET = (1.605, 1.275)
-"""Width and height [m] of the facets whose surfaces were measured."""
-
-SIZE_TOLERANCE = 0.2
-"""Share by which a facet may be larger or smaller."""
 
 RIM, RIM_SHARE = 2, 0.05
 """Pixels of a flux image's rim, and the share of light in it from which on much must lie outside the window.
@@ -48,24 +42,29 @@ Of good mirrors' photographs the share is 0.13 at most, at 3.5 deviations.
 
 
 def of_the_situation(heliostat: Heliostat, observations: Sequence[Observation]) -> list[str]:
-    """Where distance, facets or images are not what predictions were learnt from."""
+    """Where distance or images are not what predictions have been judged by."""
     doubts = []
     farthest = max(float(np.linalg.norm(o.target.center - heliostat.position)) for o in observations)
     if farthest > FARTHEST:
         doubts.append(f"its target is {farthest:.0f} m away; predictions have been judged up to {FARTHEST:.0f} m")
-    sizes = np.array([(np.linalg.norm(f.canting_x), np.linalg.norm(f.canting_y)) for f in heliostat.facets]) * 2
-    if (np.abs(sizes / FACET - 1) > SIZE_TOLERANCE).any():
-        width, height = sizes.mean(axis=0)
-        doubts.append(
-            f"its facets of {width:.2f} m x {height:.2f} m are not of the size that predictions were learnt from "
-            f"({FACET[0]} m x {FACET[1]} m)"
-        )
     rim = np.median([_rim_share(o.flux) for o in observations])
     if rim > RIM_SHARE:
         doubts.append("its spots are larger than the window of their flux images")
     if np.median([o.clipped_share for o in observations]) > CLIPPED:
         doubts.append("most of its photographs show little but their rim: the rest lies beyond the camera's range")
     return doubts
+
+
+def of_the_facets(heliostat: Heliostat) -> list[str]:
+    """Where facets are not of the kind that networks learn from; a refinement has a prior for others."""
+    _, _, half_sizes = heliostat.facet_frames
+    if of_measured_kind(half_sizes):
+        return []
+    width, height = 2 * half_sizes.mean(axis=0)
+    known = " m x ".join(str(2 * half) for half in MEASURED_FACET)
+    return [
+        f"its facets of {width:.2f} m x {height:.2f} m are not of the size that the network learnt from ({known} m)"
+    ]
 
 
 def of_canting(prior: SurfacePrior, z: Array) -> list[str]:

@@ -5,6 +5,9 @@ each, some many times the others: each group has a scale of its own, which each 
 has an inverse gamma distribution is Student's t; that predicts mirrors left out far better than one Gaussian for all
 (``python -m training.prior --compare``).
 
+Of facets of a kind that nobody measured there is a generic one: they are canted wrong, and waves of any length bend
+them, as smooth as bent glass is and much the same in all facets of a mirror.
+
 Refinement starts from it and is held to it, the network's first guess is its mean, and a predicted surface that lies
 far from it is no mirror of the kind that is known.
 """
@@ -18,6 +21,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from model.plant import Heliostat
+from model.surface import COLUMNS, ROWS, greville
+
 Array = NDArray[np.float64]
 
 LEADING = 8
@@ -29,7 +35,30 @@ GROUPS = (0, 4, 8, 24, 64, 128)
 FREEDOM = 3.0
 """Degrees of freedom of the scales: as much is known of them before a mirror is seen as so many coefficients tell."""
 
+MEASURED_FACET = (0.8025, 0.6375)
+"""Half sides [m] of the facets whose surfaces were measured: Juelich's."""
+
+SIZE_TOLERANCE = 0.2
+"""Share by which a facet may be larger or smaller and still be of that kind."""
+
 PRIOR = Path(__file__).parent / "weights" / "surface-prior.npz"
+
+
+@dataclass(frozen=True)
+class FacetKind:
+    """How facets are wrong that nobody measured; most probable for Juelich's (``python -m training.prior --generic``).
+
+    ``canting`` is the slope [rad] along each side by which they are canted wrong; ``bending`` the standard deviation of
+    a height, ``reach`` over how far heights hang together, ``grain`` what each control point has of its own, all in
+    sides of the facet; ``alike`` the share of the bending that all facets of a mirror have in common, being made and
+    mounted alike.
+    """
+
+    canting: float = 0.73e-3
+    bending: float = 0.61e-3
+    reach: float = 0.57
+    grain: float = 3.2e-5
+    alike: float = 0.7
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,3 +128,70 @@ class SurfacePrior:
 def default_prior() -> SurfacePrior:
     """The shipped prior, loaded once."""
     return SurfacePrior.load()
+
+
+def prior_of(heliostat: Heliostat) -> SurfacePrior:
+    """The shipped prior for facets of the measured kind, the generic one for all others."""
+    _, _, half_sizes = heliostat.facet_frames
+    return default_prior() if of_measured_kind(half_sizes) else generic_prior(half_sizes)
+
+
+def of_measured_kind(half_sizes: Array) -> bool:
+    """Whether facets of half sides (F, 2) [m] have about the size of those that were measured."""
+    return bool((np.abs(half_sizes / MEASURED_FACET - 1) <= SIZE_TOLERANCE).all())
+
+
+def generic_prior(half_sizes: Array) -> SurfacePrior:
+    """What is known of a mirror whose facets, of half sides (F, 2) [m], are of a kind that nobody measured.
+
+    The tilt of the whole mirror is left to the mount.
+    """
+    count, half = len(half_sizes), half_sizes.mean(axis=0)
+    directions = principal(generic_covariance(half_sizes, FacetKind()), count)
+    directions -= directions.mean(axis=(2, 3), keepdims=True)
+    tilts = np.stack([np.tile(slope.reshape(ROWS, COLUMNS), (count, 1, 1)) for slope in _places(half)])
+    mean, nothing = np.zeros_like(tilts[0]), np.zeros_like(tilts[:0])
+    return SurfacePrior(mean, orthogonal(without(directions, tilts)), nothing, "generic")
+
+
+def generic_covariance(half_sizes: Array, kind: FacetKind) -> Array:
+    """Covariance (F 64, F 64) [m2] of the heights of facets of half sides (F, 2) [m].
+
+    Heights are a Gaussian process with Matern's covariance of smoothness 5/2, whose spectrum falls as a power of the
+    frequency, as that of polished and bent glass does (Church 1988, doi:10.1364/AO.27.001518; Rasmussen and Williams
+    2006, *Gaussian Processes for Machine Learning*, eq. 4.17). Lengths go with the facets' side, slopes do not.
+    """
+    count, half = len(half_sizes), half_sizes.mean(axis=0)
+    side, (x, y) = 2 * np.sqrt(half.prod()), _places(half)
+    apart = np.sqrt(5) * np.hypot(x[:, None] - x, y[:, None] - y) / (kind.reach * side)
+    bending = (kind.bending * side) ** 2 * (1 + apart + apart**2 / 3) * np.exp(-apart)
+    canting = kind.canting**2 * (np.outer(x, x) + np.outer(y, y)) + (kind.grain * side) ** 2 * np.eye(len(x))
+    shared = np.kron(np.full((count, count), kind.alike), bending)
+    return np.asarray(shared + np.kron(np.eye(count), (1 - kind.alike) * bending + canting))
+
+
+def _places(half: Array) -> tuple[Array, Array]:
+    """Where a facet's control points lie: x and y (64,) [m]."""
+    along = (size * (2 * greville(count) - 1) for size, count in zip(half, (ROWS, COLUMNS), strict=True))
+    x, y = np.meshgrid(*along, indexing="ij")
+    return x.ravel(), y.ravel()
+
+
+def principal(covariance: Array, facets: int) -> Array:
+    """Directions (K, F, 8, 8) [m] of a covariance (K, K) [m2], each as long as its standard deviation."""
+    values, axes = np.linalg.eigh(covariance)
+    return np.asarray((axes * np.sqrt(values.clip(min=0))).T.reshape(-1, facets, ROWS, COLUMNS))
+
+
+def without(directions: Array, modes: Array) -> Array:
+    """Directions (..., F, I, J) [m] without what modes (N, F, I, J) explain of them."""
+    flat, explained = directions.reshape(*directions.shape[:-3], -1), modes.reshape(len(modes), -1)
+    return np.asarray((flat - flat @ np.linalg.pinv(explained) @ explained).reshape(directions.shape))
+
+
+def orthogonal(directions: Array) -> Array:
+    """Orthogonal directions (K, F, I, J) [m] of the same covariance, the longest first, their largest height up."""
+    flat = directions.reshape(len(directions), -1)
+    _, singular, axes = np.linalg.svd(flat, full_matrices=False)
+    signs = np.sign(axes[np.arange(len(axes)), np.abs(axes).argmax(axis=1)])
+    return np.asarray(((signs * singular)[:, None] * axes)[singular > 1e-9].reshape(-1, *directions.shape[1:]))

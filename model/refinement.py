@@ -41,7 +41,7 @@ from model.least_squares import Descent, Minimum, minimize
 from model.network.inputs import STEP_HEIGHT
 from model.observation import Observation, Ranges, SurfacePrediction, align_observations, misfits, spread_suns
 from model.plant import Heliostat
-from model.prior import SurfacePrior, default_prior
+from model.prior import SurfacePrior, prior_of
 from model.surface import control_points, require_own_grid
 from model.tracing import Optics
 
@@ -88,7 +88,7 @@ class RefinementOptions:
 
     grain: float = 0.005
     dark: float = 0.1
-    annealing: tuple[float, ...] = (0.3, 0.1)
+    annealing: tuple[float, ...] = (0.1, 0.03)
     rounds: int = 3
     few: int = 8
     steps: int = 12
@@ -485,7 +485,7 @@ def refine(
     if not observations:
         raise InvalidInputError("a refinement takes at least one image")
     require_own_grid(heliostat)
-    prior, optics = prior or default_prior(), optics or Optics()
+    prior, optics = prior or prior_of(heliostat), optics or Optics()
     options = options or RefinementOptions()
     posterior, state, fit, left_out = _consensus(
         heliostat, observations, start, (prior, optics, effects), latitude_deg, options

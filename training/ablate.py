@@ -20,9 +20,10 @@ from torch import Tensor, nn
 
 from model.network.architecture import MAX_IMAGES, SurfaceNetwork
 from model.network.catalogue import sizes_of
+from model.network.inputs import descents
 from training.config import TrainConfig
 from training.figures import interval, markdown
-from training.parts import CHANGES, PartsConfig, PartsNetwork
+from training.parts import CHANGES, PartsConfig, PartsNetwork, conjugate_descents
 from training.render import Camera, Photographs, render
 from training.train import Run, train_steps
 
@@ -43,7 +44,8 @@ def variant(values: dict[str, Any], config: TrainConfig, folder: Path) -> Run:
         network = PartsNetwork(PartsConfig(**values["parts"]))
     else:
         network = CHANGES[values.get("change", "")](SurfaceNetwork(sizes_of("ours", values.get("network", {}))))
-    return Run(config, folder, torch.device("cpu"), network)
+    way = conjugate_descents if values.get("descents") == "conjugate" else descents
+    return Run(config, folder, torch.device("cpu"), network, way)
 
 
 def errors_of(run: Run, seen: Photographs, truth: Tensor) -> Array:

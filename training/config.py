@@ -17,7 +17,7 @@ class TrainConfig:
     """Everything that decides a run; stored beside its result.
 
     ``architecture`` is a name of `model.network.catalogue`, and ``network`` has its sizes. ``looks`` is how often the
-    network sees its own guess.
+    network sees its own guess. ``bfloat16`` computes with sixteen bits, where the machine is able to.
     ``learns_from`` are parts of `training.surfaces.SPLIT`; where ``folds`` are counted, the network learns from all
     heliostats but those of one ``fold``. ``batch`` is shared among processes.
     """

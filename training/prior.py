@@ -1,6 +1,7 @@
 """Estimate the surface prior that ships: ``python -m training.prior --run runs/best``.
 
-``--compare ../shared/stj`` prints which prior predicts measured mirrors best that were left out.
+``--compare ../shared/stj`` prints which prior predicts measured mirrors best that were left out, ``--generic
+../shared/stj`` the numbers of the generic prior that make the training mirrors most probable.
 """
 
 import argparse
@@ -9,11 +10,23 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize
 from scipy.special import gammaln
 
-from model.prior import FREEDOM, GROUPS, PRIOR, SurfacePrior
+from model.prior import (
+    FREEDOM,
+    GROUPS,
+    MEASURED_FACET,
+    PRIOR,
+    FacetKind,
+    SurfacePrior,
+    generic_covariance,
+    generic_prior,
+    orthogonal,
+    principal,
+)
 from training.config import TrainConfig
-from training.surfaces import load_surfaces, split, tilt_modes, untilted, with_symmetries
+from training.surfaces import load_part, load_surfaces, split, tilt_modes, untilted, with_symmetries
 
 Array = NDArray[np.float64]
 
@@ -37,7 +50,7 @@ def estimate(surfaces: Array) -> SurfacePrior:
     A tilt of the whole mirror is kept apart: no image can show it.
     """
     mean = surfaces.mean(axis=0)
-    measured = principal(shrunk(surfaces - mean) + FLOOR**2 * np.eye(mean.size))
+    measured = principal(shrunk(surfaces - mean) + FLOOR**2 * np.eye(mean.size), len(mean))
     directions = untilted(np.concatenate([measured, canting_directions()]))
     basis = orthogonal(directions - directions.mean(axis=(2, 3), keepdims=True))
     return SurfacePrior(untilted(mean), basis, tilts(surfaces))
@@ -68,12 +81,6 @@ def shrunk(deviations: Array, share: float = FACET_SHARE) -> Array:
     return np.asarray((1 - share) * whole + share * facets)
 
 
-def principal(covariance: Array) -> Array:
-    """Directions (256, 4, 8, 8) [m] of a covariance, each as long as its standard deviation."""
-    values, axes = np.linalg.eigh(covariance)
-    return np.asarray((axes * np.sqrt(values.clip(min=0))).T.reshape(-1, 4, 8, 8))
-
-
 def canting_directions(sigma_mrad: float = 0.6) -> Array:
     """Free canting of each facet (8, 4, 8, 8) [m], ``sigma_mrad`` of slope along x and along y.
 
@@ -86,12 +93,28 @@ def canting_directions(sigma_mrad: float = 0.6) -> Array:
     return free.reshape(8, 4, 8, 8)
 
 
-def orthogonal(directions: Array) -> Array:
-    """Orthogonal directions (K, F, I, J) [m] of the same covariance, the longest first, their largest height up."""
-    flat = directions.reshape(len(directions), -1)
-    _, singular, axes = np.linalg.svd(flat, full_matrices=False)
-    signs = np.sign(axes[np.arange(len(axes)), np.abs(axes).argmax(axis=1)])
-    return np.asarray(((signs * singular)[:, None] * axes)[singular > 1e-9].reshape(-1, *directions.shape[1:]))
+def generic_kind(surfaces: Array) -> FacetKind:
+    """The kind of facets that makes mirrors (N, 4, 8, 8) [m] most probable, whatever their tilts and facets' means."""
+    flat = surfaces.reshape(len(surfaces), -1)
+    unseen = np.concatenate(
+        [np.repeat(tilt_modes()[:, None], 4, axis=1).reshape(2, -1), np.kron(np.eye(4), np.ones(64))]
+    )
+    seen = np.linalg.svd(unseen)[2][len(unseen) :].T
+
+    def kind(logs: Array) -> FacetKind:
+        canting, bending, reach, grain, odds = np.exp(logs).tolist()
+        return FacetKind(canting, bending, reach, grain, odds / (1 + odds))
+
+    def improbability(logs: Array) -> float:
+        covariance = generic_covariance(np.tile(MEASURED_FACET, (4, 1)), kind(logs))
+        lower = np.linalg.cholesky(seen.T @ covariance @ seen)
+        left = np.linalg.solve(lower, seen.T @ flat.T)
+        return float((left**2).sum() / 2 + len(flat) * np.log(np.diag(lower)).sum())
+
+    logs = np.array([*np.log([2e-3, 2e-3, 1.0, 1e-4]), 0.0])
+    simplex = np.vstack([logs, logs + 0.5 * np.eye(5)])
+    found = minimize(improbability, logs, method="Nelder-Mead", options={"initial_simplex": simplex, "xatol": 0.01})
+    return kind(found.x)
 
 
 def compare(surfaces: Array) -> str:
@@ -100,12 +123,15 @@ def compare(surfaces: Array) -> str:
     Log density of their coefficients [nats a mirror], above the Gaussian's that is estimated from the same others.
     """
     gauss: list[float] = []
-    found: dict[str, list[float]] = {name: [] for name in ("Gaussian, one scale a mirror", "a scale for each group")}
+    generic = generic_prior(np.tile(MEASURED_FACET, (4, 1)))
+    names = ("Gaussian, one scale a mirror", "a scale for each group", "generic, a scale for each group")
+    found: dict[str, list[float]] = {name: [] for name in names}
     for left_out, surface in enumerate(surfaces):
         prior = estimate(np.delete(surfaces, left_out, axis=0))
         gauss.append(_nats(prior, surface, (), np.inf))
         found["Gaussian, one scale a mirror"].append(_nats(prior, surface, (0,), FREEDOM))
         found["a scale for each group"].append(_nats(prior, surface, GROUPS, FREEDOM))
+        found["generic, a scale for each group"].append(_nats(generic, surface, GROUPS, FREEDOM))
     rng = np.random.default_rng(0)
     rows = []
     for name, values in found.items():
@@ -138,7 +164,12 @@ def main() -> None:
     parser.add_argument(
         "--compare", type=Path, metavar="DATA", help="print what priors say of mirrors left out of them"
     )
+    parser.add_argument("--generic", type=Path, metavar="DATA", help="print the generic prior's most probable numbers")
     arguments = parser.parse_args()
+    if arguments.generic is not None:
+        surfaces, names = load_part(arguments.generic, "training")
+        print(f"{len(names)} measured mirrors: {generic_kind(surfaces)}")
+        return
     if arguments.compare is not None:
         surfaces, names = load_surfaces(arguments.compare)
         apart = split(names)["apart"]

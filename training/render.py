@@ -1,7 +1,7 @@
 """Rendering training images: heliostats of the field under random suns, seen by imperfect cameras."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -39,6 +39,9 @@ CLEAREST_SKY, CLEAR_SKY = 1e-3, 0.02
 
 LAW = Srgb()
 """From light to counts, for the cameras that are drawn."""
+
+Descents = Callable[[Callable[[Tensor], Tensor], Tensor, Tensor], Tensor]
+"""A way to a step, as `model.network.inputs.descents` is one."""
 
 TENSORS = ("control_points", "attitude", "center", "sun", "plane_center", "plane_axes")
 """What a scene holds for each mirror."""
@@ -180,9 +183,9 @@ class Photographs:
         clipped = binned(self.clipped, size) * (size / FLUX_SIZE) ** 2
         return normalized(clipped_alike(self.setups.trace(z, samples, size), binned(self.flux, size), clipped))
 
-    def descents(self, z: Tensor, basis: Tensor) -> Tensor:
+    def descents(self, z: Tensor, basis: Tensor, way: Descents = descents) -> Tensor:
         """`model.network.inputs.descents` (B, images, 4, 8, 8) [m] from surfaces ``z`` (B, 4, 8, 8) [m]."""
-        return descents(lambda dz: self.trace(z[:, None] + dz, DESCENT_SAMPLES, COARSE_SIZE), self.flux, basis)
+        return way(lambda dz: self.trace(z[:, None] + dz, DESCENT_SAMPLES, COARSE_SIZE), self.flux, basis)
 
     def __getitem__(self, rows: slice) -> "Photographs":
         """Those of some of the heliostats."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.errors import InvalidInputError
-from model.prior import FREEDOM
+from model.prior import FREEDOM, MEASURED_FACET, without
 from model.surface import greville, mirrored, split_canting
 
 Array = NDArray[np.float64]
@@ -142,12 +142,10 @@ class Augmentation:
 
 def tilt_modes() -> Array:
     """Heights (2, 8, 8) [m] of one radian of slope along a facet's x and y (Juelich's facets)."""
-    x, y = np.meshgrid(0.8025 * (2 * greville(8) - 1), 0.6375 * (2 * greville(8) - 1), indexing="ij")
+    x, y = np.meshgrid(*(half * (2 * greville(8) - 1) for half in MEASURED_FACET), indexing="ij")
     return np.stack([x, y])
 
 
 def untilted(z: Array) -> Array:
     """Surfaces (..., 4, 8, 8) [m] without the tilt of the whole mirror, which is the mount's and not the surface's."""
-    modes = np.repeat(tilt_modes()[:, None], 4, axis=1).reshape(2, -1)
-    flat = z.reshape(*z.shape[:-3], -1)
-    return np.asarray((flat - flat @ np.linalg.pinv(modes) @ modes).reshape(z.shape))
+    return without(z, np.repeat(tilt_modes()[:, None], 4, axis=1))

@@ -25,10 +25,11 @@ from torch import Tensor, nn
 
 from model.network.architecture import MAX_IMAGES
 from model.network.catalogue import build
+from model.network.inputs import descents
 from training import parallel
 from training.config import TrainConfig
 from training.prior import estimate
-from training.render import Photographs, load_field, render
+from training.render import Descents, Photographs, load_field, render
 from training.surfaces import load_surfaces
 
 
@@ -53,14 +54,19 @@ def commit_of(folder: Path) -> str:
 
 
 class Run:
-    """One training run in its folder, of the config's network unless another is given."""
+    """One training run in its folder, of the config's network, and its way to descents, unless others are given."""
 
     def __init__(
-        self, config: TrainConfig, folder: Path, device: torch.device, network: nn.Module | None = None
+        self,
+        config: TrainConfig,
+        folder: Path,
+        device: torch.device,
+        network: nn.Module | None = None,
+        way: Descents = descents,
     ) -> None:
         if config.batch % parallel.size():
             raise ValueError(f"batch {config.batch} cannot be shared evenly among {parallel.size()} processes")
-        self.config, self.folder, self.device = config, folder, device
+        self.config, self.folder, self.device, self.way = config, folder, device, way
         surfaces, self.names = load_surfaces(Path(config.data))
         train, judges = config.parts(self.names)
         self.surfaces, self.validation = surfaces[train], surfaces[judges]
@@ -78,6 +84,9 @@ class Run:
         self.optimizer = torch.optim.AdamW(
             self.network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay, betas=(0.9, 0.98)
         )
+        # Without AVX-512 a CPU does sums of sixteen bits one by one, ten times as slowly as those of thirty-two.
+        able = device.type != "cpu" or torch.backends.cpu.get_cpu_capability().startswith("AVX512")
+        self.short_floats = config.bfloat16 and able
         self.step, self.commit = 0, ""
         if (folder / "checkpoint.pt").is_file():
             self._resume()
@@ -124,13 +133,13 @@ class Run:
         # Geometry does not bear sixteen bits: all of it stays outside of autocast.
         with torch.no_grad():
             guess_flux, conditions = photographs.trace(guess), photographs.setups.conditions()
-            descent = photographs.descents(guess, self.basis)
+            descent = photographs.descents(guess, self.basis, self.way)
         mask = torch.ones(guess_flux.shape[:2], device=self.device)
         return photographs.flux, conditions, mask, guess_flux, guess * 1e3, descent * 1e3
 
     def answer(self, shown: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
         """Heights and spread (B, 4, 8, 8) [mm] that the network in training says of what it is shown."""
-        with torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=self.config.bfloat16):
+        with torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=self.short_floats):
             heights, spread = self.network.train()(*shown)
         return heights.float(), spread.float()
 
@@ -222,12 +231,12 @@ def train_steps(runs: Sequence[Run]) -> list[float]:
     A batch is looked at several times, from the mean surface first and then from what the first run has just said, and
     each look changes the weights.
     """
-    leading = runs[0]
+    leading, ways = runs[0], {run.way: run for run in runs}
     photographs, truth = leading.batch()
     guess = leading.mean.expand(len(truth), -1, -1, -1)
     for _ in range(leading.config.looks):
-        shown = leading.shown(photographs, guess)
-        answers = [run.answer(shown) for run in runs]
+        shown = {way: run.shown(photographs, guess) for way, run in ways.items()}
+        answers = [run.answer(shown[run.way]) for run in runs]
         errors = [run.descend(*answer, truth) for run, answer in zip(runs, answers, strict=True)]
         guess = answers[0][0].detach() * 1e-3
     for run in runs:

@@ -127,7 +127,11 @@ class SurfacePredictor:
             misfits=misfits(heliostat, observations, z, optics, effects, latitude_deg=latitude_deg),
             used=tuple(o.identifier for o in observations),
             mahalanobis=default_prior().mahalanobis(z),
-            doubts=(*doubts.of_the_situation(heliostat, observations), *doubts.of_canting(default_prior(), z)),
+            doubts=(
+                *doubts.of_the_situation(heliostat, observations),
+                *doubts.of_the_facets(heliostat),
+                *doubts.of_canting(default_prior(), z),
+            ),
         )
 
 

@@ -1,7 +1,8 @@
 """Surfaces against deflectometry: ``python -m tests.benchmarks.surfaces``.
 
 Rendered: AA28, AA39 and AC43 as they were measured, at their own places, under suns and on targets of real photographs,
-traced by Monte Carlo with one per cent of noise; by the network and refined, from the prior's mean and from the truth.
+traced by Monte Carlo with one per cent of noise; by the network and refined, from the prior's mean and from the truth,
+and refined by the generic prior; then the same mirrors, larger by half, of whose facets there is no other prior.
 ``--scaling`` adds the time from 8 to 64 images.
 
 Real: AA39 of two years, from sets of its photographs, some of which contradict the others; flux accuracy on
@@ -34,8 +35,8 @@ from model.observation import (
     scene_of,
     spread_suns,
 )
-from model.plant import JUELICH_LATITUDE, Heliostat
-from model.prior import default_prior
+from model.plant import JUELICH_LATITUDE, Facet, Heliostat
+from model.prior import default_prior, generic_prior
 from model.refinement import refine
 from model.tracing import Window
 from model.tracing.montecarlo import trace_montecarlo
@@ -129,7 +130,26 @@ def rendered(folder: MeasurementFolder, years: MeasurementFolder, rays: int) -> 
         }
         apart = surface_error(*(end.z for end in ends.values())) * 1e3
         left = ", ".join(f"{label} {end.misfit:.4f}" for label, end in ends.items())
+        generic = generic_prior(heliostat.facet_frames[2])
+        row(
+            f"{name} refined, generic prior",
+            lambda h=heliostat, o=seen, p=generic: refine(h, o, prior=p, latitude_deg=JUELICH_LATITUDE),
+            truth,
+        )
+        larger, shape = enlarged(heliostat, 1.5), 1.5 * truth
+        images = photographed(larger, shape, places_of(years, IMAGES), rays, np.random.default_rng(1))
+        row(
+            f"{name} with facets half as large again, refined",
+            lambda h=larger, o=images: refine(h, o, latitude_deg=JUELICH_LATITUDE),
+            shape,
+        )
         print(f"| | both ends {apart:.3f} mm apart, misfit {left} | | | | | | |")
+
+
+def enlarged(heliostat: Heliostat, factor: float) -> Heliostat:
+    """A heliostat whose facets, and the distances between them, are so many times as large."""
+    facets = (Facet(factor * f.position, factor * f.canting_x, factor * f.canting_y) for f in heliostat.facets)
+    return replace(heliostat, facets=tuple(facets))
 
 
 def scaling(folder: MeasurementFolder, years: MeasurementFolder, rays: int) -> None:

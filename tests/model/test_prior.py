@@ -1,8 +1,12 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from model.observation import TRUSTED_MAHALANOBIS
-from model.prior import GROUPS, default_prior
+from model.plant import Facet
+from model.prior import GROUPS, FacetKind, default_prior, generic_prior, prior_of
+from tests.conftest import flat_heliostat
 from training.surfaces import tilt_modes
 
 
@@ -30,3 +34,23 @@ def test_a_rough_mirror_has_wider_scales():
     known, unknown = prior.precision(rough, np.zeros(counts)), prior.precision(np.zeros(counts), np.ones(counts))
     np.testing.assert_allclose(known[GROUPS[-1]] ** -0.5, 4, rtol=0.2)
     np.testing.assert_allclose(unknown, 1)
+
+
+def test_facets_of_another_size_have_the_generic_prior():
+    """Twice as large they bend by twice as much, over twice the length: slopes are the same."""
+    known = flat_heliostat()
+    assert prior_of(known) is default_prior()
+    twice = tuple(Facet(2 * f.position, 2 * f.canting_x, 2 * f.canting_y) for f in known.facets)
+    found, same = prior_of(replace(known, facets=twice)), generic_prior(known.facet_frames[2])
+    assert found.name == "generic"
+    np.testing.assert_allclose((found.basis**2).sum(axis=0), 4 * (same.basis**2).sum(axis=0), rtol=1e-6)
+
+
+def test_a_generic_mirror_has_no_tilt_of_its_own_and_facets_that_are_alike():
+    prior = generic_prior(flat_heliostat().facet_frames[2])
+    np.testing.assert_allclose(prior.basis.mean(axis=(2, 3)), 0, atol=1e-12)
+    tilts = np.repeat(tilt_modes()[:, None], 4, axis=1)
+    np.testing.assert_allclose(np.einsum("kfij,tfij->kt", prior.basis, tilts), 0, atol=1e-9)
+    bent = tilt_modes()[0] ** 2
+    first, last = np.einsum("kfij,ij->fk", prior.basis, bent - bent.mean())[[0, -1]]
+    assert first @ last / (np.linalg.norm(first) * np.linalg.norm(last)) == pytest.approx(FacetKind().alike, abs=0.02)

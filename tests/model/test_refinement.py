@@ -11,7 +11,7 @@ from model.frames import sun_direction_at
 from model.images import normalized
 from model.metrics import surface_error
 from model.observation import Observation, misfits, render_observations
-from model.plant import JUELICH_LATITUDE, Heliostat
+from model.plant import JUELICH_LATITUDE, Facet, Heliostat
 from model.prior import GROUPS, default_prior
 from model.refinement import RefinementOptions, _half_samples, refine
 from tests.conftest import flat_heliostat, target
@@ -61,6 +61,15 @@ def test_a_rough_mirror_is_found(heliostat):
     found = refine(heliostat, images(heliostat, rough), latitude_deg=JUELICH_LATITUDE)
     assert surface_error(found.z, rough) < 0.25 * surface_error(prior.mean, rough)
     assert np.mean(np.abs(found.z - rough) < 1.645 * found.z_std) > 0.8
+
+
+def test_a_mirror_of_a_kind_that_nobody_measured_is_found(heliostat, truth):
+    larger = tuple(Facet(1.5 * f.position, 1.5 * f.canting_x, 1.5 * f.canting_y) for f in heliostat.facets)
+    unknown = replace(heliostat, facets=larger)
+    found = refine(unknown, images(unknown, 1.5 * truth), latitude_deg=JUELICH_LATITUDE)
+    assert found.weights == "generic"
+    assert surface_error(found.z, 1.5 * truth) < 1.2e-4
+    assert np.mean(np.abs(found.z - 1.5 * truth) < 1.645 * found.z_std) > 0.8
 
 
 def mean_misfit(heliostat: Heliostat, z: np.ndarray, truth: np.ndarray) -> float:

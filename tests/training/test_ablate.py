@@ -7,10 +7,15 @@ import pytest
 import torch
 
 from model.network.architecture import NetworkConfig, SurfaceNetwork
+from model.network.inputs import descents
+from model.prior import default_prior
+from tests.conftest import flat_heliostat
 from training.ablate import VARIANTS, table, variant
 from training.config import TrainConfig
 from training.export import example
 from training.figures import interval
+from training.parts import conjugate_descents
+from training.render import Photographs, Setups, Situations
 from training.train import Run, train_steps
 
 ENTRIES = json.loads(VARIANTS.read_text(encoding="utf-8"))
@@ -44,6 +49,25 @@ def test_runs_side_by_side_learn_from_the_same_images_apart(stj, tmp_path):
     lines = table({"first": first, "second": second}, {"first": 1.0, "second": 2.0}, errors).splitlines()
     assert "1.000 [1.000, 1.000]" in lines[2]
     assert "1.000 [0.7" in lines[3]
+
+
+def test_conjugate_descents_come_farther_and_forgive_the_camera():
+    """They leave less of the images than steepest descent does, and hardly follow images that were shifted."""
+    rng, prior = np.random.default_rng(0), default_prior()
+    suns, aims = Situations().suns(4, rng), np.tile([0.0, 0.0, 40.0], (4, 1))
+    setups = Setups.of([flat_heliostat(focal_length=75.0)], suns, aims, torch.device("cpu"))
+    mean, basis = (torch.as_tensor(values, dtype=torch.float32) for values in (prior.mean[None], prior.basis))
+    truth = torch.as_tensor(prior.surface(rng.normal(size=len(prior.basis)))[None], dtype=torch.float32)
+    flux = setups.trace(truth)
+    seen = Photographs(setups, flux, torch.zeros_like(flux))
+    left = [
+        float((setups.trace(mean + seen.descents(mean, basis, way).sum(dim=1)) - flux).square().sum())
+        for way in (descents, conjugate_descents)
+    ]
+    assert left[1] < 0.5 * left[0]
+    shifted = Photographs(setups, torch.roll(flux, 1, dims=3), torch.zeros_like(flux))
+    followed = [float(shifted.descents(truth, basis, way).abs().sum()) for way in (descents, conjugate_descents)]
+    assert followed[1] < 0.5 * followed[0]
 
 
 def test_an_interval_of_a_mean_is_that_of_its_standard_error():
