@@ -23,7 +23,7 @@ from model.network.catalogue import sizes_of
 from model.network.inputs import descents
 from training.config import TrainConfig
 from training.figures import interval, markdown
-from training.parts import CHANGES, PartsConfig, PartsNetwork, conjugate_descents
+from training.parts import CHANGES, PartsConfig, PartsNetwork, steepest_descents
 from training.render import Camera, Photographs, render
 from training.train import Run, train_steps
 
@@ -44,7 +44,7 @@ def variant(values: dict[str, Any], config: TrainConfig, folder: Path) -> Run:
         network = PartsNetwork(PartsConfig(**values["parts"]))
     else:
         network = CHANGES[values.get("change", "")](SurfaceNetwork(sizes_of("ours", values.get("network", {}))))
-    way = conjugate_descents if values.get("descents") == "conjugate" else descents
+    way = steepest_descents if values.get("descents") == "steepest" else descents
     return Run(config, folder, torch.device("cpu"), network, way)
 
 

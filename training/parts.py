@@ -1,10 +1,9 @@
-"""Parts of a network that are tried beside it (`training.ablate`): most do not pay.
+"""Parts of a network that were tried and do not pay (`training.ablate`).
 
 `PartsNetwork` is the one that was shipped before, and may be had without each of its parts: convolutions whose weights
 are modulated by the geometry and demodulated as in StyleGAN2, attention among images, a StyleGAN2 decoder of narrow
 styles. With a vision transformer in place of the convolutions it is built as the network of Lewen et al. 2025.
-`coarse` and `blind` take something away from today's. `conjugate_descents` show it a better step: of cameras that
-nobody told of, too, and as far as conjugate gradients come.
+`coarse` and `blind` take something away from today's; `steepest_descents` show it a shorter step.
 
 Source: Lewen et al. 2024, *Inverse Deep Learning Ray Tracing for Heliostat Surface Prediction*; Lewen et al. 2025,
 arXiv 2504.03712 (vision transformer before a StyleGAN2 decoder); Karras et al. 2020, *Analyzing and Improving the Image
@@ -18,7 +17,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from model.images import FLUX_WINDOW, binned
+from model.images import binned
 from model.network.architecture import CONDITIONS, SurfaceNetwork
 from model.network.inputs import DESCENT_NOISE, STEP_HEIGHT
 from model.surface import COLUMNS, FACETS, ROWS
@@ -305,80 +304,23 @@ CHANGES = {"": lambda network: network, "coarse": coarse, "blind": blind}
 """What may be changed in today's network, by name."""
 
 
-CONJUGATE_STEPS = 4
-"""Steps of conjugate gradients."""
-
-DARK = 0.1
-"""Share of the peak from which on errors of a pixel grow with the root of its flux."""
-
-SHIFT, EXPOSURE, BACKGROUND, BLUR, GAMMA, BLACK = 0.03, 0.1, 0.02, 0.05, 0.1, 0.01
-"""What cameras are forgiven, as `model.refinement.RefinementOptions` has it [m, 1, of the peak, m, 1, of the peak]."""
-
-
-def nuisances(images: Tensor) -> Tensor:
-    """Directions (B, M, 7, R, R) in which cameras may change images (B, M, R, R), as long as their deviations."""
-    pixel, peak = FLUX_WINDOW / images.shape[-1], images.amax(dim=(2, 3), keepdim=True)
-    up, right = torch.gradient(images, spacing=pixel, dim=(2, 3))
-    (up_twice,), (right_twice,) = torch.gradient(up, spacing=pixel, dim=2), torch.gradient(right, spacing=pixel, dim=3)
-    relative = (images / peak).clamp(min=1e-4)
-    background = (peak * BACKGROUND).expand_as(images)
-    return torch.stack(
-        [
-            right * SHIFT,
-            up * SHIFT,
-            images * EXPOSURE,
-            background,
-            (up_twice + right_twice) * BLUR**2 / 2,
-            images * relative.log() * GAMMA,
-            torch.exp(-relative / BLACK) * background,
-        ],
-        dim=2,
-    )
-
-
-def conjugate_descents(trace: Callable[[Tensor], Tensor], flux: Tensor, basis: Tensor) -> Tensor:
-    """As `model.network.inputs.descents`, by some steps of conjugate gradients and with `nuisances` marginalised.
-
-    The shares are those of steepest descent; what conjugate gradients add is dealt out to all images alike.
-    """
+def steepest_descents(trace: Callable[[Tensor], Tensor], flux: Tensor, basis: Tensor) -> Tensor:
+    """As `model.network.inputs.descents`, by one step of steepest descent that takes cameras at their word."""
     directions = basis.flatten(1)
     with torch.enable_grad():
         changes = torch.zeros(*flux.shape[:2], *basis.shape[1:], device=flux.device, requires_grad=True)
-        traced = trace(changes)
-    guessed, measured = traced.detach(), binned(flux, traced.shape[-1])
-    peak = measured.amax(dim=(2, 3), keepdim=True)
-    unit = DESCENT_NOISE * peak * torch.sqrt((guessed / peak).clamp(min=0) + DARK)
-    free = (nuisances(guessed) / unit[:, :, None]).flatten(3)
-    gram = torch.linalg.cholesky(free @ free.transpose(-1, -2) + torch.eye(free.shape[2], device=flux.device))
-
-    def weighed(residual: Tensor) -> Tensor:
-        """Residuals (B, M, R, R) in units of their errors, without what a camera may have done."""
-        flat = residual.flatten(2)[..., None]
-        return residual - (free.transpose(-1, -2) @ torch.cholesky_solve(free @ flat, gram)).view_as(residual)
-
-    def uphill(residual: Tensor) -> Tensor:
-        """What residuals (B, M, R, R) ask of the prior's coefficients (B, M, K)."""
-        (gradient,) = torch.autograd.grad(traced, changes, residual / unit, retain_graph=True)
-        return gradient.flatten(2) @ directions.T
-
-    @torch.no_grad()
-    def response(coefficients: Tensor) -> Tensor:
-        """Change of the images (B, M, R, R), in units of their errors, per coefficients (B, K)."""
-        heights = (coefficients @ directions).view(-1, 1, *basis.shape[1:])
-        step = STEP_HEIGHT / heights.square().mean(dim=(1, 2, 3, 4)).sqrt().clamp(min=1e-12)
-        moved = trace((step[:, None, None, None, None] * heights).expand_as(changes)) - guessed
-        return moved / unit / step[:, None, None, None]
-
-    shares = uphill(weighed((measured - guessed) / unit))
-    left = shares.sum(dim=1)
-    direction, found, size = left, torch.zeros_like(left), left.square().sum(dim=1, keepdim=True)
-    for step in range(CONJUGATE_STEPS):
-        curved = direction + uphill(weighed(response(direction))).sum(dim=1)
-        length = size / (direction * curved).sum(dim=1, keepdim=True).clamp(min=1e-20)
-        if step == 0:
-            shares = shares * length[..., None]
-        found, left = found + length * direction, left - length * curved
-        before, size = size, left.square().sum(dim=1, keepdim=True)
-        direction = left + size / before.clamp(min=1e-20) * direction
-    shares = shares + ((found - shares.sum(dim=1)) / shares.shape[1])[:, None]
+        guessed = trace(changes)
+        measured = binned(flux, guessed.shape[-1])
+        unit = DESCENT_NOISE * measured.amax(dim=(2, 3), keepdim=True)
+        misfit = (((measured - guessed) / unit) ** 2).sum() / 2
+        (gradient,) = torch.autograd.grad(misfit, changes)
+    downhill = -gradient.flatten(2) @ directions.T
+    along = downhill.sum(dim=1)
+    along = along / along.norm(dim=1, keepdim=True).clamp(min=1e-12)
+    heights = (along @ directions).view(-1, 1, *basis.shape[1:])
+    step = STEP_HEIGHT / heights.square().mean(dim=(1, 2, 3, 4)).sqrt().clamp(min=1e-12)
+    with torch.no_grad():
+        moved = trace((step[:, None, None, None, None] * heights).expand_as(changes)) - guessed.detach()
+        curvature = (moved / unit).square().sum(dim=(1, 2, 3)) / step**2
+    shares = downhill / (1 + curvature)[:, None, None]
     return torch.einsum("bmk,kfij->bmfij", shares, basis)

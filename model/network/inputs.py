@@ -9,7 +9,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from model.images import binned
+from model.images import FLUX_WINDOW, binned
 from model.surface import sample
 from model.tracing.scene import Scene
 
@@ -22,18 +22,47 @@ MIRRORED_CONDITIONS = (1, -1, -1, 1) * 2 + (1,) * 4
 DESCENT_SAMPLES = 12
 """Points along each side of a facet for images, of `model.images.COARSE_SIZE`, that are differentiated."""
 
-DESCENT_NOISE = 0.03
-"""Standard deviation of a pixel [of the peak] that a descent counts with."""
+DESCENT_STEPS = 4
+"""Steps of conjugate gradients that a descent takes."""
+
+DESCENT_NOISE, DARK = 0.03, 0.1
+"""Standard deviation of a pixel [of the peak] that a descent counts with, and the flux [of the peak] from which on it
+grows with the flux's root."""
+
+SHIFT, EXPOSURE, BACKGROUND, BLUR, GAMMA, BLACK = 0.03, 0.1, 0.02, 0.05, 0.1, 0.01
+"""What cameras are forgiven, as `model.refinement.RefinementOptions` has it [m, 1, of the peak, m, 1, of the peak]."""
 
 STEP_HEIGHT = 3e-5
 """Height [m, root mean square] by which a surface is changed to take a difference of its images."""
 
 
-def descents(trace: Callable[[Tensor], Tensor], flux: Tensor, basis: Tensor) -> Tensor:
-    """A step of steepest descent from a guess, in each image's share: heights (B, M, 4, 8, 8) [m].
+def nuisances(images: Tensor) -> Tensor:
+    """Directions (B, M, 7, R, R) in which cameras may change images (B, M, R, R), as long as their deviations."""
+    pixel, peak = FLUX_WINDOW / images.shape[-1], images.amax(dim=(2, 3), keepdim=True)
+    up, right = torch.gradient(images, spacing=pixel, dim=(2, 3))
+    (up_twice,), (right_twice,) = torch.gradient(up, spacing=pixel, dim=2), torch.gradient(right, spacing=pixel, dim=3)
+    relative = (images / peak).clamp(min=1e-4)
+    background = (peak * BACKGROUND).expand_as(images)
+    return torch.stack(
+        [
+            right * SHIFT,
+            up * SHIFT,
+            images * EXPOSURE,
+            background,
+            (up_twice + right_twice) * BLUR**2 / 2,
+            images * relative.log() * GAMMA,
+            torch.exp(-relative / BLACK) * background,
+        ],
+        dim=2,
+    )
 
-    The gradient of the images' misfit, seen through a surface prior (steepest in standard deviations, not in metres),
-    as far down as the images would fall in line with it. The shares add up to the step.
+
+def descents(trace: Callable[[Tensor], Tensor], flux: Tensor, basis: Tensor) -> Tensor:
+    """A step towards the surface that threw the images, in each image's share: heights (B, M, 4, 8, 8) [m].
+
+    Some steps of conjugate gradients on the most probable surface by a prior, images taken as linear in it; `nuisances`
+    are marginalised, so that what a camera may have done moves no height. The shares add up to the step. They are those
+    of the first, which is the steepest; what the later steps add is dealt out to all images alike.
 
     Parameters
     ----------
@@ -48,20 +77,43 @@ def descents(trace: Callable[[Tensor], Tensor], flux: Tensor, basis: Tensor) -> 
     directions = basis.flatten(1)
     with torch.enable_grad():
         changes = torch.zeros(*flux.shape[:2], *basis.shape[1:], device=flux.device, requires_grad=True)
-        guessed = trace(changes)
-        measured = binned(flux, guessed.shape[-1])
-        unit = DESCENT_NOISE * measured.amax(dim=(2, 3), keepdim=True)
-        misfit = (((measured - guessed) / unit) ** 2).sum() / 2
-        (gradient,) = torch.autograd.grad(misfit, changes)
-    downhill = -gradient.flatten(2) @ directions.T
-    along = downhill.sum(dim=1)
-    along = along / along.norm(dim=1, keepdim=True).clamp(min=1e-12)
-    heights = (along @ directions).view(-1, 1, *basis.shape[1:])
-    step = STEP_HEIGHT / heights.square().mean(dim=(1, 2, 3, 4)).sqrt().clamp(min=1e-12)
-    with torch.no_grad():
-        moved = trace((step[:, None, None, None, None] * heights).expand_as(changes)) - guessed.detach()
-        curvature = (moved / unit).square().sum(dim=(1, 2, 3)) / step**2
-    shares = downhill / (1 + curvature)[:, None, None]
+        traced = trace(changes)
+    guessed, measured = traced.detach(), binned(flux, traced.shape[-1])
+    peak = measured.amax(dim=(2, 3), keepdim=True)
+    unit = DESCENT_NOISE * peak * torch.sqrt((guessed / peak).clamp(min=0) + DARK)
+    free = (nuisances(guessed) / unit[:, :, None]).flatten(3)
+    gram = torch.linalg.cholesky(free @ free.transpose(-1, -2) + torch.eye(free.shape[2], device=flux.device))
+
+    def weighed(residual: Tensor) -> Tensor:
+        """Residuals (B, M, R, R) in units of their errors, without what a camera may have done."""
+        flat = residual.flatten(2)[..., None]
+        return residual - (free.transpose(-1, -2) @ torch.cholesky_solve(free @ flat, gram)).view_as(residual)
+
+    def uphill(residual: Tensor) -> Tensor:
+        """What residuals (B, M, R, R) ask of the prior's coefficients (B, M, K)."""
+        (gradient,) = torch.autograd.grad(traced, changes, residual / unit, retain_graph=True)
+        return gradient.flatten(2) @ directions.T
+
+    @torch.no_grad()
+    def response(coefficients: Tensor) -> Tensor:
+        """Change of the images (B, M, R, R), in units of their errors, per coefficients (B, K)."""
+        heights = (coefficients @ directions).view(-1, 1, *basis.shape[1:])
+        step = STEP_HEIGHT / heights.square().mean(dim=(1, 2, 3, 4)).sqrt().clamp(min=1e-12)
+        moved = trace((step[:, None, None, None, None] * heights).expand_as(changes)) - guessed
+        return moved / unit / step[:, None, None, None]
+
+    shares = uphill(weighed((measured - guessed) / unit))
+    left = shares.sum(dim=1)
+    direction, found, size = left, torch.zeros_like(left), left.square().sum(dim=1, keepdim=True)
+    for step in range(DESCENT_STEPS):
+        curved = direction + uphill(weighed(response(direction))).sum(dim=1)
+        length = size / (direction * curved).sum(dim=1, keepdim=True).clamp(min=1e-20)
+        if step == 0:
+            shares = shares * length[..., None]
+        found, left = found + length * direction, left - length * curved
+        before, size = size, left.square().sum(dim=1, keepdim=True)
+        direction = left + size / before.clamp(min=1e-20) * direction
+    shares = shares + ((found - shares.sum(dim=1)) / shares.shape[1])[:, None]
     return torch.einsum("bmk,kfij->bmfij", shares, basis)
 
 

@@ -14,7 +14,7 @@ from training.ablate import VARIANTS, table, variant
 from training.config import TrainConfig
 from training.export import example
 from training.figures import interval
-from training.parts import conjugate_descents
+from training.parts import steepest_descents
 from training.render import Photographs, Setups, Situations
 from training.train import Run, train_steps
 
@@ -51,7 +51,7 @@ def test_runs_side_by_side_learn_from_the_same_images_apart(stj, tmp_path):
     assert "1.000 [0.7" in lines[3]
 
 
-def test_conjugate_descents_come_farther_and_forgive_the_camera():
+def test_descents_come_farther_than_the_steepest_and_forgive_the_camera():
     """They leave less of the images than steepest descent does, and hardly follow images that were shifted."""
     rng, prior = np.random.default_rng(0), default_prior()
     suns, aims = Situations().suns(4, rng), np.tile([0.0, 0.0, 40.0], (4, 1))
@@ -62,11 +62,11 @@ def test_conjugate_descents_come_farther_and_forgive_the_camera():
     seen = Photographs(setups, flux, torch.zeros_like(flux))
     left = [
         float((setups.trace(mean + seen.descents(mean, basis, way).sum(dim=1)) - flux).square().sum())
-        for way in (descents, conjugate_descents)
+        for way in (steepest_descents, descents)
     ]
     assert left[1] < 0.5 * left[0]
     shifted = Photographs(setups, torch.roll(flux, 1, dims=3), torch.zeros_like(flux))
-    followed = [float(shifted.descents(truth, basis, way).abs().sum()) for way in (descents, conjugate_descents)]
+    followed = [float(shifted.descents(truth, basis, way).abs().sum()) for way in (steepest_descents, descents)]
     assert followed[1] < 0.5 * followed[0]
 
 
