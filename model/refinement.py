@@ -10,12 +10,12 @@ stage begins with. Then one start is enough for mirrors like those measured; of 
 prior expects, some still end beside the best surface.
 
 What a camera adds to an image (a shift, another exposure, background, a little blur, another response) enters as a few
-directions per image with priors of their own and is marginalised exactly. All other errors, of the camera and of the
-model, grow with the flux and come in patches: they are taken for independent in the cosine transform of the image,
-with one variance for each band of spatial frequency and another for each image, a factor of the former: a hazy
-photograph tells less. They are estimated from what is left of the images and from how far a surface could bend to them
-(MacKay 1992, doi:10.1162/neco.1992.4.3.415). Errors that look like a bent mirror weigh more than that: how far apart
-the images pull the surface tells by how much (the overdispersion of quasi-likelihoods, Wedderburn 1974,
+directions per image with priors of their own (`model.nuisances`), and is marginalised exactly. All other errors, of the
+camera and of the model, grow with the flux and come in patches: they are taken for independent in the cosine transform
+of the image, with one variance for each band of spatial frequency and another for each image, a factor of the former: a
+hazy photograph tells less. They are estimated from what is left of the images and from how far a surface could bend to
+them (MacKay 1992, doi:10.1162/neco.1992.4.3.415). Errors that look like a bent mirror weigh more than that: how far
+apart the images pull the surface tells by how much (the overdispersion of quasi-likelihoods, Wedderburn 1974,
 doi:10.1093/biomet/61.3.439). An image that the others contradict is left out.
 
 All that is of one place: where images tell mirrors apart by little, their errors decide which of several mirrors is
@@ -36,9 +36,10 @@ from model import doubts
 from model.effects import Effect
 from model.errors import InvalidInputError
 from model.forecast import Aligned
-from model.images import COARSE_SIZE, FLUX_WINDOW, binned
+from model.images import COARSE_SIZE, binned
 from model.least_squares import Descent, Minimum, minimize
 from model.network.inputs import STEP_HEIGHT
+from model.nuisances import nuisances
 from model.observation import Observation, Ranges, SurfacePrediction, align_observations, misfits, spread_suns
 from model.plant import Heliostat
 from model.prior import SurfacePrior, prior_of
@@ -80,9 +81,7 @@ class RefinementOptions:
     Errors of a pixel have standard deviations relative to the image's peak, ``grain`` at least in each of `BANDS`, that
     grow with the root of the flux from a share ``dark`` of the peak on. ``annealing`` are the errors to begin with,
     stage by stage: images that are trusted little at first let the large features settle before the small ones are
-    looked at, by up to ``few`` of the images. Then they are estimated, in several ``rounds``, from all.
-    ``shift_m``, ``exposure``, ``background`` [of the peak], ``blur_m`` and ``gamma`` are the standard deviations of the
-    nuisance parameters; noise that cannot go below black lifts pixels up to ``black`` [of the peak]. Images are
+    looked at, by up to ``few`` of the images. Then they are estimated, in several ``rounds``, from all. Images are
     compared at ``resolution`` pixels a side, traced with ``samples``.
     """
 
@@ -92,35 +91,8 @@ class RefinementOptions:
     rounds: int = 3
     few: int = 8
     steps: int = 12
-    shift_m: float = 0.03
-    exposure: float = 0.1
-    background: float = 0.02
-    blur_m: float = 0.05
-    gamma: float = 0.1
-    black: float = 0.01
     resolution: int = COARSE_SIZE
     samples: int = 32
-
-
-def _nuisance(image: Array, options: RefinementOptions) -> Array:
-    """Directions (7, R, R) in which a camera may change an image, each as long as its standard deviation."""
-    pixel = FLUX_WINDOW / image.shape[0]
-    up, right = np.gradient(image, pixel)
-    laplacian = np.gradient(up, pixel, axis=0) + np.gradient(right, pixel, axis=1)
-    peak = image.max()
-    relative = np.clip(image / peak, 1e-4, None)
-    return np.stack(
-        [
-            right * options.shift_m,
-            up * options.shift_m,
-            image * options.exposure,
-            np.full_like(image, peak * options.background),
-            laplacian * options.blur_m**2 / 2,
-            image * np.log(relative) * options.gamma,
-            # Noise that is cut at black lifts the dark, and only the dark.
-            np.exp(-relative / options.black) * peak * options.background,
-        ]
-    )
 
 
 def _half_samples(suns: Array) -> list[tuple[list[int], list[int]]]:
@@ -155,8 +127,8 @@ class _Weights:
         self.bands = np.digitize(frequency[self._kept], BANDS)
         self._scale = peak * np.sqrt(np.clip(images / peak, 0, None) + options.dark)
         self._sigma = sigma[:, self.bands]
-        nuisances = self._white(np.stack([_nuisance(image, options) for image in images]).swapaxes(0, 1))
-        _, singular, self._directions = np.linalg.svd(nuisances.swapaxes(0, 1), full_matrices=False)
+        free = self._white(nuisances(torch.as_tensor(images)).numpy().swapaxes(0, 1))
+        _, singular, self._directions = np.linalg.svd(free.swapaxes(0, 1), full_matrices=False)
         self._shrunk = 1 - 1 / np.sqrt(1 + singular**2)
 
     def __call__(self, changes: NDArray[Any]) -> NDArray[Any]:

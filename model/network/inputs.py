@@ -9,7 +9,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from model.images import FLUX_WINDOW, binned
+from model.images import binned
+from model.nuisances import nuisances
 from model.surface import sample
 from model.tracing.scene import Scene
 
@@ -29,40 +30,16 @@ DESCENT_NOISE, DARK = 0.03, 0.1
 """Standard deviation of a pixel [of the peak] that a descent counts with, and the flux [of the peak] from which on it
 grows with the flux's root."""
 
-SHIFT, EXPOSURE, BACKGROUND, BLUR, GAMMA, BLACK = 0.03, 0.1, 0.02, 0.05, 0.1, 0.01
-"""What cameras are forgiven, as `model.refinement.RefinementOptions` has it [m, 1, of the peak, m, 1, of the peak]."""
-
 STEP_HEIGHT = 3e-5
 """Height [m, root mean square] by which a surface is changed to take a difference of its images."""
-
-
-def nuisances(images: Tensor) -> Tensor:
-    """Directions (B, M, 7, R, R) in which cameras may change images (B, M, R, R), as long as their deviations."""
-    pixel, peak = FLUX_WINDOW / images.shape[-1], images.amax(dim=(2, 3), keepdim=True)
-    up, right = torch.gradient(images, spacing=pixel, dim=(2, 3))
-    (up_twice,), (right_twice,) = torch.gradient(up, spacing=pixel, dim=2), torch.gradient(right, spacing=pixel, dim=3)
-    relative = (images / peak).clamp(min=1e-4)
-    background = (peak * BACKGROUND).expand_as(images)
-    return torch.stack(
-        [
-            right * SHIFT,
-            up * SHIFT,
-            images * EXPOSURE,
-            background,
-            (up_twice + right_twice) * BLUR**2 / 2,
-            images * relative.log() * GAMMA,
-            torch.exp(-relative / BLACK) * background,
-        ],
-        dim=2,
-    )
 
 
 def descents(trace: Callable[[Tensor], Tensor], flux: Tensor, basis: Tensor) -> Tensor:
     """A step towards the surface that threw the images, in each image's share: heights (B, M, 4, 8, 8) [m].
 
-    Some steps of conjugate gradients on the most probable surface by a prior, images taken as linear in it; `nuisances`
-    are marginalised, so that what a camera may have done moves no height. The shares add up to the step. They are those
-    of the first, which is the steepest; what the later steps add is dealt out to all images alike.
+    Some steps of conjugate gradients to the most probable surface by a prior, images taken as linear in it. What a
+    camera may have done (`model.nuisances`) is marginalised, so that it moves no height. The shares add up to the step;
+    they are those of the steepest descent, and what the later steps add is dealt out to all images alike.
 
     Parameters
     ----------
