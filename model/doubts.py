@@ -11,7 +11,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from model.images import FLUX_SIZE
+from model.images import FLUX_SIZE, FLUX_WINDOW
 from model.observation import Observation
 from model.plant import Heliostat
 from model.prior import MEASURED_FACET, SurfacePrior, of_measured_kind
@@ -47,24 +47,28 @@ def of_the_situation(heliostat: Heliostat, observations: Sequence[Observation]) 
     farthest = max(float(np.linalg.norm(o.target.center - heliostat.position)) for o in observations)
     if farthest > FARTHEST:
         doubts.append(f"its target is {farthest:.0f} m away; predictions have been judged up to {FARTHEST:.0f} m")
-    rim = np.median([_rim_share(o.flux) for o in observations])
-    if rim > RIM_SHARE:
+    if spilt(observations):
         doubts.append("its spots are larger than the window of their flux images")
     if np.median([o.clipped_share for o in observations]) > CLIPPED:
         doubts.append("most of its photographs show little but their rim: the rest lies beyond the camera's range")
     return doubts
 
 
-def of_the_facets(heliostat: Heliostat) -> list[str]:
-    """Where facets are not of the kind that networks learn from; a refinement has a prior for others."""
+def of_the_network(heliostat: Heliostat, observations: Sequence[Observation]) -> list[str]:
+    """Where facets or images are not of the sizes that networks learn from; a refinement takes all."""
+    doubts = []
     _, _, half_sizes = heliostat.facet_frames
-    if of_measured_kind(half_sizes):
-        return []
-    width, height = 2 * half_sizes.mean(axis=0)
-    known = " m x ".join(str(2 * half) for half in MEASURED_FACET)
-    return [
-        f"its facets of {width:.2f} m x {height:.2f} m are not of the size that the network learnt from ({known} m)"
-    ]
+    if not of_measured_kind(half_sizes):
+        width, height = 2 * half_sizes.mean(axis=0)
+        known = " m x ".join(str(2 * half) for half in MEASURED_FACET)
+        doubts.append(
+            f"its facets of {width:.2f} m x {height:.2f} m are not of the size that the network learnt from ({known} m)"
+        )
+    if observations[0].side != FLUX_WINDOW:
+        doubts.append(
+            f"its spots fill a window of {observations[0].side:g} m; the network learnt from {FLUX_WINDOW:g} m"
+        )
+    return doubts
 
 
 def of_canting(prior: SurfacePrior, z: Array) -> list[str]:
@@ -89,6 +93,11 @@ def of_facet_light(light: ArrayLike, deviation: ArrayLike) -> list[str]:
         for number, (share, sigma) in enumerate(zip(np.asarray(light), np.asarray(deviation), strict=True), start=1)
         if share < -DARK and share < -CERTAIN * sigma
     ]
+
+
+def spilt(observations: Sequence[Observation]) -> bool:
+    """Whether so much light lies on the rims of most images that much must lie outside of them."""
+    return bool(np.median([_rim_share(o.flux) for o in observations]) > RIM_SHARE)
 
 
 def _rim_share(flux: NDArray[np.floating]) -> float:

@@ -146,22 +146,23 @@ def images_under(effects: Iterable[Effect], flux: Tensor, window: Window) -> Ten
     return flux
 
 
-def centered(images: Tensor, whole: Window, size: int) -> Tensor:
-    """Energy (B, size, size) of images (B, rows, columns) in windows of `FLUX_WINDOW` about their centres of mass.
+def centered(images: Tensor, whole: Window, size: int, side: float = FLUX_WINDOW) -> Tensor:
+    """Energy (B, size, size) of images (B, rows, columns) in windows of ``side`` [m] about their centres of mass.
 
     As `model.imaging.window.flux_window` cuts measured images, differentiable.
     """
-    shares = [_overlap(images.sum(dim=axis), extent, size) for axis, extent in ((-1, whole.height), (-2, whole.width))]
+    axes = ((-1, whole.height), (-2, whole.width))
+    shares = [_overlap(images.sum(dim=axis), extent, size, side) for axis, extent in axes]
     cut: Tensor = shares[0] @ images @ shares[1].transpose(-1, -2)
     return cut
 
 
-def _overlap(line: Tensor, extent: float, size: int) -> Tensor:
+def _overlap(line: Tensor, extent: float, size: int, side: float) -> Tensor:
     """Share (B, size, n) of n cells over ``extent`` [m] in those of the window about the centre of ``line`` (B, n)."""
     cell = extent / line.shape[-1]
     low = torch.arange(line.shape[-1], dtype=line.dtype, device=line.device) * cell
     center = (line @ (low + cell / 2) / line.sum(dim=-1).clamp(min=1e-30))[:, None, None]
-    edges = torch.linspace(-FLUX_WINDOW / 2, FLUX_WINDOW / 2, size + 1, dtype=line.dtype, device=line.device)
+    edges = torch.linspace(-side / 2, side / 2, size + 1, dtype=line.dtype, device=line.device)
     first, last = center + edges[:-1, None], center + edges[1:, None]
     return (torch.minimum(last, low + cell) - torch.maximum(first, low)).clamp(min=0) / cell
 
@@ -291,20 +292,27 @@ class Aligned:
         return self.camera_images(self.flux(optics, effects, view, tracer), effects, view)
 
     def flux_images(
-        self, optics: Optics | None = None, effects: Sequence[Effect] = (), *, size: int = FLUX_SIZE, samples: int = 20
+        self,
+        optics: Optics | None = None,
+        effects: Sequence[Effect] = (),
+        *,
+        size: int = FLUX_SIZE,
+        side: float = FLUX_WINDOW,
+        samples: int = 20,
     ) -> Tensor:
         """What would be measured of the same light: flux images (B, size, size) about their own centres, sum 100.
 
-        As a measurement has it: what the camera shows of the whole target, and of that the window about its centre of
-        mass. Where no effect of a camera acts and the target shows all, that is the window about the light's.
+        As a measurement has it: what the camera shows of the whole target, and of that the window of ``side`` [m] about
+        its centre of mass. Where no effect of a camera acts and the target shows all, that is the window about the
+        light's.
         """
         view, declared = View(samples=samples), optics or Optics()
 
         def measured(group: Group, window: Window, there: Sequence[Effect], rows: list[int]) -> Tensor:
             flux = view.trace(group.scene.subset(rows), window, optics_under(there, declared))
-            return _measured(flux, window, there, size)
+            return _measured(flux, window, there, size, side)
 
-        return self._each_part(_flux_windows(effects, size), of_stage(effects, "optics", "image"), measured)
+        return self._each_part(_flux_windows(effects, size, side), of_stage(effects, "optics", "image"), measured)
 
     def flux_changes(
         self,
@@ -313,6 +321,7 @@ class Aligned:
         effects: Sequence[Effect] = (),
         *,
         size: int = FLUX_SIZE,
+        side: float = FLUX_WINDOW,
         samples: int = 20,
     ) -> Tensor:
         """`flux_images` (K + 1, B, size, size) as they are, and to first order after each of K changes of the heights.
@@ -327,10 +336,10 @@ class Aligned:
             heights = sensitivity(scene, window, effective, samples=samples, padding=view.padding)
             changes = (directions.flatten(1) @ heights.flatten(1)).view(-1, *flux.shape)
             images = flux + torch.cat([torch.zeros_like(flux)[None], changes])
-            seen = _measured(images.flatten(0, 1), window, there, size)
+            seen = _measured(images.flatten(0, 1), window, there, size, side)
             return seen.view(-1, len(rows), size, size).transpose(0, 1)
 
-        windows, acting_there = _flux_windows(effects, size), of_stage(effects, "optics", "image")
+        windows, acting_there = _flux_windows(effects, size, side), of_stage(effects, "optics", "image")
         return self._each_part(windows, acting_there, measured).transpose(0, 1)
 
     def _each_part(
@@ -348,12 +357,12 @@ class Aligned:
         return torch.cat(parts)[torch.as_tensor(places).argsort()]
 
 
-def _flux_windows(effects: Sequence[Effect], size: int) -> Callable[[Group], list[Window]]:
-    """What is traced of a group's targets for flux images of ``size`` pixels.
+def _flux_windows(effects: Sequence[Effect], size: int, side: float) -> Callable[[Group], list[Window]]:
+    """What is traced of a group's targets for flux images of ``size`` pixels over ``side`` [m].
 
     The window about the spot; the whole target where that ends within the spot, or effects of a camera act.
     """
-    view, pixel = View(size, size, window=FLUX_WINDOW), FLUX_WINDOW / size
+    view, pixel = View(size, size, window=side), side / size
     camera = bool(of_stage(effects, "image"))
 
     def windows(group: Group) -> list[Window]:
@@ -367,11 +376,11 @@ def _flux_windows(effects: Sequence[Effect], size: int) -> Callable[[Group], lis
     return windows
 
 
-def _measured(flux: Tensor, window: Window, effects: Sequence[Effect], size: int) -> Tensor:
+def _measured(flux: Tensor, window: Window, effects: Sequence[Effect], size: int, side: float) -> Tensor:
     """Flux images (B, size, size), sum 100, of what cameras with effects show of ``flux`` (B, rows, columns)."""
     if window.on_spot:
         return normalized(flux)
-    return normalized(centered(images_under(effects, flux, window).clamp(min=0), window, size))
+    return normalized(centered(images_under(effects, flux, window).clamp(min=0), window, size, side))
 
 
 def _in_order(parts: Sequence[Array], groups: Sequence[Group]) -> Array:

@@ -18,9 +18,9 @@ BLACK = 0.01
 """Noise that cannot go below black lifts pixels up to this flux [of the peak]."""
 
 
-def nuisances(images: Tensor) -> Tensor:
-    """Directions (..., 7, R, R) in which cameras may change images (..., R, R), each as long as its deviation."""
-    pixel, peak = FLUX_WINDOW / images.shape[-1], images.amax(dim=(-2, -1), keepdim=True)
+def nuisances(images: Tensor, side: float = FLUX_WINDOW) -> Tensor:
+    """Directions (..., 7, R, R) in which cameras may change images (..., R, R) of ``side`` [m], of standard length."""
+    pixel, peak = side / images.shape[-1], images.amax(dim=(-2, -1), keepdim=True)
     up, right = torch.gradient(images, spacing=pixel, dim=(-2, -1))
     (up_twice,), (right_twice,) = (torch.gradient(g, spacing=pixel, dim=d) for g, d in ((up, -2), (right, -1)))
     relative = (images / peak).clamp(min=1e-4)

@@ -12,7 +12,7 @@ from torch import Tensor
 from model.effects import Effect
 from model.errors import InvalidInputError
 from model.forecast import Aligned, Setup, align
-from model.images import FLUX_SHAPE, FLUX_SIZE, binned, clipped_alike, normalized
+from model.images import FLUX_SHAPE, FLUX_SIZE, FLUX_WINDOW, binned, clipped_alike, normalized
 from model.metrics import flux_accuracy
 from model.plant import Heliostat, TargetPlane
 from model.surface import control_points
@@ -37,7 +37,7 @@ class Observation:
     Attributes
     ----------
     flux : (64, 64)
-        4 m x 4 m about the spot's centre of mass, sum 100.
+        A square about the spot's centre of mass, sum 100.
     sun : (3,)
         Unit vector towards the sun in ENU.
     target : TargetPlane
@@ -49,6 +49,8 @@ class Observation:
         Share of each pixel that the camera's range cut off, where it did: there was at least so much light.
     taken_at : datetime or None
         When, where that is known.
+    side : float [m]
+        Of the square.
     """
 
     flux: NDArray[np.float32]
@@ -59,6 +61,7 @@ class Observation:
     motor_position: NDArray[np.float64] | None = None
     clipped: NDArray[np.float32] | None = None
     taken_at: datetime | None = None
+    side: float = FLUX_WINDOW
 
     @property
     def clipped_share(self) -> float:
@@ -176,6 +179,22 @@ def align_observations(
     return align(setups, effects, latitude_deg=latitude_deg, start=start)
 
 
+def common_side(observations: Sequence[Observation]) -> float:
+    """Side [m] of the squares that all of a heliostat's observations show.
+
+    Raises
+    ------
+    InvalidInputError
+        Where they differ.
+    """
+    sides = sorted({o.side for o in observations})
+    if len(sides) > 1:
+        raise InvalidInputError(
+            f"flux images of one heliostat must show squares of one size, got sides {sides} m; cut all to the largest"
+        )
+    return sides[0]
+
+
 class Ranges:
     """Where the camera's range cut off M observations; forecasts of them are cut off there, too.
 
@@ -211,7 +230,8 @@ def render_observations(
     """What the M photographs would show of a surface ``z`` (4, 8, 8) [m]: (M, 64, 64), sum 100."""
     with torch.no_grad():
         aligned = align_observations(heliostat, observations, z, effects, latitude_deg=latitude_deg)
-        return Ranges(observations).seen(aligned.flux_images(optics, effects, samples=samples)).double().numpy()
+        images = aligned.flux_images(optics, effects, side=common_side(observations), samples=samples)
+        return Ranges(observations).seen(images).double().numpy()
 
 
 def spread_suns(suns: NDArray[np.float64], count: int) -> list[int]:

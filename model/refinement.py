@@ -40,7 +40,15 @@ from model.images import COARSE_SIZE, binned
 from model.least_squares import Descent, Minimum, minimize
 from model.network.inputs import STEP_HEIGHT
 from model.nuisances import nuisances
-from model.observation import Observation, Ranges, SurfacePrediction, align_observations, misfits, spread_suns
+from model.observation import (
+    Observation,
+    Ranges,
+    SurfacePrediction,
+    align_observations,
+    common_side,
+    misfits,
+    spread_suns,
+)
 from model.plant import Heliostat
 from model.prior import SurfacePrior, prior_of
 from model.surface import control_points, require_own_grid
@@ -114,20 +122,21 @@ class _Weights:
     """What a change of M images weighs, where bands of frequency err by ``sigma`` (M, 5), or (1, 5) in all alike.
 
     With residual r = J dc + N n + noise and n ~ N(0, 1), the noise covariance is S + N N'. Its inverse root is known:
-    the nuisances' directions, made orthogonal in units of S, shrink. S and N are those of ``images`` (M, R, R) of a
-    surface near the one that is looked for. They stay while it is, or what is minimised would not be what was
-    differentiated; and they come of no photograph, or its noise would be weighed with itself.
+    the nuisances' directions, made orthogonal in units of S, shrink. S and N are those of ``images`` (M, R, R),
+    over ``side`` [m], of a surface near the one that is looked for. They stay while it is, or what is minimised would
+    not be what was differentiated; and they come of no photograph, or its noise would be weighed with itself. Errors
+    grow with the flux from ``dark`` [of the peak] on.
     """
 
-    def __init__(self, images: Array, sigma: Array, options: RefinementOptions) -> None:
+    def __init__(self, images: Array, sigma: Array, dark: float, side: float) -> None:
         size, peak = images.shape[-1], images.max(axis=(1, 2), keepdims=True)
         frequency = np.hypot(*np.meshgrid(np.arange(size), np.arange(size)))
         self._kept = frequency < BANDS[-1]
         self._cosines = dct(np.eye(size), axis=0, norm="ortho")
         self.bands = np.digitize(frequency[self._kept], BANDS)
-        self._scale = peak * np.sqrt(np.clip(images / peak, 0, None) + options.dark)
+        self._scale = peak * np.sqrt(np.clip(images / peak, 0, None) + dark)
         self._sigma = sigma[:, self.bands]
-        free = self._white(nuisances(torch.as_tensor(images)).numpy().swapaxes(0, 1))
+        free = self._white(nuisances(torch.as_tensor(images), side).numpy().swapaxes(0, 1))
         _, singular, self._directions = np.linalg.svd(free.swapaxes(0, 1), full_matrices=False)
         self._shrunk = 1 - 1 / np.sqrt(1 + singular**2)
 
@@ -169,7 +178,7 @@ class _Posterior:
     ) -> None:
         self.heliostat, self.observations, self.prior, self.options = heliostat, observations, prior, options
         self.optics, self.effects, self.latitude_deg = optics, effects, latitude_deg
-        self.ranges = Ranges(observations, options.resolution)
+        self.ranges, self.side = Ranges(observations, options.resolution), common_side(observations)
         flux = np.array([o.flux for o in observations], dtype=np.float64)
         self.measured = binned(flux, options.resolution)
         # The same height for each direction: small enough for images to be linear in it, large enough to stand out from
@@ -189,22 +198,28 @@ class _Posterior:
 
     def jacobian(self, state: _State) -> NDArray[Any]:
         """Change of the images per coefficient (K, M, R, R)."""
-        size, samples = self.options.resolution, self.options.samples
+        size, side, samples = self.options.resolution, self.side, self.options.samples
         with torch.no_grad():
-            images = state.aligned.flux_changes(self.changes, self.optics, self.effects, size=size, samples=samples)
+            images = state.aligned.flux_changes(
+                self.changes, self.optics, self.effects, size=size, side=side, samples=samples
+            )
             images = self.ranges.seen(images)
             changes: NDArray[Any] = (images[1:] - images[:1]).numpy()
         return np.asarray(changes / self.steps[:, None, None, None])
 
+    def weights(self, state: _State, belief: "_Belief") -> _Weights:
+        """What changes of a state's images weigh."""
+        return _Weights(state.images, belief.sigma, self.options.dark, self.side)
+
     def optimum(self, state: _State, belief: "_Belief", jacobian: NDArray[Any] | None = None) -> Minimum[_State]:
         """The highest density near a state; its Jacobian saves one."""
-        weights = _Weights(state.images, belief.sigma, self.options)
+        weights = self.weights(state, belief)
         descent = replace(DESCENT, steps=self.options.steps)
         return minimize(_Problem(self, weights, belief.precision), state, descent, jacobian)
 
     def fit(self, state: _State, jacobian: NDArray[Any], belief: "_Belief") -> "_Fit":
         """What there is to say of a state that was found with a belief."""
-        weights = _Weights(state.images, belief.sigma, self.options)
+        weights = self.weights(state, belief)
         return _Fit(belief, jacobian, weights(jacobian), weights(self.measured - state.images), weights.bands)
 
     def facet_light(self, state: _State, fit: "_Fit") -> tuple[Array, Array]:
@@ -212,7 +227,7 @@ class _Posterior:
 
         Traced with each facet a little dimmed, and estimated with the surface, which may bend instead, to first order.
         """
-        weights = _Weights(state.images, fit.belief.sigma, self.options)
+        weights = self.weights(state, fit.belief)
         count = len(self.prior.mean)
         dimmed = 1 - DIMMING * np.eye(count)
         images = [self._images(state.aligned.soiled(torch.as_tensor(facets))) for facets in dimmed]
@@ -220,9 +235,10 @@ class _Posterior:
 
     def _images(self, aligned: Aligned) -> Array:
         """Images (M, R, R) of aligned mirrors, as the cameras show them."""
-        size, samples = self.options.resolution, self.options.samples
+        size, side, samples = self.options.resolution, self.side, self.options.samples
         with torch.no_grad():
-            images = self.ranges.seen(aligned.flux_images(self.optics, self.effects, size=size, samples=samples))
+            images = aligned.flux_images(self.optics, self.effects, size=size, side=side, samples=samples)
+            images = self.ranges.seen(images)
         return np.asarray(images.double().numpy())
 
     def settled(

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from model.images import binned
+from model.images import FLUX_WINDOW, binned
 from model.nuisances import nuisances
 from model.surface import sample
 from model.tracing.scene import Scene
@@ -34,7 +34,7 @@ STEP_HEIGHT = 3e-5
 """Height [m, root mean square] by which a surface is changed to take a difference of its images."""
 
 
-def descents(trace: Callable[[Tensor], Tensor], flux: Tensor, basis: Tensor) -> Tensor:
+def descents(trace: Callable[[Tensor], Tensor], flux: Tensor, basis: Tensor, side: float = FLUX_WINDOW) -> Tensor:
     """A step towards the surface that threw the images, in each image's share: heights (B, M, 4, 8, 8) [m].
 
     Some steps of conjugate gradients to the most probable surface by a prior, images taken as linear in it. What a
@@ -50,6 +50,8 @@ def descents(trace: Callable[[Tensor], Tensor], flux: Tensor, basis: Tensor) -> 
         The measured images, sum 100.
     basis : Tensor (K, 4, 8, 8) [m]
         Directions of the prior, each as long as its standard deviation.
+    side : float [m]
+        Of what the images show.
     """
     directions = basis.flatten(1)
     with torch.enable_grad():
@@ -58,7 +60,7 @@ def descents(trace: Callable[[Tensor], Tensor], flux: Tensor, basis: Tensor) -> 
     guessed, measured = traced.detach(), binned(flux, traced.shape[-1])
     peak = measured.amax(dim=(2, 3), keepdim=True)
     unit = DESCENT_NOISE * peak * torch.sqrt((guessed / peak).clamp(min=0) + DARK)
-    free = (nuisances(guessed) / unit[:, :, None]).flatten(3)
+    free = (nuisances(guessed, side) / unit[:, :, None]).flatten(3)
     gram = torch.linalg.cholesky(free @ free.transpose(-1, -2) + torch.eye(free.shape[2], device=flux.device))
 
     def weighed(residual: Tensor) -> Tensor:
@@ -99,12 +101,13 @@ def _project(vectors: Tensor, direction: Tensor) -> Tensor:
     return vectors[..., :2] - direction[..., :2] * (vectors[..., 2] / direction[..., 2])[..., None]
 
 
-def conditions(scene: Scene) -> Tensor:
-    """Conditions (B, 12) of images taken with a scene of ideal surfaces.
+def conditions(scene: Scene, side: float = FLUX_WINDOW) -> Tensor:
+    """Conditions (B, 12) of images of ``side`` [m] taken with a scene of ideal surfaces.
 
-    All have about unit scale: how a slope along the mirror's x and y moves light on the target, per slant range and
-    with the factor two of reflection taken out (4 numbers); how a place on the mirror moves it (4); the logarithm of
-    the slant range over 100 m; the cosine of incidence; the ideal canting across x and y [5 mrad].
+    Larger images are told as those of `FLUX_WINDOW` that look the same: of a smaller mirror, and nearer. All have about
+    unit scale: how a slope along the mirror's x and y moves light on the target, per slant range and with the factor
+    two of reflection taken out (4 numbers); how a place on the mirror moves it (4); the logarithm of the slant range
+    over 100 m; the cosine of incidence; the ideal canting across x and y [5 mrad].
     """
     control_points, center, sun = scene.in_plane()
     axes = (scene.plane_axes @ scene.attitude).transpose(1, 2)
@@ -113,15 +116,14 @@ def conditions(scene: Scene) -> Tensor:
     normal = axes[:, 2]
     cosine = (normal * sun).sum(-1, keepdim=True)
     beam = 2 * cosine * normal - sun
-    slant = center[:, 2] / -beam[:, 2]
+    scale = FLUX_WINDOW / side
+    distance = torch.log(center[:, 2] / -beam[:, 2] * scale / 100)
     shifts, slopes = [], []
     for axis in (axes[:, 0], axes[:, 1]):
         turned = -(axis * sun).sum(-1, keepdim=True) * normal - cosine * axis
         slopes.append(_project(turned, beam))
-        shifts.append(_project(axis, beam))
-    return torch.cat(
-        [*slopes, *shifts, torch.log(slant / 100)[:, None], cosine, _canting(mirror.area_vectors, axes) / 5e-3], dim=1
-    )
+        shifts.append(_project(axis, beam) * scale)
+    return torch.cat([*slopes, *shifts, distance[:, None], cosine, _canting(mirror.area_vectors, axes) / 5e-3], dim=1)
 
 
 def _canting(area_vectors: Tensor, axes: Tensor) -> Tensor:

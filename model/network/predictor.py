@@ -26,7 +26,7 @@ from model.network.inputs import (
     conditions,
     descents,
 )
-from model.observation import Observation, Ranges, SurfacePrediction, align_observations, misfits
+from model.observation import Observation, Ranges, SurfacePrediction, align_observations, common_side, misfits
 from model.plant import Heliostat
 from model.prior import default_prior
 from model.surface import control_points, mirrored, require_own_grid
@@ -129,7 +129,7 @@ class SurfacePredictor:
             mahalanobis=default_prior().mahalanobis(z),
             doubts=(
                 *doubts.of_the_situation(heliostat, observations),
-                *doubts.of_the_facets(heliostat),
+                *doubts.of_the_network(heliostat, observations),
                 *doubts.of_canting(default_prior(), z),
             ),
         )
@@ -153,6 +153,7 @@ class _NetworkInputs:
         self.normals = torch.as_tensor(heliostat.facet_normals, dtype=torch.float32)
         self.basis = torch.as_tensor(default_prior().basis, dtype=torch.float32)
         self.ranges = {size: Ranges(observations, size) for size in (FLUX_SIZE, COARSE_SIZE)}
+        self.side = common_side(observations)
         self.aligned: Aligned | None = None
 
     def inputs(self, z: Array) -> dict[str, NDArray[Any]]:
@@ -164,7 +165,7 @@ class _NetworkInputs:
         self.aligned = aligned
         with torch.no_grad():
             guess_flux = self._images(aligned, FLUX_SIZE, GUESS_SAMPLES)
-        descent = descents(partial(self._changed, aligned), self.flux[None], self.basis)[0]
+        descent = descents(partial(self._changed, aligned), self.flux[None], self.basis, self.side)[0]
         return {
             "flux": _filled(self.flux.numpy()),
             "conditions": _filled(self._conditions(aligned).numpy()),
@@ -176,7 +177,7 @@ class _NetworkInputs:
 
     def _images(self, aligned: Aligned, size: int, samples: int) -> Tensor:
         """Images (M, size, size), sum 100, of aligned mirrors, as the cameras show them."""
-        images = aligned.flux_images(self.optics, self.effects, size=size, samples=samples)
+        images = aligned.flux_images(self.optics, self.effects, size=size, side=self.side, samples=samples)
         return self.ranges[size].seen(images)
 
     def _changed(self, aligned: Aligned, changes: Tensor) -> Tensor:
@@ -187,7 +188,7 @@ class _NetworkInputs:
     def _conditions(self, aligned: Aligned) -> Tensor:
         """`conditions` (M, 12) of the ideal mirror as the guess is aligned, as in training."""
         scene = aligned.groups[0].scene
-        return conditions(scene.with_(control_points=self.ideal.expand_as(scene.control_points)))
+        return conditions(scene.with_(control_points=self.ideal.expand_as(scene.control_points)), self.side)
 
 
 def mirrored_inputs(inputs: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:

@@ -32,7 +32,7 @@ from service.sources.files import require_regular
 from service.sources.folder import MeasurementFolder, measured_heights, read_surface
 from service.twin import compute
 from service.twin.consensus import agreeing
-from service.twin.evidence import Evidence, choose
+from service.twin.evidence import Evidence, as_observations, choose
 
 Array = NDArray[np.float64]
 
@@ -170,10 +170,10 @@ def observations_of(folder: MeasurementFolder, heliostat: str) -> tuple[list[Obs
     usable, refused = [], {}
     for measurement in folder.measurements(heliostat):
         try:
-            usable.append(evidence_of(folder, measurement).observation())
+            usable.append(evidence_of(folder, measurement))
         except InvalidInputError as error:
             refused[measurement.identifier] = str(error)
-    return usable, refused
+    return as_observations(usable), refused
 
 
 def predict_heliostat(

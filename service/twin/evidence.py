@@ -14,11 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy.orm import Session
 
+from model import doubts
 from model.errors import InvalidInputError
 from model.forecast import Setup
 from model.frames import sun_direction, wgs84_to_enu
 from model.images import FLUX_WINDOW
-from model.imaging.window import share_window
+from model.imaging.window import flux_window, share_window
+from model.metrics import WINDOWS
 from model.observation import Observation, spread_suns
 from model.plant import Heliostat, TargetPlane
 from model.study import FluxImage
@@ -78,23 +80,32 @@ class Evidence:
     clipped: NDArray[np.bool_] | None = None
     sheet_share: float = 0.0
 
-    def observation(self) -> Observation:
-        """What it shows of the mirror."""
+    def observation(self, side: float = FLUX_WINDOW) -> Observation:
+        """What a square of ``side`` [m] about its spot shows of the mirror; others than `FLUX_WINDOW` need ``flux``."""
         return Observation(
-            flux=self.centered,
+            flux=self.centered if side == FLUX_WINDOW else self._about_spot(side),
             sun=self.sun,
             center_of_mass=np.array(self.target.center) if self.spot is None else self.spot,
             target=self.target,
             motor_position=self.motor_position,
             identifier=self.identifier,
-            clipped=self._clipped_about_spot(),
+            clipped=self._clipped_about_spot(side),
             taken_at=self.taken_at,
+            side=side,
         )
 
-    def _clipped_about_spot(self) -> NDArray[np.float32] | None:
+    def _about_spot(self, side: float) -> NDArray[np.float32]:
+        if self.flux is None or self.spot is None:
+            raise InvalidInputError(f"{self.identifier}: a centred flux cannot be cut to {side:g} m")
+        size = self.target.width, self.target.height
+        cut = flux_window(self.flux, size, self.target.to_plane(self.spot), side)
+        return np.asarray(cut / cut.sum() * 100, dtype=np.float32)
+
+    def _clipped_about_spot(self, side: float) -> NDArray[np.float32] | None:
         if self.clipped is None or self.spot is None:
             return None
-        return share_window(self.clipped, (self.target.width, self.target.height), self.target.to_plane(self.spot))
+        size = self.target.width, self.target.height
+        return share_window(self.clipped, size, self.target.to_plane(self.spot), side)
 
     def photograph(self, heliostat: Heliostat, points: Array, degree: int = DEGREE, seen: bool = False) -> FluxImage:
         """It as a study compares it with the mirror of control points (F, I, J, 3) [m].
@@ -120,6 +131,22 @@ class Evidence:
         return FluxImage(
             shot, np.asarray(image, dtype=np.float64), seen=seen, clipped=clipped, sheet_share=self.sheet_share
         )
+
+
+def as_observations(evidence: Sequence[Evidence]) -> list[Observation]:
+    """What a heliostat's photographs show, in the smallest of `WINDOWS` that their spots do not spill out of.
+
+    None is larger than a target; photographs of which only the part about the spot is known leave it at the smallest.
+    """
+    observations = [one.observation() for one in evidence]
+    if any(one.flux is None for one in evidence):
+        return observations
+    widest = min((min(one.target.width, one.target.height) for one in evidence), default=0.0)
+    for side in WINDOWS[1:]:
+        if side > widest or not doubts.spilt(observations):
+            break
+        observations = [one.observation(side) for one in evidence]
+    return observations
 
 
 def choose(

@@ -15,7 +15,15 @@ from service.store.decisions import Grounds
 from service.store.keys import RESERVED
 from service.store.tables import DecisionRow, MeasurementRow, SurfaceRow
 from service.twin.consensus import agreeing
-from service.twin.evidence import Twin, choose, choose_measurements, evidence_of, load_twin, named_measurements
+from service.twin.evidence import (
+    Twin,
+    as_observations,
+    choose,
+    choose_measurements,
+    evidence_of,
+    load_twin,
+    named_measurements,
+)
 from service.twin.judging import Judgement, judge_surface
 from service.twin.runtime import Operations, Runtime
 
@@ -68,7 +76,7 @@ def compute_surface(
         if measurements is None:
             observations = _chosen(operations, twin, rows, images)
         else:
-            observations = [evidence_of(row, twin.origin).observation() for row in rows]
+            observations = as_observations([evidence_of(row, twin.origin) for row in rows])
         surface = operations.predict(
             twin.heliostat,
             observations,
@@ -88,7 +96,7 @@ def compute_surface(
 def _chosen(operations: Operations, twin: Twin, rows: Sequence[MeasurementRow], images: int) -> list[Observation]:
     """Up to ``images`` of what the candidates show, without those that contradict the others."""
     in_time = sorted(rows, key=lambda row: row.taken_at or row.created_at)
-    observations = [evidence_of(row, twin.origin).observation() for row in in_time]
+    observations = as_observations([evidence_of(row, twin.origin) for row in in_time])
     model = twin.model.optics, twin.model.effects
     kept, _ = agreeing(operations, twin.heliostat, observations, *model, latitude_deg=twin.origin[0])
     return choose(kept[::-1], images)

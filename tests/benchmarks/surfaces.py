@@ -9,6 +9,9 @@ Real: AA39 of two years, from sets of its photographs, some of which contradict 
 photographs that no set holds. Errors are those of the control heights, the mirror's tilt and canting counted. AC43 is
 STJ-012 of the measured surfaces, from which neither network nor prior has learnt.
 
+``--only far``: the same surfaces on heliostats 300 to 600 m away, whose spots spill out of the smallest window, by
+images of that and of the one that is chosen, on a target that holds all.
+
 ``--only photographs``: what AA39's surfaces gain by photographs that the camera's range clipped or the target cut, and
 whether photographs of other days take its deflectometry nearer to those of a day. Days are dealt out to two halves;
 surfaces from photographs of either are judged by all photographs of the other.
@@ -24,8 +27,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from model.images import FLUX_SHAPE, normalized
-from model.metrics import surface_error
+from model.doubts import spilt
+from model.images import FLUX_SHAPE, FLUX_WINDOW, normalized
+from model.metrics import WINDOWS, surface_error
 from model.network.predictor import default_predictor
 from model.observation import (
     Observation,
@@ -50,6 +54,7 @@ Array = NDArray[np.float64]
 MIRRORS = ("AA28", "AA39", "AC43")
 IMAGES = 8
 NOISE = 0.01
+FAR = (300.0, 400.0, 600.0)
 WITHIN_90 = 1.645
 BRIGHT = 0.3
 """Share of a spot's brighter half that may be cut off for a photograph to be taken here."""
@@ -83,13 +88,18 @@ def truth_of(folder: MeasurementFolder, name: str) -> tuple[Heliostat, Array]:
 
 
 def photographed(
-    heliostat: Heliostat, z: Array, setups: list[Observation], rays: int, rng: np.random.Generator
+    heliostat: Heliostat,
+    z: Array,
+    setups: list[Observation],
+    rays: int,
+    rng: np.random.Generator,
+    side: float = FLUX_WINDOW,
 ) -> list[Observation]:
-    """What an 8-bit camera with noise sees of Monte Carlo light."""
-    images, _ = trace_montecarlo(scene_of(heliostat, setups, [z]), Window(on_spot=True), rays=rays)
+    """What an 8-bit camera with noise sees of Monte Carlo light in squares of ``side`` [m]."""
+    images, _ = trace_montecarlo(scene_of(heliostat, setups, [z]), Window(side, side, on_spot=True), rays=rays)
     seen = images / images.max(axis=(1, 2), keepdims=True) + rng.normal(0, NOISE, images.shape)
     flux = normalized(np.round(seen.clip(0, 1) * 255)).astype(np.float32)
-    return [replace(setup, flux=image) for setup, image in zip(setups, flux, strict=True)]
+    return [replace(setup, flux=image, side=side) for setup, image in zip(setups, flux, strict=True)]
 
 
 def spread(observations: list[Observation], count: int) -> list[Observation]:
@@ -150,6 +160,34 @@ def enlarged(heliostat: Heliostat, factor: float) -> Heliostat:
     """A heliostat whose facets, and the distances between them, are so many times as large."""
     facets = (Facet(factor * f.position, factor * f.canting_x, factor * f.canting_y) for f in heliostat.facets)
     return replace(heliostat, facets=tuple(facets))
+
+
+def far(folder: MeasurementFolder, years: MeasurementFolder, rays: int) -> None:
+    """Print errors of heliostats whose spots are larger than the smallest window."""
+    print(f"North of the tower, canted to their distance; Monte Carlo, {rays:.0e} rays, {IMAGES} images\n{HEAD}")
+    places = [replace(o, target=replace(o.target, width=16.0, height=16.0)) for o in places_of(years, IMAGES)]
+    for distance in FAR:
+        heliostat = Heliostat.juelich("far", (0.0, distance, 1.8), distance)
+        for name in MIRRORS:
+            _, truth = truth_of(folder, name)
+            taken: list[Observation] = []
+            for side in WINDOWS:
+                taken = photographed(heliostat, truth, places, rays, np.random.default_rng(1), side)
+                fits = not spilt(taken)
+                if fits or side == FLUX_WINDOW:
+                    label = f"{name} at {distance:.0f} m, {side:g} m"
+                    row(
+                        f"{label}, network",
+                        lambda h=heliostat, o=taken: default_predictor().predict(h, o, latitude_deg=JUELICH_LATITUDE),
+                        truth,
+                    )
+                    row(
+                        f"{label}, refined",
+                        lambda h=heliostat, o=taken: refine(h, o, latitude_deg=JUELICH_LATITUDE),
+                        truth,
+                    )
+                if fits:
+                    break
 
 
 def scaling(folder: MeasurementFolder, years: MeasurementFolder, rays: int) -> None:
@@ -260,7 +298,7 @@ def main(arguments: list[str]) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rays", type=int, default=3_000_000)
     parser.add_argument("--scaling", action="store_true")
-    parser.add_argument("--only", choices=("rendered", "real", "photographs"))
+    parser.add_argument("--only", choices=("rendered", "far", "real", "photographs"))
     options = parser.parse_args(arguments)
     root: Path = data_folder()
     if not (root.parent / "stj-years").is_dir():
@@ -269,6 +307,9 @@ def main(arguments: list[str]) -> None:
     folder, years = read_folder(root), read_folder(root.parent / "stj-years")
     if options.only == "photographs":
         photographs(years)
+        return
+    if options.only == "far":
+        far(folder, years, options.rays)
         return
     if options.only != "real":
         rendered(folder, years, options.rays)

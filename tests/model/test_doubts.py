@@ -48,9 +48,9 @@ def test_far_mirrors_are_named_with_their_spots():
 
 def test_facets_of_another_size_and_clipped_photographs_are_named():
     large = [Facet(f.position, 1.5 * f.canting_x, f.canting_y) for f in near().facets]
-    (said,) = doubts.of_the_facets(replace(near(), facets=tuple(large)))
+    (said,) = doubts.of_the_network(replace(near(), facets=tuple(large)), seen(near()))
     assert "2.41 m x 1.28 m" in said
-    assert doubts.of_the_facets(near()) == []
+    assert doubts.of_the_network(near(), seen(near())) == []
     (said,) = doubts.of_the_situation(near(), seen(near(), clipped=np.ones((64, 64), np.float32)))
     assert "beyond the camera's range" in said
 

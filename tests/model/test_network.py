@@ -9,11 +9,19 @@ import pytest
 import torch
 
 from model.errors import InvalidInputError
+from model.frames import sun_direction
 from model.network.architecture import CONDITIONS, MAX_IMAGES, NetworkConfig, SurfaceNetwork
 from model.network.inputs import conditions
-from model.network.predictor import INPUTS, SurfacePredictor, default_predictor, mirrored_inputs, model_card
+from model.network.predictor import (
+    INPUTS,
+    SurfacePredictor,
+    _NetworkInputs,
+    default_predictor,
+    mirrored_inputs,
+    model_card,
+)
 from model.observation import Observation, spread_suns
-from model.plant import JUELICH_LATITUDE, TargetPlane
+from model.plant import JUELICH_LATITUDE, Facet, TargetPlane
 from model.prior import default_prior
 from model.refinement import refine
 from model.surface import control_points, mirrored
@@ -90,6 +98,28 @@ def test_conditions_say_how_slopes_and_places_move_light():
     np.testing.assert_allclose(told[6:8], place, atol=5e-3)
     assert told.shape == (CONDITIONS,)
     assert told[8] == pytest.approx(np.log(float(rays[0].slant_range) / 100), abs=1e-3)
+
+
+def test_what_is_twice_as_large_and_as_far_is_told_alike():
+    """A world enlarged by two, in images of twice the side, looks the same; its mirror has twice as many metres."""
+    small, plane = flat_heliostat((25.0, 70.0, 0.0), focal_length=80.0), target(center=(0.0, 0.0, 0.0))
+    facets = (Facet(2 * f.position, 2 * f.canting_x, 2 * f.canting_y) for f in small.facets)
+    large = replace(small, position=2 * small.position, facets=tuple(facets))
+    suns = np.array([sun_direction(azimuth, 40.0) for azimuth in (-40.0, 0.0, 40.0)])
+    blank = np.ones((64, 64), np.float32)
+    told = []
+    for heliostat, side in ((small, 4.0), (large, 8.0)):
+        seen = [Observation(blank, sun, plane, plane.center, "1", side=side) for sun in suns]
+        told.append(_NetworkInputs(heliostat, seen, None, (), JUELICH_LATITUDE).inputs(np.zeros((4, 8, 8))))
+    told[1]["conditions"][..., 4:8] *= 2
+    for name in ("conditions", "guess_flux"):
+        np.testing.assert_allclose(told[1][name], told[0][name], atol=2e-3, err_msg=name)
+
+
+def test_images_of_several_sides_are_refused():
+    sides = [replace(observation(str(side)), side=side) for side in (4.0, 6.0)]
+    with pytest.raises(InvalidInputError, match=r"one size, got sides \[4.0, 6.0\] m"):
+        refine(flat_heliostat(focal_length=75.0), sides, latitude_deg=JUELICH_LATITUDE)
 
 
 def test_a_descent_leads_towards_the_surface_that_threw_the_images():
