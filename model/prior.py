@@ -193,5 +193,7 @@ def orthogonal(directions: Array) -> Array:
     """Orthogonal directions (K, F, I, J) [m] of the same covariance, the longest first, their largest height up."""
     flat = directions.reshape(len(directions), -1)
     _, singular, axes = np.linalg.svd(flat, full_matrices=False)
-    signs = np.sign(axes[np.arange(len(axes)), np.abs(axes).argmax(axis=1)])
+    # Symmetric directions have two or four largest heights, which are equal but for rounding: the first decides.
+    largest = np.abs(axes) > (1 - 1e-6) * np.abs(axes).max(axis=1, keepdims=True)
+    signs = np.sign(axes[np.arange(len(axes)), largest.argmax(axis=1)])
     return np.asarray(((signs * singular)[:, None] * axes)[singular > 1e-9].reshape(-1, *directions.shape[1:]))
