@@ -34,7 +34,7 @@ serve: install ## the service on http://127.0.0.1:8000
 bench: install ## the figures of RESULTS.md
 	$(BIN)/python -m tests.benchmarks
 
-train: install ## the shipped weights from scratch, in an hour: network, prior, export, evaluation; resumes what is in RUN
+train: install ## the shipped weights from scratch: network, prior, export, evaluation; resumes what is in RUN
 	$(BIN)/python -m training.train --config training/configs/best.json --run $(RUN)
 	$(BIN)/python -m training.prior --run $(RUN)
 	$(BIN)/python -m training.export --run $(RUN)
