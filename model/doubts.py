@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model.images import FLUX_SIZE, FLUX_WINDOW
-from model.observation import Observation
+from model.observation import Observation, common_side
 from model.plant import Heliostat
 from model.prior import MEASURED_FACET, SurfacePrior, of_measured_kind
 from model.surface import canting_rises
@@ -64,10 +64,9 @@ def of_the_network(heliostat: Heliostat, observations: Sequence[Observation]) ->
         doubts.append(
             f"its facets of {width:.2f} m x {height:.2f} m are not of the size that the network learnt from ({known} m)"
         )
-    if observations[0].side != FLUX_WINDOW:
-        doubts.append(
-            f"its spots fill a window of {observations[0].side:g} m; the network learnt from {FLUX_WINDOW:g} m"
-        )
+    side = common_side(observations)
+    if side != FLUX_WINDOW:
+        doubts.append(f"its spots fill a window of {side:g} m; the network learnt from {FLUX_WINDOW:g} m")
     return doubts
 
 

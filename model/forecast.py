@@ -146,7 +146,7 @@ def images_under(effects: Iterable[Effect], flux: Tensor, window: Window) -> Ten
     return flux
 
 
-def centered(images: Tensor, whole: Window, size: int, side: float = FLUX_WINDOW) -> Tensor:
+def centered(images: Tensor, whole: Window, size: int, side: float) -> Tensor:
     """Energy (B, size, size) of images (B, rows, columns) in windows of ``side`` [m] about their centres of mass.
 
     As `model.imaging.window.flux_window` cuts measured images, differentiable.

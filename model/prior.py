@@ -19,7 +19,7 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from model.plant import Heliostat
 from model.surface import COLUMNS, ROWS, greville
@@ -149,7 +149,7 @@ def generic_prior(half_sizes: Array) -> SurfacePrior:
     count, half = len(half_sizes), half_sizes.mean(axis=0)
     directions = principal(generic_covariance(half_sizes, FacetKind()), count)
     directions -= directions.mean(axis=(2, 3), keepdims=True)
-    tilts = np.stack([np.tile(slope.reshape(ROWS, COLUMNS), (count, 1, 1)) for slope in _places(half)])
+    tilts = np.repeat(tilt_modes(half)[:, None], count, axis=1)
     mean, nothing = np.zeros_like(tilts[0]), np.zeros_like(tilts[:0])
     return SurfacePrior(mean, orthogonal(without(directions, tilts)), nothing, "generic")
 
@@ -162,7 +162,7 @@ def generic_covariance(half_sizes: Array, kind: FacetKind) -> Array:
     2006, *Gaussian Processes for Machine Learning*, eq. 4.17). Lengths go with the facets' side, slopes do not.
     """
     count, half = len(half_sizes), half_sizes.mean(axis=0)
-    side, (x, y) = 2 * np.sqrt(half.prod()), _places(half)
+    side, (x, y) = 2 * np.sqrt(half.prod()), tilt_modes(half).reshape(2, -1)
     apart = np.sqrt(5) * np.hypot(x[:, None] - x, y[:, None] - y) / (kind.reach * side)
     bending = (kind.bending * side) ** 2 * (1 + apart + apart**2 / 3) * np.exp(-apart)
     canting = kind.canting**2 * (np.outer(x, x) + np.outer(y, y)) + (kind.grain * side) ** 2 * np.eye(len(x))
@@ -170,11 +170,14 @@ def generic_covariance(half_sizes: Array, kind: FacetKind) -> Array:
     return np.asarray(shared + np.kron(np.eye(count), (1 - kind.alike) * bending + canting))
 
 
-def _places(half: Array) -> tuple[Array, Array]:
-    """Where a facet's control points lie: x and y (64,) [m]."""
-    along = (size * (2 * greville(count) - 1) for size, count in zip(half, (ROWS, COLUMNS), strict=True))
-    x, y = np.meshgrid(*along, indexing="ij")
-    return x.ravel(), y.ravel()
+def tilt_modes(half_size: ArrayLike = MEASURED_FACET) -> Array:
+    """Heights (2, 8, 8) [m] of one radian of slope along x and y of a facet of half sides (2,) [m].
+
+    That is where its control points lie.
+    """
+    sides = np.asarray(half_size, dtype=np.float64)
+    along = (half * (2 * greville(count) - 1) for half, count in zip(sides, (ROWS, COLUMNS), strict=True))
+    return np.stack(np.meshgrid(*along, indexing="ij"))
 
 
 def principal(covariance: Array, facets: int) -> Array:

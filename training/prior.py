@@ -24,9 +24,10 @@ from model.prior import (
     generic_prior,
     orthogonal,
     principal,
+    tilt_modes,
 )
 from training.config import TrainConfig
-from training.surfaces import load_part, load_surfaces, split, tilt_modes, untilted, with_symmetries
+from training.surfaces import load_part, load_surfaces, split, untilted, with_symmetries
 
 Array = NDArray[np.float64]
 

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.errors import InvalidInputError
-from model.prior import FREEDOM, MEASURED_FACET, without
-from model.surface import greville, mirrored, split_canting
+from model.prior import FREEDOM, tilt_modes, without
+from model.surface import mirrored, split_canting
 
 Array = NDArray[np.float64]
 
@@ -138,12 +138,6 @@ class Augmentation:
         inward = np.array([[1, -1], [-1, -1], [1, 1], [-1, 1]])
         tilt = rng.normal(0, self.tilt_mrad, (count, 4, 2)) + rng.normal(0, self.focus_mrad, (count, 1, 2)) * inward
         return np.asarray(np.einsum("nfk,kij->nfij", tilt * 1e-3, tilt_modes()))
-
-
-def tilt_modes() -> Array:
-    """Heights (2, 8, 8) [m] of one radian of slope along a facet's x and y (Juelich's facets)."""
-    x, y = np.meshgrid(*(half * (2 * greville(8) - 1) for half in MEASURED_FACET), indexing="ij")
-    return np.stack([x, y])
 
 
 def untilted(z: Array) -> Array:

@@ -155,8 +155,7 @@ class SurfaceNetwork(nn.Module):
             What the guessed surface throws there, likewise.
         guess : Tensor (B, 4, 8, 8) [mm]
         descent : Tensor (B, M, 4, 8, 8) [mm]
-            Each image's share in a step from the guess (`model.network.inputs.descents`), zero
-            where there is no image.
+            Each image's share in a step from the guess (`model.network.inputs.descents`), zero where there is no image.
 
         Returns
         -------

@@ -18,7 +18,7 @@ from model import doubts
 from model.errors import InvalidInputError
 from model.forecast import Setup
 from model.frames import sun_direction, wgs84_to_enu
-from model.images import FLUX_WINDOW
+from model.images import FLUX_WINDOW, normalized
 from model.imaging.window import flux_window, share_window
 from model.metrics import WINDOWS
 from model.observation import Observation, spread_suns
@@ -98,8 +98,7 @@ class Evidence:
         if self.flux is None or self.spot is None:
             raise InvalidInputError(f"{self.identifier}: a centred flux cannot be cut to {side:g} m")
         size = self.target.width, self.target.height
-        cut = flux_window(self.flux, size, self.target.to_plane(self.spot), side)
-        return np.asarray(cut / cut.sum() * 100, dtype=np.float32)
+        return normalized(flux_window(self.flux, size, self.target.to_plane(self.spot), side)).astype(np.float32)
 
     def _clipped_about_spot(self, side: float) -> NDArray[np.float32] | None:
         if self.clipped is None or self.spot is None:

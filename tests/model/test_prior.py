@@ -5,9 +5,8 @@ import pytest
 
 from model.observation import TRUSTED_MAHALANOBIS
 from model.plant import Facet
-from model.prior import GROUPS, FacetKind, default_prior, generic_prior, prior_of
+from model.prior import GROUPS, FacetKind, default_prior, generic_prior, prior_of, tilt_modes
 from tests.conftest import flat_heliostat
-from training.surfaces import tilt_modes
 
 
 def test_a_mirror_unlike_those_known_is_strange():

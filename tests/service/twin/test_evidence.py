@@ -9,6 +9,7 @@ from model import doubts
 from model.errors import InvalidInputError
 from model.forecast import Setup, View, align
 from model.frames import sun_direction
+from model.images import normalized
 from model.imaging.window import center_of_mass, flux_window
 from model.plant import JUELICH_LATITUDE
 from model.surface import control_points
@@ -25,8 +26,7 @@ def photographed(distance: float, side: float = 12.0) -> list[Evidence]:
     shown = []
     for sun, image in zip(suns, images, strict=True):
         spot = center_of_mass(image, (side, side))
-        cut = flux_window(image, (side, side), spot)
-        about_spot = (cut / cut.sum() * 100).astype(np.float32)
+        about_spot = normalized(flux_window(image, (side, side), spot)).astype(np.float32)
         shown.append(Evidence("1", sun, plane, image, about_spot, plane.to_enu(spot)))
     return shown
 
