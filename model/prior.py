@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model.plant import Heliostat
-from model.surface import COLUMNS, ROWS, greville
+from model.surface import COLUMNS, ROWS, greville, halving
 
 Array = NDArray[np.float64]
 
@@ -51,7 +51,8 @@ class FacetKind:
     ``canting`` is the slope [rad] along each side by which they are canted wrong; ``bending`` the standard deviation of
     a height, ``reach`` over how far heights hang together, ``grain`` what each control point has of its own, all in
     sides of the facet; ``alike`` the share of the bending that all facets of a mirror have in common, being made and
-    mounted alike.
+    mounted alike. ``ripple`` is what each control point of a grid whose spans are half as long has besides, as AA28 and
+    AC43 have it by deflectometry (``python -m training.fit``).
     """
 
     canting: float = 0.73e-3
@@ -59,6 +60,7 @@ class FacetKind:
     reach: float = 0.57
     grain: float = 3.2e-5
     alike: float = 0.7
+    ripple: float = 5.6e-5
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,6 +170,25 @@ def generic_covariance(half_sizes: Array, kind: FacetKind) -> Array:
     canting = kind.canting**2 * (np.outer(x, x) + np.outer(y, y)) + (kind.grain * side) ** 2 * np.eye(len(x))
     shared = np.kron(np.full((count, count), kind.alike), bending)
     return np.asarray(shared + np.kron(np.eye(count), (1 - kind.alike) * bending + canting))
+
+
+def ripples(half_sizes: Array) -> Array:
+    """Directions (N, F, 13, 13) [m] in which facets of half sides (F, 2) [m] are finer than their 8 x 8 heights.
+
+    Each control point of a grid whose spans are half as long has a little of its own, `FacetKind.ripple`, less what the
+    coarser grid explains.
+    """
+    side, kind = 2 * np.sqrt(half_sizes.mean(axis=0).prod()), FacetKind()
+    return np.asarray(kind.ripple * side * _finer_modes(len(half_sizes)))
+
+
+@lru_cache(maxsize=4)
+def _finer_modes(facets: int) -> Array:
+    """Orthonormal heights (N, F, 13, 13) that no 8 x 8 heights of the facets make."""
+    along = halving(ROWS), halving(COLUMNS)
+    coarse = np.kron(*along)
+    beyond = np.linalg.svd(coarse)[0][:, coarse.shape[1] :].T
+    return np.asarray(np.kron(np.eye(facets), beyond).reshape(-1, facets, *map(len, along)))
 
 
 def tilt_modes(half_size: ArrayLike = MEASURED_FACET) -> Array:

@@ -184,8 +184,14 @@ def control_points(heliostat: Heliostat, z: ArrayLike | None = None) -> Array:
     return np.asarray(centers[:, None, None, :] + np.einsum("fijc,fcd->fijd", local, axes))
 
 
-def heights(heliostat: Heliostat, points: ArrayLike, degree: int = DEGREE, samples: int = 64) -> Array:
-    """Heights z (F, 8, 8) [m], facet mean zero, of control points (F, I, J, 3) [m] in mirror coordinates.
+def heights(
+    heliostat: Heliostat,
+    points: ArrayLike,
+    degree: int = DEGREE,
+    samples: int = 64,
+    shape: tuple[int, int] = (ROWS, COLUMNS),
+) -> Array:
+    """Heights z (F, *shape) [m], facet mean zero, of control points (F, I, J, 3) [m] in mirror coordinates.
 
     The slopes of the given surface, seen in the frame of each ideal facet, are fitted by least squares: deflectometry
     measures normals, and heights follow from them up to the facet's mean. Facets that sit some millimetres off their
@@ -199,11 +205,13 @@ def heights(heliostat: Heliostat, points: ArrayLike, degree: int = DEGREE, sampl
     _, normals = evaluate(points, grid, grid, degree)
     u, v = (a.ravel() for a in np.meshgrid(grid, grid, indexing="ij"))
     local = np.einsum("fnmd,fcd->fnmc", normals, axes).reshape(len(axes), -1, 3)
-    return np.array([fit_heights(u, v, n, size) for n, size in zip(local, half_sizes, strict=True)])
+    return np.array([fit_heights(u, v, n, size, shape) for n, size in zip(local, half_sizes, strict=True)])
 
 
-def fit_heights(u: Array, v: Array, normals: Array, half_size: Array) -> Array:
-    """Heights (8, 8) [m], mean zero, of one facet whose slopes best match measured normals.
+def fit_heights(
+    u: Array, v: Array, normals: Array, half_size: Array, shape: tuple[int, int] = (ROWS, COLUMNS)
+) -> Array:
+    """Heights (*shape) [m], mean zero, of one facet whose slopes best match measured normals.
 
     Parameters
     ----------
@@ -214,15 +222,28 @@ def fit_heights(u: Array, v: Array, normals: Array, half_size: Array) -> Array:
     half_size : (2,) [m]
         Half the facet's width and height.
     """
-    value_u, slope_u = basis(ROWS, DEGREE, u)
-    value_v, slope_v = basis(COLUMNS, DEGREE, v)
+    value_u, slope_u = basis(shape[0], DEGREE, u)
+    value_v, slope_v = basis(shape[1], DEGREE, v)
     by_x = np.einsum("ni,nj->nij", slope_u, value_v).reshape(len(u), -1) / (2 * half_size[0])
     by_y = np.einsum("ni,nj->nij", value_u, slope_v).reshape(len(u), -1) / (2 * half_size[1])
     slope_x, slope_y = -normals[:, 0] / normals[:, 2], -normals[:, 1] / normals[:, 2]
     # Slopes do not see the constant mode; the pseudo-inverse leaves it at zero.
     gram = by_x.T @ by_x + by_y.T @ by_y
     solution = np.linalg.pinv(gram, rcond=1e-12, hermitian=True) @ (by_x.T @ slope_x + by_y.T @ slope_y)
-    return np.asarray((solution - solution.mean()).reshape(ROWS, COLUMNS))
+    return np.asarray((solution - solution.mean()).reshape(shape))
+
+
+@lru_cache(maxsize=4)
+def halving(count: int, degree: int = DEGREE) -> Array:
+    """Control heights (2 * count - degree, count), by those of a spline, of the same spline with its spans halved."""
+    places = (np.arange(16 * count) + 0.5) / (16 * count)
+    fine, coarse = (basis(n, degree, places)[0] for n in (2 * count - degree, count))
+    return np.asarray(np.linalg.lstsq(fine, coarse, rcond=None)[0])
+
+
+def halved(z: ArrayLike) -> Array:
+    """The same heights (..., 8, 8) [m] on the grid (..., 13, 13) whose spans are half as long."""
+    return np.asarray(halving(ROWS) @ np.asarray(z, dtype=np.float64) @ halving(COLUMNS).T)
 
 
 def mirrored(z: Array) -> Array:

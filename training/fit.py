@@ -25,7 +25,7 @@ from model.images import FLUX_SHAPE, FLUX_WINDOW
 from model.metrics import flux_accuracies
 from model.mount import Mount
 from model.plant import JUELICH_LATITUDE, Facet, Heliostat
-from model.surface import COLUMNS, DEGREE, ROWS, basis, control_points, fit_heights
+from model.surface import COLUMNS, DEGREE, ROWS, basis, control_points, fit_heights, halved, heights
 from training.cases import SOURCE
 from training.figures import markdown, shown
 from training.render import Situations
@@ -163,16 +163,19 @@ HEAD = (
     "99 % below [mrad]",
     "largest [mrad]",
     "flux accuracy lost",
+    "ripples, rms [mm]",
 )
 
 
 def row(measured: Deflectometry, fitted: Fit) -> list[str]:
-    """A mirror's line of the table; no loss of accuracy where there is no finer surface to compare with."""
-    residuals, loss = fitted.residuals_mrad, None
+    """A mirror's line of the table; neither a loss of accuracy nor ripples where there is no finer surface."""
+    residuals, loss, ripples = fitted.residuals_mrad, None, None
     if measured.fine is not None:
         coarse = control_points(measured.heliostat, fitted.z)
         loss = 1 - float(fit_accuracies(measured.heliostat, measured.fine, coarse).mean())
-    figures = (np.sqrt((residuals**2).mean()), np.quantile(residuals, 0.99), residuals.max(), loss)
+        same = halved(fitted.z)
+        ripples = 1e3 * np.std(heights(measured.heliostat, measured.fine, shape=same.shape[1:]) - same)
+    figures = (np.sqrt((residuals**2).mean()), np.quantile(residuals, 0.99), residuals.max(), loss, ripples)
     return [
         measured.heliostat.name,
         str(len(residuals)),

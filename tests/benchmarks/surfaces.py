@@ -1,9 +1,10 @@
 """Surfaces against deflectometry: ``python -m tests.benchmarks.surfaces``.
 
-Rendered: AA28, AA39 and AC43 as they were measured, at their own places, under suns and on targets of real photographs,
-traced by Monte Carlo with one per cent of noise; by the network and refined, from the prior's mean and from the truth,
-and refined by the generic prior; then the same mirrors, larger by half, of whose facets there is no other prior.
-``--scaling`` adds the time from 8 to 64 images.
+Rendered: AA28, AA39 and AC43 as deflectometry has them, 20 x 20 heights a facet, at their own places, under suns and
+on targets of real photographs, traced by Monte Carlo with one per cent of noise; by the network and refined, from the
+prior's mean and from the truth, without ripples, and by the generic prior; then the same mirrors, larger by half, of
+whose facets there is no other prior; then smoothed to the 8 x 8 heights that errors are of. ``--scaling`` adds the time
+from 8 to 64 images.
 
 Real: AA39 of two years, from sets of its photographs, some of which contradict the others; flux accuracy on
 photographs that no set holds. Errors are those of the control heights, the mirror's tilt and canting counted. AC43 is
@@ -41,7 +42,8 @@ from model.observation import (
 )
 from model.plant import JUELICH_LATITUDE, Facet, Heliostat
 from model.prior import default_prior, generic_prior
-from model.refinement import refine
+from model.refinement import RefinementOptions, refine
+from model.surface import heights
 from model.tracing import Window
 from model.tracing.montecarlo import trace_montecarlo
 from service.cli.folder import observations_of, surface_errors
@@ -80,11 +82,12 @@ def row(name: str, predict: Callable[[], SurfacePrediction], truth: Array) -> Su
     return found
 
 
-def truth_of(folder: MeasurementFolder, name: str) -> tuple[Heliostat, Array]:
-    """A heliostat and its measured heights (4, 8, 8) [m]."""
+def truth_of(folder: MeasurementFolder, name: str) -> tuple[Heliostat, Array, Array]:
+    """A heliostat, its measured heights (4, 8, 8) [m], and all that deflectometry has of them (4, I, J) [m]."""
     heliostat, measured = folder.plant.heliostats[name], folder.measured_surface(name)
     assert measured is not None
-    return heliostat, measured_heights(heliostat, measured)
+    _, rows, columns, _ = measured[0].shape
+    return heliostat, measured_heights(heliostat, measured), heights(heliostat, *measured, shape=(rows, columns))
 
 
 def photographed(
@@ -121,8 +124,8 @@ def rendered(folder: MeasurementFolder, years: MeasurementFolder, rays: int) -> 
     """Print errors of mirrors whose photographs were rendered."""
     print(f"Rendered by Monte Carlo, {rays:.0e} rays, {NOISE:.0%} noise, {IMAGES} images\n{HEAD}")
     for name in MIRRORS:
-        heliostat, truth = truth_of(folder, name)
-        seen = photographed(heliostat, truth, places_of(years, IMAGES), rays, np.random.default_rng(1))
+        heliostat, truth, fine = truth_of(folder, name)
+        seen = photographed(heliostat, fine, places_of(years, IMAGES), rays, np.random.default_rng(1))
         row(
             f"{name} network",
             lambda h=heliostat, o=seen: default_predictor().predict(h, o, latitude_deg=JUELICH_LATITUDE),
@@ -140,6 +143,13 @@ def rendered(folder: MeasurementFolder, years: MeasurementFolder, rays: int) -> 
         }
         apart = surface_error(*(end.z for end in ends.values())) * 1e3
         left = ", ".join(f"{label} {end.misfit:.4f}" for label, end in ends.items())
+        row(
+            f"{name} refined without ripples",
+            lambda h=heliostat, o=seen: refine(
+                h, o, latitude_deg=JUELICH_LATITUDE, options=RefinementOptions(rippled=False)
+            ),
+            truth,
+        )
         generic = generic_prior(heliostat.facet_frames[2])
         row(
             f"{name} refined, generic prior",
@@ -147,11 +157,17 @@ def rendered(folder: MeasurementFolder, years: MeasurementFolder, rays: int) -> 
             truth,
         )
         larger, shape = enlarged(heliostat, 1.5), 1.5 * truth
-        images = photographed(larger, shape, places_of(years, IMAGES), rays, np.random.default_rng(1))
+        images = photographed(larger, 1.5 * fine, places_of(years, IMAGES), rays, np.random.default_rng(1))
         row(
             f"{name} with facets half as large again, refined",
             lambda h=larger, o=images: refine(h, o, latitude_deg=JUELICH_LATITUDE),
             shape,
+        )
+        smooth = photographed(heliostat, truth, places_of(years, IMAGES), rays, np.random.default_rng(1))
+        row(
+            f"{name} of 8 x 8 heights, refined",
+            lambda h=heliostat, o=smooth: refine(h, o, latitude_deg=JUELICH_LATITUDE),
+            truth,
         )
         print(f"| | both ends {apart:.3f} mm apart, misfit {left} | | | | | | |")
 
@@ -169,10 +185,10 @@ def far(folder: MeasurementFolder, years: MeasurementFolder, rays: int) -> None:
     for distance in FAR:
         heliostat = Heliostat.juelich("far", (0.0, distance, 1.8), distance)
         for name in MIRRORS:
-            _, truth = truth_of(folder, name)
+            _, truth, fine = truth_of(folder, name)
             taken: list[Observation] = []
             for side in WINDOWS:
-                taken = photographed(heliostat, truth, places, rays, np.random.default_rng(1), side)
+                taken = photographed(heliostat, fine, places, rays, np.random.default_rng(1), side)
                 fits = not spilt(taken)
                 if fits or side == FLUX_WINDOW:
                     label = f"{name} at {distance:.0f} m, {side:g} m"
@@ -192,8 +208,8 @@ def far(folder: MeasurementFolder, years: MeasurementFolder, rays: int) -> None:
 
 def scaling(folder: MeasurementFolder, years: MeasurementFolder, rays: int) -> None:
     """Print the time that AA39 takes from 8 to 64 images."""
-    heliostat, truth = truth_of(folder, "AA39")
-    seen = photographed(heliostat, truth, places_of(years, 64), rays, np.random.default_rng(1))
+    heliostat, truth, fine = truth_of(folder, "AA39")
+    seen = photographed(heliostat, fine, places_of(years, 64), rays, np.random.default_rng(1))
     print(f"From 8 to 64 images\n{HEAD}")
     for count in (8, 16, 32, 64):
         row(
@@ -205,7 +221,7 @@ def scaling(folder: MeasurementFolder, years: MeasurementFolder, rays: int) -> N
 
 def real(years: MeasurementFolder) -> None:
     """Print errors of AA39 from real photographs, and the flux accuracy on photographs that no set holds."""
-    heliostat, truth = truth_of(years, "AA39")
+    heliostat, truth, _ = truth_of(years, "AA39")
     taken = [o for o in observations_of(years, "AA39")[0] if o.clipped_share < BRIGHT]
     sets = {
         "8, suns far apart": spread(taken, 8),
@@ -249,7 +265,7 @@ def whole(heliostat: Heliostat, z: Array, taken: list[Observation]) -> list[Obse
 
 def photographs(years: MeasurementFolder) -> None:
     """Print what surfaces from all photographs are worth beside those from whole ones, by other days' photographs."""
-    heliostat, truth = truth_of(years, "AA39")
+    heliostat, truth, _ = truth_of(years, "AA39")
     taken = observations_of(years, "AA39")[0]
     days = sorted({day_of(o) for o in taken})
     sides = [[o for o in taken if days.index(day_of(o)) % 2 == half] for half in (0, 1)]

@@ -5,7 +5,17 @@ import pytest
 
 from model.observation import TRUSTED_MAHALANOBIS
 from model.plant import Facet
-from model.prior import GROUPS, FacetKind, default_prior, generic_prior, prior_of, tilt_modes
+from model.prior import (
+    GROUPS,
+    MEASURED_FACET,
+    FacetKind,
+    default_prior,
+    generic_prior,
+    prior_of,
+    ripples,
+    tilt_modes,
+)
+from model.surface import halved
 from tests.conftest import flat_heliostat
 
 
@@ -53,3 +63,15 @@ def test_a_generic_mirror_has_no_tilt_of_its_own_and_facets_that_are_alike():
     bent = tilt_modes()[0] ** 2
     first, last = np.einsum("kfij,ij->fk", prior.basis, bent - bent.mean())[[0, -1]]
     assert first @ last / (np.linalg.norm(first) * np.linalg.norm(last)) == pytest.approx(FacetKind().alike, abs=0.02)
+
+
+def test_ripples_are_what_heights_do_not_reach():
+    """And grow with the facets."""
+    half_sizes = np.tile(MEASURED_FACET, (4, 1))
+    fine = ripples(half_sizes)
+    assert fine.shape == (4 * (13**2 - 8**2), 4, 13, 13)
+    z = halved(np.random.default_rng(1).normal(0, 1e-4, (4, 8, 8)))
+    np.testing.assert_allclose(np.einsum("nfij,fij->n", fine, z), 0, atol=1e-15)
+    spread = np.sqrt((fine**2).sum(axis=(1, 2, 3)))
+    np.testing.assert_allclose(spread, FacetKind().ripple * 2 * np.sqrt(np.prod(MEASURED_FACET)))
+    np.testing.assert_allclose(ripples(2 * half_sizes), 2 * fine)

@@ -12,8 +12,9 @@ from model.images import normalized
 from model.metrics import surface_error
 from model.observation import Observation, misfits, render_observations
 from model.plant import JUELICH_LATITUDE, Facet, Heliostat
-from model.prior import GROUPS, default_prior
+from model.prior import GROUPS, default_prior, ripples
 from model.refinement import RefinementOptions, _half_samples, refine
+from model.surface import halved
 from tests.conftest import flat_heliostat, target
 from tests.rendered import observe
 
@@ -61,6 +62,21 @@ def test_a_rough_mirror_is_found(heliostat):
     found = refine(heliostat, images(heliostat, rough), latitude_deg=JUELICH_LATITUDE)
     assert surface_error(found.z, rough) < 0.25 * surface_error(prior.mean, rough)
     assert np.mean(np.abs(found.z - rough) < 1.645 * found.z_std) > 0.8
+
+
+def test_what_heights_cannot_tell_is_not_told_by_them(heliostat, truth):
+    """A mirror with ripples, found with them and without: without them heights make up for what they cannot be."""
+    fine = ripples(heliostat.facet_frames[2])
+    rippled = halved(truth) + np.tensordot(np.random.default_rng(8).normal(size=len(fine)), fine, axes=1)
+    seen = images(heliostat, rippled)
+    found, without = (
+        refine(heliostat, seen, latitude_deg=JUELICH_LATITUDE, options=RefinementOptions(rippled=some))
+        for some in (True, False)
+    )
+    assert surface_error(found.z, truth) < 0.7 * surface_error(without.z, truth)
+    assert surface_error(found.z, truth) < 1.2e-4
+    within = [np.mean(np.abs(end.z - truth) < 1.645 * end.z_std) for end in (found, without)]
+    assert within[0] > within[1] + 0.2
 
 
 def test_a_mirror_of_a_kind_that_nobody_measured_is_found(heliostat, truth):

@@ -4,7 +4,17 @@ import torch
 from scipy.interpolate import BSpline
 
 from model.errors import InvalidInputError
-from model.surface import basis, control_points, evaluate, greville, heights, knots, sample, split_canting
+from model.surface import (
+    basis,
+    control_points,
+    evaluate,
+    greville,
+    halved,
+    heights,
+    knots,
+    sample,
+    split_canting,
+)
 from tests.conftest import flat_heliostat
 
 RNG = np.random.default_rng(2)
@@ -79,3 +89,20 @@ def test_canting_is_told_from_waviness():
 def test_wrong_heights_are_named():
     with pytest.raises(InvalidInputError, match="z must be finite heights"):
         control_points(flat_heliostat(), np.full((4, 8, 8), np.nan))
+
+
+def test_halved_spans_leave_the_surface_as_it_is():
+    z = np.random.default_rng(1).normal(0, 1e-4, (2, 8, 8))
+    fine = halved(z)
+    assert fine.shape == (2, 13, 13)
+    places = np.linspace(0, 1, 31)
+    for coarse_facet, fine_facet in zip(z, fine, strict=True):
+        coarse, finer = (basis(n, 3, places)[0] for n in (8, 13))
+        np.testing.assert_allclose(finer @ fine_facet @ finer.T, coarse @ coarse_facet @ coarse.T, atol=1e-12)
+
+
+def test_heights_of_another_grid_are_those_of_its_control_points():
+    heliostat = flat_heliostat((0.0, 50.0, 1.8))
+    z = np.random.default_rng(2).normal(0, 1e-4, (4, 13, 13))
+    z -= z.mean(axis=(1, 2), keepdims=True)
+    np.testing.assert_allclose(heights(heliostat, control_points(heliostat, z), shape=(13, 13)), z, atol=1e-9)
