@@ -105,6 +105,15 @@ def photographed(
     return [replace(setup, flux=image, side=side) for setup, image in zip(setups, flux, strict=True)]
 
 
+def held(heliostat: Heliostat, z: Array, setups: list[Observation], rays: int) -> list[Observation]:
+    """`photographed` in the smallest window that holds the spots, or the largest there is."""
+    for side in WINDOWS:
+        seen = photographed(heliostat, z, setups, rays, np.random.default_rng(1), side)
+        if not spilt(seen):
+            break
+    return seen
+
+
 def spread(observations: list[Observation], count: int) -> list[Observation]:
     """So many whose suns stand far apart."""
     return [observations[i] for i in spread_suns(np.array([o.sun for o in observations]), count)]
@@ -157,7 +166,7 @@ def rendered(folder: MeasurementFolder, years: MeasurementFolder, rays: int) -> 
             truth,
         )
         larger, shape = enlarged(heliostat, 1.5), 1.5 * truth
-        images = photographed(larger, 1.5 * fine, places_of(years, IMAGES), rays, np.random.default_rng(1))
+        images = held(larger, 1.5 * fine, places_of(years, IMAGES), rays)
         row(
             f"{name} with facets half as large again, refined",
             lambda h=larger, o=images: refine(h, o, latitude_deg=JUELICH_LATITUDE),
@@ -186,24 +195,19 @@ def far(folder: MeasurementFolder, years: MeasurementFolder, rays: int) -> None:
         heliostat = Heliostat.juelich("far", (0.0, distance, 1.8), distance)
         for name in MIRRORS:
             _, truth, fine = truth_of(folder, name)
-            taken: list[Observation] = []
-            for side in WINDOWS:
-                taken = photographed(heliostat, fine, places, rays, np.random.default_rng(1), side)
-                fits = not spilt(taken)
-                if fits or side == FLUX_WINDOW:
-                    label = f"{name} at {distance:.0f} m, {side:g} m"
-                    row(
-                        f"{label}, network",
-                        lambda h=heliostat, o=taken: default_predictor().predict(h, o, latitude_deg=JUELICH_LATITUDE),
-                        truth,
-                    )
-                    row(
-                        f"{label}, refined",
-                        lambda h=heliostat, o=taken: refine(h, o, latitude_deg=JUELICH_LATITUDE),
-                        truth,
-                    )
-                if fits:
-                    break
+            smallest = photographed(heliostat, fine, places, rays, np.random.default_rng(1))
+            for taken in (smallest, held(heliostat, fine, places, rays)) if spilt(smallest) else (smallest,):
+                label = f"{name} at {distance:.0f} m, {taken[0].side:g} m"
+                row(
+                    f"{label}, network",
+                    lambda h=heliostat, o=taken: default_predictor().predict(h, o, latitude_deg=JUELICH_LATITUDE),
+                    truth,
+                )
+                row(
+                    f"{label}, refined",
+                    lambda h=heliostat, o=taken: refine(h, o, latitude_deg=JUELICH_LATITUDE),
+                    truth,
+                )
 
 
 def scaling(folder: MeasurementFolder, years: MeasurementFolder, rays: int) -> None:
