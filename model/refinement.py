@@ -19,8 +19,8 @@ apart the images pull the surface tells by how much (the overdispersion of quasi
 doi:10.1093/biomet/61.3.439). An image that the others contradict is left out.
 
 Mirrors have more than their 8 x 8 heights tell, and what such ripples do to images, those heights would do in their
-place: a mirror rendered as deflectometry has it, refined without them, is missed by three times as much, and AA39 in
-its photographs likewise. They are sought with the surface (`model.prior.ripples`), to first order, and forgotten.
+place: mirrors rendered as deflectometry has them, refined without ripples, are missed by three times as much or more.
+They are sought with the surface (`model.prior.ripples`), their images to first order, and are not told of.
 
 All that is of one place: where images tell mirrors apart by little, their errors decide which of several mirrors is
 found, and no curvature at one of them shows the others. Halves of the images, each fitted anew, do (`_half_samples`).

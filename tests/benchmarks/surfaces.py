@@ -14,8 +14,9 @@ STJ-012 of the measured surfaces, from which neither network nor prior has learn
 images of that and of the one that is chosen, on a target that holds all.
 
 ``--only photographs``: what AA39's surfaces gain by photographs that the camera's range clipped or the target cut, and
-whether photographs of other days take its deflectometry nearer to those of a day. Days are dealt out to two halves;
-surfaces from photographs of either are judged by all photographs of the other.
+by leaving out those that contradict the others, as the service does; and whether photographs of other days take its
+deflectometry nearer to those of a day. Days are dealt out to two halves; surfaces from photographs of either are judged
+by all photographs of the other.
 """
 
 import argparse
@@ -48,6 +49,8 @@ from model.tracing import Window
 from model.tracing.montecarlo import trace_montecarlo
 from service.cli.folder import observations_of, surface_errors
 from service.sources.folder import MeasurementFolder, measured_heights, read_folder
+from service.twin import compute
+from service.twin.consensus import agreeing
 from tests.benchmarks import data_folder
 from tests.benchmarks.years import interval
 
@@ -273,6 +276,7 @@ def photographs(years: MeasurementFolder) -> None:
     taken = observations_of(years, "AA39")[0]
     days = sorted({day_of(o) for o in taken})
     sides = [[o for o in taken if days.index(day_of(o)) % 2 == half] for half in (0, 1)]
+    agree = [o for side in sides for o in agreeing(compute, heliostat, side, latitude_deg=JUELICH_LATITUDE)[0]]
     faultless = whole(heliostat, truth, taken)
     corrected = replace(default_prior(), mean=truth)
 
@@ -283,10 +287,17 @@ def photographs(years: MeasurementFolder) -> None:
     ways: dict[str, Callable[[list[Observation]], Array]] = {
         f"{IMAGES} whole ones": lambda side: found(spread([o for o in side if o in faultless], IMAGES)),
         f"{IMAGES} of all": lambda side: found(spread(side, IMAGES)),
-        f"{2 * IMAGES} of all": lambda side: found(spread(side, 2 * IMAGES)),
+        f"{IMAGES} that agree": lambda side: found(spread([o for o in side if o in agree], IMAGES)),
+        f"{2 * IMAGES} that agree": lambda side: found(spread([o for o in side if o in agree], 2 * IMAGES)),
         "none: deflectometry": lambda side: truth,
-        f"{2 * IMAGES} of all, about deflectometry": lambda side: (
-            refine(heliostat, spread(side, 2 * IMAGES), truth, prior=corrected, latitude_deg=JUELICH_LATITUDE).z
+        f"{2 * IMAGES} that agree, about deflectometry": lambda side: (
+            refine(
+                heliostat,
+                spread([o for o in side if o in agree], 2 * IMAGES),
+                truth,
+                prior=corrected,
+                latitude_deg=JUELICH_LATITUDE,
+            ).z
         ),
     }
     print(
