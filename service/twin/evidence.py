@@ -41,8 +41,9 @@ Item = TypeVar("Item")
 # are used are chosen among them for variety of the sun's position.
 _RECENT = 4
 
-# Share of a spot that the camera's range may cut off before others are rather chosen.
-_WHOLE = 0.1
+# Share of a spot's brighter half that the camera's range may cut off before others are rather chosen: whole ones alone
+# stand under too few suns (``python -m tests.benchmarks.light --consensus``, ``surfaces --only photographs``).
+_WHOLE = 0.3
 
 
 @dataclass(frozen=True, eq=False)
