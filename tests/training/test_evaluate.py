@@ -13,7 +13,7 @@ from model.plant import JUELICH_LATITUDE
 from training import crossvalidate, plots
 from training.cases import ELSEWHERE, MAX_DISTANCE, SOURCE, Case, make_cases, within_reach
 from training.config import TrainConfig
-from training.evaluate import DISTANCES, REFINEMENT, compared, draw, evaluate
+from training.evaluate import DISTANCES, REFINEMENT, SLOW, compared, draw, evaluate
 from training.figures import Figures, outcomes_of
 from training.methods import always, by_network, by_onnx, by_run, held_out_of
 from training.render import Camera, CleanCamera, load_field
@@ -116,7 +116,7 @@ def test_the_exported_network_is_asked_as_the_product_asks_it(cases):
 def test_tables_and_plots_of_an_evaluation(run, cases, tmp_path):
     mean = run.mean.double().numpy()
     methods = compared(run.folder, run.folder, mean)
-    methods[REFINEMENT] = lambda case, images: (case.truth / images, np.full((4, 8, 8), 1e-4))
+    methods.update(dict.fromkeys(SLOW, lambda case, images: (case.truth / images, np.full((4, 8, 8), 1e-4))))
     evaluation = evaluate(methods, cases, few=3)
     assert evaluation.figures[REFINEMENT].cases == 3
     assert evaluation.figures["network"].cases == COUNT
