@@ -27,8 +27,10 @@ found, and no curvature at one of them shows the others. Halves of the images, e
 """
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -85,6 +87,9 @@ DESCENT = Descent(
 )
 """How the minimum of the negative log posterior is sought; a gain of half a unit, or of a thousandth, is none."""
 
+ROUGHLY = replace(DESCENT, least_gain=1.0, least_share=1e-2)
+"""How it is sought where errors are estimated anew anyhow, and of halves of the images."""
+
 
 @dataclass(frozen=True)
 class RefinementOptions:
@@ -124,6 +129,11 @@ def _half_samples(suns: Array) -> list[tuple[list[int], list[int]]]:
     return [(first + others[i], others[i - 2] + others[i - 1]) for i in range(3)]
 
 
+def _unlike(one: tuple[Array, Array], other: tuple[Array, Array]) -> Array:
+    """Squared difference (K,) of what two halves of the images find, over its variance by the images' errors."""
+    return np.asarray((one[0] - other[0]) ** 2 / (one[1] + other[1]))
+
+
 class _Weights:
     """What a change of M images weighs, where bands of frequency err by ``sigma`` (M, 5), or (1, 5) in all alike.
 
@@ -135,10 +145,10 @@ class _Weights:
     """
 
     def __init__(self, images: Array, sigma: Array, dark: float, side: float) -> None:
-        size, peak = images.shape[-1], images.max(axis=(1, 2), keepdims=True)
-        frequency = np.hypot(*np.meshgrid(np.arange(size), np.arange(size)))
+        peak, along = images.max(axis=(1, 2), keepdims=True), np.arange(min(images.shape[-1], int(BANDS[-1])))
+        frequency = np.hypot(*np.meshgrid(along, along))
         self._kept = frequency < BANDS[-1]
-        self._cosines = dct(np.eye(size), axis=0, norm="ortho")
+        self._cosines = dct(np.eye(images.shape[-1]), axis=0, norm="ortho")[along]
         self.bands = np.digitize(frequency[self._kept], BANDS)
         self._scale = peak * np.sqrt(np.clip(images / peak, 0, None) + dark)
         self._sigma = sigma[:, self.bands]
@@ -212,13 +222,10 @@ class _Posterior:
         return align_observations(*model, latitude_deg=self.latitude_deg)
 
     def jacobian(self, state: _State) -> NDArray[Any]:
-        """Change of the images per coefficient (K, M, R, R)."""
-        changes = self._changes(state.aligned, self.changes) / self.steps[:, None, None, None]
-        return np.concatenate([changes, self.rippled])
+        """Change of the images (K, M, R, R) per coefficient of the prior; per one of ripples it stays `rippled`."""
+        return np.asarray(self._changes(state.aligned, self.changes) / self.steps[:, None, None, None])
 
-    def rippling(
-        self, state: _State, jacobian: NDArray[Any], belief: "_Belief"
-    ) -> tuple["_Posterior", _State, NDArray[Any], "_Belief"]:
+    def rippling(self, state: _State, belief: "_Belief") -> tuple["_Posterior", _State, "_Belief"]:
         """The posterior, and what is known of a state, with ripples, whose images are taken there, to first order."""
         directions = torch.as_tensor(ripples(self.heliostat.facet_frames[2]), dtype=torch.float32)
         rippled = self._changes(self._aligned(halved(self.prior.surface(state.c))), directions)
@@ -227,7 +234,6 @@ class _Posterior:
         return (
             _Posterior(self.heliostat, self.observations, *model, rippled),
             replace(state, c=np.concatenate([state.c, np.zeros(len(rippled))])),
-            np.concatenate([jacobian, rippled]),
             replace(belief, precision=precision),
         )
 
@@ -243,16 +249,16 @@ class _Posterior:
         """What changes of a state's images weigh."""
         return _Weights(state.images, belief.sigma, self.options.dark, self.side)
 
-    def optimum(self, state: _State, belief: "_Belief", jacobian: NDArray[Any] | None = None) -> Minimum[_State]:
-        """The highest density near a state; its Jacobian saves one."""
-        weights = self.weights(state, belief)
-        descent = replace(DESCENT, steps=self.options.steps)
-        return minimize(_Problem(self, weights, belief.precision), state, descent, jacobian)
+    def optimum(self, state: _State, belief: "_Belief", jacobian: NDArray[Any], descent: Descent) -> Minimum[_State]:
+        """The highest density near a state whose Jacobian is known."""
+        problem = _Problem(self, self.weights(state, belief), belief.precision)
+        return minimize(problem, state, replace(descent, steps=self.options.steps), jacobian)
 
     def fit(self, state: _State, jacobian: NDArray[Any], belief: "_Belief") -> "_Fit":
         """What there is to say of a state that was found with a belief."""
         weights = self.weights(state, belief)
-        return _Fit(belief, jacobian, weights(jacobian), weights(self.measured - state.images), weights.bands)
+        white = weights(np.concatenate([jacobian, self.rippled]))
+        return _Fit(belief, jacobian, white, weights(self.measured - state.images), weights.bands)
 
     def facet_light(self, state: _State, fit: "_Fit") -> tuple[Array, Array]:
         """By how much each facet sends more light than the others' mean (F,) [1], and its standard deviation.
@@ -274,12 +280,12 @@ class _Posterior:
         return np.asarray(images.double().numpy())
 
     def settled(
-        self, state: _State, jacobian: NDArray[Any], stages: Sequence[float]
+        self, state: _State, jacobian: NDArray[Any], stages: Sequence[float], descent: Descent
     ) -> tuple[_State, NDArray[Any], "_Belief"]:
         """The state near another at which large features are right, the Jacobian there and what it was found with."""
         for error in stages:
             belief = _Belief(np.full((1, len(BANDS)), error), np.ones(len(state.c)))
-            found = self.optimum(state, belief, jacobian)
+            found = self.optimum(state, belief, jacobian, descent)
             state, jacobian = found.state, found.jacobian
         return state, jacobian, belief
 
@@ -294,15 +300,13 @@ class _Posterior:
         cautious = fit.cautious(self.options.grain)[known, known]
         if len(suns) < 2:
             return cautious
-        unlike = np.mean([self._unlike(halves, state, fit) for halves in _half_samples(suns)], axis=0)[known]
+        # NumPy and torch compute without the interpreter: two threads take little more than half as long.
+        with ThreadPoolExecutor(2) as threads:
+            halves = chain.from_iterable(_half_samples(suns))
+            found = list(threads.map(lambda half: self._half(half, state, fit), halves))
+        unlike = np.mean([_unlike(*pair) for pair in zip(found[::2], found[1::2], strict=True)], axis=0)[known]
         growth = np.sqrt(np.maximum(1 / self.prior.precision(np.sqrt(unlike), np.zeros_like(unlike)), 1))
         return np.asarray(cautious + fit.of_errors[known, known] * (np.outer(growth, growth) - 1))
-
-    def _unlike(self, halves: Sequence[Sequence[int]], state: _State, fit: "_Fit") -> Array:
-        """Squared difference (K,) of what two halves of the images find, over its variance by the images' errors."""
-        found = [self._half(half, state, fit) for half in halves]
-        apart, variance = found[0][0] - found[1][0], found[0][1] + found[1][1]
-        return np.asarray(apart**2 / variance)
 
     def _half(self, images: Sequence[int], state: _State, fit: "_Fit") -> tuple[Array, Array]:
         """Coefficients (K,) that some of the images find, and their variance (K,) by the images' errors."""
@@ -310,10 +314,10 @@ class _Posterior:
         part = [self.observations[i] for i in images]
         half = _Posterior(self.heliostat, part, *model, self.rippled[:, list(images)])
         begun = half.state(state.c), fit.jacobian[:, list(images)]
-        start, jacobian, _ = half.settled(*begun, self.options.annealing[:1])
+        start, jacobian, _ = half.settled(*begun, self.options.annealing[:1], ROUGHLY)
         sigma = np.broadcast_to(fit.belief.sigma, (len(self.observations), len(BANDS)))[list(images)]
         belief = replace(fit.belief, sigma=sigma)
-        found = half.optimum(start, belief, jacobian)
+        found = half.optimum(start, belief, jacobian, ROUGHLY)
         return found.state.c, np.diag(half.fit(found.state, found.jacobian, belief).of_errors)
 
     def estimated(self, state: _State, jacobian: NDArray[Any], belief: "_Belief") -> tuple[_State, "_Fit"]:
@@ -324,7 +328,7 @@ class _Posterior:
             known = len(self.prior.basis)
             precision = self.prior.precision(state.c[:known], np.diag(fit.covariance)[:known])
             belief = _Belief(np.maximum(sigma, self.options.grain), np.r_[precision, belief.precision[known:]])
-            found = self.optimum(state, belief, jacobian)
+            found = self.optimum(state, belief, jacobian, ROUGHLY if left else DESCENT)
             state, jacobian = found.state, found.jacobian
         return state, self.fit(state, jacobian, belief)
 
@@ -346,9 +350,9 @@ class _Fit:
     belief : _Belief
         What it was found with.
     jacobian : (K, M, R, R)
-        Derivatives of the images.
+        Derivatives of the images by the prior's coefficients.
     white, left : (K, M, n), (M, n)
-        The same of weighed images, and what is left of those.
+        Derivatives of weighed images by all coefficients, and what is left of those images.
     bands : (n,)
         The band of each mode.
     """
@@ -464,11 +468,24 @@ class _Problem:
     def jacobian(self, state: _State) -> Array:
         return self.posterior.jacobian(state)
 
+    @cached_property
+    def _fine(self) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Weighed images (N, M n) of ripples, and their curvature (N, N), which no step changes."""
+        white = self._flat(self.posterior.rippled)
+        return white, white @ white.T
+
     def quadratic(self, state: _State, jacobian: Array) -> tuple[Array, Array]:
-        white = self.weights(jacobian).reshape(len(jacobian), -1)
-        left = self.weights(self.posterior.measured - state.images).ravel()
-        gradient = (white @ left.astype(white.dtype)).astype(np.float64) - self.precision * state.c
-        return gradient, (white @ white.T).astype(np.float64) + np.diag(self.precision)
+        smooth, (fine, of_fine) = self._flat(jacobian), self._fine
+        (left,) = self._flat((self.posterior.measured - state.images)[None].astype(smooth.dtype))
+        both = smooth @ fine.T
+        curvature = np.block([[smooth @ smooth.T, both], [both.T, of_fine]]).astype(np.float64)
+        gradient = np.concatenate([smooth @ left, fine @ left]).astype(np.float64)
+        return gradient - self.precision * state.c, curvature + np.diag(self.precision)
+
+    def _flat(self, changes: NDArray[Any]) -> NDArray[Any]:
+        """Weighed changes (K, M n) of changes (K, M, R, R)."""
+        white = self.weights(changes)
+        return np.asarray(white.reshape(len(white), np.prod(white.shape[1:], dtype=int)))
 
     def bounds(self, state: _State) -> None:
         return None
@@ -555,7 +572,7 @@ def _consensus(
         few = [kept[i] for i in sorted(spread_suns(suns, options.few))]
         whole = posterior(few)
         state = whole.state(c)
-        state, jacobian, belief = whole.settled(state, whole.jacobian(state), options.annealing)
+        state, jacobian, belief = whole.settled(state, whole.jacobian(state), options.annealing, DESCENT)
         if len(few) < len(kept):
             whole = posterior(kept)
             state = whole.state(state.c)
@@ -563,6 +580,6 @@ def _consensus(
         out = whole.fit(state, jacobian, belief).contradicted()
         if out is None:
             if options.rippled:
-                whole, state, jacobian, belief = whole.rippling(state, jacobian, belief)
+                whole, state, belief = whole.rippling(state, belief)
             return whole, *whole.estimated(state, jacobian, belief), left_out
         left_out.append(kept.pop(out))
