@@ -26,7 +26,7 @@ from model.network.architecture import CONDITIONS
 from model.network.inputs import DESCENT_SAMPLES, GUESS_SAMPLES, conditions, descents
 from model.observation import Observation, scene_of
 from model.plant import JUELICH_LATITUDE, Heliostat, TargetPlane
-from model.surface import control_points, halved
+from model.surface import control_points
 from model.tracing import Optics, Scene, Window, trace
 
 Array = NDArray[np.float64]
@@ -137,17 +137,11 @@ class Setups:
         return cls(ideal, tensor(normals), images)
 
     def scene(self, z: Tensor) -> Scene:
-        """The scene of surfaces ``z`` (B, 4, I, J) [m], or of other ones before each sun (B, images, 4, I, J).
-
-        They have 8 x 8 heights a facet, or those of the grid whose spans are half as long.
-        """
+        """The scene of surfaces ``z`` (B, 4, 8, 8) [m], or of other ones before each sun (B, images, 4, 8, 8)."""
         if z.ndim == 4:
             z = z[:, None].expand(-1, self.images, -1, -1, -1)
         deformed = torch.einsum("bmfij,bfk->bmfkij", z, self.lift).flatten(0, 1)
-        ideal = self.ideal.control_points
-        if ideal.shape != deformed.shape:
-            ideal = torch.as_tensor(halved(ideal.cpu().numpy())).to(ideal)
-        return self.ideal.with_(control_points=ideal + deformed)
+        return self.ideal.with_(control_points=self.ideal.control_points + deformed)
 
     def trace(self, z: Tensor, samples: int = GUESS_SAMPLES, size: int = FLUX_SIZE) -> Tensor:
         """Flux (B, images, size, size), sum 100, of surfaces as `scene` takes them, as no camera sees it."""
@@ -319,7 +313,7 @@ def observe(
 def render(
     z: Array, images: int, field: Array, situations: Situations, camera: Camera | None, device: torch.device, seed: int
 ) -> Photographs:
-    """Photographs of surfaces ``z``, as `Setups.scene` takes them, in random situations.
+    """Photographs of surfaces ``z`` (B, 4, 8, 8) [m] in random situations.
 
     Without a camera the flux is traced for the default sun and nothing else.
     """

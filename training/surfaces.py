@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.errors import InvalidInputError
-from model.prior import FREEDOM, MEASURED_FACET, ripples, tilt_modes, without
-from model.surface import halved, mirrored, split_canting
+from model.prior import FREEDOM, tilt_modes, without
+from model.surface import mirrored, split_canting
 
 Array = NDArray[np.float64]
 
@@ -89,8 +89,7 @@ class Augmentation:
     scaled about the mean surface, each by a factor of its own, whose inverse square has a chi-squared distribution of
     ``freedom`` degrees as the prior's scales have (`model.prior`), ``roughest`` at most. ``tilt_mrad`` adds canting at
     random, ``focus_mrad`` canting towards another focus: the measured heliostats AA28 and AA39 lie off the others
-    there, by what their properties call ideal. Mirrors have up to ``ripple`` times what is finer than their heights in
-    those measured (`model.prior.ripples`).
+    there, by what their properties call ideal.
     """
 
     average: float = 0.6
@@ -100,7 +99,6 @@ class Augmentation:
     roughest: float = 4.0
     tilt_mrad: float = 0.15
     focus_mrad: float = 0.4
-    ripple: float = 2.0
 
     def sample(self, surfaces: Array, count: int, rng: np.random.Generator) -> Array:
         """Random surfaces (count, 4, 8, 8) [m] from measured ones (N, 4, 8, 8)."""
@@ -111,12 +109,6 @@ class Augmentation:
         mean = surfaces.mean(axis=0)
         rough = sum(part * self._scales(count, rng) for part in split_canting(z - mean))
         return untilted(mean + rough + self._tilts(count, rng))
-
-    def rippled(self, z: Array, rng: np.random.Generator) -> Array:
-        """Surfaces (count, 4, 8, 8) [m] with random ripples, on the grid (count, 4, 13, 13) that tells them."""
-        directions = ripples(np.tile(MEASURED_FACET, (z.shape[1], 1)))
-        drawn = np.tensordot(rng.standard_normal((len(z), len(directions))), directions, axes=1)
-        return np.asarray(halved(z) + rng.uniform(0, self.ripple, (len(z), 1, 1, 1)) * drawn)
 
     def _scales(self, count: int, rng: np.random.Generator) -> Array:
         scales = np.sqrt(self.freedom / rng.chisquare(self.freedom, (count, 1, 1, 1)))

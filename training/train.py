@@ -156,9 +156,9 @@ class Run:
         c = self.config
         rng = np.random.default_rng((c.seed, self.step, parallel.rank()))
         z = c.augmentation.sample(self.surfaces, c.batch // parallel.size(), rng)
-        rippled, images = c.augmentation.rippled(z, rng), int(rng.integers(1, MAX_IMAGES + 1))
+        images = int(rng.integers(1, MAX_IMAGES + 1))
         with torch.no_grad():
-            seen = render(rippled, images, self.field, c.situations, c.camera, self.device, int(rng.integers(2**31)))
+            seen = render(z, images, self.field, c.situations, c.camera, self.device, int(rng.integers(2**31)))
         truth = torch.as_tensor(z * 1e3, dtype=torch.float32, device=self.device)
         return seen, truth - truth.mean(dim=(2, 3), keepdim=True)
 

@@ -12,7 +12,7 @@ from model.effects import effect_to_json
 from model.errors import InvalidInputError
 from model.network.architecture import NetworkConfig
 from model.network.catalogue import sizes_of
-from model.surface import halved, mirrored, split_canting
+from model.surface import mirrored, split_canting
 from training.config import TrainConfig
 from training.prior import estimate
 from training.render import Camera, Situations, load_field, render
@@ -106,17 +106,6 @@ def test_rendered_images_are_normalised_and_reproducible(surfaces, stj):
     torch.testing.assert_close(first.flux.sum(dim=(2, 3)), torch.full((3, 4), 100.0))
     torch.testing.assert_close(first.flux, again.flux, rtol=0, atol=0)
     assert not torch.equal(first.flux, other.flux)
-
-
-def test_ripples_are_what_the_heights_do_not_tell(surfaces, stj):
-    """Without any a finer grid throws the same light; with them as much of it differs as in mirrors as they are."""
-    rng, setups = np.random.default_rng(0), (4, load_field(stj), Situations(), None, torch.device("cpu"), 3)
-    without, rippled = (Augmentation(ripple=size).rippled(surfaces[:8], rng) for size in (0.0, 2.0))
-    assert rippled.shape == (8, 4, 13, 13)
-    assert 0.02e-3 < np.sqrt(np.mean((rippled - halved(surfaces[:8])) ** 2)) < 0.1e-3
-    plain, finer, seen = (render(z, *setups).flux for z in (surfaces[:8], without, rippled))
-    torch.testing.assert_close(finer, plain, rtol=0, atol=1e-3)
-    assert 1.0 < float((seen - plain).abs().sum(dim=(2, 3)).median()) < 20.0  # of 100
 
 
 def test_a_perfect_camera_sees_what_was_traced(surfaces, stj):
