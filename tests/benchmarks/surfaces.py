@@ -65,21 +65,21 @@ BRIGHT = 0.3
 """Share of a spot's brighter half that may be cut off for a photograph to be taken here."""
 
 HEAD = (
-    "| | error [mm] | canting | waviness | mean sigma | within 90 % | processor [s] | left out |\n"
-    "| --- | --- | --- | --- | --- | --- | --- | --- |"
+    "| | error [mm] | canting | waviness | mean sigma | within 90 % | processor [s] | wall [s] | left out |\n"
+    "| --- | --- | --- | --- | --- | --- | --- | --- | --- |"
 )
 
 
 def row(name: str, predict: Callable[[], SurfacePrediction], truth: Array) -> SurfacePrediction:
     """Print what a prediction is worth."""
-    start = time.process_time()
+    start, begun = time.process_time(), time.perf_counter()
     found = predict()
-    seconds = time.process_time() - start
+    seconds, wall = time.process_time() - start, time.perf_counter() - begun
     errors = surface_errors(found.z, truth)
     covered = np.mean(np.abs(found.z - truth) < WITHIN_90 * found.z_std)
     print(
         f"| {name} | {errors['mae_mm']:.3f} | {errors['mae_canting_mm']:.3f} | {errors['mae_waviness_mm']:.3f} | "
-        f"{1e3 * found.z_std.mean():.3f} | {covered:.0%} | {seconds:.1f} | {', '.join(found.contradicting)} |",
+        f"{1e3 * found.z_std.mean():.3f} | {covered:.0%} | {seconds:.1f} | {wall:.1f} | {', '.join(found.contradicting)} |",
         flush=True,
     )
     return found
@@ -181,7 +181,7 @@ def rendered(folder: MeasurementFolder, years: MeasurementFolder, rays: int) -> 
             lambda h=heliostat, o=smooth: refine(h, o, latitude_deg=JUELICH_LATITUDE),
             truth,
         )
-        print(f"| | both ends {apart:.3f} mm apart, misfit {left} | | | | | | |")
+        print(f"| | both ends {apart:.3f} mm apart, misfit {left} | | | | | | | |")
 
 
 def enlarged(heliostat: Heliostat, factor: float) -> Heliostat:
@@ -249,7 +249,7 @@ def real(years: MeasurementFolder) -> None:
         found = row(name, lambda c=chosen, s=start: refine(heliostat, c, s.z, latitude_deg=JUELICH_LATITUDE), truth)
         print(
             f"| | accuracy {accuracy(found.z):.3f}, network {accuracy(start.z):.3f}, deflectometry "
-            f"{accuracy(truth):.3f}; network's error {1e3 * surface_error(start.z, truth):.3f} | | | | | | |"
+            f"{accuracy(truth):.3f}; network's error {1e3 * surface_error(start.z, truth):.3f} | | | | | | | |"
         )
 
 
