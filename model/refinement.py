@@ -88,7 +88,7 @@ DESCENT = Descent(
 """How the minimum of the negative log posterior is sought; a gain of half a unit, or of a thousandth, is none."""
 
 ROUGHLY = replace(DESCENT, least_gain=1.0, least_share=1e-2)
-"""How it is sought where errors are estimated anew anyhow, and of halves of the images."""
+"""How it is sought by halves of the images, whose differences are told in groups."""
 
 
 @dataclass(frozen=True)
@@ -328,7 +328,7 @@ class _Posterior:
             known = len(self.prior.basis)
             precision = self.prior.precision(state.c[:known], np.diag(fit.covariance)[:known])
             belief = _Belief(np.maximum(sigma, self.options.grain), np.r_[precision, belief.precision[known:]])
-            found = self.optimum(state, belief, jacobian, ROUGHLY if left else DESCENT)
+            found = self.optimum(state, belief, jacobian, DESCENT)
             state, jacobian = found.state, found.jacobian
         return state, self.fit(state, jacobian, belief)
 
