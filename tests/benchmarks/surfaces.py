@@ -177,6 +177,11 @@ def rendered(folder: MeasurementFolder, years: MeasurementFolder, rays: int) -> 
         )
         smooth = photographed(heliostat, truth, places_of(years, IMAGES), rays, np.random.default_rng(1))
         row(
+            f"{name} of 8 x 8 heights, network",
+            lambda h=heliostat, o=smooth: default_predictor().predict(h, o, latitude_deg=JUELICH_LATITUDE),
+            truth,
+        )
+        row(
             f"{name} of 8 x 8 heights, refined",
             lambda h=heliostat, o=smooth: refine(h, o, latitude_deg=JUELICH_LATITUDE),
             truth,
