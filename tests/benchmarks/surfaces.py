@@ -79,7 +79,8 @@ def row(name: str, predict: Callable[[], SurfacePrediction], truth: Array) -> Su
     covered = np.mean(np.abs(found.z - truth) < WITHIN_90 * found.z_std)
     print(
         f"| {name} | {errors['mae_mm']:.3f} | {errors['mae_canting_mm']:.3f} | {errors['mae_waviness_mm']:.3f} | "
-        f"{1e3 * found.z_std.mean():.3f} | {covered:.0%} | {seconds:.1f} | {wall:.1f} | {', '.join(found.contradicting)} |",
+        f"{1e3 * found.z_std.mean():.3f} | {covered:.0%} | {seconds:.1f} | {wall:.1f} | "
+        f"{', '.join(found.contradicting)} |",
         flush=True,
     )
     return found
