@@ -23,7 +23,8 @@ place: mirrors rendered as deflectometry has them, refined without ripples, are 
 They are sought with the surface (`model.prior.ripples`), their images to first order, and are not told of.
 
 All that is of one place: where images tell mirrors apart by little, their errors decide which of several mirrors is
-found, and no curvature at one of them shows the others. Halves of the images, each fitted anew, do (`_half_samples`).
+found, and no curvature at one of them shows the others. Halves of the images do, each fitted anew from the prior's mean
+(`_half_samples`).
 """
 
 from collections.abc import Sequence
@@ -258,7 +259,7 @@ class _Posterior:
         """What there is to say of a state that was found with a belief."""
         weights = self.weights(state, belief)
         white = weights(np.concatenate([jacobian, self.rippled]))
-        return _Fit(belief, jacobian, white, weights(self.measured - state.images), weights.bands)
+        return _Fit(belief, white, weights(self.measured - state.images), weights.bands)
 
     def facet_light(self, state: _State, fit: "_Fit") -> tuple[Array, Array]:
         """By how much each facet sends more light than the others' mean (F,) [1], and its standard deviation.
@@ -292,31 +293,36 @@ class _Posterior:
     def covariance(self, state: _State, fit: "_Fit") -> Array:
         """Covariance (K, K) of the prior's coefficients, as far apart as halves of the images find the mirror.
 
-        Each half is fitted anew, from blurred to sharp. By as much as halves differ more than their errors should make
-        them, group by group of the prior's directions, the part that comes of errors grows; what the prior leaves open
-        stays. Halves do not show errors that all images share: `_Fit.cautious` allows for those.
+        Each half is fitted anew, from the prior's mean, and from blurred to sharp: halves that begin where all images
+        ended tend to stay there. By as much as halves differ more than their errors should make them, group by group of
+        the prior's directions, the part that comes of errors grows; what the prior leaves open stays. Halves do not
+        show errors that all images share: `_Fit.cautious` allows for those.
         """
         known, suns = slice(len(self.prior.basis)), np.array([o.sun for o in self.observations])
         cautious = fit.cautious(self.options.grain)[known, known]
         if len(suns) < 2:
             return cautious
+        mean = self.state(np.zeros_like(state.c))
+        jacobian = self.jacobian(mean)
         # NumPy and torch compute without the interpreter: two threads take little more than half as long.
         with ThreadPoolExecutor(2) as threads:
             halves = chain.from_iterable(_half_samples(suns))
-            found = list(threads.map(lambda half: self._half(half, state, fit), halves))
+            found = list(threads.map(lambda half: self._half(half, mean, jacobian, fit.belief), halves))
         unlike = np.mean([_unlike(*pair) for pair in zip(found[::2], found[1::2], strict=True)], axis=0)[known]
         growth = np.sqrt(np.maximum(1 / self.prior.precision(np.sqrt(unlike), np.zeros_like(unlike)), 1))
         return np.asarray(cautious + fit.of_errors[known, known] * (np.outer(growth, growth) - 1))
 
-    def _half(self, images: Sequence[int], state: _State, fit: "_Fit") -> tuple[Array, Array]:
-        """Coefficients (K,) that some of the images find, and their variance (K,) by the images' errors."""
+    def _half(
+        self, images: Sequence[int], state: _State, jacobian: NDArray[Any], belief: "_Belief"
+    ) -> tuple[Array, Array]:
+        """Coefficients (K,) that some images find from a state, and their variance (K,) by the images' errors."""
         model = self.prior, self.optics, self.effects, self.latitude_deg, self.options
         part = [self.observations[i] for i in images]
         half = _Posterior(self.heliostat, part, *model, self.rippled[:, list(images)])
-        begun = half.state(state.c), fit.jacobian[:, list(images)]
+        begun = half.state(state.c), jacobian[:, list(images)]
         start, jacobian, _ = half.settled(*begun, self.options.annealing[:1], ROUGHLY)
-        sigma = np.broadcast_to(fit.belief.sigma, (len(self.observations), len(BANDS)))[list(images)]
-        belief = replace(fit.belief, sigma=sigma)
+        sigma = np.broadcast_to(belief.sigma, (len(self.observations), len(BANDS)))[list(images)]
+        belief = replace(belief, sigma=sigma)
         found = half.optimum(start, belief, jacobian, ROUGHLY)
         return found.state.c, np.diag(half.fit(found.state, found.jacobian, belief).of_errors)
 
@@ -349,8 +355,6 @@ class _Fit:
     ----------
     belief : _Belief
         What it was found with.
-    jacobian : (K, M, R, R)
-        Derivatives of the images by the prior's coefficients.
     white, left : (K, M, n), (M, n)
         Derivatives of weighed images by all coefficients, and what is left of those images.
     bands : (n,)
@@ -358,7 +362,6 @@ class _Fit:
     """
 
     belief: _Belief
-    jacobian: NDArray[Any]
     white: NDArray[Any]
     left: Array
     bands: NDArray[np.int64]
