@@ -146,7 +146,8 @@ class _Weights:
     """
 
     def __init__(self, images: Array, sigma: Array, dark: float, side: float) -> None:
-        peak, along = images.max(axis=(1, 2), keepdims=True), np.arange(min(images.shape[-1], int(BANDS[-1])))
+        peak, along = images.max(axis=(1, 2), keepdims=True), np.arange(images.shape[-1])
+        along = along[along < BANDS[-1]]
         frequency = np.hypot(*np.meshgrid(along, along))
         self._kept = frequency < BANDS[-1]
         self._cosines = dct(np.eye(images.shape[-1]), axis=0, norm="ortho")[along]
@@ -302,25 +303,25 @@ class _Posterior:
         cautious = fit.cautious(self.options.grain)[known, known]
         if len(suns) < 2:
             return cautious
-        mean = self.state(np.zeros_like(state.c))
-        jacobian = self.jacobian(mean)
+        jacobian = self.jacobian(self.state(np.zeros_like(state.c)))
         # NumPy and torch compute without the interpreter: two threads take little more than half as long.
         with ThreadPoolExecutor(2) as threads:
             halves = chain.from_iterable(_half_samples(suns))
-            found = list(threads.map(lambda half: self._half(half, mean, jacobian, fit.belief), halves))
+            found = list(threads.map(lambda half: self._half(half, jacobian, fit.belief), halves))
         unlike = np.mean([_unlike(*pair) for pair in zip(found[::2], found[1::2], strict=True)], axis=0)[known]
         growth = np.sqrt(np.maximum(1 / self.prior.precision(np.sqrt(unlike), np.zeros_like(unlike)), 1))
         return np.asarray(cautious + fit.of_errors[known, known] * (np.outer(growth, growth) - 1))
 
-    def _half(
-        self, images: Sequence[int], state: _State, jacobian: NDArray[Any], belief: "_Belief"
-    ) -> tuple[Array, Array]:
-        """Coefficients (K,) that some images find from a state, and their variance (K,) by the images' errors."""
+    def _half(self, images: Sequence[int], jacobian: NDArray[Any], belief: "_Belief") -> tuple[Array, Array]:
+        """Coefficients (K,) that some of the images find, and their variance (K,) by the images' errors.
+
+        From the prior's mean, where all images have a ``jacobian`` (K, M, R, R).
+        """
         model = self.prior, self.optics, self.effects, self.latitude_deg, self.options
         part = [self.observations[i] for i in images]
         half = _Posterior(self.heliostat, part, *model, self.rippled[:, list(images)])
-        begun = half.state(state.c), jacobian[:, list(images)]
-        start, jacobian, _ = half.settled(*begun, self.options.annealing[:1], ROUGHLY)
+        mean = half.state(np.zeros_like(belief.precision))
+        start, jacobian, _ = half.settled(mean, jacobian[:, list(images)], self.options.annealing[:1], ROUGHLY)
         sigma = np.broadcast_to(belief.sigma, (len(self.observations), len(BANDS)))[list(images)]
         belief = replace(belief, sigma=sigma)
         found = half.optimum(start, belief, jacobian, ROUGHLY)

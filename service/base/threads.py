@@ -3,7 +3,8 @@
 A service computes at several things at a time (``HELIOTWIN_PARALLEL_COMPUTATIONS``), and each of them is many small
 steps: a matrix of some hundred rows, the transform of an image of 64 x 64 pixels. Threads of a library share such a
 step and then spin until the last of them is done; where another process has a core, that one comes back a time slice
-later, and every step waits for it. `tests.benchmarks.busy` measures it.
+later, and every step waits for it. `tests.benchmarks.busy` measures it. A refinement alone fits halves of its images
+two at a time (`model.refinement`): they share no step, and where there is no second core they take turns.
 """
 
 import os
