@@ -88,7 +88,7 @@ DESCENT = Descent(
 )
 """How the minimum of the negative log posterior is sought; a gain of half a unit, or of a thousandth, is none."""
 
-ROUGHLY = replace(DESCENT, least_gain=1.0, least_share=1e-2)
+ROUGHLY = replace(DESCENT, least_gain=1.0, least_share=3e-2)
 """How it is sought by halves of the images, whose differences are told in groups."""
 
 

@@ -1,7 +1,12 @@
-"""Measured comparisons: ``make bench`` prints the figures of RESULTS.md."""
+"""Measured comparisons: ``make bench`` prints the figures of RESULTS.md.
+
+They compute in as many threads as the service does, which says so when it is imported: before NumPy and torch are.
+"""
 
 import os
 from pathlib import Path
+
+import service  # noqa: F401
 
 
 def data_folder() -> Path:

@@ -22,7 +22,6 @@ from model.network.predictor import WEIGHTS, default_predictor
 from model.plant import JUELICH_LATITUDE
 from model.prior import FREEDOM, GROUPS, SurfacePrior, default_prior
 from model.refinement import refine
-from service.base import threads
 from tests.benchmarks import data_folder
 from training.cases import Case, make_cases
 from training.methods import held_out_of
@@ -63,7 +62,6 @@ def drawn(prior: SurfacePrior, count: int, rng: np.random.Generator) -> Array:
 
 def ends(kind: str, case: Case) -> Ends:
     """Refine one mirror from each start."""
-    threads.limit()
     heliostat, seen = case.heliostat, case.observations
     network = default_predictor().predict(heliostat, seen, latitude_deg=JUELICH_LATITUDE).z
     found = [refine(heliostat, seen, z, latitude_deg=JUELICH_LATITUDE) for z in (network, None, case.truth)]

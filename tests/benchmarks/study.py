@@ -32,7 +32,6 @@ from model.plant import JUELICH_LATITUDE
 from model.study import Study, StudyOptions, study
 from model.study.flux_images import Forecaster
 from model.tracing import Optics
-from service.base import threads
 from service.cli.folder_study import study_folder
 from service.sources.folder import read_folder
 from tests.benchmarks import data_folder
@@ -173,7 +172,6 @@ def run(
     path.parent.mkdir(parents=True, exist_ok=True)
     done = read(path)
     left = [case for case in wanted if done.get(case, {}).get("code") != code()]
-    threads.limit()  # as the command does; threads of two cases would spin against each other
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool, path.open("a", encoding="utf-8") as file:
         for work in as_completed([pool.submit(answer, case) for case in left]):
             record = work.result()
