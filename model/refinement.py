@@ -6,8 +6,8 @@ Levenberg-Marquardt steps bring the traced images to the measured ones; the curv
 Two things decide whether that ends where it should. Derivatives must be those of the images
 (`model.tracing.sensitivity`): a facet's canting changes an image by one percent, and differences of coarse traces miss
 a third of it. And what is minimised must not change on the way: images are weighed as those of the surface that a
-stage begins with. Then one start is enough for mirrors like those measured; of mirrors whose waviness is twice what the
-prior expects, some still end beside the best surface.
+stage begins with. Then one start is enough for most mirrors like those measured; some rough ones end at another mirror
+from one start and not from the other, and what they leave of the images tells.
 
 What a camera adds to an image (a shift, another exposure, background, a little blur, another response) enters as a few
 directions per image with priors of their own (`model.nuisances`), and is marginalised exactly. All other errors, of the
@@ -283,13 +283,23 @@ class _Posterior:
 
     def settled(
         self, state: _State, jacobian: NDArray[Any], stages: Sequence[float], descent: Descent
-    ) -> tuple[_State, NDArray[Any], "_Belief"]:
-        """The state near another at which large features are right, the Jacobian there and what it was found with."""
+    ) -> tuple[Minimum[_State], "_Belief"]:
+        """The minimum near a state at which large features are right, and what it was found with."""
         for error in stages:
             belief = _Belief(np.full((1, len(BANDS)), error), np.ones(len(state.c)))
             found = self.optimum(state, belief, jacobian, descent)
             state, jacobian = found.state, found.jacobian
-        return state, jacobian, belief
+        return found, belief
+
+    def settled_best(self, starts: Sequence[Array]) -> tuple[Minimum[_State], "_Belief"]:
+        """The lowest of what is `settled` from coefficients (K,), compared at one noise, two at a time."""
+
+        def settle(c: Array) -> tuple[Minimum[_State], "_Belief"]:
+            state = self.state(c)
+            return self.settled(state, self.jacobian(state), self.options.annealing, DESCENT)
+
+        with ThreadPoolExecutor(2) as threads:
+            return min(threads.map(settle, starts), key=lambda settled: settled[0].cost)
 
     def covariance(self, state: _State, fit: "_Fit") -> Array:
         """Covariance (K, K) of the prior's coefficients, as far apart as halves of the images find the mirror.
@@ -321,10 +331,10 @@ class _Posterior:
         part = [self.observations[i] for i in images]
         half = _Posterior(self.heliostat, part, *model, self.rippled[:, list(images)])
         mean = half.state(np.zeros_like(belief.precision))
-        start, jacobian, _ = half.settled(mean, jacobian[:, list(images)], self.options.annealing[:1], ROUGHLY)
+        start, _ = half.settled(mean, jacobian[:, list(images)], self.options.annealing[:1], ROUGHLY)
         sigma = np.broadcast_to(belief.sigma, (len(self.observations), len(BANDS)))[list(images)]
         belief = replace(belief, sigma=sigma)
-        found = half.optimum(start, belief, jacobian, ROUGHLY)
+        found = half.optimum(start.state, belief, start.jacobian, ROUGHLY)
         return found.state.c, np.diag(half.fit(found.state, found.jacobian, belief).of_errors)
 
     def estimated(self, state: _State, jacobian: NDArray[Any], belief: "_Belief") -> tuple[_State, "_Fit"]:
@@ -517,7 +527,7 @@ def refine(
     observations : sequence of Observation
         Any number from one.
     start : (4, 8, 8) [m], optional
-        Where to begin instead of the prior's mean: the network's prediction, say.
+        Where to begin besides the prior's mean: the network's prediction, say. What leaves less of the images goes on.
     latitude_deg : float [deg]
         Of the plant.
 
@@ -570,13 +580,14 @@ def _consensus(
         return _Posterior(heliostat, [observations[i] for i in part], *model, latitude_deg, options)
 
     kept, left_out = list(range(len(observations))), list[int]()
-    c = np.zeros(len(model[0].basis)) if start is None else model[0].coefficients(start)
+    mean = np.zeros(len(model[0].basis))
+    starts = [mean] if start is None else [model[0].coefficients(start), mean]
     while True:
         suns = np.array([observations[i].sun for i in kept])
         few = [kept[i] for i in sorted(spread_suns(suns, options.few))]
         whole = posterior(few)
-        state = whole.state(c)
-        state, jacobian, belief = whole.settled(state, whole.jacobian(state), options.annealing, DESCENT)
+        settled, belief = whole.settled_best(starts)
+        state, jacobian = settled.state, settled.jacobian
         if len(few) < len(kept):
             whole = posterior(kept)
             state = whole.state(state.c)
