@@ -53,6 +53,15 @@ def test_a_start_at_the_truth_gains_nothing(refined, heliostat, truth):
     assert refined.misfit < from_truth.misfit + 1e-3
 
 
+def test_a_start_far_off_is_left_for_the_prior_s_mean(refined, heliostat, truth):
+    """From where canting is twelve standard deviations off, descent alone ends at another mirror, 4 mm away."""
+    prior = default_prior()
+    far = np.zeros(len(prior.basis))
+    far[:4] = 12
+    found = refine(heliostat, images(heliostat, truth), prior.surface(far), latitude_deg=JUELICH_LATITUDE)
+    assert surface_error(found.z, refined.z) < 2e-5
+
+
 def test_a_rough_mirror_is_found(heliostat):
     """Its waviness half as much again as the prior expects, its canting less: the scales of its directions follow."""
     prior = default_prior()
