@@ -2,9 +2,11 @@
 
 Mirrors of two kinds, placed over the field and photographed eight times (`training.cases`, one per cent of noise, 8
 bits): measured ones that neither network nor prior has seen, and ones drawn from the heavy-tailed prior, whose rough
-ones are rougher than any measured one. Each is refined from the network's prediction, from the prior's mean, and from
-the truth. An end is no worse than that from the truth if it leaves no more of the images, up to a hundredth of what
-that leaves. What both leave is the images' noise, the same for both.
+ones are rougher than any measured one. Each is refined from the network's prediction and the prior's mean, from the
+mean alone, and from the truth and the mean. An end is no worse than that from the truth if it leaves no more of the
+images, up to a hundredth of what that leaves. What both leave is the images' noise, the same for both. Mirrors are of
+8 x 8 heights, and are refined as such; ``--rippled`` as real ones are, with ripples that explain a part of what heights
+leave.
 """
 
 import argparse
@@ -21,7 +23,7 @@ from model.metrics import surface_error
 from model.network.predictor import WEIGHTS, default_predictor
 from model.plant import JUELICH_LATITUDE
 from model.prior import FREEDOM, GROUPS, SurfacePrior, default_prior
-from model.refinement import refine
+from model.refinement import RefinementOptions, refine
 from tests.benchmarks import data_folder
 from training.cases import Case, make_cases
 from training.methods import held_out_of
@@ -33,7 +35,7 @@ Array = NDArray[np.float64]
 NO_WORSE = 1.01
 """Share of the misfit from the truth up to which another end is no worse."""
 
-STARTS = ("the network's prediction", "the prior's mean")
+STARTS = ("the network's prediction and the mean", "the prior's mean")
 
 
 @dataclass(frozen=True)
@@ -60,11 +62,13 @@ def drawn(prior: SurfacePrior, count: int, rng: np.random.Generator) -> Array:
     return np.stack([prior.surface(c) for c in scales * rng.standard_normal((count, len(prior.basis)))])
 
 
-def ends(kind: str, case: Case) -> Ends:
+def ends(kind: str, rippled: bool, case: Case) -> Ends:
     """Refine one mirror from each start."""
+    options = RefinementOptions(rippled=rippled)
     heliostat, seen = case.heliostat, case.observations
     network = default_predictor().predict(heliostat, seen, latitude_deg=JUELICH_LATITUDE).z
-    found = [refine(heliostat, seen, z, latitude_deg=JUELICH_LATITUDE) for z in (network, None, case.truth)]
+    starts = (network, None, case.truth)
+    found = [refine(heliostat, seen, z, latitude_deg=JUELICH_LATITUDE, options=options) for z in starts]
     roughness = float(np.sqrt((default_prior().coefficients(case.truth) ** 2).mean()))
     return Ends(
         kind,
@@ -79,6 +83,7 @@ def main(arguments: list[str]) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--each", type=int, default=50, help="mirrors of either kind")
     parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--rippled", action="store_true", help="seek ripples, which these mirrors do not have")
     options = parser.parse_args(arguments)
     root = data_folder()
     surfaces, names = load_surfaces(root)
@@ -93,7 +98,7 @@ def main(arguments: list[str]) -> None:
     with ProcessPoolExecutor(options.jobs, mp_context=get_context("spawn")) as pool:
         for kind, (z, labels) in kinds.items():
             cases = make_cases(z, labels, field, options.each, CleanCamera(), seed=700)
-            found = list(pool.map(partial(ends, kind), cases))
+            found = list(pool.map(partial(ends, kind, options.rippled), cases))
             everything += found
             errors = np.array([mirror.errors for mirror in found])
             middle, worst = np.median(errors, axis=0), errors.max(axis=0)
