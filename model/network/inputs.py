@@ -86,7 +86,9 @@ def descents(trace: Callable[[Tensor], Tensor], flux: Tensor, basis: Tensor, sid
     direction, found, size = left, torch.zeros_like(left), left.square().sum(dim=1, keepdim=True)
     for step in range(DESCENT_STEPS):
         curved = direction + uphill(weighed(response(direction))).sum(dim=1)
-        length = size / (direction * curved).sum(dim=1, keepdim=True).clamp(min=1e-20)
+        curvature, by_prior = ((direction * other).sum(dim=1, keepdim=True) for other in (curved, direction))
+        # Less than the prior's own is none: where light is clipped, images do not do what was differentiated.
+        length = torch.where(curvature >= by_prior, size / curvature.clamp(min=1e-20), 0.0)
         if step == 0:
             shares = shares * length[..., None]
         found, left = found + length * direction, left - length * curved

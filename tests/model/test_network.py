@@ -11,7 +11,7 @@ import torch
 from model.errors import InvalidInputError
 from model.frames import sun_direction
 from model.network.architecture import CONDITIONS, MAX_IMAGES, NetworkConfig, SurfaceNetwork
-from model.network.inputs import conditions
+from model.network.inputs import conditions, descents
 from model.network.predictor import (
     INPUTS,
     SurfacePredictor,
@@ -138,6 +138,20 @@ def test_a_descent_leads_towards_the_surface_that_threw_the_images():
     assert misfit[1] < 0.5 * misfit[0]
     arrived = seen.descents(truth, basis)
     assert float(arrived.abs().max()) < 0.1 * float(descent.abs().max())
+
+
+def test_images_that_do_not_do_what_was_differentiated_lead_nowhere():
+    """Clipped light may: a step against its own derivative is none, rather than one without end."""
+    prior, generator = default_prior(), torch.Generator().manual_seed(0)
+    basis = torch.as_tensor(prior.basis, dtype=torch.float32)
+    base, patterns = torch.rand(32, 32, generator=generator) + 1, torch.randn(256, 1024, generator=generator)
+
+    def trace(changes: torch.Tensor) -> torch.Tensor:
+        moved = (1e2 * changes.flatten(2) @ patterns).view(1, 2, 32, 32)
+        return base + moved - 2 * moved.detach()
+
+    descent = descents(trace, base + torch.randn(1, 2, 32, 32, generator=generator), basis)
+    assert float(descent.abs().max()) == 0
 
 
 def test_the_mirrored_world_is_told_as_such():
