@@ -124,12 +124,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", default=TrainConfig().data)
     parser.add_argument("--variants", type=Path, default=VARIANTS, help="JSON of networks by name")
+    parser.add_argument("--only", nargs="+", help="names of those to train; the others are compared with the first")
     parser.add_argument("--steps", type=int, default=700, help="batches, each looked at as often as training does")
     arguments = parser.parse_args()
     config = TrainConfig(data=arguments.data, steps=arguments.steps)
     with tempfile.TemporaryDirectory() as folder:
         variants = json.loads(arguments.variants.read_text(encoding="utf-8"))
-        runs = {name: variant(values, config, Path(folder)) for name, values in variants.items()}
+        chosen = arguments.only or list(variants)
+        if unknown := set(chosen) - set(variants):
+            parser.error(f"--only: {', '.join(sorted(unknown))} not in {arguments.variants.name}")
+        runs = {name: variant(variants[name], config, Path(folder)) for name in chosen}
         milliseconds = train(runs, arguments.steps)
         print(table(runs, milliseconds, judge(runs)))
 
