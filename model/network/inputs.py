@@ -61,12 +61,15 @@ def descents(trace: Callable[[Tensor], Tensor], flux: Tensor, basis: Tensor, sid
     peak = measured.amax(dim=(2, 3), keepdim=True)
     unit = DESCENT_NOISE * peak * torch.sqrt((guessed / peak).clamp(min=0) + DARK)
     free = (nuisances(guessed, side) / unit[:, :, None]).flatten(3)
-    gram = torch.linalg.cholesky(free @ free.transpose(-1, -2) + torch.eye(free.shape[2], device=flux.device))
+    # A guess of one bright pixel has directions so long that single digits lose the unit matrix beside them.
+    long = free.double()
+    gram = torch.linalg.cholesky(long @ long.mT + torch.eye(free.shape[2], device=flux.device))
 
     def weighed(residual: Tensor) -> Tensor:
         """Residuals (B, M, R, R) in units of their errors, without what a camera may have done."""
         flat = residual.flatten(2)[..., None]
-        return residual - (free.transpose(-1, -2) @ torch.cholesky_solve(free @ flat, gram)).view_as(residual)
+        along = torch.cholesky_solve((free @ flat).double(), gram).to(flat.dtype)
+        return residual - (free.mT @ along).view_as(residual)
 
     def uphill(residual: Tensor) -> Tensor:
         """What residuals (B, M, R, R) ask of the prior's coefficients (B, M, K)."""

@@ -10,6 +10,7 @@ import torch
 
 from model.errors import InvalidInputError
 from model.frames import sun_direction
+from model.images import normalized
 from model.network.architecture import CONDITIONS, MAX_IMAGES, NetworkConfig, SurfaceNetwork
 from model.network.inputs import conditions, descents
 from model.network.predictor import (
@@ -152,6 +153,20 @@ def test_images_that_do_not_do_what_was_differentiated_lead_nowhere():
 
     descent = descents(trace, base + torch.randn(1, 2, 32, 32, generator=generator), basis)
     assert float(descent.abs().max()) == 0
+
+
+def test_a_guess_whose_light_is_one_pixel_has_a_descent():
+    """A rough mirror that sends its light out of the window: what cameras may do outweighs all else."""
+    basis = torch.as_tensor(default_prior().basis, dtype=torch.float32)
+    guess, along = torch.zeros(32, 32), torch.linspace(-3, 3, 32)
+    guess[0, 0] = 100.0
+    spot = normalized(torch.exp(-(along[:, None] ** 2 + along**2) / 2)).expand(1, 2, 32, 32)
+    patterns = torch.randn(256, 1024, generator=torch.Generator().manual_seed(0))
+
+    def trace(changes: torch.Tensor) -> torch.Tensor:
+        return guess + (changes.flatten(2) @ patterns).view(1, 2, 32, 32)
+
+    assert torch.isfinite(descents(trace, spot, basis)).all()
 
 
 def test_the_mirrored_world_is_told_as_such():
