@@ -23,15 +23,15 @@ place: mirrors rendered as deflectometry has them, refined without ripples, are 
 They are sought with the surface (`model.prior.ripples`), their images to first order, and are not told of.
 
 All that is of one place: where images tell mirrors apart by little, their errors decide which of several mirrors is
-found, and no curvature at one of them shows the others. Halves of the images do, each fitted anew from the prior's mean
-(`_half_samples`).
+found, and no curvature at one of them shows the others. Halves of the images do, each fitted anew from another mirror
+(`_Posterior.covariance`).
 """
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import chain
+from itertools import chain, combinations
 from typing import Any
 
 import numpy as np
@@ -304,37 +304,46 @@ class _Posterior:
     def covariance(self, state: _State, fit: "_Fit") -> Array:
         """Covariance (K, K) of the prior's coefficients, as far apart as halves of the images find the mirror.
 
-        Each half is fitted anew, from the prior's mean, and from blurred to sharp: halves that begin where all images
-        ended tend to stay there. By as much as halves differ more than their errors should make them, group by group of
-        the prior's directions, the part that comes of errors grows; what the prior leaves open stays. Halves do not
-        show errors that all images share: `_Fit.cautious` allows for those.
+        Each half is fitted anew, from blurred to sharp, and begins with another two facets exchanged: the light of all
+        falls on one spot, and far away or by few suns images hardly tell which facet is bent how. Halves that begin at
+        one mirror tend to end at one. By as much as halves differ more than their errors should make them, group by
+        group of the prior's directions, the part that comes of errors grows; what the prior leaves open stays. Halves
+        do not show errors that all images share: `_Fit.cautious` allows for those.
         """
         known, suns = slice(len(self.prior.basis)), np.array([o.sun for o in self.observations])
         cautious = fit.cautious(self.options.grain)[known, known]
         if len(suns) < 2:
             return cautious
-        jacobian = self.jacobian(self.state(np.zeros_like(state.c)))
+        halves = list(chain.from_iterable(_half_samples(suns)))
+        starts = self._exchanged(state.c)[: len(halves)]
         # NumPy and torch compute without the interpreter: two threads take little more than half as long.
         with ThreadPoolExecutor(2) as threads:
-            halves = chain.from_iterable(_half_samples(suns))
-            found = list(threads.map(lambda half: self._half(half, jacobian, fit.belief), halves))
+            found = list(threads.map(lambda half, start: self._half(half, start, fit.belief), halves, starts))
         unlike = np.mean([_unlike(*pair) for pair in zip(found[::2], found[1::2], strict=True)], axis=0)[known]
         growth = np.sqrt(np.maximum(1 / self.prior.precision(np.sqrt(unlike), np.zeros_like(unlike)), 1))
         return np.asarray(cautious + fit.of_errors[known, known] * (np.outer(growth, growth) - 1))
 
-    def _half(self, images: Sequence[int], jacobian: NDArray[Any], belief: "_Belief") -> tuple[Array, Array]:
-        """Coefficients (K,) that some of the images find, and their variance (K,) by the images' errors.
+    def _exchanged(self, c: Array) -> list[Array]:
+        """Coefficients (K,) with each pair of facets exchanged, in what they differ from the prior's mean by."""
+        smooth, fine = np.split(c, [len(self.prior.basis)])
+        bent, starts = self.prior.surface(smooth) - self.prior.mean, list[Array]()
+        for pair in combinations(range(len(bent)), 2):
+            other = bent.copy()
+            other[[*pair]] = bent[[*reversed(pair)]]
+            exchanged = self.prior.coefficients(self.prior.mean + other)
+            starts.append(np.concatenate([exchanged, np.zeros_like(fine)]))
+        return starts
 
-        From the prior's mean, where all images have a ``jacobian`` (K, M, R, R).
-        """
+    def _half(self, images: Sequence[int], start: Array, belief: "_Belief") -> tuple[Array, Array]:
+        """Coefficients (K,) that some of the images find from others, and their variance (K,) by the images' errors."""
         model = self.prior, self.optics, self.effects, self.latitude_deg, self.options
         part = [self.observations[i] for i in images]
         half = _Posterior(self.heliostat, part, *model, self.rippled[:, list(images)])
-        mean = half.state(np.zeros_like(belief.precision))
-        start, _ = half.settled(mean, jacobian[:, list(images)], self.options.annealing[:1], ROUGHLY)
+        state = half.state(start)
+        near, _ = half.settled(state, half.jacobian(state), self.options.annealing[:1], ROUGHLY)
         sigma = np.broadcast_to(belief.sigma, (len(self.observations), len(BANDS)))[list(images)]
         belief = replace(belief, sigma=sigma)
-        found = half.optimum(start.state, belief, start.jacobian, ROUGHLY)
+        found = half.optimum(near.state, belief, near.jacobian, ROUGHLY)
         return found.state.c, np.diag(half.fit(found.state, found.jacobian, belief).of_errors)
 
     def estimated(self, state: _State, jacobian: NDArray[Any], belief: "_Belief") -> tuple[_State, "_Fit"]:
