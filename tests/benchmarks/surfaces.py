@@ -3,12 +3,13 @@
 Rendered: AA28, AA39 and AC43 as deflectometry has them, 20 x 20 heights a facet, at their own places, under suns and
 on targets of real photographs, traced by Monte Carlo with one per cent of noise; by the network and refined, from the
 prior's mean and from the truth, without ripples, and by the generic prior; then the same mirrors, larger by half, of
-whose facets there is no other prior; then smoothed to the 8 x 8 heights that errors are of. ``--scaling`` adds the time
-from 8 to 64 images.
+whose facets there is no other prior; then smoothed to the 8 x 8 heights that errors are of.
 
 Real: AA39 of two years, from sets of its photographs, some of which contradict the others; flux accuracy on
 photographs that no set holds. Errors are those of the control heights, the mirror's tilt and canting counted. AC43 is
 STJ-012 of the measured surfaces, from which neither network nor prior has learnt.
+
+``--only scaling``: the time that AA39 takes from 8 to 64 images.
 
 ``--only far``: the same surfaces on heliostats 300 to 600 m away, whose spots spill out of the smallest window, by
 images of that and of the one that is chosen, on a target that holds all.
@@ -334,26 +335,22 @@ def main(arguments: list[str]) -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rays", type=int, default=3_000_000)
-    parser.add_argument("--scaling", action="store_true")
-    parser.add_argument("--only", choices=("rendered", "far", "real", "photographs"))
+    parser.add_argument("--only", choices=("rendered", "real", "scaling", "far", "photographs"))
     options = parser.parse_args(arguments)
     root: Path = data_folder()
     if not (root.parent / "stj-years").is_dir():
         print(f"surfaces: no real measurements at {root}; set HELIOTWIN_STJ")
         return
     folder, years = read_folder(root), read_folder(root.parent / "stj-years")
-    if options.only == "photographs":
-        photographs(years)
-        return
-    if options.only == "far":
-        far(folder, years, options.rays)
-        return
-    if options.only != "real":
-        rendered(folder, years, options.rays)
-    if options.scaling:
-        scaling(folder, years, options.rays)
-    if options.only != "rendered":
-        real(years)
+    tables: dict[str, Callable[[], None]] = {
+        "rendered": lambda: rendered(folder, years, options.rays),
+        "real": lambda: real(years),
+        "scaling": lambda: scaling(folder, years, options.rays),
+        "far": lambda: far(folder, years, options.rays),
+        "photographs": lambda: photographs(years),
+    }
+    for name in (options.only,) if options.only else ("rendered", "real"):
+        tables[name]()
 
 
 if __name__ == "__main__":
