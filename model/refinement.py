@@ -27,7 +27,7 @@ found, and no curvature at one of them shows the others. Halves of the images do
 (`_Posterior.covariance`).
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -314,28 +314,28 @@ class _Posterior:
         cautious = fit.cautious(self.options.grain)[known, known]
         if len(suns) < 2:
             return cautious
-        halves = list(chain.from_iterable(_half_samples(suns)))
-        starts = self._exchanged(state.c)[: len(halves)]
         # NumPy and torch compute without the interpreter: two threads take little more than half as long.
         with ThreadPoolExecutor(2) as threads:
+            halves, starts = chain.from_iterable(_half_samples(suns)), self._exchanged(state.c)
             found = list(threads.map(lambda half, start: self._half(half, start, fit.belief), halves, starts))
         unlike = np.mean([_unlike(*pair) for pair in zip(found[::2], found[1::2], strict=True)], axis=0)[known]
         growth = np.sqrt(np.maximum(1 / self.prior.precision(np.sqrt(unlike), np.zeros_like(unlike)), 1))
         return np.asarray(cautious + fit.of_errors[known, known] * (np.outer(growth, growth) - 1))
 
-    def _exchanged(self, c: Array) -> list[Array]:
-        """Coefficients (K,) with each pair of facets exchanged, in what they differ from the prior's mean by."""
+    def _exchanged(self, c: Array) -> Iterator[Array]:
+        """Coefficients (K,) with each pair of facets exchanged, in what they differ from the prior's mean by.
+
+        Six of four facets, as many as there are halves at the most; without ripples.
+        """
         smooth, fine = np.split(c, [len(self.prior.basis)])
-        bent, starts = self.prior.surface(smooth) - self.prior.mean, list[Array]()
-        for pair in combinations(range(len(bent)), 2):
+        bent = self.prior.surface(smooth) - self.prior.mean
+        for a, b in combinations(range(len(bent)), 2):
             other = bent.copy()
-            other[[*pair]] = bent[[*reversed(pair)]]
-            exchanged = self.prior.coefficients(self.prior.mean + other)
-            starts.append(np.concatenate([exchanged, np.zeros_like(fine)]))
-        return starts
+            other[[a, b]] = bent[[b, a]]
+            yield np.concatenate([self.prior.coefficients(self.prior.mean + other), np.zeros_like(fine)])
 
     def _half(self, images: Sequence[int], start: Array, belief: "_Belief") -> tuple[Array, Array]:
-        """Coefficients (K,) that some of the images find from others, and their variance (K,) by the images' errors."""
+        """Coefficients (K,) that some of the images find from a start (K,), and their variance (K,) by their errors."""
         model = self.prior, self.optics, self.effects, self.latitude_deg, self.options
         part = [self.observations[i] for i in images]
         half = _Posterior(self.heliostat, part, *model, self.rippled[:, list(images)])

@@ -331,26 +331,29 @@ def photographs(years: MeasurementFolder) -> None:
         )
 
 
+TABLES: dict[str, Callable[[MeasurementFolder, MeasurementFolder, int], None]] = {
+    "rendered": rendered,
+    "real": lambda folder, years, rays: real(years),
+    "scaling": scaling,
+    "far": far,
+    "photographs": lambda folder, years, rays: photographs(years),
+}
+"""What can be printed, of the folder of many heliostats, that of one over years, and so many rays an image."""
+
+
 def main(arguments: list[str]) -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rays", type=int, default=3_000_000)
-    parser.add_argument("--only", choices=("rendered", "real", "scaling", "far", "photographs"))
+    parser.add_argument("--only", choices=TABLES)
     options = parser.parse_args(arguments)
     root: Path = data_folder()
     if not (root.parent / "stj-years").is_dir():
         print(f"surfaces: no real measurements at {root}; set HELIOTWIN_STJ")
         return
     folder, years = read_folder(root), read_folder(root.parent / "stj-years")
-    tables: dict[str, Callable[[], None]] = {
-        "rendered": lambda: rendered(folder, years, options.rays),
-        "real": lambda: real(years),
-        "scaling": lambda: scaling(folder, years, options.rays),
-        "far": lambda: far(folder, years, options.rays),
-        "photographs": lambda: photographs(years),
-    }
     for name in (options.only,) if options.only else ("rendered", "real"):
-        tables[name]()
+        TABLES[name](folder, years, options.rays)
 
 
 if __name__ == "__main__":
