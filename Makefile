@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test serve lint bench train clean
+.PHONY: help install demo test serve lint lock bench train clean
 
 help: ## list the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -22,11 +22,15 @@ demo: install ## photographs in, mirror surfaces and flux forecasts out, under o
 test: install ## every test
 	$(BIN)/pytest -n 2 --dist loadgroup $(ARGS)
 
-lint: install ## ruff, mypy and the arrows between packages and rooms
+lock: install ## the image's packages with their hashes, in the versions of constraints.txt
+	PATH=$(BIN):$$PATH $(BIN)/python docker/lock.py $(ARGS)
+
+lint: install ## ruff, mypy, imports between packages, and limits of what makes code hard to read
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python -m tests.codebase --check
 
 serve: install ## the service on http://127.0.0.1:8000
 	$(BIN)/heliotwin serve $(ARGS)

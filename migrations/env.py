@@ -1,4 +1,6 @@
-"""How Alembic reaches the database: the connection that `service.store.database` hands in, or one from the settings."""
+"""How Alembic reaches the database: the connection that `service.store.database` hands in, or one
+from the settings.
+"""
 
 from alembic import context
 from sqlalchemy import Connection, text

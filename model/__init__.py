@@ -1,1 +1,1 @@
-"""The heliostat and its light: pure functions and small frozen dataclasses, without database, HTTP or files."""
+"""The heliostat and its light: pure functions and frozen dataclasses, without database or HTTP."""

@@ -1,8 +1,8 @@
-"""The few errors that the model raises; the service maps each to one HTTP status."""
+"""The errors of the model; the service maps each to one HTTP status."""
 
 
 class ModelError(Exception):
-    """Base of everything the model raises on purpose; the message names the field and the remedy."""
+    """Base of all intended errors of the model; the message names the field and the remedy."""
 
 
 class InvalidInputError(ModelError, ValueError):
@@ -10,11 +10,15 @@ class InvalidInputError(ModelError, ValueError):
 
 
 class UnreachableError(ModelError):
-    """The geometry has no solution: a target behind the mirror, an orientation the mount cannot reach."""
+    """The geometry has no solution: a target behind the mirror, or an unreachable attitude."""
+
+
+class WeightsError(ModelError):
+    """Shipped weights are missing or differ from their model card; the installation is damaged."""
 
 
 class ImageRefusedError(ModelError):
-    """A photograph cannot be measured; ``reason`` is the short code that its quality record keeps."""
+    """A photograph cannot be measured; ``reason`` is the code in its quality record."""
 
     def __init__(self, reason: str, detail: str) -> None:
         super().__init__(f"{reason}: {detail}")

@@ -1,7 +1,7 @@
-"""Flux images as numbers, alike for numpy and torch.
+"""Flux images as arrays, for numpy and torch.
 
-The flux image that everything compares, predicts from and reports is a square about the spot's centre of mass, of the
-side, the pixels and the sum that Lewen et al. 2024 (iDLR) chose.
+The flux image that everything compares, predicts from and reports is a square about the spot's
+centre of mass, with the width, the pixels and the sum of Lewen et al. 2024 (iDLR).
 """
 
 from typing import TYPE_CHECKING, TypeVar
@@ -15,7 +15,7 @@ if TYPE_CHECKING:  # its sizes are read where nothing is traced
 Images = TypeVar("Images", NDArray[np.float64], "Tensor")
 
 FLUX_WINDOW = 4.0
-"""Side [m] of a flux image about its centre of mass."""
+"""Width [m] of a flux image about its centre of mass."""
 
 FLUX_SIZE = 64
 """Pixels along a side of a flux image."""
@@ -23,23 +23,24 @@ FLUX_SIZE = 64
 FLUX_SHAPE = (FLUX_SIZE, FLUX_SIZE)
 
 FLUX_SUM = 100.0
-"""What the pixels of a normalised flux image add up to."""
+"""Sum of the pixels of a normalised flux image."""
 
 COARSE_SIZE = 32
-"""Pixels along a side of images that are fitted: the sun has blurred all that is finer."""
+"""Pixels along a side of fitted images: the sun blurs all finer detail."""
 
 
 def normalized(images: Images) -> Images:
-    """Images (..., R, C) scaled to a sum of `FLUX_SUM`; a black one stays black."""
+    """Scale images (..., R, C) to a sum of `FLUX_SUM`; a black one stays black."""
     scaled: Images = FLUX_SUM * images / images.sum((-2, -1)).clip(1e-9)[..., None, None]
     return scaled
 
 
 def clipped_alike(forecast: Images, measured: Images, clipped: Images) -> Images:
-    """Forecasts (..., R, C) as a camera shows them whose range cut off ``measured`` by the shares ``clipped`` [1].
+    """Saturate forecasts (..., R, C) as the camera saturated ``measured``, by the shares
+    ``clipped`` [1] of pixels.
 
-    Of such a pixel only this is known: that the light was at least so much. Forecasts are brought to the scale of what
-    was not cut off, and cut off where they are brighter; what lies above is no error.
+    Of a saturated pixel only a lower limit of the light is known. Forecasts are scaled to the light
+    that is not saturated, and limited where they are brighter: the excess is no error.
     """
     free = 1 - clipped
     scale = (measured * free).sum((-2, -1)) / (forecast * free).sum((-2, -1)).clip(1e-9)
@@ -49,7 +50,9 @@ def clipped_alike(forecast: Images, measured: Images, clipped: Images) -> Images
 
 
 def binned(images: Images, resolution: int) -> Images:
-    """Images (..., n R, n R) in R = ``resolution`` pixels a side, their sums kept."""
+    """Sum images (..., n R, n R) to R = ``resolution`` pixels along a side."""
     size = images.shape[-1] // resolution
-    coarse: Images = images.reshape(*images.shape[:-2], resolution, size, resolution, size).sum((-3, -1))
+    coarse: Images = images.reshape(*images.shape[:-2], resolution, size, resolution, size).sum(
+        (-3, -1)
+    )
     return coarse

@@ -1,15 +1,21 @@
-"""Least squares by Levenberg and Marquardt, for refinements and studies.
+"""Nonlinear least squares by the method of Levenberg and Marquardt.
 
-A damped Gauss-Newton step is tried; if it lowers the cost it is taken and the damping eased, otherwise it is tried
-again with more. Where a Jacobian is much more work than a step, one may serve many steps: every step corrects it by
-what the response really did (Broyden 1965), and it is taken anew where corrections no longer help.
+Notes
+-----
+Near a state the cost is approximated by a quadratic form in the change ``d``, with the downhill
+``gradient`` g and the Gauss-Newton ``curvature`` H::
 
-Sources: Marquardt 1963, doi:10.1137/0111030; Broyden 1965, doi:10.1090/S0025-5718-1965-0198670-6; for bounds, the
-bounded-variable least squares of Stark and Parker 1995.
+    cost(d) = cost(0) - g' d + d' H d / 2
+
+The step solves ``(H + damping diag(H)) d = g``, if there are bounds within them. A step that lowers
+the cost is accepted and the damping is reduced; otherwise the step is repeated with more damping.
+
+Sources: Marquardt 1963, doi:10.1137/0111030; for bounds, the bounded-variable least squares of
+Stark and Parker 1995.
 """
 
 from dataclasses import dataclass
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,109 +26,122 @@ Array = NDArray[np.float64]
 State = TypeVar("State")
 
 
+class Quadratic(NamedTuple):
+    """Downhill gradient (P,) and Gauss-Newton curvature (P, P) of a cost."""
+
+    gradient: Array
+    curvature: Array
+
+
+class Bounds(NamedTuple):
+    """Smallest and largest change (P,) of a state."""
+
+    low: Array
+    high: Array
+
+
 class Problem(Protocol[State]):
-    """What is to be minimised, at states that know more of themselves than P numbers."""
+    """A cost to minimize, as a function of states, which may hold more than P numbers."""
 
     def cost(self, state: State) -> float:
-        """Half the sum of squares; infinite where there is no answer."""
-
-    def response(self, state: State) -> Array:
-        """What is compared with data (...), whose change a Jacobian tells."""
+        """Half the sum of squares; infinite if the model has no answer."""
 
     def jacobian(self, state: State) -> Array:
-        """Derivatives (P, ...) of the response."""
+        """Derivatives (P, ...) of what is compared with the data."""
 
-    def quadratic(self, state: State, jacobian: Array) -> tuple[Array, Array]:
-        """Downhill gradient (P,) and Gauss-Newton curvature (P, P) of the cost."""
+    def quadratic(self, state: State, jacobian: Array) -> Quadratic:
+        """Quadratic approximation of the cost."""
 
-    def bounds(self, state: State) -> tuple[Array, Array] | None:
-        """Least and greatest change (P,) of a state; None for any."""
+    def bounds(self, state: State) -> Bounds | None:
+        """Bounds on the change of a state; None if there are none."""
 
-    def moved(self, state: State, change: Array) -> State:
+    def step(self, state: State, change: Array) -> State:
         """The state after a change (P,)."""
 
 
 @dataclass(frozen=True)
-class Descent:
-    """How a minimum is sought.
+class MinimizerOptions:
+    """Options of `minimize`.
 
-    At most ``steps`` are tried, with at most ``jacobians`` taken on the way. A Jacobian is taken anew after every step,
-    or ``corrected`` as long as that helps. ``damping``, the first, is divided by ``easing`` after a step that was
-    taken, down to ``least_damping``, and multiplied by ``raising`` after one that was not. It ends with a step that
-    gains less than ``least_gain`` and ``least_share`` of the cost; after ``patience`` steps in a row that gain nothing;
-    or where they take more than ``most_damping``.
+    Attributes
+    ----------
+    max_steps, max_jacobians : int
+        Largest numbers of trial steps and of Jacobians; one Jacobian is computed after each
+        accepted step.
+    damping : float
+        Of the first step.
+    damping_decrease, damping_increase : float
+        Factors after an accepted and after a rejected step.
+    min_damping : float
+    patience : float
+        Number of rejected steps in a row after which it ends.
+    min_gain, min_relative_gain : float
+        It ends with a step that lowers the cost by less than their sum; the second is a share of
+        the cost.
     """
 
-    steps: int
-    jacobians: int
-    corrected: bool = False
+    max_steps: int
+    max_jacobians: int
     damping: float = 1e-2
-    easing: float = 5.0
-    raising: float = 8.0
-    least_damping: float = 0.0
-    most_damping: float = np.inf
+    damping_decrease: float = 5.0
+    damping_increase: float = 8.0
+    min_damping: float = 0.0
     patience: float = np.inf
-    least_gain: float = 0.0
-    least_share: float = 0.0
+    min_gain: float = 0.0
+    min_relative_gain: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class Minimum(Generic[State]):
-    """A local minimum: the state, its cost, and the last Jacobian (P, ...), of it or of a state shortly before."""
+    """A local minimum, its cost, and the Jacobian (P, ...) at it or at a state shortly before."""
 
     state: State
     cost: float
     jacobian: Array
 
 
-def minimize(problem: Problem[State], state: State, descent: Descent, jacobian: Array | None = None) -> Minimum[State]:
-    """The local minimum below a state of finite cost; a ``jacobian`` there or nearby may be given, to be corrected."""
-    left = descent.jacobians
-    fresh = jacobian is None
+def minimize(
+    problem: Problem[State], state: State, options: MinimizerOptions, jacobian: Array | None = None
+) -> Minimum[State]:
+    """Find the local minimum downhill of a state of finite cost.
+
+    ``jacobian`` is that of the state or of one nearby, if it is known.
+    """
+    n_jacobians = options.max_jacobians
     if jacobian is None:
-        jacobian, left = problem.jacobian(state), left - 1
-    cost, damping, failed = problem.cost(state), descent.damping, 0
-    for _ in range(descent.steps):
-        change = damped_step(*problem.quadratic(state, jacobian), damping, problem.bounds(state))
-        trial = problem.moved(state, change)
+        jacobian, n_jacobians = problem.jacobian(state), n_jacobians - 1
+    cost, damping, n_rejected = problem.cost(state), options.damping, 0
+    for _ in range(options.max_steps):
+        change = damped_step(problem.quadratic(state, jacobian), damping, problem.bounds(state))
+        trial = problem.step(state, change)
         trial_cost = problem.cost(trial)
-        gain, enough = cost - trial_cost, descent.least_gain + descent.least_share * cost
+        gain, enough = cost - trial_cost, options.min_gain + options.min_relative_gain * cost
         if gain > 0:
-            if descent.corrected:
-                jacobian = broyden(jacobian, change, problem.response(trial) - problem.response(state))
-            state, cost, failed = trial, trial_cost, 0
-            damping = max(damping / descent.easing, descent.least_damping)
+            state, cost, n_rejected = trial, trial_cost, 0
+            damping = max(damping / options.damping_decrease, options.min_damping)
         else:
-            damping, failed = damping * descent.raising, failed + 1
+            damping, n_rejected = damping * options.damping_increase, n_rejected + 1
         if gain > 0 and gain >= enough:
-            fresh = False
-            anew = not descent.corrected
-            if anew and not left:
+            if not n_jacobians:
                 break
-        else:
-            anew = descent.corrected and not fresh and left > 0
-            if not anew and (gain > 0 or failed >= descent.patience or damping > descent.most_damping):
-                break
-        if anew:
-            jacobian, fresh, left = problem.jacobian(state), True, left - 1
+            jacobian, n_jacobians = problem.jacobian(state), n_jacobians - 1
+        elif gain > 0 or n_rejected >= options.patience:
+            break
     return Minimum(state, cost, jacobian)
 
 
-def damped_step(gradient: Array, curvature: Array, damping: float, bounds: tuple[Array, Array] | None = None) -> Array:
-    """The change (P,) to the least of a quadratic form with damped curvature (P, P), down a gradient (P,).
+def damped_step(quadratic: Quadratic, damping: float, bounds: Bounds | None = None) -> Array:
+    """Solve for the step (P,) of a quadratic form with a damped curvature.
 
-    Within ``bounds``, least and greatest changes (P,): a full step that was only cut at the bounds would go astray
-    where unknowns make up for each other.
+    With ``bounds`` the constrained problem is solved: clipping the full step would mislead if
+    parameters compensate each other.
     """
+    gradient, curvature = quadratic
     damped = curvature + damping * np.diag(np.diag(curvature))
     if bounds is None:
         return np.asarray(np.linalg.solve(damped, gradient), dtype=np.float64)
     root = np.linalg.cholesky(damped)
-    solution = lsq_linear(root.T, solve_triangular(root, gradient, lower=True), bounds, method="bvls")
+    solution = lsq_linear(
+        root.T, solve_triangular(root, gradient, lower=True), tuple(bounds), method="bvls"
+    )
     return np.asarray(np.clip(solution.x, *bounds))
-
-
-def broyden(jacobian: Array, change: Array, response: Array) -> Array:
-    """A Jacobian (P, ...) corrected, as little as can be, to tell what a change (P,) made of the response (...)."""
-    missed = response - np.tensordot(change, jacobian, axes=1)
-    return np.asarray(jacobian + np.multiply.outer(change / (change @ change), missed))

@@ -1,12 +1,13 @@
 """Every accuracy and error figure, defined once.
 
-Flux accuracy compares shapes on a window centred on each image's own centre of mass (DESIGN.md, section 7), so that
-neither aiming nor exposure counts. Surface error is the mean absolute difference of control heights after each
-facet's mean is taken out, which no image can see.
+Flux accuracy compares shapes on a window centred on each image's own centre of mass (DESIGN.md,
+section 7), so that neither aiming nor exposure counts. Surface error is the mean absolute
+difference of control heights after each facet's mean is taken out, which no image can see.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,14 +20,15 @@ Array = NDArray[np.float64]
 
 
 WINDOWS = (FLUX_WINDOW, 6.0, 8.0, 12.0)
-"""Sides [m] of windows to compare in: that of a flux image, unless a spot is larger (`accuracy_window`)."""
+"""Sides [m] of comparison windows: a flux image's, unless a spot is larger (`accuracy_window`)."""
 
 SPILL = 0.02
 """Share of a spot's energy that may lie outside its window."""
 
 
 def flux_accuracies(measured: Array, forecast: Array) -> Array:
-    """1 - sum|measured - forecast| / sum(measured) of fluxes (..., R, C), both scaled to the same sum.
+    """1 - sum|measured - forecast| / sum(measured) of fluxes (..., R, C), both scaled to the same
+    sum.
 
     One for equal shapes. Source: Lewen et al. 2024 (iDLR), flux accuracy.
     """
@@ -52,7 +54,7 @@ def flux_accuracy(measured: ArrayLike, forecast: ArrayLike) -> float:
 
 @dataclass(frozen=True)
 class FluxComparison:
-    """Accuracy of a forecast and the shares of the measured and forecast energy outside its window."""
+    """Accuracy of a forecast, and the shares of both energies outside its window."""
 
     accuracy: float
     window: float
@@ -69,10 +71,12 @@ def compare_on_target(
 ) -> FluxComparison:
     """Compare two fluxes (rows, columns) over one target of ``size`` (width, height) [m].
 
-    Each is cut to a square ``window`` [m] about its own centre of mass, (resolution, resolution) pixels.
+    Each is cut to a square ``window`` [m] about its own centre of mass, (resolution, resolution)
+    pixels.
     """
-    cuts, outside = zip(*(_cut(flux, size, window, resolution) for flux in (measured, forecast)), strict=True)
-    return FluxComparison(flux_accuracy(*cuts), window, *outside)
+    first, second = (_cut(flux, size, window, resolution) for flux in (measured, forecast))
+    accuracy = flux_accuracy(first.flux, second.flux)
+    return FluxComparison(accuracy, window, first.outside, second.outside)
 
 
 def accuracy_window(
@@ -82,27 +86,36 @@ def accuracy_window(
     spill: float = SPILL,
     widest: float = WINDOWS[-1],
 ) -> float:
-    """Side [m] of the smallest of `WINDOWS`, up to ``widest``, that holds all of the spots but ``spill``.
+    """Side [m] of the smallest of `WINDOWS`, up to ``widest``, that holds all of the spots but
+    ``spill``.
 
-    ``images`` are N fluxes (rows, columns) over whole targets of ``sizes`` (width, height) [m]; of many, half of them
-    must fit.
+    ``images`` are N fluxes (rows, columns) over whole targets of ``sizes`` (width, height) [m]; of
+    many, half of them must fit.
     """
     windows = [window for window in WINDOWS if window <= widest]
     for window in windows:
-        outside = [_cut(i, size, window, FLUX_SIZE)[1] for i, size in zip(images, sizes, strict=True)]
+        outside = [
+            _cut(i, size, window, FLUX_SIZE).outside for i, size in zip(images, sizes, strict=True)
+        ]
         if np.median(outside) <= spill:
             return window
     return windows[-1]
 
 
-def _cut(image: ArrayLike, size: tuple[float, float], window: float, resolution: int) -> tuple[Array, float]:
+class _Cut(NamedTuple):
     """A flux in the window about its centre of mass, and the share of its energy outside."""
+
+    flux: Array
+    outside: float
+
+
+def _cut(image: ArrayLike, size: tuple[float, float], window: float, resolution: int) -> _Cut:
     flux = np.asarray(image, dtype=np.float64)
     cut = flux_window(flux, size, center_of_mass(flux, size), window, resolution)
-    return cut, float(1 - cut.sum() / flux.sum())
+    return _Cut(cut, float(1 - cut.sum() / flux.sum()))
 
 
 def surface_error(z: ArrayLike, truth: ArrayLike) -> float:
-    """Mean absolute error [m] of control heights (..., F, I, J), each facet's mean removed from both."""
+    """Mean absolute error [m] of heights (..., F, I, J), without the mean of each facet."""
     difference = np.asarray(z, dtype=np.float64) - np.asarray(truth, dtype=np.float64)
     return float(np.abs(difference - difference.mean(axis=(-2, -1), keepdims=True)).mean())

@@ -1,19 +1,21 @@
-"""Blocking and shading: neighbours that stand between a mirror and the sun, or between it and its target.
+"""Blocking and shading by neighbours between a mirror and the sun, or between it and its target.
 
-Every mirror is taken for the rectangle of its outline. `Neighbours.obstacles` finds, for the mirrors of a scene, the
-few rectangles that may come in their way at all; `clear` tells which share of each of a mirror's samples they leave
-free. Samples are cut in proportion where a rectangle's edge crosses them, so that power follows the edge smoothly.
+Every mirror is the rectangle of its outline. `Neighbours.obstacles` finds the few rectangles that
+may hide a mirror; `clear` computes the free share of each of its samples. A sample that an edge
+crosses is divided in proportion, so that the power is a continuous function of the edge's position.
 
-Approximations: the sun is a point here; its disc blurs a shadow's edge by some centimetres between neighbours, evenly
-to both sides. Where the edges of two shadows lie in one sample, the larger counts: those of neighbours in a row, or of
-one before the sun and before the target, mostly lie on each other.
+Approximations: the sun is a point. Its disc blurs a shadow's edge by some centimetres between
+neighbours, equally to both sides. If the edges of two shadows are in one sample, the larger shadow
+counts: those of neighbours in a row, or before the sun and before the target, mostly overlap.
 
-Source: ray casting against the neighbours' outlines, as in SolTrace; bounding spheres to leave the others out as in
-Collado and Guallar, *Campo: Generation of regular heliostat fields*, Renewable Energy 46 (2012).
+Source: ray casting against the neighbours' outlines as in SolTrace; bounding spheres to exclude
+others as in Collado and Guallar, *Campo: Generation of regular heliostat fields*, Renewable Energy
+46 (2012).
 """
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -25,19 +27,19 @@ from model.plant import Heliostat
 
 Array = NDArray[np.float64]
 
-# A rectangle where no light comes by, for mirrors that have fewer obstacles than others of their batch [m].
+# A rectangle out of all light, for mirrors with fewer obstacles than others of their batch [m].
 _NOWHERE = np.array([[0.0, 0.0, -1e6], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 
 def outlines(heliostats: Sequence[Heliostat], sun: ArrayLike, aims: ArrayLike) -> Array:
-    """Rectangles (N, 3, 3) [m] of mirrors that send the sun (3,) to ``aims`` (N, 3) [m], in ENU.
+    """Rectangles (N, 3, 3) [m] in ENU of mirrors that reflect the sun (3,) to ``aims`` (N, 3) [m].
 
     Each is its centre, then half its width and half its height as vectors.
 
     Raises
     ------
     UnreachableError
-        Where a mount cannot turn there.
+        If a mount cannot reach its aim.
     """
     mount = Mount.stack([heliostat.mount for heliostat in heliostats])
     positions = np.array([heliostat.position for heliostat in heliostats])
@@ -47,16 +49,24 @@ def outlines(heliostats: Sequence[Heliostat], sun: ArrayLike, aims: ArrayLike) -
     return np.concatenate([mount.mirror_center(positions, attitudes)[:, None], sides], axis=1)
 
 
+class Outlines(NamedTuple):
+    """Names, `outlines` (n, 3, 3) [m] and aims (n, 3) [m] of mirrors."""
+
+    names: Sequence[str]
+    rectangles: Array
+    aims: Array
+
+
 @dataclass(frozen=True, eq=False)
 class Neighbours:
-    """The mirrors of a field as they are aligned under one sun.
+    """The mirrors of a field, aligned under one sun.
 
     Attributes
     ----------
     rows : dict
-        Heliostat name to its place in the arrays, which are in the order of the mirrors' easting.
+        Heliostat name to its row in the arrays, which are in the order of the mirrors' easting.
     rectangles : (N, 3, 3) [m]
-        As `outlines` gives them.
+        As of `outlines`.
     aims : (N, 3) [m]
     sun : (3,)
         Unit vector towards the sun.
@@ -68,12 +78,12 @@ class Neighbours:
     sun: Array
 
     @classmethod
-    def from_outlines(cls, parts: Iterable[tuple[Sequence[str], Array, Array]], sun: ArrayLike) -> "Neighbours":
-        """Of parts of a field: names, `outlines` (n, 3, 3) [m] and aims (n, 3) [m] of each."""
+    def from_outlines(cls, parts: Iterable[Outlines], sun: ArrayLike) -> "Neighbours":
+        """Join the outlines of parts of a field."""
         listed = list(parts)
-        names = [name for part in listed for name in part[0]]
-        rectangles = np.concatenate([np.zeros((0, 3, 3)), *(part[1] for part in listed)])
-        aims = np.concatenate([np.zeros((0, 3)), *(part[2] for part in listed)])
+        names = [name for part in listed for name in part.names]
+        rectangles = np.concatenate([np.zeros((0, 3, 3)), *(part.rectangles for part in listed)])
+        aims = np.concatenate([np.zeros((0, 3)), *(part.aims for part in listed)])
         order = np.argsort(rectangles[:, 0, 0], kind="stable")
         rows = {names[old]: new for new, old in enumerate(order)}
         return cls(rows, rectangles[order], aims[order], np.asarray(sun, dtype=np.float64))
@@ -84,9 +94,10 @@ class Neighbours:
         return np.asarray(np.linalg.norm(self.rectangles[:, 1:], axis=(1, 2)))
 
     def obstacles(self, names: Sequence[str]) -> Array:
-        """Rectangles (B, K, 3, 3) [m] that may hide parts of these heliostats' mirrors, for `Scene.obstacles`.
+        """Rectangles (B, K, 3, 3) [m] that may hide parts of these heliostats' mirrors, for
+        `Scene.obstacles`.
 
-        A heliostat that does not stand in the field has none.
+        A heliostat that is not in the field has none.
         """
         radii = self.radii
         top = float((self.rectangles[:, 0, 2] + radii).max(initial=-np.inf))
@@ -97,7 +108,7 @@ class Neighbours:
         return padded
 
     def _before(self, name: str, radii: Array, top: float) -> Iterator[int]:
-        """The rows whose spheres a beam as wide as this mirror's sphere meets on its way to sun or target."""
+        """Rows of mirrors whose spheres intersect the beams from this mirror's sphere."""
         if name not in self.rows:
             return
         row = self.rows[name]
@@ -105,7 +116,7 @@ class Neighbours:
         outgoing = self.aims[row] - center
         length = float(np.linalg.norm(outgoing))
         for direction, end in ((self.sun, np.inf), (outgoing / length, length)):
-            # Above the field's top there is nothing to meet.
+            # Above the field's top there are no obstacles.
             climb = (top - center[2] + radii[row]) / direction[2] if direction[2] > 0 else np.inf
             reach = min(end, climb) + 2 * float(radii.max())
             first, last = np.searchsorted(easting, [center[0] - reach, center[0] + reach])
@@ -118,7 +129,7 @@ class Neighbours:
 
 
 def clear(obstacles: Tensor, points: Tensor, direction: Tensor, cell: Tensor) -> Tensor:
-    """Share (B, S) of light that leaves mirror points along a direction and meets none of the obstacles.
+    """Share (B, S) of the light from mirror points that meets no obstacle along a direction.
 
     Parameters
     ----------
@@ -127,23 +138,32 @@ def clear(obstacles: Tensor, points: Tensor, direction: Tensor, cell: Tensor) ->
     points : Tensor (B, 3, S) [m]
     direction : Tensor (B, 3, S) or (B, 3, 1)
     cell : Tensor (B,) [m]
-        Width of the patch of the mirror that each point stands for.
+        Width of the patch of the mirror around each point.
     """
     center, right, up = obstacles.unbind(-2)
     length_x, length_y = right.norm(dim=-1), up.norm(dim=-1)
     normal = torch.linalg.cross(right, up)
-    # Coordinates in which a rectangle reaches from -1 to 1, one row each for x, y and the distance from its plane.
-    frame = torch.stack([right / length_x[..., None] ** 2, up / length_y[..., None] ** 2, normal], dim=-2)
+    # Coordinates in which a rectangle extends from -1 to 1: rows for x, y and the distance from
+    # its plane.
+    frame = torch.stack(
+        [right / length_x[..., None] ** 2, up / length_y[..., None] ** 2, normal], dim=-2
+    )
     place = frame @ points[:, None] - frame @ center[..., None]
     moved = frame @ direction[:, None]
     ahead = moved[..., 2, :]
-    distance = -place[..., 2, :] / torch.where(ahead.abs() < 1e-9, torch.full_like(ahead, 1e-9), ahead)
+    distance = -place[..., 2, :] / torch.where(
+        ahead.abs() < 1e-9, torch.full_like(ahead, 1e-9), ahead
+    )
     x, y = (place[..., axis, :] + distance * moved[..., axis, :] for axis in (0, 1))
-    hidden = (distance > 0) * _covered(x, cell[:, None] / length_x) * _covered(y, cell[:, None] / length_y)
+    hidden = (
+        (distance > 0)
+        * _covered(x, cell[:, None] / length_x)
+        * _covered(y, cell[:, None] / length_y)
+    )
     return (1 - hidden).amin(dim=1)
 
 
 def _covered(x: Tensor, cell: Tensor) -> Tensor:
-    """Share (B, K, S) of cells as wide as ``cell`` (B, K) about ``x`` (B, K, S) that lies between -1 and 1."""
+    """Share (B, K, S), from -1 to 1, of cells of width ``cell`` (B, K) about ``x`` (B, K, S)."""
     share: Tensor = ((1 - x.abs()) / cell[..., None] + 0.5).clamp(0, 1)
     return share

@@ -1,4 +1,4 @@
-"""What surface prediction takes in and gives back."""
+"""Measured images of a heliostat, and the surfaces predicted from them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,30 +9,31 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from model.effects import Effect
 from model.errors import InvalidInputError
-from model.forecast import Aligned, Setup, align
+from model.forecast import Aligned, align
 from model.images import FLUX_SHAPE, FLUX_SIZE, FLUX_WINDOW, binned, clipped_alike, normalized
 from model.metrics import flux_accuracy
 from model.plant import Heliostat, TargetPlane
+from model.plant_model import PlantModel
+from model.setup import Setup
 from model.surface import control_points
-from model.tracing import Optics, Scene
+from model.tracing import Scene
 from model.tracing.alignment import align_to_spots
 
 TRUSTED_MISFIT = 0.2
-"""Misfit of an image up to which a surface explains it: twice what clean images leave, more than real ones do."""
+"""Largest misfit of an explained image: twice that of clean images, more than that of real ones."""
 
 
 TRUSTED_MAHALANOBIS = 1.8
-"""Mahalanobis distance per root degree of freedom up to which a surface may be a mirror of this kind.
+"""Largest Mahalanobis distance, per root degree of freedom, of a mirror of the known type.
 
-One in a thousand lies farther (chi-squared, 8).
+One in a thousand has a larger distance (chi-squared, 8).
 """
 
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """One measured flux image and where it was taken.
+    """One measured flux image with its sun and target.
 
     Attributes
     ----------
@@ -42,13 +43,13 @@ class Observation:
         Unit vector towards the sun in ENU.
     target : TargetPlane
     center_of_mass : (3,) [m]
-        The spot in ENU; the target's centre is a fair guess where it is not known.
+        Of the spot, in ENU; the target's centre is a fair guess if it is not known.
     identifier : str
     motor_position : (2,) [steps] or None
     clipped : (64, 64) [1] or None
-        Share of each pixel that the camera's range cut off, where it did: there was at least so much light.
+        Saturated share of each pixel, if any: the light there was at least as much.
     taken_at : datetime or None
-        When, where that is known.
+        None if it is not known.
     side : float [m]
         Of the square.
     """
@@ -65,16 +66,20 @@ class Observation:
 
     @property
     def clipped_share(self) -> float:
-        """Share [1] of the spot's brighter half that the camera's range cut off."""
+        """Saturated share [1] of the spot's brighter half."""
         if self.clipped is None:
             return 0.0
         return float(self.clipped[self.flux > 0.5 * self.flux.max()].mean())
 
     def __post_init__(self) -> None:
         if self.clipped is not None and self.clipped.shape != FLUX_SHAPE:
-            raise InvalidInputError(f"clipped of {self.identifier} must be {FLUX_SHAPE}, got {self.clipped.shape}")
+            raise InvalidInputError(
+                f"clipped of {self.identifier} must be {FLUX_SHAPE}, got {self.clipped.shape}"
+            )
         if self.flux.shape != FLUX_SHAPE:
-            raise InvalidInputError(f"flux of {self.identifier} must be {FLUX_SHAPE}, got {self.flux.shape}")
+            raise InvalidInputError(
+                f"flux of {self.identifier} must be {FLUX_SHAPE}, got {self.flux.shape}"
+            )
         if not np.isfinite(self.flux).all() or not self.flux.sum() > 0:
             raise InvalidInputError(f"flux of {self.identifier} must be finite and hold energy")
 
@@ -92,19 +97,20 @@ class SurfacePrediction:
     method : str
         "network" or "refined".
     weights : str
-        Name and content hash of the weights that were used.
+        Name and content hash of the weights.
     misfits : tuple of float
-        How badly the surface explains each of its own images: one minus the flux accuracy of re-rendering it.
+        Of each image: one minus the accuracy of the flux image that is rendered from the surface.
     used : tuple of str
         Identifiers of the images.
-    tells : tuple of float [1]
-        Share of each image in what all of them tell of the surface, where that was estimated.
-    mahalanobis : float
-        Mahalanobis distance of the surface from the prior; about one is usual (`SurfacePrior.mahalanobis`).
+    information_shares : tuple of float [1]
+        Share of each image in the information about the surface, if it was estimated.
+    mahalanobis_distance : float
+        Mahalanobis distance of the surface from the prior; about one is usual
+        (`SurfacePrior.mahalanobis`).
     contradicting : tuple of str
-        Identifiers of images that the surface does without: what the others tell contradicts them.
-    doubts : tuple of str
-        What else speaks against it, in sentences (`model.doubts`).
+        Identifiers of images that were excluded because the others contradict them.
+    warnings : tuple of str
+        Further reasons not to trust it, in sentences (`model.prediction_warnings`).
     """
 
     z: NDArray[np.float64]
@@ -114,10 +120,10 @@ class SurfacePrediction:
     weights: str
     misfits: tuple[float, ...]
     used: tuple[str, ...]
-    tells: tuple[float, ...] = ()
-    mahalanobis: float = 1.0
+    information_shares: tuple[float, ...] = ()
+    mahalanobis_distance: float = 1.0
     contradicting: tuple[str, ...] = ()
-    doubts: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
     @property
     def misfit(self) -> float:
@@ -127,117 +133,123 @@ class SurfacePrediction:
     @property
     def suspicious(self) -> tuple[str, ...]:
         """Identifiers of the images that the surface does not explain."""
-        return tuple(name for name, misfit in zip(self.used, self.misfits, strict=True) if misfit > TRUSTED_MISFIT)
+        return tuple(
+            name
+            for name, misfit in zip(self.used, self.misfits, strict=True)
+            if misfit > TRUSTED_MISFIT
+        )
 
     @property
     def trusted(self) -> bool:
-        """Whether every image is explained, and by a mirror like those known, and nothing else speaks against it.
+        """Whether the surface explains every image, is of the known type, and has no warnings.
 
-        Not so for a foreign spot, a mirror of another kind, or images of another heliostat: a surface can often be bent
-        to explain those, but not a likely one.
+        A surface can often be bent to explain a foreign spot, a mirror of another type or images of
+        another heliostat, but not a likely surface.
         """
-        return not self.suspicious and not self.doubts and self.mahalanobis <= TRUSTED_MAHALANOBIS
+        return (
+            not self.suspicious
+            and not self.warnings
+            and self.mahalanobis_distance <= TRUSTED_MAHALANOBIS
+        )
 
 
-def scene_of(
-    heliostat: Heliostat,
-    observations: Sequence[Observation],
-    surfaces: Sequence[NDArray[np.float64] | None] = (None,),
-    dtype: torch.dtype = torch.float32,
+def _setups(
+    heliostat: Heliostat, observations: Sequence[Observation], z: NDArray[np.float64]
+) -> list[Setup]:
+    """Setups of a surface ``z`` (F, I, J) [m]."""
+    points = control_points(heliostat, z)
+    return [
+        Setup(heliostat, points, o.sun, o.target, o.center_of_mass, taken_at=o.taken_at)
+        for o in observations
+    ]
+
+
+def observed_scene(
+    heliostat: Heliostat, observations: Sequence[Observation], z: NDArray[np.float64]
 ) -> Scene:
-    """The scene of a heliostat's M observations with each of K surfaces in turn, aligned by the measured spots.
-
-    ``surfaces`` are heights (4, 8, 8) [m], None the ideal one; the scene holds K * M mirrors, all observations of the
-    first surface first.
-    """
-    count = len(observations) * len(surfaces)
-    shapes = [control_points(heliostat, z) for z in surfaces]
-    points = [shape for shape in shapes for _ in observations]
-    suns = np.tile([o.sun for o in observations], (len(surfaces), 1))
-    targets = [o.target for o in observations] * len(surfaces)
-    spots = np.tile([o.center_of_mass for o in observations], (len(surfaces), 1))
-    angles = align_to_spots([heliostat] * count, points, suns, targets, spots)
-    return Scene.build([heliostat] * count, points, angles, suns, targets, dtype=dtype)
+    """The scene of M observations of a surface ``z`` (4, 8, 8) [m], aligned by the spots."""
+    return align_to_spots(_setups(heliostat, observations, z)).scene.to(torch.float32)
 
 
 def align_observations(
     heliostat: Heliostat,
     observations: Sequence[Observation],
     z: NDArray[np.float64],
-    effects: Sequence[Effect] = (),
-    *,
-    latitude_deg: float,
+    model: PlantModel,
     start: Aligned | None = None,
 ) -> Aligned:
-    """The heliostat with surface ``z`` (4, 8, 8) [m] turned so that its spots lie where the M were observed.
+    """Align the heliostat with surface ``z`` (4, 8, 8) [m] so that its spots are where the M were
+    observed.
 
-    A tilt of the whole mirror is taken back by the mount and leaves no trace. ``start`` is what this gave for a surface
-    that differs little, and saves rounds. ``latitude_deg`` [deg] is the plant's, along which the sun's clock runs.
+    The mount compensates a tilt of the whole mirror. ``start`` is the result for a similar surface,
+    and saves rounds.
     """
-    points = control_points(heliostat, z)
-    setups = [Setup(heliostat, points, o.sun, o.target, o.center_of_mass, taken_at=o.taken_at) for o in observations]
-    return align(setups, effects, latitude_deg=latitude_deg, start=start)
+    return align(_setups(heliostat, observations, z), model, start=start)
 
 
 def common_side(observations: Sequence[Observation]) -> float:
-    """Side [m] of the squares that all of a heliostat's observations show.
+    """Width [m] of the squares of all observations of a heliostat.
 
     Raises
     ------
     InvalidInputError
-        Where they differ.
+        If they differ.
     """
     sides = sorted({o.side for o in observations})
     if len(sides) > 1:
         raise InvalidInputError(
-            f"flux images of one heliostat must show squares of one size, got sides {sides} m; cut all to the largest"
+            f"flux images of one heliostat must show squares of one size, got sides {sides} m; cut"
+            " all to the largest"
         )
     return sides[0]
 
 
-class Ranges:
-    """Where the camera's range cut off M observations; forecasts of them are cut off there, too.
+class Saturation:
+    """Saturates forecasts where the camera saturated M observations.
 
-    ``size`` is that of the forecasts' pixels along a side.
+    ``size`` is the number of pixels along a side of the forecasts.
     """
 
     def __init__(self, observations: Sequence[Observation], size: int = FLUX_SIZE) -> None:
         nothing = np.zeros(FLUX_SHAPE)
-        clipped = np.array([nothing if o.clipped is None else o.clipped for o in observations], dtype=np.float64)
-        self._cut_off = bool(clipped.any())
+        clipped = np.array(
+            [nothing if o.clipped is None else o.clipped for o in observations], dtype=np.float64
+        )
+        self._is_saturated = bool(clipped.any())
         flux = np.array([o.flux for o in observations], dtype=np.float64)
         self._measured, self._clipped = (
-            torch.as_tensor(binned(image, size)) for image in (flux, clipped * (size / FLUX_SIZE) ** 2)
+            torch.as_tensor(binned(image, size))
+            for image in (flux, clipped * (size / FLUX_SIZE) ** 2)
         )
 
-    def seen(self, images: Tensor) -> Tensor:
+    def apply(self, images: Tensor) -> Tensor:
         """Forecasts (..., M, R, R) as the camera shows them, sum 100."""
-        if not self._cut_off:
+        if not self._is_saturated:
             return images
-        return normalized(clipped_alike(images, self._measured.to(images), self._clipped.to(images)))
+        return normalized(
+            clipped_alike(images, self._measured.to(images), self._clipped.to(images))
+        )
 
 
 def render_observations(
     heliostat: Heliostat,
     observations: Sequence[Observation],
     z: NDArray[np.float64],
-    optics: Optics | None = None,
-    effects: Sequence[Effect] = (),
-    *,
-    latitude_deg: float,
+    model: PlantModel,
     samples: int = 24,
 ) -> NDArray[np.float64]:
-    """What the M photographs would show of a surface ``z`` (4, 8, 8) [m]: (M, 64, 64), sum 100."""
+    """Render the M images of a surface ``z`` (4, 8, 8) [m]: (M, 64, 64), sum 100."""
     with torch.no_grad():
-        aligned = align_observations(heliostat, observations, z, effects, latitude_deg=latitude_deg)
-        images = aligned.flux_images(optics, effects, side=common_side(observations), samples=samples)
-        return Ranges(observations).seen(images).double().numpy()
+        aligned = align_observations(heliostat, observations, z, model)
+        images = aligned.flux_images(side=common_side(observations), samples=samples)
+        return Saturation(observations).apply(images).double().numpy()
 
 
 def spread_suns(suns: NDArray[np.float64], count: int) -> list[int]:
-    """Indices of up to ``count`` unit vectors of (N, 3): the first, then each time the farthest from those chosen.
+    """Select up to ``count`` of N unit vectors (N, 3): the first, then each time the farthest from
+    those selected.
 
-    Images under suns that stand far apart tell more of a mirror than images of one morning.
+    Images under suns that are far apart determine a mirror better than images of one morning.
     """
     chosen = [0]
     while len(chosen) < min(count, len(suns)):
@@ -251,11 +263,10 @@ def misfits(
     heliostat: Heliostat,
     observations: Sequence[Observation],
     z: NDArray[np.float64],
-    optics: Optics | None = None,
-    effects: Sequence[Effect] = (),
-    *,
-    latitude_deg: float,
+    model: PlantModel,
 ) -> tuple[float, ...]:
-    """One minus the accuracy with which heights ``z`` (4, 8, 8) [m] re-render each of the images they came from."""
-    images = render_observations(heliostat, observations, z, optics, effects, latitude_deg=latitude_deg).clip(min=0)
-    return tuple(1 - flux_accuracy(o.flux, image) for o, image in zip(observations, images, strict=True))
+    """One minus the accuracy with which heights ``z`` (4, 8, 8) [m] render each image."""
+    images = render_observations(heliostat, observations, z, model).clip(min=0)
+    return tuple(
+        1 - flux_accuracy(o.flux, image) for o, image in zip(observations, images, strict=True)
+    )

@@ -1,12 +1,12 @@
-"""What a plant is made of: facets, heliostats, target planes, receivers.
+"""The parts of a plant: facets, heliostats, target planes, receivers.
 
-Plain frozen data in numpy; the tracers turn it into batched tensors (`model.tracing.scene`).
+Frozen dataclasses in numpy; the tracers convert them to batched tensors (`model.tracing.scene`).
 """
 
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,14 +14,54 @@ from numpy.typing import ArrayLike, NDArray
 from model.errors import InvalidInputError
 from model.frames import enu_to_wgs84, wgs84_to_enu
 from model.mount import Mount
+from model.site import Site
 
 Vector = NDArray[np.float64]
 
-JUELICH_LATITUDE = 50.913
-"""Latitude [deg] of the Solar Tower Juelich: that of synthetic fields, and never a default of what acts on a plant."""
-
 STEP_DEG = 8.0
-"""Most [deg] between the planes that stand for a cylinder: they leave it by no more than 1 % of the radius."""
+"""Largest angle [deg] between a cylinder's planes: they deviate by 1 % of the radius at most."""
+
+
+MAX_ASPECT = 20.0
+"""Largest ratio of the longer to the shorter side of a plane or of an unrolled cylinder."""
+
+MIN_OPENING_DEG = 5.0
+"""Smallest opening [deg] of a cylinder."""
+
+
+def require_plane_shape(width: float, height: float) -> None:
+    """Refuse a plane of ``width`` and ``height`` [m] that would need too large a grid.
+
+    For planes of requests and files; the planes of a cylinder are narrower.
+
+    Raises
+    ------
+    InvalidInputError
+    """
+    if max(width, height) > MAX_ASPECT * min(width, height):
+        raise InvalidInputError(
+            f"width {width:g} m and height {height:g} m: one must be no more than {MAX_ASPECT:g}"
+            " times the other; give a larger plane, or several"
+        )
+
+
+def require_cylinder_shape(radius: float, height: float, opening_deg: float) -> None:
+    """Refuse a cylinder that would need too large a grid, as `require_plane_shape` does.
+
+    ``radius`` and ``height`` [m], ``opening_deg`` [deg].
+    """
+    if opening_deg < MIN_OPENING_DEG:
+        raise InvalidInputError(
+            f"opening_deg {opening_deg:g}: must be {MIN_OPENING_DEG:g} or more; give a plane"
+            " instead"
+        )
+    width = math.radians(opening_deg) * radius
+    if max(width, height) > MAX_ASPECT * min(width, height, radius):
+        raise InvalidInputError(
+            f"height {height:g} m, radius {radius:g} m and arc {width:g} m: the longer of height"
+            f" and arc must be no more than {MAX_ASPECT:g} times each of the others; give a plane,"
+            " or several cylinders"
+        )
 
 
 def _vector(name: str, value: ArrayLike) -> Vector:
@@ -34,14 +74,15 @@ def _vector(name: str, value: ArrayLike) -> Vector:
 
 @dataclass(frozen=True, eq=False)
 class Facet:
-    """One mirror facet and its ideal pose on the heliostat.
+    """One mirror facet and its ideal pose.
 
     Attributes
     ----------
     position : (3,) [m]
         Its centre in mirror coordinates (x right, y up, z out of the mirror).
     canting_x, canting_y : (3,) [m]
-        Half its width and half its height, as vectors in mirror coordinates (PAINT's ``canting_e``, ``canting_n``).
+        Half its width and half its height, as vectors in mirror coordinates (PAINT's ``canting_e``,
+        ``canting_n``).
     """
 
     position: Vector
@@ -55,9 +96,20 @@ class Facet:
             raise InvalidInputError("facet canting vectors must span an area")
 
 
+class FacetFrames(NamedTuple):
+    """Centres (F, 3) [m], axes (F, 3 axes, 3) and half sizes (F, 2) [m] of facets.
+
+    The axes are orthonormal: x along ``canting_x``, z normal, y to complete them.
+    """
+
+    centers: NDArray[np.float64]
+    axes: NDArray[np.float64]
+    half_sizes: NDArray[np.float64]
+
+
 @dataclass(frozen=True, eq=False)
 class Heliostat:
-    """A heliostat: where it stands, how it turns and what mirrors it carries.
+    """A heliostat: position, mount and facets.
 
     Attributes
     ----------
@@ -68,7 +120,7 @@ class Heliostat:
     facets : tuple of Facet
         In PAINT's order: upper left, upper right, lower left, lower right, seen from the front.
     width, height : float [m]
-        The mirror's outline.
+        Of the whole mirror.
     """
 
     name: str
@@ -93,10 +145,10 @@ class Heliostat:
         mount: Mount | None = None,
         facet_depth: float = 0.0402,
     ) -> "Heliostat":
-        """A heliostat of the Solar Tower Juelich's kind: four facets of 1.605 m x 1.275 m.
+        """A heliostat of the Solar Tower Juelich's type: four facets of 1.605 m x 1.275 m.
 
-        ``position`` (3,) [m]; the facets are canted to ``focal_length`` [m], or lie in one plane without it, and stand
-        ``facet_depth`` [m] before the mirror's reference plane.
+        The facets are canted to ``focal_length`` [m], or lie in one plane without it. They are
+        ``facet_depth`` [m] in front of the mirror's reference plane; ``position`` (3,) [m].
         """
         curvature = 0.0 if focal_length is None else 1 / (2 * focal_length)
         facets = tuple(
@@ -111,42 +163,50 @@ class Heliostat:
 
     @property
     def has_facets_in_order(self) -> bool:
-        """Whether four facets in two rows and two columns are listed as `facets` says; true of any other mirror.
+        """Whether four facets in two rows and two columns have the order of `facets`; true for
+        other mirrors.
 
-        Surfaces are lists of facets, and one that is listed elsewhere would be taken for another.
+        Surfaces are lists of facets: a facet in another place would be confused with another one.
         """
         places = np.array([facet.position[:2] for facet in self.facets])
         quarters = [(bool(x), bool(y)) for x, y in places > places.mean(axis=0)]
-        return len(set(quarters)) < 4 or quarters == [(False, True), (True, True), (False, False), (True, False)]
+        return len(set(quarters)) < 4 or quarters == [
+            (False, True),
+            (True, True),
+            (False, False),
+            (True, False),
+        ]
 
     @property
-    def facet_frames(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Centres (F, 3) [m], axes (F, 3 axes, 3) and half sizes (F, 2) [m] of the facets in mirror coordinates.
-
-        The axes are orthonormal: x along ``canting_x``, z their common normal, y completing them.
-        """
+    def facet_frames(self) -> FacetFrames:
+        """Frames of the ideal facets in mirror coordinates."""
         half_x = np.array([facet.canting_x for facet in self.facets])
         half_y = np.array([facet.canting_y for facet in self.facets])
-        half_sizes = np.stack([np.linalg.norm(half_x, axis=-1), np.linalg.norm(half_y, axis=-1)], axis=-1)
+        half_sizes = np.stack(
+            [np.linalg.norm(half_x, axis=-1), np.linalg.norm(half_y, axis=-1)], axis=-1
+        )
         x = half_x / half_sizes[:, :1]
         z = np.cross(half_x, half_y)
         z /= np.linalg.norm(z, axis=-1, keepdims=True)
         axes = np.stack([x, np.cross(z, x), z], axis=-2)
-        return np.array([facet.position for facet in self.facets]), axes, half_sizes
+        centers = np.array([facet.position for facet in self.facets])
+        return FacetFrames(centers, axes, half_sizes)
 
     @property
     def facet_normals(self) -> NDArray[np.float64]:
-        """Unit normals (F, 3) of the ideal facets in mirror coordinates: where a height above them points."""
-        return np.asarray(self.facet_frames[1][:, 2])
+        """Unit normals (F, 3) of the ideal facets: the directions of heights."""
+        return np.asarray(self.facet_frames.axes[:, 2])
 
 
 def _orient(surface: "TargetPlane | Cylinder", kind: str) -> None:
-    """Make ``normal`` and ``up`` unit vectors, ``up`` perpendicular to ``normal``, and check them and ``center``."""
+    """Check ``normal``, ``up`` and ``center``, and make the first two orthonormal."""
     normal, up = _vector(f"{kind} normal", surface.normal), _vector(f"{kind} up", surface.up)
     normal = normal / max(float(np.linalg.norm(normal)), 1e-300)
     up = up - (up @ normal) * normal
     if np.linalg.norm(normal) < 0.5 or np.linalg.norm(up) < 1e-6:
-        raise InvalidInputError(f"{kind} {surface.name}: normal must not vanish and up must not be parallel to it")
+        raise InvalidInputError(
+            f"{kind} {surface.name}: normal must not vanish and up must not be parallel to it"
+        )
     object.__setattr__(surface, "center", _vector(f"{kind} center", surface.center))
     object.__setattr__(surface, "normal", _vector(f"{kind} normal", normal))
     object.__setattr__(surface, "up", _vector(f"{kind} up", up / np.linalg.norm(up)))
@@ -154,7 +214,7 @@ def _orient(surface: "TargetPlane | Cylinder", kind: str) -> None:
 
 @dataclass(frozen=True, eq=False)
 class TargetPlane:
-    """A rectangle that light falls on: a calibration target, or any plane to forecast on.
+    """A rectangle that light falls on: a calibration target, or another plane.
 
     Attributes
     ----------
@@ -162,7 +222,7 @@ class TargetPlane:
     center : (3,) [m]
         In ENU.
     normal : (3,)
-        Unit normal of the side that is lit.
+        Unit normal of the lit side.
     up : (3,)
         Unit vector of the image's upward direction, made perpendicular to ``normal``.
     width, height : float [m]
@@ -182,43 +242,53 @@ class TargetPlane:
 
     @classmethod
     def from_corners(
-        cls, name: str, upper_left: Vector, upper_right: Vector, lower_left: Vector, lower_right: Vector
+        cls,
+        name: str,
+        upper_left: Vector,
+        upper_right: Vector,
+        lower_left: Vector,
+        lower_right: Vector,
     ) -> "TargetPlane":
-        """The plane of four corners (3,) [m] as they appear in the image, by the means of opposite edges."""
+        """The plane of four corners (3,) [m] as in the image, by the means of opposite edges.
+
+        Raises
+        ------
+        InvalidInputError
+            If it has no area, or `require_plane_shape` refuses it.
+        """
         corners = np.array([upper_left, upper_right, lower_left, lower_right], dtype=np.float64)
         right = (corners[1] + corners[3] - corners[0] - corners[2]) / 2
         up = (corners[0] + corners[1] - corners[2] - corners[3]) / 2
-        return cls(
-            name=name,
-            center=corners.mean(axis=0),
-            normal=np.cross(right, up),
-            up=up,
-            width=float(np.linalg.norm(right)),
-            height=float(np.linalg.norm(up)),
-        )
+        width, height = float(np.linalg.norm(right)), float(np.linalg.norm(up))
+        plane = cls(name, corners.mean(axis=0), np.cross(right, up), up, width, height)
+        try:
+            require_plane_shape(width, height)
+        except InvalidInputError as error:
+            raise InvalidInputError(f"target {name}: {error}") from None
+        return plane
 
     @property
     def right(self) -> Vector:
-        """Unit vector along the image's columns (towards the west on a target that faces north)."""
+        """Unit vector along the image's columns: west on a target that faces north."""
         return np.asarray(np.cross(self.up, self.normal))
 
     @property
     def axes(self) -> NDArray[np.float64]:
-        """Rows right, up, normal (3, 3)."""
+        """Right, up and normal as rows (3, 3)."""
         return np.stack([self.right, self.up, self.normal])
 
     @property
     def middle(self) -> "TargetPlane":
-        """Itself."""
+        """The plane."""
         return self
 
     @property
     def shape(self) -> dict[str, float]:
-        """Nothing beside its rectangle."""
+        """No numbers besides those of the rectangle."""
         return {}
 
     def patches(self, columns: int) -> "Iterator[Patch]":
-        """Itself, all over."""
+        """The plane as one patch."""
         yield Patch(slice(0, columns), np.ones(columns), self)
 
     def to_plane(self, points: ArrayLike) -> NDArray[np.float64]:
@@ -229,21 +299,21 @@ class TargetPlane:
         """ENU points (..., 3) of coordinates (..., 2) [m] right and up of the centre."""
         return np.asarray(self.center + np.asarray(coordinates, dtype=np.float64) @ self.axes[:2])
 
-    def holds(self, point: ArrayLike) -> bool:
+    def contains(self, point: ArrayLike) -> bool:
         """Whether a point (3,) [m] of the plane lies within the rectangle."""
         return bool((np.abs(self.to_plane(point)) <= np.array([self.width, self.height]) / 2).all())
 
 
 @dataclass(frozen=True, eq=False)
 class Patch:
-    """A plane that stands for a part of a receiver's surface.
+    """A plane that replaces a part of a receiver's surface.
 
     Attributes
     ----------
     columns : slice
-        Of the receiver's map, about the plane.
+        Of the receiver's map.
     shares : (n,)
-        How much of the light on the plane counts in each of those columns.
+        Weights of the plane's light in each of those columns.
     plane : TargetPlane
     """
 
@@ -253,7 +323,7 @@ class Patch:
 
 
 class Receiver(Protocol):
-    """What a field's light falls on, and all that is asked of its shape; its map is the lit surface unrolled."""
+    """A surface that the light of a field falls on; its map is the unrolled surface."""
 
     @property
     def name(self) -> str:
@@ -261,7 +331,7 @@ class Receiver(Protocol):
 
     @property
     def center(self) -> Vector:
-        """The middle of the lit surface (3,) [m], in ENU, where mirrors aim unless they are told otherwise."""
+        """Middle of the lit surface (3,) [m] in ENU, the default aim of mirrors."""
 
     @property
     def normal(self) -> Vector:
@@ -281,34 +351,34 @@ class Receiver(Protocol):
 
     @property
     def shape(self) -> dict[str, float]:
-        """What describes the surface beside all this, by names that forecasts keep."""
+        """Further numbers of the surface, by the names that stored forecasts use."""
 
     @property
     def middle(self) -> TargetPlane:
         """A plane that touches the surface in its middle."""
 
     def patches(self, columns: int) -> Iterator[Patch]:
-        """Planes that stand for the surface, whose map has so many columns."""
+        """Planes that replace the surface, for a map of ``columns`` columns."""
 
 
 @dataclass(frozen=True, eq=False)
 class Cylinder:
-    """A receiver that is a part of a cylinder, or all of it, lit from outside.
+    """A receiver that is a cylinder or a part of one, lit from outside.
 
-    Its map is the surface unrolled: rows along the axis, columns over the angle, evenly.
+    Its map is the unrolled surface: rows along the axis, columns over the angle, equally spaced.
 
     Attributes
     ----------
     name : str
     center : (3,) [m]
-        The middle of the lit surface, in ENU; the axis runs ``radius`` behind it.
+        The middle of the lit surface, in ENU; the axis is ``radius`` behind it.
     normal : (3,)
         Unit normal there, away from the axis.
     up : (3,)
         Unit vector along the axis, upwards in the map; made perpendicular to ``normal``.
     radius, height : float [m]
     opening_deg : float [deg]
-        The angle that the lit surface spans, half of it to each side of the middle; 360 all around.
+        Angle of the lit surface, half of it to each side of the middle; 360 for all around.
     """
 
     name: str
@@ -321,9 +391,13 @@ class Cylinder:
 
     def __post_init__(self) -> None:
         if not (0 < self.radius < 1e3 and 0 < self.height < 1e4):
-            raise InvalidInputError(f"receiver {self.name}: radius and height must be positive metres")
+            raise InvalidInputError(
+                f"receiver {self.name}: radius and height must be positive metres"
+            )
         if not 0 < self.opening_deg <= 360:
-            raise InvalidInputError(f"receiver {self.name}: opening_deg must lie in (0, 360], got {self.opening_deg}")
+            raise InvalidInputError(
+                f"receiver {self.name}: opening_deg must lie in (0, 360], got {self.opening_deg}"
+            )
         _orient(self, "receiver")
 
     @property
@@ -337,9 +411,10 @@ class Cylinder:
         return float(np.radians(self.opening_deg)) * self.radius
 
     def tangent(self, angle: float, left: float, right: float) -> TargetPlane:
-        """The plane that touches the surface at ``angle`` [rad] from its middle, positive rightwards.
+        """The plane that touches the surface at ``angle`` [rad] from its middle, positive to the
+        right.
 
-        It reaches ``left`` and ``right`` [m] from the line where it touches.
+        It extends ``left`` and ``right`` [m] from the line of contact.
         """
         normal = np.cos(angle) * self.normal + np.sin(angle) * self.right
         touched = self.center + self.radius * (normal - self.normal)
@@ -359,13 +434,13 @@ class Cylinder:
     def patches(self, columns: int) -> Iterator[Patch]:
         """Planes that touch it, every few degrees.
 
-        Between the lines where two planes touch, their light is blended in proportion: the cosine of incidence goes
-        from column to column as it does on the cylinder.
+        Between two lines of contact the light of both planes is blended in proportion, so that the
+        cosine of incidence changes from column to column as on the cylinder.
         """
         step = np.radians(self.opening_deg) / columns
         count = min(columns, math.ceil(self.opening_deg / STEP_DEG))
         edges = np.linspace(0, columns, count + 1).round().astype(int)
-        # A cosine that is drawn by straight lines falls short by this on average.
+        # A cosine that is approximated by straight lines is too small by this factor on average.
         blended = np.sinc(self.opening_deg / count / 360) ** 2
         for index, edge in enumerate(edges):
             first, last = edges[max(index - 1, 0)], edges[min(index + 1, count)]
@@ -377,7 +452,7 @@ class Cylinder:
 
 @dataclass(frozen=True, eq=False)
 class Plant:
-    """A tower with its heliostats and targets; ``origin`` (3,) is the tower base in WGS84 [deg, deg, m]."""
+    """A tower with heliostats and targets; ``origin`` (3,) is its base in WGS84 [deg, deg, m]."""
 
     name: str
     origin: Vector
@@ -387,6 +462,11 @@ class Plant:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "origin", _vector("plant origin", self.origin))
+
+    @property
+    def site(self) -> Site:
+        """Location of the tower base."""
+        return Site.from_origin(self.origin)
 
     def to_enu(self, wgs84: ArrayLike) -> NDArray[np.float64]:
         """ENU (..., 3) [m] of WGS84 positions (..., 3) [deg, deg, m]."""

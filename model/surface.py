@@ -1,16 +1,17 @@
 """Mirror surfaces as tensor-product B-splines (NURBS whose weights are all one).
 
-A facet is a grid of control points, clamped uniform knots, any degree. heliotwin's own surfaces put the control points
-on the Greville abscissae, where x and y are linear in the parameters, and store only heights: the deviation from the
-ideally canted, flat facet. Points and normals always come with their area element |du x dv|, because on other grids
-(evenly spaced control points, say) the parameters do not cover the mirror evenly.
+A facet is a grid of control points with clamped uniform knots of any degree. heliotwin's surfaces
+have their control points at the Greville abscissae, where x and y are linear in the parameters.
+They store heights only: the deviation from the ideally canted, flat facet. Points and normals
+always come with their area element |du x dv|, since on other grids (evenly spaced control points)
+the parameters do not cover the mirror evenly.
 
 Source: Piegl and Tiller, *The NURBS Book*, algorithms A2.2, A2.3 and section 9.2.
 """
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -21,13 +22,14 @@ from model.errors import InvalidInputError
 from model.plant import Heliostat
 
 FACETS, ROWS, COLUMNS, DEGREE = 4, 8, 8, 3
-"""heliotwin's own grid: facets, control points along x, along y, and the spline's degree."""
+"""heliotwin's grid: facets, control points along x and along y, and the spline's degree."""
 
 Array = NDArray[np.float64]
+Values = TypeVar("Values", Array, Tensor)
 
 
 def require_own_grid(heliostat: Heliostat) -> None:
-    """Refuse a heliostat that has not as many facets as predicted surfaces: what was learnt says nothing of it.
+    """Refuse a heliostat whose number of facets is not that of predicted surfaces.
 
     Raises
     ------
@@ -35,27 +37,38 @@ def require_own_grid(heliostat: Heliostat) -> None:
     """
     count = len(heliostat.facets)
     if count != FACETS:
-        raise InvalidInputError(f"surfaces are predicted of mirrors of {FACETS} facets, {heliostat.name} has {count}")
+        raise InvalidInputError(
+            f"surfaces are predicted of mirrors of {FACETS} facets, {heliostat.name} has {count}"
+        )
 
 
 def knots(count: int, degree: int) -> Array:
     """Clamped uniform knots (count + degree + 1,) on [0, 1] for ``count`` control points."""
     if not 1 <= degree < count:
-        raise InvalidInputError(f"a spline of degree {degree} needs more than {degree} control points, got {count}")
+        raise InvalidInputError(
+            f"a spline of degree {degree} needs more than {degree} control points, got {count}"
+        )
     inner = np.linspace(0, 1, count - degree + 1)
     return np.concatenate([np.zeros(degree), inner, np.ones(degree)])
 
 
 def greville(count: int, degree: int = DEGREE) -> Array:
-    """Greville abscissae (count,) on [0, 1]: the parameters at which control points make x(u) = u."""
+    """Greville abscissae (count,) on [0, 1]: parameters at which control points give x(u) = u."""
     t = knots(count, degree)
     return np.array([t[i + 1 : i + 1 + degree].mean() for i in range(count)])
 
 
-def basis(count: int, degree: int, parameters: ArrayLike) -> tuple[Array, Array]:
-    """Basis functions and their first derivatives, each (n, count), at ``parameters`` (n,) in [0, 1].
+class Basis(NamedTuple, Generic[Values]):
+    """Basis functions and their first derivatives, each (n, count)."""
 
-    Cox-de Boor recursion; the derivative from the functions of one degree less.
+    values: Values
+    slopes: Values
+
+
+def basis(count: int, degree: int, parameters: ArrayLike) -> Basis[Array]:
+    """Evaluate the basis at ``parameters`` (n,) in [0, 1] by the Cox-de Boor recursion.
+
+    The derivatives are computed from the functions of one degree less.
     """
     u, t = np.asarray(parameters, dtype=np.float64), knots(count, degree)
     span = np.clip(np.searchsorted(t, u, side="right") - 1, degree, count - 1)
@@ -75,27 +88,30 @@ def basis(count: int, degree: int, parameters: ArrayLike) -> tuple[Array, Array]
             slopes[:, i] += degree / (t[i + degree] - t[i]) * lower[:, i]
         if t[i + degree + 1] > t[i + 1]:
             slopes[:, i] -= degree / (t[i + degree + 1] - t[i + 1]) * lower[:, i + 1]
-    return values[:, :count], slopes
+    return Basis(values[:, :count], slopes)
 
 
 @lru_cache(maxsize=64)
 def midpoint_basis(
     count: int, degree: int, samples: int, dtype: torch.dtype, device: torch.device
-) -> tuple[Tensor, Tensor]:
-    """Basis and derivatives, each (samples, count), at the midpoints of ``samples`` equal parameter intervals."""
-    values, slopes = basis(count, degree, (np.arange(samples) + 0.5) / samples)
-    return torch.as_tensor(values, dtype=dtype, device=device), torch.as_tensor(slopes, dtype=dtype, device=device)
+) -> Basis[Tensor]:
+    """Evaluate the basis at the midpoints of ``samples`` equal parameter intervals."""
+    found = basis(count, degree, (np.arange(samples) + 0.5) / samples)
+    return Basis(*(torch.as_tensor(array, dtype=dtype, device=device) for array in found))
 
 
 @lru_cache(maxsize=64)
-def edge_basis(count: int, degree: int, samples: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+def edge_basis(
+    count: int, degree: int, samples: int, dtype: torch.dtype, device: torch.device
+) -> Tensor:
     """Basis (samples + 1, count) at the ends of ``samples`` equal parameter intervals."""
-    return torch.as_tensor(basis(count, degree, np.linspace(0, 1, samples + 1))[0], dtype=dtype, device=device)
+    values = basis(count, degree, np.linspace(0, 1, samples + 1)).values
+    return torch.as_tensor(values, dtype=dtype, device=device)
 
 
 @dataclass(frozen=True, eq=False)
 class FacetSamples:
-    """Points of a surface with the area each stands for; component first, as the tracers want them.
+    """Points of a surface with their areas; component first, as the tracers need them.
 
     Attributes
     ----------
@@ -121,14 +137,13 @@ def sample(control_points: Tensor, samples: int, degree: int = DEGREE) -> FacetS
     Parameters
     ----------
     control_points : Tensor (..., F, 3, I, J) [m]
-        In any Cartesian frame; the samples come in the same.
+        In any Cartesian frame, which is also that of the samples.
     samples : int
         Along each parameter of each facet; S = F * samples**2.
     """
-    across_x = (control_points.shape[-2], degree, samples, control_points.dtype, control_points.device)
-    across_y = (control_points.shape[-1], degree, samples, control_points.dtype, control_points.device)
-    value_u, slope_u = midpoint_basis(*across_x)
-    value_v, slope_v = midpoint_basis(*across_y)
+    (rows, columns), kind = control_points.shape[-2:], (control_points.dtype, control_points.device)
+    value_u, slope_u = midpoint_basis(rows, degree, samples, *kind)
+    value_v, slope_v = midpoint_basis(columns, degree, samples, *kind)
     along_v, along_v_slope = control_points @ value_v.T, control_points @ slope_v.T
     points = value_u @ along_v
     area_vectors = _cross(slope_u @ along_v, value_u @ along_v_slope) / samples**2
@@ -141,10 +156,11 @@ def _facets_last(values: Tensor) -> Tensor:
 
 
 def canted(control_points: Tensor, tilt: Tensor) -> Tensor:
-    """Control points (B, F, 3, I, J) [m] with each facet turned about its own centre; differentiable in both.
+    """Rotate each facet of control points (B, F, 3, I, J) [m] about its centre; differentiable in
+    both.
 
-    ``tilt`` (B, F, 2) [rad] is added to the facet's slope along the mirror's x and y. Canting errors are milliradians:
-    the turn is taken to first order, which errs by a millionth of the facet's size.
+    ``tilt`` (B, F, 2) [rad] is added to the facet's slope along the mirror's x and y. Canting
+    errors are milliradians: the first-order rotation errs by a millionth of the facet's size.
     """
     centre = control_points.mean(dim=(-2, -1), keepdim=True)
     x, y, z = (control_points - centre).unbind(2)
@@ -153,8 +169,17 @@ def canted(control_points: Tensor, tilt: Tensor) -> Tensor:
     return centre + turned
 
 
-def evaluate(control_points: ArrayLike, u: ArrayLike, v: ArrayLike, degree: int = DEGREE) -> tuple[Array, Array]:
-    """Points and unit normals, each (..., n, m, 3), of one or more facets on the grid ``u`` (n,) by ``v`` (m,).
+class FacetGrid(NamedTuple):
+    """Points [m] and unit normals, each (..., n, m, 3), of facets on a grid of parameters."""
+
+    points: Array
+    normals: Array
+
+
+def evaluate(
+    control_points: ArrayLike, u: ArrayLike, v: ArrayLike, degree: int = DEGREE
+) -> FacetGrid:
+    """Evaluate facets on the grid ``u`` (n,) by ``v`` (m,).
 
     ``control_points`` is (..., I, J, 3) [m], the layout of files and reports.
     """
@@ -166,18 +191,26 @@ def evaluate(control_points: ArrayLike, u: ArrayLike, v: ArrayLike, degree: int 
         return np.asarray(np.einsum("ni,...ijc,mj->...nmc", a, points, b, optimize=True))
 
     normals = np.cross(product(slope_u, value_v), product(value_u, slope_v))
-    return product(value_u, value_v), normals / np.linalg.norm(normals, axis=-1, keepdims=True)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    return FacetGrid(product(value_u, value_v), normals)
 
 
 def control_points(heliostat: Heliostat, z: ArrayLike | None = None) -> Array:
-    """Control points (F, I, J, 3) [m] in mirror coordinates of heights ``z`` (F, I, J) [m] over the canted facets.
+    """Control points (F, I, J, 3) [m] in mirror coordinates of heights ``z`` (F, I, J) [m] over the
+    canted facets.
 
     None gives the ideal surface: flat facets in their ideal poses.
     """
     centers, axes, half_sizes = heliostat.facet_frames
-    heights = np.zeros((len(heliostat.facets), ROWS, COLUMNS)) if z is None else np.asarray(z, dtype=np.float64)
+    heights = (
+        np.zeros((len(heliostat.facets), ROWS, COLUMNS))
+        if z is None
+        else np.asarray(z, dtype=np.float64)
+    )
     if heights.ndim != 3 or len(heights) != len(heliostat.facets) or not np.isfinite(heights).all():
-        raise InvalidInputError(f"z must be finite heights (facets, i, j) for {len(heliostat.facets)} facets")
+        raise InvalidInputError(
+            f"z must be finite heights (facets, i, j) for {len(heliostat.facets)} facets"
+        )
     x = (2 * greville(heights.shape[1]) - 1)[None, :, None] * half_sizes[:, 0, None, None]
     y = (2 * greville(heights.shape[2]) - 1)[None, None, :] * half_sizes[:, 1, None, None]
     local = np.stack(np.broadcast_arrays(x, y, heights), axis=-1)
@@ -191,27 +224,32 @@ def heights(
     samples: int = 64,
     shape: tuple[int, int] = (ROWS, COLUMNS),
 ) -> Array:
-    """Heights z (F, *shape) [m], facet mean zero, of control points (F, I, J, 3) [m] in mirror coordinates.
+    """Fit heights z (F, *shape) [m] with zero facet means to control points (F, I, J, 3) [m] in
+    mirror coordinates.
 
-    The slopes of the given surface, seen in the frame of each ideal facet, are fitted by least squares: deflectometry
-    measures normals, and heights follow from them up to the facet's mean. Facets that sit some millimetres off their
-    ideal place keep their own centre.
+    The slopes of the given surface, in the frame of each ideal facet, are fitted by least squares:
+    deflectometry measures normals, which determine heights up to the facet's mean. Facets some
+    millimetres off their ideal place keep their own centre.
     """
     _, axes, half_sizes = heliostat.facet_frames
     count = len(np.asarray(points))
     if count != len(axes):
-        raise InvalidInputError(f"a surface of {count} facets for {heliostat.name}, which has {len(axes)}")
+        raise InvalidInputError(
+            f"a surface of {count} facets for {heliostat.name}, which has {len(axes)}"
+        )
     grid = (np.arange(samples) + 0.5) / samples
-    _, normals = evaluate(points, grid, grid, degree)
+    normals = evaluate(points, grid, grid, degree).normals
     u, v = (a.ravel() for a in np.meshgrid(grid, grid, indexing="ij"))
     local = np.einsum("fnmd,fcd->fnmc", normals, axes).reshape(len(axes), -1, 3)
-    return np.array([fit_heights(u, v, n, size, shape) for n, size in zip(local, half_sizes, strict=True)])
+    return np.array(
+        [fit_heights(u, v, n, size, shape) for n, size in zip(local, half_sizes, strict=True)]
+    )
 
 
 def fit_heights(
     u: Array, v: Array, normals: Array, half_size: Array, shape: tuple[int, int] = (ROWS, COLUMNS)
 ) -> Array:
-    """Heights (*shape) [m], mean zero, of one facet whose slopes best match measured normals.
+    """Fit heights (*shape) [m] with zero mean to the measured normals of one facet.
 
     Parameters
     ----------
@@ -227,45 +265,57 @@ def fit_heights(
     by_x = np.einsum("ni,nj->nij", slope_u, value_v).reshape(len(u), -1) / (2 * half_size[0])
     by_y = np.einsum("ni,nj->nij", value_u, slope_v).reshape(len(u), -1) / (2 * half_size[1])
     slope_x, slope_y = -normals[:, 0] / normals[:, 2], -normals[:, 1] / normals[:, 2]
-    # Slopes do not see the constant mode; the pseudo-inverse leaves it at zero.
+    # Slopes do not determine the constant mode; the pseudo-inverse sets it to zero.
     gram = by_x.T @ by_x + by_y.T @ by_y
-    solution = np.linalg.pinv(gram, rcond=1e-12, hermitian=True) @ (by_x.T @ slope_x + by_y.T @ slope_y)
+    solution = np.linalg.pinv(gram, rcond=1e-12, hermitian=True) @ (
+        by_x.T @ slope_x + by_y.T @ slope_y
+    )
     return np.asarray((solution - solution.mean()).reshape(shape))
 
 
 @lru_cache(maxsize=4)
 def halving(count: int, degree: int = DEGREE) -> Array:
-    """Control heights (2 * count - degree, count), by those of a spline, of the same spline with its spans halved."""
+    """Matrix (2 * count - degree, count) from a spline's heights to those with halved spans."""
     places = (np.arange(16 * count) + 0.5) / (16 * count)
-    fine, coarse = (basis(n, degree, places)[0] for n in (2 * count - degree, count))
+    fine, coarse = (basis(n, degree, places).values for n in (2 * count - degree, count))
     return np.asarray(np.linalg.lstsq(fine, coarse, rcond=None)[0])
 
 
 def halved(z: ArrayLike) -> Array:
-    """The same heights (..., 8, 8) [m] on the grid (..., 13, 13) whose spans are half as long."""
+    """Heights (..., 8, 8) [m] on the grid (..., 13, 13) with halved spans."""
     return np.asarray(halving(ROWS) @ np.asarray(z, dtype=np.float64) @ halving(COLUMNS).T)
 
 
 def mirrored(z: Array) -> Array:
-    """The same mirrors (..., 4, 8, 8) with left and right exchanged."""
+    """Mirrors (..., 4, 8, 8) with left and right exchanged."""
     return np.asarray(z[..., [1, 0, 3, 2], ::-1, :])
 
 
-def split_canting(z: ArrayLike) -> tuple[Array, Array]:
-    """Canting and waviness, two (..., 8, 8) [m] height fields that add up to ``z``.
+class SurfaceParts(NamedTuple):
+    """Canting and waviness (..., 8, 8) [m], which add up to the heights."""
 
-    Canting is the plane a x + b y of each facet that fits its heights best; on the Greville grid that is a rigid tilt.
+    canting: Array
+    waviness: Array
+
+
+def split_canting(z: ArrayLike) -> SurfaceParts:
+    """Split heights ``z`` (..., 8, 8) [m] into canting and waviness.
+
+    Canting is the plane a x + b y of each facet that fits its heights best; on the Greville grid it
+    is a rigid tilt.
     """
     surface: Any = np.asarray(z, dtype=np.float64)
     x, y = 2 * greville(surface.shape[-2]) - 1, 2 * greville(surface.shape[-1]) - 1
-    design = np.stack([a.ravel() for a in np.meshgrid(x, y, indexing="ij")] + [np.ones(x.size * y.size)], axis=-1)
+    design = np.stack(
+        [a.ravel() for a in np.meshgrid(x, y, indexing="ij")] + [np.ones(x.size * y.size)], axis=-1
+    )
     plane = design @ np.linalg.lstsq(design, surface.reshape(-1, x.size * y.size).T, rcond=None)[0]
     canting = plane.T.reshape(surface.shape)
-    return canting, surface - canting
+    return SurfaceParts(canting, surface - canting)
 
 
 def canting_rises(z: ArrayLike) -> Array:
-    """By how much (..., F, 2) [m] canting lifts facets of heights (..., F, I, J) [m] over their width and height."""
-    canting, _ = split_canting(z)
+    """Rise (..., F, 2) [m] over facets by canting, of heights (..., F, I, J) [m]."""
+    canting = split_canting(z).canting
     across, up = canting[..., -1, 0] - canting[..., 0, 0], canting[..., 0, -1] - canting[..., 0, 0]
     return np.stack([across, up], axis=-1)

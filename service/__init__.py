@@ -1,11 +1,11 @@
-"""The service: eight rooms. base, drawing <- sources, store <- twin <- jobs <- web <- cli."""
+"""The service: eight packages. base, drawing <- sources, store <- twin <- jobs <- web <- cli."""
 
 import os
 
 from service.base import threads
 
-# OpenCV reads this when it is loaded. It stands behind the checks of `service.sources.decode`: whatever gets past them,
-# no image of more pixels is decoded.
+# OpenCV reads this when it is loaded. It is a second limit after the checks of
+# `service.sources.decode`: OpenCV decodes no image of more pixels.
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**27))
 
-threads.limit()
+threads.limit_threads()

@@ -1,24 +1,40 @@
 """What the tests share: where the real data lie, and small scenes."""
 
+import fcntl
+import gc
 import os
+import tempfile
 
 # Two cores, several test processes: threads of linear algebra would only spin against each other.
 for _library in ("OMP", "OPENBLAS", "MKL"):
     os.environ.setdefault(f"{_library}_NUM_THREADS", "1")
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import httpx
 import numpy as np
 import pytest
 import torch
 
 from model.mount import Mount
 from model.plant import Heliostat, TargetPlane
+from service.cli.demo_plant import write_plant
 from tests.benchmarks import data_folder
 from tests.undeclared import camera
+from tests.waiting import WAIT_LIMIT_S
 
 torch.set_num_threads(1)
+
+# Time limit of requests that set none: the default of 5 s would fail on a busy machine.
+_patient = httpx.Timeout(WAIT_LIMIT_S)
+for _phase in ("connect", "read", "write", "pool"):
+    setattr(httpx._config.DEFAULT_TIMEOUT_CONFIG, _phase, getattr(_patient, _phase))
+
+
+def pytest_collection_finish() -> None:
+    """Spare the garbage collector what stays: modules and tests are millions of objects."""
+    gc.freeze()
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -31,7 +47,9 @@ def drawn_sheets() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def stj() -> Path:
-    """The real measurements of the Solar Tower Juelich; tests that need them skip where they are absent."""
+    """The real measurements of the Solar Tower Juelich; tests that need them skip where they are
+    absent.
+    """
     root = data_folder()
     if not root.is_dir():
         pytest.skip(f"no real measurements at {root}; set HELIOTWIN_STJ")
@@ -47,6 +65,29 @@ def undeclared(stj: Path) -> Path:
     return root
 
 
+def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], None]) -> Path:
+    """A folder that the first of several test processes makes and all share; read it only."""
+    base = factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        base = base.parent
+    folder = base / f"shared-{name}"
+    with (base / f"{name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not folder.exists():
+            unfinished = Path(tempfile.mkdtemp(dir=base))
+            make(unfinished)
+            unfinished.rename(folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def made_plant(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The demonstration's plant with few images and rays; read it only."""
+    return made_once(
+        tmp_path_factory, "plant", lambda root: write_plant(root, images=4, rays=60_000)
+    )
+
+
 def flat_heliostat(
     position=(0.0, 60.0, 1.8), focal_length: float | None = None, mount: Mount | None = None
 ) -> Heliostat:
@@ -56,4 +97,6 @@ def flat_heliostat(
 
 def target(size: float = 8.0, center=(0.0, 0.0, 40.0)) -> TargetPlane:
     """A square target on the tower that faces the field in the north."""
-    return TargetPlane("target", np.array(center), np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]), size, size)
+    return TargetPlane(
+        "target", np.array(center), np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]), size, size
+    )

@@ -1,8 +1,9 @@
-"""A Monte Carlo of a field of heliostats with all their shadows, which shares nothing with the tracers under test.
+"""Monte Carlo simulation of a field of heliostats with shading and blocking.
 
-Every ray starts at a random point of a random facet, looks for a random point of an even sun (a pillbox), is reflected
-exactly, and is lost where the outline of any other mirror of the field stands in its way, before or after. It reads
-the plans of a heliostat (`model.plant`) and no other code of the model; numpy, brute force.
+It shares no code with the tracers under test. Every ray starts at a random point of a random facet.
+It comes from a random point of a uniform sun (a pillbox) and is reflected exactly. It is lost if
+the outline of another mirror is in its way, before or after the reflection. The simulation uses the
+geometry of a heliostat (`model.plant`) and no other code of the model: numpy, brute force.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,7 +15,9 @@ from model.plant import Cylinder, Heliostat, TargetPlane
 
 Array = NDArray[np.float64]
 Land = Callable[[Array, Array], tuple[Array, Array, Array]]
-"""Right and up [m] on a map where rays (n, 3) from points (n, 3) meet the receiver, and whether they do."""
+"""Right and up [m] on a map where rays (n, 3) from points (n, 3) meet the receiver, and whether
+they do.
+"""
 
 PIVOT = 0.175
 DNI = 1000.0
@@ -25,7 +28,9 @@ def unit(vectors: Array) -> Array:
 
 
 def pose(heliostat: Heliostat, sun: Array, aim: Array) -> tuple[Array, Array]:
-    """Centre (3,) and axes right, up, normal (3, 3) of a Juelich mirror: first axis east, second upright in it."""
+    """Centre (3,) and axes right, up, normal (3, 3) of a Juelich mirror: first axis east, second
+    upright in it.
+    """
     center = heliostat.position
     for _ in range(6):
         normal = unit(sun + unit(aim - center))
@@ -46,7 +51,9 @@ def onto_plane(plane: TargetPlane) -> Land:
 
 
 def onto_cylinder(cylinder: Cylinder) -> Land:
-    """Right counts the arc from the middle, up the height; only the outside is lit, where a ray meets it first."""
+    """Right counts the arc from the middle, up the height; only the outside is lit, where a ray
+    meets it first.
+    """
     right = np.cross(cylinder.up, cylinder.normal)
     axis = cylinder.center - cylinder.radius * cylinder.normal
     frame = np.array([cylinder.normal, right])
@@ -58,7 +65,11 @@ def onto_cylinder(cylinder: Cylinder) -> Land:
         first = (-b - root) / a
         place = p + first[:, None] * d
         up = (start + first[:, None] * ray - axis) @ cylinder.up
-        return cylinder.radius * np.arctan2(place[:, 1], place[:, 0]), up, (b**2 > a * c) & (first > 0)
+        return (
+            cylinder.radius * np.arctan2(place[:, 1], place[:, 0]),
+            up,
+            (b**2 > a * c) & (first > 0),
+        )
 
     return land
 
@@ -76,9 +87,11 @@ def trace_field(
     seed: int,
     shadows: bool = True,
 ) -> tuple[Array, Array]:
-    """Irradiance (rows, columns) [W/m2] on a map of ``size`` (width, height) [m], and power (N,) [W] of each mirror.
+    """Irradiance (rows, columns) [W/m2] on a map of ``size`` (width, height) [m], and power (N,)
+    [W] of each mirror.
 
-    ``rays`` a mirror; power is what leaves the field towards the receiver, whether it meets it or not.
+    ``rays`` a mirror; power is what leaves the field towards the receiver, whether it meets it or
+    not.
     """
     rng = np.random.default_rng(seed)
     poses = [pose(heliostat, sun, aim) for heliostat in heliostats]
@@ -115,13 +128,22 @@ def _sun_points(sun: Array, half_angle: float, rays: int, rng: np.random.Generat
     first = unit(np.cross(sun, [1.0, 0.0, 0.0]))
     second = np.cross(sun, first)
     radius, turn = half_angle * np.sqrt(rng.random(rays)), rng.uniform(0, 2 * np.pi, rays)
-    return unit(sun + np.outer(radius * np.cos(turn), first) + np.outer(radius * np.sin(turn), second))
+    return unit(
+        sun + np.outer(radius * np.cos(turn), first) + np.outer(radius * np.sin(turn), second)
+    )
 
 
-def _meets(start: Array, ray: Array, stands: tuple[Array, Array], heliostat: Heliostat) -> NDArray[np.bool_]:
-    """Whether rays (n, 3) from points (n, 3) meet the outline of a mirror that stands somewhere."""
-    center, (right, up, normal) = stands
+def _meets(
+    start: Array, ray: Array, placement: tuple[Array, Array], heliostat: Heliostat
+) -> NDArray[np.bool_]:
+    """Whether rays (n, 3) from points (n, 3) meet the outline of a mirror.
+
+    ``placement`` is its centre, and its right, up and normal directions.
+    """
+    center, (right, up, normal) = placement
     distance = (center - start) @ normal / (ray @ normal)
     place = start + distance[:, None] * ray - center
-    inside = (np.abs(place @ right) < heliostat.width / 2) & (np.abs(place @ up) < heliostat.height / 2)
+    inside = (np.abs(place @ right) < heliostat.width / 2) & (
+        np.abs(place @ up) < heliostat.height / 2
+    )
     return inside & (distance > 0)

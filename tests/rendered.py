@@ -20,5 +20,7 @@ def observe(
     rng: np.random.Generator,
     noise: float = 0.01,
 ) -> list[Observation]:
-    """8-bit images of heights ``z`` (4, 8, 8) [m] under suns (N, 3) on N planes, with noise relative to the peak."""
+    """8-bit images of heights ``z`` (4, 8, 8) [m] under suns (N, 3) on N planes, with noise
+    relative to the peak.
+    """
     return render.observe(heliostat, z, render.places(suns, planes), render.CleanCamera(noise), rng)

@@ -1,4 +1,6 @@
-"""README's table of additions, each tried: into a copy of the packages goes the one file, and the one line."""
+"""README's table of additions, each tried: into a copy of the packages goes the one file, and the
+one line.
+"""
 
 import json
 import os
@@ -11,8 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from tests import house
-from tests.benchmarks import data_folder
+from tests import packages
 
 ROOT = Path(__file__).parents[1]
 ADDED = Path(__file__).parent / "additions"
@@ -23,21 +24,19 @@ FILES = {
     "page": "service/web/pages/hello.py",
     "CLI verb": "service/cli/verbs/greet.py",
     "importer": "service/sources/importers/notes.py",
-    "export format": "service/web/answers/representations/table.py",
+    "export format": "service/web/responses/representations/table.py",
     "effect": "model/effects/dust_glow.py",
     "sun shape": "model/sunshape/cosine.py",
     "receiver": "model/wedge.py",
-    "network": "model/network/tiny.py",
 }
 """What is added, and its one file; `tests/additions` holds them."""
 
 LINES = {
-    "export format": ("service/web/answers/formats.py", "OFFERED = (\n", '    "table",\n'),
+    "export format": ("service/web/responses/formats.py", "OFFERED = (", '"table", '),
     "effect": ("model/effects/catalogue.py", '    "background",\n', '    "dust_glow",\n'),
-    "sun shape": ("model/sunshape/__init__.py", '    "gaussian",\n', '    "cosine",\n'),
-    "network": ("model/network/catalogue.py", "NETWORKS = {\n", '    "tiny": "tiny",\n'),
+    "sun shape": ("model/sunshape/__init__.py", "DECLARABLE = (", '"cosine", '),
 }
-"""The one line in another file, and the line that it follows, where there is one at all."""
+"""The addition in another file, and the text that it follows."""
 
 
 def _section(title: str) -> str:
@@ -50,7 +49,9 @@ def tried(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """What came of each addition: "ok", or how it failed."""
     root = tmp_path_factory.mktemp("additions")
     for package in ("model", "service", "training", "migrations"):
-        shutil.copytree(ROOT / package, root / package, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(
+            ROOT / package, root / package, ignore=shutil.ignore_patterns("__pycache__")
+        )
     for path in FILES.values():
         assert not (root / path).exists()
         shutil.copy(ADDED / Path(path).name, root / path)
@@ -58,9 +59,11 @@ def tried(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
         text = (root / path).read_text(encoding="utf-8")
         assert text.count(after) == 1
         (root / path).write_text(text.replace(after, after + line), encoding="utf-8")
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("HELIOTWIN_")}
+    environment = {
+        name: value for name, value in os.environ.items() if not name.startswith("HELIOTWIN_")
+    }
     done = subprocess.run(
-        [sys.executable, "-P", "-W", "error", str(ADDED / "trial.py"), str(root), str(data_folder().resolve())],
+        [sys.executable, "-P", "-W", "error", str(ADDED / "trial.py"), str(root)],
         env=environment | {"PYTHONPATH": str(root), "HELIOTWIN_DATA_DIR": str(root / "data")},
         cwd=root,
         capture_output=True,
@@ -94,7 +97,9 @@ def test_the_words_of_the_glossary_are_those_of_the_code():
     """Each dotted name in the last column is a module, or something in one."""
     rows = [line for line in _section("### Words").splitlines() if line.startswith("| ")][2:]
     assert len(rows) > 30
-    for name in (found for row in rows for found in re.findall(r"`(model\.[\w.]+|service\.[\w.]+)`", row)):
+    for name in (
+        found for row in rows for found in re.findall(r"`(model\.[\w.]+|service\.[\w.]+)`", row)
+    ):
         parts = name.split(".")
         for length in range(len(parts), 0, -1):
             try:
@@ -107,7 +112,7 @@ def test_the_words_of_the_glossary_are_those_of_the_code():
             break
 
 
-def test_readme_shows_the_house_as_it_is():
+def test_readme_has_the_table_of_packages():
     text = (ROOT / "README.md").read_text(encoding="utf-8")
-    shown = text.partition("<!-- python -m tests.house -->\n")[2].partition("\n<!-- end -->")[0]
-    assert shown == house.table(), "README shows what `python -m tests.house` printed once"
+    shown = text.partition("<!-- python -m tests.packages -->\n")[2].partition("\n<!-- end -->")[0]
+    assert shown == packages.table(), "README shows what `python -m tests.packages` printed once"

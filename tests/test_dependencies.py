@@ -15,7 +15,8 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("model", "service", "training", "migrations")
 
-# An extra is imported where it may be missing: in a function, or under a `try`, by the packages that know of it.
+# An extra is imported where it may be missing: in a function, or under a `try`, by the packages
+# that know of it.
 GUARDED = {"otel": ("service",), "ray": ("service",), "training": ("training",)}
 
 
@@ -28,7 +29,9 @@ def _declared(requirements: list[str]) -> set[str]:
 
 
 def _project() -> dict[str, Any]:
-    document: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    document: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))[
+        "project"
+    ]
     return document
 
 
@@ -54,7 +57,9 @@ _installed = lru_cache(packages_distributions)
 
 
 def _distributions(module: str) -> set[str]:
-    """The distributions that hold this module; of a namespace, as opentelemetry's, those that hold the part."""
+    """The distributions that hold this module; of a namespace, as opentelemetry's, those that hold
+    the part.
+    """
     found = {_normal(name) for name in _installed().get(module.split(".")[0], ())}
     part = _normal("-".join(module.split(".")[:2]))
     return found if len(found) == 1 else {name for name in found if name.startswith(part)}
@@ -65,18 +70,26 @@ def test_every_import_is_declared(package: str):
     project = _project()
     always = _declared(project["dependencies"])
     extras = {name: _declared(project["optional-dependencies"][name]) for name in GUARDED}
-    allowed = set().union(*(extras[name] for name, packages in GUARDED.items() if package in packages))
+    allowed = set().union(
+        *(extras[name] for name, packages in GUARDED.items() if package in packages)
+    )
     for module, at_top, path in _foreign(package):
         names = _distributions(module)
         assert names, f"{path}: {module} is not installed; make install"
         if names & always:
             continue
         assert names & allowed, f"{path}: {module} is declared nowhere"
-        assert not at_top or package == "training", f"{path}: {module} is of an extra, and imported without a guard"
+        assert not at_top or package == "training", (
+            f"{path}: {module} is of an extra, and imported without a guard"
+        )
 
 
 def test_every_dependency_has_an_upper_bound():
     project = _project()
-    extras = [requirement for names in project["optional-dependencies"].values() for requirement in names]
+    extras = [
+        requirement for names in project["optional-dependencies"].values() for requirement in names
+    ]
     for requirement in (*project["dependencies"], *extras):
-        assert re.search(r"<\d|==", requirement) or requirement.startswith("heliotwin["), requirement
+        assert re.search(r"<\d|==", requirement) or requirement.startswith("heliotwin["), (
+            requirement
+        )

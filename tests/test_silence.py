@@ -1,4 +1,6 @@
-"""No command opens a connection that nobody asked for: each is watched at the kernel's door, below all libraries."""
+"""No command opens a connection that nobody asked for: each is watched at the kernel's door, below
+all libraries.
+"""
 
 import os
 import re
@@ -12,9 +14,9 @@ from pathlib import Path
 import httpx
 import pytest
 
-from service.cli.demo_plant import write_plant
-from tests.faults.harness import ROOT, until
+from tests.faults.harness import ROOT
 from tests.service.conftest import free_port
+from tests.waiting import WAIT_LIMIT_S, child_process, until
 
 pytestmark = [pytest.mark.slow]
 
@@ -40,16 +42,22 @@ def watching(record: Path) -> list[str]:
         "-e",
         "inject=connect:error=ENETUNREACH",
     ]
-    asked = subprocess.run([*watch, "-o", str(record), "true"], capture_output=True, text=True, check=False)
+    asked = subprocess.run(
+        [*watch, "-o", str(record), "true"], capture_output=True, text=True, check=False
+    )
     if asked.returncode:
         pytest.skip(f"this machine lets nobody watch a process: {asked.stderr.strip()}")
     return [*watch, "-o", str(record)]
 
 
 def opened(record: Path) -> list[str]:
-    """The connections that were tried; those of one machine's processes with each other are none."""
+    """The connections that were tried; those of one machine's processes with each other
+    are none.
+    """
     lines = record.read_text(encoding="utf-8").splitlines()
-    return [line for line in lines if re.search(r"sa_family=(?!AF_UNIX|AF_NETLINK|AF_UNSPEC)", line)]
+    return [
+        line for line in lines if re.search(r"sa_family=(?!AF_UNIX|AF_NETLINK|AF_UNSPEC)", line)
+    ]
 
 
 def watched(folder: Path, *command: object) -> tuple[str, list[str]]:
@@ -68,16 +76,11 @@ def watched(folder: Path, *command: object) -> tuple[str, list[str]]:
 
 
 def environment(folder: Path, **more: str) -> dict[str, str]:
-    """That of a machine where nothing is set, not even that it is one for tests; some libraries mind those."""
+    """That of a machine where nothing is set, not even that it is one for tests; some libraries
+    mind those.
+    """
     places = {"HOME": str(folder / "home"), "PATH": "/usr/bin:/bin", "PYTHONPATH": str(ROOT)}
     return places | {"HELIOTWIN_DATA_DIR": str(folder / "data"), "OMP_NUM_THREADS": "1"} | more
-
-
-@pytest.fixture(scope="module")
-def plant(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("plant")
-    write_plant(root, images=4, rays=60_000)
-    return root
 
 
 _CALLS_OUT = """
@@ -107,38 +110,47 @@ def test_verbs_of_the_store(tmp_path: Path, word: str):
     [["predict", "--out", "out", "--images", "2"], ["study", "--out", "out.json"]],
     ids=lambda words: words[0],
 )
-def test_verbs_on_a_folder(tmp_path: Path, plant: Path, words: list[str]):
+def test_verbs_on_a_folder(tmp_path: Path, made_plant: Path, words: list[str]):
     verb, *options = words
-    _, calls = watched(tmp_path, *HELIOTWIN, verb, plant, *options)
+    _, calls = watched(tmp_path, *HELIOTWIN, verb, made_plant, *options)
     assert calls == []
 
 
-def test_demonstration(tmp_path: Path, plant: Path):
-    _, calls = watched(tmp_path, *HELIOTWIN, "demo", "--data", plant)
+def test_demonstration(tmp_path: Path, made_plant: Path):
+    _, calls = watched(tmp_path, *HELIOTWIN, "demo", "--data", made_plant)
     assert calls == []
 
 
 def test_service(tmp_path: Path):
     port, record = free_port(), tmp_path / "calls"
     command = [*watching(record), *HELIOTWIN, "serve"]
-    process = subprocess.Popen(
-        command, cwd=tmp_path, env=environment(tmp_path, HELIOTWIN_PORT=str(port)), stderr=subprocess.DEVNULL
-    )
-    try:
+    options = {
+        "cwd": tmp_path,
+        "env": environment(tmp_path, HELIOTWIN_PORT=str(port)),
+        "stderr": subprocess.DEVNULL,
+    }
+    with child_process(command, **options) as process:
 
         def is_ready() -> bool:
             assert process.poll() is None, "it ended"
             try:
-                return httpx.get(f"http://127.0.0.1:{port}/readyz", timeout=60).status_code == 200
+                return httpx.get(f"http://127.0.0.1:{port}/readyz").status_code == 200
             except httpx.TransportError:
                 return False
 
-        until(is_ready, "the service is ready")
-        for path in ("/", "/docs", "/metrics", "/forecast"):
-            assert httpx.get(f"http://127.0.0.1:{port}{path}", timeout=30).status_code == 200
-        time.sleep(LONG_ENOUGH_S)
-    finally:
-        (child,) = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text(encoding="utf-8").split()
-        os.kill(int(child), signal.SIGTERM)  # watched to its end, which the watcher's own would cut off
-        process.wait(60)
+        try:
+            until(is_ready, "the service is ready")
+            for path in ("/", "/docs", "/metrics", "/forecast"):
+                assert httpx.get(f"http://127.0.0.1:{port}{path}").status_code == 200
+            time.sleep(LONG_ENOUGH_S)
+        finally:
+            (child,) = (
+                Path(f"/proc/{process.pid}/task/{process.pid}/children")
+                .read_text(encoding="utf-8")
+                .split()
+            )
+            os.kill(
+                int(child), signal.SIGTERM
+            )  # watched to its end, which the watcher's own would cut off
+            process.wait(WAIT_LIMIT_S)
     assert opened(record) == []

@@ -1,4 +1,6 @@
-"""The built wheel alone, in an environment that holds nothing but what it asks for: what a plain installation gets."""
+"""The built wheel alone, in an environment that holds nothing but what it asks for: what a plain
+installation gets.
+"""
 
 import json
 import os
@@ -11,25 +13,28 @@ import httpx
 import numpy as np
 import pytest
 
-from service.cli.demo_plant import write_plant
 from tests.docker.engine import ROOT, clone
-from tests.faults.harness import until
 from tests.service.conftest import free_port
+from tests.waiting import WAIT_LIMIT_S, child_process, until
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.slow]
 
 
 def _bare() -> dict[str, str]:
     """This process's environment without what would lead to this checkout or its packages."""
     return {
-        name: value for name, value in os.environ.items() if not name.startswith(("HELIOTWIN_", "PYTHON", "VIRTUAL"))
+        name: value
+        for name, value in os.environ.items()
+        if not name.startswith(("HELIOTWIN_", "PYTHON", "VIRTUAL"))
     }
 
 
 def _run(*command: str | Path, folder: Path, **settings: str) -> str:
     """What a command prints that must succeed, in the bare environment with ``settings``."""
     environment = _bare() | settings
-    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command, cwd=folder, env=environment, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stderr
     return done.stdout
@@ -37,12 +42,22 @@ def _run(*command: str | Path, folder: Path, **settings: str) -> str:
 
 @pytest.fixture(scope="module")
 def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The interpreter of a fresh environment with the wheel and, by the locked versions, its dependencies."""
+    """The interpreter of a fresh environment with the wheel and, by the locked versions, its
+    dependencies.
+    """
     folder = tmp_path_factory.mktemp("wheel")
     venv.create(folder / "environment", with_pip=True)
     python = folder / "environment" / "bin" / "python"
     pip = [str(python), "-m", "pip", "--quiet", "--disable-pip-version-check"]
-    probe = [*pip, "download", "--no-deps", "--no-cache-dir", "--dest", str(folder / "probe"), "setuptools>=77"]
+    probe = [
+        *pip,
+        "download",
+        "--no-deps",
+        "--no-cache-dir",
+        "--dest",
+        str(folder / "probe"),
+        "setuptools>=77",
+    ]
     asked = subprocess.run(probe, env=_bare(), capture_output=True, text=True, check=False)
     if asked.returncode:
         pytest.skip(f"no package registry answers: {asked.stderr.strip().splitlines()[-1]}")
@@ -51,14 +66,6 @@ def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
     # Without bytecode, which would be made of all packages and is needed of few.
     _run(*pip, "install", "--no-compile", "-c", ROOT / "constraints.txt", wheel, folder=folder)
     return python
-
-
-@pytest.fixture(scope="module")
-def plant(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of measurements, as small as a study can be."""
-    root = tmp_path_factory.mktemp("plant")
-    write_plant(root, images=4, rays=60_000)
-    return root
 
 
 def heliotwin(python: Path, folder: Path, *arguments: object) -> str:
@@ -75,18 +82,26 @@ def report(python: Path, folder: Path, *arguments: object) -> dict[str, Any]:
 def test_nothing_of_development_is_there(python: Path):
     names = ("httpx", "pytest", "ray", "onnx", "opentelemetry.sdk", "tests")
     ask = f"import importlib.util as u; print([name for name in {names} if u.find_spec(name)])"
-    done = subprocess.run([python, "-c", ask], cwd="/", env=_bare(), capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [python, "-c", ask], cwd="/", env=_bare(), capture_output=True, text=True, check=False
+    )
     assert done.stdout.strip() == "[]", done.stderr
 
 
-def test_verbs_on_a_folder(python: Path, plant: Path, tmp_path: Path):
+def test_verbs_on_a_folder(python: Path, made_plant: Path, tmp_path: Path):
     assert "predict" in heliotwin(python, tmp_path, "--help")
-    assert len(report(python, tmp_path, "flux", plant, "--out", "flux")["images"]) == 16
-    predicted = report(python, tmp_path, "predict", plant, "--out", "predicted", "--images", 2)["heliostats"]
+    assert len(report(python, tmp_path, "flux", made_plant, "--out", "flux")["images"]) == 16
+    predicted = report(
+        python, tmp_path, "predict", made_plant, "--out", "predicted", "--images", 2
+    )["heliostats"]
     for name in predicted:
-        with np.load(tmp_path / "predicted" / name / "Deflectometry" / f"{name}-nurbs-surface.npz") as surface:
+        with np.load(
+            tmp_path / "predicted" / name / "Deflectometry" / f"{name}-nurbs-surface.npz"
+        ) as surface:
             assert surface["z"].shape == (4, 8, 8)
-    study = report(python, tmp_path, "study", plant, "--out", "study.json", "--html", "study.html")
+    study = report(
+        python, tmp_path, "study", made_plant, "--out", "study.json", "--html", "study.html"
+    )
     assert study["verdict"] in ("effect", "none", "unexplained")
     assert "<html" in (tmp_path / "study.html").read_text(encoding="utf-8")
 
@@ -96,21 +111,23 @@ def test_service(python: Path, tmp_path: Path):
     settings = {"HELIOTWIN_DATA_DIR": str(tmp_path / "data"), "HELIOTWIN_PORT": str(port)}
     program = str(python.parent / "heliotwin")
     _run(program, "migrate", folder=tmp_path, **settings)
-    with (tmp_path / "log").open("wb") as log:
-        process = subprocess.Popen([program, "serve"], cwd=tmp_path, env=_bare() | settings, stderr=log)
-    try:
+    with (
+        (tmp_path / "log").open("wb") as log,
+        child_process(
+            [program, "serve"], cwd=tmp_path, env=_bare() | settings, stderr=log
+        ) as process,
+    ):
 
         def answers() -> bool:
             assert process.poll() is None, (tmp_path / "log").read_text(encoding="utf-8")
             try:
-                return httpx.get(f"http://127.0.0.1:{port}/livez", timeout=10).status_code == 200
+                return httpx.get(f"http://127.0.0.1:{port}/livez").status_code == 200
             except httpx.TransportError:
                 return False
 
         until(answers, "the service answers")
-        assert httpx.get(f"http://127.0.0.1:{port}/readyz", timeout=60).json()["status"] == "ok"
-        assert httpx.get(f"http://127.0.0.1:{port}/", timeout=30).status_code == 200
-    finally:
+        assert httpx.get(f"http://127.0.0.1:{port}/readyz").json()["status"] == "ok"
+        assert httpx.get(f"http://127.0.0.1:{port}/").status_code == 200
         process.terminate()
-        assert process.wait(60) in (0, -15)
+        assert process.wait(WAIT_LIMIT_S) in (0, -15)
     assert "Traceback" not in (tmp_path / "log").read_text(encoding="utf-8")

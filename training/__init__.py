@@ -1,1 +1,1 @@
-"""What makes the weights: surfaces, augmentation, rendering, training, evaluation, export."""
+"""Training of the network: surfaces, augmentation, rendering, training, evaluation, export."""

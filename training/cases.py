@@ -1,7 +1,8 @@
-"""Mirrors to be judged by: known surfaces, placed over the field and photographed.
+"""Test cases: mirrors with known surfaces, placed in the field and photographed.
 
-The paper's situation (Lewen et al. 2024): slant distances to 300 m, azimuths within 45 degrees of north, images on one
-calibration target; forecasts under new suns on that target and on a plane 18 m to its west and 15 m above it.
+The cases follow the paper (Lewen et al. 2024). Slant distances are up to 300 m, and azimuths within
+45 degrees of north. The images are on one calibration target. Forecasts use new suns, on that
+target and on a plane 18 m to its west and 15 m above it.
 """
 
 from collections.abc import Sequence
@@ -13,40 +14,44 @@ from numpy.typing import NDArray
 from model.network.architecture import MAX_IMAGES
 from model.observation import Observation
 from model.plant import Heliostat, TargetPlane
-from training.render import Camera, CleanCamera, Situations, observe, places
+from training.render import Camera, CleanCamera, SceneSampler, observe, places
 
 Array = NDArray[np.float64]
 
 NEW_SUNS = 4
-"""Suns under which a prediction is judged, none of which it was made from."""
+"""Suns of the forecasts of a case; no image of the prediction has one of them."""
 
 MAX_DISTANCE = 300.0
-"""[m]"""
+"""Largest distance [m]."""
 
 MAX_AZIMUTH = 45.0
-"""East or west of north, seen from the tower [deg]."""
+"""Largest azimuth east or west of north, seen from the tower [deg]."""
 
-SOURCE = TargetPlane("source", np.array([0.0, -3.2, 35.9]), np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), 8.6, 7.2)
-"""About Juelich's solar_tower_juelich_lower."""
+SOURCE = TargetPlane(
+    "source", np.array([0.0, -3.2, 35.9]), np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), 8.6, 7.2
+)
+"""Approximately Juelich's solar_tower_juelich_lower."""
 
-ELSEWHERE = TargetPlane("elsewhere", SOURCE.center + [-18.0, 0.0, 15.0], SOURCE.normal, SOURCE.up, 8.6, 7.2)
-"""About Juelich's multi_focus_tower."""
+ELSEWHERE = TargetPlane(
+    "elsewhere", SOURCE.center + [-18.0, 0.0, 15.0], SOURCE.normal, SOURCE.up, 8.6, 7.2
+)
+"""Approximately Juelich's multi_focus_tower."""
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One heliostat whose surface is known.
+    """One heliostat with a known surface.
 
     Attributes
     ----------
     surface : str
-        Which measured surface it has.
+        Name of its measured surface.
     heliostat : Heliostat
     truth : (4, 8, 8) [m]
     observations : list of Observation
         `MAX_IMAGES` images to predict from.
     forecasts : list of Observation
-        `NEW_SUNS` on the source target, then the same elsewhere; without images.
+        `NEW_SUNS` on the source target, then the same on `ELSEWHERE`; without images.
     """
 
     surface: str
@@ -57,7 +62,7 @@ class Case:
 
     @property
     def distance(self) -> float:
-        """From the mirror to the source target [m]."""
+        """Distance from the mirror to the source target [m]."""
         return float(np.linalg.norm(self.heliostat.position - SOURCE.center))
 
 
@@ -69,28 +74,37 @@ def make_cases(
     camera: Camera | CleanCamera,
     seed: int = 100,
 ) -> list[Case]:
-    """``count`` cases of surfaces (N, 4, 8, 8) [m] in turn, at random places of a field (M, 3) [m].
+    """Make ``count`` cases of surfaces (N, 4, 8, 8) [m] at random positions of a field.
 
-    A case depends on the seed and its number alone, so that the first of many are the same as those of few.
+    The surfaces are used in turn; ``field`` is (M, 3) [m]. A case depends only on the seed and its
+    number, so that the first cases are the same for any count.
     """
     near = field[within_reach(field)]
     return [
-        _case(names[i % len(names)], surfaces[i % len(names)], near, camera, np.random.default_rng((seed, i)))
+        _case(
+            names[i % len(names)],
+            surfaces[i % len(names)],
+            near,
+            camera,
+            np.random.default_rng((seed, i)),
+        )
         for i in range(count)
     ]
 
 
-def _case(name: str, truth: Array, field: Array, camera: Camera | CleanCamera, rng: np.random.Generator) -> Case:
-    situations = Situations()
-    (heliostat,) = situations.heliostats(field[rng.integers(len(field), size=1)], rng)
-    suns = situations.suns(MAX_IMAGES + NEW_SUNS, rng)
+def _case(
+    name: str, truth: Array, field: Array, camera: Camera | CleanCamera, rng: np.random.Generator
+) -> Case:
+    scenes = SceneSampler()
+    (heliostat,) = scenes.heliostats(field[rng.integers(len(field), size=1)], rng)
+    suns = scenes.suns(MAX_IMAGES + NEW_SUNS, rng)
     setups = places(suns[:MAX_IMAGES], [SOURCE] * MAX_IMAGES)
     new = places(np.tile(suns[MAX_IMAGES:], (2, 1)), [SOURCE] * NEW_SUNS + [ELSEWHERE] * NEW_SUNS)
     return Case(name, heliostat, truth, observe(heliostat, truth, setups, camera, rng), new)
 
 
 def within_reach(field: Array) -> NDArray[np.bool_]:
-    """Which positions (N, 3) [m] of a field lie where the paper places its mirrors."""
+    """Mask of the positions (N, 3) [m] within the paper's distances and azimuths."""
     azimuth = np.degrees(np.arctan2(field[:, 0], field[:, 1]))
     distance = np.linalg.norm(field - SOURCE.center, axis=1)
     return np.asarray((np.abs(azimuth) <= MAX_AZIMUTH) & (distance <= MAX_DISTANCE))

@@ -1,25 +1,23 @@
-"""What decides a training run."""
+"""The configuration of a training run."""
 
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from model.network.architecture import NetworkConfig
-from model.network.catalogue import NETWORKS, sizes_of
-from training.render import Camera, Situations
-from training.surfaces import Augmentation, fold_of, split
+from training.render import Camera, SceneSampler
+from training.surfaces import Augmentation, Partition, fold_of, split
 
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Everything that decides a run; stored beside its result.
+    """All settings of a run; stored with its result.
 
-    ``architecture`` is a name of `model.network.catalogue`, and ``network`` has its sizes. ``looks`` is how often the
-    network sees its own guess. ``bfloat16`` computes with sixteen bits, where the machine is able to.
-    ``learns_from`` are parts of `training.surfaces.SPLIT`; where ``folds`` are counted, the network learns from all
-    heliostats but those of one ``fold``. ``batch`` is shared among processes.
+    ``n_iterations`` is the number of times that the network is applied, each to its previous
+    output. ``bfloat16`` computes with sixteen bits if the machine supports it. ``learns_from`` are
+    parts of `training.surfaces.SPLIT`. With ``folds`` the network learns from all heliostats except
+    those of one ``fold``.
     """
 
     data: str = "../shared/stj"
@@ -36,37 +34,35 @@ class TrainConfig:
     spread_weight: float = 0.1
     ema: float = 0.999
     bfloat16: bool = True
-    looks: int = 2
-    architecture: str = "ours"
-    network: Any = field(default_factory=NetworkConfig)
+    n_iterations: int = 2
+    network: NetworkConfig = field(default_factory=NetworkConfig)
     augmentation: Augmentation = field(default_factory=Augmentation)
-    situations: Situations = field(default_factory=Situations)
+    scenes: SceneSampler = field(default_factory=SceneSampler)
     camera: Camera = field(default_factory=Camera)
 
-    def parts(self, names: Sequence[str]) -> tuple[list[int], list[int]]:
-        """Indices of the heliostats in ``names`` to learn from, and of those that judge while it learns, if any."""
+    def parts(self, names: Sequence[str]) -> Partition:
+        """Indices in ``names`` of the heliostats for training, and of those for validation."""
         if self.folds:
             return fold_of(names, self.fold, self.folds)
         parts = split(names)
         judges = [] if "validation" in self.learns_from else parts["validation"]
-        return sorted(i for part in self.learns_from for i in parts[part]), judges
+        return Partition(sorted(i for part in self.learns_from for i in parts[part]), judges)
 
     @classmethod
     def read(cls, path: Path) -> "TrainConfig":
-        """A config from JSON; keys that are left out keep their defaults.
-
-        Another network may be named by its sizes alone, as in ``{"ours": {}}``.
-        """
+        """Read a config from JSON; missing keys have their defaults."""
         values = json.loads(path.read_text(encoding="utf-8"))
-        for name in NETWORKS:
-            sizes = values.pop(name, None)
-            if sizes is not None:
-                values |= {"architecture": name, "network": sizes}
-        if "network" in values:
-            values["network"] = sizes_of(values.get("architecture", cls.architecture), values["network"])
-        for name, part in {"augmentation": Augmentation, "situations": Situations, "camera": Camera}.items():
+        kinds = {
+            "network": NetworkConfig,
+            "augmentation": Augmentation,
+            "scenes": SceneSampler,
+            "camera": Camera,
+        }
+        for name, part in kinds.items():
             if values.get(name) is not None:
-                values[name] = part(**{k: tuple(v) if isinstance(v, list) else v for k, v in values[name].items()})
+                values[name] = part(
+                    **{k: tuple(v) if isinstance(v, list) else v for k, v in values[name].items()}
+                )
         if "learns_from" in values:
             values["learns_from"] = tuple(values["learns_from"])
         return cls(**values)

@@ -15,6 +15,7 @@ import onnx
 import torch
 from torch import nn
 
+from model.checksums import digests
 from model.images import FLUX_SIZE, normalized
 from model.network.architecture import CONDITIONS, MAX_IMAGES
 from model.network.predictor import INPUTS, WEIGHTS, SurfacePredictor
@@ -27,11 +28,14 @@ from training.surfaces import load_part
 from training.train import Run
 
 PARITY_MM = 1e-4
-"""Largest difference between torch and onnxruntime that is let through [mm]."""
+"""Largest allowed difference between torch and onnxruntime [mm]."""
 
 
 def example(batch: int, images: int) -> tuple[torch.Tensor, ...]:
-    """Inputs of the network's form in the order of `INPUTS`, the first ``images`` of eight present."""
+    """Random inputs of the network in the order of `INPUTS`.
+
+    The first ``images`` of the eight images are present.
+    """
     generator = torch.Generator().manual_seed(batch * 10 + images)
     fluxes = torch.rand(2, batch, MAX_IMAGES, FLUX_SIZE, FLUX_SIZE, generator=generator) ** 4
     flux, guess_flux = normalized(fluxes)
@@ -61,7 +65,7 @@ def export(network: nn.Module, path: Path) -> None:
 
 
 def rounded(network: nn.Module) -> nn.Module:
-    """The network with its parameters rounded in place to what a 16-bit float holds."""
+    """Round the network's parameters in place to 16-bit floats."""
     with torch.no_grad():
         for parameter in network.parameters():
             parameter.copy_(parameter.half().float())
@@ -69,9 +73,10 @@ def rounded(network: nn.Module) -> nn.Module:
 
 
 def store_in_half(path: Path) -> None:
-    """Store the large weights of an ONNX file as 16-bit floats; they are cast back when it is loaded.
+    """Store the large weights of an ONNX file as 16-bit floats.
 
-    Half the file, the same arithmetic; exact for a network that was `rounded` before.
+    They are cast back when the file is loaded. The file has half the size, and the arithmetic is
+    the same. The result is exact for a network that was `rounded` before.
     """
     model = onnx.load(path)
     casts = []
@@ -79,9 +84,11 @@ def store_in_half(path: Path) -> None:
         if tensor.data_type == onnx.TensorProto.FLOAT and len(tensor.raw_data) > 4096:
             name, values = tensor.name, onnx.numpy_helper.to_array(tensor).astype(np.float16)
             tensor.CopyFrom(onnx.numpy_helper.from_array(values, f"{name}_half"))
-            casts.append(onnx.helper.make_node("Cast", [f"{name}_half"], [name], to=onnx.TensorProto.FLOAT))
-    for told in (model.graph, *model.graph.node, *model.graph.value_info):
-        del told.metadata_props[:]  # the exporter's stack traces, with paths of the machine
+            casts.append(
+                onnx.helper.make_node("Cast", [f"{name}_half"], [name], to=onnx.TensorProto.FLOAT)
+            )
+    for part in (model.graph, *model.graph.node, *model.graph.value_info):
+        del part.metadata_props[:]  # stack traces of the exporter, with local paths
     nodes = [*casts, *model.graph.node]
     del model.graph.node[:]
     model.graph.node.extend(nodes)
@@ -89,7 +96,10 @@ def store_in_half(path: Path) -> None:
 
 
 def parity(network: nn.Module, path: Path) -> float:
-    """Largest difference [mm] between torch and onnxruntime at batches 1, 2, 7 and one to eight images."""
+    """Largest difference [mm] between torch and onnxruntime.
+
+    Batches of 1, 2 and 7 are compared, each with one to eight images.
+    """
     session = SurfacePredictor(path)
     worst = 0.0
     for batch in (1, 2, 7):
@@ -97,16 +107,19 @@ def parity(network: nn.Module, path: Path) -> float:
             inputs = example(batch, images)
             with torch.no_grad():
                 expected = network(*inputs)[0].numpy()
-            z, _ = session.look({name: tensor.numpy() for name, tensor in zip(INPUTS, inputs, strict=True)})
+            z, _ = session.iterate(
+                {name: tensor.numpy() for name, tensor in zip(INPUTS, inputs, strict=True)}
+            )
             worst = max(worst, float(np.abs(z * 1e3 - expected).max()))
     return worst
 
 
 def evaluation(run: Run, path: Path, count: int = 128) -> dict[str, Any]:
-    """Figures of the exported network, and of the surfaces that it must beat, on ``count`` test mirrors."""
+    """Results of the exported network and of reference surfaces on ``count`` test cases."""
     surfaces, names = load_part(Path(run.config.data), "test")
     clean, imperfect = (
-        make_cases(surfaces, names, run.field, count, camera) for camera in (CleanCamera(), run.config.camera)
+        make_cases(surfaces, names, run.field, count, camera)
+        for camera in (CleanCamera(), run.config.camera)
     )
     network, mean = by_onnx(SurfacePredictor(path)), run.mean.double().numpy()
     outcomes = {
@@ -116,22 +129,33 @@ def evaluation(run: Run, path: Path, count: int = 128) -> dict[str, Any]:
         "network, 8 images of imperfect cameras": outcomes_of(network, imperfect),
         "network, 1 clean image": outcomes_of(network, clean, images=1),
     }
-    return {name: asdict(Figures.of(found, outcomes["ideal surface"])) for name, found in outcomes.items()}
+    return {
+        name: asdict(Figures.of(found, outcomes["ideal surface"]))
+        for name, found in outcomes.items()
+    }
 
 
 def model_card(run: Run, path: Path, difference: float) -> dict[str, Any]:
-    """What the weights are, what they were trained on and by which commit, and how well they do."""
+    """Model card: description of the weights, training data, commit and results."""
     network = run.average
     return {
         "name": path.stem,
-        "weights": SurfacePredictor(path).name,
-        "task": "mirror surface (4 x 8 x 8 control heights) from 1 to 8 flux images of one heliostat",
+        **digests(path),
+        "task": (
+            "mirror surface (4 x 8 x 8 control heights) from 1 to 8 flux images of one heliostat"
+        ),
         "parameters": sum(p.numel() for p in network.parameters()),
         "trained_on": {
-            "surfaces": f"{len(run.surfaces)} measured surfaces of the Solar Tower Juelich (surfaces.npz), augmented",
+            "surfaces": (
+                f"{len(run.surfaces)} measured surfaces of the Solar Tower Juelich (surfaces.npz),"
+                " augmented"
+            ),
             "learnt": run.learnt,
             "held_out": [name for name in run.names if name not in run.learnt],
-            "images": "convolution-traced flux with random cameras, suns of the year, field positions of Juelich",
+            "images": (
+                "convolution-traced flux with random cameras, suns of the year, field positions of"
+                " Juelich"
+            ),
             "steps": run.step,
             "samples": run.step * run.config.batch,
             "commit": run.commit,
@@ -139,12 +163,15 @@ def model_card(run: Run, path: Path, difference: float) -> dict[str, Any]:
         "config": asdict(run.config),
         "onnx_parity_mm": difference,
         "evaluation": evaluation(run, path),
-        "limits": "Four-facet mirrors of the Juelich kind, flux in 4 m x 4 m windows; other mirrors are out of domain.",
+        "limits": (
+            "Four-facet mirrors of the Juelich kind, flux in 4 m x 4 m windows; other mirrors are"
+            " out of domain."
+        ),
     }
 
 
 def main() -> None:
-    """Export, check, write."""
+    """Export the weights, check them and write the model card."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--run", type=Path, default=Path("runs/best"))
     parser.add_argument("--out", type=Path, default=WEIGHTS)
@@ -154,11 +181,17 @@ def main() -> None:
     export(network, arguments.out)
     difference = parity(network, arguments.out)
     if not math.isfinite(difference) or difference > PARITY_MM:
-        raise SystemExit(f"ONNX differs from torch by {difference:.2e} mm, more than {PARITY_MM:.0e}")
+        raise SystemExit(
+            f"ONNX differs from torch by {difference:.2e} mm, more than {PARITY_MM:.0e}"
+        )
     card = model_card(run, arguments.out, difference)
-    arguments.out.with_suffix(".json").write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
+    arguments.out.with_suffix(".json").write_text(
+        json.dumps(card, indent=1) + "\n", encoding="utf-8"
+    )
     print(json.dumps(card["evaluation"], indent=1))
-    print(f"{arguments.out}: {arguments.out.stat().st_size / 1e6:.1f} MB, parity {difference:.1e} mm")
+    print(
+        f"{arguments.out}: {arguments.out.stat().st_size / 1e6:.1f} MB, parity {difference:.1e} mm"
+    )
 
 
 if __name__ == "__main__":

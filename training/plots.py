@@ -1,4 +1,7 @@
-"""Plots of training and evaluation; ``python -m training.plots`` draws the learning curves of all runs."""
+"""Plots of training and evaluation.
+
+``python -m training.plots`` draws the learning curves of all runs.
+"""
 
 import argparse
 import json
@@ -16,7 +19,7 @@ Line = tuple[Sequence[float], Sequence[float]]
 
 
 def lines(series: Mapping[str, Line], across: str, up: str) -> Figure:
-    """Named lines (x, y) over one another."""
+    """Plot named lines (x, y) in one figure."""
     figure = Figure(figsize=(7, 4.5), layout="constrained")
     axes = figure.subplots()
     for name, (x, y) in series.items():
@@ -28,7 +31,10 @@ def lines(series: Mapping[str, Line], across: str, up: str) -> Figure:
 
 
 def surfaces(rows: Mapping[str, Mapping[str, Array]]) -> Figure:
-    """Rows of surfaces (4, 8, 8) [m], each drawn as the mirror is seen from the front, on one scale a row."""
+    """Plot rows of surfaces (4, 8, 8) [m], seen from the front.
+
+    Each row has one scale.
+    """
     count = max(len(row) for row in rows.values())
     figure = Figure(figsize=(3.2 * count, 2.7 * len(rows)), layout="constrained")
     panes = figure.subplots(len(rows), count, squeeze=False)
@@ -43,7 +49,10 @@ def surfaces(rows: Mapping[str, Mapping[str, Array]]) -> Figure:
 
 
 def mirror(z: Array, points: int = 40) -> Array:
-    """Heights (2 * points, 2 * points) [m] of a surface (4, 8, 8) on even steps, the upper left corner first."""
+    """Heights (2 * points, 2 * points) [m] of a surface (4, 8, 8), evenly spaced.
+
+    The upper left corner comes first.
+    """
     across, along = (basis(count, DEGREE, np.linspace(0, 1, points))[0] for count in z.shape[1:])
     # i runs to the right and j upwards; rows run downwards.
     seen = (across @ z @ along.T).transpose(0, 2, 1)[:, ::-1]
@@ -51,13 +60,21 @@ def mirror(z: Array, points: int = 40) -> Array:
 
 
 def learning_curves(runs: Sequence[Path]) -> Figure:
-    """Errors of runs' ``curve.jsonl`` over their steps: on training samples, and on validation surfaces by look."""
+    """Plot errors of runs' ``curve.jsonl`` over their steps.
+
+    The errors are on training samples, and on validation surfaces for each iteration.
+    """
     series: dict[str, Line] = {}
     for run in runs:
-        curve = [json.loads(line) for line in (run / "curve.jsonl").read_text(encoding="utf-8").splitlines()]
+        curve = [
+            json.loads(line)
+            for line in (run / "curve.jsonl").read_text(encoding="utf-8").splitlines()
+        ]
         steps = [line["step"] for line in curve]
         series[f"{run.name}, training"] = (steps, [line["train_mae_mm"] for line in curve])
-        for look, errors in enumerate(zip(*(line["validation_mae_mm"] for line in curve), strict=True), start=1):
+        for look, errors in enumerate(
+            zip(*(line["validation_mae_mm"] for line in curve), strict=True), start=1
+        ):
             series[f"{run.name}, validation, look {look}"] = (steps, errors)
     return lines(series, "step", "mean error of control heights [mm]")
 
@@ -69,7 +86,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("out/learning-curves.png"))
     arguments = parser.parse_args()
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    learning_curves(sorted(path.parent for path in arguments.runs.glob("*/curve.jsonl"))).savefig(arguments.out)
+    learning_curves(sorted(path.parent for path in arguments.runs.glob("*/curve.jsonl"))).savefig(
+        arguments.out
+    )
     print(arguments.out)
 
 

@@ -1,11 +1,9 @@
 """Train the surface network: ``python -m training.train --config training/configs/best.json``.
 
-Images are rendered as the training goes, so that no surface is seen twice under the same sun. Each batch is looked at
-from the mean surface, then from what the network has just said of it. A run keeps everything in one folder: its config,
-a checkpoint to resume from, its curve, and the weights of the exponential moving average.
-
-On several GPUs, or CPU processes, which share every batch:
-``torchrun --nproc-per-node 4 -m training.train --config training/configs/best.json --folder runs/best``.
+Images are rendered during training, so that no surface occurs twice under the same sun. The network
+is applied to each batch first from the mean surface, then from its previous output. A run has one
+folder: its config, a checkpoint to resume from, its learning curve, and the weights of the
+exponential moving average.
 """
 
 import argparse
@@ -15,37 +13,66 @@ import math
 import shutil
 import subprocess
 import time
-from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from model.network.architecture import MAX_IMAGES
-from model.network.catalogue import build
-from model.network.inputs import descents
-from training import parallel
+from model.network.architecture import MAX_IMAGES, SurfaceNetwork
 from training.config import TrainConfig
 from training.prior import estimate
-from training.render import Descents, Photographs, load_field, render
+from training.render import Photographs, load_field, render
 from training.surfaces import load_surfaces
 
 
-def loss_terms(heights: Tensor, spread: Tensor, truth: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean absolute height error [mm] and slope error [mm per control spacing], and the spread's neg. log-likelihood.
+class LossTerms(NamedTuple):
+    """Height error [mm], slope error [mm per control spacing], and the spread's loss.
 
-    Mirrors count by their ``weight`` (B,). The spread learns from the error but does not pull at the heights.
+    Errors are mean absolute ones. The spread's loss is its negative log-likelihood.
+    """
+
+    error: Tensor
+    slopes: Tensor
+    likelihood: Tensor
+
+
+def loss_terms(heights: Tensor, spread: Tensor, truth: Tensor, weight: Tensor) -> LossTerms:
+    """Compute the loss; mirrors count by their ``weight`` (B,).
+
+    The spread learns from the height error, but its gradient does not change the heights.
     """
     error = heights - truth
-    slopes = error.diff(dim=-1).abs().mean(dim=(1, 2, 3)) + error.diff(dim=-2).abs().mean(dim=(1, 2, 3))
+    slopes = error.diff(dim=-1).abs().mean(dim=(1, 2, 3)) + error.diff(dim=-2).abs().mean(
+        dim=(1, 2, 3)
+    )
     likelihood = (error.detach().abs() / spread + torch.log(spread)).mean()
-    return (weight * error.abs().mean(dim=(1, 2, 3))).mean(), (weight * slopes).mean(), likelihood
+    height_error = (weight * error.abs().mean(dim=(1, 2, 3))).mean()
+    return LossTerms(height_error, (weight * slopes).mean(), likelihood)
+
+
+def learning_rate(config: TrainConfig, step: int) -> float:
+    """Linear warm-up, then a cosine to a hundredth."""
+    if step < config.warmup:
+        return config.learning_rate * (step + 1) / config.warmup
+    progress = min(1.0, (step - config.warmup) / max(1, config.steps - config.warmup))
+    return config.learning_rate * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * progress)))
+
+
+@torch.no_grad()
+def update_average(average: nn.Module, network: nn.Module, decay: float) -> None:
+    """Move the exponential moving average of the weights towards a network."""
+    for mean, current in zip(average.parameters(), network.parameters(), strict=True):
+        mean.lerp_(current, 1 - decay)
 
 
 def commit_of(folder: Path) -> str:
-    """The repository's commit, ``+`` where tracked files differ from it; "unknown" outside of one or without git."""
+    """The repository's commit, with ``+`` if tracked files differ from it.
+
+    The result is "unknown" outside of a repository or without git.
+    """
     if shutil.which("git") is None:
         return "unknown"
     asked = ["git", "describe", "--always", "--abbrev=12", "--dirty=+", "--exclude=*"]
@@ -53,38 +80,40 @@ def commit_of(folder: Path) -> str:
     return done.stdout.strip() or "unknown"
 
 
-class Run:
-    """One training run in its folder, of the config's network, and its way to descents, unless others are given."""
+class Batch(NamedTuple):
+    """Photographs of mirrors, and their true heights (B, 4, 8, 8) [mm]."""
 
-    def __init__(
-        self,
-        config: TrainConfig,
-        folder: Path,
-        device: torch.device,
-        network: nn.Module | None = None,
-        way: Descents = descents,
-    ) -> None:
-        if config.batch % parallel.size():
-            raise ValueError(f"batch {config.batch} cannot be shared evenly among {parallel.size()} processes")
-        self.config, self.folder, self.device, self.way = config, folder, device, way
+    photographs: Photographs
+    truth: Tensor
+
+
+class Run:
+    """One training run in its folder."""
+
+    def __init__(self, config: TrainConfig, folder: Path, device: torch.device) -> None:
+        self.config, self.folder, self.device = config, folder, device
         surfaces, self.names = load_surfaces(Path(config.data))
-        train, judges = config.parts(self.names)
-        self.surfaces, self.validation = surfaces[train], surfaces[judges]
-        self.learnt = [self.names[i] for i in train]
+        parts = config.parts(self.names)
+        self.surfaces, self.validation = surfaces[parts.training], surfaces[parts.held_out]
+        self.learnt = [self.names[i] for i in parts.training]
         self.field = load_field(Path(config.data))
         prior = estimate(self.surfaces)
         self.mean, self.basis = (
-            torch.as_tensor(values, dtype=torch.float32, device=device) for values in (prior.mean, prior.basis)
+            torch.as_tensor(values, dtype=torch.float32, device=device)
+            for values in (prior.mean, prior.basis)
         )
         self.usual = float(np.abs(self.surfaces - prior.mean).mean()) * 1e3
         torch.manual_seed(config.seed)
-        network = network or build(config.architecture, config.network)
-        self.network = network.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        network = SurfaceNetwork(config.network).to(device)
+        self.network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.average = copy.deepcopy(self.network).requires_grad_(False)
         self.optimizer = torch.optim.AdamW(
-            self.network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay, betas=(0.9, 0.98)
+            self.network.parameters(),
+            lr=config.learning_rate,
+            weight_decay=config.weight_decay,
+            betas=(0.9, 0.98),
         )
-        # Without AVX-512 a CPU does sums of sixteen bits one by one, ten times as slowly as those of thirty-two.
+        # Without AVX-512, a CPU is ten times slower with sixteen bits than with thirty-two.
         able = device.type != "cpu" or torch.backends.cpu.get_cpu_capability().startswith("AVX512")
         self.short_floats = config.bfloat16 and able
         self.step, self.commit = 0, ""
@@ -93,121 +122,104 @@ class Run:
 
     @classmethod
     def open(cls, folder: Path) -> "Run":
-        """A run as its folder describes it, on the CPU."""
+        """Open a run from its folder, on the CPU."""
         return cls(TrainConfig.read(folder / "config.json"), folder, torch.device("cpu"))
 
+    @property
+    def _stateful(self) -> dict[str, Any]:
+        return {name: getattr(self, name) for name in ("network", "average", "optimizer")}
+
     def _resume(self) -> None:
-        state = torch.load(self.folder / "checkpoint.pt", map_location=self.device, weights_only=True)
-        self.network.load_state_dict(state["network"])
-        self.average.load_state_dict(state["average"])
-        self.optimizer.load_state_dict(state["optimizer"])
-        self.step = state["step"]
-        self.commit = state["commit"]
+        state = torch.load(
+            self.folder / "checkpoint.pt", map_location=self.device, weights_only=True
+        )
+        for name, part in self._stateful.items():
+            part.load_state_dict(state[name])
+        self.step, self.commit = state["step"], state["commit"]
 
     def save(self) -> None:
-        """Write the config and the checkpoint; a crash while writing leaves the old one."""
-        if parallel.rank() > 0:
-            return
+        """Write the config and the checkpoint; the old one remains if a crash interrupts."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        (self.folder / "config.json").write_text(json.dumps(asdict(self.config), indent=1) + "\n", encoding="utf-8")
-        state = {
-            "network": self.network.state_dict(),
-            "average": self.average.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
-            "step": self.step,
-            "commit": self.commit,
-        }
+        (self.folder / "config.json").write_text(
+            json.dumps(asdict(self.config), indent=1) + "\n", encoding="utf-8"
+        )
+        state = {name: part.state_dict() for name, part in self._stateful.items()}
+        state |= {"step": self.step, "commit": self.commit}
         torch.save(state, self.folder / "checkpoint.tmp")
         (self.folder / "checkpoint.tmp").replace(self.folder / "checkpoint.pt")
 
-    def _learning_rate(self) -> float:
-        """Linear warm-up, then a cosine to a hundredth."""
-        c = self.config
-        if self.step < c.warmup:
-            return c.learning_rate * (self.step + 1) / c.warmup
-        progress = min(1.0, (self.step - c.warmup) / max(1, c.steps - c.warmup))
-        return c.learning_rate * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * progress)))
-
-    def shown(self, photographs: Photographs, guess: Tensor) -> tuple[Tensor, ...]:
-        """What the network is shown of photographs of B mirrors, beside guesses (B, 4, 8, 8) [m]."""
-        # Geometry does not bear sixteen bits: all of it stays outside of autocast.
+    def inputs(self, photographs: Photographs, guess: Tensor) -> tuple[Tensor, ...]:
+        """Return the network's inputs for photographs of B mirrors and guesses (B, 4, 8, 8) [m]."""
+        # Geometry needs more than sixteen bits: all of it is outside of autocast.
         with torch.no_grad():
             guess_flux, conditions = photographs.trace(guess), photographs.setups.conditions()
-            descent = photographs.descents(guess, self.basis, self.way)
+            descent = photographs.conjugate_gradient_steps(guess, self.basis)
         mask = torch.ones(guess_flux.shape[:2], device=self.device)
         return photographs.flux, conditions, mask, guess_flux, guess * 1e3, descent * 1e3
 
-    def answer(self, shown: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
-        """Heights and spread (B, 4, 8, 8) [mm] that the network in training says of what it is shown."""
-        with torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=self.short_floats):
-            heights, spread = self.network.train()(*shown)
-        return heights.float(), spread.float()
-
     @torch.no_grad()
-    def predict(self, photographs: Photographs, looks: int | None = None) -> Tensor:
-        """Surfaces (B, 4, 8, 8) [m] that the averaged network sees after all its looks."""
+    def predict(self, photographs: Photographs, n_iterations: int | None = None) -> Tensor:
+        """Return the surfaces (B, 4, 8, 8) [m] of the averaged network after all iterations."""
         guess = self.mean.expand(len(photographs.flux), -1, -1, -1)
-        for _ in range(self.config.looks if looks is None else looks):
-            guess = self.average.eval()(*self.shown(photographs, guess))[0] * 1e-3
+        for _ in range(self.config.n_iterations if n_iterations is None else n_iterations):
+            guess = self.average.eval()(*self.inputs(photographs, guess))[0] * 1e-3
         return guess
 
-    def batch(self) -> tuple[Photographs, Tensor]:
-        """Photographs of the step's mirrors, and their true heights (B, 4, 8, 8) [mm]."""
+    def batch(self) -> Batch:
+        """Render photographs of the step's mirrors."""
         c = self.config
-        rng = np.random.default_rng((c.seed, self.step, parallel.rank()))
-        z = c.augmentation.sample(self.surfaces, c.batch // parallel.size(), rng)
+        rng = np.random.default_rng((c.seed, self.step, 0))
+        z = c.augmentation.sample(self.surfaces, c.batch, rng)
         images = int(rng.integers(1, MAX_IMAGES + 1))
         with torch.no_grad():
-            seen = render(z, images, self.field, c.situations, c.camera, self.device, int(rng.integers(2**31)))
+            seen = render(
+                z, images, self.field, c.scenes, c.camera, self.device, int(rng.integers(2**31))
+            )
         truth = torch.as_tensor(z * 1e3, dtype=torch.float32, device=self.device)
-        return seen, truth - truth.mean(dim=(2, 3), keepdim=True)
+        return Batch(seen, truth - truth.mean(dim=(2, 3), keepdim=True))
 
     def train_step(self) -> float:
-        """Render a batch, learn from each look at it; return the last look's height error [mm]."""
-        return train_steps([self])[0]
+        """Render a batch and learn from each iteration on it; return the last height error [mm]."""
+        photographs, truth = self.batch()
+        guess = self.mean.expand(len(truth), -1, -1, -1)
+        for _ in range(self.config.n_iterations):
+            inputs = self.inputs(photographs, guess)
+            with torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=self.short_floats):
+                heights, spread = (values.float() for values in self.network.train()(*inputs))
+            error = self.optimizer_step(heights, spread, truth)
+            guess = heights.detach() * 1e-3
+        self.step += 1
+        return error
 
-    def descend(self, heights: Tensor, spread: Tensor, truth: Tensor) -> float:
-        """Change the weights once for the network's answers to be true; return the height error [mm]."""
+    def optimizer_step(self, heights: Tensor, spread: Tensor, truth: Tensor) -> float:
+        """Update the weights once; return the height error [mm]."""
         c = self.config
         rough = (truth - 1e3 * self.mean).abs().mean(dim=(1, 2, 3))
-        # Rough mirrors err by more; they would else have the others' share of the network.
-        error, slopes, likelihood = loss_terms(heights, spread, truth, (self.usual / rough).clamp(max=1))
-        self.optimizer.param_groups[0]["lr"] = self._learning_rate()
+        # Rough mirrors have larger errors; without the weight they would dominate the loss.
+        error, slopes, likelihood = loss_terms(
+            heights, spread, truth, (self.usual / rough).clamp(max=1)
+        )
+        self.optimizer.param_groups[0]["lr"] = learning_rate(c, self.step)
         self.optimizer.zero_grad()
         loss = error + c.slope_weight * slopes + c.spread_weight * likelihood
         loss.backward()  # type: ignore[no-untyped-call]
-        parallel.average_gradients(self.network.parameters())
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
-        # One batch in thousands overflows; its step would be the end of the run.
+        # One batch in thousands overflows; its step would end the run.
         if torch.isfinite(norm):
             self.optimizer.step()
-            self._update_average()
+            decay = min(c.ema, (1 + self.step) / (10 + self.step))
+            update_average(self.average, self.network, decay)
         return float((heights.detach() - truth).abs().mean())
-
-    def _update_average(self) -> None:
-        decay = min(self.config.ema, (1 + self.step) / (10 + self.step))
-        with torch.no_grad():
-            for mean, current in zip(self.average.parameters(), self.network.parameters(), strict=True):
-                mean.lerp_(current, 1 - decay)
-
-    def validate(self, repeats: int = 8) -> list[float]:
-        """Mean absolute height error [mm] on validation mirrors, eight clean images each, after each look."""
-        if not len(self.validation):
-            return []
-        z = self.validation.repeat(repeats, axis=0)
-        seen = render(z, MAX_IMAGES, self.field, self.config.situations, None, self.device, seed=0)
-        truth = torch.as_tensor(z, dtype=torch.float32, device=self.device)
-        truth = truth - truth.mean(dim=(2, 3), keepdim=True)
-        guesses = [self.predict(seen, looks) for looks in range(1, self.config.looks + 1)]
-        return [round(float((guess - truth).abs().mean()) * 1e3, 4) for guess in guesses]
 
     def train(self, minutes: float, every: int = 250) -> None:
         """Train to the last step, or until the time is up."""
         end = time.monotonic() + 60 * minutes
-        # A run that goes on by other code than it began with says so.
-        self.commit = " ".join(dict.fromkeys([*self.commit.split(), commit_of(Path(__file__).parent)]))
+        # A run that continues with other code records both commits.
+        self.commit = " ".join(
+            dict.fromkeys([*self.commit.split(), commit_of(Path(__file__).parent)])
+        )
         errors: list[float] = []
-        while self.step < self.config.steps and not parallel.agreed(time.monotonic() >= end, self.device):
+        while self.step < self.config.steps and time.monotonic() < end:
             errors.append(self.train_step())
             if self.step % every == 0 or self.step == self.config.steps:
                 self._report(float(np.mean(errors)))
@@ -215,51 +227,52 @@ class Run:
         self.save()
 
     def _report(self, error: float) -> None:
-        """One line of the curve, and a checkpoint."""
+        """Append one line to the learning curve, and write a checkpoint."""
         self.save()
-        if parallel.rank() > 0:
-            return
-        line = {"step": self.step, "train_mae_mm": round(error, 4), "validation_mae_mm": self.validate()}
+        line = {
+            "step": self.step,
+            "train_mae_mm": round(error, 4),
+            "validation_mae_mm": validate(self),
+        }
         with (self.folder / "curve.jsonl").open("a", encoding="utf-8") as file:
             file.write(json.dumps(line) + "\n")
         print(json.dumps(line), flush=True)
 
 
-def train_steps(runs: Sequence[Run]) -> list[float]:
-    """One step of runs side by side, on the same images: those of the first; their last looks' height errors [mm].
+def validate(run: Run, repeats: int = 8) -> list[float]:
+    """Mean absolute height error [mm] on validation mirrors after each iteration.
 
-    A batch is looked at several times, from the mean surface first and then from what the first run has just said, and
-    each look changes the weights.
+    Each mirror has eight clean images.
     """
-    leading, ways = runs[0], {run.way: run for run in runs}
-    photographs, truth = leading.batch()
-    guess = leading.mean.expand(len(truth), -1, -1, -1)
-    for _ in range(leading.config.looks):
-        shown = {way: run.shown(photographs, guess) for way, run in ways.items()}
-        answers = [run.answer(shown[run.way]) for run in runs]
-        errors = [run.descend(*answer, truth) for run, answer in zip(runs, answers, strict=True)]
-        guess = answers[0][0].detach() * 1e-3
-    for run in runs:
-        run.step += 1
-    return errors
+    if not len(run.validation):
+        return []
+    z = run.validation.repeat(repeats, axis=0)
+    seen = render(z, MAX_IMAGES, run.field, run.config.scenes, None, run.device, seed=0)
+    truth = torch.as_tensor(z, dtype=torch.float32, device=run.device)
+    truth = truth - truth.mean(dim=(2, 3), keepdim=True)
+    guesses = [run.predict(seen, count) for count in range(1, run.config.n_iterations + 1)]
+    return [round(float((guess - truth).abs().mean()) * 1e3, 4) for guess in guesses]
 
 
 def main() -> None:
     """Train, or resume, one run."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--config", type=Path, help="JSON of TrainConfig; defaults without one")
-    # torchrun takes "--run" for a beginning of its own "--run-path", wherever it stands.
-    parser.add_argument("--run", "--folder", type=Path, default=Path("runs/best"), help="folder of the run")
-    parser.add_argument("--minutes", type=float, default=float("inf"), help="stop after so many minutes")
-    parser.add_argument("--fold", type=int, help="which heliostats to keep back, for a cross-validation")
+    parser.add_argument("--run", type=Path, default=Path("runs/best"), help="folder of the run")
+    parser.add_argument(
+        "--minutes", type=float, default=float("inf"), help="stop after so many minutes"
+    )
+    parser.add_argument(
+        "--fold", type=int, help="which heliostats to keep back, for a cross-validation"
+    )
     parser.add_argument("--folds", type=int, default=5)
     parser.add_argument("--device", help="a GPU where there is one, unless given")
     arguments = parser.parse_args()
     config = TrainConfig.read(arguments.config) if arguments.config else TrainConfig()
     if arguments.fold is not None:
         config = replace(config, fold=arguments.fold, folds=arguments.folds)
-    with parallel.team(arguments.device) as device:
-        Run(config, arguments.run, device).train(arguments.minutes)
+    device = arguments.device or ("cuda" if torch.cuda.is_available() else "cpu")
+    Run(config, arguments.run, torch.device(device)).train(arguments.minutes)
 
 
 if __name__ == "__main__":

@@ -80,22 +80,40 @@ def upgrade() -> None:
         sa.Column("center_up_m", sa.Double(), nullable=True),
         sa.Column("arrays", sa.LargeBinary(), nullable=True),
         sa.Column("created_at", sa.DateTime(timezone=True), nullable=False),
-        sa.CheckConstraint("kind IN ('raw', 'cropped', 'flux', 'flux-centered')", name=op.f("ck_measurements_kind")),
-        sa.ForeignKeyConstraint(
-            ["heliostat_id"], ["heliostats.id"], name=op.f("fk_measurements_heliostat_id_heliostats")
+        sa.CheckConstraint(
+            "kind IN ('raw', 'cropped', 'flux', 'flux-centered')", name=op.f("ck_measurements_kind")
         ),
-        sa.ForeignKeyConstraint(["image_sha256"], ["images.sha256"], name=op.f("fk_measurements_image_sha256_images")),
-        sa.ForeignKeyConstraint(["target_id"], ["targets.id"], name=op.f("fk_measurements_target_id_targets")),
+        sa.ForeignKeyConstraint(
+            ["heliostat_id"],
+            ["heliostats.id"],
+            name=op.f("fk_measurements_heliostat_id_heliostats"),
+        ),
+        sa.ForeignKeyConstraint(
+            ["image_sha256"], ["images.sha256"], name=op.f("fk_measurements_image_sha256_images")
+        ),
+        sa.ForeignKeyConstraint(
+            ["target_id"], ["targets.id"], name=op.f("fk_measurements_target_id_targets")
+        ),
         sa.PrimaryKeyConstraint("id", name=op.f("pk_measurements")),
-        sa.UniqueConstraint("heliostat_id", "identifier", name=op.f("uq_measurements_heliostat_id_identifier")),
         sa.UniqueConstraint(
-            "heliostat_id", "image_sha256", "kind", name=op.f("uq_measurements_heliostat_id_image_sha256_kind")
+            "heliostat_id", "identifier", name=op.f("uq_measurements_heliostat_id_identifier")
+        ),
+        sa.UniqueConstraint(
+            "heliostat_id",
+            "image_sha256",
+            "kind",
+            name=op.f("uq_measurements_heliostat_id_image_sha256_kind"),
         ),
     )
     op.create_index(
-        op.f("ix_measurements_heliostat_id_accepted"), "measurements", ["heliostat_id", "accepted"], unique=False
+        op.f("ix_measurements_heliostat_id_accepted"),
+        "measurements",
+        ["heliostat_id", "accepted"],
+        unique=False,
     )
-    op.create_index(op.f("ix_measurements_image_sha256"), "measurements", ["image_sha256"], unique=False)
+    op.create_index(
+        op.f("ix_measurements_image_sha256"), "measurements", ["image_sha256"], unique=False
+    )
     op.create_index(op.f("ix_measurements_target_id"), "measurements", ["target_id"], unique=False)
 
     op.create_table(
@@ -110,14 +128,26 @@ def upgrade() -> None:
         sa.Column("misfit", sa.Double(), nullable=True),
         sa.Column("content_sha256", sa.String(length=64), nullable=True),
         sa.Column("arrays", sa.LargeBinary(), nullable=False),
-        sa.CheckConstraint("source IN ('measured', 'network', 'refined', 'imported')", name=op.f("ck_surfaces_source")),
-        sa.ForeignKeyConstraint(["heliostat_id"], ["heliostats.id"], name=op.f("fk_surfaces_heliostat_id_heliostats")),
+        sa.CheckConstraint(
+            "source IN ('measured', 'network', 'refined', 'imported')",
+            name=op.f("ck_surfaces_source"),
+        ),
+        sa.ForeignKeyConstraint(
+            ["heliostat_id"], ["heliostats.id"], name=op.f("fk_surfaces_heliostat_id_heliostats")
+        ),
         sa.PrimaryKeyConstraint("id", name=op.f("pk_surfaces")),
-        sa.UniqueConstraint("heliostat_id", "content_sha256", name=op.f("uq_surfaces_heliostat_id_content_sha256")),
-        sa.UniqueConstraint("heliostat_id", "version", name=op.f("uq_surfaces_heliostat_id_version")),
+        sa.UniqueConstraint(
+            "heliostat_id", "content_sha256", name=op.f("uq_surfaces_heliostat_id_content_sha256")
+        ),
+        sa.UniqueConstraint(
+            "heliostat_id", "version", name=op.f("uq_surfaces_heliostat_id_version")
+        ),
     )
     op.create_index(
-        op.f("ix_surfaces_heliostat_id_valid_from"), "surfaces", ["heliostat_id", "valid_from"], unique=False
+        op.f("ix_surfaces_heliostat_id_valid_from"),
+        "surfaces",
+        ["heliostat_id", "valid_from"],
+        unique=False,
     )
 
     op.create_table(
@@ -142,8 +172,12 @@ def upgrade() -> None:
         sa.Column("model_version", sa.String(length=128), nullable=False),
         sa.Column("flux", sa.LargeBinary(), nullable=False),
         sa.Column("created_at", sa.DateTime(timezone=True), nullable=False),
-        sa.ForeignKeyConstraint(["heliostat_id"], ["heliostats.id"], name=op.f("fk_forecasts_heliostat_id_heliostats")),
-        sa.ForeignKeyConstraint(["surface_id"], ["surfaces.id"], name=op.f("fk_forecasts_surface_id_surfaces")),
+        sa.ForeignKeyConstraint(
+            ["heliostat_id"], ["heliostats.id"], name=op.f("fk_forecasts_heliostat_id_heliostats")
+        ),
+        sa.ForeignKeyConstraint(
+            ["surface_id"], ["surfaces.id"], name=op.f("fk_forecasts_surface_id_surfaces")
+        ),
         sa.PrimaryKeyConstraint("id", name=op.f("pk_forecasts")),
     )
     op.create_index(op.f("ix_forecasts_heliostat_id"), "forecasts", ["heliostat_id"], unique=False)
@@ -154,15 +188,24 @@ def upgrade() -> None:
         sa.Column("surface_id", sa.Integer(), nullable=False),
         sa.Column("measurement_id", sa.Integer(), nullable=False),
         sa.ForeignKeyConstraint(
-            ["measurement_id"], ["measurements.id"], name=op.f("fk_surface_measurements_measurement_id_measurements")
+            ["measurement_id"],
+            ["measurements.id"],
+            name=op.f("fk_surface_measurements_measurement_id_measurements"),
         ),
         sa.ForeignKeyConstraint(
-            ["surface_id"], ["surfaces.id"], name=op.f("fk_surface_measurements_surface_id_surfaces")
+            ["surface_id"],
+            ["surfaces.id"],
+            name=op.f("fk_surface_measurements_surface_id_surfaces"),
         ),
-        sa.PrimaryKeyConstraint("surface_id", "measurement_id", name=op.f("pk_surface_measurements")),
+        sa.PrimaryKeyConstraint(
+            "surface_id", "measurement_id", name=op.f("pk_surface_measurements")
+        ),
     )
     op.create_index(
-        op.f("ix_surface_measurements_measurement_id"), "surface_measurements", ["measurement_id"], unique=False
+        op.f("ix_surface_measurements_measurement_id"),
+        "surface_measurements",
+        ["measurement_id"],
+        unique=False,
     )
 
 

@@ -1,4 +1,6 @@
-"""Studies, the declared model and the versions that came after it, and the version that each surface was made by."""
+"""Studies, the declared model and the versions that came after it, and the version that each
+surface was made by.
+"""
 
 import sqlalchemy as sa
 from alembic import op
@@ -26,7 +28,9 @@ def upgrade() -> None:
         sa.Column("report", sa.JSON(none_as_null=True), nullable=False),
         sa.Column("skipped", sa.JSON(none_as_null=True), nullable=False),
         sa.Column("html", sa.Text(), nullable=True),
-        sa.CheckConstraint("verdict IN ('effect', 'none', 'unexplained')", name=op.f("ck_studies_verdict")),
+        sa.CheckConstraint(
+            "verdict IN ('effect', 'none', 'unexplained')", name=op.f("ck_studies_verdict")
+        ),
         sa.PrimaryKeyConstraint("id", name=op.f("pk_studies")),
     )
 
@@ -40,7 +44,9 @@ def upgrade() -> None:
         sa.Column("adopted_by", sa.String(length=64), nullable=False),
         sa.Column("withdrawn_at", sa.DateTime(timezone=True), nullable=True),
         sa.Column("withdrawn_by", sa.String(length=64), nullable=True),
-        sa.ForeignKeyConstraint(["study_id"], ["studies.id"], name=op.f("fk_models_study_id_studies")),
+        sa.ForeignKeyConstraint(
+            ["study_id"], ["studies.id"], name=op.f("fk_models_study_id_studies")
+        ),
         sa.PrimaryKeyConstraint("number", name=op.f("pk_models")),
     )
     op.create_index(op.f("ix_models_study_id"), "models", ["study_id"], unique=False)
@@ -48,7 +54,9 @@ def upgrade() -> None:
     op.add_column("plant", sa.Column("declared", sa.JSON(none_as_null=True), nullable=True))
     op.add_column("surfaces", sa.Column("model_version", sa.String(length=256), nullable=True))
     # All surfaces so far that came from photographs were made by the declared model.
-    op.execute("UPDATE surfaces SET model_version = '1:none' WHERE source IN ('network', 'refined')")
+    op.execute(
+        "UPDATE surfaces SET model_version = '1:none' WHERE source IN ('network', 'refined')"
+    )
     _resize_model_version(128, 256)
 
 

@@ -17,11 +17,17 @@ def upgrade() -> None:
         sa.Column("surface_id", sa.Integer(), nullable=False),
         sa.Column("taken_at", sa.DateTime(timezone=True), nullable=False),
         sa.Column("accuracy", sa.Double(), nullable=False),
-        sa.ForeignKeyConstraint(["heliostat_id"], ["heliostats.id"], name=op.f("fk_drift_heliostat_id_heliostats")),
         sa.ForeignKeyConstraint(
-            ["measurement_id"], ["measurements.id"], name=op.f("fk_drift_measurement_id_measurements")
+            ["heliostat_id"], ["heliostats.id"], name=op.f("fk_drift_heliostat_id_heliostats")
         ),
-        sa.ForeignKeyConstraint(["surface_id"], ["surfaces.id"], name=op.f("fk_drift_surface_id_surfaces")),
+        sa.ForeignKeyConstraint(
+            ["measurement_id"],
+            ["measurements.id"],
+            name=op.f("fk_drift_measurement_id_measurements"),
+        ),
+        sa.ForeignKeyConstraint(
+            ["surface_id"], ["surfaces.id"], name=op.f("fk_drift_surface_id_surfaces")
+        ),
         sa.PrimaryKeyConstraint("heliostat_id", name=op.f("pk_drift")),
     )
 

@@ -1,4 +1,6 @@
-"""Versions of the plant's model keep what was declared when they were made; one may come of another declaration."""
+"""Versions of the plant's model keep what was declared when they were made; one may come of another
+declaration.
+"""
 
 import sqlalchemy as sa
 from alembic import op
@@ -21,7 +23,9 @@ def upgrade() -> None:
 
 def downgrade() -> None:
     # What is declared now stays declared; that of earlier versions, and those that came of it, go.
-    op.execute(f"UPDATE plant SET declared = (SELECT declared {_NEWEST}) WHERE EXISTS (SELECT 1 {_NEWEST})")
+    op.execute(
+        f"UPDATE plant SET declared = (SELECT declared {_NEWEST}) WHERE EXISTS (SELECT 1 {_NEWEST})"
+    )
     op.execute("DELETE FROM models WHERE study_id IS NULL")
     with op.batch_alter_table("models") as models:
         models.alter_column("study_id", existing_type=sa.Integer(), nullable=False)

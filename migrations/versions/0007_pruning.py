@@ -1,4 +1,6 @@
-"""Images bear their verdict and whether they were pruned; totals say how many the store keeps, and of what size."""
+"""Images bear their verdict and whether they were pruned; totals say how many the store keeps, and
+of what size.
+"""
 
 import sqlalchemy as sa
 from alembic import op
@@ -9,12 +11,16 @@ branch_labels = None
 depends_on = None
 
 _INDEX = "ix_images_pruned_at_accepted_created_at"
-_ACCEPTED = "SELECT 1 FROM measurements WHERE image_sha256 = images.sha256 AND measurements.accepted"
+_ACCEPTED = (
+    "SELECT 1 FROM measurements WHERE image_sha256 = images.sha256 AND measurements.accepted"
+)
 
 
 def upgrade() -> None:
-    # Column by column: measurements refer to the table, which SQLite would not let go to be made anew.
-    op.add_column("images", sa.Column("accepted", sa.Boolean(), server_default=sa.false(), nullable=False))
+    # Column by column: measurements refer to the table, so SQLite could not drop and recreate it.
+    op.add_column(
+        "images", sa.Column("accepted", sa.Boolean(), server_default=sa.false(), nullable=False)
+    )
     op.add_column("images", sa.Column("pruned_at", sa.DateTime(timezone=True), nullable=True))
     op.add_column("images", sa.Column("pruned_for", sa.String(8), nullable=True))
     op.add_column("images", sa.Column("removed_at", sa.DateTime(timezone=True), nullable=True))

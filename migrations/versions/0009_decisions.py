@@ -1,4 +1,4 @@
-"""Surfaces keep trust and decisions on what is today's, photographs their corrections, forecasts the time asked for."""
+"""Store trust in surfaces, decisions on the active one, corrections, and times of forecasts."""
 
 import sqlalchemy as sa
 from alembic import op
@@ -23,7 +23,9 @@ _TRUST: tuple[sa.Column[object], ...] = (
 
 def upgrade() -> None:
     op.add_column("forecasts", sa.Column("sun_at", sa.DateTime(timezone=True), nullable=True))
-    op.add_column("surfaces", sa.Column("set_aside", sa.Boolean(), server_default=sa.false(), nullable=False))
+    op.add_column(
+        "surfaces", sa.Column("set_aside", sa.Boolean(), server_default=sa.false(), nullable=False)
+    )
     for column in _TRUST:
         op.add_column("surfaces", column)
     op.create_table(
@@ -41,13 +43,21 @@ def upgrade() -> None:
         sa.Column("photographs", sa.Integer(), nullable=False),
         sa.Column("set_aside_before", sa.JSON(none_as_null=True), nullable=False),
         sa.ForeignKeyConstraint(
-            ["heliostat_id"], ["heliostats.id"], name=op.f("fk_surface_decisions_heliostat_id_heliostats")
+            ["heliostat_id"],
+            ["heliostats.id"],
+            name=op.f("fk_surface_decisions_heliostat_id_heliostats"),
         ),
-        sa.ForeignKeyConstraint(["surface_id"], ["surfaces.id"], name=op.f("fk_surface_decisions_surface_id_surfaces")),
+        sa.ForeignKeyConstraint(
+            ["surface_id"], ["surfaces.id"], name=op.f("fk_surface_decisions_surface_id_surfaces")
+        ),
         sa.PrimaryKeyConstraint("id", name=op.f("pk_surface_decisions")),
     )
-    op.create_index(op.f("ix_surface_decisions_heliostat_id"), "surface_decisions", ["heliostat_id"])
-    op.add_column("measurements", sa.Column("corrected_at", sa.DateTime(timezone=True), nullable=True))
+    op.create_index(
+        op.f("ix_surface_decisions_heliostat_id"), "surface_decisions", ["heliostat_id"]
+    )
+    op.add_column(
+        "measurements", sa.Column("corrected_at", sa.DateTime(timezone=True), nullable=True)
+    )
     op.create_table(
         "corrections",
         sa.Column("id", sa.Integer(), nullable=False),
@@ -58,7 +68,9 @@ def upgrade() -> None:
         sa.Column("before", sa.JSON(none_as_null=True), nullable=False),
         sa.Column("after", sa.JSON(none_as_null=True), nullable=False),
         sa.ForeignKeyConstraint(
-            ["measurement_id"], ["measurements.id"], name=op.f("fk_corrections_measurement_id_measurements")
+            ["measurement_id"],
+            ["measurements.id"],
+            name=op.f("fk_corrections_measurement_id_measurements"),
         ),
         sa.PrimaryKeyConstraint("id", name=op.f("pk_corrections")),
     )
@@ -66,7 +78,7 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    # Older versions know nothing of what is set aside: there the newest surface is today's again.
+    # Older versions know no candidates: there the newest surface is active again.
     op.drop_table("surface_decisions")
     op.drop_table("corrections")
     op.drop_column("measurements", "corrected_at")

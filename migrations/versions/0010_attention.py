@@ -19,7 +19,9 @@ def upgrade() -> None:
         sa.Column("made_at", sa.DateTime(timezone=True), nullable=False),
         sa.Column("made_by", sa.String(64), nullable=False),
         sa.ForeignKeyConstraint(
-            ["heliostat_id"], ["heliostats.id"], name=op.f("fk_acknowledgements_heliostat_id_heliostats")
+            ["heliostat_id"],
+            ["heliostats.id"],
+            name=op.f("fk_acknowledgements_heliostat_id_heliostats"),
         ),
         sa.PrimaryKeyConstraint("id", name=op.f("pk_acknowledgements")),
     )

@@ -1,32 +1,32 @@
-"""Axis tilt: the mount's foundation does not stand as surveyed.
+"""Axis tilt: the foundation of the mount differs from the survey.
 
 What it is
-    Foundations settle and pylons lean. Both axes are turned with the ground, about north by ``north_deg``, then about
-    up by ``up_deg``, right-handed: for a first axis that points east, a positive ``north_deg`` lowers its east end
-    and a positive ``up_deg`` turns that end towards the north. A tilt about the first axis itself only shifts its
-    zero.
+    Foundations settle and pylons lean. Both axes turn with the ground: about north by
+    ``north_deg``, then about up by ``up_deg``, right-handed. If the first axis points east, a
+    positive ``north_deg`` lowers its east end, and a positive ``up_deg`` turns that end towards
+    north. A tilt about the first axis itself only shifts its zero.
 
 Source
-    Tilted axes in kinematic models: Baheti and Scott, *Design of self-calibrating controllers for heliostats in a
-    solar power plant*, IEEE Transactions on Automatic Control 25 (1980); ARTIST's deviations ``first_joint_tilt_n``
-    and ``first_joint_tilt_u``.
+    Tilted axes in kinematic models: Baheti and Scott, *Design of self-calibrating controllers for
+    heliostats in a solar power plant*, IEEE Transactions on Automatic Control 25 (1980); ARTIST's
+    deviations ``first_joint_tilt_n`` and ``first_joint_tilt_u``.
 
 In an image
-    With the spot brought back to its place the normal is where sun and target demand it, whatever the axes do. What
-    is left of the tilt is that the mirror is rolled about its normal, by up to the tilt's size or a little more, and
-    its image with it: a turn about the spot's middle.
+    The mirror is aligned to the spot, so sun and target fix its normal for any axes. What remains
+    of the tilt is a roll of the mirror about its normal, by about the size of the tilt. The image
+    turns with it about the spot's centre.
 
 What it scales with
-    The roll is a function of the two axis angles: it grows as the normal comes near the first axis (low suns in east
-    and west) and does not depend on distance. Round spots do not show it.
+    The roll is a function of the two axis angles. It grows as the normal comes near the first axis
+    (low suns in east and west), and it is independent of distance. Round spots do not show it.
 
 What it is confused with
-    - Registration rotation: the same angle in every image, also in those of a mirror that stands square.
-    - Wrong sun positions: roll the image too, and change the incidence; compare morning with afternoon, where a clock
-      error changes its sense.
-    - Canting: changes the image in the mirror's own frame.
-    Where the motors are known, a tilt of a degree moves the spot by metres, by another way under each sun, which tells
-    it from a clock, a pylon that leans and encoders that are off.
+    - Registration rotation: the same angle in every image, also without a tilt.
+    - Wrong sun positions: roll the image too, and change the incidence. Compare morning with
+      afternoon, where a clock error has the opposite sign.
+    - Canting: changes the image in the mirror's frame.
+    If the motor positions are known, a tilt of a degree moves the spot by metres, differently for
+    each sun. This distinguishes it from a clock error, pylon bending and encoder offsets.
 """
 
 from dataclasses import dataclass
@@ -40,7 +40,10 @@ from model.mount import Mount, rotation
 
 @dataclass(frozen=True, eq=False)
 class AxisTilt(Effect):
-    """The foundation is turned about north by ``north_deg``, then about up by ``up_deg`` [deg], right-handed."""
+    """The foundation turns about north by ``north_deg``, then about up by ``up_deg`` [deg].
+
+    Both turns are right-handed.
+    """
 
     name: ClassVar[str] = "axis_tilt"
     about: ClassVar[str] = "Axis tilt: the mount's foundation does not stand as surveyed."

@@ -1,31 +1,32 @@
-"""Background: light on the target, or counts in the camera, that the heliostat did not send.
+"""Background: light on the target or counts in the camera from other sources than the heliostat.
 
 What it is
-    The target is lit by sky and sun, by other heliostats' stray light, and the camera adds its black level. What is
-    left after an imperfect subtraction is a plane in shares of the image's peak::
+    Sky and sun and stray light from other heliostats illuminate the target, and the camera adds its
+    black level. An imperfect subtraction leaves a plane, relative to the image's peak::
 
         seen = light + peak * (level + gradient_x * x + gradient_y * y)
 
-    with x to the right and y upwards of the image's centre, in metres on the target. The level is negative where too
-    much was subtracted.
+    with x to the right and y upwards from the image's centre, in metres on the target. The level is
+    negative if too much was subtracted.
 
 Source
-    Radiometry; the subtraction of an image of the empty target, and what it leaves, in Roeger et al., *Techniques to
-    measure solar flux density distribution on large-scale receivers*, J. Solar Energy Engineering 136 (2014).
+    Radiometry; the subtraction of an image of the empty target, and its residual, in Roeger et al.,
+    *Techniques to measure solar flux density distribution on large-scale receivers*, J. Solar
+    Energy Engineering 136 (2014).
 
 In an image
-    Corners that ought to be dark are grey, brighter to one side. Normalised to the same energy, the spot itself looks
-    too dim.
+    Corners that should be dark are gray, and brighter on one side. After normalisation to the same
+    energy, the spot itself looks too dim.
 
 What it scales with
-    The ratio of daylight to the spot: strongest for far and for blocked heliostats, whose spots are faint. It follows
-    the target and the hour, not the heliostat.
+    The ratio of daylight to the spot. It is strongest for far and for blocked heliostats, whose
+    spots are faint. It depends on the target and the hour, not on the heliostat.
 
 What it is confused with
-    - The sun's aureole: falls off with the distance from the spot and grows with the slant range.
-    - A gamma below one: lifts faint light, but leaves black black.
-    - A spot that is cut off by the window: spill has the spot's shape.
-    Images whose background the separation has taken out (`model.imaging`) show little of it.
+    - The sun's aureole: decreases with the distance from the spot and grows with the slant range.
+    - A gamma below one: raises faint light, but leaves black black.
+    - A spot that is truncated by the window: spillage has the spot's shape.
+    Images whose background was separated (`model.imaging`) show little of it.
 """
 
 from dataclasses import dataclass
@@ -40,13 +41,16 @@ from model.tracing.scene import Window
 
 @dataclass(frozen=True, eq=False)
 class Background(Effect):
-    """A plane is added to the image, in shares of its peak: ``level + gradient_x * x + gradient_y * y``.
+    """Adds a plane to the image, relative to its peak.
 
-    x counts to the right and y upwards of the image's centre, in metres: the same plane in any window.
+    The plane is ``level + gradient_x * x + gradient_y * y``, with x to the right and y upwards from
+    the image's centre, in metres. It is the same plane in any window.
     """
 
     name: ClassVar[str] = "background"
-    about: ClassVar[str] = "Background: light on the target, or counts in the camera, that the heliostat did not send."
+    about: ClassVar[str] = (
+        "Background: light on the target, or counts in the camera, that the heliostat did not send."
+    )
     stage: ClassVar[Stage] = "image"
     scales_with: ClassVar[frozenset[Factor]] = frozenset({"weather", "camera"})
     comes: ClassVar[frozenset[Arrival]] = frozenset({"since", "day"})
@@ -58,10 +62,13 @@ class Background(Effect):
     def on_image(self, images: Tensor, window: Window) -> Tensor:
         """Add the plane."""
         peak = images.amax(dim=(-2, -1), keepdim=True)
-        x, y = _centers(images.shape[-1], window.width, images), _centers(images.shape[-2], window.height, images)
+        x, y = (
+            _centers(images.shape[-1], window.width, images),
+            _centers(images.shape[-2], window.height, images),
+        )
         return images + peak * (self.level + self.gradient_x * x - self.gradient_y * y[:, None])
 
 
 def _centers(size: int, extent: float, like: Tensor) -> Tensor:
-    """Centres (size,) [m] of pixels off the middle of ``extent`` [m]; rows count downwards."""
+    """Pixel centres (size,) [m], relative to the centre of ``extent`` [m]; rows count downwards."""
     return extent * ((torch.arange(size, dtype=like.dtype, device=like.device) + 0.5) / size - 0.5)

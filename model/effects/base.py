@@ -1,9 +1,9 @@
-"""What an effect is: a few bounded parameters and pure functions that act where the physics acts.
+"""Base of effects: bounded parameters, and functions that act at one stage of the light's path.
 
-Light meets the hooks in this order: `Effect.on_sun` and `Effect.on_mount` change where things point, in numpy, since
-the alignment that follows is numpy; `Effect.on_scene` changes mirrors that already stand before the sun,
-`Effect.on_optics` what the light meets on its way, and `Effect.on_image` what the camera makes of the flux, all three
-in torch, where parameters that are tensors carry gradients.
+The methods act in this order. `Effect.on_sun` and `Effect.on_mount` change directions; they use
+numpy, because the alignment after them does. `Effect.on_scene` changes aligned mirrors,
+`Effect.on_optics` the optics on the light's path, and `Effect.on_image` the camera's image of the
+flux. These three use torch, so that parameters can be tensors with gradients.
 """
 
 import math
@@ -22,18 +22,22 @@ from model.effects.scope import Always, ByDay, Scope
 from model.errors import InvalidInputError
 from model.mount import Mount
 from model.plant import Heliostat
+from model.site import Site
 from model.tracing.scene import Optics, Scene, Window
 
 Array = NDArray[np.float64]
 Scalar = float | Tensor
 ByHeliostat = Mapping[str, Any]
-"""Heliostat name to a number, an array or a tensor: (facets,) or a scalar, as the parameter's owner says."""
+"""Heliostat name to a number, an array or a tensor.
+
+The shape is (facets,) or a scalar, depending on the parameter's owner.
+"""
 
 Owner = Literal["set", "camera", "heliostat", "facet"]
 Stage = Literal["geometry", "optics", "image"]
 Arrival = Literal["since", "day"]
 Factor = Literal["distance", "heliostat", "elevation", "side", "roll", "weather", "camera"]
-"""What may vary between photographs; `model.study.advice` says which photographs vary it."""
+"""What may vary between photographs; `model.study.advice` names photographs that vary it."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +52,7 @@ class Parameter:
     neutral : float
         The value at which the effect changes nothing.
     owner : {"set", "camera", "heliostat", "facet"}
-        Whom one value belongs to: all measurements, a camera's, one heliostat, or each facet of one heliostat.
+        What has one value: all measurements, a camera, a heliostat, or each facet of a heliostat.
     """
 
     name: str
@@ -60,11 +64,14 @@ class Parameter:
 
     @property
     def shared(self) -> bool:
-        """Whether all heliostats have one value in common."""
+        """True if all heliostats have the same value."""
         return self.owner in ("set", "camera")
 
     def check(self, effect: str, value: object) -> None:
-        """Raise `InvalidInputError` unless ``value``, a number or an array, is finite and within the bounds."""
+        """Raise `InvalidInputError` unless ``value`` is finite and within the bounds.
+
+        ``value`` is a number or an array.
+        """
         try:
             numbers = np.asarray(value.detach().cpu() if isinstance(value, Tensor) else value)
         except ValueError:  # rows of different lengths
@@ -74,13 +81,16 @@ class Parameter:
             kind = "numbers, one a facet," if self.owner == "facet" else "a number"
             unit = "" if self.unit == "1" else f" {self.unit}"
             raise InvalidInputError(
-                f"effect {effect}: '{self.name}' must be {kind} in [{self.low:g}, {self.high:g}]{unit}, "
-                f"got {str(value)[:80]}"
+                f"effect {effect}: '{self.name}' must be {kind} in [{self.low:g},"
+                f" {self.high:g}]{unit}, got {str(value)[:80]}"
             )
 
 
 def parameter(neutral: float, low: float, high: float, unit: str, owner: Owner = "set") -> Any:
-    """A dataclass field of an effect; one that belongs to heliostats is a mapping, empty where none is named."""
+    """A dataclass field for a parameter of an effect.
+
+    Parameters of heliostats or facets are mappings, which are empty by default.
+    """
     about = {"neutral": neutral, "low": low, "high": high, "unit": unit, "owner": owner}
     if owner in ("heliostat", "facet"):
         return field(default_factory=dict, metadata=about)
@@ -89,33 +99,39 @@ def parameter(neutral: float, low: float, high: float, unit: str, owner: Owner =
 
 @dataclass(frozen=True, eq=False)
 class Effect:
-    """Base of all effects, which are frozen dataclasses of parameters; without arguments an effect changes nothing.
+    """Base of all effects: frozen dataclasses of parameters.
+
+    Without arguments, an effect changes nothing.
 
     Attributes
     ----------
     name : str
-        As in DESIGN.md, section 5.
+        Key of the effect in `model.effects.catalogue.CATALOGUE`.
     about : str
-        What it is, in one sentence for people.
+        One sentence that describes the effect.
     stage : {"geometry", "optics", "image"}
-        What must be done anew when a parameter changes: the alignment of the mirrors, the tracing, or only the image.
+        What to repeat if a parameter changes: the alignment of the mirrors, the tracing, or only
+        the image.
     scales_with : frozenset of Factor
-        What changes the effect's mark in an image; what is not named leaves it alone.
+        What changes the effect's trace in an image; other factors do not.
     guesses : tuple of dict
-        Parameters to begin a fit from, where those near neutral lead nowhere one by one.
+        Start values of a fit, if parameters near neutral, changed one by one, do not lead anywhere.
     prior_std : float
-        Prior standard deviation of a parameter about neutral, in shares of its range. It should matter only for what
-        images cannot tell.
+        Prior standard deviation of a parameter about neutral, relative to its range. It should
+        matter only if images do not determine the parameter.
     relative : bool
-        Whether images show only by how much a mirror's facets differ, and not what they share.
+        True if images show only the differences between a mirror's facets, not their common part.
     only_moves : bool
-        Whether it leaves the light's shape and moves its centre alone: photographs without motors say nothing of it.
+        True if the effect only moves the spot and keeps its shape. Photographs without motor
+        positions do not show it.
     comes : frozenset of {"since", "day"}
-        How it may come, if it is not always there: at a date, to stay, or with each day anew.
+        How the effect may appear, if it is not always present: permanently from a date, or with
+        separate values for each day.
     of_heliostats : bool
-        Whether it is of mirror, mount or drive, so that one heliostat may have it alone; not of the sun or a camera.
+        True if the effect belongs to mirror, mount or drive, so that a single heliostat may have
+        it. False if it belongs to the sun or a camera.
     scope : Scope
-        When and where this one acts.
+        When and where this effect acts.
     """
 
     name: ClassVar[str]
@@ -134,7 +150,9 @@ class Effect:
     def __post_init__(self) -> None:
         if isinstance(self.scope, ByDay):
             if not all(p.shared for p in self.parameters()):
-                raise InvalidInputError(f"effect {self.name}: what belongs to heliostats has no values by day")
+                raise InvalidInputError(
+                    f"effect {self.name}: what belongs to heliostats has no values by day"
+                )
         elif self.scope.heliostats is not None and not self.of_heliostats:
             raise InvalidInputError(
                 f"effect {self.name}: the sun and the camera are the same for all heliostats; "
@@ -145,7 +163,9 @@ class Effect:
             if p.shared:
                 p.check(self.name, value)
             elif not isinstance(value, Mapping):
-                raise InvalidInputError(f"effect {self.name}: '{p.name}' must map heliostat names to values")
+                raise InvalidInputError(
+                    f"effect {self.name}: '{p.name}' must map heliostat names to values"
+                )
             else:
                 for one in value.values():
                     p.check(self.name, one)
@@ -157,53 +177,64 @@ class Effect:
 
     @property
     def heliostats(self) -> list[str] | None:
-        """Those that its parameters name; None for what all have in common."""
+        """Heliostats that its parameters name; None for an effect with shared parameters."""
         named = [getattr(self, p.name) for p in self.parameters() if not p.shared]
         return sorted({name for by_heliostat in named for name in by_heliostat}) if named else None
 
     def at(self, taken_at: datetime | None, heliostat: str | None) -> "Effect | None":
-        """What it is at a time and a heliostat, None where it does not act; of one day it is always the same object.
+        """The effect at a time and a heliostat; None if it does not act.
 
-        What is of no known time is of today: what has changed stays so, and the day is as days usually are. What is of
-        no heliostat, as the sun, has only what all have.
+        For one day, it is always the same object. Without a time, the current state counts: a
+        permanent change persists, and values by day are the usual ones. Without a heliostat, such
+        as for the sun, only the effects of all heliostats act.
         """
         phase = self.scope.phase(taken_at, heliostat)
         return self._days[phase] if isinstance(phase, date) else self if phase else None
 
     @cached_property
     def _days(self) -> dict[date, "Effect"]:
-        """The effect of each day that has values of its own."""
+        """The effect for each day that has separate values."""
         by_day = self.scope.by_day if isinstance(self.scope, ByDay) else {}
         return {day: replace(self, **values, scope=Always()) for day, values in by_day.items()}
 
-    def on_sun(self, suns: Array, latitude_deg: float) -> Array:
-        """Unit vectors (B, 3) towards the sun, as they were recorded, to where it really stood."""
+    def on_sun(self, suns: Array, site: Site) -> Array:
+        """Convert recorded unit vectors (B, 3) towards the sun to the true ones."""
         return suns
 
     def on_mount(self, mount: Mount, heliostat: str) -> Mount:
-        """The mount of a heliostat of that name as it was surveyed to how it really stands."""
+        """Convert a heliostat's surveyed mount to the real one; ``heliostat`` is its name."""
         return mount
 
     def on_scene(self, scene: Scene, heliostats: Sequence[Heliostat]) -> Scene:
-        """A scene of B mirrors, those of the B ``heliostats``, to how they really are."""
+        """Convert a scene of B mirrors to the real mirrors of B ``heliostats``."""
         return scene
 
     def on_optics(self, optics: Optics) -> Optics:
-        """The declared optics to what the light really meets."""
+        """Convert the declared optics to the real optics."""
         return optics
 
     def on_image(self, images: Tensor, window: Window) -> Tensor:
-        """Irradiance (B, rows, columns) over ``window`` to what the camera shows of it."""
+        """Convert irradiance (B, rows, columns) over ``window`` to the camera's image."""
         return images
 
 
-def acting(effects: Iterable[Effect], taken_at: datetime | None, heliostat: str | None) -> tuple[Effect, ...]:
-    """The effects that act at a time and a heliostat, as they are then; the same objects wherever the same act."""
-    return tuple(there for effect in effects if (there := effect.at(taken_at, heliostat)) is not None)
+def acting(
+    effects: Iterable[Effect], taken_at: datetime | None, heliostat: str | None
+) -> tuple[Effect, ...]:
+    """The effects that act at a time and a heliostat, as they are then.
+
+    If the same effects act, the objects are the same.
+    """
+    return tuple(
+        there for effect in effects if (there := effect.at(taken_at, heliostat)) is not None
+    )
 
 
 def quadrature(first: Scalar, second: Scalar) -> Scalar:
-    """Standard deviation of the sum of two independent errors; differentiable where the first is zero, too."""
+    """Standard deviation of the sum of two independent errors.
+
+    It is differentiable even if the first error is zero.
+    """
     if not isinstance(first, Tensor) and not isinstance(second, Tensor):
         return math.hypot(first, second)
     if not isinstance(first, Tensor) and first == 0:
@@ -211,13 +242,15 @@ def quadrature(first: Scalar, second: Scalar) -> Scalar:
     return torch.sqrt(torch.as_tensor(first) ** 2 + torch.as_tensor(second) ** 2)
 
 
-def stacked(effect: str, values: ByHeliostat, heliostats: Sequence[Heliostat], neutral: Tensor) -> Tensor:
-    """The values (B, ...) of B heliostats, ``neutral`` (...) for those that are not named.
+def stacked(
+    effect: str, values: ByHeliostat, heliostats: Sequence[Heliostat], neutral: Tensor
+) -> Tensor:
+    """The values (B, ...) of B heliostats, ``neutral`` (...) for missing names.
 
     Raises
     ------
     InvalidInputError
-        Where a heliostat has not as many facets as values.
+        If the number of values differs from the number of a heliostat's facets.
     """
     rows = []
     for heliostat in heliostats:
@@ -225,7 +258,8 @@ def stacked(effect: str, values: ByHeliostat, heliostats: Sequence[Heliostat], n
         row = neutral if value is None else torch.as_tensor(value).to(neutral)
         if row.shape != neutral.shape:
             raise InvalidInputError(
-                f"effect {effect}: {heliostat.name} has {neutral.shape[0]} facets, got {row.shape[0]} values"
+                f"effect {effect}: {heliostat.name} has {neutral.shape[0]} facets, got"
+                f" {row.shape[0]} values"
             )
         rows.append(row)
     return torch.stack(rows)

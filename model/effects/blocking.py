@@ -1,29 +1,30 @@
 """Blocking: a neighbour in front hides the lower part of the mirror.
 
 What it is
-    In dense fields light that the lower part of a mirror reflects strikes the back of the heliostat in front.
-    ``lower_fraction`` of the mirror's height, counted from its lower edge along its y, is lost. The line is taken
-    as straight and parallel to the mirror's edge, which it nearly is between neighbours of the same build.
+    In dense fields, light from the lower part of a mirror strikes the back of the heliostat in
+    front. ``lower_fraction`` of the mirror's height, from its lower edge along its y, is lost. The
+    line is assumed to be straight and parallel to the mirror's edge. Between neighbours of the same
+    type this is nearly true.
 
 Source
-    Sassi, *Some notes on shadow and blockage effects*, Solar Energy 31 (1983); Lipps and Walzel, *An analytic
-    evaluation of the flux density due to sunlight reflected from a flat mirror having a polygonal boundary*, Solar
-    Energy 21 (1978). Cells of the surface that the line crosses are cut in proportion, so that the flux is continuous
-    in the fraction.
+    Sassi, *Some notes on shadow and blockage effects*, Solar Energy 31 (1983); Lipps and Walzel,
+    *An analytic evaluation of the flux density due to sunlight reflected from a flat mirror having
+    a polygonal boundary*, Solar Energy 21 (1978). Cells of the surface on the line count in
+    proportion, so that the flux is continuous in the fraction.
 
 In an image
-    The lower facets' light is missing. Where the facets' images fall together, the spot is dimmer;
-    where they do not, one side of it is cut off along a soft line and the centre of mass moves.
+    The lower facets' light is missing. If the facets' images overlap, the spot is dimmer. If they
+    do not, one side of the spot is missing along a soft line, and the centroid moves.
 
 What it scales with
-    It belongs to a heliostat and its neighbours: strong for far heliostats behind others, for low targets and low
-    suns. Taken as one fraction for all images of a heliostat, it is a mean over the suns that were seen.
+    It depends on a heliostat and its neighbours. It is strong for far heliostats behind others, for
+    low targets and low suns. One fraction for all images of a heliostat is a mean over their suns.
 
 What it is confused with
-    - Soiling of both lower facets: cuts whole facets, never parts of one, and not upper facets at all beyond one
-      half.
+    - Soiling of both lower facets: dims whole facets, never parts of one, and never upper facets,
+      which blocking of more than one half does.
     - Canting: keeps the energy.
-    - A dim sun: normalised images cannot see the energy that is lost, only the shape.
+    - A dim sun: normalised images do not show lost energy, only the shape.
 """
 
 from collections.abc import Sequence
@@ -39,7 +40,7 @@ from model.tracing.scene import Scene
 
 @dataclass(frozen=True, eq=False)
 class Blocking(Effect):
-    """The lowest ``lower_fraction`` of the mirror's height, counted along its y, sends no light to the target."""
+    """The lowest ``lower_fraction`` of the mirror's height, along its y, sends no light."""
 
     name: ClassVar[str] = "blocking"
     about: ClassVar[str] = "Blocking: a neighbour in front hides the lower part of the mirror."
@@ -51,8 +52,10 @@ class Blocking(Effect):
 
     def on_scene(self, scene: Scene, heliostats: Sequence[Heliostat]) -> Scene:
         """Raise the line below which mirrors are blocked."""
-        # A mirror that is not named is cut half its height below its edge: nowhere.
-        fraction = stacked(self.name, self.lower_fraction, heliostats, scene.control_points.new_tensor(-0.5))
+        # For a missing name, the line is half a height below the lower edge, so nothing is blocked.
+        fraction = stacked(
+            self.name, self.lower_fraction, heliostats, scene.control_points.new_tensor(-0.5)
+        )
         height = fraction.new_tensor([heliostat.height for heliostat in heliostats])
         line = (fraction - 0.5) * height
         before = scene.blocked_below

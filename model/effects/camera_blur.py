@@ -1,28 +1,30 @@
-"""Camera blur: a lens out of focus, air that shimmers.
+"""Camera blur: a defocused lens or shimmering air.
 
 What it is
-    Defocus, the lens's aberrations, the roughness of the target's paint, hot air between tower and camera, and the
-    resampling of a rectified image smear it by a Gaussian of ``sigma_m`` on the target, the same in all directions.
+    Defocus, aberrations, the roughness of the target's paint, hot air between tower and camera, and
+    the resampling of a rectified image blur it. The blur is a Gaussian of ``sigma_m`` on the
+    target, the same in all directions.
 
 Source
-    The point spread function and its transfer function, as in Goodman, *Introduction to Fourier Optics*; that many
-    small causes make a Gaussian is the central limit theorem. For targets of solar towers: Roeger et al., *Techniques
-    to measure solar flux density distribution on large-scale receivers*, J. Solar Energy Engineering 136 (2014).
+    The point spread function and its transfer function, as in Goodman, *Introduction to Fourier
+    Optics*. Many small causes give a Gaussian by the central limit theorem. For targets of solar
+    towers: Roeger et al., *Techniques to measure solar flux density distribution on large-scale
+    receivers*, J. Solar Energy Engineering 136 (2014).
 
 In an image
-    All detail is smoothed, the target's printed marks and edges too. The spot's variance grows by sigma squared in
-    either direction; its energy and its place stay.
+    All detail is smoothed, including the target's printed marks and edges. The spot's variance
+    grows by sigma squared in each direction. Its energy and position stay the same.
 
 What it scales with
-    Nothing of the heliostat: the same in metres for near and far ones, for any sun and incidence, and for all images
-    of a camera on one target.
+    Nothing of the heliostat. It is the same in metres for near and far ones, for any sun and
+    incidence, and for all images of a camera on one target.
 
 What it is confused with
-    - Slope error, sun shape, jitter: grow in proportion to the slant range. A set with heliostats at several
-      distances tells them apart, one with a single distance cannot.
-    - A response with gamma below one: fattens spots without smoothing what is fine.
+    - Slope error, sun shape, jitter: grow in proportion to the slant range. Images of heliostats at
+      several distances distinguish them, images at a single distance do not.
+    - A response with gamma below one: widens spots without smoothing fine detail.
 
-Light is mirrored at the image's edges, where the camera would have seen what lies beyond; so none is lost.
+The image is mirrored at its edges, as a substitute for the light beyond them; so no light is lost.
 """
 
 import math
@@ -39,7 +41,7 @@ from model.tracing.scene import Window
 
 @dataclass(frozen=True, eq=False)
 class CameraBlur(Effect):
-    """The image is smeared by a Gaussian of standard deviation ``sigma_m`` [m on the target] per axis."""
+    """Blurs the image by a Gaussian of standard deviation ``sigma_m`` [m on the target]."""
 
     name: ClassVar[str] = "camera_blur"
     about: ClassVar[str] = "Camera blur: a lens out of focus, air that shimmers."
@@ -49,7 +51,10 @@ class CameraBlur(Effect):
     sigma_m: Scalar = parameter(0.0, 0.0, 0.5, "m", "camera")
 
     def on_image(self, images: Tensor, window: Window) -> Tensor:
-        """Blur along rows and columns; light is mirrored at the window's edges, so that none is lost."""
+        """Blur along rows and columns.
+
+        Light is mirrored at the window's edges, so that none is lost.
+        """
         pixel_x, pixel_y = window.pixel
         across = _blur(images.shape[-1], pixel_x, self.sigma_m, images)
         down = _blur(images.shape[-2], pixel_y, self.sigma_m, images)
@@ -57,7 +62,10 @@ class CameraBlur(Effect):
 
 
 def _blur(size: int, pixel: float, sigma: Scalar, like: Tensor) -> Tensor:
-    """The Gaussian blur of lines of pixels as a matrix (size, size): diagonal in cosines, whose edges mirror."""
+    """Gaussian blur of a line of pixels, as a matrix (size, size).
+
+    The matrix is diagonal in the cosine transform, which mirrors at the edges.
+    """
     cosines = _cosines(size, like.dtype, like.device)
     frequency = torch.arange(size, dtype=like.dtype, device=like.device) / (2 * size * pixel)
     transfer = torch.exp(-2 * math.pi**2 * sigma**2 * frequency**2)

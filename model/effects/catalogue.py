@@ -1,4 +1,7 @@
-"""The catalogue of effects, and effects as JSON: ``{"name": .., "parameters": {..}, "scope": {..}}`` (DESIGN.md, 7)."""
+"""The catalogue of effects, and effects as JSON.
+
+The form is ``{"name": .., "parameters": {..}, "scope": {..}}``.
+"""
 
 from collections.abc import Iterable, Mapping
 from datetime import date
@@ -31,43 +34,45 @@ ORDER = (
     "camera_shoulder",
     "target_registration",
 )
-"""The order in which light meets effects; each is the file of that name in this package."""
+"""Order of the effects along the light's path; each is the file of that name in this package."""
 
 
 def _effect_of(name: str) -> type[Effect]:
-    """The class that a file of this package has for its effect."""
+    """The effect class of a file in this package."""
     module = import_module(f"model.effects.{name}").__name__
     return next(effect for effect in Effect.__subclasses__() if effect.__module__ == module)
 
 
 CATALOGUE: dict[str, type[Effect]] = {name: _effect_of(name) for name in ORDER}
-"""Every effect by its name, in the order in which light meets them."""
+"""All effects by name, in the order of `ORDER`."""
 
 
 def in_light_order(effects: Iterable[Effect]) -> list[Effect]:
-    """Effects in the catalogue's order, however they were listed; those of no catalogue come last."""
+    """Sort effects by the catalogue's order; effects outside of the catalogue come last."""
     order = {name: index for index, name in enumerate(CATALOGUE)}
     return sorted(effects, key=lambda effect: order.get(effect.name, len(order)))
 
 
 def light_effects(effects: Iterable[Effect]) -> list[Effect]:
-    """Those that act on light itself; the others say how the camera's photograph of it differs."""
+    """Effects on the light itself; the others act on the camera's image."""
     return [effect for effect in effects if effect.stage != "image"]
 
 
 def model_version(effects: Iterable[Effect]) -> str:
-    """Version of the plant's model and the effects it holds, ``1:none`` where it holds none."""
+    """Version of the plant's model and the names of its effects, ``1:none`` without effects."""
     names = [effect.name for effect in in_light_order(effects)]
     return f"2:{'+'.join(names)}" if names else "1:none"
 
 
 def effects_from_json(data: object) -> list[Effect]:
-    """Effects of a list, or of an object such as a study's report that has the list under ``effects``.
+    """Parse effects from a list, or from an object with the list under ``effects``.
+
+    Such an object is a study's report.
 
     Raises
     ------
     InvalidInputError
-        Where it is neither, or an effect is malformed.
+        If it is neither, or an effect is malformed.
     """
     entries = data.get("effects") if isinstance(data, Mapping) else data
     if not isinstance(entries, list):
@@ -76,7 +81,9 @@ def effects_from_json(data: object) -> list[Effect]:
 
 
 def effect_from_json(data: object) -> Effect:
-    """One effect; parameters that are not given are neutral, and may come as a report's ``{"value": ..}``.
+    """Parse one effect; missing parameters are neutral.
+
+    Values may have the form of a report, ``{"value": ..}``.
 
     Raises
     ------
@@ -87,13 +94,17 @@ def effect_from_json(data: object) -> Effect:
         raise InvalidInputError(f"an effect must be an object with a 'name', got {str(data)[:80]}")
     name, given = data["name"], data.get("parameters", {})
     if name not in CATALOGUE:
-        raise InvalidInputError(f"effect '{name}' is unknown; the catalogue has {', '.join(CATALOGUE)}")
+        raise InvalidInputError(
+            f"effect '{name}' is unknown; the catalogue has {', '.join(CATALOGUE)}"
+        )
     known = {p.name: p for p in CATALOGUE[name].parameters()}
     if not isinstance(given, Mapping):
         raise InvalidInputError(f"effect {name}: 'parameters' must be an object")
     for key in given:
         if key not in known:
-            raise InvalidInputError(f"effect {name}: no parameter '{key}'; it has {', '.join(known)}")
+            raise InvalidInputError(
+                f"effect {name}: no parameter '{key}'; it has {', '.join(known)}"
+            )
     values = {key: _read(name, known[key], value) for key, value in given.items()}
     scope = scope_from_json(data.get("scope"), name)
     if isinstance(scope, ByDay):
@@ -102,19 +113,23 @@ def effect_from_json(data: object) -> Effect:
     named = None if isinstance(scope, ByDay) else scope.heliostats
     if named is not None and effect.heliostats not in (None, list(named)):
         raise InvalidInputError(
-            f"effect {name}: the scope's 'heliostats' must be those that its parameters name, or null, "
-            f"got {', '.join(named)[:80]}"
+            f"effect {name}: the scope's 'heliostats' must be those that its parameters name, or"
+            f" null, got {', '.join(named)[:80]}"
         )
     return effect
 
 
-def _by_day(effect: str, known: Mapping[str, Parameter], given: Mapping[str, Any]) -> dict[date, dict[str, float]]:
-    """Values of the parameters on each day that some are given for; what is not, is as on other days."""
+def _by_day(
+    effect: str, known: Mapping[str, Parameter], given: Mapping[str, Any]
+) -> dict[date, dict[str, float]]:
+    """Parameter values by day; missing ones are as on other days."""
     days: dict[date, dict[str, float]] = {}
     for key, data in given.items():
         by_day = data.get("by_day", {}) if isinstance(data, Mapping) else {}
         if not isinstance(by_day, Mapping):
-            raise InvalidInputError(f"effect {effect}: 'by_day' of '{key}' must map days to numbers")
+            raise InvalidInputError(
+                f"effect {effect}: 'by_day' of '{key}' must map days to numbers"
+            )
         for day, value in by_day.items():
             known[key].check(effect, value)
             days.setdefault(day_from_json(day, effect), {})[key] = float(value)
@@ -125,7 +140,7 @@ def _read(effect: str, parameter: Parameter, data: Any) -> Any:
     """A parameter's value, checked before numbers become arrays."""
     value = _bare(data)
     if parameter.shared or not isinstance(value, Mapping):
-        return value  # what is no mapping where one is wanted, the effect itself refuses
+        return value  # the effect itself rejects a value that is not a mapping
     by_heliostat = {name: _bare(one) for name, one in value.items()}
     for one in by_heliostat.values():
         parameter.check(effect, one)
@@ -133,26 +148,31 @@ def _read(effect: str, parameter: Parameter, data: Any) -> Any:
 
 
 def _bare(data: Any) -> Any:
-    """The value of a report's ``{"value": .., "ci95": .., "unit": ..}``; anything else as it is."""
+    """The value of a report's ``{"value": .., "ci95": .., "unit": ..}``; other data unchanged."""
     return data["value"] if isinstance(data, Mapping) and "value" in data else data
 
 
 def effect_to_json(effect: Effect) -> dict[str, Any]:
-    """An effect as JSON; `effect_from_json` reads it back."""
+    """Convert an effect to JSON; `effect_from_json` reads it back."""
     plain = {p.name: _plain(getattr(effect, p.name)) for p in effect.parameters()}
     if effect.scope == Always():
         return {"name": effect.name, "parameters": plain}
     if isinstance(effect.scope, ByDay):
         days = {day.isoformat(): values for day, values in sorted(effect.scope.by_day.items())}
         plain = {
-            name: {"value": value, "by_day": {day: values[name] for day, values in days.items() if name in values}}
+            name: {
+                "value": value,
+                "by_day": {day: values[name] for day, values in days.items() if name in values},
+            }
             for name, value in plain.items()
         }
     return {"name": effect.name, "parameters": plain, "scope": effect.scope.to_json()}
 
 
 def _plain(value: Any) -> Any:
-    """Tensors and arrays as floats and lists."""
+    """Convert tensors and arrays to floats and lists."""
     if isinstance(value, Mapping):
         return {name: _plain(one) for name, one in value.items()}
-    return np.asarray(value.detach().cpu() if isinstance(value, Tensor) else value, dtype=np.float64).tolist()
+    return np.asarray(
+        value.detach().cpu() if isinstance(value, Tensor) else value, dtype=np.float64
+    ).tolist()

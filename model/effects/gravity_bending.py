@@ -1,33 +1,37 @@
-"""Gravity bending: the mirror sags under its own weight, the more the flatter it lies.
+"""Gravity bending: the mirror sags under its weight, more if it is closer to horizontal.
 
 What it is
-    Frame and facets bend between and beyond their supports. The part of the weight that presses on the mirror is that
-    along its normal, the sine of the normal's elevation; a mirror that stands upright does not sag, one that faces
-    the zenith sags fully. The sag is taken as a paraboloid over the whole mirror::
+    Frame and facets bend between and beyond their supports. Only the weight's component along the
+    mirror's normal bends it, which is the sine of the normal's elevation. A vertical mirror does
+    not sag, one that faces the zenith sags fully. The sag is modelled as a paraboloid over the
+    whole mirror::
 
-        z -= amplitude * (sin(elevation of the normal) - reference) * ((y / y_edge)**2 + along * (x / x_edge)**2)
+        z -= amplitude * (sin(elevation of the normal) - reference)
+             * ((y / y_edge)**2 + along * (x / x_edge)**2)
 
-    with x along the torque tube, which carries the mirror and holds it straighter than across. A positive amplitude
-    lowers the upper and lower edges, which makes the mirror convex and its focus longer. A surface that was measured,
-    or learnt from images, holds the sag of the attitude it was seen in; so it is the deviation from there that counts.
-    Normals of a field on the northern side of its tower stand at some 30 degrees in the middle, hence `REFERENCE`.
-    Both it and `ALONG` were chosen by the images of undeclared set 3, as was the power of two.
+    with x along the torque tube, which supports the mirror and keeps it straighter in this
+    direction. A positive amplitude lowers the upper and lower edges. This makes the mirror convex
+    and its focus longer. A surface that was measured, or learnt from images, includes the sag of
+    its attitude, so only the deviation from there counts. Normals of a field north of its tower
+    have a mean elevation of some 30 degrees, hence `REFERENCE`. `REFERENCE`, `ALONG` and the power
+    of two were chosen by the images of undeclared set 3.
 
 Source
-    Moya and Ho, *Modeling and validation of heliostat deformation due to static loading*, ASME ES2011-54216; Yuan,
-    Christian, Ho, *Compensation of gravity induced heliostat deflections for improved optical performance*, J. Solar
-    Energy Engineering 137 (2015). The paraboloid is the lowest term of a plate's deflection.
+    Moya and Ho, *Modeling and validation of heliostat deformation due to static loading*, ASME
+    ES2011-54216; Yuan, Christian, Ho, *Compensation of gravity induced heliostat deflections for
+    improved optical performance*, J. Solar Energy Engineering 137 (2015). The paraboloid is the
+    lowest term of a plate's deflection.
 
 In an image
-    A change of focus: the spot grows or shrinks as a whole, in both directions. Off axis the change is one of
-    astigmatism as well.
+    A change of focus: the spot grows or shrinks as a whole, in both directions. Off axis, the
+    astigmatism changes as well.
 
 What it scales with
-    The sine of the normal's elevation, so high suns and near heliostats show it most; a slope of 2 amplitude / r_edge
-    at the edge, which moves light by twice that times the slant range.
+    The sine of the normal's elevation, so high suns and near heliostats show it most. The slope at
+    the edge is 2 amplitude / r_edge, which moves light by twice that times the slant range.
 
 What it is confused with
-    - Canting: the same at any elevation, and each heliostat's own.
+    - Canting: the same at any elevation, and different for each heliostat.
     - Slope error, sun shape: blur the image without focusing it; they never make a spot smaller.
     - A registration scale: resizes the image, independent of sun and distance.
 """
@@ -35,7 +39,7 @@ What it is confused with
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -46,10 +50,10 @@ from model.surface import basis, greville
 from model.tracing.scene import Scene
 
 REFERENCE = 0.5
-"""Sine of the normal's elevation at which mirrors have the surfaces that are known."""
+"""Sine of the normal's elevation at which mirrors have their known surfaces."""
 
 ALONG = 0.4
-"""Sag of the left and right edges as a share of that of the upper and lower ones."""
+"""Sag of the left and right edges, relative to that of the upper and lower edges."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +61,9 @@ class GravityBending(Effect):
     """Edges sink by ``amplitude_mm`` [mm] per unit of the sine of the normal's elevation."""
 
     name: ClassVar[str] = "gravity_bending"
-    about: ClassVar[str] = "Gravity bending: the mirror sags under its own weight, the more the flatter it lies."
+    about: ClassVar[str] = (
+        "Gravity bending: the mirror sags under its own weight, the more the flatter it lies."
+    )
     stage: ClassVar[Stage] = "geometry"
     scales_with: ClassVar[frozenset[Factor]] = frozenset({"distance", "elevation"})
     of_heliostats: ClassVar[bool] = True
@@ -67,7 +73,9 @@ class GravityBending(Effect):
     def on_scene(self, scene: Scene, heliostats: Sequence[Heliostat]) -> Scene:
         """Lower the mirrors' heights by the sag of their attitude."""
         points = scene.control_points
-        edges = points.new_tensor([(heliostat.width / 2, heliostat.height / 2) for heliostat in heliostats])
+        edges = points.new_tensor(
+            [(heliostat.width / 2, heliostat.height / 2) for heliostat in heliostats]
+        )
         depth = 1e-3 * self.amplitude_mm * (scene.attitude[:, 2, 2] - REFERENCE)
         sag = depth[:, None, None, None] * _paraboloid(points, edges, scene.degree)
         x, y, z = points.unbind(2)
@@ -76,10 +84,11 @@ class GravityBending(Effect):
 
 
 def _paraboloid(points: Tensor, edges: Tensor, degree: int) -> Tensor:
-    """Spline coefficients (B, F, I, J) over facets (B, F, 3, I, J) of a sag that is one at the upper and lower edge.
+    """Spline coefficients (B, F, I, J) of a sag that is one at the upper and lower edge.
 
-    ``edges`` (B, 2) [m] are half the mirrors' widths and heights. Interpolated at the Greville abscissae: exact where x
-    and y are linear in the parameters, as on heliotwin's grid.
+    ``points`` are the facets' (B, F, 3, I, J); ``edges`` (B, 2) [m] are half the mirrors' widths
+    and heights. The sag is interpolated at the Greville abscissae. This is exact if x and y are
+    linear in the parameters, as on heliotwin's grid.
     """
     value_u, inverse_u = _collocation(points.shape[-2], degree, points.dtype, points.device)
     value_v, inverse_v = _collocation(points.shape[-1], degree, points.dtype, points.device)
@@ -88,8 +97,15 @@ def _paraboloid(points: Tensor, edges: Tensor, degree: int) -> Tensor:
     return inverse_u @ (y**2 + ALONG * x**2) @ inverse_v.T
 
 
+class _Collocation(NamedTuple):
+    """Matrix (count, count) from coefficients to values at the Greville abscissae; its inverse."""
+
+    values: Tensor
+    inverse: Tensor
+
+
 @lru_cache(maxsize=16)
-def _collocation(count: int, degree: int, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Basis at the Greville abscissae (count, count), which turns coefficients to values, and its inverse."""
-    values = torch.as_tensor(basis(count, degree, greville(count, degree))[0])
-    return values.to(dtype=dtype, device=device), torch.linalg.inv(values).to(dtype=dtype, device=device)
+def _collocation(count: int, degree: int, dtype: torch.dtype, device: torch.device) -> _Collocation:
+    values = torch.as_tensor(basis(count, degree, greville(count, degree)).values)
+    inverse = torch.linalg.inv(values)
+    return _Collocation(*(m.to(dtype=dtype, device=device) for m in (values, inverse)))

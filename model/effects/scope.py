@@ -1,8 +1,9 @@
-"""When and where an effect acts: always, since a date, or on each day by values of its own; everywhere or not.
+"""Scope of an effect: always, since a date, or by day, for all heliostats or some.
 
-A mirror is canted anew, a camera is set anew: from that date on the plant is another one. Haze and wind come and go:
-each day has its own. Days are those of the photographs' times, in the zone that these are recorded in. What mirror and
-drive do, one heliostat may have alone.
+If a mirror is canted again, or a camera has new settings, the plant is different from that date on.
+Haze and wind change from day to day, so each day has separate values. Days are those of the
+photographs' times, in their recorded time zone. An effect of mirror or drive may belong to a single
+heliostat.
 """
 
 from collections.abc import Mapping
@@ -15,22 +16,27 @@ from model.errors import InvalidInputError
 
 @dataclass(frozen=True)
 class Always:
-    """The whole set, or all photographs of some ``heliostats``; None for all."""
+    """All photographs, or all of some ``heliostats``; None for all heliostats."""
 
     heliostats: tuple[str, ...] | None = None
 
     def phase(self, taken_at: datetime | None, heliostat: str | None) -> date | bool:
-        """What photographs must share for the effect to be the same in them; False where it does not act."""
+        """The phase in which photographs have the same effect; False if it does not act."""
         return self.heliostats is None or heliostat in self.heliostats
 
     def to_json(self) -> dict[str, Any]:
-        """As DESIGN.md, section 7, has it; without ``heliostats`` where all have it."""
-        return {"kind": "set"} | ({} if self.heliostats is None else {"heliostats": list(self.heliostats)})
+        """The scope as JSON; without ``heliostats`` if all have the effect."""
+        return {"kind": "set"} | (
+            {} if self.heliostats is None else {"heliostats": list(self.heliostats)}
+        )
 
 
 @dataclass(frozen=True)
 class Since:
-    """From the first photograph of ``since`` on, of some ``heliostats`` or all; what is of no time is of today."""
+    """From the date ``since`` on, for some ``heliostats`` or all.
+
+    A photograph without a time counts as current.
+    """
 
     since: date
     heliostats: tuple[str, ...] | None = None
@@ -41,19 +47,19 @@ class Since:
         return theirs and (taken_at is None or taken_at.date() >= self.since)
 
     def to_json(self) -> dict[str, Any]:
-        """As DESIGN.md, section 7, has it; null where all heliostats, or the camera, have it."""
+        """The scope as JSON; ``heliostats`` is null if all, or the camera, have the effect."""
         named = None if self.heliostats is None else list(self.heliostats)
         return {"kind": "since", "since": self.since.isoformat(), "heliostats": named}
 
 
 @dataclass(frozen=True)
 class ByDay:
-    """Each day by values of its own.
+    """Separate values for each day.
 
     Attributes
     ----------
     by_day : mapping
-        Day to the values of parameters by their names; on other days the effect's own hold.
+        Day to parameter values by name; on other days, the effect's own values count.
     """
 
     by_day: Mapping[date, Mapping[str, float]] = field(default_factory=dict)
@@ -64,7 +70,7 @@ class ByDay:
         return day if day is not None and day in self.by_day else True
 
     def to_json(self) -> dict[str, Any]:
-        """As DESIGN.md, section 7, has it; the values stand beside the parameters."""
+        """The scope as JSON; the values are with the parameters."""
         return {"kind": "day"}
 
 
@@ -72,18 +78,18 @@ Scope = Always | Since | ByDay
 
 
 def scope_from_json(data: object, effect: str) -> Scope:
-    """A scope without its values; `Always` where none is given.
+    """Parse a scope without its values; `Always` if none is given.
 
     Raises
     ------
     InvalidInputError
-        Where it is none.
+        If it is malformed.
     """
     given = {"kind": "set"} if data is None else data
     if not isinstance(given, Mapping) or given.get("kind") not in ("set", "since", "day"):
         raise InvalidInputError(
-            f'effect {effect}: \'scope\' must be {{"kind": "set"}}, {{"kind": "since", "since": DATE}} or '
-            f'{{"kind": "day"}}, got {str(data)[:80]}'
+            f'effect {effect}: \'scope\' must be {{"kind": "set"}}, {{"kind": "since", "since":'
+            f' DATE}} or {{"kind": "day"}}, got {str(data)[:80]}'
         )
     heliostats = _heliostats_from_json(given.get("heliostats"), effect)
     if given["kind"] == "set":
@@ -91,23 +97,26 @@ def scope_from_json(data: object, effect: str) -> Scope:
     if given["kind"] == "since":
         return Since(day_from_json(given.get("since"), effect), heliostats)
     if heliostats is not None:
-        raise InvalidInputError(f"effect {effect}: a scope by day is of all heliostats; leave its 'heliostats' out")
+        raise InvalidInputError(
+            f"effect {effect}: a scope by day is of all heliostats; leave its 'heliostats' out"
+        )
     return ByDay()
 
 
 def _heliostats_from_json(data: object, effect: str) -> tuple[str, ...] | None:
-    """Names, sorted; None for all."""
+    """Sorted names; None for all."""
     if data is None:
         return None
     if not isinstance(data, list) or not data or not all(isinstance(name, str) for name in data):
         raise InvalidInputError(
-            f"effect {effect}: the scope's 'heliostats' must be a list of names, or null for all, got {str(data)[:80]}"
+            f"effect {effect}: the scope's 'heliostats' must be a list of names, or null for all,"
+            f" got {str(data)[:80]}"
         )
     return tuple(sorted(set(data)))
 
 
 def day_from_json(data: object, effect: str) -> date:
-    """A day; InvalidInputError where it is none."""
+    """Parse a day; InvalidInputError if it is malformed."""
     try:
         return date.fromisoformat(str(data))
     except ValueError:

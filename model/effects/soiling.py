@@ -1,29 +1,29 @@
-"""Soiling: facets that reflect less than the best of their heliostat.
+"""Soiling: facets that reflect less than the best one of their heliostat.
 
 What it is
-    Dust, bird droppings, corroded silver, a cracked facet. Each facet reflects ``reflectivity_ratio`` of what a clean
-    one does, the same all over.
+    Causes are dust, bird droppings, corroded silver or a cracked facet. Each facet reflects
+    ``reflectivity_ratio`` of the light that a clean one reflects, uniformly.
 
 Source
-    Picotti et al., *Soiling of solar collectors - Modelling approaches for airborne dust and its interactions with
-    surfaces*, Renewable and Sustainable Energy Reviews 81 (2018). That a facet's share of the light scales with it is
-    radiometry.
+    Picotti et al., *Soiling of solar collectors - Modelling approaches for airborne dust and its
+    interactions with surfaces*, Renewable and Sustainable Energy Reviews 81 (2018). By radiometry,
+    a facet's light is proportional to its reflectivity.
 
 In an image
-    The light of one facet is dimmer. Where the facets' images fall together, that only changes the spot's height;
-    where they do not, with a heliostat that is near or out of focus, a quarter of the image is darker and the centre
-    of mass moves away from it.
+    The light of one facet is dimmer. If the facets' images overlap, only the spot's peak changes.
+    If they do not, as for a heliostat that is near or out of focus, a quarter of the image is
+    darker, and the centroid moves away from it.
 
 What it scales with
-    Nothing: not the distance, not the sun. The darker part is fixed in the mirror's frame, and its shape on the
-    target is that of the facet's own image. It changes over weeks, and at once by washing.
+    Nothing, neither distance nor sun. The darker part is fixed in the mirror's frame, and has the
+    shape of the facet's image on the target. It changes over weeks, and at once by washing.
 
 What it is confused with
-    - Even soiling of all facets: invisible in images that are normalised, and in any image whose exposure is not
-      known. Only ratios to the best facet are meant.
-    - Blocking: always dims the mirror's lower edge, in part, and comes and goes with the sun and the aim.
-    - Canting: moves a facet's light and takes none.
-    - A gradient of the background: goes on where there is no light.
+    - Uniform soiling of all facets: invisible in normalised images, and in any image of unknown
+      exposure. The ratios are relative to the best facet.
+    - Blocking: always dims the mirror's lower edge, in part, and changes with the sun and the aim.
+    - Canting: moves a facet's light and keeps its energy.
+    - A gradient of the background: continues outside of the spot.
 """
 
 from collections.abc import Sequence
@@ -37,7 +37,7 @@ from model.tracing.scene import Scene
 
 @dataclass(frozen=True, eq=False)
 class Soiling(Effect):
-    """Each facet reflects ``reflectivity_ratio`` of what a clean one does."""
+    """Each facet reflects ``reflectivity_ratio`` of the light that a clean one reflects."""
 
     name: ClassVar[str] = "soiling"
     about: ClassVar[str] = "Soiling: facets that reflect less than the best of their heliostat."

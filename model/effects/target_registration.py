@@ -1,31 +1,36 @@
-"""Target registration: the target's corners were not found where they are.
+"""Target registration: errors of the target's corners.
 
 What it is
-    A photograph is rectified by the corners of the target. Corners that are off by some pixels, or a target that was
-    surveyed with the wrong size, leave an affine error: a point (x, y) [m, right and up of the centre] appears at::
+    A photograph is rectified by the corners of the target. Corners with errors of some pixels, or a
+    target that was surveyed with the wrong size, leave an affine error. A point (x, y) [m, right
+    and up of the centre] appears at::
 
         R(rotation_deg) (scale_x * (x + shear * y), scale_y * y)
 
-    with R turning anticlockwise. A shift is no part of it, since images are aligned by their spots.
+    with R turning anticlockwise. A shift is not included, because images are aligned by their
+    spots.
 
 Source
-    The hierarchy of plane transformations in Hartley and Zisserman, *Multiple View Geometry in Computer Vision*,
-    section 2.4.
+    The hierarchy of plane transformations in Hartley and Zisserman, *Multiple View Geometry in
+    Computer Vision*, section 2.4.
 
 In an image
-    The spot is wider, flatter, leaning or turned, with all its detail, and so are the target's edges and marks.
-    Irradiance keeps its values: energy on the image grows with the area, scale_x * scale_y.
+    The spot is wider, flatter, sheared or turned, with all its detail, and so are the target's
+    edges and marks. Irradiance keeps its values: energy on the image grows with the area, scale_x *
+    scale_y.
 
 What it scales with
-    Nothing of the heliostat: the same for all of them on one target, at any distance and sun. Two targets of one
-    camera have errors of their own.
+    Nothing of the heliostat: the same for all of them on one target, at any distance and sun. Two
+    targets of one camera have different errors.
 
 What it is confused with
-    - Gravity and focus errors: resize the spot, but differently at every distance and elevation, and not its blurred
-      rim alike.
-    - Blur in one direction (jitter): adds a variance, where a scale multiplies it; compare small and large spots.
-    - Axis tilt: turns images by an angle that depends on the mount's position; a registration's is always the same.
-    - A wrong aspect of the pixels is scale_x against scale_y.
+    - Gravity and focus errors: resize the spot, but differently at every distance and elevation,
+      and without its blurred rim.
+    - Blur in one direction (jitter): adds a variance, while a scale multiplies it; compare small
+      and large spots.
+    - Axis tilt: turns images by an angle that depends on the mount's position; a registration's
+      angle is always the same.
+    - A wrong aspect ratio of the pixels: changes scale_x relative to scale_y.
 """
 
 import math
@@ -44,12 +49,14 @@ from model.tracing.scene import Window
 class TargetRegistration(Effect):
     """The image shows the target scaled, sheared and turned about its centre.
 
-    A point (x, y) [m, right and up] appears at R(rotation_deg) (scale_x * (x + shear * y), scale_y * y), with R
-    anticlockwise.
+    A point (x, y) [m, right and up] appears at R(rotation_deg) (scale_x * (x + shear * y), scale_y
+    * y), with R anticlockwise.
     """
 
     name: ClassVar[str] = "target_registration"
-    about: ClassVar[str] = "Target registration: the target's corners were not found where they are."
+    about: ClassVar[str] = (
+        "Target registration: the target's corners were not found where they are."
+    )
     stage: ClassVar[Stage] = "image"
     scales_with: ClassVar[frozenset[Factor]] = frozenset({"camera"})
 
@@ -59,16 +66,18 @@ class TargetRegistration(Effect):
     rotation_deg: Scalar = parameter(0.0, -15.0, 15.0, "deg", "camera")
 
     def on_image(self, images: Tensor, window: Window) -> Tensor:
-        """Resample bicubically; irradiance keeps its values, what lies beyond the image is dark."""
+        """Resample bicubically; irradiance keeps its values, and pixels outside are dark."""
         size = images.new_tensor([window.width, -window.height])  # grids count rows downwards
-        # A grid tells for each pixel shown where on the true image it comes from, in half sizes.
+        # The grid gives the source position of each pixel in the true image, in half sizes.
         back = torch.linalg.inv(self._matrix(images)) * size / size[:, None]
         theta = torch.cat([back, images.new_zeros(2, 1)], dim=1)[None]
         grid = affine_grid(theta, [1, 1, *images.shape[-2:]], align_corners=False)
-        return grid_sample(images[None], grid, mode="bicubic", padding_mode="zeros", align_corners=False)[0]
+        return grid_sample(
+            images[None], grid, mode="bicubic", padding_mode="zeros", align_corners=False
+        )[0]
 
     def _matrix(self, like: Tensor) -> Tensor:
-        """From where a point is to where it appears (2, 2), right and up."""
+        """Matrix (2, 2) from true to apparent positions, right and up."""
         scale_x, scale_y, shear, degrees = (
             torch.as_tensor(value, dtype=like.dtype, device=like.device)
             for value in (self.scale_x, self.scale_y, self.shear, self.rotation_deg)
@@ -76,5 +85,7 @@ class TargetRegistration(Effect):
         angle = degrees * (math.pi / 180)
         cosine, sine = torch.cos(angle), torch.sin(angle)
         turn = torch.stack([cosine, -sine, sine, cosine]).view(2, 2)
-        stretch = torch.stack([scale_x, scale_x * shear, torch.zeros_like(shear), scale_y]).view(2, 2)
+        stretch = torch.stack([scale_x, scale_x * shear, torch.zeros_like(shear), scale_y]).view(
+            2, 2
+        )
         return turn @ stretch

@@ -1,15 +1,16 @@
-"""The camera's law: from counts to light and back.
+"""Camera response curves: conversion between counts and linear intensity ("light").
 
-A camera made for human eyes encodes light by a curve (its transfer function) before it stores a count. On a target that
-daylight lights up already, spot and daylight go through that curve together: a difference of counts is not a difference
-of light. Photographs are therefore turned into light first, and only then is the daylight taken off.
+A consumer camera encodes light by a curve (its transfer function) before it stores counts. On a
+target in daylight, spot and daylight go through that curve together. So a difference of counts is
+not proportional to a difference of light. Photographs are therefore converted to light first, and
+the daylight is subtracted afterwards.
 
-Counts and light are shares here, of the largest count and of the light that gives it: 0 to 1. Exposure is the unit of
-light, which no photograph tells; all that follows is normalised.
+Counts and light are relative here: to the largest count and to the light at that count, from 0 to
+1. The exposure is the unit of light. It is unknown, so all later steps normalise.
 
-Source: IEC 61966-2-1 (sRGB); Debevec and Malik, *Recovering high dynamic range radiance maps from photographs*,
-SIGGRAPH 1997. On two years' photographs of one mirror the sRGB curve lifts the accuracy of forecasts from 0.869 to
-0.899 without a fitted number (RESULTS.md).
+Source: IEC 61966-2-1 (sRGB); Debevec and Malik, *Recovering high dynamic range radiance maps from
+photographs*, SIGGRAPH 1997. On two years' photographs of one mirror the sRGB curve raises the
+accuracy of forecasts from 0.869 to 0.899 without a fitted number (RESULTS.md).
 """
 
 from abc import ABC, abstractmethod
@@ -27,35 +28,40 @@ Array = NDArray[np.float64]
 
 
 class Transfer(ABC):
-    """A transfer function, rising from (0, 0) to (1, 1); a frozen dataclass of numbers."""
+    """A transfer function from (0, 0) to (1, 1), increasing; a frozen dataclass of numbers."""
 
     @abstractmethod
     def light(self, counts: ArrayLike) -> Array:
-        """Light (...) [1] that gives ``counts`` (...) [1]."""
+        """Convert ``counts`` (...) [1] to light (...) [1]."""
 
     @abstractmethod
     def counts(self, light: ArrayLike) -> Array:
-        """Counts (...) [1] that ``light`` (...) [1] gives; what is brighter than all counts gives the largest."""
+        """Convert ``light`` (...) [1] to counts (...) [1].
+
+        Light above the range gives the largest count.
+        """
 
 
 @dataclass(frozen=True)
 class Srgb(Transfer):
-    """The curve of nearly every camera that stores 8 bits."""
+    """The sRGB curve, which nearly every 8-bit camera uses."""
 
     def light(self, counts: ArrayLike) -> Array:
-        """IEC 61966-2-1, section 5.2."""
+        """Decode by IEC 61966-2-1, section 5.2."""
         share = np.asarray(counts, dtype=np.float64)
-        return np.where(share <= 0.04045, share / 12.92, ((np.maximum(share, 0) + 0.055) / 1.055) ** 2.4)
+        return np.where(
+            share <= 0.04045, share / 12.92, ((np.maximum(share, 0) + 0.055) / 1.055) ** 2.4
+        )
 
     def counts(self, light: ArrayLike) -> Array:
-        """IEC 61966-2-1, section 5.3."""
+        """Encode by IEC 61966-2-1, section 5.3."""
         share = np.clip(light, 0, 1).astype(np.float64)
         return np.where(share <= 0.0031308, share * 12.92, 1.055 * share ** (1 / 2.4) - 0.055)
 
 
 @dataclass(frozen=True)
 class Power(Transfer):
-    """Light is counts to the power ``gamma``; one is a linear camera."""
+    """Light is counts to the power ``gamma``; a linear camera has 1."""
 
     gamma: float = 1.0
 
@@ -64,17 +70,20 @@ class Power(Transfer):
             raise InvalidInputError(f"a camera's gamma must lie in [0.2, 5], got {self.gamma}")
 
     def light(self, counts: ArrayLike) -> Array:
-        """The counts' power."""
+        """Raise counts to the power."""
         return np.asarray(np.maximum(counts, 0) ** self.gamma, dtype=np.float64)
 
     def counts(self, light: ArrayLike) -> Array:
-        """The power's inverse."""
+        """Apply the inverse power."""
         return np.asarray(np.clip(light, 0, 1) ** (1 / self.gamma), dtype=np.float64)
 
 
 @dataclass(frozen=True)
 class Measured(Transfer):
-    """A measured curve: ``lights`` at ``shares`` of the counts, both from 0 to 1 and rising, linear between."""
+    """A measured curve: ``lights`` at ``shares`` of the largest count.
+
+    Both increase from 0 to 1, and the curve is linear between them.
+    """
 
     shares: tuple[float, ...]
     lights: tuple[float, ...]
@@ -82,46 +91,58 @@ class Measured(Transfer):
     def __post_init__(self) -> None:
         for what, values in (("counts", self.shares), ("light", self.lights)):
             numbers = np.asarray(values, dtype=np.float64)
-            if len(numbers) < 2 or not np.isfinite(numbers).all() or (numbers[0], numbers[-1]) != (0, 1):
-                raise InvalidInputError(f"a camera's '{what}' must be at least two finite numbers from 0 to 1")
+            if (
+                len(numbers) < 2
+                or not np.isfinite(numbers).all()
+                or (numbers[0], numbers[-1]) != (0, 1)
+            ):
+                raise InvalidInputError(
+                    f"a camera's '{what}' must be at least two finite numbers from 0 to 1"
+                )
             if not (np.diff(numbers) > 0).all():
-                raise InvalidInputError(f"a camera's '{what}' must rise from each number to the next")
+                raise InvalidInputError(
+                    f"a camera's '{what}' must rise from each number to the next"
+                )
         if len(self.shares) != len(self.lights):
             raise InvalidInputError("a camera's 'counts' and 'light' must be of one length")
 
     def light(self, counts: ArrayLike) -> Array:
-        """Linear interpolation."""
+        """Interpolate linearly."""
         return np.asarray(np.interp(np.asarray(counts, dtype=np.float64), self.shares, self.lights))
 
     def counts(self, light: ArrayLike) -> Array:
-        """Linear interpolation."""
+        """Interpolate linearly."""
         return np.asarray(np.interp(np.asarray(light, dtype=np.float64), self.lights, self.shares))
 
 
 LINEAR = Power(1.0)
 
 USUAL_AMBIENT = 0.53
-"""Counts [1] of a target that daylight lights up: the median of 86 photographs over two years, 0.44 to 0.66."""
+"""Counts [1] of a target in daylight.
+
+The median of 86 photographs over two years; their range is 0.44 to 0.66.
+"""
 
 
 @dataclass(frozen=True)
 class Camera:
-    """How a camera turns light into counts, and from when on, of which targets.
+    """How a camera converts light to counts, from when on, and for which targets.
 
     Attributes
     ----------
     transfer : Transfer or None
-        None: sRGB where it stores 8 bits, linear where it stores more.
+        None: sRGB for 8 bits, linear for more.
     ambient : float [1]
-        Counts of the sheet under daylight, for images whose background was taken off in counts.
+        Counts of the sheet in daylight, for images whose background was subtracted in counts.
     since : datetime or None
-        With time zone; None: ever since.
+        With time zone; None: always.
     targets : tuple of str
-        Names of those that it looks at; none: all.
+        Names of the targets that it photographs; empty: all.
     peak_counts : float [1]
-        Counts of the sheet at the spot's brightest place, likewise: such images are stretched, and do not tell it.
+        Counts of the sheet at the spot's brightest position, for images whose background was
+        subtracted in counts. Such images are stretched, so they do not show it.
     bits : int or None
-        Of its counts in files of 16 bits; None: they were scaled to 16.
+        Bits of its counts in 16-bit files; None: they were scaled to 16.
     """
 
     transfer: Transfer | None = None
@@ -133,42 +154,52 @@ class Camera:
 
     def __post_init__(self) -> None:
         if not 0 <= self.ambient < 1:
-            raise InvalidInputError(f"a camera's 'ambient' must lie in [0, 1) of its counts, got {self.ambient}")
+            raise InvalidInputError(
+                f"a camera's 'ambient' must lie in [0, 1) of its counts, got {self.ambient}"
+            )
         if not self.ambient < self.peak_counts <= 1:
             raise InvalidInputError(
-                f"a camera's 'peak_counts' must lie above its ambient {self.ambient}, up to 1, got {self.peak_counts}"
+                f"a camera's 'peak_counts' must lie above its ambient {self.ambient}, up to 1, got"
+                f" {self.peak_counts}"
             )
         if self.bits is not None and not 8 < self.bits <= 16:
             raise InvalidInputError(f"a camera's 'bits' must lie in 9 to 16, got {self.bits}")
 
     def law(self, depth: DTypeLike) -> Transfer:
-        """Its transfer function in files of a depth, uint8 or uint16."""
+        """The transfer function for files of a depth, uint8 or uint16."""
         return self.transfer or (Srgb() if depth == np.uint8 else LINEAR)
 
     def most(self, depth: DTypeLike) -> int:
-        """Its largest count in such files."""
+        """The largest count in files of a depth."""
         return 255 if depth == np.uint8 else (1 << (self.bits or 16)) - 1
 
     def light_of(self, image: NDArray[np.integer[Any]]) -> NDArray[np.float32]:
-        """Light (...) [1] of an image's counts, none above its largest."""
+        """Light (...) [1] of an image's counts, which are at most the camera's largest."""
         most = self.most(image.dtype)
         levels = self.law(image.dtype).light(np.arange(most + 1) / most)
         return np.asarray(levels.astype(np.float32)[image])
 
-    def light_of_difference(self, counts: ArrayLike, depth: DTypeLike = np.uint8) -> Array:
-        """Light (...) [1] of a spot of which ``counts`` (...) over the sheet are known, in any unit: PAINT's ``flux``.
+    def light_of_difference(
+        self, counts: ArrayLike, depth: DTypeLike = np.uint8, largest: float | None = None
+    ) -> Array:
+        """Light (...) [1] of a spot whose background was subtracted in counts, such as PAINT's
+        ``flux``.
 
-        Such an image is stretched: its brightest place stands for `peak_counts`.
+        ``counts`` (...) above the sheet may have any unit. Such an image is stretched, so its
+        brightest position has `peak_counts`. ``largest`` is the count at that position, by default
+        the maximum of ``counts``.
         """
         law, share = self.law(depth), np.asarray(counts, dtype=np.float64)
-        over = (self.peak_counts - self.ambient) * share / max(float(share.max(initial=0)), 1e-12)
+        largest = float(share.max(initial=0)) if largest is None else largest
+        over = (self.peak_counts - self.ambient) * share / max(largest, 1e-12)
         return law.light(self.ambient + over) - law.light(self.ambient)
 
 
 def camera_at(cameras: Sequence[Camera], target: str, taken_at: datetime | None) -> Camera | None:
-    """The camera that looked at a target at a time; None where none is declared for them.
+    """The camera of a target at a time; None if none is declared.
 
-    The latest that was there by then counts; for a photograph of unknown time the latest of all.
+    If several are possible, the latest one counts. A photograph of unknown time has the latest of
+    all.
     """
     there = [
         camera
@@ -180,15 +211,16 @@ def camera_at(cameras: Sequence[Camera], target: str, taken_at: datetime | None)
 
 
 def cameras_from_json(data: object) -> tuple[Camera, ...]:
-    """Cameras of ``twin.json``: ``[{"transfer": "srgb", "ambient": 0.53, "since": TIME, "targets": [..]}]``.
+    """Parse the cameras of ``twin.json``.
 
-    ``transfer`` is ``srgb``, ``linear``, ``{"gamma": 2.2}`` or ``{"counts": [..], "light": [..]}``; there are also
-    ``bits`` and ``peak_counts``. Each key may be left out.
+    The form is ``[{"transfer": "srgb", "ambient": 0.53, "since": TIME, "targets": [..]}]``.
+    ``transfer`` is ``srgb``, ``linear``, ``{"gamma": 2.2}`` or ``{"counts": [..], "light": [..]}``.
+    There are also ``bits`` and ``peak_counts``. Each key is optional.
 
     Raises
     ------
     InvalidInputError
-        Where one is malformed, or its law does not rise.
+        If one is malformed, or its curve does not increase.
     """
     if not isinstance(data, list):
         raise InvalidInputError("'cameras' must be a list of cameras")
@@ -198,7 +230,9 @@ def cameras_from_json(data: object) -> tuple[Camera, ...]:
 def _camera(data: object) -> Camera:
     known = {"transfer", "ambient", "peak_counts", "bits", "since", "targets"}
     if not isinstance(data, Mapping) or set(data) - known:
-        raise InvalidInputError(f"a camera must be an object with {', '.join(sorted(known))}, got {str(data)[:80]}")
+        raise InvalidInputError(
+            f"a camera must be an object with {', '.join(sorted(known))}, got {str(data)[:80]}"
+        )
     targets, bits = data.get("targets", []), data.get("bits")
     if not isinstance(targets, list) or not all(isinstance(name, str) for name in targets):
         raise InvalidInputError("a camera's 'targets' must be a list of names")
@@ -227,7 +261,9 @@ def _moment(since: object) -> datetime | None:
     except ValueError:
         moment = datetime.min
     if moment is not None and moment.tzinfo is None:
-        raise InvalidInputError(f"a camera's 'since' must be an ISO 8601 time with its zone, got {str(since)[:80]}")
+        raise InvalidInputError(
+            f"a camera's 'since' must be an ISO 8601 time with its zone, got {str(since)[:80]}"
+        )
     return moment
 
 
@@ -238,15 +274,18 @@ def _transfer(data: object) -> Transfer:
         try:
             numbers = {key: np.asarray(value, dtype=np.float64) for key, value in data.items()}
         except (TypeError, ValueError):
-            raise InvalidInputError(f"a camera's 'transfer' must hold numbers, got {str(data)[:80]}") from None
+            raise InvalidInputError(
+                f"a camera's 'transfer' must hold numbers, got {str(data)[:80]}"
+            ) from None
         if any(values.ndim != (key != "gamma") for key, values in numbers.items()):
             raise InvalidInputError(
-                f"a camera's 'gamma' is one number, 'counts' and 'light' are lists, got {str(data)[:80]}"
+                "a camera's 'gamma' is one number, 'counts' and 'light' are lists, got"
+                f" {str(data)[:80]}"
             )
         if "gamma" in numbers:
             return Power(float(numbers["gamma"]))
         return Measured(tuple(numbers["counts"].tolist()), tuple(numbers["light"].tolist()))
     raise InvalidInputError(
-        'a camera\'s \'transfer\' must be "srgb", "linear", {"gamma": ..} or {"counts": [..], "light": [..]}, '
-        f"got {str(data)[:80]}"
+        'a camera\'s \'transfer\' must be "srgb", "linear", {"gamma": ..} or {"counts": [..],'
+        f' "light": [..]}}, got {str(data)[:80]}'
     )

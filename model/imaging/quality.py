@@ -1,4 +1,4 @@
-"""Whether a photograph can be measured: a few figures, and the limits beyond which it is refused."""
+"""Quality of a photograph: a few measures, and the limits for its rejection."""
 
 from dataclasses import dataclass, replace
 
@@ -6,92 +6,110 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.imaging.separate import Separation
+from model.imaging.strips import row_strips
 
 SATURATED_GRAY = 250
-_LOWEST_CEILING = 240  # a frame that was averaged or scaled after it was taken has its largest count below 255
-_PILE = 6.0  # pixels at three counts from a ceiling on over those at a count below it
-_LEAST_PILE = 1.2e-4  # share of the image that a count below it holds at least, for chance makes piles of a few
-# Of what was cut off only the rim is known, and that there was at least so much light: a spot that is mostly rim tells
-# nothing. On real photographs the accuracy of forecasts falls slowly up to there.
+_LOWEST_CEILING = 240  # a frame that was averaged or scaled has its largest count below 255
+_PILE = 6.0  # ratio of pixels at three counts from a ceiling on to those at a count below it
+# Least share of the image for one count below: chance makes small accumulations.
+_MIN_PILE = 1.2e-4
+# Of a saturated area only the rim and a lower bound of the light are known. A spot with a small rim
+# has little information. On real photographs the accuracy of forecasts falls slowly up to this
+# limit.
 _LIMIT_SATURATED = 0.6
-# Real photographs of which a side was taken away, up to half of their light, are forecast as well as whole ones
-# (tests/benchmarks/cut.py). Here the estimate no longer grows: more may be missing than is seen.
+# Real photographs with one side removed, up to half of their light, are forecast as well as whole
+# ones (tests/benchmarks/cut.py). From this value on the estimate no longer grows: more may be
+# missing than is visible.
 _LIMIT_CUT = 0.3
 _LIMIT_SECOND = 0.40
-# In light, 300 real empty targets show patches of at most 0.33 of the background; 86 real spots start at 0.9.
-_LEAST_CONTRAST = 0.36
-_LEAST_CERTAINTY = 10.0
+# In light, 300 real empty targets show patches of at most 0.33 of the background; 86 real spots
+# start at 0.9.
+_MIN_CONTRAST = 0.36
+_MIN_CERTAINTY = 10.0
 _CERTAIN = 30.0
-_LEAST_AREA = 0.003
+_MIN_AREA = 0.003
 
 _REMEDY = {
-    "no_spot": "no spot stands out from the target; photograph while the heliostat is on target",
-    "low_signal": "the spot is too faint against daylight and texture; give an empty-target reference or more exposure",
+    "no_spot": (
+        "no spot is brighter than the target around it; photograph while the heliostat is on target"
+    ),
+    "low_signal": (
+        "the spot is too faint against daylight and texture; give an empty-target reference or more"
+        " exposure"
+    ),
     "saturated": "the spot's centre is beyond the camera's range; shorten the exposure",
     "cut": "the spot runs over the target's edge; aim the heliostat at the target's centre",
-    "second_spot": "another spot is about as strong, so it is unknown which is meant; clear the target of others",
+    "second_spot": (
+        "another spot is about as strong, so it is unknown which is meant; clear the target of"
+        " others"
+    ),
 }
 
 
 def ceiling(counts: NDArray[np.uint8]) -> int:
-    """The count of an image (rows, columns) from which on the camera's range has cut the light off.
+    """The count from which on an image (rows, columns) is saturated.
 
-    Pixels pile up there: frames that were averaged or scaled after they were taken have their plateau below 255, real
-    ones at 245 to 253. `SATURATED_GRAY` where there is no such pile below it.
+    Pixels accumulate there. Frames that were averaged or scaled have their plateau below 255, real
+    ones at 245 to 253. The result is `SATURATED_GRAY` if there is no accumulation below it.
     """
     pixels = np.bincount(counts.ravel(), minlength=256)
     for level in range(_LOWEST_CEILING, SATURATED_GRAY + 2):
-        below = max(float(pixels[level - 12 : level - 2].mean()), _LEAST_PILE * counts.size)
+        below = max(float(pixels[level - 12 : level - 2].mean()), _MIN_PILE * counts.size)
         if pixels[level : level + 3].sum() > _PILE * below and pixels[level] > 1.5 * below:
             return level - 2  # interpolation has spread the plateau's edge
     return SATURATED_GRAY
 
 
 def cut_off_at(counts: NDArray[np.unsignedinteger], most: int) -> int | None:
-    """The count of an image (rows, columns) of 16 bits at which its range ends too early, or None.
+    """The count at which the range of a 16-bit image (rows, columns) ends too early, or None.
 
-    Of a camera of fewer bits, or with a black level taken off, pixels pile up at one count that lies too far below the
-    largest one, ``most``, for `ceiling` to look there.
+    If a camera has fewer bits, or a black level was subtracted, pixels accumulate at one count. It
+    is too far below ``most``, the largest count, for `ceiling` to find it.
     """
-    pixels = np.bincount(counts.ravel(), minlength=1 << 16)
+    strips = (counts[strip].ravel() for strip in row_strips(counts.shape))
+    pixels = np.sum([np.bincount(strip, minlength=1 << 16) for strip in strips], axis=0)
     for level in (*((1 << bits) - 1 for bits in range(10, 16)), int(counts.max())):
         if 255 * level < _LOWEST_CEILING * most:
             below = 0.1 * float(pixels[level - 12 * level // 255 : level - 2 * level // 255].sum())
-            if pixels[level] > _PILE * max(below, _LEAST_PILE * counts.size):
+            if pixels[level] > _PILE * max(below, _MIN_PILE * counts.size):
                 return level
     return None
 
 
 @dataclass(frozen=True)
 class Quality:
-    """What a photograph is worth.
+    """The quality of a photograph.
 
     Attributes
     ----------
     accepted : bool
     reason : str or None
-        Short code of the refusal: ``target_not_found``, ``no_spot``, ``low_signal``, ``saturated``, ``cut`` or
-        ``second_spot``.
+        Short code of the rejection: ``target_not_found``, ``no_spot``, ``low_signal``,
+        ``saturated``, ``cut`` or ``second_spot``.
     detail : str or None
         One sentence with the remedy.
     saturated_share : float [1]
-        Share of the spot's bright area (above half its peak) where the gray value is at the camera's limit.
+        Share of the spot's bright area (above half its peak) where the gray value is at the
+        camera's limit.
     clipped_share : float [1]
-        The same where at least one colour is: such light still raises the gray value, but less than in proportion.
+        The same where at least one colour is at the limit. More light still increases the gray
+        value there, but less than in proportion.
     cut_share : float [1]
-        Estimated share of the spot's energy that falls beside the target.
+        Estimated share of the spot's energy that misses the target.
     signal_to_background : float [1]
-        The spot's peak over the target's own brightness there; on separated flux, over the mean level off the spot.
+        The spot's peak divided by the target's brightness there. For separated flux, the divisor is
+        the mean level off the spot.
     energy_outside_window : float [1]
-        Share of the spot's energy that the centred window leaves out.
+        Share of the spot's energy outside of the centered window.
     second_spot_share : float [1]
-        Energy of other spots on the target over the energy of all.
+        Energy of other spots on the target, divided by the energy of all.
     signal_to_noise : float [1]
-        The spot's peak over the deviation of the smoothed background.
+        The spot's peak divided by the deviation of the smoothed background.
     spot_area_share : float [1]
-        Area of the spot with its wings over the target's area.
+        Area of the spot with its wings, divided by the target's area.
     sheet_share : float [1]
-        Share of the flux that the sheet's own pattern, as it is seen off the spot, moves about within it.
+        Share of the flux that the sheet's pattern displaces within the spot, estimated from the
+        pattern off the spot.
     """
 
     accepted: bool
@@ -109,15 +127,18 @@ class Quality:
 
 
 def judge(
-    parts: Separation, saturated: NDArray[np.bool_], clipped: NDArray[np.bool_], energy_outside_window: float
+    parts: Separation,
+    saturated: NDArray[np.bool_],
+    clipped: NDArray[np.bool_],
+    energy_outside_window: float,
 ) -> Quality:
-    """The quality of a separated image, and its refusal if a limit is passed.
+    """Compute the quality of a separated image; reject it if a limit is exceeded.
 
     Parameters
     ----------
     parts : Separation
     saturated, clipped : bool (rows, columns)
-        Where the gray value, and where at least one colour, was at the camera's limit.
+        Pixels with the gray value, and with at least one colour, at the camera's limit.
     energy_outside_window : float [1]
     """
     if not parts.main.any():
@@ -137,13 +158,15 @@ def judge(
         spot_area_share=area,
         sheet_share=_sheet_share(parts),
     )
-    if contrast < _LEAST_CONTRAST or certainty < _LEAST_CERTAINTY or area < _LEAST_AREA:
-        return _refuse(quality, "low_signal" if certainty > _CERTAIN and area > _LEAST_AREA else "no_spot")
+    if contrast < _MIN_CONTRAST or certainty < _MIN_CERTAINTY or area < _MIN_AREA:
+        return _refuse(
+            quality, "low_signal" if certainty > _CERTAIN and area > _MIN_AREA else "no_spot"
+        )
     return _limited(quality)
 
 
 def _limited(quality: Quality) -> Quality:
-    """The same, or refused for the first figure that passes its limit."""
+    """The same quality, or a rejection for the first measure that exceeds its limit."""
     limits = (
         ("saturated", quality.saturated_share > _LIMIT_SATURATED),
         ("cut", quality.cut_share > _LIMIT_CUT),
@@ -160,12 +183,14 @@ def _refuse(quality: Quality, reason: str) -> Quality:
 
 
 def refused(reason: str, detail: str | None = None) -> Quality:
-    """A refusal with its remedy, of an image of which nothing was measured."""
+    """A rejection with its remedy, for an image without measurements."""
     return Quality(accepted=False, reason=reason, detail=detail or _REMEDY[reason])
 
 
-def judge_flux(flux: NDArray[np.floating], main: NDArray[np.bool_], outside: float, second: float) -> Quality:
-    """The quality of an image whose background was already removed (rows, columns)."""
+def judge_flux(
+    flux: NDArray[np.floating], main: NDArray[np.bool_], outside: float, second: float
+) -> Quality:
+    """The quality of an image (rows, columns) whose background was already removed."""
     peak = float(flux.max())
     if peak <= 0 or not main.any():
         return refused("no_spot")
@@ -184,23 +209,31 @@ def judge_flux(flux: NDArray[np.floating], main: NDArray[np.bool_], outside: flo
 
 
 def _second_share(parts: Separation) -> float:
-    """Energy of the other spots over the energy of all."""
+    """Energy of the other spots, divided by the energy of all."""
     signal = np.maximum(parts.smooth, 0)
     others = float(signal[parts.foreign].sum())
     return others / max(others + float(signal[parts.main].sum()), 1e-9)
 
 
 def _sheet_share(parts: Separation) -> float:
-    """Mean error of the flux over its mean, of a sheet that is as uneven under the spot as it is elsewhere.
+    """Mean error of the flux relative to its mean, caused by an uneven sheet.
 
-    Stains and seams reflect the spot's light as they do the daylight; unevenness is taken for normally distributed.
+    The sheet is assumed to be as uneven under the spot as elsewhere. Stains and seams reflect the
+    spot's light in the same way as daylight. The unevenness is assumed to be normally distributed.
     """
     off = ~(parts.main | parts.foreign)
     if not off.any():
         return 0.0
-    uneven = 1.4826 * float(np.median(np.abs(parts.smooth[off] / np.maximum(parts.background[off], 1.0))))
+    uneven = 1.4826 * float(
+        np.median(np.abs(parts.smooth[off] / np.maximum(parts.background[off], 1.0)))
+    )
     light = float((parts.flux + parts.background)[parts.main].sum(dtype=np.float64))
-    return float((2 / np.pi) ** 0.5) * uneven * light / max(float(parts.flux.sum(dtype=np.float64)), 1e-9)
+    return (
+        float((2 / np.pi) ** 0.5)
+        * uneven
+        * light
+        / max(float(parts.flux.sum(dtype=np.float64)), 1e-9)
+    )
 
 
 def _bright_share(
@@ -211,10 +244,11 @@ def _bright_share(
 
 
 def _cut_share(flux: NDArray[np.floating]) -> float:
-    """Energy beyond the image's edges over all energy, by continuing each row and column exponentially.
+    """Estimated share of the energy beyond the image's edges.
 
-    A profile of edge value e and inward slope g goes on with the area e^2 / g; it is at most that of the spot's radius,
-    for a profile that does not fall towards the edge at all.
+    Each row and column is extrapolated exponentially. A profile with edge value e and inward slope
+    g continues with the area e^2 / g. If a profile does not fall towards the edge, the spot's
+    radius limits its extension.
     """
     radius = float(np.sqrt((flux > 0.5 * flux.max()).sum() / np.pi))
     depth = max(4, round(0.5 * radius))

@@ -1,14 +1,15 @@
-"""From a camera frame to the target seen straight on: which marks are the target's, and the homography through them.
+"""Rectify a camera frame: select the target's marks, and fit the homography through them.
 
-Where a target's marks stand is data, a `Layout`: a bracket at each corner unless the plant says otherwise, as it must
-where marks serve several targets that share an edge. Four marks give a homography as a hypothesis; it must be plausible
-(convex, the right aspect, arms along the edges) and is scored by all marks of the layout that agree with it.
+The positions of a target's marks are a `Layout`. The default is a bracket at each corner. Plants
+where marks serve several targets with a common edge have other layouts. Four marks give a
+homography as a hypothesis. It must be plausible (convex, the right aspect ratio, arms along the
+edges), and its score is from all marks of the layout that agree with it.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations, product
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -22,16 +23,20 @@ CROP_SIZE = 256
 
 Pixel = TypeVar("Pixel", np.uint8, np.float32)
 
-_CANDIDATES = 4  # marks of one kind and attitude that are tried for one place
-_ASPECT_TOLERANCE = 0.35  # of the natural logarithm; a view from the side shortens the width
+_CANDIDATES = 4  # marks of one kind and orientation that are tried for one position
+_ASPECT_TOLERANCE = 0.35  # of the natural logarithm; an oblique view shortens the width
 _ARM_TOLERANCE_DEG = 14.0
 _MIN_ARM_RATIO, _MAX_ARM_RATIO = 0.03, 0.35  # arm to the target's side
-_AGREEMENT = 0.35  # of an arm: how far a mark may lie from where the homography puts it
+_AGREEMENT = 0.35  # largest distance of a mark from its predicted position, relative to an arm
 
 
 @dataclass(frozen=True)
 class MarkPlace:
-    """Where a mark stands on the plane: kind, quarter turns (see `Mark`), and x right and y down in target sides."""
+    """Position of a mark on the plane.
+
+    ``kind`` and ``quarter`` (quarter turns) are as in `Mark`; ``x`` (right) and ``y`` (down) are in
+    target sides.
+    """
 
     kind: Kind
     quarter: int
@@ -40,10 +45,18 @@ class MarkPlace:
 
 
 Layout = tuple[MarkPlace, ...]
-"""The marks of a target; the first four are those of its corners: upper left, upper right, lower left, lower right."""
+"""The marks of a target.
 
-BRACKETS: Layout = (MarkPlace("L", 0, 0, 0), MarkPlace("L", 1, 1, 0), MarkPlace("L", 3, 0, 1), MarkPlace("L", 2, 1, 1))
-"""A target by itself: an L bracket at each corner."""
+The first four are those of its corners: upper left, upper right, lower left, lower right.
+"""
+
+BRACKETS: Layout = (
+    MarkPlace("L", 0, 0, 0),
+    MarkPlace("L", 1, 1, 0),
+    MarkPlace("L", 3, 0, 1),
+    MarkPlace("L", 2, 1, 1),
+)
+"""A separate target: an L bracket at each corner."""
 
 _SQUARE = np.array([[place.x, place.y] for place in BRACKETS], dtype=np.float64)
 
@@ -54,23 +67,25 @@ def find_corners(
     layouts: Sequence[Layout] = (BRACKETS,),
     light: NDArray[np.float32] | None = None,
 ) -> Points:
-    """The target's corners in a camera frame, by its marks.
+    """Find the target's corners in a camera frame, by its marks.
 
     Parameters
     ----------
     gray : uint8 (rows, columns)
-        Counts, in which marks are told from what is no mark.
+        Counts, for the detection of marks.
     plane : TargetPlane
-        Its aspect tells it from other targets in the frame.
+        Its aspect ratio distinguishes it from other targets in the frame.
     layouts : sequence of Layout
-        Those to try, in order.
+        Layouts to try, in order.
     light : float32 (rows, columns), optional
-        The same in light, in which edges lie where they are: a lens blurs light, and a curve moves the middle of that.
+        The same image in light, for the positions of edges. A lens blurs light, and a response
+        curve moves the middle of a blurred edge.
 
     Returns
     -------
     ndarray (4, 2) [px]
-        x, y of the upper left, upper right, lower left and lower right corner; pixel centres are integers.
+        x, y of the upper left, upper right, lower left and lower right corner; pixel centres are
+        integers.
 
     Raises
     ------
@@ -89,24 +104,25 @@ def find_corners(
 
 
 def check_corners(corners: ArrayLike) -> Points:
-    """Configured corners as a (4, 2) array [px].
+    """Validate configured corners and return them as a (4, 2) array [px].
 
     Raises
     ------
     InvalidInputError
-        If they are not four finite points of a convex quadrilateral in the order upper left, upper right, lower left,
-        lower right.
+        If they are not four finite points of a convex quadrilateral in the order upper left, upper
+        right, lower left, lower right.
     """
     points = np.asarray(corners, dtype=np.float64)
     if points.shape != (4, 2) or not np.isfinite(points).all() or _smallest_turn(points) <= 1.0:
         raise InvalidInputError(
-            "corners must be four points (x, y) in pixels: upper left, upper right, lower left, lower right"
+            "corners must be four points (x, y) in pixels: upper left, upper right, lower left,"
+            " lower right"
         )
     return points
 
 
 def rectify(image: NDArray[Pixel], corners: Points, size: int = CROP_SIZE) -> NDArray[Pixel]:
-    """The target seen straight on.
+    """Warp an image to the rectified target.
 
     Parameters
     ----------
@@ -114,35 +130,50 @@ def rectify(image: NDArray[Pixel], corners: Points, size: int = CROP_SIZE) -> ND
     corners : (4, 2) [px]
         See `find_corners`.
     size : int
-        Pixels on a side of the result, whose outer edges are the target's.
+        Pixels per side of the result, whose outer edges are the target's.
 
     Returns
     -------
     ndarray (size, size) or (size, size, 3)
-        Each pixel the mean over the area that it covers: it is sampled finely and averaged.
+        Each pixel is the mean over its area, computed by fine sampling and averaging.
     """
-    longest = max(np.linalg.norm(corners[a] - corners[b]) for a, b in ((0, 1), (2, 3), (0, 2), (1, 3)))
+    longest = max(
+        np.linalg.norm(corners[a] - corners[b]) for a, b in ((0, 1), (2, 3), (0, 2), (1, 3))
+    )
     factor = int(np.clip(np.ceil(longest / size), 1, 8))
     fine = size * factor
     edge = np.array([[0, 0], [fine, 0], [0, fine], [fine, fine]], dtype=np.float64) - 0.5
     transform = cv2.getPerspectiveTransform(corners.astype(np.float32), edge.astype(np.float32))
     warped = cv2.warpPerspective(image, transform, (fine, fine), flags=cv2.INTER_LINEAR)
-    return np.asarray(cv2.resize(warped, (size, size), interpolation=cv2.INTER_AREA), dtype=image.dtype)
+    return np.asarray(
+        cv2.resize(warped, (size, size), interpolation=cv2.INTER_AREA), dtype=image.dtype
+    )
 
 
 def _fit_layout(marks: list[Mark], layout: Layout, plane: TargetPlane) -> Points | None:
-    """The corners by the best agreeing set of marks, or None."""
+    """The corners by the set of marks with the best agreement, or None."""
     candidates = [
-        [mark for mark in marks if (mark.kind, mark.quarter) == (place.kind, place.quarter)][:_CANDIDATES]
+        [mark for mark in marks if (mark.kind, mark.quarter) == (place.kind, place.quarter)][
+            :_CANDIDATES
+        ]
         for place in layout
     ]
     own = _best_of(((0, 1, 2, 3),), layout, candidates, plane)
     if own is not None:
         return own
-    # A corner's mark is hidden: by other marks of the layout, or else by its neighbours' arms.
-    others = tuple(places for places in combinations(range(len(layout)), 4) if places != (0, 1, 2, 3))
+    # A corner's mark is hidden. Use other marks of the layout, or else its neighbours' arms.
+    others = tuple(
+        places for places in combinations(range(len(layout)), 4) if places != (0, 1, 2, 3)
+    )
     fitted = _best_of(others, layout, candidates, plane)
     return fitted if fitted is not None else _best_completed(layout, candidates, plane)
+
+
+class _ScoredCorners(NamedTuple):
+    """Corners (4, 2) [px], and the sum of the scores of consistent marks."""
+
+    score: float
+    corners: Points
 
 
 def _best_of(
@@ -151,22 +182,27 @@ def _best_of(
     candidates: list[list[Mark]],
     plane: TargetPlane,
 ) -> Points | None:
-    """The corners by the best agreeing four marks, out of the given sets of places."""
-    best: tuple[float, Points] | None = None
+    """The corners by the four marks with the best agreement, from the given sets of positions."""
+    best: _ScoredCorners | None = None
     for places in sets:
         source = np.array([[layout[i].x, layout[i].y] for i in places], dtype=np.float64)
         if _spread(source) < 0.2:
             continue
         for chosen in product(*(candidates[i] for i in places)):
             fitted = _fit_four(source, list(chosen), layout, candidates, plane)
-            if fitted is not None and (best is None or fitted[0] > best[0]):
+            if fitted is not None and (best is None or fitted.score > best.score):
                 best = fitted
-    return None if best is None else best[1]
+    return None if best is None else best.corners
 
 
-def _best_completed(layout: Layout, candidates: list[list[Mark]], plane: TargetPlane) -> Points | None:
-    """The corners by the best agreeing three corner marks, the fourth put where its neighbours' arms meet."""
-    best: tuple[float, Points] | None = None
+def _best_completed(
+    layout: Layout, candidates: list[list[Mark]], plane: TargetPlane
+) -> Points | None:
+    """The corners by the three corner marks with the best agreement.
+
+    The fourth corner is the intersection of its neighbours' arms.
+    """
+    best: _ScoredCorners | None = None
     for hidden in range(4):
         opposite = 3 - hidden
         first, second = (i for i in range(4) if i not in (hidden, opposite))
@@ -176,36 +212,46 @@ def _best_completed(layout: Layout, candidates: list[list[Mark]], plane: TargetP
                 continue
             chosen = {hidden: guess, opposite: across, first: a, second: b}
             fitted = _fit_four(_SQUARE, [chosen[i] for i in range(4)], layout, candidates, plane)
-            if fitted is not None and (best is None or fitted[0] > best[0]):
+            if fitted is not None and (best is None or fitted.score > best.score):
                 best = fitted
-    return None if best is None else best[1]
+    return None if best is None else best.corners
 
 
 def _meeting(opposite: Mark, first: Mark, second: Mark) -> Mark | None:
-    """The corner where the arms of two marks meet that do not point to the opposite corner."""
+    """The corner where two marks' arms intersect, except the arms towards ``opposite``."""
     arms = []
     for mark in (first, second):
-        toward = [float(arm @ (opposite.point - mark.point)) / float(np.linalg.norm(arm)) for arm in mark.arms]
+        toward = [
+            float(arm @ (opposite.point - mark.point)) / float(np.linalg.norm(arm))
+            for arm in mark.arms
+        ]
         arms.append(mark.arms[int(np.argmin(toward))])
     point = intersection((first.point, arms[0]), (second.point, arms[1]))
-    return None if point is None else Mark("L", (opposite.quarter + 2) % 4, point, -opposite.arms, 0.0)
+    return (
+        None if point is None else Mark("L", (opposite.quarter + 2) % 4, point, -opposite.arms, 0.0)
+    )
 
 
 def _spread(points: Points) -> float:
-    """Twice the smallest area of a triangle among four points: zero where three lie in line."""
+    """Twice the smallest triangle area among four points; zero if three are collinear."""
     return min(abs(_cross(b - a, c - a)) for a, b, c in combinations(points, 3))
 
 
 def _fit_four(
-    source: Points, chosen: list[Mark], layout: Layout, candidates: list[list[Mark]], plane: TargetPlane
-) -> tuple[float, Points] | None:
-    """Score and corners of the homography through four marks, or None if it is implausible."""
+    source: Points,
+    chosen: list[Mark],
+    layout: Layout,
+    candidates: list[list[Mark]],
+    plane: TargetPlane,
+) -> _ScoredCorners | None:
+    """Fit a homography through four marks; None if it is implausible."""
     sizes = np.array([mark.size for mark in chosen])
     if sizes.max() > 1.8 * sizes.min():
         return None
     points = np.array([mark.point for mark in chosen])
     transform = np.asarray(
-        cv2.getPerspectiveTransform(source.astype(np.float32), points.astype(np.float32)), dtype=np.float64
+        cv2.getPerspectiveTransform(source.astype(np.float32), points.astype(np.float32)),
+        dtype=np.float64,
     )
     corners = _project(transform, _SQUARE)
     if not _plausible(corners, sizes, plane) or not all(
@@ -213,11 +259,14 @@ def _fit_four(
     ):
         return None
     agreeing = _agreeing(transform, layout, candidates, float(sizes.mean()))
-    return sum(mark.score for mark in agreeing.values()), _settled(corners, agreeing, layout)
+    score = sum(mark.score for mark in agreeing.values())
+    return _ScoredCorners(score, _settled(corners, agreeing, layout))
 
 
-def _agreeing(transform: Points, layout: Layout, candidates: list[list[Mark]], size: float) -> dict[int, Mark]:
-    """The best mark near where the homography puts it, by place."""
+def _agreeing(
+    transform: Points, layout: Layout, candidates: list[list[Mark]], size: float
+) -> dict[int, Mark]:
+    """The best mark near each position that the homography predicts, by index in the layout."""
     found = {}
     for index, (place, marks) in enumerate(zip(layout, candidates, strict=True)):
         expected = _project(transform, np.array([[place.x, place.y]]))[0]
@@ -228,7 +277,7 @@ def _agreeing(transform: Points, layout: Layout, candidates: list[list[Mark]], s
 
 
 def _settled(corners: Points, agreeing: dict[int, Mark], layout: Layout) -> Points:
-    """The corners: measured where their mark is seen, else by the homography through all agreeing marks."""
+    """The corners: measured if their mark is visible, else by the homography through all marks."""
     if len(agreeing) > 4:
         source = np.array([[layout[i].x, layout[i].y] for i in agreeing], dtype=np.float64)
         points = np.array([mark.point for mark in agreeing.values()])
@@ -238,7 +287,7 @@ def _settled(corners: Points, agreeing: dict[int, Mark], layout: Layout) -> Poin
 
 
 def _project(transform: Points, points: Points) -> Points:
-    """Points (n, 2) through a homography (3, 3)."""
+    """Project points (n, 2) by a homography (3, 3)."""
     mapped = points @ transform[:, :2].T + transform[:, 2]
     return np.asarray(mapped[:, :2] / mapped[:, 2:], dtype=np.float64)
 
@@ -248,18 +297,24 @@ def _cross(a: Points, b: Points) -> float:
 
 
 def _smallest_turn(corners: Points) -> float:
-    """Smallest cross product of successive edges, around upper left, upper right, lower right, lower left."""
+    """Smallest cross product of successive edges.
+
+    The order is upper left, upper right, lower right, lower left.
+    """
     ring = corners[[0, 1, 3, 2]]
     edges = np.roll(ring, -1, axis=0) - ring
     return min(_cross(a, b) for a, b in zip(edges, np.roll(edges, -1, axis=0), strict=True))
 
 
 def _plausible(corners: Points, sizes: Points, plane: TargetPlane) -> bool:
-    """Whether a quadrilateral can be the photograph of this target with these marks."""
+    """Check if a quadrilateral can be the photograph of this target with these marks."""
     top, bottom, left, right = (
         float(np.linalg.norm(corners[b] - corners[a])) for a, b in ((0, 1), (2, 3), (0, 2), (1, 3))
     )
-    if _smallest_turn(corners) <= 0 or max(top / bottom, bottom / top, left / right, right / left) > 1.6:
+    if (
+        _smallest_turn(corners) <= 0
+        or max(top / bottom, bottom / top, left / right, right / left) > 1.6
+    ):
         return False
     aspect = np.log((top + bottom) / (left + right)) - np.log(plane.width / plane.height)
     arm = sizes.mean() / ((top + bottom + left + right) / 4)
@@ -267,9 +322,12 @@ def _plausible(corners: Points, sizes: Points, plane: TargetPlane) -> bool:
 
 
 def _arms_agree(transform: Points, mark: Mark, place: Points) -> bool:
-    """Whether a mark's arms point along the target's edges as the homography draws them there."""
+    """Check if a mark's arms point along the target's edges according to the homography."""
     quarter = mark.quarter * np.pi / 2
-    along = np.array([np.cos(quarter), np.sin(quarter)]), np.array([-np.sin(quarter), np.cos(quarter)])
+    along = (
+        np.array([np.cos(quarter), np.sin(quarter)]),
+        np.array([-np.sin(quarter), np.cos(quarter)]),
+    )
     base = _project(transform, place[None])[0]
     for arm, direction in zip(mark.arms, along, strict=True):
         edge = _project(transform, (place + 0.1 * direction)[None])[0] - base

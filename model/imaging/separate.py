@@ -1,11 +1,12 @@
-"""Separating the heliostat's spot from the target that it falls on, in light (`model.imaging.light`).
+"""Separate the heliostat's spot from the target, in light (`model.imaging.light`).
 
-Light = that of the sheet by day + flux. The sheet's is fitted as a smooth surface to the pixels off the spot, after
-dark lines, rivets and marks were bridged, and subtracted. What remains is kept where it belongs to the main spot; its
-faint wings fade out softly, for a hard mask would cut them.
+The image is the sheet in daylight plus the flux. Dark lines, rivets and marks are filled first. A
+smooth surface is fitted to the pixels off the spot, and subtracted. The remaining signal of the
+main spot is kept. Its faint wings fade out softly, because a hard mask would truncate them.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -19,22 +20,23 @@ _MARK_WIDTH = 41  # ... and up to this width marks
 _LINE_FLANK = 3  # [px] by which lines are widened, for their blurred flanks
 _LINE_DARKNESS, _MARK_DARKNESS = 0.03, 0.15  # relative to the surroundings
 _GRAIN = 1.5  # [px] smoothing of the flux itself, far below the width of the sun's image
-_SMOOTHING = 2.0  # [px] of the map on which the spot is told from noise
+_SMOOTHING = 2.0  # [px] smoothing of the map that separates spots from noise
 _ROUNDS = 12
-_STRIDE = 4  # [px] of the pixels to which the surface is fitted
+_STRIDE = 4  # [px] step of the pixels for the fit of the surface
 _SPOT_LEVEL = 3.0  # noise deviations above which a pixel may belong to a spot
 _WING_SHARE = 0.01  # ... and share of the peak
-_CUTS = (0.15, 0.2, 0.3, 0.4, 0.5, 0.6)  # shares of the peak: a core begins at the first, for daylight is uneven
-_VALLEY = 0.6  # of the lower peak: a deeper valley parts two spots
-_WING_REACH = 0.8  # how far wings reach out of the core, in its mean radius
-_MARGIN = 0.25  # added around it, for the light below the noise, likewise
-_TENDRIL = 9  # [px] width up to which a bright streak at a spot is the sheet's
+# Shares of the peak; the first is the start of a core, because daylight is uneven.
+_CUTS = (0.15, 0.2, 0.3, 0.4, 0.5, 0.6)
+_VALLEY = 0.6  # of the lower peak: a deeper valley separates two spots
+_WING_REACH = 0.8  # reach of wings beyond the core, relative to its mean radius
+_MARGIN = 0.25  # margin around it for the light below the noise, in the same unit
+_TENDRIL = 9  # [px] width up to which a bright streak at a spot belongs to the sheet
 _MIN_AREA = 40  # [px] of a spot
 
 
 @dataclass(frozen=True, eq=False)
 class Separation:
-    """A rectified image taken apart.
+    """The parts of a rectified image.
 
     Attributes
     ----------
@@ -42,9 +44,9 @@ class Separation:
         The main spot's flux, zero elsewhere.
     background : float32 (rows, columns) [light]
     smooth : float32 (rows, columns) [light]
-        The whole signal, smoothed: all spots.
+        The whole smoothed signal with all spots.
     main, foreign : bool (rows, columns)
-        Where the main spot lies, and where others lie.
+        Pixels of the main spot, and of other spots.
     noise : float [light]
         Deviation of ``smooth`` off the spots.
     """
@@ -57,50 +59,73 @@ class Separation:
     noise: float
 
 
-def separate(crop: Image, empty: Image | None = None) -> Separation:
-    """The spot on a rectified image (rows, columns), given optionally the same target without light.
-
-    Both in light, 255 the largest that the camera can tell.
-
-    An empty reference carries the sheet's own pattern; it is scaled by a smooth surface to the image's illumination.
-    """
+def separate(crop: Image) -> Separation:
+    """Separate the spot on a rectified image (rows, columns), with 255 as the camera's maximum."""
     bridged, hidden = bridge_dark_features(crop)
-    reference = np.ones_like(bridged) if empty is None else _pattern(empty)
-    # Only the pattern is divided out: the flux on a dull panel is dimmed by the same reflectance as the daylight.
-    even = _blurred(bridged / reference, _GRAIN)
+    even = _blurred(bridged, _GRAIN)
     surface = fit_background(even, hidden)
-    rough, noise, main, foreign = _tell_spots(even, surface, hidden)
-    if main.any():
-        # The first surface only had to find the spots; the second is fitted to all that is off them.
-        surface = _polynomial(even, ~(main | foreign | hidden))
-        rough, noise, main, foreign = _tell_spots(even, surface, hidden)
-    background = surface + _bridge_over(rough, main | foreign)
+    signal = _signal(even, surface, hidden)
+    if signal.spots.main.any():
+        # The first surface only finds the spots; the second is fitted to all pixels off them.
+        surface = _polynomial(even, ~(signal.spots.main | signal.spots.foreign | hidden))
+        signal = _signal(even, surface, hidden)
+    main, foreign = signal.spots
+    background = surface + _bridge_over(signal.smooth, main | foreign)
     flux = np.maximum(even - background, 0) * _feathered(main, foreign)
     return Separation(
-        flux.astype(np.float32), background.astype(np.float32), np.asarray(rough, np.float32), main, foreign, noise
+        flux.astype(np.float32),
+        background.astype(np.float32),
+        np.asarray(signal.smooth, np.float32),
+        main,
+        foreign,
+        signal.noise,
     )
 
 
-def _tell_spots(even: Image, surface: Image, hidden: Mask) -> tuple[Image, float, Mask, Mask]:
-    """The smoothed signal over a surface, its noise, and the masks of the main and the foreign spots."""
-    rough = _blurred(even - surface, _SMOOTHING)
-    noise = _noise(rough, hidden)
-    return rough, noise, *find_spots(rough, noise)
+class Spots(NamedTuple):
+    """Masks of the main spot and of the other spots (rows, columns)."""
+
+    main: Mask
+    foreign: Mask
+
+
+class _Signal(NamedTuple):
+    """The smoothed signal above a surface, its noise, and its spots."""
+
+    smooth: Image
+    noise: float
+    spots: Spots
+
+
+def _signal(even: Image, surface: Image, hidden: Mask) -> _Signal:
+    smooth = _blurred(even - surface, _SMOOTHING)
+    noise = _noise(smooth, hidden)
+    return _Signal(smooth, noise, find_spots(smooth, noise))
 
 
 def _blurred(image: NDArray[np.floating], sigma: float) -> Image:
     return np.asarray(cv2.GaussianBlur(image.astype(np.float32), (0, 0), sigma), dtype=np.float32)
 
 
-def bridge_dark_features(crop: Image) -> tuple[Image, Mask]:
-    """The image with dark lines, rivets and marks filled from their surroundings, and the mask of the marks."""
+class BridgedImage(NamedTuple):
+    """An image with filled dark features, and the mask of its marks."""
+
+    image: Image
+    marks: Mask
+
+
+def bridge_dark_features(crop: Image) -> BridgedImage:
+    """Fill dark lines, rivets and marks from their surroundings."""
     gray = crop.astype(np.float32)
-    # Marks are darker than the sheet itself; a gap between two spots, or a spot and the edge, is only darker than they.
+    # Marks are darker than the sheet. A gap between two spots, or between a spot and the edge, is
+    # only darker than the spots.
     sheet = fit_background(gray, np.zeros(gray.shape, bool))
     hidden = _dark(gray, _MARK_WIDTH, _MARK_DARKNESS) & (gray < (1 - _MARK_DARKNESS) * sheet)
     hidden = cv2.dilate(hidden.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
-    lines = cv2.dilate(_dark(gray, _LINE_WIDTH, _LINE_DARKNESS).astype(np.uint8), _disc(_LINE_FLANK)).astype(bool)
-    return _fill(gray, hidden | lines), hidden
+    lines = cv2.dilate(
+        _dark(gray, _LINE_WIDTH, _LINE_DARKNESS).astype(np.uint8), _disc(_LINE_FLANK)
+    ).astype(bool)
+    return BridgedImage(_fill(gray, hidden | lines), hidden)
 
 
 def _dark(gray: Image, width: int, darkness: float) -> Mask:
@@ -113,7 +138,7 @@ def _dark(gray: Image, width: int, darkness: float) -> Mask:
 
 
 def _fill(gray: Image, holes: Mask) -> Image:
-    """Holes filled by the mean of their neighbours, weighted by nearness, from fine to coarse."""
+    """Fill holes by the weighted mean of their neighbours, from fine to coarse scales."""
     filled, missing = np.where(holes, 0, gray).astype(np.float32), holes.copy()
     for sigma in (1.0, 2.0, 4.0, 8.0, 16.0):
         weight = _blurred((~holes).astype(np.float32), sigma)
@@ -126,20 +151,16 @@ def _fill(gray: Image, holes: Mask) -> Image:
     return filled
 
 
-def _pattern(empty: Image) -> Image:
-    """The sheet's reflectance relative to its smooth brightness, which is that day's light."""
-    filled, hidden = bridge_dark_features(empty)
-    return np.clip(filled / np.maximum(_polynomial(filled, ~hidden), 1.0), 0.5, 2.0).astype(np.float32)
-
-
 def fit_background(gray: Image, hidden: Mask) -> Image:
-    """The sheet's brightness under and around the spot (rows, columns).
+    """Fit the sheet's brightness under and around the spot (rows, columns).
 
-    A polynomial surface is fitted, in rounds, to the pixels that are not brighter than it by more than noise allows.
-    The less of the sheet is free, the stiffer the surface.
+    A polynomial surface is fitted, in iterations, to the pixels that are not brighter than noise
+    allows. If less of the sheet is free, the surface has a lower degree.
     """
     free = ~hidden
-    surface = np.full(gray.shape, np.median(gray[free]) if free.any() else gray.mean(), dtype=np.float32)
+    surface = np.full(
+        gray.shape, np.median(gray[free]) if free.any() else gray.mean(), dtype=np.float32
+    )
     smooth = _blurred(gray, _SMOOTHING)
     for round_ in range(_ROUNDS):
         residual = smooth - surface
@@ -155,9 +176,10 @@ def fit_background(gray: Image, hidden: Mask) -> Image:
 
 
 def _polynomial(gray: Image, keep: Mask, most: int = 3) -> Image:
-    """The polynomial surface through the kept pixels, of a degree that their share of the sheet supports.
+    """Fit a polynomial surface to the kept pixels.
 
-    Its normal equations are moments of the image, which separate into rows and columns.
+    Its degree depends on their share of the sheet. Its normal equations are moments of the image,
+    which separate into rows and columns.
     """
     share = keep.mean()
     degree = min(3 if share > 0.35 else 2 if share > 0.15 else 1, most)
@@ -165,7 +187,9 @@ def _polynomial(gray: Image, keep: Mask, most: int = 3) -> Image:
     weight = keep[::_STRIDE, ::_STRIDE].astype(np.float64)
     if weight.sum() < 64:
         return np.full(gray.shape, float(np.percentile(gray, 20)), dtype=np.float32)
-    y_powers, x_powers = (np.vander(axis[::_STRIDE], 2 * degree + 1, increasing=True) for axis in (y, x))
+    y_powers, x_powers = (
+        np.vander(axis[::_STRIDE], 2 * degree + 1, increasing=True) for axis in (y, x)
+    )
     moments = y_powers.T @ weight @ x_powers
     right = y_powers.T @ (weight * gray[::_STRIDE, ::_STRIDE]) @ x_powers
     terms = [(j, i) for j in range(degree + 1) for i in range(degree + 1 - j)]
@@ -178,10 +202,10 @@ def _polynomial(gray: Image, keep: Mask, most: int = 3) -> Image:
 
 
 def _bridge_over(residual: Image, spots: Mask) -> Image:
-    """What remains of the sheet's brightness off the spots, carried smoothly across them.
+    """Interpolate the remaining brightness of the sheet smoothly across the spots.
 
-    It follows shadow edges and glare outside; under a spot it is the smoothest interpolation
-    that push-pull gives: averages over ever larger cells, from coarse to fine (Gortler et al. 1996, The Lumigraph).
+    Outside, it follows shadow edges and glare. Under a spot it is a push-pull interpolation:
+    averages over increasing cells, then from coarse to fine (Gortler et al. 1996, The Lumigraph).
     """
     known = (~spots).astype(np.float32)
     return _blurred(_push_pull(residual * known, known), _SMOOTHING)
@@ -189,42 +213,47 @@ def _bridge_over(residual: Image, spots: Mask) -> Image:
 
 def _push_pull(weighted: Image, weight: Image) -> Image:
     if min(weight.shape) <= 2:
-        return np.full(weight.shape, weighted.sum() / max(float(weight.sum()), 1e-6), dtype=np.float32)
+        return np.full(
+            weight.shape, weighted.sum() / max(float(weight.sum()), 1e-6), dtype=np.float32
+        )
     halved = (np.asarray(cv2.pyrDown(image), dtype=np.float32) for image in (weighted, weight))
     coarse = _push_pull(*halved)
     spread = cv2.pyrUp(coarse, dstsize=(weight.shape[1], weight.shape[0]))
     sure = np.minimum(weight, 1.0)
-    return np.where(weight > 0, sure * weighted / np.maximum(weight, 1e-6) + (1 - sure) * spread, spread)
+    return np.where(
+        weight > 0, sure * weighted / np.maximum(weight, 1e-6) + (1 - sure) * spread, spread
+    )
 
 
 def _noise(smooth: Image, hidden: Mask) -> float:
-    """Deviation of a map about zero, by its lower half: spots only add."""
+    """Deviation of a map about zero, from its lower half, because spots only add."""
     below = smooth[~hidden & (smooth < 0)]
     return max(float(1.4826 * np.median(-below)) if below.size else 0.0, 0.25)
 
 
-def find_spots(smooth: Image, noise: float) -> tuple[Mask, Mask]:
-    """Masks of the main spot, the one with the most energy, and of the others (rows, columns), of a smoothed signal.
+def find_spots(smooth: Image, noise: float) -> Spots:
+    """Find the spots in a smoothed signal.
 
-    A spot starts from its core and takes in the wings around it, so that a sunlit patch that touches the wings is not
-    taken for light of the spot.
+    The main spot has the most energy. A spot is a core and the wings around it, so that a sunlit
+    patch next to the wings does not count as its light.
     """
     cores = _cores(smooth, noise)
     if not cores:
-        return np.zeros(smooth.shape, bool), np.zeros(smooth.shape, bool)
+        return Spots(*np.zeros((2, *smooth.shape), bool))
     level = max(_SPOT_LEVEL * noise, _WING_SHARE * float(smooth.max()))
     regions = _nearest(cores)
     masks = [_with_wings(smooth > level, core, regions == i) for i, core in enumerate(cores)]
     energies = [float(smooth[mask].sum()) for mask in masks]
     main = masks[int(np.argmax(energies))]
-    return main, np.any(masks, axis=0) & ~main
+    return Spots(main, np.any(masks, axis=0) & ~main)
 
 
 def _cores(smooth: Image, noise: float) -> list[Mask]:
-    """The spots' bright cores.
+    """The bright cores of the spots.
 
-    The signal is cut at rising levels. A core that falls apart into peaks that rise well above the cut is several spots
-    that overlap; shallower valleys are the facets' images of one heliostat.
+    The signal is thresholded at increasing levels. If a core splits into peaks well above the
+    level, it is several overlapping spots. Shallower valleys are between the facets' images of one
+    heliostat.
     """
     cores = [np.ones(smooth.shape, bool)]
     for share in _CUTS:
@@ -242,15 +271,19 @@ def _cores(smooth: Image, noise: float) -> list[Mask]:
 
 
 def _peaks_above(smooth: Image, core: Mask, level: float) -> list[Mask]:
-    """The connected parts of a core above a level that are large enough and rise well above it."""
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(((smooth > level) & core).astype(np.uint8), connectivity=8)
+    """The connected parts of a core that are large enough and rise well above a level."""
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(
+        ((smooth > level) & core).astype(np.uint8), connectivity=8
+    )
     parts = [labels == i for i in range(1, len(stats)) if stats[i, cv2.CC_STAT_AREA] >= _MIN_AREA]
     return [part for part in parts if level < _VALLEY * float(smooth[part].max())]
 
 
 def _nearest(shapes: list[Mask]) -> NDArray[np.int32]:
-    """Every pixel's nearest shape, by its index."""
-    distances = [cv2.distanceTransform((~shape).astype(np.uint8), cv2.DIST_L2, 5) for shape in shapes]
+    """The index of every pixel's nearest shape."""
+    distances = [
+        cv2.distanceTransform((~shape).astype(np.uint8), cv2.DIST_L2, 5) for shape in shapes
+    ]
     return np.asarray(np.argmin(distances, axis=0), dtype=np.int32)
 
 
@@ -258,16 +291,20 @@ def _with_wings(bright: Mask, core: Mask, region: Mask) -> Mask:
     """A core with the bright pixels around it."""
     distance = cv2.distanceTransform((~core).astype(np.uint8), cv2.DIST_L2, 5)
     near = bright & region & (distance < _WING_REACH * _radius(core))
-    # Opening cuts the thin tendrils along seams and wrinkles of the sheet.
+    # Opening removes thin streaks along seams and wrinkles of the sheet.
     compact = cv2.morphologyEx(near.astype(np.uint8), cv2.MORPH_OPEN, _disc(_TENDRIL))
-    _, labels = cv2.connectedComponents((compact.astype(bool) | core).astype(np.uint8), connectivity=8)
+    _, labels = cv2.connectedComponents(
+        (compact.astype(bool) | core).astype(np.uint8), connectivity=8
+    )
     joined = np.isin(labels, np.unique(labels[core])).astype(np.uint8)
     wider = cv2.dilate(joined, _disc(max(3, round(2 * _MARGIN * _radius(core)) | 1))).astype(bool)
     return np.asarray(wider & region)
 
 
 def _disc(diameter: int) -> NDArray[np.uint8]:
-    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (diameter, diameter)), dtype=np.uint8)
+    return np.asarray(
+        cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (diameter, diameter)), dtype=np.uint8
+    )
 
 
 def _radius(mask: Mask) -> float:
@@ -275,7 +312,10 @@ def _radius(mask: Mask) -> float:
 
 
 def _feathered(main: Mask, foreign: Mask, reach: float = 6.0) -> Image:
-    """Weight 1 in the main spot, falling to 0 within a few pixels [px] around it, 0 in other spots."""
+    """Weight 1 in the main spot, falling to 0 around it, and 0 in other spots.
+
+    ``reach`` [px] is the standard deviation of the fall, a Gaussian.
+    """
     if not main.any():
         return np.zeros(main.shape, np.float32)
     distance = cv2.distanceTransform((~main).astype(np.uint8), cv2.DIST_L2, 5)

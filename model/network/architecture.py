@@ -1,16 +1,17 @@
-"""The network: flux images of one heliostat in, its mirror surface out.
+"""The network: from flux images of one heliostat to its mirror surface.
 
-Beside each image it sees what a guess of the surface would throw there, traced, and in which direction the guess would
-have to change for the image to come out as measured; it says how far and where else. The first guess is the mean
-surface; its own answer is the next guess, so that it may look again.
+With each measured image it gets the image traced from a guess of the surface, and a step of the
+guess that would explain the difference. It predicts the correction. The first guess is the mean
+surface; each prediction is the next guess.
 
-Each pair of images passes the same convolutional encoder, is told its geometry and its descent, and becomes one
-vector; a weighted mean makes one vector of any number of images, in any order; a perceptron decodes it into the control
-heights of the facets. Read it from top to bottom.
+One convolutional encoder turns each pair of images, with geometry and step, into a vector. A
+weighted mean pools the vectors of any number of images in any order. A perceptron decodes the
+result into the control heights of the facets.
 
-Source: Lewen et al. 2024, *Inverse Deep Learning Ray Tracing for Heliostat Surface Prediction* (the idea); Zaheer et
-al. 2017, *Deep Sets* (encode one by one, pool, decode); Adler and Oktem 2017, *Solving ill-posed inverse problems using
-iterative deep neural networks* (what to make of a descent is learnt).
+Source: Lewen et al. 2024, *Inverse Deep Learning Ray Tracing for Heliostat Surface Prediction* (the
+idea); Zaheer et al. 2017, *Deep Sets* (encode one by one, pool, decode); Adler and Oktem 2017,
+*Solving ill-posed inverse problems using iterative deep neural networks* (a learnt iteration with
+the gradient as an input).
 """
 
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ from torch.nn import functional
 from model.surface import COLUMNS, FACETS, ROWS
 
 MAX_IMAGES = 8
-"""Images that one prediction takes at the most."""
+"""Largest number of images of a prediction."""
 
 CONDITIONS = 12
 """Numbers that describe the geometry of one image (`model.network.inputs.conditions`)."""
@@ -42,7 +43,7 @@ class NetworkConfig:
 
 
 class EncoderBlock(nn.Module):
-    """Two convolutions with a skip, told the geometry; the first halves the resolution where ``stride`` is two."""
+    """Two convolutions with a skip connection, conditioned on the geometry."""
 
     def __init__(self, inputs: int, outputs: int, stride: int) -> None:
         super().__init__()
@@ -61,21 +62,25 @@ class EncoderBlock(nn.Module):
 
 
 class Encoder(nn.Module):
-    """One flux image, that of the guess and their geometry to a feature vector."""
+    """Encodes a flux image, the guess's image and the geometry as a feature vector."""
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         fine, middle, coarse = config.channels
         self.fold = nn.PixelUnshuffle(4)
         self.blocks = nn.ModuleList(
-            [EncoderBlock(4 * 16, fine, 1), EncoderBlock(fine, middle, 2), EncoderBlock(middle, coarse, 2)]
+            [
+                EncoderBlock(4 * 16, fine, 1),
+                EncoderBlock(fine, middle, 2),
+                EncoderBlock(middle, coarse, 2),
+            ]
         )
         self.to_features = nn.Linear(coarse * 16, config.features)
 
     def forward(self, flux: Tensor, guess_flux: Tensor, conditions: Tensor) -> Tensor:
         """Fluxes (N, 64, 64) of sum 100 and conditions (N, 12) to features (N, features)."""
         x = torch.stack([flux, guess_flux], dim=1)  # (N, 2, 64, 64)
-        # The root brings out the faint wings, where the mirror's edges show.
+        # The root amplifies the faint wings, in which the mirror's edges appear.
         x = torch.cat([x * 8, torch.sqrt(x.clamp(min=0) * 8)], dim=1)  # (N, 4, 64, 64)
         x = self.fold(x)  # (N, 64, 16, 16)
         for block in self.blocks:
@@ -100,9 +105,10 @@ class Perceptron(nn.Module):
 
 
 class Pooling(nn.Module):
-    """One vector of a heliostat's images, a weighted mean; blind to order.
+    """Weighted mean of the images' vectors, independent of their order.
 
-    Each feature has its own weights: one image may tell most of one facet, another of the next.
+    Each feature has separate weights: one image may be informative about one facet, another about
+    the next.
     """
 
     def __init__(self, config: NetworkConfig) -> None:
@@ -120,7 +126,7 @@ class Pooling(nn.Module):
 class SurfaceNetwork(nn.Module):
     """Flux images and a guess to control heights [mm] and the spread of their error [mm].
 
-    ``scale`` [mm] is the unit in which the network thinks of heights.
+    ``scale`` [mm] is the unit of heights inside the network.
     """
 
     def __init__(self, config: NetworkConfig, scale: float = 0.35) -> None:
@@ -132,30 +138,39 @@ class SurfaceNetwork(nn.Module):
         self.pooling = Pooling(config)
         self.norm = nn.LayerNorm(config.features)
         to_heights = nn.Linear(config.hidden, 2 * POINTS)
-        self.decoder = nn.Sequential(nn.Linear(config.features + 2 * POINTS, config.hidden), nn.GELU(), to_heights)
-        # What is nearly linear in the images passes by.
+        self.decoder = nn.Sequential(
+            nn.Linear(config.features + 2 * POINTS, config.hidden), nn.GELU(), to_heights
+        )
+        # A linear path for the part that is nearly linear in the images.
         self.bypass = nn.Linear(config.features + POINTS, POINTS)
-        for last in (to_heights, self.bypass):  # the first answer is the guess
+        for last in (to_heights, self.bypass):  # the initial prediction is the guess
             nn.init.zeros_(last.weight)
             nn.init.zeros_(last.bias)
 
     def forward(
-        self, flux: Tensor, conditions: Tensor, mask: Tensor, guess_flux: Tensor, guess: Tensor, descent: Tensor
+        self,
+        flux: Tensor,
+        conditions: Tensor,
+        mask: Tensor,
+        guess_flux: Tensor,
+        guess: Tensor,
+        descent: Tensor,
     ) -> tuple[Tensor, Tensor]:
         """Predict.
 
         Parameters
         ----------
         flux : Tensor (B, M, 64, 64)
-            4 m x 4 m about the centre of mass, sum 100; anything where there is no image.
+            4 m x 4 m about the centre of mass, sum 100; any values without an image.
         conditions : Tensor (B, M, 12)
         mask : Tensor (B, M)
-            One where there is an image, zero elsewhere.
+            One with an image, zero without.
         guess_flux : Tensor (B, M, 64, 64)
-            What the guessed surface throws there, likewise.
+            Traced from the guess, likewise.
         guess : Tensor (B, 4, 8, 8) [mm]
         descent : Tensor (B, M, 4, 8, 8) [mm]
-            Each image's share in a step from the guess (`model.network.inputs.descents`), zero where there is no image.
+            Each image's share of a step from the guess
+            (`model.network.inputs.conjugate_gradient_steps`), zero without an image.
 
         Returns
         -------
@@ -164,17 +179,21 @@ class SurfaceNetwork(nn.Module):
         """
         shares = descent.flatten(2) / self.scale  # (B, M, points)
         step = shares.sum(dim=1)  # (B, points)
-        alone = shares * mask.sum(dim=1)[:, None, None]  # (B, M, points)
+        scaled = shares * mask.sum(dim=1)[:, None, None]  # (B, M, points)
         each = (images.flatten(0, 1) for images in (flux, guess_flux, conditions))  # (B M, ...)
         features = self.encoder(*each).view(*mask.shape, -1)  # (B, M, features)
-        features = features + self.from_geometry(torch.cat([conditions, alone], dim=2))  # (B, M, features)
+        features = features + self.from_geometry(
+            torch.cat([conditions, scaled], dim=2)
+        )  # (B, M, features)
         pooled = self.norm(self.pooling(self.blocks(features), mask))  # (B, features)
-        known = torch.cat([pooled, guess.flatten(1) / self.scale, step], dim=1)  # (B, features + 2 points)
-        heights, log_spread = self.decoder(known).view(-1, 2, *guess.shape[1:]).unbind(1)  # (B, 4, 8, 8) each
-        heights = heights + self.bypass(torch.cat([pooled, step], dim=1)).view_as(heights)  # (B, 4, 8, 8)
+        known = torch.cat(
+            [pooled, guess.flatten(1) / self.scale, step], dim=1
+        )  # (B, features + 2 points)
+        heights, log_spread = (
+            self.decoder(known).view(-1, 2, *guess.shape[1:]).unbind(1)
+        )  # (B, 4, 8, 8) each
+        heights = heights + self.bypass(torch.cat([pooled, step], dim=1)).view_as(
+            heights
+        )  # (B, 4, 8, 8)
         heights = heights - heights.mean(dim=(2, 3), keepdim=True)
         return guess + self.scale * heights, self.scale * torch.exp(log_spread.clamp(-6, 2))
-
-
-SIZES, NETWORK = NetworkConfig, SurfaceNetwork
-"""The networks that a training may have, by name."""

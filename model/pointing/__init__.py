@@ -1,26 +1,25 @@
-"""Motors and spots to calibrated mounts: their parameters, steps and drift, and where the light lands."""
+"""Calibrate mounts by motors and spots: parameters, steps, drift, and where the light lands."""
 
-from model.pointing.calibration import Field
-from model.pointing.clock import Clock
+from model.pointing.calibration import FieldPrior
+from model.pointing.clock import ClockFault
 from model.pointing.drives import Noise
 from model.pointing.field import FieldMounts, calibrate_field
 from model.pointing.kinematics import PARAMETERS
 from model.pointing.mounts import CalibratedMount, Step
-from model.pointing.readings import Reading, Weather, days_by_order
-from model.pointing.reasons import Contradiction, off_by
+from model.pointing.readings import Reading, Weather
+from model.pointing.reasons import Contradiction, pointing_error
 
 __all__ = [
     "PARAMETERS",
     "CalibratedMount",
-    "Clock",
+    "ClockFault",
     "Contradiction",
-    "Field",
     "FieldMounts",
+    "FieldPrior",
     "Noise",
     "Reading",
     "Step",
     "Weather",
     "calibrate_field",
-    "days_by_order",
-    "off_by",
+    "pointing_error",
 ]

@@ -1,17 +1,41 @@
-"""What moves a calibrated mount in time: slow drift, steps, and measurements that contradict all others.
+"""Infer how a calibrated mount changes over time: drift, steps and foreign measurements.
 
-Around a guess of the parameters residuals are linear, ``y = J x + Jz (drift + jitter + steps) + foreign + noise``, with
-everything Gaussian: the parameters x by the field's prior; two drives' zeros that drift (Ornstein and Uhlenbeck, over
-years) and jitter (over hours); a step of one zero or both from one measurement on; a spot that has nothing to do with
-the light, all over the place. So each question has an answer in closed form, the odds that data give: is there a step
-before this measurement, or is this one alone foreign? The likeliest is believed, then the next, as long as odds are for
-one; what later ones make needless is dropped (Savage and Dickey's ratio). Each belief raises the posterior, so it ends.
+Notes
+-----
+Around a guess of the parameters the residuals of a heliostat's M measurements are linear in all
+unknowns::
+
+    y = J x + Z (drift + jitter + steps) + foreign + noise
+
+    x        parameters of the mount, N(prior_mean, prior_cov), the prior of the field
+    drift    of each drive's zero over years: Ornstein-Uhlenbeck process (drift_rad, drift_days)
+    jitter   of each drive's zero over hours: Ornstein-Uhlenbeck process (jitter_rad, jitter_days)
+    steps    a sudden change of one zero or both, from one measurement on
+    foreign  a spot that is not the heliostat's: anywhere on the target
+    noise    of a measured spot, N(0, spot_rad^2)
+
+``J`` (2 M, P) and ``Z`` (2 M, 2) are derivatives by parameters and by zeros. Without steps and
+foreign spots ``y`` is Gaussian, with the precision ``A = (J prior_cov J' + Z K Z' + spot_rad^2
+I)^-1``, ``K`` the covariance of drift and jitter. A step or a foreign spot adds a block of columns
+``D`` with sizes of N(0, V), so that its Bayes factor has a closed form::
+
+    g = D' A y,   H = D' A D,   log B = (g' (H + V^-1)^-1 g - log det(H + V^-1) - log det V) / 2
+
+A measurement of an unknown time, ``day`` NaN, has a drift and a jitter that no other measurement
+shares, and comes before all others. No step begins at it. Which steps lie before it is not known
+either: the squares of all steps are added to the variance of its zeros (`unknown_steps`). So it
+informs about parameters only, not about changes over time.
+
+`infer_changes` adds the change with the highest odds, then the next, while the odds are above one.
+It drops a change whose odds fall below one (the Savage-Dickey density ratio). Each action raises
+the posterior probability, so it ends.
 
 Sources: Rasmussen and Williams 2006, *Gaussian Processes for Machine Learning*, ch. 2; Dickey 1971,
 doi:10.1214/aoms/1177693507.
 """
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,10 +48,11 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Noise:
-    """Spreads of what is not a parameter, and odds.
+    """Standard deviations of all that is not a parameter, and prior odds of changes.
 
-    The spreads are those of greatest evidence on half of the heliostats that `tests.benchmarks.pointing` looks at. The
-    second drive's jitter is what photographs of one hour have beside the grain of their spots: wind and backlash.
+    The values maximise the evidence on half of the heliostats of `tests.benchmarks.pointing`. The
+    second drive's jitter is the scatter of photographs within one hour beyond the noise of their
+    spots: wind and backlash.
 
     Attributes
     ----------
@@ -36,11 +61,12 @@ class Noise:
     drift_rad, jitter_rad : pair of float [rad]
         Of the drives' zeros.
     drift_days, jitter_days : float [d]
-        Over which they forget where they were.
+        Correlation times.
     step_rad, foreign_rad : pair of float [rad]
-        How far a step moves a zero, and a foreign spot lies away: the common ones, and the rare large ones.
+        Of the change of a zero by a step, and of the distance of a foreign spot: common ones, and
+        rare large ones.
     step_odds, foreign_odds : float
-        Of a step before a measurement, and of a foreign spot in it, before its spot is seen.
+        Prior odds of a step before a measurement, and of a foreign spot in it.
     """
 
     spot_rad: float = 0.27e-3
@@ -54,36 +80,37 @@ class Noise:
     foreign_odds: float = 1e-2
 
     def drift(self, apart_days: Array) -> Array:
-        """Covariance (2, ...) [rad2] of a drift with itself, days apart."""
+        """Return the autocovariance (2, ...) [rad2] of the drift at a time difference [d]."""
         return np.multiply.outer(np.square(self.drift_rad), np.exp(-apart_days / self.drift_days))
 
     def jitter(self, apart_days: Array) -> Array:
-        """Covariance (2, ...) [rad2] of a jitter with itself, days apart."""
+        """Return the autocovariance (2, ...) [rad2] of the jitter at a time difference [d]."""
         return np.multiply.outer(np.square(self.jitter_rad), np.exp(-apart_days / self.jitter_days))
 
 
 @dataclass(frozen=True, eq=False)
-class Believed:
-    """The posterior of H heliostats, whose readings are in order of time.
+class Posterior:
+    """The posterior of H heliostats with up to M measurements each, in order of time.
 
     Attributes
     ----------
     parameters : (H, P)
         Means.
     covariance : (H, P, P)
-        Of the parameters at the newest measurement, its drift and steps in their zeros.
+        Of the parameters at the newest measurement; drift and steps are included in their zeros.
     drift, jitter, steps : (H, M, 2) [rad]
-        What is added to the zeros at each measurement: means, ``steps`` all up to then.
+        Means of what is added to the zeros at each measurement; ``steps`` is the sum of all steps
+        up to then.
     drifted_std : (H, 2) [rad]
-        Of the drift from the first measurement to the newest.
+        Standard deviation of the drift from the first measurement to the newest.
     steps_std : (H, M, 2) [rad]
-        Of the step that begins at a measurement; 0 where none does.
+        Standard deviation of the step that begins at a measurement; 0 without a step.
     stepped, foreign : (H, M) of bool
-        Where a step begins, and measurements that were left out.
+        Measurements at which a step begins, and those that are excluded as foreign.
     evidence : (H,)
-        Logarithm of the probability of the data, and of these beliefs, less a constant.
+        Log probability of the data and the changes, up to a constant.
     spread : (H, P)
-        Posterior standard deviations of the parameters alone.
+        Standard deviations of the parameters alone.
     """
 
     parameters: Array
@@ -100,36 +127,74 @@ class Believed:
 
     @property
     def zeros(self) -> Array:
-        """What is added to the zeros at each measurement (H, M, 2) [rad]."""
+        """Sum of drift, jitter and steps at each measurement (H, M, 2) [rad]."""
         return self.drift + self.jitter + self.steps
 
 
-def believe(
-    y: Array, jacobian: Array, readings: Readings, prior_mean: Array, prior_cov: Array, noise: Noise
-) -> Believed:
-    """The posterior of linear residuals ``y`` (H, M, 2) [rad] with derivatives ``jacobian`` (H, M, 2, P).
+def unknown_steps(posterior: Posterior) -> Array:
+    """Return the variance (H, 2) [rad2] of zeros at an unknown time: the squares of all steps."""
+    begun = np.diff(posterior.steps, axis=1, prepend=0.0) * posterior.stepped[..., None]
+    return np.asarray((begun**2).sum(axis=1))
 
-    ``y`` is what x and zeros shall explain, counted from zero: both are 0 where readings are padded. ``prior_mean``
-    (P,) and ``prior_cov`` (P, P) are the field's.
+
+def _time_differences(days: Array, others: Array) -> Array:
+    """Time differences (H, M, K) [d] of days (H, M) to others (H, K); infinite if unknown."""
+    apart = np.abs(days[:, :, None] - others[:, None])
+    return np.where(np.isnan(apart), np.inf, apart)
+
+
+def _lags(days: Array) -> Array:
+    """Time differences (H, M, M) [d] among days (H, M); 0 of each to itself."""
+    apart = _time_differences(days, days)
+    same = np.arange(days.shape[1])
+    apart[:, same, same] = 0.0
+    return apart
+
+
+def infer_changes(
+    y: Array,
+    jacobian: Array,
+    readings: Readings,
+    prior_mean: Array,
+    prior_cov: Array,
+    noise: Noise,
+    undated_variance: Array | None = None,
+) -> Posterior:
+    """Infer parameters, drift, steps and foreign spots from linear residuals.
+
+    Parameters
+    ----------
+    y : (H, M, 2) [rad]
+        What parameters and zeros explain, counted from zero; 0 in padding.
+    jacobian : (H, M, 2, P)
+        Derivatives of the residuals by the parameters; 0 in padding.
+    readings : Readings
+    prior_mean, prior_cov : (P,), (P, P)
+        The field's.
+    noise : Noise
+    undated_variance : (H, 2) [rad2]
+        Of the zeros of measurements of an unknown time, in addition to drift and jitter; 0 by
+        default.
     """
-    problem = _Problem.of(y, jacobian, readings, prior_mean, prior_cov, noise)
-    terms = _Terms.none(*readings.used.shape)
+    model = _LinearModel.of(y, jacobian, readings, prior_mean, prior_cov, noise, undated_variance)
+    changes = _Changes.empty(*readings.used.shape)
     active = np.arange(len(y))
     while len(active):
-        part, chosen = problem.rows(active), terms.rows(active)
-        grew = chosen.grow(part)
-        chosen.shed(part)
-        terms.write(active, chosen)
-        active = active[grew]
-    return problem.posterior(terms)
+        part, chosen = model.rows(active), changes.rows(active)
+        has_grown = chosen.add_best(part)
+        chosen.drop_unsupported(part)
+        changes.assign(active, chosen)
+        active = active[has_grown]
+    return model.posterior(changes)
 
 
 @dataclass(frozen=True, eq=False)
-class _Problem:
-    """Gaussian data without steps and foreign spots; N = 2 M.
+class _LinearModel:
+    """The Gaussian model without steps and foreign spots; N = 2 M.
 
-    ``y`` (H, N); ``by_parameter`` (H, N, P); ``by_zero`` (H, M, 2, 2), the last the drive; ``precision`` (H, N, N), the
-    inverse covariance of ``y``; ``log_det`` (H,) of that covariance.
+    ``y`` (H, N) less the prior's mean; ``by_parameter`` (H, N, P) is J; ``by_zero`` (H, M, 2, 2) is
+    Z, its last axis the drive; ``precision`` (H, N, N) is A; ``log_det`` (H,) is that of the
+    covariance; ``undated_variance`` (H, 2).
     """
 
     y: Array
@@ -141,31 +206,44 @@ class _Problem:
     prior_mean: Array
     prior_cov: Array
     noise: Noise
+    undated_variance: Array
 
     @classmethod
-    def of(cls, y: Array, jacobian: Array, readings: Readings, mean: Array, cov: Array, noise: Noise) -> "_Problem":
+    def of(
+        cls,
+        y: Array,
+        jacobian: Array,
+        readings: Readings,
+        mean: Array,
+        cov: Array,
+        noise: Noise,
+        undated_variance: Array | None = None,
+    ) -> "_LinearModel":
         heliostats, most, _, count = jacobian.shape
         by_parameter = jacobian.reshape(heliostats, 2 * most, count)
         by_zero = jacobian[..., ZEROS]
         covariance = by_parameter @ cov @ by_parameter.swapaxes(1, 2)
-        apart = np.abs(readings.days[:, :, None] - readings.days[:, None])
-        moving = noise.drift(apart) + noise.jitter(apart)
+        variance = np.zeros((heliostats, 2)) if undated_variance is None else undated_variance
+        moving = noise.drift(_lags(readings.days)) + _quick(readings.days, noise, variance)
         for drive in (0, 1):
             along = by_zero[..., drive]
-            covariance += np.einsum("hia,hij,hjb->hiajb", along, moving[drive], along, optimize=True).reshape(
-                covariance.shape
-            )
-        # One where nothing is used: it adds nothing to the evidence.
+            covariance += np.einsum(
+                "hia,hij,hjb->hiajb", along, moving[drive], along, optimize=True
+            ).reshape(covariance.shape)
+        # A variance of one in padding adds nothing to the evidence.
         diagonal = np.arange(2 * most)
-        covariance[:, diagonal, diagonal] += np.repeat(np.where(readings.used, noise.spot_rad**2, 1.0), 2, axis=1)
+        covariance[:, diagonal, diagonal] += np.repeat(
+            np.where(readings.used, noise.spot_rad**2, 1.0), 2, axis=1
+        )
         target = y.reshape(heliostats, -1) - by_parameter @ mean
         log_det = np.linalg.slogdet(covariance)[1]
+        precision = np.asarray(np.linalg.inv(covariance))
         return cls(
-            target, by_parameter, by_zero, np.asarray(np.linalg.inv(covariance)), log_det, readings, mean, cov, noise
+            target, by_parameter, by_zero, precision, log_det, readings, mean, cov, noise, variance
         )
 
-    def rows(self, rows: NDArray[np.intp]) -> "_Problem":
-        """That of some heliostats."""
+    def rows(self, rows: NDArray[np.intp]) -> "_LinearModel":
+        """Select some heliostats."""
         if len(rows) == len(self.y):
             return self
         return replace(
@@ -175,161 +253,211 @@ class _Problem:
             by_zero=self.by_zero[rows],
             precision=self.precision[rows],
             log_det=self.log_det[rows],
+            undated_variance=self.undated_variance[rows],
             readings=Readings(**{name: value[rows] for name, value in vars(self.readings).items()}),
         )
 
-    def posterior(self, terms: "_Terms") -> Believed:
+    def posterior(self, changes: "_Changes") -> Posterior:
+        """Return means and covariances of all unknowns, given the changes."""
         heliostats, most = self.readings.used.shape
         noise, days = self.noise, self.readings.days
-        solved = terms.solve(self)
-        explained = solved.precision_y
-        pulled = np.einsum("hmka,hmk->hma", self.by_zero, explained.reshape(heliostats, most, 2))
-        apart = np.abs(days[:, :, None] - days[:, None])
-        drift = np.einsum("khij,hjk->hik", noise.drift(apart), pulled)
-        jitter = np.einsum("khij,hjk->hik", noise.jitter(apart), pulled)
-        begun, steps_std = terms.begun(solved)
+        solution = changes.solve(self)
+        explained = solution.precision_y
+        by_zeros = np.einsum("hmka,hmk->hma", self.by_zero, explained.reshape(heliostats, most, 2))
+        drift = np.einsum("khij,hjk->hik", noise.drift(_lags(days)), by_zeros)
+        jitter = np.einsum("khij,hjk->hik", _quick(days, noise, self.undated_variance), by_zeros)
+        steps, steps_std = _step_sizes(changes, solution)
         last = np.maximum(self.readings.used.sum(axis=1) - 1, 0)
         newest = days[np.arange(heliostats), last]
-        precision = solved.precision(self)
-        covariance, spread = self._spread(terms, precision, newest)
+        precision = solution.precision(self)
+        covariance = self._newest_covariance(changes, precision, newest)
         used = self.readings.used[..., None]
-        return Believed(
-            parameters=self.prior_mean + (explained[:, None] @ self.by_parameter)[:, 0] @ self.prior_cov,
+        return Posterior(
+            parameters=self.prior_mean
+            + (explained[:, None] @ self.by_parameter)[:, 0] @ self.prior_cov,
             covariance=covariance,
             drift=drift * used,
             jitter=jitter * used,
-            steps=begun.cumsum(axis=1) * used,
+            steps=steps.cumsum(axis=1) * used,
             drifted_std=self._drifted_std(precision, newest),
             steps_std=steps_std,
-            stepped=terms.mask(*_STEPS),
-            foreign=terms.mask(*_FOREIGN),
-            evidence=solved.evidence - 0.5 * self.log_det,
-            spread=spread,
+            stepped=changes.mask(*_STEPS),
+            foreign=changes.mask(*_FOREIGN),
+            evidence=solution.evidence - 0.5 * self.log_det,
+            spread=self._spread(precision),
         )
 
     def _drift_at(self, day: Array) -> Array:
         """Covariances (H, 2, N) of the drift at a ``day`` (H,) with the data."""
         heliostats, most = self.readings.used.shape
-        shared = self.noise.drift(np.abs(self.readings.days - day[:, None]))
-        return np.asarray(np.einsum("hmka,ahm->hamk", self.by_zero, shared).reshape(heliostats, 2, 2 * most))
+        shared = self.noise.drift(_time_differences(self.readings.days, day[:, None])[..., 0])
+        return np.asarray(
+            np.einsum("hmka,ahm->hamk", self.by_zero, shared).reshape(heliostats, 2, 2 * most)
+        )
 
     def _drifted_std(self, precision: Array, newest: Array) -> Array:
-        first = self.readings.days[:, 0]
+        """Standard deviations (H, 2) [rad] of the drift from the first to the newest known time."""
+        used, days = self.readings.used, self.readings.days
+        place = np.minimum(_undated(self.readings), np.maximum(used.sum(axis=1) - 1, 0))
+        first = days[np.arange(len(days)), place]
         cross = self._drift_at(newest) - self._drift_at(first)
-        told = np.diagonal(cross @ precision @ cross.swapaxes(1, 2), axis1=1, axis2=2)
+        explained = np.diagonal(cross @ precision @ cross.swapaxes(1, 2), axis1=1, axis2=2)
         free = 2 * (self.noise.drift(np.zeros(1)) - self.noise.drift(newest - first)).T
-        return np.sqrt(np.maximum(free - told, 0))
+        return np.where(np.isnan(newest)[:, None], 0.0, np.sqrt(np.maximum(free - explained, 0)))
 
-    def _spread(self, terms: "_Terms", precision: Array, newest: Array) -> tuple[Array, Array]:
-        """Covariances (H, P, P) of the state at the days ``newest`` (H,), and spreads (H, P) of the parameters."""
+    def _spread(self, precision: Array) -> Array:
+        """Standard deviations (H, P) of the parameters alone."""
         cross = np.swapaxes(self.by_parameter @ self.prior_cov, 1, 2)
-        own = self.prior_cov - cross @ precision @ cross.swapaxes(1, 2)
+        covariance = self.prior_cov - cross @ precision @ cross.swapaxes(1, 2)
+        return np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0))
+
+    def _newest_covariance(self, changes: "_Changes", precision: Array, newest: Array) -> Array:
+        """Covariances (H, P, P) of the parameters with their zeros at the days ``newest`` (H,)."""
+        cross = np.swapaxes(self.by_parameter @ self.prior_cov, 1, 2)
         at_zero = self._drift_at(newest)
-        stepped = terms.stepped_variance(self.noise)  # what each measurement shares with the newest
+        stepped = changes.stepped_variance(self.noise)  # shared by each measurement with the newest
         at_zero += np.einsum("hmka,hma->hamk", self.by_zero, stepped).reshape(at_zero.shape)
         cross[:, ZEROS] += at_zero
         prior = np.tile(self.prior_cov, (len(newest), 1, 1))
         zeros = np.arange(ZEROS.start, ZEROS.stop)
         prior[:, zeros, zeros] += np.square(self.noise.drift_rad) + stepped[:, -1]
-        newest_cov = prior - cross @ precision @ cross.swapaxes(1, 2)
-        variances = np.diagonal(own, axis1=1, axis2=2)
-        return newest_cov, np.sqrt(np.maximum(variances, 0))
+        return np.asarray(prior - cross @ precision @ cross.swapaxes(1, 2))
+
+
+def _undated(readings: Readings) -> NDArray[np.intp]:
+    """Count the measurements of an unknown time of each heliostat (H,): its first ones."""
+    return np.asarray((readings.used & np.isnan(readings.days)).sum(axis=1))
+
+
+def _quick(days: Array, noise: Noise, undated_variance: Array) -> Array:
+    """Covariance (2, H, M, M) [rad2] of the jitter, and of steps before unknown times."""
+    covariance = noise.jitter(_lags(days))
+    same = np.arange(days.shape[1])
+    covariance[:, :, same, same] += undated_variance.T[..., None] * np.isnan(days)
+    return covariance
+
+
+class ChangePointScore(NamedTuple):
+    """Score and information (H, M) of a number that is 0 before a measurement, then constant.
+
+    Its estimate is ``score / information``, with variance ``1 / information``.
+    """
+
+    score: Array
+    information: Array
 
 
 @dataclass(frozen=True, eq=False)
-class Posterior:
-    """Data with the steps and foreign spots that are believed in them, of any size: what else is asked of them."""
+class ConditionedModel:
+    """The linear model with inferred changes, for further questions to the data."""
 
-    problem: _Problem
-    terms: "_Terms"
+    model: _LinearModel
+    changes: "_Changes"
 
     @classmethod
     def of(
-        cls, y: Array, jacobian: Array, readings: Readings, mean: Array, cov: Array, noise: Noise, believed: Believed
-    ) -> "Posterior":
-        """As `believe`, of heliostats that ``believed`` is of; it may be padded further."""
+        cls,
+        y: Array,
+        jacobian: Array,
+        readings: Readings,
+        mean: Array,
+        cov: Array,
+        noise: Noise,
+        posterior: Posterior,
+    ) -> "ConditionedModel":
+        """Build it with the arguments of `infer_changes` and its ``posterior``."""
         most = readings.used.shape[1]
-        terms = _Terms.marked(believed.stepped[:, :most], believed.foreign[:, :most])
-        return cls(_Problem.of(y, jacobian, readings, mean, cov, noise), terms)
+        changes = _Changes.from_masks(posterior.stepped[:, :most], posterior.foreign[:, :most])
+        return cls(
+            _LinearModel.of(y, jacobian, readings, mean, cov, noise, unknown_steps(posterior)),
+            changes,
+        )
 
-    def left_out(self) -> Array:
-        """What each measurement (H, M, 2) [rad] lies off what all others of its heliostat foretell.
+    def leave_one_out_residuals(self) -> Array:
+        """Return the residual (H, M, 2) [rad] of each measurement to its prediction by all others.
 
-        NaN where one is foreign, or there is none. Source: Rasmussen and Williams 2006, eq. 5.12.
+        NaN for foreign measurements and padding. Source: Rasmussen and Williams 2006, eq. 5.12.
         """
-        heliostats, most = self.problem.readings.used.shape
-        solved = self.terms.solve(self.problem)
-        blocks = solved.precision(self.problem).reshape(heliostats, most, 2, most, 2)
-        own = np.einsum("hiaib->hiab", blocks)
-        off = np.linalg.solve(own, solved.precision_y.reshape(heliostats, most, 2, 1))[..., 0]
-        told = self.problem.readings.used & ~self.terms.mask(*_FOREIGN)
-        return np.where(told[..., None], off, np.nan)
+        heliostats, most = self.model.readings.used.shape
+        solution = self.changes.solve(self.model)
+        blocks = solution.precision(self.model).reshape(heliostats, most, 2, most, 2)
+        diagonal = np.einsum("hiaib->hiab", blocks)
+        residuals = np.linalg.solve(diagonal, solution.precision_y.reshape(heliostats, most, 2, 1))[
+            ..., 0
+        ]
+        is_known = self.model.readings.used & ~self.changes.mask(*_FOREIGN)
+        return np.where(is_known[..., None], residuals, np.nan)
 
-    def told_of_a_change(self, by_change: Array) -> tuple[Array, Array]:
-        """What data tell of a number that is 0 up to a measurement and one value from it on, for each measurement.
+    def change_point_score(self, by_change: Array) -> ChangePointScore:
+        """Score a change at each measurement by the residuals' derivatives ``by_change`` (H, M, 2).
 
-        ``by_change`` (H, M, 2) are the residuals' derivatives by it. Gives its pull (H, M) and information (H, M): the
-        number is likeliest ``pull / information``, with variance ``1 / information``. Steps within one measurement are
-        not believed for this question: they would be the change itself by another name.
+        Steps at the measurement or next to it are left out of the model: they would explain the
+        same change.
         """
-        problem, terms = self.problem, self.terms
-        change = (by_change * problem.readings.used[..., None])[..., None]
-        pull, information = _of_change(problem, terms, change)
-        is_step = np.isin(terms.kind, _STEPS)
-        for term in range(terms.kind.shape[1]):
-            place = terms.place[:, term, None]
-            beside = is_step & (np.abs(terms.place - place) <= 1)
-            without = replace(terms, kind=np.where(beside, 0, terms.kind).astype(np.int8))
-            near = is_step[:, term, None] & (np.abs(np.arange(terms.most) - place) <= 1)
+        model, changes = self.model, self.changes
+        columns = (by_change * model.readings.used[..., None])[..., None]
+        score, information = _change_point_terms(model, changes, columns)
+        is_step = np.isin(changes.kind, _STEPS)
+        for term in range(changes.kind.shape[1]):
+            place = changes.place[:, term, None]
+            is_adjacent = is_step & (np.abs(changes.place - place) <= 1)
+            without = replace(changes, kind=np.where(is_adjacent, 0, changes.kind).astype(np.int8))
+            near = is_step[:, term, None] & (np.abs(np.arange(changes.most) - place) <= 1)
             rows = np.nonzero(near.any(axis=1))[0]
-            other = _of_change(problem.rows(rows), without.rows(rows), change[rows])
-            for old, new in zip((pull, information), other, strict=True):
+            other = _change_point_terms(model.rows(rows), without.rows(rows), columns[rows])
+            for old, new in zip((score, information), other, strict=True):
                 old[rows] = np.where(near[rows], new, old[rows])
-        return pull, information
+        return ChangePointScore(score, information)
 
 
-def _of_change(problem: _Problem, terms: "_Terms", change: Array) -> tuple[Array, Array]:
-    heliostats, most = problem.readings.used.shape
-    solved = terms.solve(problem)
-    pull = np.einsum("hmka,hmk->hm", change, solved.precision_y.reshape(heliostats, most, 2))
-    blocks = solved.precision(problem).reshape(heliostats, most, 2, most, 2)
-    return _from_here(pull, 1), _of_pairs(change, blocks)[..., 0, 0]
+def _change_point_terms(
+    model: _LinearModel, changes: "_Changes", columns: Array
+) -> ChangePointScore:
+    heliostats, most = model.readings.used.shape
+    solution = changes.solve(model)
+    score = np.einsum("hmka,hmk->hm", columns, solution.precision_y.reshape(heliostats, most, 2))
+    blocks = solution.precision(model).reshape(heliostats, most, 2, most, 2)
+    information = _information_from_here(columns, blocks)[..., 0, 0]
+    return ChangePointScore(_sum_from_here(score, 1), information)
 
 
-# Kinds of terms beside none, 0: steps of both drives, the first, the second, common ones and large ones; foreign spots.
+# Kinds of changes; 0 is none. Steps of both drives, the first, the second: common ones, then large
+# ones; foreign spots.
 _STEPS, _FOREIGN = (1, 2, 3, 4, 5, 6), (7, 8)
 _LARGE = 4  # of both drives
 
-# A drive that did not step moved by no more than this share of what one that did.
+# A drive without a step moves by no more than this share of the one with a step.
 _STILL = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class _Solved:
-    """Beliefs weighed against data.
+class _Solution:
+    """The model solved for the sizes of T changes.
 
-    ``weighed`` (H, N, 2 T) is the precision times what the terms' sizes move; ``cov`` (H, 2 T, 2 T) of those sizes, and
-    their means ``sizes`` (H, 2 T); ``precision_y`` (H, N); ``evidence`` (H,).
+    ``weighted_design`` (H, N, 2 T) is A D; ``cov`` (H, 2 T, 2 T) and ``sizes`` (H, 2 T) are the
+    posterior of the sizes; ``precision_y`` (H, N); ``evidence`` (H,).
     """
 
-    weighed: Array
+    weighted_design: Array
     cov: Array
     sizes: Array
     precision_y: Array
     evidence: Array
 
-    def precision(self, problem: _Problem) -> Array:
-        """Inverse covariance (H, N, N) of ``y`` with these beliefs."""
+    def precision(self, model: _LinearModel) -> Array:
+        """Inverse covariance (H, N, N) of ``y`` given the changes."""
         if not self.cov.shape[-1]:
-            return problem.precision
-        return problem.precision - self.weighed @ self.cov @ self.weighed.swapaxes(1, 2)
+            return model.precision
+        return model.precision - self.weighted_design @ self.cov @ self.weighted_design.swapaxes(
+            1, 2
+        )
 
 
 @dataclass(eq=False)
-class _Terms:
-    """What is believed of each heliostat: up to T steps and foreign spots.
+class _Changes:
+    """Up to T steps and foreign spots of each heliostat.
 
-    ``kind`` (H, T) of them; ``place`` (H, T): the measurement.
+    ``kind`` (H, T); ``place`` (H, T) is the index of the measurement; ``most`` is M.
     """
 
     kind: NDArray[np.int8]
@@ -337,22 +465,23 @@ class _Terms:
     most: int
 
     @classmethod
-    def none(cls, heliostats: int, most: int) -> "_Terms":
+    def empty(cls, heliostats: int, most: int) -> "_Changes":
         return cls(np.zeros((heliostats, 0), np.int8), np.zeros((heliostats, 0), np.intp), most)
 
     @classmethod
-    def marked(cls, stepped: Mask, foreign: Mask) -> "_Terms":
-        """Terms of the largest kinds where steps and foreign spots are believed (H, M)."""
+    def from_masks(cls, stepped: Mask, foreign: Mask) -> "_Changes":
+        """Make changes of the largest kinds from masks (H, M) of steps and foreign spots."""
         kinds = np.concatenate([stepped * _LARGE, foreign * _FOREIGN[-1]], axis=1).astype(np.int8)
         count = int((kinds > 0).sum(axis=1).max(initial=0))
         first = np.argsort(kinds == 0, axis=1, kind="stable")[:, :count]
         most = stepped.shape[1]
         return cls(np.take_along_axis(kinds, first, axis=1), first % most, most)
 
-    def rows(self, rows: NDArray[np.intp]) -> "_Terms":
-        return _Terms(self.kind[rows], self.place[rows], self.most)
+    def rows(self, rows: NDArray[np.intp]) -> "_Changes":
+        return _Changes(self.kind[rows], self.place[rows], self.most)
 
-    def write(self, rows: NDArray[np.intp], other: "_Terms") -> None:
+    def assign(self, rows: NDArray[np.intp], other: "_Changes") -> None:
+        """Replace the changes of some heliostats."""
         more = other.kind.shape[1] - self.kind.shape[1]
         if more > 0:
             self.kind = np.pad(self.kind, ((0, 0), (0, more)))
@@ -362,134 +491,156 @@ class _Terms:
         self.place[rows, : other.kind.shape[1]] = other.place
 
     def mask(self, *kinds: int) -> Mask:
-        """Measurements (H, M) that have a term of one of ``kinds``."""
+        """Mark the measurements (H, M) with a change of one of ``kinds``."""
         mask = np.zeros((len(self.kind), self.most), dtype=bool)
         rows, terms = np.nonzero(np.isin(self.kind, kinds))
         mask[rows, self.place[rows, terms]] = True
         return mask
 
     def stepped_variance(self, noise: Noise) -> Array:
-        """Prior variances (H, M, 2) [rad2] of all steps up to each measurement."""
-        begun = np.zeros((len(self.kind), self.most, 2))
+        """Prior variances (H, M, 2) [rad2] of the sum of all steps up to each measurement."""
+        variance = np.zeros((len(self.kind), self.most, 2))
         rows, terms = np.nonzero(np.isin(self.kind, _STEPS))
-        begun[rows, self.place[rows, terms]] = _variances(noise)[self.kind[rows, terms]]
-        return begun.cumsum(axis=1)
+        variance[rows, self.place[rows, terms]] = _variances(noise)[self.kind[rows, terms]]
+        return variance.cumsum(axis=1)
 
-    def solve(self, problem: _Problem) -> _Solved:
+    def solve(self, model: _LinearModel) -> _Solution:
+        """Solve the linear model for the sizes of the changes."""
         heliostats, count = self.kind.shape
         after = np.arange(self.most) >= self.place[..., None]
-        alone = np.arange(self.most) == self.place[..., None]
+        at = np.arange(self.most) == self.place[..., None]
         is_step, is_foreign = (np.isin(self.kind, kinds) for kinds in (_STEPS, _FOREIGN))
         from_here, here = (
             (places & kinds[..., None]).swapaxes(1, 2)[:, :, None, :, None]
-            for places, kinds in ((after, is_step), (alone, is_foreign))
+            for places, kinds in ((after, is_step), (at, is_foreign))
         )
-        design = from_here * problem.by_zero[:, :, :, None] + here * np.eye(2)[:, None]
+        design = from_here * model.by_zero[:, :, :, None] + here * np.eye(2)[:, None]
         design = design.reshape(heliostats, 2 * self.most, 2 * count)
-        variance = _variances(problem.noise)[self.kind].reshape(heliostats, 2 * count)
-        weighed = problem.precision @ design
-        inverse = design.swapaxes(1, 2) @ weighed
+        variance = _variances(model.noise)[self.kind].reshape(heliostats, 2 * count)
+        weighted_design = model.precision @ design
+        inverse = design.swapaxes(1, 2) @ weighted_design
         diagonal = np.arange(2 * count)
         inverse[:, diagonal, diagonal] += 1 / variance
         cov = np.linalg.inv(inverse)
-        alpha = (problem.precision @ problem.y[..., None])[..., 0]
-        pull = (weighed.swapaxes(1, 2) @ problem.y[..., None])[..., 0]
-        sizes = (cov @ pull[..., None])[..., 0]
-        odds = np.log(_odds(problem.noise))[self.kind].sum(axis=1)
+        alpha = (model.precision @ model.y[..., None])[..., 0]
+        score = (weighted_design.swapaxes(1, 2) @ model.y[..., None])[..., 0]
+        sizes = (cov @ score[..., None])[..., 0]
+        odds = np.log(_odds(model.noise))[self.kind].sum(axis=1)
         evidence = odds + 0.5 * (
-            (pull * sizes).sum(axis=1)
-            - (alpha * problem.y).sum(axis=1)
+            (score * sizes).sum(axis=1)
+            - (alpha * model.y).sum(axis=1)
             - np.linalg.slogdet(inverse)[1]
             - np.log(variance).sum(axis=1)
         )
-        precision_y = alpha - (weighed @ sizes[..., None])[..., 0]
-        return _Solved(weighed, cov, sizes, precision_y, evidence)
+        precision_y = alpha - (weighted_design @ sizes[..., None])[..., 0]
+        return _Solution(weighted_design, cov, sizes, precision_y, evidence)
 
-    def grow(self, problem: _Problem) -> Mask:
-        """Believe in what has the best odds, of each heliostat (H,) where any has good ones."""
-        solved = self.solve(problem)
-        gains = self._gains(problem, solved)
-        best = gains.reshape(len(gains), -1).argmax(axis=1)
+    def add_best(self, model: _LinearModel) -> Mask:
+        """Add the change with the highest odds, if above one; mark the heliostats (H,) with one."""
+        log_odds = self._log_odds(model, self.solve(model))
+        best = log_odds.reshape(len(log_odds), -1).argmax(axis=1)
         kinds, places = np.divmod(best, self.most)
-        good = gains[np.arange(len(gains)), kinds, places] > 0
-        self.kind = np.column_stack([self.kind, np.where(good, kinds + 1, 0)]).astype(np.int8)
-        self.place = np.column_stack([self.place, np.where(good, places, 0)])
-        return good
+        is_likely = log_odds[np.arange(len(log_odds)), kinds, places] > 0
+        self.kind = np.column_stack([self.kind, np.where(is_likely, kinds + 1, 0)]).astype(np.int8)
+        self.place = np.column_stack([self.place, np.where(is_likely, places, 0)])
+        return is_likely
 
-    def _gains(self, problem: _Problem, solved: _Solved) -> Array:
-        """Log odds (H, K, M) of a step before each measurement, or a foreign spot in it, by kind."""
+    def _log_odds(self, model: _LinearModel, solution: _Solution) -> Array:
+        """Log odds (H, K, M) of a step before each measurement, or a foreign spot, by kind."""
         heliostats = len(self.kind)
-        pull = solved.precision_y.reshape(heliostats, self.most, 2)
-        blocks = solved.precision(problem).reshape(heliostats, self.most, 2, self.most, 2)
-        foreign_hess = np.einsum("hiaib->hiab", blocks)
-        step_pull = _from_here(np.einsum("hmka,hmk->hma", problem.by_zero, pull), 1)
-        step_hess = _of_pairs(problem.by_zero, blocks)
-        noise, used = problem.noise, problem.readings.used
+        score = solution.precision_y.reshape(heliostats, self.most, 2)
+        blocks = solution.precision(model).reshape(heliostats, self.most, 2, self.most, 2)
+        foreign_information = np.einsum("hiaib->hiab", blocks)
+        step_score = _sum_from_here(np.einsum("hmka,hmk->hma", model.by_zero, score), 1)
+        step_information = _information_from_here(model.by_zero, blocks)
+        noise, used = model.noise, model.readings.used
         variances = _variances(noise)
-        of_steps = [_gain(step_pull, step_hess, variances[kind]) for kind in _STEPS]
-        of_foreign = [_gain(pull, foreign_hess, variances[kind]) for kind in _FOREIGN]
-        gains = np.stack([*of_steps, *of_foreign], axis=1)
-        gains += np.log(_odds(noise))[1:, None]
+        of_steps = [
+            _log_bayes_factor(step_score, step_information, variances[kind]) for kind in _STEPS
+        ]
+        of_foreign = [
+            _log_bayes_factor(score, foreign_information, variances[kind]) for kind in _FOREIGN
+        ]
+        log_odds = np.stack([*of_steps, *of_foreign], axis=1)
+        log_odds += np.log(_odds(noise))[1:, None]
         steps = slice(0, len(_STEPS))
-        gains[:, steps, 0] = -np.inf  # a step before the first is the zero itself
-        gains[:, steps] = np.where(self.mask(*_STEPS)[:, None], -np.inf, gains[:, steps])
+        # A step before the first measurement is the zero itself, and none is known before an
+        # unknown time.
+        is_first = np.arange(self.most) <= _undated(model.readings)[:, None]
+        log_odds[:, steps] = np.where(is_first[:, None], -np.inf, log_odds[:, steps])
+        log_odds[:, steps] = np.where(self.mask(*_STEPS)[:, None], -np.inf, log_odds[:, steps])
         foreign = slice(len(_STEPS), None)
-        gains[:, foreign] = np.where(self.mask(*_FOREIGN)[:, None], -np.inf, gains[:, foreign])
-        return np.where(used[:, None], gains, -np.inf)
+        log_odds[:, foreign] = np.where(
+            self.mask(*_FOREIGN)[:, None], -np.inf, log_odds[:, foreign]
+        )
+        return np.where(used[:, None], log_odds, -np.inf)
 
-    def shed(self, problem: _Problem) -> None:
-        """Drop beliefs whose odds are against them by now, the worst of a heliostat first."""
+    def drop_unsupported(self, model: _LinearModel) -> None:
+        """Drop changes with odds below one, the least likely of each heliostat first."""
         while self.kind.any():
-            solved = self.solve(problem)
+            solution = self.solve(model)
             heliostats, count = self.kind.shape
-            cov = np.einsum("htatb->htab", solved.cov.reshape(heliostats, count, 2, count, 2))
-            size = solved.sizes.reshape(heliostats, count, 2)
-            surprise = (size * np.linalg.solve(cov, size[..., None])[..., 0]).sum(axis=-1)
-            variance = _variances(problem.noise)[self.kind]
-            gain = 0.5 * (surprise + np.linalg.slogdet(cov)[1] - np.log(variance).sum(axis=-1))
-            gain += np.log(_odds(problem.noise))[self.kind]
-            gain[self.kind == 0] = np.inf
-            worst = gain.argmin(axis=1)
-            rows = np.nonzero(gain[np.arange(heliostats), worst] < 0)[0]
+            cov = np.einsum("htatb->htab", solution.cov.reshape(heliostats, count, 2, count, 2))
+            size = solution.sizes.reshape(heliostats, count, 2)
+            chi_square = (size * np.linalg.solve(cov, size[..., None])[..., 0]).sum(axis=-1)
+            variance = _variances(model.noise)[self.kind]
+            log_odds = 0.5 * (
+                chi_square + np.linalg.slogdet(cov)[1] - np.log(variance).sum(axis=-1)
+            )
+            log_odds += np.log(_odds(model.noise))[self.kind]
+            log_odds[self.kind == 0] = np.inf
+            worst = log_odds.argmin(axis=1)
+            rows = np.nonzero(log_odds[np.arange(heliostats), worst] < 0)[0]
             if not len(rows):
                 return
             self.kind[rows, worst[rows]] = 0
 
-    def begun(self, solved: _Solved) -> tuple[Array, Array]:
-        """Steps (H, M, 2) [rad] where they begin, and their standard deviations (H, M, 2) [rad]."""
-        heliostats, count = self.kind.shape
-        size, std = np.zeros((2, heliostats, self.most, 2))
-        rows, terms = np.nonzero(np.isin(self.kind, _STEPS))
-        places = self.place[rows, terms]
-        size[rows, places] = solved.sizes.reshape(heliostats, count, 2)[rows, terms]
-        variance = np.diagonal(solved.cov, axis1=1, axis2=2).reshape(heliostats, count, 2)
-        std[rows, places] = np.sqrt(variance[rows, terms])
-        return size, std
+
+class _StepSizes(NamedTuple):
+    """Each step (H, M, 2) [rad] at the measurement where it begins, and its deviation [rad]."""
+
+    sizes: Array
+    std: Array
 
 
-def _of_pairs(columns: Array, blocks: Array) -> Array:
-    """Information (H, M, A, A) on what begins at a measurement: the sum of all pairs of those from it on.
+def _step_sizes(changes: _Changes, solution: _Solution) -> _StepSizes:
+    heliostats, count = changes.kind.shape
+    size, std = np.zeros((2, heliostats, changes.most, 2))
+    rows, terms = np.nonzero(np.isin(changes.kind, _STEPS))
+    places = changes.place[rows, terms]
+    size[rows, places] = solution.sizes.reshape(heliostats, count, 2)[rows, terms]
+    variance = np.diagonal(solution.cov, axis1=1, axis2=2).reshape(heliostats, count, 2)
+    std[rows, places] = np.sqrt(variance[rows, terms])
+    return _StepSizes(size, std)
 
-    ``columns`` (H, M, 2, A) are what it moves, ``blocks`` (H, M, 2, M, 2) the precision. From one measurement to the
-    next come the pair of it with itself, and those with all later ones, twice.
+
+def _information_from_here(columns: Array, blocks: Array) -> Array:
+    """Information (H, M, A, A) on a change from each measurement on.
+
+    It is the sum over all pairs of later measurements. ``columns`` (H, M, 2, A) are the
+    derivatives, ``blocks`` (H, M, 2, M, 2) the precision. From one
+    measurement to the next the sum gains the measurement's pair with itself and, twice, its pairs
+    with all later ones.
     """
     heliostats, most, _, count = columns.shape
     half = columns.swapaxes(2, 3) @ blocks.reshape(heliostats, most, 2, 2 * most)
-    own = np.einsum("hiail->hial", half.reshape(heliostats, most, count, most, 2)) @ columns
+    with_itself = np.einsum("hiail->hial", half.reshape(heliostats, most, count, most, 2)) @ columns
     half *= (np.arange(2 * most) // 2 > np.arange(most)[:, None])[:, None]
-    later = half.reshape(heliostats, count * most, 2 * most) @ columns.reshape(heliostats, 2 * most, count)
+    later = half.reshape(heliostats, count * most, 2 * most) @ columns.reshape(
+        heliostats, 2 * most, count
+    )
     later = later.reshape(heliostats, most, count, count)
-    return _from_here(own + later + later.swapaxes(2, 3), 1)
+    return _sum_from_here(with_itself + later + later.swapaxes(2, 3), 1)
 
 
 def _odds(noise: Noise) -> Array:
-    """Of each kind of term (K,); one of none has even ones."""
+    """Prior odds of each kind of change (K,); 1 for none."""
     step, foreign = noise.step_odds / len(_STEPS), noise.foreign_odds / len(_FOREIGN)
     return np.array([1.0] + [step] * len(_STEPS) + [foreign] * len(_FOREIGN))
 
 
 def _variances(noise: Noise) -> Array:
-    """Of the two sizes of each kind of term (K, 2) [rad2]."""
+    """Prior variances of the two sizes of each kind of change (K, 2) [rad2]."""
     of_steps = [
         [size * first, size * second]
         for size in noise.step_rad
@@ -498,13 +649,16 @@ def _variances(noise: Noise) -> Array:
     return np.square([[1.0, 1.0], *of_steps, *([size, size] for size in noise.foreign_rad)])
 
 
-def _gain(pull: Array, hess: Array, variance: Array) -> Array:
-    """Log of the Bayes factor (...) for a term of two sizes, by their pull (..., 2) and information (..., 2, 2)."""
-    inner = hess + np.diag(1 / variance)
-    size = np.linalg.solve(inner, pull[..., None])[..., 0]
-    return np.asarray(0.5 * ((pull * size).sum(axis=-1) - np.linalg.slogdet(inner)[1] - np.log(variance).sum()))
+def _log_bayes_factor(score: Array, information: Array, variance: Array) -> Array:
+    """Log Bayes factor (...) of a change, by score (..., 2) and information (..., 2, 2)."""
+    precision = information + np.diag(1 / variance)
+    size = np.linalg.solve(precision, score[..., None])[..., 0]
+    return np.asarray(
+        0.5
+        * ((score * size).sum(axis=-1) - np.linalg.slogdet(precision)[1] - np.log(variance).sum())
+    )
 
 
-def _from_here(values: Array, axis: int) -> Array:
-    """Sums from each place on to the end."""
+def _sum_from_here(values: Array, axis: int) -> Array:
+    """Sum from each place to the end."""
     return np.flip(np.flip(values, axis).cumsum(axis), axis)

@@ -1,4 +1,4 @@
-"""The mounts of a field: from readings to calibrated mounts, steps, and what contradicts them."""
+"""Calibrate a field: mounts, steps, outliers, clock faults and covariates of the readings."""
 
 import dataclasses
 from collections.abc import Collection, Mapping, Sequence
@@ -7,14 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.plant import Heliostat, TargetPlane
-from model.pointing.calibration import Field, calibrate, calibrate_kinds
-from model.pointing.clock import Clock, find_clock
-from model.pointing.covariates import Explained, explain
+from model.pointing.calibration import FieldPrior, calibrate, calibrate_kinds
+from model.pointing.clock import ClockFault, find_clock_fault
+from model.pointing.covariates import ExplainedShare, explain_errors
 from model.pointing.drives import Noise
-from model.pointing.kinematics import Chain
+from model.pointing.kinematics import KinematicChain
 from model.pointing.mounts import CalibratedMount, mounts_of
-from model.pointing.readings import Reading, padded
-from model.pointing.reasons import Contradiction, Reasons
+from model.pointing.readings import Reading, pad_readings
+from model.pointing.reasons import Contradiction, ContradictionClassifier
+from model.site import Site
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,73 +24,90 @@ class FieldMounts:
 
     Attributes
     ----------
-    field : Field
-        What its heliostats share; of several kinds of drives, those of the largest.
+    prior : FieldPrior
+        That of the largest kind of drives.
     mounts, readings : by heliostat
-        Of those that were wanted; readings in order of time.
+        Of the requested heliostats; readings in order of time.
     contradictions : by heliostat and reading
-        Readings that were left out.
-    odd : tuple of str
-        Heliostats whose property files have drives of another kind than the field's.
-    clock : Clock or None
-        A fault of the clock that was taken for steps. Mounts are calibrated by the suns as they were recorded.
+        Excluded readings.
+    unusual : tuple of str
+        Heliostats whose property files have drives of unusual lengths.
+    clock : ClockFault or None
+        A fault of the clock that looks like steps. Mounts are calibrated by the recorded suns.
     covariates : by name
-        What time of day, season and weather explain of the errors that are left.
+        Shares of the remaining errors that time of day, season and weather explain.
     """
 
-    field: Field
+    prior: FieldPrior
     mounts: dict[str, CalibratedMount]
     readings: dict[str, list[Reading]]
     contradictions: dict[str, dict[str, Contradiction]]
-    odd: tuple[str, ...] = ()
-    clock: Clock | None = None
-    covariates: dict[str, Explained] = dataclasses.field(default_factory=dict)
+    unusual: tuple[str, ...] = ()
+    clock: ClockFault | None = None
+    covariates: dict[str, ExplainedShare] = dataclasses.field(default_factory=dict)
 
 
 def calibrate_field(
     heliostats: Mapping[str, Heliostat],
     readings: Mapping[str, Sequence[Reading]],
     targets: Mapping[str, TargetPlane],
+    site: Site,
     *,
-    latitude_deg: float,
     noise: Noise | None = None,
-    field: Field | None = None,
-    wanted: Collection[str] | None = None,
+    prior: FieldPrior | None = None,
+    requested: Collection[str] | None = None,
 ) -> FieldMounts:
-    """Calibrate the mounts of heliostats, all of which have actuators, by their readings in any order.
+    """Calibrate the mounts of heliostats with actuators by their readings, in any order.
 
-    ``field`` is the prior, by default what those with drives of one kind make together; who has no reading gets the
-    mount that it makes likely. Where mounts of some are ``wanted``, the others make the prior with them, and are among
-    those that a spot may be of.
+    Parameters
+    ----------
+    heliostats, readings, targets : by name
+    site : Site
+    noise : Noise, optional
+    prior : FieldPrior, optional
+        By default estimated from all heliostats with the same kind of drives. A heliostat without
+        readings gets its mean.
+    requested : names, optional
+        Heliostats to return. The others contribute to the prior, and may be the source of a foreign
+        spot.
     """
     names = list(readings)
-    ordered = {name: sorted(readings[name], key=lambda one: one.day) for name in names}
-    chain, arrays = Chain.of([heliostats[name] for name in names]), padded(list(ordered.values()))
-    if field is None:
+    ordered = {
+        name: sorted(readings[name], key=lambda reading: (np.isfinite(reading.day), reading.day))
+        for name in names
+    }
+    chain = KinematicChain.of([heliostats[name] for name in names])
+    arrays = pad_readings(list(ordered.values()))
+    if prior is None:
         kinds = calibrate_kinds(chain, arrays, noise)
     else:
-        kinds = [(np.arange(len(names)), calibrate(chain, arrays, noise, field))]
+        kinds = [(np.arange(len(names)), calibrate(chain, arrays, noise, prior))]
     every: dict[str, CalibratedMount] = {}
-    odd: set[str] = set()
+    unusual: set[str] = set()
     for rows, done in kinds:
         of_kind = [names[row] for row in rows]
-        every |= zip(of_kind, mounts_of(done, [heliostats[name] for name in of_kind], arrays.of(rows)), strict=True)
-        odd |= {name for name, is_odd in zip(of_kind, done.field.is_odd(chain.rows(rows)), strict=True) if is_odd}
-    mounts = {name: every[name] for name in names if wanted is None or name in wanted}
-    reasons = Reasons(heliostats, every, targets, latitude_deg)
+        every |= zip(
+            of_kind,
+            mounts_of(done, [heliostats[name] for name in of_kind], arrays.of(rows)),
+            strict=True,
+        )
+        is_unusual = done.prior.is_unusual(chain.rows(rows))
+        unusual |= {name for name, differs in zip(of_kind, is_unusual, strict=True) if differs}
+    mounts = {name: every[name] for name in names if requested is None or name in requested}
+    classifier = ContradictionClassifier(heliostats, every, targets, site)
     contradictions = {
         name: {
-            ordered[name][place].name: reasons.explain(name, ordered[name][place])
+            ordered[name][place].name: classifier.classify(name, ordered[name][place])
             for place in np.nonzero(mount.foreign)[0]
         }
         for name, mount in mounts.items()
     }
     return FieldMounts(
-        kinds[0][1].field,
+        kinds[0][1].prior,
         mounts,
         {name: ordered[name] for name in mounts},
         contradictions,
-        tuple(name for name in mounts if name in odd),
-        find_clock(kinds, arrays, latitude_deg),
-        explain(kinds, arrays, list(ordered.values()), latitude_deg),
+        tuple(name for name in mounts if name in unusual),
+        find_clock_fault(kinds, arrays, site),
+        explain_errors(kinds, arrays, list(ordered.values()), site),
     )

@@ -1,41 +1,44 @@
-"""Where a heliostat sends the sun's light at its motors' steps: the parameters of its mount, and what each one moves.
+"""Model where a heliostat reflects the sun's light at given motor positions, and the derivatives by
+its parameters.
 
-The chain is that of PAINT with the small errors of a real mount in it. With E the turn of the foundation, T the lack of
-a right angle between the axes, and m the mirror's normal at zero angles::
+Notes
+-----
+The kinematic chain is PAINT's with the small errors of a real mount. E is the rotation of the
+foundation, T the lack of a right angle between the axes, and m the mirror's normal at zero angles::
 
     n = E R_x(t1) T R_z(t2) m,   E = R_z(foundation_up) R_y(foundation_north),   T = R_y(axes_skew),
                                  m = R_x(mirror_tilt) (0, -1, 0)
 
-and light leaves the mirror's centre along 2 (n . sun) n - sun. A turn of the foundation about east, or of the mirror
-about the second axis, is one of a drive's zero and has no parameter of its own.
+Light leaves the mirror's centre along 2 (n . sun) n - sun. A rotation of the foundation about east,
+or of the mirror about the second axis, equals a change of a drive's zero, so neither has a separate
+parameter.
 
-A residual is the pair of angles [rad], sidewards and upwards as seen from the mirror, from the light's way to the
-measured spot: what the spot is off, whatever plane it lies on. Arrays have leading dimensions (H, M), heliostats and
-their measurements.
+A residual is the pair of angles [rad], sideways and upwards as seen from the mirror, from the
+reflected ray to the measured spot. It does not depend on the plane of the spot. Arrays have leading
+dimensions (H, M), heliostats and their measurements.
 
-Sources: PAINT, ``kinematics_properties``; errors of the mount as parameters of a fit: Baheti and Scott 1980, *Design of
-self-calibrating controllers for heliostats in a solar power plant*.
+Sources: PAINT, ``kinematics_properties``; errors of the mount as parameters of a fit: Baheti and
+Scott 1980, *Design of self-calibrating controllers for heliostats in a solar power plant*.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from model.actuator import LinearActuator
 from model.errors import InvalidInputError
-from model.mount import LinearActuator, Mount, rotation
+from model.mount import Mount, rotation
 from model.plant import Heliostat
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Parameter:
-    """A kinematic parameter: its unit, its spread over a field of one kind, and what it is.
-
-    ``spread`` [unit] is the standard deviation about PAINT's value that is believed before a field has been seen.
-    """
+class KinematicParameter:
+    """A kinematic parameter; ``spread`` [unit] is its prior deviation from PAINT's value."""
 
     name: str
     unit: str
@@ -44,34 +47,52 @@ class Parameter:
 
 
 PARAMETERS = (
-    Parameter("east", "m", 0.05, "the pivot lies further east than surveyed"),
-    Parameter("north", "m", 0.05, "the pivot lies further north than surveyed"),
-    Parameter("up", "m", 0.05, "the pivot lies higher than surveyed"),
-    Parameter("foundation_north", "rad", 0.03, "the first axis dips to the east: the foundation is turned about north"),
-    Parameter("foundation_up", "rad", 0.05, "the first axis points north of east: the foundation is turned about up"),
-    Parameter("axes_skew", "rad", 0.005, "the axes lack a right angle"),
-    Parameter("mirror_tilt", "rad", 0.01, "the mirror's normal is not perpendicular to the second axis"),
-    Parameter("first_zero", "rad", 0.03, "the first drive's angle at its reference"),
-    Parameter("second_zero", "rad", 0.03, "the second drive's angle at its reference"),
-    Parameter("first_radius", "m", 0.002, "the first spindle turns at a longer arm"),
-    Parameter("second_radius", "m", 0.002, "the second spindle turns at a longer arm"),
-    Parameter("first_offset", "m", 0.002, "the first spindle is held further from the pivot"),
-    Parameter("second_offset", "m", 0.002, "the second spindle is held further from the pivot"),
-    Parameter("first_stroke", "m", 0.002, "the first spindle is longer at its reference"),
-    Parameter("second_stroke", "m", 0.002, "the second spindle is longer at its reference"),
-    Parameter("mirror_ahead", "m", 0.02, "the mirror lies further before the pivot"),
+    KinematicParameter("east", "m", 0.05, "the pivot lies further east than surveyed"),
+    KinematicParameter("north", "m", 0.05, "the pivot lies further north than surveyed"),
+    KinematicParameter("up", "m", 0.05, "the pivot lies higher than surveyed"),
+    KinematicParameter(
+        "foundation_north",
+        "rad",
+        0.03,
+        "the first axis dips to the east: the foundation is turned about north",
+    ),
+    KinematicParameter(
+        "foundation_up",
+        "rad",
+        0.05,
+        "the first axis points north of east: the foundation is turned about up",
+    ),
+    KinematicParameter("axes_skew", "rad", 0.005, "the axes lack a right angle"),
+    KinematicParameter(
+        "mirror_tilt", "rad", 0.01, "the mirror's normal is not perpendicular to the second axis"
+    ),
+    KinematicParameter("first_zero", "rad", 0.03, "the first drive's angle at its reference"),
+    KinematicParameter("second_zero", "rad", 0.03, "the second drive's angle at its reference"),
+    KinematicParameter("first_radius", "m", 0.002, "the first spindle turns at a longer arm"),
+    KinematicParameter("second_radius", "m", 0.002, "the second spindle turns at a longer arm"),
+    KinematicParameter(
+        "first_offset", "m", 0.002, "the first spindle is held further from the pivot"
+    ),
+    KinematicParameter(
+        "second_offset", "m", 0.002, "the second spindle is held further from the pivot"
+    ),
+    KinematicParameter("first_stroke", "m", 0.002, "the first spindle is longer at its reference"),
+    KinematicParameter(
+        "second_stroke", "m", 0.002, "the second spindle is longer at its reference"
+    ),
+    KinematicParameter("mirror_ahead", "m", 0.02, "the mirror lies further before the pivot"),
 )
 NAMES = tuple(parameter.name for parameter in PARAMETERS)
 SPREAD: Array = np.array([parameter.spread for parameter in PARAMETERS])
 ZEROS = slice(NAMES.index("first_zero"), NAMES.index("second_zero") + 1)
-"""Where the drives' zeros stand among the parameters: what lost steps and drift move."""
+"""The drives' zeros among the parameters: lost steps and drift change them."""
 STROKES = slice(NAMES.index("first_stroke"), NAMES.index("second_stroke") + 1)
-"""Where the spindles' lengths at their references stand."""
+"""The spindles' lengths at their references among the parameters."""
 
 ANOTHER_KIND_M = 0.02
-"""Lengths [m] of drives of one kind differ by millimetres; by more than this they are another kind's."""
+"""Largest difference [m] between lengths of drives of one kind; they differ by millimetres."""
 
-# Their motors' steps a metre differ by less than this share.
+# Largest relative difference between the motor steps per metre of one kind.
 _ANOTHER_KIND = 0.01
 
 _X, _Y, _Z = np.eye(3)
@@ -79,7 +100,7 @@ _X, _Y, _Z = np.eye(3)
 
 @dataclass(frozen=True, eq=False)
 class Readings:
-    """What motors, sun and photographs said: H heliostats with up to M measurements each, in order of time.
+    """Measurements of H heliostats, up to M each, in order of time: motors, sun and spot.
 
     Attributes
     ----------
@@ -90,9 +111,9 @@ class Readings:
     spot : (H, M, 3) [m]
         Measured centres of the light, in ENU.
     days : (H, M) [d]
-        When, from any moment on.
+        Times, from any origin.
     used : (H, M) of bool
-        Where there is a measurement; the rest is padding, which may hold any finite numbers.
+        True for a measurement, False for padding of any finite numbers.
     """
 
     steps: Array
@@ -102,18 +123,20 @@ class Readings:
     used: NDArray[np.bool_]
 
     def of(self, rows: NDArray[np.intp] | slice) -> "Readings":
-        """Those of some heliostats, no more padded than they need."""
+        """Select some heliostats, with the least padding."""
         used = self.used[rows]
         most = max(1, int(used.sum(axis=1).max(initial=0)))
         if used[:, most:].any():
             raise InvalidInputError("readings: padding must follow the measurements")
         cut = (rows, slice(0, most))
-        return Readings(self.steps[cut], self.sun[cut], self.spot[cut], self.days[cut], used[:, :most])
+        return Readings(
+            self.steps[cut], self.sun[cut], self.spot[cut], self.days[cut], used[:, :most]
+        )
 
 
 @dataclass(frozen=True, eq=False)
-class Chain:
-    """Kinematics of H heliostats as their properties have them, before any calibration.
+class KinematicChain:
+    """Kinematics of H heliostats from their property files, before any calibration.
 
     Attributes
     ----------
@@ -121,9 +144,9 @@ class Chain:
     ahead : (H,) [m]
         The mirror's centre before the pivot, along the normal.
     increment, offset, radius, stroke, zero : (H, 2) [steps/m, m, m, m, rad]
-        The drives', as in `model.mount.LinearActuator`.
+        Of the drives, as in `model.actuator.LinearActuator`.
     sense : (H, 2)
-        1, or -1 where the angle shrinks as the stroke grows.
+        1, or -1 if the angle decreases with the stroke.
     """
 
     pivot: Array
@@ -136,18 +159,24 @@ class Chain:
     sense: Array
 
     @classmethod
-    def of(cls, heliostats: Sequence[Heliostat]) -> "Chain":
-        """The chain of heliostats whose mounts all have actuators; InvalidInputError for one that has none."""
+    def of(cls, heliostats: Sequence[Heliostat]) -> "KinematicChain":
+        """Build the chain of heliostats; InvalidInputError for one without actuators."""
         for heliostat in heliostats:
             if heliostat.mount.actuators is None:
-                raise InvalidInputError(f"heliostat {heliostat.name} has no linear actuators in its kinematics")
+                raise InvalidInputError(
+                    f"heliostat {heliostat.name} has no linear actuators in its kinematics"
+                )
         drives = [heliostat.mount.actuators or () for heliostat in heliostats]
 
         def values(name: str) -> Array:
-            return np.array([[getattr(drive, name) for drive in pair] for pair in drives], dtype=np.float64)
+            return np.array(
+                [[getattr(drive, name) for drive in pair] for pair in drives], dtype=np.float64
+            )
 
         return cls(
-            pivot=np.array([heliostat.position + heliostat.mount.joint for heliostat in heliostats]),
+            pivot=np.array(
+                [heliostat.position + heliostat.mount.joint for heliostat in heliostats]
+            ),
             ahead=np.array([heliostat.mount.mirror_offset[2] for heliostat in heliostats]),
             increment=values("increment"),
             offset=values("offset"),
@@ -158,31 +187,31 @@ class Chain:
         )
 
     def kinds(self) -> list[NDArray[np.intp]]:
-        """Rows of heliostats whose drives are of one kind, the largest kind first.
+        """Group the rows of heliostats by kind of drive, the largest kind first.
 
-        Those of one kind turn the same ways, and differ by what single heliostats are adjusted by. Their strokes and
-        zeros are no mark of a kind: some property files hold defaults for them.
+        Drives of one kind turn the same way and have nearly the same lengths. Strokes and zeros are
+        not compared: some property files have defaults for them.
         """
         found, left = [], np.arange(len(self.pivot))
         while left.size:
-            one = left[0]
-            alike = (self.sense[left] == self.sense[one]) & (
-                np.abs(self.increment[left] / self.increment[one] - 1) < _ANOTHER_KIND
+            first = left[0]
+            alike = (self.sense[left] == self.sense[first]) & (
+                np.abs(self.increment[left] / self.increment[first] - 1) < _ANOTHER_KIND
             )
             for lengths in (self.offset, self.radius):
-                alike &= np.abs(lengths[left] - lengths[one]) < ANOTHER_KIND_M
+                alike &= np.abs(lengths[left] - lengths[first]) < ANOTHER_KIND_M
             of_kind = alike.all(axis=1)
             found.append(left[of_kind])
             left = left[~of_kind]
         return sorted(found, key=len, reverse=True)
 
-    def rows(self, rows: NDArray[np.intp] | slice) -> "Chain":
-        """The chain of some of the heliostats."""
-        return Chain(**{name: value[rows] for name, value in vars(self).items()})
+    def rows(self, rows: NDArray[np.intp] | slice) -> "KinematicChain":
+        """Select some heliostats."""
+        return KinematicChain(**{name: value[rows] for name, value in vars(self).items()})
 
 
-def calibrated(mount: Mount, parameters: Array) -> Mount:
-    """A mount of PAINT's kind with its ``parameters`` (P,), in the order of `PARAMETERS`, in it."""
+def apply_parameters(mount: Mount, parameters: Array) -> Mount:
+    """Return a mount of PAINT's kind with ``parameters`` (P,), in the order of `PARAMETERS`."""
     if mount.actuators is None:
         raise InvalidInputError("this mount has no actuators, so there is nothing to calibrate")
     p = dict(zip(NAMES, parameters.tolist(), strict=True))
@@ -214,31 +243,41 @@ def _longer(drive: LinearActuator, radius: float, offset: float, stroke: float) 
     )
 
 
-@dataclass(frozen=True, eq=False)
-class Light:
-    """Where light leaves a mirror and whither: ``center`` (H, M, 3) [m] and unit ``direction`` (H, M, 3)."""
+class Residuals(NamedTuple):
+    """Residuals (H, M, 2) [rad] and their derivatives (H, M, 2, P) by the parameters."""
 
-    center: Array
-    direction: Array
+    values: Array
+    jacobian: Array
 
 
-def residuals(chain: Chain, readings: Readings, parameters: Array, zeros: Array) -> tuple[Array, Array]:
-    """Residuals (H, M, 2) [rad] and their derivatives (H, M, 2, P) by the parameters.
+def residuals(
+    chain: KinematicChain, readings: Readings, parameters: Array, zeros: Array
+) -> Residuals:
+    """Return the residuals ``measured - forecast`` with their derivatives; 0 in padding.
 
-    ``parameters`` (H, P) are in the order of `PARAMETERS`; ``zeros`` (H, M, 2) [rad] are added to those of the drives
-    at each measurement. What a photograph shows is ``residual = measured - forecast``, both 0 where nothing is used.
+    Parameters
+    ----------
+    chain, readings
+    parameters : (H, P)
+        In the order of `PARAMETERS`.
+    zeros : (H, M, 2) [rad]
+        Added to the drives' zeros at each measurement.
     """
     p = dict(zip(NAMES, parameters.T[:, :, None], strict=True))
     angles, slopes = _drive_angles(chain, readings.steps, parameters)
     angles = angles + parameters[:, None, ZEROS] + zeros
-    # Rotations are written out: each is a turn of two components, and matrices would take most of the time.
+    # Rotations are written out by component: matrix products would take most of the time.
     normal = _turn(0, p["mirror_tilt"], np.broadcast_to(-_Y, (*angles.shape[:2], 3)))
     tilt_axis = np.broadcast_to(_X, normal.shape)
     normal, tilt_axis = (_turn(2, angles[..., 1], vector) for vector in (normal, tilt_axis))
     second_axis = np.broadcast_to(_Z, normal.shape)
-    normal, tilt_axis, second_axis = (_turn(1, p["axes_skew"], v) for v in (normal, tilt_axis, second_axis))
+    normal, tilt_axis, second_axis = (
+        _turn(1, p["axes_skew"], v) for v in (normal, tilt_axis, second_axis)
+    )
     skew_axis = np.broadcast_to(_Y, normal.shape)
-    turned = (_turn(0, angles[..., 0] - np.pi / 2, v) for v in (normal, tilt_axis, second_axis, skew_axis))
+    turned = (
+        _turn(0, angles[..., 0] - np.pi / 2, v) for v in (normal, tilt_axis, second_axis, skew_axis)
+    )
     normal, tilt_axis, second_axis, skew_axis = turned
     first_axis = np.broadcast_to(_X, normal.shape)
     moved = [normal, tilt_axis, second_axis, skew_axis, first_axis]
@@ -254,12 +293,18 @@ def residuals(chain: Chain, readings: Readings, parameters: Array, zeros: Array)
     to_spot = to_spot / distance
     sidewards = np.cross(_Z, to_spot)
     sidewards = sidewards / np.linalg.norm(sidewards, axis=-1, keepdims=True)
-    seen = np.stack([sidewards, np.cross(to_spot, sidewards)], axis=-2) * readings.used[..., None, None]
-    # The angles' sines would bend back beyond a right angle; a robust fit never gets there.
+    seen = (
+        np.stack([sidewards, np.cross(to_spot, sidewards)], axis=-2)
+        * readings.used[..., None, None]
+    )
+    # Sines of angles decrease beyond a right angle; a robust fit stays far below it.
     residual = -(seen @ (2 * cosine * normal - readings.sun)[..., None])[..., 0]
 
-    # residual = -seen . direction, where seen is at right angles to the way from the mirror to the spot.
-    by_normal = -2 * (cosine[..., None] * seen + (seen @ normal[..., None]) * readings.sun[..., None, :])
+    # residual = -seen . direction, with seen at right angles to the direction from the mirror to
+    # the spot.
+    by_normal = -2 * (
+        cosine[..., None] * seen + (seen @ normal[..., None]) * readings.sun[..., None, :]
+    )
     shift = -seen / distance[..., None]
     by_normal = by_normal + ahead[..., None] * shift
     axes = {
@@ -277,22 +322,29 @@ def residuals(chain: Chain, readings: Readings, parameters: Array, zeros: Array)
         for name, slope in slopes.items():
             columns[f"{which}_{name}"] = columns[f"{which}_zero"] * slope[..., drive, None]
     columns["mirror_ahead"] = (shift @ normal[..., None])[..., 0]
-    return residual, np.stack([columns[name] for name in NAMES], axis=-1)
+    return Residuals(residual, np.stack([columns[name] for name in NAMES], axis=-1))
 
 
 def _turn(axis: int, angle: Array, vector: Array) -> Array:
-    """Vectors (..., 3) turned about a coordinate axis by angles (...) [rad], right-handed."""
+    """Rotate vectors (..., 3) about a coordinate axis by angles (...) [rad], right-handed."""
     cosine, sine = np.cos(angle), np.sin(angle)
     turned = np.empty(vector.shape)
-    one, two = (axis + 1) % 3, (axis + 2) % 3
+    x, y = (axis + 1) % 3, (axis + 2) % 3
     turned[..., axis] = vector[..., axis]
-    turned[..., one] = cosine * vector[..., one] - sine * vector[..., two]
-    turned[..., two] = sine * vector[..., one] + cosine * vector[..., two]
+    turned[..., x] = cosine * vector[..., x] - sine * vector[..., y]
+    turned[..., y] = sine * vector[..., x] + cosine * vector[..., y]
     return turned
 
 
-def _drive_angles(chain: Chain, steps: Array, parameters: Array) -> tuple[Array, dict[str, Array]]:
-    """Angles (H, M, 2) [rad] of both drives without their zeros, and their slopes (H, M, 2) [rad/m]."""
+class _Angles(NamedTuple):
+    """Angles (H, M, 2) [rad] of both drives, and their slopes (H, M, 2) [rad/m] by lengths."""
+
+    angles: Array
+    slopes: dict[str, Array]
+
+
+def _drive_angles(chain: KinematicChain, steps: Array, parameters: Array) -> _Angles:
+    """Return the drives' angles without the zeros among the parameters."""
     first = NAMES.index("first_radius")
     radius, offset, stroke = (parameters[:, None, first + k : first + k + 2] for k in (0, 2, 4))
     radius, offset = chain.radius[:, None] + radius, chain.offset[:, None] + offset
@@ -300,22 +352,22 @@ def _drive_angles(chain: Chain, steps: Array, parameters: Array) -> tuple[Array,
     at, at_slopes = _pivot(steps / chain.increment[:, None] + reference, offset, radius)
     zero, zero_slopes = _pivot(reference, offset, radius)
     sense = chain.sense[:, None]
-    return chain.zero[:, None] + sense * (at - zero), {
-        name: sense * (at_slopes[name] - zero_slopes[name]) for name in at_slopes
-    }
+    slopes = {name: sense * (at_slopes[name] - zero_slopes[name]) for name in at_slopes}
+    return _Angles(chain.zero[:, None] + sense * (at - zero), slopes)
 
 
-# The triangle of a spindle is degenerate where its sides lie in one line; a fit is kept from there.
+# The triangle of a spindle degenerates if its sides lie in one line; a fit is kept away from it.
 _WIDEST_COSINE = 1 - 1e-9
 
 
-def _pivot(stroke: Array, offset: Array, radius: Array) -> tuple[Array, dict[str, Array]]:
-    """The pivot's angle [rad] in a triangle of sides ``offset``, ``radius`` and ``stroke`` [m], and its slopes."""
+def _pivot(stroke: Array, offset: Array, radius: Array) -> _Angles:
+    """Return the pivot's angle in a triangle of sides ``offset``, ``radius`` and ``stroke`` [m]."""
     cosine = (offset**2 + radius**2 - stroke**2) / (2 * offset * radius)
     cosine = np.clip(cosine, -_WIDEST_COSINE, _WIDEST_COSINE)
     sine = np.sqrt(1 - cosine**2)
-    return np.arccos(cosine), {
+    slopes = {
         "radius": -(1 / offset - cosine / radius) / sine,
         "offset": -(1 / radius - cosine / offset) / sine,
         "stroke": stroke / (offset * radius * sine),
     }
+    return _Angles(np.arccos(cosine), slopes)

@@ -1,19 +1,22 @@
-"""Which photograph would tell most of a mount: the information that a spot is expected to bring.
+"""Find the photographs that are most informative about a mount, by expected information.
 
-A spot measured with noise R, where the mount foretells it with covariance S + R, tells half the logarithm of
-det(S + R) / det(R): much where the mount is unsure, nothing where it knows. Source: Lindley 1956,
-doi:10.1214/aoms/1177728069.
+The mount predicts a spot with covariance S + R, where R is the measurement noise. The information
+of that spot is half the logarithm of det(S + R) / det(R): high if the mount is uncertain, zero if
+it is known. Source: Lindley 1956, doi:10.1214/aoms/1177728069.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from model.errors import ModelError
+from model.fleet import in_parts
 from model.plant import Heliostat, TargetPlane
 from model.pointing.mounts import CalibratedMount
+from model.pointing.spots import find_motors, spot_covariance
 
 Array = NDArray[np.float64]
 
@@ -42,18 +45,6 @@ class Proposal:
     std_mrad: float
 
 
-def propose(
-    heliostat: Heliostat, mount: CalibratedMount, plane: TargetPlane, sun: ArrayLike, day: float, slot: int = 0
-) -> Proposal:
-    """What a photograph of a heliostat would tell; raises what `CalibratedMount.motors` raises."""
-    source = np.asarray(sun, dtype=np.float64)
-    motors = mount.motors(heliostat, source, plane.center, day)
-    cov = mount.covariance_at(heliostat, motors[None], source[None], plane.center[None], np.array([day]))[0]
-    bits = 0.5 * (np.log2(np.linalg.det(cov)) - 4 * np.log2(mount.noise.spot_rad))
-    std = 1e3 * float(np.sqrt(np.trace(cov) / 2))
-    return Proposal(heliostat.name, plane.name, slot, motors, max(0.0, float(bits)), std)
-
-
 def plan(
     heliostats: Mapping[str, Heliostat],
     mounts: Mapping[str, CalibratedMount],
@@ -61,23 +52,34 @@ def plan(
     suns: Sequence[Array],
     days: Sequence[float],
 ) -> list[Proposal]:
-    """One photograph for each of the ``suns`` (3,), at ``days`` [d]: each of the heliostat that it tells most of.
+    """Propose the most informative photograph for each of the ``suns`` (3,), at ``days`` [d].
 
-    A heliostat is proposed once. All are looked at under the middle sun on the first of ``planes`` they reach; those
-    that promise most, some for each sun, on every plane and under every sun.
+    A heliostat is proposed once at most. All heliostats are evaluated under the middle sun, on the
+    first of ``planes`` that they reach. The most informative of them, two per sun, are evaluated on
+    every plane and under every sun.
     """
     middle = len(suns) // 2
-    first = [_best(heliostats[name], mounts[name], planes, suns, days, [middle], True) for name in mounts]
-    promising = sorted((one for one in first if one is not None), key=lambda one: -one.information_bits)
-    chosen: list[Proposal] = []
-    left = [one.heliostat for one in promising[: 2 * len(suns)]]
-    for slot in range(len(suns)):
-        offers = [_best(heliostats[name], mounts[name], planes, suns, days, [slot], False) for name in left]
-        best = max((one for one in offers if one is not None), key=lambda one: one.information_bits, default=None)
+    first = [
+        next(proposals(heliostats[name], mount, planes, suns, days, [middle]), None)
+        for name, mount in mounts.items()
+    ]
+    promising = sorted(
+        (one for one in first if one is not None), key=lambda one: -one.information_bits
+    )
+    names = [one.heliostat for one in promising[: 2 * len(suns)]]
+    slots = range(len(suns))
+    offers = [
+        one
+        for name in names
+        for one in proposals(heliostats[name], mounts[name], planes, suns, days, slots)
+    ]
+    chosen: dict[str, Proposal] = {}
+    for slot in slots:
+        left = [one for one in offers if one.slot == slot and one.heliostat not in chosen]
+        best = max(left, key=lambda one: one.information_bits, default=None)
         if best is not None:
-            chosen.append(best)
-            left.remove(best.heliostat)
-    return chosen
+            chosen[best.heliostat] = best
+    return list(chosen.values())
 
 
 def best_sun(
@@ -87,28 +89,55 @@ def best_sun(
     suns: Sequence[Array],
     days: Sequence[float],
 ) -> Proposal | None:
-    """The photograph that tells most of one heliostat, each sun's on the first of ``planes`` in reach; None without."""
-    found = [_best(heliostat, mount, planes, suns, days, [slot], True) for slot in range(len(suns))]
-    return max((one for one in found if one is not None), key=lambda one: one.information_bits, default=None)
+    """The most informative photograph of one heliostat; None if no plane is in reach.
+
+    Each sun is evaluated on the first of ``planes`` that the heliostat reaches.
+    """
+    found = proposals(heliostat, mount, planes, suns, days, range(len(suns)))
+    first = [next(on_planes) for _, on_planes in groupby(found, key=lambda one: one.slot)]
+    return max(first, key=lambda one: one.information_bits, default=None)
 
 
-def _best(
+def proposals(
     heliostat: Heliostat,
     mount: CalibratedMount,
     planes: Sequence[TargetPlane],
     suns: Sequence[Array],
     days: Sequence[float],
     slots: Sequence[int],
-    any_plane: bool,
-) -> Proposal | None:
-    """The proposal that tells most of one heliostat, or, for ``any_plane``, the first; None where none is in reach."""
-    found = []
-    for slot in slots:
-        for plane in planes:
-            try:
-                found.append(propose(heliostat, mount, plane, suns[slot], days[slot], slot))
-            except ModelError:  # beyond the drives' travel, or behind the mirror
-                continue
-            if any_plane:
-                return found[0]
-    return max(found, key=lambda one: one.information_bits, default=None)
+) -> Iterator[Proposal]:
+    """Photographs of one heliostat under the suns of ``slots``, on each of ``planes``, in that
+    order.
+
+    Those beyond the drives' travel, or behind the mirror, are left out.
+    """
+    pairs = [(slot, plane) for slot in slots for plane in planes]
+    if not pairs:
+        return
+    by_slot = dict(enumerate(suns)), dict(enumerate(days))
+    for _, made in in_parts(lambda part: _propose_all(heliostat, mount, part, *by_slot), pairs):
+        if not isinstance(made, ModelError):
+            yield from made
+
+
+def _propose_all(
+    heliostat: Heliostat,
+    mount: CalibratedMount,
+    pairs: Sequence[tuple[int, TargetPlane]],
+    suns: Mapping[int, Array],
+    days: Mapping[int, float],
+) -> list[Proposal]:
+    """Expected information for each pair of a slot and a plane; raises if one is out of reach."""
+    sun, day = (
+        np.array([suns[slot] for slot, _ in pairs]),
+        np.array([days[slot] for slot, _ in pairs]),
+    )
+    centers = np.array([plane.center for _, plane in pairs])
+    motors = find_motors(mount, heliostat, sun, centers, day)
+    cov = spot_covariance(mount, heliostat, motors, sun, centers, day)
+    bits = np.maximum(0.5 * (np.log2(np.linalg.det(cov)) - 4 * np.log2(mount.noise.spot_rad)), 0.0)
+    std = 1e3 * np.sqrt(np.trace(cov, axis1=1, axis2=2) / 2)
+    return [
+        Proposal(heliostat.name, plane.name, slot, motors[row], float(bits[row]), float(std[row]))
+        for row, (slot, plane) in enumerate(pairs)
+    ]

@@ -1,7 +1,7 @@
-"""Why a measurement contradicts all others of its heliostat: what would have to be true for it to fit.
+"""Find the likeliest reason why a measurement contradicts all others of its heliostat.
 
-Each reason says what the measurement would be if it were so, another target or another sun; the mount, or that of
-another heliostat, says whether it then fits.
+Each reason changes the measurement: another target, another sun, another heliostat. A reason is
+likely if the changed measurement fits the mount.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -12,126 +12,162 @@ from numpy.typing import NDArray
 
 from model.errors import ModelError
 from model.plant import Heliostat, TargetPlane
-from model.pointing.kinematics import ZEROS, Chain, residuals
-from model.pointing.mounts import CalibratedMount, landed
-from model.pointing.readings import Reading, later, padded
+from model.pointing.kinematics import ZEROS, KinematicChain, residuals
+from model.pointing.mounts import CalibratedMount
+from model.pointing.readings import Reading, pad_readings
+from model.pointing.spots import intersect_plane, reflect_rays
+from model.site import Site
 
 Array = NDArray[np.float64]
 
-# What a reason leaves must be less than this [rad], or than this share of what it explains.
+# Largest error with a reason [rad], or its largest share of the error without.
 _FITS = 3e-3
 _EXPLAINS = 0.15
 
-# A spot of another heliostat lies further away than that [rad]; so many others are tried.
-_ANOTHERS = 10e-3
-_TRIED = 4
+# Smallest error [rad] at which other heliostats are tried, and their number.
+_OTHER_SPOT = 10e-3
+_N_OTHERS = 4
 
-# Clocks are set to other zones, which are whole or half hours apart, or to summer.
+# Time zones and summer time differ by whole or half hours.
 _HOURS = (-2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0)
 
 
 @dataclass(frozen=True)
 class Contradiction:
-    """A measurement that was left out: ``reason`` is a short code, ``detail`` a sentence.
+    """An excluded measurement: ``reason`` is a short code, ``detail`` a sentence.
 
-    ``off_mrad`` [mrad] is how far its spot lies from the forecast one, seen from the mirror.
+    ``error_mrad`` [mrad] is the angle between its spot and the forecast one, from the mirror.
     """
 
     reason: str
     detail: str
-    off_mrad: float
+    error_mrad: float
 
 
-def off_by(heliostat: Heliostat, mount: CalibratedMount, readings: Sequence[Reading]) -> Array:
-    """Angles (N,) [rad] between forecast and measured spots, seen from the mirror."""
-    motors, suns, spots = (np.array([getattr(one, name) for one in readings]) for name in ("motors", "sun", "spot"))
-    centers, directions = mount.light(heliostat, motors, suns, np.array([one.day for one in readings]))
-    ways = spots - centers
-    ways /= np.linalg.norm(ways, axis=-1, keepdims=True)
-    return np.asarray(2 * np.arcsin(np.clip(np.linalg.norm(ways - directions, axis=-1) / 2, 0, 1)))
+def pointing_error(
+    heliostat: Heliostat, mount: CalibratedMount, readings: Sequence[Reading]
+) -> Array:
+    """Return the angles (N,) [rad] between forecast and measured spots, from the mirror."""
+    motors, suns, spots = (
+        np.array([getattr(reading, name) for reading in readings])
+        for name in ("motors", "sun", "spot")
+    )
+    centers, directions = reflect_rays(
+        mount, heliostat, motors, suns, np.array([reading.day for reading in readings])
+    )
+    to_spots = spots - centers
+    to_spots /= np.linalg.norm(to_spots, axis=-1, keepdims=True)
+    return np.asarray(
+        2 * np.arcsin(np.clip(np.linalg.norm(to_spots - directions, axis=-1) / 2, 0, 1))
+    )
 
 
-class Reasons:
-    """What may explain readings of a calibrated field: its targets, the sun, and its other heliostats."""
+class ContradictionClassifier:
+    """Finds reasons for contradictory readings: other targets, suns or heliostats of the field."""
 
     def __init__(
         self,
         heliostats: Mapping[str, Heliostat],
         mounts: Mapping[str, CalibratedMount],
         targets: Mapping[str, TargetPlane],
-        latitude_deg: float,
+        site: Site,
     ) -> None:
         self._heliostats, self._mounts, self._targets = heliostats, mounts, targets
-        self._latitude_deg = latitude_deg
+        self._site = site
         self._measured = [name for name, mount in mounts.items() if len(mount.days)]
-        self._chain = Chain.of([heliostats[name] for name in self._measured])
+        self._chain = KinematicChain.of([heliostats[name] for name in self._measured])
         newest = [mounts[name].parameters.copy() for name in self._measured]
         for name, parameters in zip(self._measured, newest, strict=True):
             parameters[ZEROS] += mounts[name].stepped[-1]
         self._newest = np.array(newest)
 
-    def explain(self, name: str, reading: Reading) -> Contradiction:
-        """The likeliest reason why a reading of heliostat ``name`` contradicts its others."""
+    def classify(self, name: str, reading: Reading) -> Contradiction:
+        """Return the likeliest reason why a reading of heliostat ``name`` is contradictory."""
         heliostat, mount = self._heliostats[name], self._mounts[name]
         try:
-            off = float(off_by(heliostat, mount, [reading])[0])
+            error = float(pointing_error(heliostat, mount, [reading])[0])
         except ModelError:
-            return Contradiction("motors", "its drives cannot stand where its motors are said to be", 1e3 * np.pi)
+            return Contradiction(
+                "motors", "its drives cannot reach the reported motor positions", 1e3 * np.pi
+            )
         fits = {
-            (code, detail): float(off_by(heliostat, mount, [other])[0])
-            for code, detail, other in _otherwise(reading, self._targets, self._latitude_deg)
+            (code, detail): float(pointing_error(heliostat, mount, [other])[0])
+            for code, detail, other in _alternatives(reading, self._targets, self._site)
         }
-        if off > _ANOTHERS:
-            fits |= self._of_others(name, reading)
-        (code, detail), left = min(fits.items(), key=lambda item: item[1], default=(("", ""), np.inf))
-        if left < max(_FITS, _EXPLAINS * off) and left < off / 2:
-            return Contradiction(code, f"{detail}, to {1e3 * left:.1f} mrad", 1e3 * off)
-        return Contradiction(*_elsewhere(heliostat, mount, reading, self._targets), 1e3 * off)
+        if error > _OTHER_SPOT:
+            fits |= self._other_heliostats(name, reading)
+        (code, detail), left = min(
+            fits.items(), key=lambda item: item[1], default=(("", ""), np.inf)
+        )
+        if left < max(_FITS, _EXPLAINS * error) and left < error / 2:
+            return Contradiction(code, f"{detail}, to {1e3 * left:.1f} mrad", 1e3 * error)
+        return _unexplained(heliostat, mount, reading, self._targets, 1e3 * error)
 
-    def _of_others(self, name: str, reading: Reading) -> dict[tuple[str, str], float]:
-        """How well a reading fits those heliostats that it fits best [rad]."""
+    def _other_heliostats(self, name: str, reading: Reading) -> dict[tuple[str, str], float]:
+        """Return the errors [rad] of a reading at the heliostats that it fits best."""
         count = len(self._measured)
-        alike = padded([[reading]] * count)
-        apart = residuals(self._chain, alike, self._newest, np.zeros((count, 1, 2)))[0][:, 0]
+        copies = pad_readings([[reading]] * count)
+        apart = residuals(self._chain, copies, self._newest, np.zeros((count, 1, 2))).values[:, 0]
         found = {}
-        for place in np.argsort(np.linalg.norm(apart, axis=-1))[:_TRIED]:
+        for place in np.argsort(np.linalg.norm(apart, axis=-1))[:_N_OTHERS]:
             other = self._measured[place]
             if other == name:
                 continue
             try:
-                left = float(off_by(self._heliostats[other], self._mounts[other], [reading])[0])
-            except ModelError:  # that heliostat's drives cannot stand there
+                left = float(
+                    pointing_error(self._heliostats[other], self._mounts[other], [reading])[0]
+                )
+            except ModelError:  # the drives of that heliostat cannot get there
                 continue
             found["wrong_heliostat", f"it fits heliostat {other}"] = left
         return found
 
 
-def _otherwise(
-    reading: Reading, targets: Mapping[str, TargetPlane], latitude_deg: float
+def _alternatives(
+    reading: Reading, targets: Mapping[str, TargetPlane], site: Site
 ) -> Iterator[tuple[str, str, Reading]]:
-    """Code, detail and what the reading would be, of each reason that lies with it alone."""
-    own = targets[reading.target]
+    """Iterate over code, detail and changed reading of each reason within one heliostat."""
+    target = targets[reading.target]
     for name, plane in targets.items():
         if name != reading.target:
-            spot = plane.to_enu(own.to_plane(reading.spot))
-            yield "wrong_target", f"its spot fits on {name} in place of {own.name}", replace(reading, spot=spot)
+            spot = plane.to_enu(target.to_plane(reading.spot))
+            yield (
+                "wrong_target",
+                f"its spot fits on {name} in place of {target.name}",
+                replace(reading, spot=spot),
+            )
     for hours in _HOURS:
-        sun = later(reading.sun, 60 * hours, latitude_deg)
-        way = "later" if hours > 0 else "earlier"
-        yield "clock", f"it fits a sun {abs(hours):g} h {way}: check the clock's time zone", replace(reading, sun=sun)
+        sun = site.advance_sun(reading.sun, 60 * hours)
+        direction = "later" if hours > 0 else "earlier"
+        yield (
+            "clock",
+            f"it fits a sun {abs(hours):g} h {direction}: check the clock's time zone",
+            replace(reading, sun=sun),
+        )
 
 
-def _elsewhere(
-    heliostat: Heliostat, mount: CalibratedMount, reading: Reading, targets: Mapping[str, TargetPlane]
-) -> tuple[str, str]:
-    """Of a reading that nothing explains: whether its light should have been seen on the target."""
+def _unexplained(
+    heliostat: Heliostat,
+    mount: CalibratedMount,
+    reading: Reading,
+    targets: Mapping[str, TargetPlane],
+    error_mrad: float,
+) -> Contradiction:
+    """Describe a reading without a likely reason, and where its light should have been."""
     plane = targets[reading.target]
-    centers, directions = mount.light(heliostat, reading.motors[None], reading.sun[None], np.array([reading.day]))
+    centers, directions = reflect_rays(
+        mount, heliostat, reading.motors[None], reading.sun[None], np.array([reading.day])
+    )
     try:
-        point = landed(centers[0], directions[0], plane)
+        point = intersect_plane(centers[0], directions[0], plane)
     except ModelError:
-        return "motors", "its motors send the light away from the target: check motors and sun"
+        detail = "its motors point the light away from the target: check motors and sun"
+        return Contradiction("motors", detail, error_mrad)
     apart = float(np.linalg.norm(point - reading.spot))
-    if plane.holds(point):
-        return "foreign_spot", f"its light should lie {apart:.2f} m away on the same target: likely a foreign spot"
-    return "motors", f"its motors send the light {apart:.1f} m away, off the target: check motors, sun and spot"
+    if plane.contains(point):
+        detail = f"its light should be {apart:.2f} m away on the same target: likely a foreign spot"
+        return Contradiction("foreign_spot", detail, error_mrad)
+    detail = (
+        f"its motors point the light {apart:.1f} m away, off the target: check motors, sun and spot"
+    )
+    return Contradiction("motors", detail, error_mrad)

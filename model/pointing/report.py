@@ -1,4 +1,4 @@
-"""Calibrated mounts as JSON, and back: MOUNTS.json of the command line, documents of the store."""
+"""Convert calibrated mounts to JSON and back: MOUNTS.json, and documents of the store."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
@@ -9,43 +9,54 @@ from numpy.typing import NDArray
 
 from model.effects import Effect, effect_to_json, in_light_order
 from model.errors import InvalidInputError
-from model.pointing.clock import Clock
-from model.pointing.covariates import Explained
+from model.pointing.clock import ClockFault
+from model.pointing.covariates import ExplainedShare
 from model.pointing.drives import Noise
 from model.pointing.field import FieldMounts
 from model.pointing.kinematics import NAMES, PARAMETERS
-from model.pointing.mounts import CalibratedMount, Step
+from model.pointing.mounts import CalibratedMount, Step, cause_of
 from model.pointing.readings import Reading
 from model.pointing.reasons import Contradiction
+from model.times import format_time
 
 Array = NDArray[np.float64]
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
-# Standard deviations that make a drift sure.
-_SURE = 3.0
+# Standard deviations of a significant drift.
+_SIGNIFICANT = 3.0
 
-_DIGITS = 9  # of radians and metres: far below what a step of a motor does
+_DIGITS = 9  # of radians and metres: far below the effect of a motor step
 
 
 def day_of(moment: datetime | None) -> float:
-    """Days [d] since 1970, as readings have them; NaN without a moment."""
+    """Return days [d] since 1970, as in readings; NaN without a time."""
     return float("nan") if moment is None else (moment - _EPOCH).total_seconds() / 86400
 
 
 def moment_of(day: float) -> datetime:
-    """When that was, to the second."""
+    """Return the time of a day [d] since 1970, to the second."""
     return _EPOCH + timedelta(seconds=round(day * 86400))
 
 
 def sun_to_json(effects: Iterable[Effect]) -> list[dict[str, Any]]:
-    """Those of a model's effects that move the sun, as JSON: a mount holds under the sun it was calibrated under."""
-    return [effect_to_json(one) for one in in_light_order(effects) if type(one).on_sun is not Effect.on_sun]
+    """Return the effects that move the sun as JSON: a calibration is valid for its sun."""
+    moving = (
+        effect for effect in in_light_order(effects) if type(effect).on_sun is not Effect.on_sun
+    )
+    return [effect_to_json(effect) for effect in moving]
 
 
 def parameters_to_json(mount: CalibratedMount) -> dict[str, Any]:
-    """Every parameter with its unit, its spread before and after, and whether the data determine it."""
-    rows = zip(PARAMETERS, mount.parameters, mount.spread, mount.prior_spread, mount.determined, strict=True)
+    """Return each parameter with its unit, and its standard deviations by posterior and prior."""
+    rows = zip(
+        PARAMETERS,
+        mount.parameters,
+        mount.spread,
+        mount.prior_spread,
+        mount.determined,
+        strict=True,
+    )
     return {
         parameter.name: {
             "value": _rounded(value),
@@ -64,15 +75,16 @@ def mount_to_json(
     contradictions: Mapping[str, Contradiction],
     effects: Iterable[Effect] = (),
 ) -> dict[str, Any]:
-    """A mount as JSON, with what it was made of; ``readings`` in order of time, their suns as ``effects`` move them."""
-    believed = 1e3 * mount.off[~mount.foreign]
+    """Return a mount with its ``readings`` in order of time; ``effects`` moved their suns."""
+    errors = 1e3 * mount.errors_rad[~mount.foreign]
     return {
         "valid_from": _begin(mount),
         "sun": sun_to_json(effects),
         "measurements": len(readings),
+        "undated": mount.n_undated,
         "residual_mrad": {
-            "median": round(float(np.median(believed)), 3) if believed.size else None,
-            "p90": round(float(np.percentile(believed, 90)), 3) if believed.size else None,
+            "median": round(float(np.median(errors)), 3) if errors.size else None,
+            "p90": round(float(np.percentile(errors, 90)), 3) if errors.size else None,
         },
         "parameters": parameters_to_json(mount),
         "steps": [
@@ -84,56 +96,66 @@ def mount_to_json(
                 "zeros_mrad": _rounded(1e3 * step.zeros, 3),
                 "std_mrad": _rounded(1e3 * step.std, 3),
                 "motor_steps": _rounded(step.motors, 1),
-                **dict(zip(("change", "detail"), mount.change(step), strict=True)),
+                "change": cause_of(step, mount).code,
+                "detail": cause_of(step, mount).detail,
             }
             for step in mount.steps
         ],
         "drift": _drift(mount),
-        "outliers": {name: vars(one) | {"off_mrad": round(one.off_mrad, 2)} for name, one in contradictions.items()},
+        "outliers": {
+            name: {"reason": one.reason, "detail": one.detail, "off_mrad": round(one.error_mrad, 2)}
+            for name, one in contradictions.items()
+        },
         "covariance": _rounded(mount.covariance, 14),
         "history": {
-            "at": [_iso(day) for day in mount.days],
-            **{name: _rounded(getattr(mount, name)) for name in ("drift", "jitter", "stepped", "residuals")},
+            "at": [None if np.isnan(day) else _iso(day) for day in mount.days],
+            **{
+                name: _rounded(getattr(mount, name))
+                for name in ("drift", "jitter", "stepped", "residuals")
+            },
             "foreign": np.nonzero(mount.foreign)[0].tolist(),
         },
     }
 
 
 def _begin(mount: CalibratedMount) -> str | None:
-    """Since when the newest state holds: the last step, or the first measurement."""
-    if not len(mount.days):
+    """Return the time of the last step, or of the first measurement; None if no time is known."""
+    if mount.until is None:
         return None
-    return _iso(mount.days[mount.steps[-1].after if mount.steps else 0])
+    return _iso(mount.days[mount.steps[-1].after if mount.steps else mount.n_undated])
 
 
 def _drift(mount: CalibratedMount) -> dict[str, Any]:
-    """How far the zeros went slowly from the first measurement to the newest, beside all steps."""
-    gone = mount.drift[-1] - mount.drift[0] if len(mount.days) else np.zeros(2)
+    """Describe the drift of the zeros from the first measurement to the newest."""
+    drift = np.zeros(2) if mount.until is None else mount.drift[-1] - mount.drift[mount.n_undated]
     return {
-        "zeros_mrad": _rounded(1e3 * gone, 3),
+        "zeros_mrad": _rounded(1e3 * drift, 3),
         "std_mrad": _rounded(1e3 * mount.drifted_std, 3),
-        "is_sure": bool((np.abs(gone) > _SURE * np.maximum(mount.drifted_std, 1e-9)).any()),
+        "is_sure": bool((np.abs(drift) > _SIGNIFICANT * np.maximum(mount.drifted_std, 1e-9)).any()),
     }
 
 
 def parameters_from_json(document: Any, where: str) -> Array:
-    """The parameters (P,) of a document that `mount_to_json` wrote: all but how its drives' zeros went in time."""
+    """Read the parameters (P,) from a document of `mount_to_json`."""
     try:
         return np.array([document["parameters"][name]["value"] for name in NAMES], dtype=np.float64)
     except (KeyError, TypeError, ValueError) as error:
-        raise _no_mount(where, error) from None
+        raise _format_error(where, error) from None
 
 
-def _no_mount(where: str, error: Exception) -> InvalidInputError:
-    what = f"{error} is missing" if isinstance(error, KeyError) else "a field of it has another form"
-    return InvalidInputError(f"{where}: no calibrated mount as `heliotwin calibrate` writes it; {what}")
+def _format_error(where: str, error: Exception) -> InvalidInputError:
+    fault = f"{error} is missing" if isinstance(error, KeyError) else "a field has another form"
+    return InvalidInputError(f"{where}: not a calibrated mount of `heliotwin calibrate`: {fault}")
 
 
 def mount_from_json(document: Any, where: str, noise: Noise | None = None) -> CalibratedMount:
-    """The mount of a document that `mount_to_json` wrote; `InvalidInputError` for any other."""
+    """Read a mount from a document of `mount_to_json`; `InvalidInputError` for any other."""
     try:
         history = document["history"]
-        days = np.array([day_of(datetime.fromisoformat(moment)) for moment in history["at"]], dtype=np.float64)
+        times = [
+            None if moment is None else datetime.fromisoformat(moment) for moment in history["at"]
+        ]
+        days = np.array([day_of(time) for time in times], dtype=np.float64)
         count = len(days)
         values = {
             name: np.array(history[name], dtype=np.float64).reshape(count, 2)
@@ -141,8 +163,12 @@ def mount_from_json(document: Any, where: str, noise: Noise | None = None) -> Ca
         }
         foreign = np.isin(np.arange(count), history["foreign"])
         entries = [document["parameters"][name] for name in NAMES]
-        parameters, spread, prior = (np.array([e[key] for e in entries]) for key in ("value", "std", "prior_std"))
-        covariance = np.array(document["covariance"], dtype=np.float64).reshape(len(NAMES), len(NAMES))
+        parameters, spread, prior = (
+            np.array([e[key] for e in entries]) for key in ("value", "std", "prior_std")
+        )
+        covariance = np.array(document["covariance"], dtype=np.float64).reshape(
+            len(NAMES), len(NAMES)
+        )
         by_moment = {moment: place for place, moment in enumerate(history["at"])}
         steps = tuple(
             Step(
@@ -155,11 +181,14 @@ def mount_from_json(document: Any, where: str, noise: Noise | None = None) -> Ca
             for step in document["steps"]
         )
         drifted = 1e-3 * np.array(document["drift"]["std_mrad"], dtype=np.float64).reshape(2)
-        finite = all(np.isfinite(value).all() for value in (*values.values(), parameters, covariance, drifted))
+        finite = all(
+            np.isfinite(value).all()
+            for value in (*values.values(), parameters, covariance, drifted)
+        )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise _no_mount(where, error) from None
+        raise _format_error(where, error) from None
     if not finite:
-        raise InvalidInputError(f"{where}: a calibrated mount has finite numbers only")
+        raise InvalidInputError(f"{where}: a calibrated mount must have finite numbers only")
     return CalibratedMount(
         parameters=parameters,
         covariance=covariance,
@@ -174,17 +203,26 @@ def mount_from_json(document: Any, where: str, noise: Noise | None = None) -> Ca
     )
 
 
-def field_to_json(done: FieldMounts, skipped: Mapping[str, str], effects: Sequence[Effect] = ()) -> dict[str, Any]:
-    """MOUNTS.json: the field's prior, each mount, and what was left out with the reasons."""
-    means, spreads = done.field.mean, np.sqrt(np.diag(done.field.covariance))
+def field_to_json(
+    done: FieldMounts, skipped: Mapping[str, str], effects: Sequence[Effect] = ()
+) -> dict[str, Any]:
+    """Return MOUNTS.json: the field's prior, each mount, and skipped heliostats with reasons."""
+    means, spreads = done.prior.mean, np.sqrt(np.diag(done.prior.covariance))
     return {
         "parameters": {
-            p.name: {"unit": p.unit, "about": p.about, "field_mean": _rounded(mean), "field_std": _rounded(spread)}
+            p.name: {
+                "unit": p.unit,
+                "about": p.about,
+                "field_mean": _rounded(mean),
+                "field_std": _rounded(spread),
+            }
             for p, mean, spread in zip(PARAMETERS, means, spreads, strict=True)
         },
         "heliostats": {
-            name: mount_to_json(mount, done.readings[name], done.contradictions[name], effects)
-            | ({"note": _ODD} if name in done.odd else {})
+            name: (
+                mount_to_json(mount, done.readings[name], done.contradictions[name], effects)
+                | ({"note": _UNUSUAL} if name in done.unusual else {})
+            )
             for name, mount in done.mounts.items()
         },
         "clock": clock_to_json(done.clock),
@@ -193,35 +231,45 @@ def field_to_json(done: FieldMounts, skipped: Mapping[str, str], effects: Sequen
     }
 
 
-def clock_to_json(clock: Clock | None) -> dict[str, Any] | None:
-    """A fault of the clock: minutes that the sun stood later than recorded, since a day."""
+def clock_to_json(clock: ClockFault | None) -> dict[str, Any] | None:
+    """Return a clock fault: minutes from the recorded sun to the true one, since a day."""
     if clock is None:
         return None
     since = moment_of(clock.since).date().isoformat()
-    return {"minutes": round(clock.minutes, 2), "std_minutes": round(clock.std_minutes, 2), "since": since}
+    return {
+        "minutes": round(clock.minutes, 2),
+        "std_minutes": round(clock.std_minutes, 2),
+        "since": since,
+    }
 
 
-def _covariate(one: Explained) -> dict[str, Any]:
-    """How many measurements tell it, and the shares of squared errors that it explains; None where too few do."""
-    shares = {way: {"value": round(value, 4), "ci95": _rounded(one.ci95[way], 4)} for way, value in one.share.items()}
+def _covariate(one: ExplainedShare) -> dict[str, Any]:
+    """Return the number of measurements, and the shares of squared errors if there are any."""
+    shares = {
+        way: {"value": round(value, 4), "ci95": _rounded(one.ci95[way], 4)}
+        for way, value in one.share.items()
+    }
     return {"measurements": one.measurements, "share": shares or None}
 
 
 def clock_in_words(document: Mapping[str, Any]) -> str:
-    """The same in words."""
+    """Describe the clock fault of `clock_to_json` in a sentence."""
     minutes = document["minutes"]
     way = "slow" if minutes > 0 else "fast"
     return (
-        f"from {document['since']} on the clock was {abs(minutes):.1f} ± {document['std_minutes']:.1f} minutes {way}: "
-        "that explains where the light of most heliostats went"
+        f"from {document['since']} on the clock was {abs(minutes):.1f} ±"
+        f" {document['std_minutes']:.1f} minutes {way}: this explains the spots of most heliostats"
     )
 
 
-_ODD = "its property file has spindles of another length than all others; the field's median was the start"
+_UNUSUAL = (
+    "its property file has spindles of unusual length; the calibration started from the field's"
+    " median"
+)
 
 
 def _iso(day: float) -> str:
-    return moment_of(float(day)).isoformat()
+    return format_time(moment_of(float(day)))
 
 
 def _rounded(value: Any, digits: int = _DIGITS) -> Any:

@@ -1,13 +1,18 @@
-"""The closed loop: the physical effect that photographs demand and the model lacks, and what it buys.
+"""The closed loop: find the physical effects that photographs demand and the model lacks, and their
+gain.
 
-    study(flux_images, optics, effects).to_json()
+    study_to_json(study(flux_images, model))
 
-`flux_images` holds the data and cuts them for comparison, `unknowns` turns effects into numbers to be fitted, `fitting`
-fits them, `judging` decides with images that no fit has seen, `loop` adds effect after effect, `report` says it.
+The modules in the order of the data: `flux_images` (measured images and their forecasts),
+`parameters` (effects as a vector), `fitting` (least squares), `trials` (fit one part, forecast the
+held-out part), `scopes` and `scope_search` (when and where an effect acts), `judging` and
+`selection` (gains on held-out images), `loop`, `outcome` and `report`.
 """
 
 from model.study.flux_images import FluxImage
-from model.study.loop import StudyOptions, study
-from model.study.report import Study
+from model.study.loop import study
+from model.study.outcome import Study
+from model.study.report import conclude, study_to_json
+from model.study.trials import StudyOptions
 
-__all__ = ["FluxImage", "Study", "StudyOptions", "study"]
+__all__ = ["FluxImage", "Study", "StudyOptions", "conclude", "study", "study_to_json"]

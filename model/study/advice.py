@@ -1,6 +1,7 @@
-"""Which photographs tell effects apart that a study could not: those under which one changes and the other does not.
+"""Suggest photographs that distinguish effects which a study could not.
 
-Drawn from what each effect scales with, which its class names and its file says at length.
+In such photographs one effect changes and the other does not. The suggestions are derived from the
+factors that each effect scales with. Its class names them, and its file explains them.
 """
 
 from model.effects.base import Factor
@@ -15,18 +16,22 @@ PHOTOGRAPHS: dict[Factor, str] = {
     "weather": "the same heliostats on another day of other haze and wind",
     "camera": "a spot on another target or with another camera and exposure",
 }
-"""What varies, and the photographs that vary it; those that tell most come first."""
+"""Factors, each with the photographs that vary it, the most informative first."""
 
-SCALES_WITH: dict[str, frozenset[Factor]] = {name: effect.scales_with for name, effect in CATALOGUE.items()}
+SCALES_WITH: dict[str, frozenset[Factor]] = {
+    name: effect.scales_with for name, effect in CATALOGUE.items()
+}
 """What changes each effect's mark in an image; what is not named leaves it alone."""
 
-SAME_SCALING = "a lamp or an edge of known shape on the target, for both effects are the camera's own"
+SAME_SCALING = (
+    "a lamp or an edge of known shape on the target, for both effects are the camera's own"
+)
 
 MOST = 2
 
 
-def told_apart_by(first: str, second: str) -> str:
-    """The photographs that would tell two effects of the catalogue apart."""
+def photographs_to_distinguish(first: str, second: str) -> str:
+    """The photographs that would distinguish two effects of the catalogue."""
     differ = SCALES_WITH[first] ^ SCALES_WITH[second]
     wanted = [photographs for factor, photographs in PHOTOGRAPHS.items() if factor in differ]
     return ", and ".join(wanted[:MOST]) or SAME_SCALING

@@ -1,10 +1,11 @@
 """Measured flux images and their forecasts, cut alike, so that only their shapes are compared."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -12,16 +13,20 @@ from numpy.typing import NDArray
 
 from model.effects import Effect, effect_to_json
 from model.errors import InvalidInputError
-from model.forecast import Aligned, Setup, View, align
+from model.forecast import Aligned, View, align
+from model.frames import sun_angles
 from model.images import FLUX_SIZE, clipped_alike
 from model.imaging.window import overlap_matrix
 from model.metrics import accuracy_window
 from model.plant import Heliostat, TargetPlane
+from model.plant_model import PlantModel
 from model.pointing.mounts import CalibratedMount
+from model.pointing.spots import observe_angles
+from model.progress import nothing_between
+from model.setup import Setup
 from model.study.noise import black_lift, grain_variance
-from model.study.position import USUAL_RAD, whitened
-from model.study.unknowns import copied, copy_name
-from model.tracing import Optics
+from model.study.parameters import copied, copy_name
+from model.study.position import USUAL_RAD, whiten
 
 Array = NDArray[np.float64]
 
@@ -37,17 +42,19 @@ class FluxImage:
     image : (rows, columns)
         Over the whole target, row 0 at the top, in any unit.
     seen : bool
-        Whether the mirror's surface was predicted from it: such a surface flatters its own photographs.
+        Whether the mirror's surface was predicted from it: such a surface flatters its own
+        photographs.
     clipped : bool (rows, columns) or None
-        Where the camera's range cut the light off, where it did.
+        Saturated pixels, None if there are none.
     sheet_share : float [1]
-        Share of the light that the pattern of the sheet behind the spot moves about (`model.imaging.Quality`).
+        Share of the light that the pattern of the sheet behind the spot moves about
+        (`model.imaging.Quality`).
     spot_std_rad : float [rad]
-        Standard deviation per direction of its spot about where a right model sends it; of account where
-        ``setup.angles`` says where the mount stood (`model.study.position`).
-    spot_doubts_rad : (2, K) [rad] or None
-        What each of K independent deviations of the mount's calibration moves its spot by, sidewards and upwards; they
-        are the same for all photographs of a heliostat.
+        Standard deviation per direction of its spot about the position that a correct model
+        predicts. It is used if ``setup.angles`` gives the mount's angles (`model.study.position`).
+    spot_shifts_rad : (2, K) [rad] or None
+        Spot shifts, sidewards and upwards, by K independent deviations of the mount's calibration.
+        The deviations are the same for all photographs of a heliostat.
     """
 
     setup: Setup
@@ -56,11 +63,13 @@ class FluxImage:
     clipped: NDArray[np.bool_] | None = None
     sheet_share: float = 0.0
     spot_std_rad: float = USUAL_RAD
-    spot_doubts_rad: Array | None = None
+    spot_shifts_rad: Array | None = None
 
     def __post_init__(self) -> None:
         if self.image.ndim != 2 or not np.isfinite(self.image).all() or not self.image.sum() > 0:
-            raise InvalidInputError(f"photograph {self.key} must be a finite image that holds energy")
+            raise InvalidInputError(
+                f"photograph {self.key} must be a finite image that holds energy"
+            )
 
     @property
     def key(self) -> str:
@@ -80,34 +89,42 @@ class FluxImage:
     @property
     def elevation_deg(self) -> float:
         """Elevation [deg] of the sun."""
-        return float(np.degrees(np.arcsin(self.setup.sun[2])))
+        return float(sun_angles(self.setup.sun)[1])
 
     @property
     def azimuth_deg(self) -> float:
-        """Azimuth [deg] of the sun from south, positive to the east."""
-        return float(np.degrees(np.arctan2(self.setup.sun[0], -self.setup.sun[1])))
+        """Azimuth [deg] of the sun, from north over east."""
+        return float(sun_angles(self.setup.sun)[0])
 
     @property
     def slant_range(self) -> float:
         """Distance [m] from the heliostat to its target."""
         return float(np.linalg.norm(self.setup.heliostat.position - self.setup.plane.center))
 
-    def sent(self, nominal: Heliostat, mount: CalibratedMount, motors: Array | None, day: float) -> "FluxImage":
-        """It with where its motors (2,) [steps] sent the light, where it is newer than all that calibrated its mount.
+    def sent(
+        self, nominal: Heliostat, mount: CalibratedMount, motors: Array | None, day: float
+    ) -> "FluxImage":
+        """Add the axis angles of its motors (2,) [steps], if it is newer than the calibration of
+        its mount.
 
-        ``nominal`` is the heliostat as its properties have it, ``day`` as `model.pointing.Reading` counts it [d].
+        ``nominal`` has the mount of the heliostat's properties; ``day`` [d] is that of
+        `model.pointing.Reading`.
         """
         spot = self.setup.spot
         if motors is None or spot is None or not mount.is_before(self.taken_at):
             return self
-        angles, std_rad, doubts_rad = mount.told(nominal, motors, self.setup.sun, spot, day)
-        setup = replace(self.setup, angles=angles)
-        return replace(self, setup=setup, spot_std_rad=std_rad, spot_doubts_rad=doubts_rad)
+        observed = observe_angles(mount, nominal, motors, self.setup.sun, spot, day)
+        setup = replace(self.setup, angles=observed.angles)
+        return replace(
+            self, setup=setup, spot_std_rad=observed.std_rad, spot_shifts_rad=observed.shared_rad
+        )
 
     def noise_share(self, window: float) -> float:
-        """The error (one minus accuracy) that grain and sheet alone make, in a cut of side ``window`` [m]."""
+        """The error that grain and sheet alone cause, in a cut of side ``window`` [m]."""
         images, planes = np.stack([self.image, black_lift(self.image)]), [self.setup.plane] * 2
-        seen, lift = windows(images, planes, centers(images[:1], planes[:1]).repeat(2, axis=0), window, FLUX_SIZE)
+        seen, lift = windows(
+            images, planes, centers(images[:1], planes[:1]).repeat(2, axis=0), window, FLUX_SIZE
+        )
         # A lift of the dark takes from the light's share of the sum.
         lifted = lift - seen * lift.sum() / seen.sum()
         grain = np.sqrt(2 / np.pi * grain_variance(seen))
@@ -126,7 +143,8 @@ def spot_window(flux_images: Sequence[FluxImage]) -> float:
 
 
 def centers(images: NDArray[np.floating], planes: Sequence[TargetPlane]) -> Array:
-    """Centres of mass (N, 2) [m] of images (N, rows, columns), right and down of the planes' centres.
+    """Centres of mass (N, 2) [m] of images (N, rows, columns), right and down of the planes'
+    centres.
 
     Raises
     ------
@@ -137,14 +155,22 @@ def centers(images: NDArray[np.floating], planes: Sequence[TargetPlane]) -> Arra
     total = across.sum(axis=1)
     if not (total > 0).all():
         raise InvalidInputError("an image without energy has no centre of mass")
-    shares = [line @ ((np.arange(line.shape[1]) + 0.5) / line.shape[1] - 0.5) / total for line in (across, along)]
+    shares = [
+        line @ ((np.arange(line.shape[1]) + 0.5) / line.shape[1] - 0.5) / total
+        for line in (across, along)
+    ]
     return np.stack(shares, axis=1) * _sizes(planes)
 
 
 def windows(
-    images: NDArray[np.floating], planes: Sequence[TargetPlane], centers: Array, window: float, resolution: int
+    images: NDArray[np.floating],
+    planes: Sequence[TargetPlane],
+    centers: Array,
+    window: float,
+    resolution: int,
 ) -> Array:
-    """Energy (N, resolution, resolution) of images (N, rows, columns) in squares about ``centers`` (N, 2) [m].
+    """Energy (N, resolution, resolution) of images (N, rows, columns) in squares about ``centers``
+    (N, 2) [m].
 
     As `model.imaging.window.flux_window`, for many images at once.
     """
@@ -163,7 +189,9 @@ def _sizes(planes: Sequence[TargetPlane]) -> Array:
     return np.array([(plane.width, plane.height) for plane in planes])
 
 
-def cut(images: NDArray[np.floating], planes: Sequence[TargetPlane], window: float, resolution: int) -> Array:
+def cut(
+    images: NDArray[np.floating], planes: Sequence[TargetPlane], window: float, resolution: int
+) -> Array:
     """Windows (N, resolution, resolution) of sum one about each image's own centre of mass.
 
     Position and exposure are free for every image (N, rows, columns), and this takes both out.
@@ -173,7 +201,7 @@ def cut(images: NDArray[np.floating], planes: Sequence[TargetPlane], window: flo
 
 
 def in_pixels(images: Array, rows: int, columns: int) -> Array:
-    """Energy of images (N, R, C) in the pixels (rows, columns) of a coarser camera; they are never made finer."""
+    """Energy of images (N, R, C) in the pixels (rows, columns) of a camera, if it is coarser."""
     if images.shape[1] <= rows and images.shape[2] <= columns:
         return images
     down, across = (
@@ -183,21 +211,64 @@ def in_pixels(images: Array, rows: int, columns: int) -> Array:
     return np.asarray(down @ images @ across.T)
 
 
+class TracedFlux(NamedTuple):
+    """Aligned setups and their flux (N, rows, columns) [W/m2]."""
+
+    aligned: Aligned
+    flux: torch.Tensor
+
+
+class Saturated(NamedTuple):
+    """Linear intensity of photographs and the saturated share of each pixel, (n, rows, columns)."""
+
+    light: Array
+    shares: Array
+
+
+class SharedShifts(NamedTuple):
+    """Rows (n,) of a heliostat's photographs, and their spot shifts (n, 2, K) by shared deviations.
+
+    The shifts are in standard deviations of the spots.
+    """
+
+    rows: NDArray[np.intp]
+    shifts: Array
+
+
+def shared_shifts(flux_images: Sequence[FluxImage]) -> list[SharedShifts]:
+    """List the spot shifts of each heliostat whose mount's calibration has shared deviations."""
+    is_known = [p.setup.angles is not None and p.spot_shifts_rad is not None for p in flux_images]
+    names = np.where(is_known, [p.heliostat for p in flux_images], "")
+    found = []
+    for name in sorted(set(names.tolist()) - {""}):
+        rows = np.flatnonzero(names == name)
+        some = [flux_images[row] for row in rows.tolist()]
+        std = np.array([p.spot_std_rad for p in some])[:, None, None]
+        found.append(SharedShifts(rows, np.array([p.spot_shifts_rad for p in some]) / std))
+    return found
+
+
+def saturated_pixels(flux_images: Sequence[FluxImage], rows: int, columns: int) -> Saturated:
+    """Intensity and saturated shares of saturated photographs of one size, in (rows, columns)."""
+    light = np.stack([np.asarray(p.image, dtype=np.float64) for p in flux_images])
+    clipped = np.stack([np.asarray(p.clipped, dtype=np.float64) for p in flux_images])
+    pixel = light[0].size / (rows * columns)
+    return Saturated(in_pixels(light, rows, columns), in_pixels(clipped, rows, columns) / pixel)
+
+
 class Forecaster:
-    """Forecasts of photographs under any effects, cut as the photographs are; remembers what it has just traced."""
+    """Forecasts photographs under any effects, cut as the photographs are; caches the last flux."""
 
     def __init__(
         self,
         flux_images: Sequence[FluxImage],
-        optics: Optics,
-        declared: Sequence[Effect],
+        model: PlantModel,
         window: float,
         view: View,
-        *,
-        latitude_deg: float,
+        between: Callable[[], None] = nothing_between,
     ) -> None:
-        self.flux_images, self.optics, self.declared = flux_images, optics, list(declared)
-        self.window, self.view, self.latitude_deg = window, view, latitude_deg
+        self.flux_images, self.model, self.window, self.view = flux_images, model, window, view
+        self.between = between
         self.setups = [p.setup for p in flux_images]
         self.planes = [setup.plane for setup in self.setups]
         self.spot_std_rad = np.array([p.spot_std_rad for p in flux_images])
@@ -207,33 +278,44 @@ class Forecaster:
         self._start: Aligned | None = None
         self._copies: dict[int, Forecaster] = {}
         self._measured: dict[int, Array] = {}
-        self._ranges: dict[tuple[tuple[int, ...], int, int], tuple[Array, Array]] = {}
+        self._saturated: dict[tuple[tuple[int, ...], int, int], Saturated] = {}
         self._different = len(self.flux_images)
 
     def copies(self, count: int) -> "Forecaster":
-        """The same of photographs that are there ``count`` times, of heliostats that are copies of the first.
+        """The same of photographs that are there ``count`` times, of heliostats that are copies of
+        the first.
 
-        What belongs to a heliostat may differ between copies; tracing them at once is several times faster than one by
-        one.
+        What belongs to a heliostat may differ between copies; tracing them at once is several times
+        faster than one by one.
         """
         if count not in self._copies:
             heliostats = {id(s.heliostat): s.heliostat for s in self.setups}
             flux_images = []
             for number in range(count):
-                renamed = {k: replace(h, name=copy_name(h.name, number)) for k, h in heliostats.items()}
+                renamed = {
+                    k: replace(h, name=copy_name(h.name, number)) for k, h in heliostats.items()
+                }
                 setups = [replace(s, heliostat=renamed[id(s.heliostat)]) for s in self.setups]
-                flux_images += [replace(p, setup=s) for s, p in zip(setups, self.flux_images, strict=True)]
-            declared = [copied(effect, count) for effect in self.declared]
-            self._copies[count] = Forecaster(
-                flux_images, self.optics, declared, self.window, self.view, latitude_deg=self.latitude_deg
+                flux_images += [
+                    replace(p, setup=s) for s, p in zip(setups, self.flux_images, strict=True)
+                ]
+            model = replace(
+                self.model, effects=tuple(copied(effect, count) for effect in self.model.effects)
             )
-            self._copies[count]._ranges, self._copies[count]._different = self._ranges, self._different
+            self._copies[count] = Forecaster(
+                flux_images, model, self.window, self.view, self.between
+            )
+            self._copies[count]._saturated = self._saturated
+            self._copies[count]._different = self._different
         return self._copies[count]
 
     def measured(self, resolution: int = FLUX_SIZE) -> Array:
         """The photographs' cuts (N, resolution, resolution)."""
         if resolution not in self._measured:
-            cuts = [cut(p.image[None], [p.setup.plane], self.window, resolution) for p in self.flux_images]
+            cuts = [
+                cut(p.image[None], [p.setup.plane], self.window, resolution)
+                for p in self.flux_images
+            ]
             self._measured[resolution] = np.concatenate(cuts)
         return self._measured[resolution]
 
@@ -247,84 +329,78 @@ class Forecaster:
         InvalidInputError
             Where they leave no light.
         """
-        model = [*self.declared, *effects]
-        aligned, flux = self._traced(model)
+        aligned, flux = self._trace(self.model.with_effects(effects))
         with torch.no_grad():
-            images = aligned.camera_images(flux, model, self.view).double().numpy().clip(min=0)
+            images = aligned.camera_images(flux, self.view).double().numpy().clip(min=0)
         cuts = np.empty((len(images), resolution, resolution))
         for camera in np.unique(self.cameras, axis=0):
             rows = np.flatnonzero((self.cameras == camera).all(axis=1))
             planes = [self.planes[row] for row in rows]
             cuts[rows] = cut(
-                self._within_range(rows, in_pixels(images[rows], *camera)), planes, self.window, resolution
+                self._saturate(rows, in_pixels(images[rows], *camera)),
+                planes,
+                self.window,
+                resolution,
             )
         return cuts
 
     def displaced(self, effects: Sequence[Effect]) -> Array:
-        """How far spots lie (N, 2) [rad] from where their motors sent them under the declared effects and these.
+        """How far spots lie (N, 2) [rad] from where their motors sent them under the declared
+        effects and these.
 
         NaN where motors are not known. Raises as `cuts`.
         """
-        return self._traced([*self.declared, *effects])[0].displaced
+        return self._trace(self.model.with_effects(effects)).aligned.displacements
 
-    def off(self, effects: Sequence[Effect]) -> Array:
-        """The same (N, 2) in standard deviations, independent of each other (`model.study.position.whitened`)."""
+    def position_residuals(self, effects: Sequence[Effect]) -> Array:
+        """The same (N, 2) in independent standard deviations (`model.study.position`)."""
         off = self.displaced(effects) / self.spot_std_rad[:, None]
-        for rows, doubts in self._doubts:
-            off[rows] = whitened(off[rows], doubts)
+        for rows, shifts in self._shared_shifts:
+            off[rows] = whiten(off[rows], shifts)
         return np.asarray(off)
 
     @cached_property
-    def _doubts(self) -> list[tuple[NDArray[np.intp], Array]]:
-        """Rows (n,) of each heliostat whose photographs share doubts, and these (n, 2, K) in standard deviations."""
-        told = [p.setup.angles is not None and p.spot_doubts_rad is not None for p in self.flux_images]
-        names = np.where(told, [p.heliostat for p in self.flux_images], "")
-        found = []
-        for name in sorted(set(names.tolist()) - {""}):
-            rows = np.flatnonzero(names == name)
-            doubts = np.array([self.flux_images[row].spot_doubts_rad for row in rows.tolist()])
-            found.append((rows, doubts / self.spot_std_rad[rows, None, None]))
-        return found
+    def _shared_shifts(self) -> list[SharedShifts]:
+        return shared_shifts(self.flux_images)
 
-    def _within_range(self, rows: NDArray[np.intp], forecasts: Array) -> Array:
-        """Forecasts (n, R, C) of the photographs ``rows`` (n,), cut off where the camera's range cut those off."""
-        places = [place for place, row in enumerate(rows.tolist()) if self.flux_images[row].clipped is not None]
+    def _saturate(self, rows: NDArray[np.intp], forecasts: Array) -> Array:
+        """Saturate forecasts (n, R, C) where the photographs ``rows`` (n,) are saturated."""
+        places = [
+            place
+            for place, row in enumerate(rows.tolist())
+            if self.flux_images[row].clipped is not None
+        ]
         if not places:
             return forecasts
-        measured, shares = self._range(tuple(rows[places].tolist()), forecasts.shape[1], forecasts.shape[2])
+        # Copies of a photograph have the same saturated pixels.
+        once = tuple(row for row in rows[places].tolist() if row < self._different)
+        key = (once, forecasts.shape[1], forecasts.shape[2])
+        if key not in self._saturated:
+            self._saturated[key] = saturated_pixels(
+                [self.flux_images[row] for row in once], *key[1:]
+            )
+        times = len(places) // len(once), 1, 1
+        light, shares = (np.tile(values, times) for values in self._saturated[key])
         seen = forecasts.copy()
-        seen[places] = clipped_alike(forecasts[places], measured, shares)
+        seen[places] = clipped_alike(forecasts[places], light, shares)
         return seen
 
-    def _range(self, cut_off: tuple[int, ...], rows: int, columns: int) -> tuple[Array, Array]:
-        """Of photographs that were cut off, alike in size: light and the share of each pixel, (n, rows, columns)."""
-        once = tuple(row for row in cut_off if row < self._different)
-        if (once, rows, columns) not in self._ranges:
-            taken = [self.flux_images[row] for row in once]
-            light = np.stack([np.asarray(one.image, dtype=np.float64) for one in taken])
-            clipped = np.stack([np.asarray(one.clipped, dtype=np.float64) for one in taken])
-            pixel = light[0].size / (rows * columns)
-            shares = in_pixels(clipped, rows, columns) / pixel
-            self._ranges[once, rows, columns] = in_pixels(light, rows, columns), shares
-        light, shares = self._ranges[once, rows, columns]
-        times = len(cut_off) // len(once), 1, 1
-        return np.tile(light, times), np.tile(shares, times)
-
-    def _traced(self, model: Sequence[Effect]) -> tuple[Aligned, torch.Tensor]:
-        """Aligned setups and their flux; both are kept while only later stages change."""
-        geometry = _name(model, ("geometry",))
+    def _trace(self, model: PlantModel) -> TracedFlux:
+        """Align and trace; both results are cached while only later stages change."""
+        self.between()
+        geometry = _name(model.effects, ("geometry",))
         if geometry not in self._aligned:
-            # The one before differs little: fits go by small steps. Their differences take double precision.
-            self._start = align(
-                self.setups, model, latitude_deg=self.latitude_deg, dtype=torch.float64, start=self._start
-            )
+            # Fits take small steps, so the last alignment is a good start. Differences of their
+            # forecasts need double precision.
+            self._start = align(self.setups, model, dtype=torch.float64, start=self._start)
             self._aligned = {geometry: self._start}
             self._flux = {}
-        light = _name(model, ("geometry", "optics"))
+        aligned = replace(self._aligned[geometry], model=model)
+        light = _name(model.effects, ("geometry", "optics"))
         if light not in self._flux:
             with torch.no_grad():
-                self._flux = {light: self._aligned[geometry].flux(self.optics, model, self.view)}
-        return self._aligned[geometry], self._flux[light]
+                self._flux = {light: aligned.flux(self.view)}
+        return TracedFlux(aligned, self._flux[light])
 
 
 def _name(effects: Sequence[Effect], stages: tuple[str, ...]) -> str:

@@ -1,11 +1,12 @@
-"""Judging fits by images that they have not seen."""
+"""Judge fits by images that no fit has seen."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import date
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t
+from scipy.stats import bootstrap, spearmanr, t
 
 from model.study.flux_images import FluxImage
 from model.study.scopes import days_of
@@ -14,24 +15,24 @@ Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
 FEW = 3
-"""Images of a heliostat from which on they tell how much they scatter."""
+"""Fewest images of a heliostat that give an estimate of their scatter."""
 
 SEVERAL = 3
-"""Heliostats from which on one of them is kept from the fits of what all have in common."""
+"""Smallest number of heliostats of which one is excluded from the fits of shared effects."""
 
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """Which photographs are fitted and which judge.
+    """Which photographs are fitted, and which judge.
 
     Attributes
     ----------
     fit : Rows
-        Images of the heliostats that all unknowns are fitted to.
+        Images that all unknowns are fitted to.
     own : Rows
-        Images of the heliostats that are kept from the fit: only what belongs to one heliostat is fitted to them.
+        Images of the excluded heliostat, to which only unknowns of that heliostat are fitted.
     held_out : Rows
-        Images that no fit sees, of all heliostats.
+        Images of all heliostats that no fit sees.
     """
 
     fit: Rows
@@ -40,49 +41,57 @@ class Split:
 
     @property
     def fitted(self) -> Rows:
-        """All that are fitted in some way."""
+        """All images that are fitted."""
         return np.sort(np.concatenate([self.fit, self.own]))
 
 
 FRESH = 2
-"""Images that no surface was predicted from, from which on they alone judge."""
+"""Smallest number of images without a surface predicted from them that judge alone."""
 
 
 def split(flux_images: Sequence[FluxImage]) -> Split:
-    """Every second image of each heliostat judges; and one heliostat of several is kept apart.
+    """Split photographs: every second image of each heliostat judges.
 
-    They are counted by the day, where most have one, and by the sun's elevation: what comes and goes shall be seen by
-    fits and by judges alike.
-
-    The one that is kept apart is at the median distance: the others span it. Images that surfaces were predicted from
-    do not judge; where fewer than `FRESH` others are left they have to, which the report says.
+    The images are in order of their days, if most have one, and of the sun's elevation. So fits and
+    judges see the same days. One heliostat of several is excluded from the fits of shared effects:
+    the one of median distance, within the range of the others. Images that surfaces were predicted
+    from do not judge, unless fewer than `FRESH` others are left; the report says so.
     """
-    seen, dated = [p.seen for p in flux_images], days_of(flux_images) is not None
+    seen, known_days = [p.seen for p in flux_images], days_of(flux_images)
+    dated = known_days is not None
+    days = [day or date.min for day in known_days or [None] * len(flux_images)]
     judged_apart = any(seen) and seen.count(False) >= FRESH
     names = sorted({p.heliostat for p in flux_images})
-    distance = {name: np.mean([p.slant_range for p in flux_images if p.heliostat == name]) for name in names}
-    kept = sorted(names, key=lambda name: distance[name])[len(names) // 2] if len(names) >= SEVERAL else None
+    distance = {
+        name: np.mean([p.slant_range for p in flux_images if p.heliostat == name]) for name in names
+    }
+    kept = (
+        sorted(names, key=lambda name: distance[name])[len(names) // 2]
+        if len(names) >= SEVERAL
+        else None
+    )
     parts: dict[str, list[int]] = {"fit": [], "own": [], "held_out": []}
     for number, name in enumerate(sorted(names, key=lambda name: name == kept)):
         rows = [row for row, p in enumerate(flux_images) if p.heliostat == name]
-        rows.sort(key=lambda row: _turn(flux_images[row], dated))
-        # Of a day on which every heliostat was photographed once, some judge and some are fitted.
-        fitted = [row for row in rows if seen[row]] if judged_apart else rows[number % 2 if dated else 0 :: 2]
-        if not fitted:  # a heliostat none of whose images is seen, beside others
+        rows.sort(key=lambda row: (days[row], flux_images[row].elevation_deg, flux_images[row].key))
+        # Even on a day with one image per heliostat, some are fitted and some judge.
+        fitted = (
+            [row for row in rows if seen[row]]
+            if judged_apart
+            else rows[number % 2 if dated else 0 :: 2]
+        )
+        if not fitted:  # no surface was predicted from images of this heliostat
             fitted = rows[::2]
         parts["own" if name == kept else "fit"] += fitted
         parts["held_out"] += [row for row in rows if row not in fitted]
-    return Split(*(np.array(sorted(parts[part]), dtype=np.int64) for part in ("fit", "own", "held_out")))
-
-
-def _turn(flux_image: FluxImage, dated: bool) -> tuple[str, float, str]:
-    day = flux_image.taken_at.date().isoformat() if dated and flux_image.taken_at is not None else ""
-    return day, flux_image.elevation_deg, flux_image.key
+    return Split(
+        *(np.array(sorted(parts[part]), dtype=np.int64) for part in ("fit", "own", "held_out"))
+    )
 
 
 @dataclass(frozen=True)
 class Gain:
-    """Mean of paired differences, its 95 % interval and how many standard errors it is worth."""
+    """Mean of paired differences, its 95 % interval, and its ratio to the standard error."""
 
     mean: float
     low: float
@@ -90,38 +99,46 @@ class Gain:
     score: float
 
 
-def paired_gain(differences: Array, heliostats: NDArray[np.str_], rounds: int = 2000, seed: int = 0) -> Gain:
-    """Bootstrap of the mean of paired differences (N,), images drawn anew within each heliostat.
+def paired_gain(
+    differences: Array, heliostats: NDArray[np.str_], rounds: int = 2000, seed: int = 0
+) -> Gain:
+    """Bootstrap of the mean of paired differences (N,), resampled within each heliostat.
 
-    Heliostats with fewer than `FEW` images are drawn from together: one alone would seem to be certain.
+    Heliostats with fewer than `FEW` images are pooled: a single one would seem to be certain. The
+    gain of fewer than two differences is zero.
 
     Source: Efron and Tibshirani 1993, *An Introduction to the Bootstrap*, chapters 8 and 13.
     """
-    rng, total = np.random.default_rng(seed), np.zeros(rounds)
+    if len(differences) < 2:
+        return Gain(0.0, 0.0, 0.0, 0.0)
     names, members, counts = np.unique(heliostats, return_inverse=True, return_counts=True)
     groups = np.where(counts < FEW, -1, np.arange(len(names)))[members]
     if 0 < (groups == -1).sum() < FEW:
         groups[:] = 0
-    for group in np.unique(groups):
-        own = differences[groups == group]
-        total += own[rng.integers(len(own), size=(rounds, len(own)))].sum(axis=1)
-    means = total / len(differences)
-    low, high = np.quantile(means, [0.025, 0.975])
+    own = [differences[groups == group] for group in np.unique(groups)]
+
+    def mean_of(*drawn: Array, axis: int) -> Array:
+        return np.asarray(sum(some.sum(axis=axis) for some in drawn) / len(differences))
+
+    drawn = bootstrap(own, mean_of, n_resamples=rounds, method="percentile", rng=seed)
+    low, high = drawn.confidence_interval
     mean = float(differences.mean())
-    return Gain(mean, float(low), float(high), mean / max(float(means.std()), 1e-9))
+    return Gain(
+        mean, float(low), float(high), mean / max(float(drawn.bootstrap_distribution.std()), 1e-9)
+    )
 
 
 USUAL, USUAL_SCATTER = 2, 0.01
-"""What is known beforehand of the standard deviation of gains from image to image, and from how many, as it were."""
+"""Prior of the standard deviation of gains among images: as if from `USUAL` images."""
 
 
 def few_gain(differences: Array, among: int = 1) -> Gain:
-    """The mean of a few differences (N,) with its 95 % interval by a moderated t; fewer than two gain nothing.
+    """Mean of a few differences (N,) with its 95 % interval by a moderated t.
 
-    How much few images scatter is hardly known from themselves, and counts as if `USUAL` images had shown their usual
-    scatter besides. The interval holds for all ``among`` gains that are looked at at once (Bonferroni).
+    It is zero for fewer than two. The interval holds for ``among`` gains together (Bonferroni).
 
-    Source: Smyth, *Linear models and empirical Bayes methods*, Stat. Appl. Genet. Mol. Biol. 3 (2004), section 4.
+    Source: Smyth, *Linear models and empirical Bayes methods*, Stat. Appl. Genet. Mol. Biol. 3
+    (2004), section 4.
     """
     count = len(differences)
     if count < 2:
@@ -134,8 +151,7 @@ def few_gain(differences: Array, among: int = 1) -> Gain:
 
 
 def rank_correlation(a: Array, b: Array) -> float:
-    """Spearman's rank correlation; zero where one of them does not vary."""
-    if np.ptp(a) == 0 or np.ptp(b) == 0:
+    """Spearman's rank correlation, ties by their mean rank; zero if one of them does not vary."""
+    if np.ptp(a) == 0 or np.ptp(b) == 0:  # SciPy would warn, and return NaN
         return 0.0
-    first, second = (np.argsort(np.argsort(values)).astype(np.float64) for values in (a, b))
-    return float(np.corrcoef(first, second)[0, 1])
+    return float(spearmanr(a, b).statistic)

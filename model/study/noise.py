@@ -1,7 +1,7 @@
 """The noise of a photograph, read from the photograph alone.
 
-Grain is what no smooth light explains. What is cut at black leaves no grain but a lift: where there is no light, noise
-below zero is lost and noise above it stays.
+Grain is what no smooth light explains. What is cut at black leaves no grain but a lift: where there
+is no light, noise below zero is lost and noise above it stays.
 """
 
 import numpy as np
@@ -12,9 +12,9 @@ from scipy.stats import norm
 Array = NDArray[np.float64]
 
 SPACING = 2
-"""Pixels of a cut between those that are compared: neighbours share the noise of a coarse or resampled camera."""
+"""Pixels between those that are compared: neighbours share the noise of a coarse camera."""
 
-LEAST_BLACK = 0.01
+MIN_BLACK = 0.01
 """Share of black pixels below which an image is not cut at black."""
 
 BLOCK = 9
@@ -22,9 +22,11 @@ BLOCK = 9
 
 
 def grain_variance(image: Array, spacing: int = SPACING, bins: int = 12) -> Array:
-    """Variance of each pixel's noise (rows, columns), a line in its intensity: read noise, rounding and counting.
+    """Variance of each pixel's noise (rows, columns), a line in its intensity: read noise, rounding
+    and counting.
 
-    A mask that no plane and no slope answers leaves the grain (Immerkaer 1996, doi:10.1006/cviu.1996.0060).
+    A mask that no plane and no slope answers leaves the grain (Immerkaer 1996,
+    doi:10.1006/cviu.1996.0060).
     """
     grain, inner = _grain(image, spacing), image[spacing:-spacing, spacing:-spacing]
     parts = np.array_split(np.argsort(inner, axis=None), bins)
@@ -37,7 +39,7 @@ def grain_variance(image: Array, spacing: int = SPACING, bins: int = 12) -> Arra
 
 
 def _grain(image: Array, spacing: int) -> Array:
-    """Squares of the mask's answers (rows - 2 spacing, columns - 2 spacing), whose mean is the noise's variance."""
+    """Squares of the mask's responses (rows - 2 spacing, columns - 2 spacing)."""
     lines = image[: -2 * spacing] - 2 * image[spacing:-spacing] + image[2 * spacing :]
     columns = lines[:, : -2 * spacing] - 2 * lines[:, spacing:-spacing] + lines[:, 2 * spacing :]
     return np.asarray((columns / 6) ** 2)
@@ -46,13 +48,14 @@ def _grain(image: Array, spacing: int) -> Array:
 def black_lift(image: NDArray[np.floating]) -> Array:
     """What noise that is cut at black lifts each pixel by on the average (rows, columns).
 
-    A normal variable of mean mu >= 0 and deviation sigma that is cut at zero is lifted by sigma (phi(a) - a Phi(-a)),
-    a = mu / sigma, and the share Phi(-a) of its values is cut (Tobin 1958, doi:10.2307/1907382). No more can be lifted
-    than is there. That such a lift also moves the centre of mass is not counted.
+    A normal variable of mean mu >= 0 and deviation sigma that is cut at zero is lifted by sigma
+    (phi(a) - a Phi(-a)), a = mu / sigma, and the share Phi(-a) of its values is cut (Tobin 1958,
+    doi:10.2307/1907382). No more can be lifted than is there. That such a lift also moves the
+    centre of mass is not counted.
     """
     above = np.asarray(image - image.min(), dtype=np.float64)
     black = above == 0
-    if min(above.shape) < BLOCK or not LEAST_BLACK <= black.mean() < 1:
+    if min(above.shape) < BLOCK or not MIN_BLACK <= black.mean() < 1:
         return np.zeros_like(above)
     grey = ~maximum_filter(black, 3)[1:-1, 1:-1]
     faint = grey & (above <= np.quantile(above[~black], 0.25))[1:-1, 1:-1]

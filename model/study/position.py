@@ -1,18 +1,21 @@
-"""Where spots lie beside where their motors sent them, as a part of what photographs say for or against a model.
+"""Offsets of spots from where their motors sent them, as evidence for or against a model.
 
-A photograph whose mount's angles are known (`Setup.angles`) tells two things: the shape of its light, and where it
-went. An encoder that is off, a clock, a tilted foundation and a leaning pylon hardly change shapes, and each moves
-spots in another way. What they say is held against the mount that is declared: as surveyed, or as calibrated by
-photographs *of another time*. A calibration has axes, zeros and drives of its own free, which take in whatever moved
-the spots that it saw; so those photographs must not be given angles, or they would speak twice, and on calibrated
-mounts effects are sought only since the first photograph thereafter (`model.forecast.altered`).
+A photograph with known mount angles (`Setup.angles`) has two kinds of information: the shape of its
+spot and the position. An encoder offset, a clock error, a tilted foundation and a leaning pylon
+hardly change the shape, but each moves spots in a different way. The positions are compared with
+the declared mount: as surveyed, or as calibrated by photographs *of another time*. A calibration
+fits axes, zeros and drives, so it absorbs whatever moved the spots that it used. Those photographs
+must not have angles, or they would count twice. On calibrated mounts, effects are therefore
+searched only from the first later photograph on (`model.forecast.apply_mount_effects`).
 
-What a calibration leaves open moves the spots of all photographs of its mount together, and would pass for an effect
-that begins with the first of them. So residuals are whitened by the covariance that the mount's own parameters give
-them (`whitened`): what these could have done speaks for nothing else.
+The remaining uncertainty of a calibration moves the spots of all photographs of its mount together.
+It could be mistaken for an effect that begins with the first of them. So the residuals are whitened
+by the covariance that results from the mount's parameters (`whiten`): shifts that these parameters
+can explain are no evidence for an effect.
 
-Fits count the residual [rad] in its standard deviations beside the pixels. Judges count what is left by the likelihood
-of Student's t, for real spots are now and then another heliostat's, and weigh it against accuracy by `NAT`.
+Fits add the residual, in standard deviations, to the residuals of the pixels. Held-out images are
+judged by the likelihood of Student's t, because some real spots belong to another heliostat. `NAT`
+weighs this likelihood against accuracy.
 """
 
 import numpy as np
@@ -21,7 +24,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 USUAL_RAD = 1e-3
-"""Standard deviation [rad] per direction of real spots about forecasts by calibrated mounts of other photographs."""
+"""Standard deviation [rad] per direction of real spots about forecasts by calibrated mounts."""
 
 TAILS = 4.0
 """Degrees of freedom of Student's t."""
@@ -33,23 +36,27 @@ With it the least gain that studies ask for is a displacement of about one stand
 """
 
 EXPECTED = 1.084
-"""Loss [nat] of residuals that are normal: (TAILS / 2 + 1) E ln(1 + x / TAILS), with x chi-squared of two degrees."""
+"""Loss [nat] of residuals that are normal: (TAILS / 2 + 1) E ln(1 + x / TAILS), with x chi-squared
+of two degrees.
+"""
 
 
-def whitened(off: Array, doubts: Array) -> Array:
-    """Residuals (n, 2) of one mount, of unit variance beside doubts (n, 2, K) that they share, made independent.
+def whiten(off: Array, shifts: Array) -> Array:
+    """Whiten the residuals (n, 2) of one mount, which have unit variance and shared deviations.
 
-    ``doubts`` are what each of K independent deviations of the mount's parameters moves them by, in the same units.
-    The symmetric root of the precision leaves each residual as nearly as can be what it was.
+    ``shifts`` (n, 2, K) are their shifts by K independent deviations of the mount's parameters, in
+    the same units. The symmetric root of the precision changes each residual as little as possible.
     """
-    shared = doubts.reshape(off.size, -1)
+    shared = shifts.reshape(off.size, -1)
     vectors, sizes, _ = np.linalg.svd(shared, full_matrices=False)
     flat = off.ravel()
-    return np.asarray((flat + vectors @ ((1 / np.hypot(1, sizes) - 1) * (vectors.T @ flat))).reshape(off.shape))
+    return np.asarray(
+        (flat + vectors @ ((1 / np.hypot(1, sizes) - 1) * (vectors.T @ flat))).reshape(off.shape)
+    )
 
 
 def loss(off: Array) -> Array:
-    """Loss [nat] (N,) by residuals (N, 2) in standard deviations, less a constant; zero where they are not known."""
+    """Loss [nat] (N,) by residuals (N, 2) in standard deviations; zero if they are unknown."""
     square = np.nan_to_num((off**2).sum(axis=-1))
     return np.asarray((TAILS / 2 + 1) * np.log1p(square / TAILS))
 

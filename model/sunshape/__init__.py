@@ -1,4 +1,4 @@
-"""Sun shapes: the radiance of the sun and its aureole over the angle from the centre of the disc; one file a shape."""
+"""Sun shapes: the radiance of the sun and its aureole over the angle from the disc's centre."""
 
 from importlib import import_module
 
@@ -35,11 +35,7 @@ __all__ = [
     "transfer_table",
 ]
 
-DECLARABLE = (
-    "buie",
-    "pillbox",
-    "gaussian",
-)
+DECLARABLE = ("buie", "pillbox", "gaussian")
 """Those that ``twin.json`` may name; each is the file of that name in this package."""
 
 

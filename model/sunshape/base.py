@@ -1,7 +1,8 @@
 """What a sun shape is, and what the tracers make of it.
 
-The convolution tracer needs a shape's transfer function (its Hankel transform over angular frequency), the Monte Carlo
-tracer needs random angles; both come from the one profile that each class states.
+The convolution tracer needs a shape's transfer function (its Hankel transform over angular
+frequency), the Monte Carlo tracer needs random angles; both come from the one profile that each
+class states.
 """
 
 import math
@@ -9,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from itertools import pairwise
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -31,7 +32,8 @@ SOFT_FROM = 0.9
 
 
 class SunShape(ABC):
-    """Base of all sun shapes, which are frozen dataclasses of parameters: what the tracers ask of one.
+    """Base of all sun shapes, which are frozen dataclasses of parameters: what the tracers ask of
+    one.
 
     Attributes
     ----------
@@ -58,28 +60,43 @@ def check(name: str, value: float | Tensor, low: float, high: float) -> None:
         raise InvalidInputError(f"{name} must lie in [{low:g}, {high:g}], got {number:g}")
 
 
+class _Quadrature(NamedTuple):
+    """Gauss-Legendre angles [rad] and weights, each (n,)."""
+
+    angles: NDArray[np.float64]
+    weights: NDArray[np.float64]
+
+
 @lru_cache(maxsize=16)
-def _quadrature(edges: tuple[float, ...]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Gauss-Legendre angles and weights (n,) over each smooth piece."""
-    # Gauss and Legendre need pi nodes a cycle at a piece's middle, for the Bessel function's at the highest frequency.
+def _quadrature(edges: tuple[float, ...]) -> _Quadrature:
+    """The quadrature over each smooth piece."""
+    # Gauss and Legendre need pi nodes a cycle at a piece's middle, for the Bessel function's at the
+    # highest frequency.
     densest = np.pi * FREQUENCY_STEP * FREQUENCY_COUNT
     pieces = [
         (low, high, *np.polynomial.legendre.leggauss(16 + math.ceil(densest * (high - low))))
         for low, high in pairwise(edges)
     ]
     angles = [low + (high - low) / 2 * (1 + nodes) for low, high, nodes, _ in pieces]
-    return np.concatenate(angles), np.concatenate([(high - low) / 2 * weights for low, high, _, weights in pieces])
+    weights = [(high - low) / 2 * weights for low, high, _, weights in pieces]
+    return _Quadrature(np.concatenate(angles), np.concatenate(weights))
+
+
+class _Hankel(NamedTuple):
+    """Angles (n,), weights angle * d(angle) (n,) and Bessel kernel (K, n) of a Hankel transform."""
+
+    angles: Tensor
+    weights: Tensor
+    kernel: Tensor
 
 
 @lru_cache(maxsize=8)
-def _hankel(edges: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-    """Angles (n,), weights angle * d(angle) (n,) and Bessel kernel (K, n) of the Hankel transform."""
+def _hankel(edges: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> _Hankel:
     angles, weights = _quadrature(edges)
     frequency = FREQUENCY_STEP * torch.arange(FREQUENCY_COUNT, dtype=torch.float64)
     kernel = torch.special.bessel_j0(2 * np.pi * frequency[:, None] * torch.as_tensor(angles))
     tensors = (torch.as_tensor(angles), torch.as_tensor(weights * angles), kernel)
-    on_angles, on_weights, on_kernel = (tensor.to(dtype=dtype, device=device) for tensor in tensors)
-    return on_angles, on_weights, on_kernel
+    return _Hankel(*(tensor.to(dtype=dtype, device=device) for tensor in tensors))
 
 
 def transfer_table(
@@ -87,11 +104,12 @@ def transfer_table(
 ) -> Tensor:
     """The shape's transfer function (K,) at multiples of `FREQUENCY_STEP`, one at frequency zero.
 
-    The two-dimensional Fourier transform of the normalised radiance in the small-angle plane, which for a profile
-    that depends on the angle alone is its Hankel transform. Differentiable in the shape's tensor parameters.
+    The two-dimensional Fourier transform of the normalised radiance in the small-angle plane, which
+    for a profile that depends on the angle alone is its Hankel transform. Differentiable in the
+    shape's tensor parameters.
 
-    With ``ends`` (E,) [rad] it is that of the light up to each of these angles, (E, K), less than one at frequency zero
-    by the light beyond.
+    With ``ends`` (E,) [rad] it is that of the light up to each of these angles, (E, K), less than
+    one at frequency zero by the light beyond.
     """
     angles, weights, kernel = _hankel(shape.edges, dtype, device)
     density = shape.profile(angles) * weights
@@ -105,7 +123,7 @@ def transfer_table(
 
 
 def integral(shape: SunShape) -> Tensor:
-    """Radiance times angle (scalar) over the whole shape: what makes a profile a share of the light."""
+    """Integral of radiance times angle over the whole shape, which normalises a profile."""
     angles, weights = (torch.as_tensor(values) for values in _quadrature(shape.edges))
     return (shape.profile(angles) * angles * weights).sum()
 
@@ -120,11 +138,13 @@ def half_angle(shape: SunShape, share: float) -> float:
 
 
 def random_angles(shape: SunShape, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Random angles (count,) [rad] from the sun's centre, distributed as radiance times sin(angle)."""
+    """Random angles (count,) [rad] from the sun's centre, by radiance times sin(angle)."""
     edges = np.asarray(shape.edges)
     grid = np.concatenate([np.linspace(a, b, 2049)[:-1] for a, b in pairwise(edges)])
     grid = np.append(grid, edges[-1])
     middle = (grid[1:] + grid[:-1]) / 2
-    density = shape.profile(torch.as_tensor(middle)).detach().numpy() * np.sin(middle) * np.diff(grid)
+    density = (
+        shape.profile(torch.as_tensor(middle)).detach().numpy() * np.sin(middle) * np.diff(grid)
+    )
     cumulative = np.concatenate([[0.0], np.cumsum(density)])
     return np.asarray(np.interp(rng.random(count) * cumulative[-1], cumulative, grid))

@@ -17,10 +17,11 @@ AUREOLE_EDGE = 43.6e-3
 class Buie(SunShape):
     """Buie's sun shape: a limb-darkened disc and an aureole that falls as a power of the angle.
 
-    ``circumsolar_ratio`` is the chi of the formula, 0 (no aureole) to 0.5; it may be a tensor, for gradients.
+    ``circumsolar_ratio`` is the chi of the formula, 0 (no aureole) to 0.5; it may be a tensor, for
+    gradients.
 
-    Source: Buie, Monger, Dey, *Sunshape distributions for terrestrial solar simulations*, Solar Energy 74 (2003),
-    doi:10.1016/S0038-092X(03)00125-7, eqs. 6 to 9.
+    Source: Buie, Monger, Dey, *Sunshape distributions for terrestrial solar simulations*, Solar
+    Energy 74 (2003), doi:10.1016/S0038-092X(03)00125-7, eqs. 6 to 9.
     """
 
     units: ClassVar[Mapping[str, float]] = {"circumsolar_ratio": 1.0}
@@ -39,9 +40,13 @@ class Buie(SunShape):
         """Radiance relative to the centre's; the formula counts angles in milliradians."""
         theta = (angle * 1e3).clamp(min=1e-9)
         disc = torch.cos(0.326 * theta) / torch.cos(0.308 * theta)
-        chi = torch.as_tensor(self.circumsolar_ratio, dtype=angle.dtype, device=angle.device).clamp(min=1e-9)
+        chi = torch.as_tensor(self.circumsolar_ratio, dtype=angle.dtype, device=angle.device).clamp(
+            min=1e-9
+        )
         kappa = 0.9 * torch.log(13.5 * chi) * chi**-0.3
         gamma = 2.2 * torch.log(0.52 * chi) * chi**0.43 - 0.1
         aureole = torch.exp(kappa + gamma * torch.log(theta))
         inside = angle <= SOLAR_DISC
-        return torch.where(inside, disc, torch.where(angle <= AUREOLE_EDGE, aureole, torch.zeros_like(aureole)))
+        return torch.where(
+            inside, disc, torch.where(angle <= AUREOLE_EDGE, aureole, torch.zeros_like(aureole))
+        )

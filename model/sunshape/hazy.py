@@ -1,4 +1,7 @@
-"""A declared sun behind more haze, or less, than a clear sky's. It stands in no ``twin.json``: an effect makes it."""
+"""A declared sun behind more or less haze than that of a clear sky.
+
+It is not declared in ``twin.json``: an effect creates it.
+"""
 
 from dataclasses import dataclass
 
@@ -14,9 +17,11 @@ CLEAR_SKY = 0.02
 
 @dataclass(frozen=True)
 class Hazy(SunShape):
-    """``sun`` with what Buie's sun of ``circumsolar_ratio`` has, share by share of its light, over that of a clear sky.
+    """``sun`` with what Buie's sun of ``circumsolar_ratio`` has, share by share of its light, over
+    that of a clear sky.
 
-    At `CLEAR_SKY` it is ``sun`` itself, whatever its shape. The ratio may be a tensor, for gradients.
+    At `CLEAR_SKY` it is ``sun`` itself, whatever its shape. The ratio may be a tensor, for
+    gradients.
     """
 
     sun: SunShape
@@ -28,7 +33,7 @@ class Hazy(SunShape):
         return tuple(sorted({*self.sun.edges, *Buie().edges}))
 
     def profile(self, angle: Tensor) -> Tensor:
-        """Shares of the light per solid angle; haze takes no more from a direction than there is."""
+        """Shares of the light per solid angle; haze takes at most what there is."""
         suns = self.sun, Buie(self.circumsolar_ratio), Buie(CLEAR_SKY)
         own, hazy, clear = (sun.profile(angle) / integral(sun).to(angle) for sun in suns)
         within = angle <= self.sun.edges[-1]

@@ -1,4 +1,4 @@
-"""Ray tracing of heliostat flux: scenes, a deterministic convolution tracer and a Monte Carlo reference."""
+"""Ray tracing of heliostat flux: scenes, a convolution tracer and a Monte Carlo reference."""
 
 from model.tracing.convolution import Flux, trace
 from model.tracing.scene import Optics, Scene, Window

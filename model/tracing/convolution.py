@@ -1,28 +1,40 @@
 """The convolution tracer: deterministic, batched, differentiable.
 
-Every mirror sample throws one ray, the sun's central ray, onto the target plane with its share of the power, a patch
-as large as the sample's share of the mirror. The cone around it (sun shape, slope errors) is the same for all samples
-of a mirror up to their distance to the target, so the image of the patches is convolved with it. That is done in
-frequency space, where everything is exact and smooth: the cone enters by its transfer function, stretched by the slant
-range and by the beam's slope on the plane, and what spreading a ray over pixels has smeared is divided out again, so
-that a pixel holds its area's mean irradiance.
+Notes
+-----
+Each sample of a mirror reflects one central ray of the sun to the target plane, with the power of
+its part of the mirror. The cone about the ray (sun shape, slope errors) is the same for all samples
+of a mirror, apart from their distance. So the image is a convolution, which is computed in
+frequency space::
 
-A transform is periodic: light that leaves the padded window on one side would come back on the other. The sun's shape
-is therefore cut off where that would begin, so that far light that misses the window is lost, as it is in the field.
+    image = F^-1 [ F(splat of the rays) * cone * patch * unsmear ]
 
-Approximations: the cone's size is taken at each mirror's or each facet's centre, and the cone is small.
+    cone     transfer function of sun shape, slope error and jitter, scaled by the slant range
+             and sheared by the beam's slope on the plane (`_cone_transfer`)
+    patch    transfer function of the parallelogram of a sample, so that samples leave no grid
+             (`_patch_transfer`)
+    unsmear  inverse of the B-spline that spreads a ray over pixels, times the mean over a pixel
+             (`_frequencies`)
 
-Source: the idea of analytic cone optics is that of HELIOS and of Lipps and Walzel, Solar Energy 21 (1978); the
-formulation in frequency space, with the transfer function's argument in closed form, is ours (see `_cone_transfer`).
+A transform is periodic: light that leaves the padded window on one side would enter on the other.
+So the sun's profile ends where that would begin. Light that misses the window by more is lost, as
+in the field.
+
+Approximations: the cone has the size of each mirror's or each facet's centre, and the cone is
+small.
+
+Source: analytic cone optics as in HELIOS and Lipps and Walzel, Solar Energy 21 (1978). The
+formulation in frequency space, with a closed form of the transfer function's argument, is ours.
 """
 
 import math
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any, Literal, TypeVar, cast
+from typing import Any, Literal, NamedTuple, TypeVar, cast
 
 import torch
+from scipy.fft import next_fast_len
 from torch import Tensor
 
 from model.errors import InvalidInputError, UnreachableError
@@ -31,9 +43,12 @@ from model.neighbours import clear
 from model.sunshape import FREQUENCY_COUNT, FREQUENCY_STEP, SunShape, half_angle, transfer_table
 from model.sunshape.base import SOFT_FROM
 from model.surface import edge_basis, midpoint_basis, sample
-from model.tracing.scene import Optics, Scene, Window
+from model.tracing.scene import Optics, Scene, Size, Window
 
-Made = TypeVar("Made")
+Result = TypeVar("Result")
+
+MAX_GRID = 2**25
+"""Largest number of pixels of padded windows in one batch: about 22 bytes each."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +64,7 @@ class Flux:
     center : Tensor (B, 2) [m]
         Centre of the window on the plane.
     power : Tensor (B,) [W]
-        All that the mirror throws at the plane, in the window or not.
+        Reflected power, inside and outside of the window.
     """
 
     irradiance: Tensor
@@ -58,7 +73,7 @@ class Flux:
     power: Tensor
 
     def normalized(self) -> Tensor:
-        """Flux (B, rows, columns) that sums to 100 (the paper's rule)."""
+        """Flux (B, rows, columns) with a sum of 100."""
         return normalized(self.irradiance)
 
 
@@ -71,16 +86,18 @@ class Rays:
     hits : Tensor (B, 2, S) [m]
         Right and up of the plane's centre.
     power : Tensor (B, S) [m2]
-        Projected mirror area that each ray stands for.
+        Projected mirror area of each ray.
     direction : Tensor (B, 3)
         Mean unit direction from mirror to target, in the plane's frame.
     slant_range : Tensor (B,) [m]
     normal : Tensor (B, 3)
         Mean mirror normal in the plane's frame.
     footprint : Tensor (B, 2, 2) [m]
-        How far apart, right and up, the rays of neighbouring samples land, along the facet's x and y; mirror means.
+        Distance, right and up, of the hits of adjacent samples along the facet's x and y; mirror
+        means.
     spot_per_angle : Tensor (B, 2) or None [m/rad]
-        How far, right and up, the spot moves as the mirror turns about the mount's first axis, where that is known.
+        Movement of the spot, right and up, with a rotation about the mount's first axis, if that is
+        known.
     """
 
     hits: Tensor
@@ -97,18 +114,18 @@ class Rays:
         return self.spot_of(1)
 
     def spot_of(self, parts: int) -> Tensor:
-        """Common centre of mass (B / parts, 2) [m] of mirrors that were traced in so many parts."""
+        """Common centre of mass (B / parts, 2) [m] of mirrors that were traced in several parts."""
         moment = (self.hits * self.power[:, None]).sum(-1).view(-1, parts, 2).sum(1)
         return moment / self.power.sum(-1).view(-1, parts).sum(1, keepdim=True)
 
 
 def central_rays(scene: Scene, samples: int) -> Rays:
-    """Reflect the sun's centre at some ``samples``**2 points of each facet and meet the plane.
+    """Reflect the sun's centre at ``samples``**2 points of each facet, and intersect the plane.
 
     Raises
     ------
     UnreachableError
-        Where a mirror shows its back to the sun or to the target.
+        If a mirror faces away from the sun or from the target.
     """
     control_points, center, sun = scene.in_plane()
     mirror = sample(control_points, samples, scene.degree)
@@ -120,8 +137,12 @@ def central_rays(scene: Scene, samples: int) -> Rays:
     mean_normal, mean_point = normals.mean(-1), points.mean(-1)
     mean_normal = mean_normal / mean_normal.norm(dim=-1, keepdim=True)
     beam = 2 * (mean_normal * sun).sum(-1, keepdim=True) * mean_normal - sun
-    if bool(((mean_normal * sun).sum(-1) <= 0).any()) or bool(((-beam[:, 2] <= 1e-3) | (mean_point[:, 2] <= 0)).any()):
-        raise UnreachableError("a mirror shows its back to the sun or to the target; check sun, target and alignment")
+    if bool(((mean_normal * sun).sum(-1) <= 0).any()) or bool(
+        ((-beam[:, 2] <= 1e-3) | (mean_point[:, 2] <= 0)).any()
+    ):
+        raise UnreachableError(
+            "a mirror shows its back to the sun or to the target; check sun, target and alignment"
+        )
     distance = points[:, 2] / direction[:, 2]
     hits = points[:, :2] - direction[:, :2] * distance[:, None]
     power = facing.clamp(min=0)
@@ -142,13 +163,15 @@ def central_rays(scene: Scene, samples: int) -> Rays:
         if scene.first_axis is None
         else _spot_per_angle(scene, scene.first_axis, mean_normal, sun, beam, slant_range)
     )
-    return Rays(hits, power, beam, slant_range, mean_normal, _footprint(hits, samples), spot_per_angle)
+    return Rays(
+        hits, power, beam, slant_range, mean_normal, _footprint(hits, samples), spot_per_angle
+    )
 
 
 def _unblocked(scene: Scene, line: Tensor, samples: int) -> Tensor:
-    """Share (B, S) of each sample's cell that lies above ``line`` (B,) [m] along the mirror's y.
+    """Share (B, S) of each sample's cell above ``line`` (B,) [m] along the mirror's y.
 
-    Cells are cut, not dropped, so that the power follows the line smoothly.
+    Cells are divided, not dropped, so that the power is a continuous function of the line.
     """
     y = scene.control_points[:, :, 1]
     value_u, _ = midpoint_basis(y.shape[-2], scene.degree, samples, y.dtype, y.device)
@@ -161,19 +184,24 @@ def _unblocked(scene: Scene, line: Tensor, samples: int) -> Tensor:
 def _spot_per_angle(
     scene: Scene, axis: Tensor, normal: Tensor, sun: Tensor, beam: Tensor, slant_range: Tensor
 ) -> Tensor:
-    """Movement (B, 2) [m/rad] of the spot as mirrors turn about ``axis`` (B, 3), all others in the plane's frame.
+    """Movement (B, 2) [m/rad] of the spot as mirrors rotate about ``axis`` (B, 3).
 
-    The normal moves by axis x normal, the beam 2 (n.s) n - s by the derivative of that, and the spot by the slant range
-    times what of it lies across the beam, taken along the beam to the plane.
+    All but the axis are in the plane's frame. The normal moves by axis x normal, and the beam 2
+    (n.s) n - s by its derivative. The spot moves by the slant range times the part of that across
+    the beam, projected along the beam to the plane.
     """
     moved = torch.linalg.cross(torch.einsum("bij,bj->bi", scene.plane_axes, axis), normal)
-    turned = 2 * ((moved * sun).sum(-1, keepdim=True) * normal + (normal * sun).sum(-1, keepdim=True) * moved)
-    moved_spot: Tensor = slant_range[:, None] * (turned[:, :2] - beam[:, :2] * turned[:, 2:] / beam[:, 2:])
+    turned = 2 * (
+        (moved * sun).sum(-1, keepdim=True) * normal + (normal * sun).sum(-1, keepdim=True) * moved
+    )
+    moved_spot: Tensor = slant_range[:, None] * (
+        turned[:, :2] - beam[:, :2] * turned[:, 2:] / beam[:, 2:]
+    )
     return moved_spot
 
 
 def _footprint(hits: Tensor, samples: int) -> Tensor:
-    """Mean steps (B, 2 along x and y, 2) [m] between the hits (B, 2, S) of neighbouring samples."""
+    """Mean steps (B, 2 along x and y, 2) [m] between the hits (B, 2, S) of adjacent samples."""
     if samples < 2:
         return hits.new_zeros(len(hits), 2, 2)
     grid = hits.view(*hits.shape[:2], -1, samples, samples)
@@ -182,34 +210,61 @@ def _footprint(hits: Tensor, samples: int) -> Tensor:
     return torch.stack([along_x, along_y], dim=1) / (samples - 1)
 
 
-@lru_cache(maxsize=16)
-def _frequencies(
-    rows: int, columns: int, pixel: tuple[float, float], dtype: torch.dtype, device: torch.device
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Frequencies right (1, C/2+1), up (R, 1) [cycles/m] of a real FFT, and what undoes the splat's smear (R, C/2+1).
+class _Frequencies(NamedTuple):
+    """Frequencies right (1, C/2+1) and up (R, 1) [cycles/m] of a real FFT.
 
-    A quadratic B-spline multiplies by sinc^3 along each axis, the mean over a pixel by sinc; two sincs remain to be
-    divided out.
+    ``unsmear`` (R, C/2+1) is the inverse of the splat's smear.
+    """
+
+    right: Tensor
+    up: Tensor
+    unsmear: Tensor
+
+
+_CACHED_PIXELS = 2**20  # frequencies of larger images would take more memory than time
+
+
+def _frequencies(
+    rows: int, columns: int, pixel: Size, dtype: torch.dtype, device: torch.device
+) -> _Frequencies:
+    """Return the frequencies of `_compute_frequencies`, cached if the image is small."""
+    is_small = rows * columns <= _CACHED_PIXELS
+    compute = _cached_frequencies if is_small else _compute_frequencies
+    return compute(rows, columns, pixel, dtype, device)
+
+
+def _compute_frequencies(
+    rows: int, columns: int, pixel: Size, dtype: torch.dtype, device: torch.device
+) -> _Frequencies:
+    """Compute the frequencies of an image.
+
+    A quadratic B-spline multiplies by sinc^3 along each axis, the mean over a pixel by sinc; two
+    sincs remain to be divided out.
     """
     right = torch.fft.rfftfreq(columns, dtype=dtype, device=device)[None, :]
     # Rows run downwards, the plane's second axis up.
     up = -torch.fft.fftfreq(rows, dtype=dtype, device=device)[:, None]
     unsmear = 1 / (torch.sinc(right) * torch.sinc(up)) ** 2
-    return right / pixel[0], up / pixel[1], unsmear
+    return _Frequencies(right / pixel[0], up / pixel[1], unsmear)
+
+
+_cached_frequencies = lru_cache(maxsize=16)(_compute_frequencies)
 
 
 def _patch_transfer(rays: Rays, right: Tensor, up: Tensor) -> Tensor:
-    """Transfer function (B, R, C/2+1) of the patch of light that each ray stands for.
+    """Transfer function (B, R, C/2+1) of the patch of light of each ray.
 
-    The patches of a flat mirror tile its image without gap or overlap, so that the sampling leaves no trace: the sun's
-    sharp edge would otherwise show the grid of the rays.
+    The patches of a flat mirror tile its image without gaps and overlaps, so that samples leave no
+    grid.
     """
     step_x, step_y = rays.footprint[:, 0, :, None, None], rays.footprint[:, 1, :, None, None]
-    return torch.sinc(step_x[:, 0] * right + step_x[:, 1] * up) * torch.sinc(step_y[:, 0] * right + step_y[:, 1] * up)
+    return torch.sinc(step_x[:, 0] * right + step_x[:, 1] * up) * torch.sinc(
+        step_y[:, 0] * right + step_y[:, 1] * up
+    )
 
 
 def _interpolate(table: Tensor, frequency: Tensor) -> Tensor:
-    """Linear interpolation of a transfer table (K,) or (B, K) at frequencies (B, ...) [cycles/rad]."""
+    """Interpolate a transfer table (K,) or (B, K) linearly at frequencies (B, ...) [cycles/rad]."""
     position = (frequency / FREQUENCY_STEP).clamp(max=FREQUENCY_COUNT - 1.001)
     index = position.detach().long()
     fraction = position - index
@@ -223,12 +278,15 @@ def _interpolate(table: Tensor, frequency: Tensor) -> Tensor:
 
 
 def _cone_transfer(rays: Rays, optics: Optics, right: Tensor, up: Tensor, table: Tensor) -> Tensor:
-    """Transfer function (B, R, C/2+1) of the reflected cone, and of the mount's jitter, on the target plane.
+    """Transfer function (B, R, C/2+1) of the reflected cone and of the mount's jitter, on the
+    target plane.
 
-    A ray tilted by a small angle e (a vector across the beam d) meets the plane, whose normal is z, shifted by
-    R (e - d e_z / d_z). The frequency f on the plane therefore sees the angular frequency g = R (f - z (d.f) / d_z),
-    which lies across the beam; its length decides the sun shape's transfer, its components along and across the plane
-    of incidence that of the slope error, which turns the ray by twice the error along and 2 cos(incidence) across.
+    A ray tilted by a small angle e (a vector across the beam d) hits the plane, whose normal is z,
+    shifted by R (e - d e_z / d_z). So the frequency f on the plane corresponds to the angular
+    frequency g = R (f - z (d.f) / d_z) across the beam. The length of g is the argument of the sun
+    shape's transfer function. Its components in the plane of incidence and across it are those of
+    the slope error, which rotates the ray by twice the error in that plane, and by
+    2 cos(incidence) times the error across it.
     """
     d = rays.direction[:, :, None, None]
     slope = -(d[:, 0] * right + d[:, 1] * up) / d[:, 2]
@@ -236,7 +294,9 @@ def _cone_transfer(rays: Rays, optics: Optics, right: Tensor, up: Tensor, table:
     # The tiny term keeps the root's gradient finite at frequency zero.
     transfer = _interpolate(table, angular * torch.sqrt(right**2 + up**2 + slope**2 + 1e-24))
     if isinstance(optics.slope_error, Tensor) or optics.slope_error > 0:
-        sigma = torch.as_tensor(optics.slope_error, dtype=right.dtype, device=right.device).reshape(-1, 1, 1)
+        sigma = torch.as_tensor(optics.slope_error, dtype=right.dtype, device=right.device).reshape(
+            -1, 1, 1
+        )
         n = rays.normal
         cosine = (n * rays.direction).sum(-1)[:, None, None]
         across = torch.linalg.cross(n, rays.direction)
@@ -248,97 +308,105 @@ def _cone_transfer(rays: Rays, optics: Optics, right: Tensor, up: Tensor, table:
     if isinstance(optics.tracking_jitter, Tensor) or optics.tracking_jitter > 0:
         if rays.spot_per_angle is None:
             raise InvalidInputError("tracking jitter needs a scene with 'first_axis'")
-        sigma = torch.as_tensor(optics.tracking_jitter, dtype=right.dtype, device=right.device).reshape(-1, 1, 1)
-        moved = rays.spot_per_angle[:, 0, None, None] * right + rays.spot_per_angle[:, 1, None, None] * up
+        sigma = torch.as_tensor(
+            optics.tracking_jitter, dtype=right.dtype, device=right.device
+        ).reshape(-1, 1, 1)
+        moved = (
+            rays.spot_per_angle[:, 0, None, None] * right
+            + rays.spot_per_angle[:, 1, None, None] * up
+        )
         transfer = transfer * torch.exp(-2 * math.pi**2 * (sigma * moved) ** 2)
     return transfer
 
 
 def _splat(x: Tensor, y: Tensor, weight: Tensor, rows: int, columns: int) -> Tensor:
-    """Spread weights (B, S) over pixels (B, rows, columns) at coordinates x, y (B, S); what falls outside is lost.
+    """Spread weights (B, S) over pixels (B, rows, columns) at coordinates x, y (B, S).
 
-    Each becomes a quadratic B-spline, three pixels wide: rays that stand in a grid of their own would beat visibly
-    against the pixels under a narrower one, and its slope is continuous for gradients.
+    Each becomes a quadratic B-spline, three pixels wide. The regular grid of rays would interfere
+    visibly with the pixels under a narrower one, and its slope is continuous for gradients. Weights
+    outside of the image are lost.
     """
     column, row = x.detach().round(), y.detach().round()
     inside = (column >= 1) & (column < columns - 1) & (row >= 1) & (row < rows - 1)
     across, down = quadratic(x - column), quadratic(y - row)
     batch = torch.arange(x.shape[0], device=x.device)[:, None] * (rows * columns)
-    corner = batch + (row.clamp(1, rows - 2).long() - 1) * columns + column.clamp(1, columns - 2).long() - 1
+    corner = (
+        batch
+        + (row.clamp(1, rows - 2).long() - 1) * columns
+        + column.clamp(1, columns - 2).long()
+        - 1
+    )
     corner = corner.flatten()
     weight = weight * inside
     image = torch.zeros(x.shape[0] * rows * columns, dtype=x.dtype, device=x.device)
     for step_down, share_down in enumerate(down):
         line = weight * share_down
         for step_across, share_across in enumerate(across):
-            image = image.index_add(0, corner + (step_down * columns + step_across), (line * share_across).flatten())
+            image = image.index_add(
+                0, corner + (step_down * columns + step_across), (line * share_across).flatten()
+            )
     return image.view(x.shape[0], rows, columns)
 
 
-def quadratic(offset: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Shares of the pixel before, at and after a point that lies ``offset`` in [-1/2, 1/2] from its nearest pixel."""
+def quadratic(offset: Tensor) -> tuple[Tensor, ...]:
+    """Shares of three pixels: before, at and after the one nearest to a point, at ``offset``."""
     return 0.5 * (0.5 - offset) ** 2, 0.75 - offset**2, 0.5 * (0.5 + offset) ** 2
 
 
-_CONE_SHARE = 0.99  # of the sun's light: windows are padded by its reach
-_ENDS_PER_OCTAVE = 4  # mirrors whose light is cut off at about the same angle share a table
-_ROOM = 2 ** (1 / _ENDS_PER_OCTAVE) / SOFT_FROM  # for the step to such an angle, and for the soft end there
+_CONE_SHARE = 0.99  # of the sun's light; windows are padded by its extent
+_ENDS_PER_OCTAVE = 4  # mirrors whose light ends at about the same angle share a table
+_MARGIN = 2 ** (1 / _ENDS_PER_OCTAVE) / SOFT_FROM  # the next step, and the soft end there
 
 
 def _reach(rays: Rays, optics: Optics) -> float:
-    """How far [m] on the plane nearly all light of a ray lands from its centre, for the farthest of the mirrors."""
-    errors = [float(torch.as_tensor(sigma).detach().max()) for sigma in (optics.slope_error, optics.tracking_jitter)]
-    angle = _ROOM * _kept(half_angle, optics.sun_shape, _CONE_SHARE) + 6 * math.hypot(*errors)
+    """Distance [m] on the plane from a ray's hit within which nearly all of its light lands."""
+    errors = [
+        float(torch.as_tensor(sigma).detach().max())
+        for sigma in (optics.slope_error, optics.tracking_jitter)
+    ]
+    angle = _MARGIN * _cached(half_angle, optics.sun_shape, _CONE_SHARE) + 6 * math.hypot(*errors)
     return float(angle * _per_angle(rays).max())
 
 
 def _per_angle(rays: Rays) -> Tensor:
-    """Distance (B,) [m/rad] on the plane per angle off the beam, in the plane of incidence, where it is longest."""
+    """Largest shift (B,) [m/rad] on the plane per angle, which is in the plane of incidence."""
     return (rays.slant_range / -rays.direction[:, 2]).detach()
 
 
 def _sun_tables(sun: SunShape, rays: Rays, free: float) -> Tensor:
-    """The sun's transfer (K,) or (B, K) without the light that would land farther than ``free`` [m] off a ray."""
+    """Transfer function (K,) or (B, K) of the sun's light within ``free`` [m] of a ray."""
     dtype, device = rays.hits.dtype, rays.hits.device
     steps = (torch.log2(free / _per_angle(rays)) * _ENDS_PER_OCTAVE).floor()
-    # One step above the sun's edge nothing of it is cut off.
+    # One step above the sun's edge all of the light is inside.
     whole = math.ceil(math.log2(sun.edges[-1]) * _ENDS_PER_OCTAVE) + 1
     different, which = torch.unique(steps.clamp(max=whole), return_inverse=True)
     if float(different[0]) == whole:
-        return _kept(transfer_table, sun, dtype, device)
+        return _cached(transfer_table, sun, dtype, device)
     ends = tuple((2 ** (different / _ENDS_PER_OCTAVE)).tolist())
-    tables = _kept(transfer_table, sun, dtype, device, ends)
+    tables = _cached(transfer_table, sun, dtype, device, ends)
     return tables[0] if len(ends) == 1 else tables[which]
 
 
-def _kept(work: Callable[..., Made], sun: SunShape, *given: Hashable) -> Made:
-    """What ``work`` makes of a sun; kept for the next time where the sun is made of plain numbers."""
+def _cached(work: Callable[..., Result], sun: SunShape, *given: Hashable) -> Result:
+    """Call ``work`` with a sun; results of suns of plain numbers are cached."""
     if any(isinstance(value, Tensor) for value in vars(sun).values()):
         return work(sun, *given)
-    return cast(Made, _remembered(work, sun, *given))
+    return cast(Result, _cached_call(work, sun, *given))
 
 
 @lru_cache(maxsize=128)
-def _remembered(work: Callable[..., object], sun: Any, *given: Hashable) -> object:
+def _cached_call(work: Callable[..., object], sun: Any, *given: Hashable) -> object:
     return work(sun, *given)
 
 
-def _padded(size: int, padding: float, reach: float) -> int:
-    """An even length of small prime factors that leaves ``padding`` of the window on each side.
+def _padded_size(size: int, padding: float, reach: float) -> int:
+    """Padded size: even, with small prime factors, and ``padding`` of the window on each side.
 
-    In all it leaves ``reach`` [px], but no more than the window itself: nothing comes from farther to where it counts.
+    Both sides together are at least ``reach`` [px], or the window's size if that is smaller: no
+    light from farther away returns to the window.
     """
-    length = math.ceil((size + max(2 * padding * size, min(reach, size))) / 2) * 2
-    while not _smooth(length):
-        length += 2
-    return length
-
-
-def _smooth(length: int) -> bool:
-    for prime in (2, 3, 5):
-        while length % prime == 0:
-            length //= prime
-    return length == 1
+    least = math.ceil((size + max(2 * padding * size, min(reach, size))) / 2)
+    return 2 * int(next_fast_len(least, real=True))
 
 
 def trace(
@@ -357,20 +425,21 @@ def trace(
     scene : Scene
     window : Window
     optics : Optics, optional
-        Buie's sun with a circumsolar ratio of 0.02, 1000 W/m2 and a perfect mirror unless given.
+        By default Buie's sun with a circumsolar ratio of 0.02, 1000 W/m2 and a perfect mirror.
     samples : int
-        Points along each side of each facet.
+        Rays along each side of each facet.
     padding : float
-        How far beyond the window, in windows, rays are followed before they are lost; more where the sun's cone reaches
-        farther.
+        Distance beyond the window, in windows, up to which rays are followed; more if the sun's
+        cone is larger.
     cones : {"mirror", "facet"}
-        Whether the reflected cone is taken at each mirror's centre or at each facet's, which costs four times as much
-        and counts for mirrors near the tower, where a facet is visibly nearer than the next.
+        Whether the reflected cone is that of each mirror's or of each facet's centre. The latter
+        costs four times as much. It matters for mirrors near the tower, whose facets differ in
+        distance.
 
     Raises
     ------
     UnreachableError
-        Where a mirror shows its back to the sun or to the target.
+        If a mirror faces away from the sun or from the target.
     """
     if samples < 1:
         raise InvalidInputError("samples must be at least one")
@@ -385,9 +454,27 @@ def trace(
         tracking_jitter=_of_parts(optics.tracking_jitter, parts),
     )
     irradiance = optics.irradiance(rays.slant_range)
-    image = _image(rays, center.repeat_interleave(parts, dim=0), window, optics, irradiance, (padding, padding), parts)
+    image = _image(
+        rays,
+        center.repeat_interleave(parts, dim=0),
+        window,
+        optics,
+        irradiance,
+        (padding, padding),
+        parts,
+    )
     power = (rays.power.sum(-1) * irradiance).view(-1, parts).sum(1)
     return Flux(irradiance=image, spot=spot, center=center, power=power)
+
+
+class SuperposedFlux(NamedTuple):
+    """Irradiance (rows, columns) [W/m2] over a window, and the mirrors' reflected power (B,) [W].
+
+    The power is that inside and outside of the window.
+    """
+
+    irradiance: Tensor
+    power: Tensor
 
 
 def superpose(
@@ -397,44 +484,36 @@ def superpose(
     *,
     samples: int = 16,
     padding: tuple[float, float] = (0.25, 0.25),
-) -> tuple[Tensor, Tensor]:
-    """The sum of the flux of all mirrors of a scene, which share one target plane.
+) -> SuperposedFlux:
+    """Add up the flux of all mirrors of a scene, which have one target plane.
 
-    Parameters as of `trace`, ``padding`` above and aside; spectra are added, so that it costs one inverse transform.
-
-    Returns
-    -------
-    irradiance : Tensor (rows, columns) [W/m2]
-        Over a window about the plane's centre.
-    power : Tensor (B,) [W]
-        What each mirror throws at the plane, in the window or not.
-
-    Raises
-    ------
-    UnreachableError
-        Where a mirror shows its back to the sun or to the target.
+    Parameters are those of `trace`; ``padding`` is vertical and horizontal. Spectra are added, so
+    that one inverse transform is enough. Raises `UnreachableError` if a mirror faces away from the
+    sun or from the target.
     """
     optics, rays = optics or Optics(), central_rays(scene, samples)
     irradiance, center = optics.irradiance(rays.slant_range), rays.hits.new_zeros(scene.batch, 2)
     image = _image(rays, center, window, optics, irradiance, padding, parts=scene.batch)
-    return image[0], rays.power.sum(-1) * irradiance
+    return SuperposedFlux(image[0], rays.power.sum(-1) * irradiance)
 
 
 def _of_parts(value: float | Tensor, parts: int) -> float | Tensor:
-    """A value of all mirrors as it is, values (B,) of each repeated for the mirror's parts."""
-    return value.repeat_interleave(parts) if isinstance(value, Tensor) and value.numel() > 1 else value
+    """A value of all mirrors unchanged, or values (B,), each repeated for the mirror's parts."""
+    return (
+        value.repeat_interleave(parts) if isinstance(value, Tensor) and value.numel() > 1 else value
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class Raster:
-    """Where rays land among the pixels of padded windows, and what blurs them there.
+    """Rays in padded windows, and what blurs them.
 
     Attributes
     ----------
     x, y : Tensor (B, S) [px]
         Column and row.
     weight : Tensor (B, S) [W/m2]
-        What each ray gives to a pixel that it lies in alone.
+        Irradiance of a pixel that holds the whole ray.
     transfer : Tensor (B, R, C / 2 + 1)
         Of cone, patch and mount, with the splat's smear undone.
     shape : tuple of int
@@ -451,31 +530,52 @@ class Raster:
     inner: tuple[slice, slice]
 
     def blurred(self, images: Tensor, parts: int = 1) -> Tensor:
-        """Windows (..., rows, columns) of sharp images (..., B, R, C), those of ``parts`` mirrors each added up."""
+        """Blur sharp images (..., B, R, C), add up ``parts`` mirrors each, and crop them."""
         spectrum = (torch.fft.rfft2(images) * self.transfer).unflatten(-3, (-1, parts)).sum(-3)
         whole: Tensor = torch.fft.irfft2(spectrum, s=self.shape)
         return whole[..., self.inner[0], self.inner[1]]
 
 
 def raster(
-    rays: Rays, center: Tensor, window: Window, optics: Optics, irradiance: Tensor, padding: tuple[float, float]
+    rays: Rays,
+    center: Tensor,
+    window: Window,
+    optics: Optics,
+    irradiance: Tensor,
+    padding: tuple[float, float],
 ) -> Raster:
-    """Rays (B) in windows about ``center`` (B, 2) [m], padded above and aside as `trace` tells."""
+    """Place rays (B) in windows about ``center`` (B, 2) [m]; padding is (vertical, horizontal)."""
     pixel_x, pixel_y = window.pixel
     reach = _reach(rays, optics)
-    rows, columns = (
-        _padded(window.rows, padding[0], reach / pixel_y),
-        _padded(window.columns, padding[1], reach / pixel_x),
-    )
+    rows = _padded_size(window.rows, padding[0], reach / pixel_y)
+    columns = _padded_size(window.columns, padding[1], reach / pixel_x)
+    if len(rays.hits) * rows * columns > MAX_GRID:
+        raise InvalidInputError(
+            f"resolution: {window.rows} x {window.columns} pixels of {pixel_x:.3g} m x"
+            f" {pixel_y:.3g} m need a grid of {rows} x {columns}, {MAX_GRID} pixels are the most;"
+            " ask for fewer"
+        )
     free = min((rows - window.rows) * pixel_y, (columns - window.columns) * pixel_x)
     table = _sun_tables(optics.sun_shape, rays, free)
     first_row, first_column = (rows - window.rows) // 2, (columns - window.columns) // 2
     x = (rays.hits[:, 0] - center[:, :1] + window.width / 2) / pixel_x + first_column - 0.5
     y = (window.height / 2 - rays.hits[:, 1] + center[:, 1:]) / pixel_y + first_row - 0.5
     right, up, unsmear = _frequencies(rows, columns, window.pixel, x.dtype, x.device)
-    transfer = _cone_transfer(rays, optics, right, up, table) * _patch_transfer(rays, right, up) * unsmear
-    inner = (slice(first_row, first_row + window.rows), slice(first_column, first_column + window.columns))
-    return Raster(x, y, rays.power * (irradiance / (pixel_x * pixel_y))[:, None], transfer, (rows, columns), inner)
+    transfer = (
+        _cone_transfer(rays, optics, right, up, table) * _patch_transfer(rays, right, up) * unsmear
+    )
+    inner = (
+        slice(first_row, first_row + window.rows),
+        slice(first_column, first_column + window.columns),
+    )
+    return Raster(
+        x,
+        y,
+        rays.power * (irradiance / (pixel_x * pixel_y))[:, None],
+        transfer,
+        (rows, columns),
+        inner,
+    )
 
 
 def _image(
@@ -487,6 +587,8 @@ def _image(
     padding: tuple[float, float],
     parts: int,
 ) -> Tensor:
-    """Irradiance (B / parts, rows, columns) [W/m2] of rays (B) in windows about ``center`` (B, 2) [m]."""
-    seen = raster(rays, center, window, optics, irradiance, padding)
-    return seen.blurred(_splat(seen.x, seen.y, seen.weight, *seen.shape), parts)
+    """Irradiance (B / parts, rows, columns) [W/m2] of rays (B) in windows about ``center``."""
+    rays_on_grid = raster(rays, center, window, optics, irradiance, padding)
+    return rays_on_grid.blurred(
+        _splat(rays_on_grid.x, rays_on_grid.y, rays_on_grid.weight, *rays_on_grid.shape), parts
+    )

@@ -1,12 +1,14 @@
-"""The Monte Carlo tracer: the slow, plain reference.
+"""The Monte Carlo tracer: the slow and simple reference.
 
-Every ray is thrown for itself: a random place on a random facet, a random direction from the sun's disc and aureole, a
-random slope error, random tracking jitter of the mount, exact reflection, exact intersection with the plane. It shares
-the scene with the convolution tracer and nothing of its method, so that each can be tested against the other.
+Each ray has a random place on a random facet, a random direction from the sun's disc and aureole, a
+random slope error, and a random tracking jitter. Reflection and intersection with the plane are
+exact. It shares the scene with the convolution tracer but none of its method, so that each can be
+tested against the other.
 """
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -22,29 +24,39 @@ from model.tracing.scene import Optics, Scene, Window
 Array = NDArray[np.float64]
 
 CHUNK = 500_000
-"""Rays traced at a time; bounds the memory to some hundred megabytes."""
+"""Rays traced at once; limits the memory to some hundred megabytes."""
 
 
 def _unit(vectors: Array) -> Array:
     return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
 
 
-def _across(axis: Array) -> tuple[Array, Array]:
-    """Two unit vectors (..., 3) that complete ``axis`` (..., 3) to an orthonormal frame."""
+def _across(axis: Array) -> Array:
+    """Two unit vectors (2, ..., 3) that complete ``axis`` (..., 3) to an orthonormal frame."""
     helper = np.where(np.abs(axis[..., :1]) < 0.9, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
     first = _unit(np.cross(axis, helper))
-    return first, np.cross(axis, first)
+    return np.stack([first, np.cross(axis, first)])
 
 
-def _mirror_points(control_points: Array, degree: int, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Random points and area vectors, each (n, 3), of one facet (I, J, 3), even in the parameters."""
+class _FacetPoints(NamedTuple):
+    """Points [m] of a facet and their area vectors [m2], each (n, 3)."""
+
+    points: Array
+    areas: Array
+
+
+def _facet_points(
+    control_points: Array, degree: int, count: int, rng: np.random.Generator
+) -> _FacetPoints:
+    """Random points of one facet (I, J, 3), uniform in the parameters."""
     value_u, slope_u = basis(control_points.shape[0], degree, rng.random(count))
     value_v, slope_v = basis(control_points.shape[1], degree, rng.random(count))
 
     def product(a: Array, b: Array) -> Array:
         return np.asarray(np.einsum("nj,njc->nc", b, np.tensordot(a, control_points, axes=1)))
 
-    return product(value_u, value_v), np.cross(product(slope_u, value_v), product(value_u, slope_v))
+    areas = np.cross(product(slope_u, value_v), product(value_u, slope_v))
+    return _FacetPoints(product(value_u, value_v), areas)
 
 
 def _sun_rays(sun: Array, optics: Optics, count: int, rng: np.random.Generator) -> Array:
@@ -56,62 +68,73 @@ def _sun_rays(sun: Array, optics: Optics, count: int, rng: np.random.Generator) 
 
 
 def _sigma(value: float | Tensor, scene: Scene, index: int) -> float:
-    """The standard deviation that belongs to one mirror of a scene."""
+    """The standard deviation of one mirror of a scene."""
     return float(torch.as_tensor(value).detach().expand(scene.batch)[index])
 
 
 def _rays(
     scene: Scene, index: int, optics: Optics, count: int, rng: np.random.Generator
 ) -> Iterator[tuple[Array, Array]]:
-    """Hits (n, 2) [m] on the plane and the projected mirror area (n,) [m2] of each, facet by facet."""
+    """Hits (n, 2) [m] on the plane and projected areas (n,) [m2] of rays, facet by facet."""
     points, centers, suns = scene.in_plane()
     facets = (points[index].double() + centers[index].double()[:, None, None]).numpy()
     sun = _unit(suns[index].double().numpy())
-    slope_error, jitter = (_sigma(v, scene, index) for v in (optics.slope_error, optics.tracking_jitter))
+    slope_error, jitter = (
+        _sigma(v, scene, index) for v in (optics.slope_error, optics.tracking_jitter)
+    )
     inside = scene.obstacles_in_plane()
     obstacles = np.zeros((0, 3, 3)) if inside is None else inside[index].double().numpy()
     shares = rng.multinomial(count, np.full(len(facets), 1 / len(facets)))
     for facet, share in enumerate(shares):
-        place, area = _mirror_points(np.moveaxis(facets[facet], 0, -1), scene.degree, share, rng)
-        seen = _seen(scene, index, facet, place)
+        place, area = _facet_points(np.moveaxis(facets[facet], 0, -1), scene.degree, share, rng)
+        visible = _visible_share(scene, index, facet, place)
         if jitter > 0:
-            place, area = _swung(scene, index, place, area, rng.normal(0, jitter, share))
+            angle = rng.normal(0, jitter, share)
+            place, area = _rotate_about_first_axis(scene, index, place, area, angle)
         normal = _unit(area)
         toward_sun = _sun_rays(sun, optics, share, rng)
-        # The light that a patch collects counts its own area, not that of the tilted micro-facets on it.
-        weight = (area * toward_sun).sum(axis=-1).clip(min=0) * seen * len(facets) / count
+        # The light that a patch collects counts its own area, not that of the tilted micro-facets
+        # on it.
+        weight = (area * toward_sun).sum(axis=-1).clip(min=0) * visible * len(facets) / count
         if slope_error > 0:
             first, second = _across(normal)
             tilt = rng.normal(0, slope_error, (2, share, 1))
             normal = _unit(normal + tilt[0] * first + tilt[1] * second)
         out = 2 * (normal * toward_sun).sum(axis=-1, keepdims=True) * normal - toward_sun
-        weight = weight * _free(obstacles, place, toward_sun) * _free(obstacles, place, out)
+        weight = weight * _is_free(obstacles, place, toward_sun) * _is_free(obstacles, place, out)
         distance = -place[:, 2] / out[:, 2]
         hits = place[:, :2] + distance[:, None] * out[:, :2]
         ahead = (distance > 0) & (out[:, 2] < 0)
         yield hits[ahead], weight[ahead]
 
 
-def _center_and_turn(scene: Scene, index: int) -> tuple[Array, Array]:
-    """The mirror's centre (3,) [m] in the frame of its plane, and ENU to that frame (3, 3)."""
+class _PlaneFrame(NamedTuple):
+    """A mirror's centre (3,) [m] in the frame of its plane, and the rotation (3, 3) from ENU."""
+
+    center: Array
+    rotation: Array
+
+
+def _plane_frame(scene: Scene, index: int) -> _PlaneFrame:
     turn = scene.plane_axes[index].double().numpy()
-    return turn @ (scene.center[index] - scene.plane_center[index]).double().numpy(), turn
+    center = (scene.center[index] - scene.plane_center[index]).double().numpy()
+    return _PlaneFrame(turn @ center, turn)
 
 
-def _seen(scene: Scene, index: int, facet: int, place: Array) -> Array:
-    """Share (n,) of the light at mirror points (n, 3), given in the plane's frame, that gets to the target."""
+def _visible_share(scene: Scene, index: int, facet: int, place: Array) -> Array:
+    """Share (n,) of the light at mirror points (n, 3) in the plane's frame that is not lost."""
     share = np.ones(len(place))
     if scene.facet_reflectivity is not None:
         share *= float(scene.facet_reflectivity[index, facet])
     if scene.blocked_below is not None:
-        center, turn = _center_and_turn(scene, index)
+        center, turn = _plane_frame(scene, index)
         upwards = turn @ scene.attitude[index, :, 1].double().numpy()
         share *= (place - center) @ upwards >= float(scene.blocked_below[index])
     return share
 
 
-def _free(obstacles: Array, place: Array, direction: Array) -> NDArray[np.bool_]:
-    """Which rays (n,) from points (n, 3) along directions (n, 3) meet no rectangle of ``obstacles`` (K, 3, 3)."""
+def _is_free(obstacles: Array, place: Array, direction: Array) -> NDArray[np.bool_]:
+    """Which rays (n,) from ``place`` (n, 3) along ``direction`` hit no rectangle (K, 3, 3)."""
     free = np.ones(len(place), dtype=bool)
     for center, right, up in obstacles:
         normal = np.cross(right, up)
@@ -122,28 +145,37 @@ def _free(obstacles: Array, place: Array, direction: Array) -> NDArray[np.bool_]
     return free
 
 
-def _swung(scene: Scene, index: int, place: Array, area: Array, angle: Array) -> tuple[Array, Array]:
-    """Points and area vectors (n, 3) of a mirror that is turned about its first axis by ``angle`` (n,) [rad] each."""
+def _rotate_about_first_axis(
+    scene: Scene, index: int, place: Array, area: Array, angle: Array
+) -> _FacetPoints:
+    """Rotate a mirror's points and area vectors about its first axis by angles (n,) [rad]."""
     if scene.first_axis is None:
         raise InvalidInputError("tracking jitter needs a scene with 'first_axis'")
-    center, turn = _center_and_turn(scene, index)
+    center, turn = _plane_frame(scene, index)
     jitter = rotation(turn @ scene.first_axis[index].double().numpy(), angle)
-    return center + np.einsum("nij,nj->ni", jitter, place - center), np.einsum("nij,nj->ni", jitter, area)
+    points = center + np.einsum("nij,nj->ni", jitter, place - center)
+    return _FacetPoints(points, np.einsum("nij,nj->ni", jitter, area))
+
+
+class MonteCarloFlux(NamedTuple):
+    """Irradiance (B, rows, columns) [W/m2], row 0 at the top, and spots (B, 2) [m].
+
+    A spot is the centre of mass under a point sun, right and up of the plane's centre.
+    """
+
+    irradiance: Array
+    spot: Array
 
 
 def trace_montecarlo(
-    scene: Scene, window: Window, optics: Optics | None = None, *, rays: int = 1_000_000, seed: int = 0
-) -> tuple[Array, Array]:
-    """Trace every mirror of a scene with ``rays`` random rays.
-
-    Returns
-    -------
-    irradiance : (B, rows, columns) [W/m2]
-        Row 0 at the top.
-    spot : (B, 2) [m]
-        Centre of mass under a point sun, right and up of the plane's centre; the window's centre where it is on the
-        spot.
-    """
+    scene: Scene,
+    window: Window,
+    optics: Optics | None = None,
+    *,
+    rays: int = 1_000_000,
+    seed: int = 0,
+) -> MonteCarloFlux:
+    """Trace every mirror of a scene with ``rays`` random rays, at least one."""
     if rays < 1:
         raise InvalidInputError("rays must be at least one")
     optics = optics or Optics()
@@ -158,11 +190,11 @@ def trace_montecarlo(
                 image += _histogram(hits - center, weight, window) * min(CHUNK, rays - start) / rays
         images.append(image * _irradiance(scene, index, optics) / np.prod(window.pixel))
         spots.append(spot)
-    return np.array(images), np.array(spots)
+    return MonteCarloFlux(np.array(images), np.array(spots))
 
 
 def _spot(scene: Scene, index: int, optics: Optics, rng: np.random.Generator) -> Array:
-    """Centre of mass (2,) [m] of the light from the sun's very centre, which is where the convolution tracer has it."""
+    """Centre of mass (2,) [m] of the light from the sun's centre, as in the convolution tracer."""
     point_sun = replace(optics, sun_shape=Pillbox(1e-6), slope_error=0.0, tracking_jitter=0.0)
     total, moment = 0.0, np.zeros(2)
     for hits, weight in _rays(scene, index, point_sun, 200_000, rng):
@@ -172,7 +204,7 @@ def _spot(scene: Scene, index: int, optics: Optics, rng: np.random.Generator) ->
 
 
 def _histogram(hits: Array, weight: Array, window: Window) -> Array:
-    """Weights (n,) summed over the window's pixels (rows, columns)."""
+    """Sum weights (n,) over the window's pixels (rows, columns)."""
     pixel_x, pixel_y = window.pixel
     column = np.floor((hits[:, 0] + window.width / 2) / pixel_x)
     row = np.floor((window.height / 2 - hits[:, 1]) / pixel_y)

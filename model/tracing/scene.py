@@ -1,7 +1,8 @@
-"""Scenes: what both tracers trace. A batch of mirrors, each with its pose, its sun and its target plane."""
+"""Scenes: the input of both tracers, a batch of mirrors with poses, suns and target planes."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -11,26 +12,28 @@ from torch import Tensor
 from model.errors import InvalidInputError
 from model.images import FLUX_SIZE, FLUX_WINDOW
 from model.mount import Mount
-from model.plant import Heliostat, TargetPlane
+from model.plant import TargetPlane
+from model.setup import Setup
 from model.sunshape import Buie, SunShape
 from model.surface import DEGREE
 
 
 @dataclass(frozen=True, eq=False)
 class Optics:
-    """What the light meets besides the mirror's shape.
+    """The sun, the mirror's reflectance and errors, and the air.
 
     Attributes
     ----------
     sun_shape : SunShape
     slope_error : float or Tensor (B,) [rad]
-        Standard deviation of the mirror's normals per axis, below what the surface resolves.
+        Standard deviation of the mirror's normals per axis, below the resolution of the surface.
     tracking_jitter : float or Tensor (B,) [rad]
-        Standard deviation with which the mirror turns about the first mount axis while it is imaged.
+        Standard deviation of the mirror's rotation about the first mount axis during an exposure.
     dni : float [W/m2]
     reflectivity : float
     attenuation : tuple of float
-        Loss of light between mirror and target as a polynomial in the slant range [km], constant term first.
+        Lost share of the light between mirror and target: a polynomial in the slant range [km],
+        constant term first.
     """
 
     sun_shape: SunShape = field(default_factory=Buie)
@@ -46,10 +49,12 @@ class Optics:
         if not 0 <= self.dni < 1e5:
             raise InvalidInputError(f"dni [W/m2] must lie in [0, 100000), got {self.dni}")
         if not np.isfinite(self.attenuation).all():
-            raise InvalidInputError(f"attenuation must be finite coefficients, got {self.attenuation}")
+            raise InvalidInputError(
+                f"attenuation must be finite coefficients, got {self.attenuation}"
+            )
 
     def irradiance(self, slant_range: Tensor) -> Tensor:
-        """DNI [W/m2] after the mirror and the air, for slant ranges [m]."""
+        """Irradiance [W/m2] of the light after mirror and air, for slant ranges [m]."""
         loss = torch.zeros_like(slant_range)
         for coefficient in reversed(self.attenuation):
             loss = loss * (slant_range / 1000) + coefficient
@@ -57,12 +62,18 @@ class Optics:
 
 
 CLEAR_DAY = (0.006739, 0.1046, -0.0170, 0.002845)
-"""Attenuation of a clear day, 23 km visibility (Vittitoe and Biggs 1978, as in DELSOL3, SAND86-8018, eq. 2.2-3)."""
+"""Attenuation of a clear day, 23 km visibility (Vittitoe and Biggs 1978, as in DELSOL3,
+SAND86-8018, eq. 2.2-3).
+"""
+
+
+Size = tuple[float, float]
+"""Width and height [m]."""
 
 
 @dataclass(frozen=True)
 class Window:
-    """The rectangle of the target plane that is imaged.
+    """The imaged rectangle of the target plane.
 
     Attributes
     ----------
@@ -70,7 +81,7 @@ class Window:
     rows, columns : int
         Row 0 at the top, column 0 at the image's left edge.
     on_spot : bool
-        Centred on the spot's centre of mass instead of the plane's centre.
+        Whether its centre is the spot's centre of mass instead of the plane's centre.
     """
 
     width: float = FLUX_WINDOW
@@ -91,19 +102,31 @@ class Window:
         return cls(width=plane.width, height=plane.height, rows=rows, columns=columns)
 
     @property
-    def pixel(self) -> tuple[float, float]:
-        """Pixel width and height [m]."""
+    def pixel(self) -> Size:
+        """Size of a pixel."""
         return self.width / self.columns, self.height / self.rows
+
+
+class PlaneScene(NamedTuple):
+    """Control points (B, F, 3, I, J) [m], mirror centres (B, 3) [m] and suns (B, 3) in a plane.
+
+    Points are relative to the centres, which the caller adds to them: slopes are differences of
+    microns, and single precision would lose those in coordinates of a hundred metres.
+    """
+
+    control_points: Tensor
+    center: Tensor
+    sun: Tensor
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A batch of mirrors before the sun and a plane each.
+    """A batch of mirrors, each with a sun and a target plane.
 
     Attributes
     ----------
     control_points : Tensor (B, F, 3, I, J) [m]
-        In mirror coordinates; B may be one and is then shared.
+        In mirror coordinates; a batch of one is shared by all mirrors.
     attitude : Tensor (B, 3, 3)
         Mirror coordinates to ENU.
     center : Tensor (B, 3) [m]
@@ -112,16 +135,17 @@ class Scene:
         Unit vectors towards the sun.
     plane_center : Tensor (B, 3) [m]
     plane_axes : Tensor (B, 3, 3)
-        Rows right, up and normal of the target plane.
+        Right, up and normal of the target plane, as rows.
     degree : int
     facet_reflectivity : Tensor (B, F) or None
-        Relative to `Optics.reflectivity`; None for even facets.
+        Relative to `Optics.reflectivity`; None for equal facets.
     first_axis : Tensor (B, 3) or None
-        The mount's first axis in ENU, about which tracking jitter turns the mirror.
+        The mount's first axis in ENU, about which tracking jitter rotates the mirror.
     blocked_below : Tensor (B,) or None [m]
-        Mirror y below which a neighbour takes the light away; None for free mirrors.
+        Mirror y below which a neighbour blocks the light; None for free mirrors.
     obstacles : Tensor (B, K, 3, 3) or None [m]
-        Rectangles in ENU, centre and half sides, that shade and block the mirrors (`model.neighbours`).
+        Rectangles in ENU, centre and half sides, that shade and block the mirrors
+        (`model.neighbours`).
     """
 
     control_points: Tensor
@@ -137,22 +161,18 @@ class Scene:
     obstacles: Tensor | None = None
 
     @classmethod
-    def build(
+    def from_setups(
         cls,
-        heliostats: Sequence[Heliostat],
-        control_points: Sequence[ArrayLike],
+        setups: Sequence[Setup],
         angles: ArrayLike,
-        suns: ArrayLike,
-        planes: Sequence[TargetPlane],
-        *,
-        degree: int = DEGREE,
         dtype: torch.dtype = torch.float32,
         device: torch.device | str = "cpu",
     ) -> "Scene":
-        """A scene of ``B`` heliostats with control points (F, I, J, 3) [m], axis angles (B, 2) [rad], suns (B, 3)."""
-        mount = Mount.stack([heliostat.mount for heliostat in heliostats])
+        """The scene of B setups with surfaces of one grid, at axis angles (B, 2) [rad]."""
+        mount = Mount.stack([setup.heliostat.mount for setup in setups])
         attitudes = mount.attitude(angles)
-        centers = mount.mirror_center([heliostat.position for heliostat in heliostats], attitudes)
+        centers = mount.mirror_center([setup.heliostat.position for setup in setups], attitudes)
+        planes = [setup.plane for setup in setups]
         different = {id(plane): plane for plane in planes}  # few planes, many mirrors
         axes = {key: plane.axes for key, plane in different.items()}
 
@@ -160,63 +180,69 @@ class Scene:
             return torch.as_tensor(np.asarray(values), dtype=dtype, device=device)
 
         return cls(
-            control_points=tensor(control_points).movedim(-1, -3).contiguous(),
+            control_points=tensor([setup.control_points for setup in setups])
+            .movedim(-1, -3)
+            .contiguous(),
             attitude=tensor(attitudes),
             center=tensor(centers),
-            sun=tensor(suns),
+            sun=tensor([setup.sun for setup in setups]),
             plane_center=tensor([plane.center for plane in planes]),
             plane_axes=tensor([axes[id(plane)] for plane in planes]),
-            degree=degree,
+            degree=setups[0].degree,
             first_axis=tensor(mount.first_axis),
         )
 
     def with_(self, **changes: Tensor) -> "Scene":
-        """The same scene with some tensors replaced."""
+        """Replace some tensors."""
         return replace(self, **changes)  # type: ignore[arg-type]
 
     @property
     def batch(self) -> int:
-        """How many mirrors are traced."""
+        """Number of mirrors."""
         return self.sun.shape[0]
 
-    def repeated(self, times: int) -> "Scene":
-        """The same mirrors ``times`` over, one whole batch after another."""
-        return self._each(lambda tensor: tensor.repeat(times, *[1] * (tensor.ndim - 1)))
-
     def subset(self, rows: Sequence[int]) -> "Scene":
-        """Some of the mirrors, in this order."""
-        return self if list(rows) == list(range(self.batch)) else self._each(lambda tensor: tensor[list(rows)])
+        """Select some mirrors, in the given order."""
+        return (
+            self
+            if list(rows) == list(range(self.batch))
+            else self._each(lambda tensor: tensor[list(rows)])
+        )
 
     def to(self, dtype: torch.dtype) -> "Scene":
-        """The same scene in another precision."""
+        """Convert to another precision."""
         return self._each(lambda tensor: tensor.to(dtype))
 
     def _each(self, change: Callable[[Tensor], Tensor]) -> "Scene":
-        """The same scene with every tensor changed."""
+        """Change every tensor."""
         tensors = {f.name: getattr(self, f.name) for f in fields(self)}
-        return self.with_(**{name: change(value) for name, value in tensors.items() if isinstance(value, Tensor)})
+        return self.with_(
+            **{name: change(value) for name, value in tensors.items() if isinstance(value, Tensor)}
+        )
 
     def by_facet(self) -> "Scene":
-        """The same facets as mirrors of their own, those of one mirror following one another (B * F mirrors)."""
+        """Make each facet a separate mirror (B * F mirrors); those of one mirror are adjacent."""
         facets = self.control_points.shape[1]
         apart = self._each(lambda tensor: tensor.repeat_interleave(facets, dim=0))
         points = self.control_points.expand(self.batch, -1, -1, -1, -1).flatten(0, 1)[:, None]
         if self.facet_reflectivity is None:
             return apart.with_(control_points=points)
-        return apart.with_(control_points=points, facet_reflectivity=self.facet_reflectivity.reshape(-1, 1))
+        return apart.with_(
+            control_points=points, facet_reflectivity=self.facet_reflectivity.reshape(-1, 1)
+        )
 
-    def in_plane(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Control points (B, F, 3, I, J) [m] about their mirrors' centres, the centres (B, 3) [m], suns (B, 3).
+    def in_plane(self) -> PlaneScene:
+        """Transform the scene to the frame of each target plane.
 
-        All in the frame of each target plane. Splines are affine invariant, so turning the few control points turns all
-        their samples. The centres, a hundred metres away, are for the caller to add to those: slopes are differences
-        of microns, which single precision would lose beside them.
+        Splines are affine invariant: rotating the few control points rotates all samples.
         """
         turn = self.plane_axes @ self.attitude
-        points = torch.einsum("bij,bfjuv->bfiuv", turn, self.control_points.expand(self.batch, -1, -1, -1, -1))
+        points = torch.einsum(
+            "bij,bfjuv->bfiuv", turn, self.control_points.expand(self.batch, -1, -1, -1, -1)
+        )
         center = torch.einsum("bij,bj->bi", self.plane_axes, self.center - self.plane_center)
         sun = torch.einsum("bij,bj->bi", self.plane_axes, self.sun)
-        return points, center, sun
+        return PlaneScene(points, center, sun)
 
     def obstacles_in_plane(self) -> Tensor | None:
         """Obstacles (B, K, 3, 3) [m] in the frame of each target plane."""

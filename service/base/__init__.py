@@ -1,1 +1,1 @@
-"""What every room stands on: settings, logs, names, faults, types of fields."""
+"""Foundations of the service: settings, logs, names, errors, field types."""

@@ -1,30 +1,33 @@
-"""Choices that requests, the command line and the tables share; light, for every start of the command reads them."""
+"""Choices shared by requests, the command line and the tables.
+
+Every start of the command imports this module, so it must stay small.
+"""
 
 from typing import Literal
 
 from model.errors import InvalidInputError
 
 Method = Literal["network", "refined"]
-"""How a surface is predicted."""
+"""Method of surface prediction."""
 
-MOST_IMAGES = {"network": 8, "refined": 64}
-"""How many images each method takes."""
+MAX_IMAGES = {"network": 8, "refined": 64}
+"""Maximum number of images per method."""
 
 RoleName = Literal["read", "ingest", "operate", "admin"]
-"""What a key may do; each may also do what those before it may."""
+"""Roles of keys. Each role includes the permissions of those before it."""
 
 
 def require_images(method: str, count: int) -> None:
-    """Refuse a method that there is not, or more images than it takes.
+    """Reject an unknown method or an invalid number of images.
 
     Raises
     ------
     InvalidInputError
     """
-    if method not in MOST_IMAGES:
+    if method not in MAX_IMAGES:
         raise InvalidInputError(f"method must be 'network' or 'refined', got {method!r}")
-    if not 1 <= count <= MOST_IMAGES[method]:
+    if not 1 <= count <= MAX_IMAGES[method]:
         raise InvalidInputError(
-            f"images must lie in 1 to {MOST_IMAGES[method]} for the method {method}, got {count}; "
-            f"refined takes up to {MOST_IMAGES['refined']}"
+            f"images must lie in 1 to {MAX_IMAGES[method]} for the method {method}, got {count}; "
+            f"refined takes up to {MAX_IMAGES['refined']}"
         )

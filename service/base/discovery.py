@@ -1,4 +1,4 @@
-"""Finding modules: a resource, page, job kind or group of verbs is one new file, and stands in no list."""
+"""Discovery of modules: a new resource, page, job kind or command group needs only a new file."""
 
 import pkgutil
 from importlib import import_module
@@ -6,9 +6,12 @@ from types import ModuleType
 
 
 def modules_of(package: str) -> list[ModuleType]:
-    """Every module of a package, imported, in the order of their names."""
+    """Import all modules of a package, sorted by name."""
     path = import_module(package).__path__
-    return [import_module(f"{package}.{found.name}") for found in sorted(pkgutil.iter_modules(path), key=_name)]
+    return [
+        import_module(f"{package}.{found.name}")
+        for found in sorted(pkgutil.iter_modules(path), key=_name)
+    ]
 
 
 def _name(found: pkgutil.ModuleInfo) -> str:

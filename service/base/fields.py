@@ -1,10 +1,13 @@
-"""Types of the fields that requests and answers share, with their bounds and units.
+"""Field types that requests and responses share, with limits and units.
 
-Numbers are finite, unknown keys are refused, and names fit a pattern that is safe in paths and URLs.
+Numbers are finite, unknown keys are rejected, and names fit a pattern that is safe in paths and
+URLs.
 """
 
-from datetime import UTC, datetime
-from typing import Annotated, Any, Literal
+from collections.abc import Iterable
+from datetime import UTC, date, datetime
+from itertools import islice
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import (
@@ -15,14 +18,23 @@ from pydantic import (
     ConfigDict,
     Discriminator,
     Field,
+    ModelWrapValidatorHandler,
     Strict,
     StringConstraints,
     Tag,
+    ValidationError,
+    model_validator,
 )
 
-from model.plant import Cylinder, TargetPlane
-from service.base.choices import Method as Method  # one of these types, and a choice of the command line
-from service.base.names import IDENTIFIER, MEASUREMENT, NAME
+from model.plant import (
+    MIN_OPENING_DEG,
+    Cylinder,
+    TargetPlane,
+    require_cylinder_shape,
+    require_plane_shape,
+)
+from service.base.choices import Method as Method  # also used by the command line
+from service.base.names import IDENTIFIER, LINE, LINES, MEASUREMENT, NAME
 
 Name = Annotated[
     str,
@@ -42,7 +54,19 @@ MeasurementName = Annotated[
     Field(description="The `id` of a measurement, as the service gave it.", examples=["205363"]),
 ]
 
-Kind = Literal["raw", "cropped", "flux", "flux-centered"]
+Text = Annotated[str, StringConstraints(pattern=LINE, max_length=500)]
+"""A single line of text. Every string from a caller has this type, `Lines`, or a name type."""
+
+Lines = Annotated[str, StringConstraints(pattern=LINES, max_length=800_000)]
+"""Text with several lines."""
+
+Search = Annotated[Text, Field(max_length=32)]
+"""A part of a name."""
+
+Reason = Annotated[Text, Field(min_length=1, max_length=200)]
+"""Reason for a change."""
+
+Kind = Literal["raw", "cropped", "flux", "flux-centered", "none"]
 Source = Literal["measured", "network", "refined", "imported"]
 Verdict = Literal["effect", "none", "unexplained"]
 State = Literal["queued", "running", "done", "failed", "cancelled"]
@@ -54,14 +78,16 @@ def _is_number(value: Any) -> Any:
     return value
 
 
-# JSON has types: what only stands for a number there is a mistake. Forms and queries, which are all text, have float
-# and int themselves.
-Number = Annotated[float, BeforeValidator(_is_number)]
+# JSON has types, so a string in place of a number is an error. Forms and queries are all text and
+# use float and int.
+Number = Annotated[float, Strict()]
 Whole = Annotated[int, BeforeValidator(_is_number)]
 Flag = Annotated[bool, Strict()]
 
 Metres = Annotated[Number, Field(ge=-1e6, le=1e6)]
-Position = Annotated[tuple[Metres, Metres, Metres], Field(description="East, north, up of the tower base [m].")]
+Position = Annotated[
+    tuple[Metres, Metres, Metres], Field(description="East, north, up of the tower base [m].")
+]
 
 Direction = tuple[
     Annotated[Number, Field(ge=-1e3, le=1e3)],
@@ -75,66 +101,130 @@ Wgs84 = tuple[
     Annotated[Number, Field(ge=-1e4, le=1e5)],
 ]
 
-MotorPosition = tuple[Annotated[Number, Field(ge=0, le=1e9)], Annotated[Number, Field(ge=0, le=1e9)]]
-"""Of both axes [steps]."""
+MotorPosition = tuple[
+    Annotated[Number, Field(ge=0, le=1e9)], Annotated[Number, Field(ge=0, le=1e9)]
+]
+"""Positions of both axes [steps]."""
 
-AZIMUTH = Field(ge=-360, le=360, description="Sun azimuth from south, positive to the east [deg].")
-ELEVATION = Field(gt=0, le=90, description="Sun elevation above the horizon [deg].")
+AZIMUTH = Field(ge=0, lt=360, description="Sun azimuth from north over east [deg].")
+ELEVATION = Field(gt=0, le=90, description="Sun elevation as seen, with refraction [deg].")
 Azimuth = Annotated[Number, AZIMUTH]
 Elevation = Annotated[Number, ELEVATION]
 Extent = Annotated[Number, Field(ge=0.01, le=1e3)]
 
 
-def moment_of(told: datetime) -> datetime:
-    """A moment in UTC, which one without a zone means; ValueError where its year is a slip of the finger."""
-    moment = told.replace(tzinfo=UTC) if told.tzinfo is None else told
-    if moment < datetime(1970, 1, 1, tzinfo=UTC):
+def parse_moment(moment: datetime) -> datetime:
+    """Convert a time to UTC. A time without a zone counts as UTC.
+
+    Raises
+    ------
+    ValueError
+        If the year is implausible.
+    """
+    utc = moment.replace(tzinfo=UTC) if moment.tzinfo is None else moment
+    if utc < datetime(1970, 1, 1, tzinfo=UTC):
         raise ValueError("give a year from 1970 on")
-    if moment >= datetime(9000, 1, 1, tzinfo=UTC):
+    if utc >= datetime(9000, 1, 1, tzinfo=UTC):
         raise ValueError("give a year before 9000")
-    return moment.astimezone(UTC)
+    return utc.astimezone(UTC)
 
 
-Moment = Annotated[AwareDatetime, AfterValidator(moment_of)]
+Moment = Annotated[AwareDatetime, AfterValidator(parse_moment)]
 
-FormMoment = Annotated[datetime, AfterValidator(moment_of)]
-"""In forms: what a browser's field for a moment gives bears no zone; the pages say that it means UTC."""
+FormMoment = Annotated[datetime, AfterValidator(parse_moment)]
+"""Times in forms. A browser's date field has no time zone; the pages state that it is UTC."""
 
 Version = Annotated[int, Field(ge=1, le=2**31 - 1)]
-"""In paths and queries."""
+"""For paths and queries."""
 VersionIn = Annotated[Whole, Field(ge=1, le=2**31 - 1)]
-"""In bodies."""
+"""For bodies."""
 
 ModelVersion = Annotated[
     VersionIn | None,
-    Field(description="Number of a version of the plant's model, see /v1/models; the current one without it."),
+    Field(
+        description=(
+            "Number of a version of the plant's model, see /v1/models; the current one without it."
+        )
+    ),
 ]
 
 
-def filled(given: Any) -> Any:
-    """What a form was sent with but for what nobody filled in; for validators before a model."""
-    return {name: value for name, value in given.items() if value != ""} if isinstance(given, dict) else given
+def _number_of(version: Any) -> Any:
+    return int(version.partition(":")[0]) if isinstance(version, str) else version
+
+
+ModelNumber = Annotated[int, BeforeValidator(_number_of)]
+"""A version of the plant's model, also from the text of number and effects in the store."""
+
+
+def drop_empty_fields(given: Any) -> Any:
+    """Remove empty fields from a submitted form. For validators in mode "before"."""
+    return (
+        {name: value for name, value in given.items() if value != ""}
+        if isinstance(given, dict)
+        else given
+    )
+
+
+# Limit of listed errors. A list of 100,000 errors takes a second.
+_MAX_FAULTS = 100
+
+# Entries per list and object that are validated again if a document has more errors.
+_FIRST = 10
+
+
+def _shortened(value: Any, fields: Iterable[str] = ()) -> Any:
+    """The first entries of all nested lists and objects, and all ``fields`` keys."""
+    if isinstance(value, dict):
+        names = dict.fromkeys([*(name for name in fields if name in value), *islice(value, _FIRST)])
+        return {name: _shortened(value[name]) for name in names}
+    return [_shortened(entry) for entry in value[:_FIRST]] if isinstance(value, list) else value
 
 
 class Model(BaseModel):
-    """Base of the requests: finite numbers, no unknown keys."""
+    """Base class of requests: finite numbers, no unknown keys."""
 
     model_config = ConfigDict(allow_inf_nan=False, extra="forbid", frozen=True)
 
+    @model_validator(mode="wrap")
+    @classmethod
+    def _few_faults(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        """Limit a document's errors to those of its first entries, to bound their cost."""
+        try:
+            return handler(data)
+        except ValidationError as error:
+            count = error.error_count()
+            if count <= _MAX_FAULTS:
+                raise
+        try:
+            handler(_shortened(data, cls.model_fields))
+        except ValidationError as error:
+            if error.error_count() <= _MAX_FAULTS:
+                raise
+        raise ValueError(f"has {count} faults; send fewer entries to see which")
+
 
 class Plane(Model):
-    """A rectangle in space, seen from its lit side."""
+    """A rectangle in space, seen from its irradiated side."""
 
     center: Position
-    normal: Direction = Field(description="Normal of the lit side, east-north-up; need not be of unit length.")
+    normal: Direction = Field(
+        description="Normal of the lit side, east-north-up; need not be of unit length."
+    )
     up: Direction = Field(
-        default=(0.0, 0.0, 1.0), description="Upward direction of the image, not parallel to the normal."
+        default=(0.0, 0.0, 1.0),
+        description="Upward direction of the image, not parallel to the normal.",
     )
     width: Extent = Field(description="[m]")
-    height: Extent = Field(description="[m]")
+    height: Extent = Field(description="[m]; width and height are at most 20 times each other.")
+
+    @model_validator(mode="after")
+    def _shape(self) -> Self:
+        require_plane_shape(self.width, self.height)
+        return self
 
     def named(self, name: str) -> TargetPlane:
-        """The model's plane of this name."""
+        """Convert to the model's target plane with this name."""
         return TargetPlane(
             name=name,
             center=np.array(self.center),
@@ -146,19 +236,33 @@ class Plane(Model):
 
 
 class ReceiverIn(Model):
-    """A receiver that is a part of a cylinder, or all of it, lit from outside."""
+    """A receiver: a cylinder or a part of one, irradiated from outside."""
 
-    center: Position = Field(description="The middle of the lit surface: east, north, up of the tower base [m].")
-    normal: Direction = Field(description="Normal there, away from the axis, east-north-up; of any length.")
-    up: Direction = Field(default=(0.0, 0.0, 1.0), description="Along the axis, upwards in the map.")
+    center: Position = Field(
+        description="The middle of the lit surface: east, north, up of the tower base [m]."
+    )
+    normal: Direction = Field(
+        description="Normal there, away from the axis, east-north-up; of any length."
+    )
+    up: Direction = Field(
+        default=(0.0, 0.0, 1.0), description="Along the axis, upwards in the map."
+    )
     radius: Annotated[Number, Field(ge=0.01, lt=1e3)] = Field(description="[m]")
     height: Extent = Field(description="Along the axis [m].")
     opening_deg: Number = Field(
-        default=360.0, gt=0, le=360, description="Angle of the lit surface, half of it to each side of its middle."
+        default=360.0,
+        ge=MIN_OPENING_DEG,
+        le=360,
+        description="Angle of the lit surface, half of it to each side of its middle.",
     )
 
+    @model_validator(mode="after")
+    def _shape(self) -> Self:
+        require_cylinder_shape(self.radius, self.height, self.opening_deg)
+        return self
+
     def named(self, name: str) -> Cylinder:
-        """The model's receiver of this name."""
+        """Convert to the model's cylinder with this name."""
         return Cylinder(
             name=name,
             center=np.array(self.center),
@@ -171,20 +275,20 @@ class ReceiverIn(Model):
 
 
 class Sun(Model):
-    """Where the sun stands."""
+    """A sun position."""
 
     azimuth_deg: Azimuth
     elevation_deg: Elevation
 
 
 class SunAt(Model):
-    """Where the sun stands over the plant at a time."""
+    """The sun position over the plant at a time."""
 
     at: Moment = Field(description="Time with zone; by day.")
 
 
 def _way_to_say(sun: Any) -> str:
-    """Which of the two ways somebody says where the sun stands by."""
+    """Whether the sun is given by its position or by a time."""
     by_time = "at" in sun if isinstance(sun, dict) else isinstance(sun, SunAt)
     return "(time)" if by_time else "(position)"
 
@@ -192,12 +296,14 @@ def _way_to_say(sun: Any) -> str:
 AnySun = Annotated[
     Annotated[Sun, Tag("(position)")] | Annotated[SunAt, Tag("(time)")],
     Discriminator(_way_to_say),
-    Field(description='Where the sun stands: its position, or the time, `{"at": ..}`.'),
+    Field(description='Where the sun is: its position, or the time, `{"at": ..}`.'),
 ]
 
 
 def _square(value: Any) -> Any:
-    return (value, value) if isinstance(value, int | float) and not isinstance(value, bool) else value
+    return (
+        (value, value) if isinstance(value, int | float) and not isinstance(value, bool) else value
+    )
 
 
 Side = Annotated[Whole, Field(ge=8, le=1024)]
@@ -214,32 +320,196 @@ Rows = list[list[float]]
 
 
 class AccuracyOut(BaseModel):
-    """How well held-out photographs are forecast."""
+    """Forecast accuracy on held-out photographs."""
 
     accuracy_mean: float = Field(description="[1]")
     accuracy_median: float = Field(description="[1]")
     per_image: dict[str, float] = Field(description="By heliostat and measurement, `H/ID` [1].")
     position_error_mrad: float | None = Field(
         default=None,
-        description="Median angle from where motors sent the light to where it lies [mrad]; null: not known.",
+        description=(
+            "Median angle from where motors sent the light to where it lies [mrad]; null: not"
+            " known."
+        ),
     )
 
 
-class StudyReport(BaseModel):
-    """What a study found; the report of `heliotwin study` is one, too."""
+class ReportFigures(BaseModel):
+    """Common fields of all study reports, without the effects."""
 
     model_config = ConfigDict(extra="allow")
 
-    verdict: Verdict = Field(description="effect: it is found; none: nothing is missing; unexplained: something is.")
+    verdict: Verdict = Field(
+        description="effect: it is found; none: nothing is missing; unexplained: something is."
+    )
     conclusion: str = ""
     images: dict[str, int] = Field(description="How many were fitted and how many judged the fit.")
     before: AccuracyOut = Field(description="By the model that the study was made with.")
     after: AccuracyOut = Field(description="With the effects that were found.")
     noise_floor: float = Field(description="Error that the photographs' noise alone makes [1].")
-    unexplained_share: float = Field(description="Share of the error beyond the noise that is left [1].")
-    effects: list[dict[str, Any]] = Field(
-        description="What was found: parameters with 95 % intervals, scope (when, and whose where "
-        "it names `heliostats`), gain."
+    unexplained_share: float = Field(
+        description="Share of the error beyond the noise that is left [1]."
     )
-    candidates: list[dict[str, Any]] = Field(description="Every effect tried by itself, the best first.")
     skipped: dict[str, str] = Field(default={}, description="What was left out, with the reasons.")
+
+
+class StudyReport(ReportFigures):
+    """The result of a study, also of `heliotwin study`."""
+
+    effects: list[dict[str, Any]] = Field(
+        description=(
+            "What was found: parameters with 95 % intervals, scope (when, and whose where "
+            "it names `heliostats`), gain."
+        )
+    )
+    candidates: list[dict[str, Any]] = Field(
+        description="Every effect tried by itself, the best first."
+    )
+
+
+class EffectScope(BaseModel):
+    """When and at which heliostats an effect acts."""
+
+    kind: Literal["set", "since", "day"] = "set"
+    since: date | None = None
+    heliostats: list[str] | None = None
+
+
+class FittedParameter(BaseModel):
+    """A fitted value with its 95 % interval, also by day.
+
+    The value is a number, or numbers by heliostat.
+    """
+
+    value: Any
+    ci95: Any = None
+    unit: str = ""
+    by_day: dict[str, float] = {}
+
+
+class FoundEffect(BaseModel):
+    """An effect that a study found."""
+
+    name: str
+    scope: EffectScope = EffectScope()
+    parameters: dict[str, FittedParameter] = {}
+
+
+class MeanGain(BaseModel):
+    """A gain in accuracy without its interval."""
+
+    mean: float
+
+
+class TriedEffect(BaseModel):
+    """An effect of the catalogue, fitted alone."""
+
+    name: str
+    accuracy_after: float | None = None
+    score: float | None = None
+    accuracy_gain: MeanGain | None = None
+
+
+class ResidualPattern(BaseModel):
+    """Whether the residual is a pattern of the target."""
+
+    is_targets: bool = False
+
+
+class Residual(BaseModel):
+    """The pattern of the remaining error."""
+
+    pattern: ResidualPattern = ResidualPattern()
+
+
+class CheckedStudyReport(ReportFigures):
+    """A study report for its page, with the open parts of `StudyReport` checked.
+
+    Optional parts have defaults.
+    """
+
+    effects: list[FoundEffect]
+    candidates: list[TriedEffect]
+    residual: Residual = Residual()
+
+
+class MountReport(BaseModel):
+    """The result of a mount calibration, also of `heliotwin calibrate`."""
+
+    sun: list[dict[str, Any]] = Field(
+        default=[],
+        description="Effects of the plant's model that moved the sun when it was calibrated.",
+    )
+    measurements: int
+    residual_mrad: dict[str, float | None] = Field(
+        description="Between forecast and measured spots [mrad]."
+    )
+    parameters: dict[str, dict[str, Any]] = Field(
+        description=(
+            "By name: value, std, prior_std, unit, and whether the measurements determine it."
+        )
+    )
+    steps: list[dict[str, Any]] = Field(
+        description="Steps of the drives' zeros, each between two measurements."
+    )
+    drift: dict[str, Any] = Field(
+        description="How far the zeros went slowly from the first measurement to the newest."
+    )
+    outliers: dict[str, dict[str, Any]] = Field(
+        description="Measurements that contradict all others, and why."
+    )
+
+
+OfAxes = tuple[float, float]
+"""One value per axis."""
+
+
+class MountStep(BaseModel):
+    """A step in the zero positions of a drive."""
+
+    after: str
+    before: str
+    begin: datetime = Field(alias="from")
+    to: datetime
+    zeros_mrad: OfAxes
+    motor_steps: OfAxes
+    detail: str = ""
+
+
+class MountDrift(BaseModel):
+    """A slow drift of the zero positions."""
+
+    zeros_mrad: OfAxes
+    is_sure: bool
+
+
+class MountOutlier(BaseModel):
+    """A measurement that contradicts all others."""
+
+    reason: str
+    detail: str
+    off_mrad: float
+
+
+class ClockReport(BaseModel):
+    """A clock error; see `model.pointing.report.clock_to_json`."""
+
+    minutes: float
+    std_minutes: float
+    since: date
+
+
+class MountHistory(BaseModel):
+    """The times of the measurements."""
+
+    at: list[datetime] = Field(min_length=1)
+
+
+class CheckedMountReport(MountReport):
+    """A mount report for pages and jobs, with the open parts of `MountReport` checked."""
+
+    steps: list[MountStep]  # type: ignore[assignment]
+    drift: MountDrift  # type: ignore[assignment]
+    outliers: dict[str, MountOutlier]  # type: ignore[assignment]
+    history: MountHistory
+    clock: ClockReport | None = None

@@ -1,7 +1,7 @@
-"""How the processes of the service log: as text for people, or one JSON object a line.
+"""Logging of the service's processes, as text or as one JSON object per line.
 
-Whatever a caller sends stays inside its line: JSON escapes it, and in text all control characters are escaped and the
-lines of a traceback are indented.
+Text from callers cannot add lines: JSON escapes it. The text format escapes control characters and
+indents tracebacks.
 """
 
 import logging
@@ -18,12 +18,12 @@ from service.base.settings import Settings
 _TEXT = "%(asctime)s %(levelname)s %(name)s %(about)s %(message)s"
 _CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
 
-_bound: ContextVar[dict[str, Any]] = ContextVar("bound", default={})  # noqa: B039  # never changed, only replaced
+_bound: ContextVar[dict[str, object]] = ContextVar("bound", default={})  # noqa: B039  # never changed, only replaced
 
 
 @contextmanager
-def bound(**fields: Any) -> Iterator[None]:
-    """Let every line that is logged in this block, and in threads that serve it, bear ``fields``."""
+def log_context(**fields: Any) -> Iterator[None]:
+    """Add ``fields`` to every log record in this block, and in threads that serve it."""
     token = _bound.set(_bound.get() | fields)
     try:
         yield
@@ -42,23 +42,27 @@ def _escaped(text: str) -> str:
 
 
 class TextFormatter(logging.Formatter):
-    """A line for people; it begins with the id of the request, or the job, that it belongs to."""
+    """Text log lines, with the id of the request or job."""
 
     def __init__(self) -> None:
         super().__init__(_TEXT)
 
     def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802  # the library's name
-        """The line without its traceback."""
+        """Format the line without its traceback."""
         record.about = getattr(record, "request_id", None) or getattr(record, "job", None) or "-"
         return _escaped(super().formatMessage(record))
 
     def formatException(self, ei: Any) -> str:  # noqa: N802
-        """The traceback, so that none of its lines looks like another entry."""
-        return "\n".join(f"    {_escaped(line)}" for line in super().formatException(ei).split("\n"))
+        """Format the traceback, indented so that no line looks like another entry."""
+        return "\n".join(
+            f"    {_escaped(line)}" for line in super().formatException(ei).split("\n")
+        )
 
 
 def json_formatter() -> logging.Formatter:
-    """Time, level, logger, message, what is bound or given as ``extra``, and the exception where there is one."""
+    """JSON log lines: time, level, logger, message, extra fields, and the exception if there is
+    one.
+    """
     return JsonFormatter(
         ["levelname", "name", "message"],
         rename_fields={"levelname": "level", "name": "logger", "exc_info": "exception"},
@@ -67,8 +71,8 @@ def json_formatter() -> logging.Formatter:
     )
 
 
-def set_up(settings: Settings) -> None:
-    """Log to standard error, at the level and in the format that the settings name."""
+def configure_logging(settings: Settings) -> None:
+    """Log to standard error, at the level and in the format of the settings."""
     handler = logging.StreamHandler()
     handler.addFilter(_add_bound)
     handler.setFormatter(json_formatter() if settings.log_format == "json" else TextFormatter())

@@ -1,28 +1,59 @@
-"""Progress: how work tells what it does and how far it is, and may be ended by what it tells."""
+"""Progress reports of long work, which can also stop the work."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 Progress = Callable[[str], None]
-"""Takes the name of what is done next."""
-
-Report = Callable[[float, str], None]
-"""Takes the share that is done, 0 to 1, and what is being done; what it raises ends the work."""
+"""Callback that takes the name of the next step."""
 
 
-def quiet(_name: str) -> None:
-    """A progress callback that says nothing."""
+class Report(Protocol):
+    """Callback for the completed share, 0 to 1, and the current activity.
+
+    If it raises an exception, the work stops. ``phase`` describes the units of ``n_done`` and
+    ``n_total``.
+    """
+
+    def __call__(
+        self,
+        share: float,
+        message: str,
+        *,
+        phase: str = "",
+        n_done: int | None = None,
+        n_total: int | None = None,
+    ) -> None:
+        """Receive a report."""
+
+
+def no_report(share: float, message: str, **counts: Any) -> None:
+    """Ignore a report."""
+
+
+def no_progress(_name: str) -> None:
+    """Ignore a step."""
 
 
 @dataclass(eq=False)
 class Steps:
-    """Turns the names of what is done one after the other into shares of ``total``."""
+    """Convert step names to shares of ``total`` steps; ``phase`` describes the units."""
 
     total: int
     report: Report
-    done: int = 0
+    phase: str = ""
+    begun: int = 0
+    name: str = ""
 
     def __call__(self, name: str) -> None:
-        """Report that ``name`` is done next."""
-        self.report(self.done / max(self.total, 1), name)
-        self.done += 1
+        """Report that step ``name`` begins."""
+        self.name = name
+        self.begun += 1
+        self.alive()
+
+    def alive(self) -> None:
+        """Repeat the last report, so that the work can also be stopped between steps."""
+        done = min(max(self.begun - 1, 0), self.total)
+        self.report(
+            done / max(self.total, 1), self.name, phase=self.phase, n_done=done, n_total=self.total
+        )

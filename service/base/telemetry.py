@@ -1,16 +1,16 @@
-"""Traces by OpenTelemetry: requests (FastAPI's own spans), uses of the model, and attempts at jobs."""
+"""OpenTelemetry traces of requests (FastAPI's spans), model computations and job attempts."""
 
-from service.base.faults import NotStartedError
+from service.base.errors import NotStartedError
 from service.base.settings import Settings
 
 
-def set_up(settings: Settings, name: str) -> None:
-    """Send this process's spans, as service ``name``, to the collector that the settings name, if they do.
+def configure_tracing(settings: Settings, name: str) -> None:
+    """Send this process's spans, as service ``name``, to the collector of the settings, if any.
 
     Raises
     ------
     NotStartedError
-        Where they do and the extra packages are not installed.
+        If a collector is set and the extra packages are not installed.
     """
     if settings.otlp_endpoint is None:
         return
@@ -20,7 +20,9 @@ def set_up(settings: Settings, name: str) -> None:
         from opentelemetry.sdk.trace import TracerProvider
         from opentelemetry.sdk.trace.export import BatchSpanProcessor
     except ImportError as error:
-        raise NotStartedError("otlp_endpoint: install heliotwin[otel] first, or unset it") from error
+        raise NotStartedError(
+            "otlp_endpoint: install heliotwin[otel] first, or unset it"
+        ) from error
     from opentelemetry import trace
 
     provider = TracerProvider(resource=Resource.create({SERVICE_NAME: name}))

@@ -1,4 +1,4 @@
-"""The demonstration: photographs in, stored mirror surfaces and flux forecasts out, with a table and pictures."""
+"""The demonstration: from photographs to stored surfaces, flux forecasts, a table and pictures."""
 
 import shlex
 import shutil
@@ -22,33 +22,38 @@ from model.metrics import flux_accuracy
 from model.network.architecture import MAX_IMAGES
 from model.observation import Observation
 from model.plant import Heliostat
+from model.setup import Setup
+from model.surface import DEGREE, control_points
 from service.base.arrays import unpack
 from service.base.choices import Method
+from service.base.fields import Sun
 from service.base.settings import Settings
 from service.cli.demo_plant import write_plant
 from service.cli.folder import observations_of, surface_errors, write_json
+from service.cli.folder_store import FolderStore
 from service.cli.output import make_table
 from service.drawing.pictures import comparison_picture, of_peak, surface_picture
 from service.drawing.templates import ASSETS, TEMPLATES
 from service.sources.folder import MeasurementFolder, measured_heights, read_folder
-from service.twin import compute
-from service.twin.evidence import choose
-from service.twin.forecast import ForecastRequest, make_forecast
-from service.twin.importing import import_folder
-from service.twin.prediction import predict_surface
-from service.twin.runtime import Runtime
+from service.twin.forecasts.heliostat_forecast import ForecastRequest, make_forecast
+from service.twin.heliostats.measurements import choose_diverse
+from service.twin.runtime import operations
+from service.twin.runtime.runtime import Runtime
+from service.twin.surfaces.prediction import predict_surface
+from service.twin.transfer.importing import import_folder
 
 Array = NDArray[np.float64]
 
 HELD_OUT = 4
-"""Every fourth image is kept from the prediction, to judge it by."""
+"""Every fourth image is held out from the prediction, to test it."""
 
 
 @dataclass(frozen=True)
 class Result:
-    """What came out for one heliostat; accuracies are means over the judged images, errors in mm.
+    """Results for one heliostat: mean accuracies over the test images, surface errors in mm.
 
-    ``held_out`` says whether the judged images were kept from the prediction; with few images they cannot be.
+    ``held_out`` is False if the test images were also used for the prediction, because there are
+    too few images.
     """
 
     heliostat: str
@@ -65,22 +70,32 @@ class Result:
 
 
 def run_demo(data: Path | None, out: Path, console: Console, quiet: bool = False) -> dict[str, Any]:
-    """Run the main job on the embedded plant or on a folder; everything it makes lies under ``out``."""
+    """Run the demonstration on the embedded plant or on a folder.
+
+    All files are written to ``out``. Return the report.
+    """
     out.mkdir(parents=True, exist_ok=True)
     with _bars(console, quiet) as bars:
         root = data
         if root is None:
             root = out / "plant"
             task = bars.add_task("photograph a plant", total=4)
-            write_plant(root, lambda name: bars.update(task, description=f"photograph {name}", advance=1))
+            write_plant(
+                root, lambda name: bars.update(task, description=f"photograph {name}", advance=1)
+            )
         folder = read_folder(root)
-        # A store holds one plant: demonstrations on different data under one folder keep out of each other's way.
+        # A store holds one plant: each plant has a separate store, so that demonstrations on
+        # different data can share one folder.
         store = out / f"store-{folder.plant.name}"
         runtime = _open_store(store)
         try:
-            count = sum(len(m.images) for name in folder.plant.heliostats for m in folder.measurements(name))
+            count = sum(
+                len(m.images) for name in folder.plant.heliostats for m in folder.measurements(name)
+            )
             task = bars.add_task("import", total=count + len(folder.plant.heliostats))
-            imported = import_folder(runtime, folder, lambda name: bars.update(task, description=name, advance=1))
+            imported = import_folder(
+                runtime, folder, lambda name: bars.update(task, description=name, advance=1)
+            )
             made, skipped = _predict_all(runtime, folder, bars)
         finally:
             runtime.close()
@@ -102,7 +117,11 @@ def run_demo(data: Path | None, out: Path, console: Console, quiet: bool = False
 
 
 def _bars(console: Console, quiet: bool) -> Progress:
-    columns = (TextColumn("{task.description:<34}"), BarColumn(), TextColumn("{task.completed}/{task.total}"))
+    columns = (
+        TextColumn("{task.description:<34}"),
+        BarColumn(),
+        TextColumn("{task.completed}/{task.total}"),
+    )
     return Progress(*columns, TimeElapsedColumn(), console=console, disable=quiet)
 
 
@@ -114,7 +133,7 @@ def _open_store(folder: Path) -> Runtime:
 
 @dataclass(frozen=True, eq=False)
 class _Made:
-    """A result and what its pictures show: surfaces (4, 8, 8) [m], photographs, and forecasts by the refined one."""
+    """A result with its surfaces (4, 8, 8) [m], test images and refined forecasts."""
 
     result: Result
     surfaces: dict[str, Array | None]
@@ -122,12 +141,15 @@ class _Made:
     forecasts: list[Array]
 
 
-def _predict_all(runtime: Runtime, folder: MeasurementFolder, bars: Progress) -> tuple[list[_Made], dict[str, str]]:
+def _predict_all(
+    runtime: Runtime, folder: MeasurementFolder, bars: Progress
+) -> tuple[list[_Made], dict[str, str]]:
     made, skipped = [], {}
     task = bars.add_task("predict and forecast", total=len(folder.plant.heliostats))
     for name in folder.plant.heliostats:
         bars.update(task, description=f"predict and forecast {name}")
-        usable, refused = observations_of(folder, name)
+        with runtime.database.reading() as session:
+            usable, refused = observations_of(FolderStore(folder, runtime, session), name)
         if usable:
             made.append(_predict(runtime, folder, name, usable))
         else:
@@ -137,28 +159,36 @@ def _predict_all(runtime: Runtime, folder: MeasurementFolder, bars: Progress) ->
 
 
 def _split(observations: list[Observation]) -> tuple[list[Observation], list[Observation]]:
-    """Images to predict from and images to judge by; the same ones where there are fewer than four."""
+    """Split into images to predict from and test images.
+
+    With fewer than `HELD_OUT` images, both lists are the same.
+    """
     if len(observations) < HELD_OUT:
         return observations, observations
     judged = observations[HELD_OUT - 1 :: HELD_OUT]
     used = [o for o in observations if not any(o is j for j in judged)]
-    return choose(used, MAX_IMAGES), judged
+    return choose_diverse(used, MAX_IMAGES), judged
 
 
 def _stored(runtime: Runtime, name: str, method: Method, used: Sequence[Observation]) -> Array:
-    """Predict from stored measurements, store the version, and give back its heights (4, 8, 8) [m]."""
+    """Predict from stored measurements, store the version, and return its heights (4, 8, 8) [m]."""
     row = predict_surface(runtime, name, method, [o.identifier for o in used]).row
     return unpack(row.arrays)["z"].astype(np.float64)
 
 
-def _predict(runtime: Runtime, folder: MeasurementFolder, name: str, observations: list[Observation]) -> _Made:
+def _predict(
+    runtime: Runtime, folder: MeasurementFolder, name: str, observations: list[Observation]
+) -> _Made:
     heliostat = folder.plant.heliostats[name]
     used, judged = _split(observations)
     surfaces: dict[str, Array | None] = {"ideal": None}
     surfaces["network"] = _stored(runtime, name, "network", used)
     surfaces["refined"] = _stored(runtime, name, "refined", used)
     _store_forecast(runtime, name, judged[0])
-    fluxes = {key: [_forecast(heliostat, o, folder, (z, None)) for o in judged] for key, z in surfaces.items()}
+    fluxes = {
+        key: [_forecast(heliostat, o, folder, (z, None)) for o in judged]
+        for key, z in surfaces.items()
+    }
     errors: dict[str, dict[str, float]] = {}
     measured = folder.measured_surface(name)
     if measured is not None:
@@ -187,51 +217,56 @@ def _predict(runtime: Runtime, folder: MeasurementFolder, name: str, observation
 
 
 def _store_forecast(runtime: Runtime, name: str, observation: Observation) -> None:
-    """Keep one forecast, as the calibration system would ask for it."""
+    """Store one forecast, as the calibration system would request it."""
     azimuth, elevation = sun_angles(observation.sun)
     request = ForecastRequest(
         heliostat=name,
-        sun_azimuth_deg=float(azimuth),
-        sun_elevation_deg=float(elevation),
+        sun=Sun(azimuth_deg=float(azimuth), elevation_deg=float(elevation)),
         target=observation.target.name,
     )
     make_forecast(runtime, request)
 
 
 def _forecast(
-    heliostat: Heliostat, observation: Observation, folder: MeasurementFolder, surface: tuple[Array | None, Any]
+    heliostat: Heliostat,
+    observation: Observation,
+    folder: MeasurementFolder,
+    surface: tuple[Array | None, Any],
 ) -> Array:
-    """Forecast (64, 64) in the window of an observation, about its own centre of mass.
+    """Forecast (64, 64) in the window of an observation, centered on the forecast's centroid.
 
-    It is traced in a wider window first, because the centre of mass of an image is not quite that of its rays.
+    The flux is traced in a wider window first, because the centroid of the image differs slightly
+    from the centroid of its rays.
     """
     z, measured = surface
     wide = 1.5 * FLUX_WINDOW
-    traced = compute.forecast(
-        heliostat,
-        z,
-        observation.sun,
-        observation.target,
-        spot=observation.center_of_mass,
-        resolution=(96, 96),
-        window=wide,
-        optics=folder.optics,
-        surface=measured,
-        latitude_deg=float(folder.plant.origin[0]),
-    )
+    points, degree = (control_points(heliostat, z), DEGREE) if measured is None else measured
+    spot = observation.center_of_mass
+    setup = Setup(heliostat, points, observation.sun, observation.target, spot, degree=degree)
+    traced = operations.forecast(setup, folder.model, (96, 96), wide)
     center = center_of_mass(traced.camera_view, (wide, wide))
     return flux_window(traced.camera_view, (wide, wide), center, FLUX_WINDOW, FLUX_SIZE)
 
 
 def _drawn(out: Path, made: Sequence[_Made], ends: Mapping[str, float]) -> list[Result]:
-    """The results with the pictures drawn for them, all on the same scales, whose ``ends`` are the settings'."""
-    pairs = [of_peak(o.flux, flux) for one in made for o, flux in zip(one.judged, one.forecasts, strict=True)]
+    """Results with their pictures, all on the same scales.
+
+    ``ends`` are the scales of the settings.
+    """
+    pairs = [
+        of_peak(o.flux, flux)
+        for one in made
+        for o, flux in zip(one.judged, one.forecasts, strict=True)
+    ]
     top = max(float(image.max()) for pair in pairs for image in pair)
     return [replace(one.result, pictures=_draw(out, one, top, ends)) for one in made]
 
 
 def _draw(out: Path, made: _Made, top: float, ends: Mapping[str, float]) -> tuple[str, ...]:
-    """Surface maps, and measured beside forecast for every judged image; gives back their paths under ``out``."""
+    """Draw surface maps, and measured and forecast flux of each test image.
+
+    Return the paths of the pictures, relative to ``out``.
+    """
     name = made.result.heliostat
     drawn = {
         f"surfaces/{name}-{key}.png": surface_picture(z, f"{name}, {key}", ends["heights"])
@@ -239,7 +274,9 @@ def _draw(out: Path, made: _Made, top: float, ends: Mapping[str, float]) -> tupl
         if z is not None
     }
     for observation, flux in zip(made.judged, made.forecasts, strict=True):
-        title = f"{name}/{observation.identifier}: accuracy {flux_accuracy(observation.flux, flux):.1%}"
+        title = (
+            f"{name}/{observation.identifier}: accuracy {flux_accuracy(observation.flux, flux):.1%}"
+        )
         bounds = top, ends["flux_difference"]
         picture = comparison_picture(observation.flux, flux, FLUX_WINDOW, title, bounds)
         drawn[f"flux/{name}-{observation.identifier}.png"] = picture
@@ -255,8 +292,9 @@ def _cell(value: float | None) -> str:
 
 COLUMNS = ("name", "images", "ideal", "network", "refined", "measured", "net. mm", "ref. mm")
 CAPTION = (
-    "images: those predicted from + those kept to judge by; without + they are the same. ideal to measured: flux "
-    "accuracy with that surface; mm: error of the network's and the refined surface against the measured one"
+    "images: those predicted from + those kept to judge by; without + they are the same. ideal to"
+    " measured: flux accuracy with that surface; mm: error of the network's and the refined surface"
+    " against the measured one"
 )
 
 
@@ -280,7 +318,7 @@ def _print(console: Console, results: list[Result], out: Path, store: Path) -> N
         table.add_row(*_row(result))
     console.print(table)
     console.print(f"pictures and report: {out / 'report.html'}", highlight=False)
-    # The last line can be pasted as it stands: the command may lie in an environment that is not on the path.
+    # A person can paste the last line: it has the full path if the command is not on the PATH.
     beside = str(Path(sys.executable).with_name("heliotwin"))
     command = "heliotwin" if shutil.which("heliotwin") else shlex.quote(beside)
     console.print("next, the service on what was made:", highlight=False)
@@ -289,11 +327,14 @@ def _print(console: Console, results: list[Result], out: Path, store: Path) -> N
 
 
 def _page(report: dict[str, Any], results: list[Result]) -> str:
-    """A page with a conclusion, the table and the pictures, which lie beside it."""
+    """HTML page with a conclusion, the table and links to the pictures."""
     judging = [result for result in results if result.held_out] or results
     photographs = sum(result.judged for result in judging)
     accuracies = {
-        key: sum(getattr(result, f"accuracy_{key}") * result.judged for result in judging) / photographs
+        key: (
+            sum(getattr(result, f"accuracy_{key}") * result.judged for result in judging)
+            / photographs
+        )
         for key in ("ideal", "network", "refined")
     }
     return TEMPLATES.get_template("demo.html").render(
@@ -304,5 +345,7 @@ def _page(report: dict[str, Any], results: list[Result]) -> str:
         accuracies=accuracies,
         photographs=photographs,
         is_unseen=judging[0].held_out,
-        errors_mm=[result.error_refined_mm for result in results if result.error_refined_mm is not None],
+        errors_mm=[
+            result.error_refined_mm for result in results if result.error_refined_mm is not None
+        ],
     )

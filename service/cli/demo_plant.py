@@ -1,28 +1,32 @@
-"""A small plant of the demonstration's own, written as a measurement folder: four heliostats, a target, photographs.
+"""A small plant for the demonstration: a measurement folder with four heliostats and one target.
 
-The true mirrors are drawn from the surface prior, traced by the Monte Carlo tracer, which shares nothing with what
-predicts and forecasts, and photographed by a synthetic camera in perspective, with daylight, background and noise.
+The true mirror surfaces are drawn from the surface prior. The Monte Carlo tracer traces them. It
+shares no code with the prediction and the forecast. A synthetic camera photographs the flux in
+perspective, with daylight, background and noise.
 """
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from model.actuator import LinearActuator
 from model.frames import sun_angles, sun_direction_at
-from model.mount import LinearActuator, Mount
+from model.mount import Mount
 from model.plant import Heliostat, Plant, TargetPlane
 from model.prior import default_prior
+from model.setup import Setup
 from model.surface import control_points
-from model.tracing import Scene, Window
+from model.tracing import Window
 from model.tracing.alignment import align_to_spots
 from model.tracing.montecarlo import trace_montecarlo
-from service.base.progress import Progress, quiet
+from service.base.progress import Progress, no_progress
 from service.cli.demo_camera import CameraOptions, photograph
 from service.cli.folder import write_json
+from service.sources.paint_documents import azimuth_from_south
 
 Array = NDArray[np.float64]
 
@@ -34,24 +38,32 @@ POSITIONS = {
     "AK08": (-72.0, 138.0, 1.8),
 }
 TARGET = TargetPlane(
-    "calibration_target", np.array([0.0, 0.0, 40.0]), np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]), 8.0, 7.0
+    "calibration_target",
+    np.array([0.0, 0.0, 40.0]),
+    np.array([0.0, 1.0, 0.0]),
+    np.array([0.0, 0.0, 1.0]),
+    8.0,
+    7.0,
 )
-# Spindles as the Juelich heliostats have them; they stand as surveyed, so that motors tell where mirrors point.
+# Spindles as at the Juelich heliostats; the mounts have no errors, so motor positions give exact
+# mirror orientations.
 DRIVES = (
-    LinearActuator(154166.6667, 0.0775, 0.338, 0.325, 0.039, clockwise=False, max_increment=80000.0),
+    LinearActuator(
+        154166.6667, 0.0775, 0.338, 0.325, 0.039, clockwise=False, max_increment=80000.0
+    ),
     LinearActuator(154166.6667, 0.0775, 0.338, 0.325, 0.944, clockwise=True, max_increment=80000.0),
 )
 IMAGES, RAYS, PIXELS = 8, 400_000, 112
-"""Photographs of each heliostat, rays and pixels along each side of each."""
+"""Photographs per heliostat, rays per photograph, and pixels along each side of the flux image."""
 
 
-def _actuator(drive: LinearActuator) -> dict[str, Any]:
+def _actuator(drive: LinearActuator) -> dict[str, object]:
     document = asdict(drive)
     clockwise = document.pop("clockwise")
     return {"type_axis": "linear", "clockwise_axis_movement": int(clockwise), **document}
 
 
-def properties(mirror: Heliostat, plant: Plant) -> dict[str, Any]:
+def properties(mirror: Heliostat, plant: Plant) -> dict[str, object]:
     """The heliostat as PAINT's ``heliostat-properties.json``."""
     translations = {f"joint_translation_{axis}_{stage}": 0.0 for stage in (1, 2) for axis in "enu"}
     return {
@@ -60,7 +72,8 @@ def properties(mirror: Heliostat, plant: Plant) -> dict[str, Any]:
         "width": mirror.width,
         "initial_orientation": [0.0, -1.0, 0.0],
         "kinematics_properties": {
-            "actuators": [_actuator(one) for one in mirror.mount.actuators or ()] or [{"type_axis": "ideal"}] * 2,
+            "actuators": [_actuator(one) for one in mirror.mount.actuators or ()]
+            or [{"type_axis": "ideal"}] * 2,
             **translations,
             "concentrator_translation_e": 0.0,
             "concentrator_translation_n": float(mirror.mount.mirror_offset[2]),
@@ -81,24 +94,34 @@ def properties(mirror: Heliostat, plant: Plant) -> dict[str, Any]:
     }
 
 
-def tower(plant: Plant) -> dict[str, Any]:
+def tower(plant: Plant) -> dict[str, object]:
     """The tower as PAINT's ``tower-measurements.json``."""
     x, y = TARGET.width / 2, TARGET.height / 2
-    corners = {"upper_left": (-x, y), "upper_right": (x, y), "lower_left": (-x, -y), "lower_right": (x, -y)}
+    corners = {
+        "upper_left": (-x, y),
+        "upper_right": (x, y),
+        "lower_left": (-x, -y),
+        "lower_right": (x, -y),
+    }
     return {
         "power_plant_properties": {"ID": plant.name, "coordinates": ORIGIN.tolist()},
         TARGET.name: {
             "type": "planar",
             "normal_vector": TARGET.normal.tolist(),
-            "coordinates": {name: plant.to_wgs84(TARGET.to_enu(place)).tolist() for name, place in corners.items()},
+            "coordinates": {
+                name: plant.to_wgs84(TARGET.to_enu(place)).tolist()
+                for name, place in corners.items()
+            },
         },
     }
 
 
 def suns(count: int, rng: np.random.Generator) -> Array:
-    """Unit vectors (count, 3): hours of the day through the seasons."""
+    """Sun directions (count, 3), unit vectors: hours of the day through the seasons."""
     hour_angle = np.linspace(-55, 55, count) + rng.uniform(-5, 5, count)
-    return sun_direction_at(rng.permutation(np.linspace(0, 22, count)), hour_angle, float(ORIGIN[0]))
+    return sun_direction_at(
+        rng.permutation(np.linspace(0, 22, count)), hour_angle, float(ORIGIN[0])
+    )
 
 
 def photographs(
@@ -106,40 +129,61 @@ def photographs(
 ) -> tuple[Array, Array, list[NDArray[np.uint8]]]:
     """Suns (count, 3), motor positions (count, 2) [steps] and camera frames of one heliostat.
 
-    Its spot wanders about the target's centre.
+    The spots lie at random positions near the target's centre.
     """
     directions = suns(count, rng)
     spots = TARGET.to_enu(rng.uniform(-0.6, 0.6, (count, 2)))
-    points, mirrors, planes = [control_points(mirror, z)] * count, [mirror] * count, [TARGET] * count
-    angles = align_to_spots(mirrors, points, directions, planes, spots)
-    scene = Scene.build(mirrors, points, angles, directions, planes)
-    traced, _ = trace_montecarlo(scene, Window.of(TARGET, PIXELS, PIXELS), rays=rays, seed=int(rng.integers(2**31)))
+    points = control_points(mirror, z)
+    setups = [
+        Setup(mirror, points, sun, TARGET, spot)
+        for sun, spot in zip(directions, spots, strict=True)
+    ]
+    aligned = align_to_spots(setups)
+    scene = aligned.scene.to(torch.float32)
+    traced, _ = trace_montecarlo(
+        scene, Window.of(TARGET, PIXELS, PIXELS), rays=rays, seed=int(rng.integers(2**31))
+    )
     frames = [
-        photograph(flux, TARGET, rng, CameraOptions(time_stamp=f"demo {mirror.name} image {index + 1}"))
+        photograph(
+            flux, TARGET, rng, CameraOptions(time_stamp=f"demo {mirror.name} image {index + 1}")
+        )
         for index, flux in enumerate(traced)
     ]
-    return directions, mirror.mount.motors_from_angles(angles), frames
+    return directions, mirror.mount.motors_from_angles(aligned.angles), frames
 
 
 def write_plant(
-    root: Path, progress: Progress = quiet, *, images: int = IMAGES, rays: int = RAYS, seed: int = 2024
+    root: Path,
+    progress: Progress = no_progress,
+    *,
+    images: int = IMAGES,
+    rays: int = RAYS,
+    seed: int = 2024,
 ) -> None:
-    """Write the demonstration's measurement folder; the true surfaces lie in ``H/Deflectometry``."""
+    """Write the demonstration's measurement folder, with true surfaces in ``H/Deflectometry``."""
     rng = np.random.default_rng(seed)
     plant, prior = Plant("demo", ORIGIN), default_prior()
     write_json(root / "demo-tower-measurements.json", tower(plant))
     for number, (name, position) in enumerate(POSITIONS.items(), start=1):
         progress(name)
         mirror = Heliostat.juelich(
-            name, position, float(np.linalg.norm(position - TARGET.center)), mount=Mount.juelich(DRIVES)
+            name,
+            position,
+            float(np.linalg.norm(position - TARGET.center)),
+            mount=Mount.juelich(DRIVES),
         )
         z = prior.surface(rng.normal(0, 0.8, len(prior.basis)))
-        write_json(root / name / "Properties" / f"{name}-heliostat-properties.json", properties(mirror, plant))
+        write_json(
+            root / name / "Properties" / f"{name}-heliostat-properties.json",
+            properties(mirror, plant),
+        )
         (root / name / "Deflectometry").mkdir(parents=True, exist_ok=True)
         (root / name / "Calibration").mkdir(parents=True, exist_ok=True)
         points = control_points(mirror, z)
         np.savez_compressed(
-            root / name / "Deflectometry" / f"{name}-nurbs-surface.npz", control_points=points, degrees=np.array([3, 3])
+            root / name / "Deflectometry" / f"{name}-nurbs-surface.npz",
+            control_points=points,
+            degrees=np.array([3, 3]),
         )
         taken = zip(*photographs(mirror, z, images, rays, rng), strict=True)
         for index, (sun, motors, frame) in enumerate(taken, start=1):
@@ -147,7 +191,7 @@ def write_plant(
             stem = root / name / "Calibration" / f"{number}{index:02d}"
             about = {
                 "target_name": TARGET.name,
-                "sun_azimuth": float(azimuth),
+                "sun_azimuth": azimuth_from_south(float(azimuth)),
                 "sun_elevation": float(elevation),
                 "motor_position": {
                     f"axis_{axis}_motor_position": round(float(steps))
@@ -155,4 +199,6 @@ def write_plant(
                 },
             }
             write_json(stem.with_name(f"{stem.name}-calibration-properties.json"), about)
-            cv2.imwrite(str(stem.with_name(f"{stem.name}-raw.png")), cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
+            cv2.imwrite(
+                str(stem.with_name(f"{stem.name}-raw.png")), cv2.cvtColor(frame, cv2.COLOR_RGB2BGR)
+            )

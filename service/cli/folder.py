@@ -1,13 +1,12 @@
-"""The command line's verbs on a measurement folder: flux, predict; and what all of them share.
+"""Verbs on a measurement folder: flux and predict, and functions that all folder verbs share.
 
-Each walks the heliostats, skips what lacks something and says why, writes its files under one folder and returns the
-report that it also writes there. A verb fails only if nothing is left.
+Each verb visits all heliostats and skips those with missing data, with a reason. It writes its
+files to one folder, with a report that it also returns. A verb fails only if every heliostat is
+skipped.
 """
 
 import json
-from collections.abc import Iterator
-from dataclasses import asdict
-from functools import lru_cache
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,64 +14,36 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from model.ephemeris import clock_fault
+from model.effects import Effect, effect_to_json
 from model.errors import InvalidInputError, ModelError
-from model.imaging import Camera, ImageKind, MeasuredFlux
-from model.imaging.light import camera_at
+from model.images import FLUX_WINDOW
+from model.imaging import ImageKind
 from model.metrics import surface_error
 from model.network.architecture import MAX_IMAGES
 from model.observation import Observation, SurfacePrediction
-from model.plant import Heliostat, TargetPlane
-from model.surface import split_canting
+from model.plant import Heliostat
+from model.surface import DEGREE, control_points, split_canting
+from service import store
+from service.base.arrays import pair_or_none, unpack
 from service.base.choices import Method, require_images
-from service.base.progress import Progress, quiet
-from service.sources.decode import Pixels, decode_image
-from service.sources.documents import IMAGE_KINDS, Measurement
-from service.sources.files import require_regular
+from service.base.progress import Progress, no_progress
+from service.cli.folder_store import FolderStore, open_folder
+from service.sources.documents import optics_to_json, read_json
 from service.sources.folder import MeasurementFolder, measured_heights, read_surface
-from service.twin import compute
-from service.twin.consensus import agreeing
-from service.twin.evidence import Evidence, as_observations, choose
+from service.store.tables import NO_IMAGE, MeasurementRow
+from service.twin.heliostats.measurements import accepted_measurement, to_observations
+from service.twin.surfaces.prediction import choose_observations
 
 Array = NDArray[np.float64]
 
 ROUGHEST_FIRST: tuple[ImageKind, ...] = ("raw", "cropped", "flux", "flux-centered")
-"""Kinds of image by how much is left to do to them."""
+"""Kinds of image, from the least to the most processed."""
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write indented JSON, making the folder."""
+    """Write indented JSON; create the folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-
-
-def read_image(path: Path) -> Pixels:
-    """Decode an image file; a file that is no image is named."""
-    try:
-        return decode_image(require_regular(path).read_bytes())
-    except InvalidInputError as error:
-        raise InvalidInputError(f"{path}: {error}") from None
-
-
-@lru_cache(maxsize=512)
-def _measure(path: Path, kind: ImageKind, plane: TargetPlane, camera: Camera | None) -> MeasuredFlux:
-    return compute.measure(read_image(path), kind, plane, camera=camera)
-
-
-def measure(folder: MeasurementFolder, measurement: Measurement, kind: ImageKind | None = None) -> MeasuredFlux:
-    """Flux of a measurement's most worked-out image, or of its image of one kind."""
-    chosen = next(k for k in IMAGE_KINDS if k in measurement.images) if kind is None else kind
-    plane = folder.plant.targets[measurement.target]
-    camera = camera_at(folder.cameras, measurement.target, measurement.taken_at)
-    return _measure(measurement.images[chosen], chosen, plane, camera)
-
-
-def clock_fault_of(folder: MeasurementFolder, measurement: Measurement) -> str | None:
-    """Where a measurement's time and sun disagree, and the likely reason; None where they agree, or it has no time."""
-    if measurement.taken_at is None:
-        return None
-    latitude_deg, longitude_deg, _ = folder.plant.origin
-    return clock_fault(measurement.sun, measurement.taken_at, latitude_deg, longitude_deg)
 
 
 def _write_report(folder: MeasurementFolder, report: dict[str, Any], path: Path) -> None:
@@ -80,136 +51,145 @@ def _write_report(folder: MeasurementFolder, report: dict[str, Any], path: Path)
     write_json(path, report)
 
 
-def finish(folder: MeasurementFolder, report: dict[str, Any], path: Path, done: str) -> dict[str, Any]:
-    """Write the report with all that was skipped; refuse to call nothing a success."""
+def forecast_report(
+    folder: MeasurementFolder, surfaces: str, effects: Sequence[Effect], **more: Any
+) -> dict[str, Any]:
+    """An empty report of forecasts with these ``surfaces``, by the model with added effects."""
+    model = folder.model.with_effects(effects)
+    return {
+        "warnings": [],
+        "surfaces": surfaces,
+        **more,
+        "effects": [effect_to_json(effect) for effect in model.effects],
+        "optics": {"dni_w_m2": model.optics.dni, **optics_to_json(model.optics)},
+        "ideal_surfaces": [],
+        "skipped": {},
+    }
+
+
+def finish(
+    folder: MeasurementFolder, report: dict[str, Any], path: Path, done: str
+) -> dict[str, Any]:
+    """Write the report with all skipped items; raise ModelError if ``report[done]`` is empty."""
     _write_report(folder, report, path)
     if not report[done]:
-        reasons = "; ".join(f"{name}: {reason}" for name, reason in list(report["skipped"].items())[:3])
+        reasons = "; ".join(
+            f"{name}: {reason}" for name, reason in list(report["skipped"].items())[:3]
+        )
         raise ModelError(f"nothing was left to do, everything was skipped ({reasons}); see {path}")
     return report
 
 
-# --- flux -------------------------------------------------------------------------------------------------------------
+# --- flux
+# --------------------------------------------------------------------------------------------------
 
 
-def flux_folder(folder: MeasurementFolder, out: Path, progress: Progress = quiet) -> dict[str, Any]:
-    """Measure every camera frame or crop: ``OUT/H/ID-flux.png``, ``ID-flux-centered.npz``, ``quality.json``."""
+def flux_folder(
+    folder: MeasurementFolder, out: Path, progress: Progress = no_progress
+) -> dict[str, Any]:
+    """Measure the flux of every camera frame or crop.
+
+    The files are ``OUT/H/ID-flux.png``, ``OUT/H/ID-flux-centered.npz`` and ``OUT/quality.json``.
+    """
     report: dict[str, Any] = {"images": {}, "skipped": {}}
-    for name in folder.plant.heliostats:
-        measurements = folder.measurements(name)
-        if not measurements:
-            report["skipped"][name] = "no image"
-        for measurement in measurements:
-            progress(measurement.key)
-            kind = next(k for k in ROUGHEST_FIRST if k in measurement.images)
-            try:
-                measured = measure(folder, measurement, kind)
-            except ModelError as error:
-                report["skipped"][measurement.key] = str(error)
-                continue
-            entry = {"kind": kind, **asdict(measured.quality), "clock": clock_fault_of(folder, measurement)}
-            if measured.flux is not None and measured.center_of_mass is not None:
-                spot = folder.plant.targets[measurement.target].to_enu(measured.center_of_mass)
-                entry["center_of_mass_m"] = [float(v) for v in measured.center_of_mass]
-                entry["center_of_mass_wgs84"] = [float(v) for v in folder.plant.to_wgs84(spot)]
-            _write_flux(out / name, measurement.identifier, measured)
-            report["images"][measurement.key] = entry
+    with open_folder(folder, ROUGHEST_FIRST, progress=progress) as opened:
+        report["skipped"] |= opened.refused
+        for name in opened.names:
+            rows = opened.measurements(name)
+            rows = [row for row in rows if row.kind != NO_IMAGE]
+            if not rows and not any(key.startswith(f"{name}/") for key in opened.refused):
+                report["skipped"][name] = "no image"
+            for row in rows:
+                entry = {"kind": row.kind, **row.quality}
+                center = pair_or_none(row.center_right_m, row.center_up_m)
+                if center is not None:
+                    spot = store.target_plane(row.target).to_enu(center)
+                    entry["center_of_mass_m"] = list(center)
+                    entry["center_of_mass_wgs84"] = folder.plant.to_wgs84(spot).tolist()
+                _write_flux(out / name, row, center)
+                report["images"][f"{name}/{row.identifier}"] = entry
     return finish(folder, report, out / "quality.json", "images")
 
 
-def _write_flux(folder: Path, identifier: str, measured: MeasuredFlux) -> None:
-    """The flux over the whole target as an 8-bit picture, the centred window as numbers; nothing of a refused one."""
+def _write_flux(folder: Path, row: MeasurementRow, center: tuple[float, float] | None) -> None:
+    """Write the flux over the whole target (8-bit picture) and the centered window (arrays).
+
+    Nothing is written for a rejected image.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    if measured.flux is not None:
-        write_gray(folder / f"{identifier}-flux.png", measured.flux)
-    if measured.centered is not None:
-        arrays = {"flux": measured.centered, "window_m": np.array(measured.window)}
-        if measured.center_of_mass is not None:
-            arrays["center_of_mass_m"] = measured.center_of_mass
-        np.savez_compressed(folder / f"{identifier}-flux-centered.npz", **arrays)  # type: ignore[arg-type]
+    known = {} if row.arrays is None else unpack(row.arrays)
+    if "flux" in known:
+        write_gray(folder / f"{row.identifier}-flux.png", known["flux"])
+    if "centered" in known:
+        arrays = {"flux": known["centered"], "window_m": np.array(FLUX_WINDOW)}
+        if center is not None:
+            arrays["center_of_mass_m"] = np.array(center)
+        np.savez_compressed(folder / f"{row.identifier}-flux-centered.npz", **arrays)  # type: ignore[arg-type]
 
 
 def write_gray(path: Path, image: NDArray[Any]) -> None:
-    """An 8-bit grey picture, the peak at 255."""
-    scaled = np.round(np.asarray(image, dtype=np.float64) / max(float(image.max()), 1e-30) * 255).astype(np.uint8)
+    """Write an 8-bit gray picture with the peak at 255."""
+    scaled = np.round(
+        np.asarray(image, dtype=np.float64) / max(float(image.max()), 1e-30) * 255
+    ).astype(np.uint8)
     if not cv2.imwrite(str(path), scaled):
         raise OSError(f"{path} could not be written")
 
 
-# --- predict ----------------------------------------------------------------------------------------------------------
+# --- predict
+# --------------------------------------------------------------------------------------------------
 
 
-def evidence_of(folder: MeasurementFolder, measurement: Measurement) -> Evidence:
-    """What a measurement tells the model, of its most worked-out image.
-
-    Raises
-    ------
-    InvalidInputError
-        Where the image cannot be read, or is refused; the message says why.
-    """
-    measured, target = measure(folder, measurement), folder.plant.targets[measurement.target]
-    if measured.centered is None:
-        raise InvalidInputError(f"{measured.quality.reason}: {measured.quality.detail}")
-    center = measured.center_of_mass
-    return Evidence(
-        identifier=measurement.identifier,
-        sun=measurement.sun,
-        target=target,
-        flux=measured.flux,
-        centered=measured.centered,
-        spot=measurement.spot if center is None else target.to_enu(center),
-        motor_position=measurement.motor_position,
-        taken_at=measurement.taken_at,
-        clipped=measured.clipped,
-        sheet_share=measured.quality.sheet_share,
-    )
-
-
-def observations_of(folder: MeasurementFolder, heliostat: str) -> tuple[list[Observation], dict[str, str]]:
-    """What a heliostat's images show, and why others were refused, by identifier."""
-    usable, refused = [], {}
-    for measurement in folder.measurements(heliostat):
-        try:
-            usable.append(evidence_of(folder, measurement))
-        except InvalidInputError as error:
-            refused[measurement.identifier] = str(error)
-    return as_observations(usable), refused
+def observations_of(
+    opened: FolderStore, heliostat: str
+) -> tuple[list[Observation], dict[str, str]]:
+    """Observations of a heliostat, and the reasons of rejected images by identifier."""
+    origin, (rows, refused) = opened.context(heliostat).origin, opened.photographs(heliostat)
+    return to_observations([accepted_measurement(row, origin) for row in rows]), refused
 
 
 def predict_heliostat(
-    folder: MeasurementFolder, heliostat: Heliostat, method: Method, images: int
+    opened: FolderStore, name: str, method: Method, images: int
 ) -> tuple[SurfacePrediction, dict[str, Any]]:
-    """Predict one heliostat's surface; the second value is its entry in ``predictions.json``."""
-    usable, refused = observations_of(folder, heliostat.name)
-    if not usable:
-        reason = f"every image was refused: {next(iter(refused.values()))}" if refused else "no image"
+    """Predict one heliostat's surface; also return its entry in ``predictions.json``."""
+    twin, (rows, refused) = opened.context(name), opened.photographs(name)
+    if not rows:
+        reason = (
+            f"every image was refused: {next(iter(refused.values()))}" if refused else "no image"
+        )
         raise InvalidInputError(reason)
-    model, latitude_deg = (folder.optics, folder.effects), float(folder.plant.origin[0])
-    kept, apart = agreeing(compute, heliostat, usable, *model, latitude_deg=latitude_deg)
-    predicted = compute.predict(heliostat, choose(kept, images), method, *model, latitude_deg=latitude_deg)
+    with opened.runtime.computing(f"predict_{method}") as operations:
+        chosen, apart = choose_observations(operations, twin, rows, images)
+        predicted = operations.predict(twin.heliostat, chosen, twin.model, method)
     entry: dict[str, Any] = {
         "method": method,
         "weights": predicted.weights,
         "images": list(predicted.used),
-        "tells": {name: round(share, 3) for name, share in zip(predicted.used, predicted.tells, strict=False)},
+        "information_share": {
+            name: round(share, 3)
+            for name, share in zip(predicted.used, predicted.information_shares, strict=False)
+        },
         "refused": refused | apart,
         "misfit": round(predicted.misfit, 4),
         "trusted": predicted.trusted,
-        "strangeness": round(predicted.mahalanobis, 3),
+        "mahalanobis_distance": round(predicted.mahalanobis_distance, 3),
         "suspicious": list(predicted.suspicious),
         "contradicting": list(predicted.contradicting),
-        "doubts": list(predicted.doubts),
+        "warnings": list(predicted.warnings),
         "z_rms_mm": round(float(np.sqrt((predicted.z**2).mean()) * 1e3), 4),
         "z_std_mean_mm": round(float(predicted.z_std.mean() * 1e3), 4),
     }
-    measured = folder.measured_surface(heliostat.name)
+    measured = opened.folder.measured_surface(name)
     if measured is not None:
-        entry["against_measured"] = surface_errors(predicted.z, measured_heights(heliostat, measured))
+        truth = measured_heights(twin.heliostat, measured)
+        entry["against_measured"] = surface_errors(predicted.z, truth)
     return predicted, entry
 
 
 def surface_errors(z: Array, truth: Array) -> dict[str, float]:
-    """Mean absolute errors [mm] of control heights: all, canting alone, waviness alone, and of the ideal surface."""
+    """Mean absolute errors [mm] of control heights: total, canting, waviness, and the ideal
+    surface's.
+    """
     (canting, waviness), (true_canting, true_waviness) = split_canting(z), split_canting(truth)
     errors = {
         "mae_mm": surface_error(z, truth),
@@ -225,22 +205,28 @@ def predict_folder(
     out: Path,
     method: Method = "network",
     images: int = MAX_IMAGES,
-    progress: Progress = quiet,
+    progress: Progress = no_progress,
+    mounts: Path | None = None,
 ) -> dict[str, Any]:
-    """Predict every heliostat's surface from up to ``images`` of its images; files as DESIGN.md, section 6."""
+    """Predict every heliostat's surface from up to ``images`` of its images.
+
+    The files are those of `write_surface` and ``OUT/predictions.json``. ``mounts`` is a file of
+    `heliotwin calibrate`.
+    """
     require_images(method, images)
     report: dict[str, Any] = {"method": method, "heliostats": {}, "skipped": {}}
     try:
-        for name, heliostat in folder.plant.heliostats.items():
-            progress(name)
-            try:
-                predicted, entry = predict_heliostat(folder, heliostat, method, images)
-            except ModelError as error:
-                report["skipped"][name] = str(error)
-                continue
-            write_surface(out, name, predicted)
-            report["heliostats"][name] = entry
-    except KeyboardInterrupt:  # hours of work may lie behind it
+        with open_folder(folder, mounts_file=mounts, progress=progress) as opened:
+            for name in opened.names:
+                progress(name)
+                try:
+                    predicted, entry = predict_heliostat(opened, name, method, images)
+                except ModelError as error:
+                    report["skipped"][name] = str(error)
+                    continue
+                write_surface(out, name, predicted)
+                report["heliostats"][name] = entry
+    except KeyboardInterrupt:  # the finished predictions may be hours of work
         left = [name for name in folder.plant.heliostats if name not in report["heliostats"]]
         report["skipped"] = dict.fromkeys(left, "interrupted") | report["skipped"]
         _write_report(folder, report, out / "predictions.json")
@@ -249,7 +235,7 @@ def predict_folder(
 
 
 def write_surface(out: Path, name: str, predicted: SurfacePrediction) -> None:
-    """``OUT/H/Deflectometry/H-nurbs-surface.npz``, readable as a measured surface."""
+    """Write ``OUT/H/Deflectometry/H-nurbs-surface.npz``, in the format of a measured surface."""
     path = out / name / "Deflectometry" / f"{name}-nurbs-surface.npz"
     path.parent.mkdir(parents=True, exist_ok=True)
     np.savez_compressed(
@@ -261,36 +247,81 @@ def write_surface(out: Path, name: str, predicted: SurfacePrediction) -> None:
     )
 
 
-# --- surfaces ---------------------------------------------------------------------------------------------------------
+# --- surfaces
+# --------------------------------------------------------------------------------------------------
 
 
 def check_surfaces(surfaces: str) -> None:
-    """Refuse a choice of surfaces that is none of those that verbs know."""
+    """Check that ``surfaces`` is ``measured``, ``ideal`` or a folder."""
     if surfaces not in ("measured", "ideal") and not Path(surfaces).is_dir():
-        raise InvalidInputError(f"--surfaces must be 'measured', 'ideal' or a folder of predictions, got {surfaces!r}")
+        raise InvalidInputError(
+            f"--surfaces must be 'measured', 'ideal' or a folder of predictions, got {surfaces!r}"
+        )
 
 
-def with_surfaces(
-    folder: MeasurementFolder, surfaces: str, skipped: dict[str, str]
+def surfaces_of(
+    folder: MeasurementFolder,
+    surfaces: str,
+    skipped: dict[str, str],
+    without_surface: set[str] | None = None,
 ) -> Iterator[tuple[Heliostat, tuple[Array, int] | None]]:
-    """Heliostats with the surfaces to trace, as `surface_of` has them; ``skipped`` tells why others are left out."""
+    """Iterate over heliostats with control points and degree of their surface; None is the ideal.
+
+    A heliostat whose surface is missing has the ideal one, and its name is added to
+    ``without_surface``. Without that set it is skipped. Heliostats whose surface cannot be read are
+    skipped, too: they are added to ``skipped``, with the reason.
+    """
     for name, heliostat in folder.plant.heliostats.items():
+        if name in folder.skipped:
+            continue
         try:
-            surface = surface_of(folder, heliostat, surfaces)
+            found = _find_surface(folder, heliostat, surfaces)
+            if found is None and surfaces != "ideal":
+                root = folder.root if surfaces == "measured" else Path(surfaces)
+                if without_surface is None:
+                    raise InvalidInputError(f"no surface in {root / name / 'Deflectometry'}")
+                without_surface.add(name)
         except ModelError as error:
             skipped[name] = str(error)
         else:
-            yield heliostat, surface
+            yield heliostat, found
 
 
-def surface_of(folder: MeasurementFolder, heliostat: Heliostat, surfaces: str) -> tuple[Array, int] | None:
-    """The surface to trace: None for the ideal one; refused where it is missing."""
+def points_of(heliostat: Heliostat, surface: tuple[Array, int] | None) -> tuple[Array, int]:
+    """Control points (F, I, J, 3) [m] and spline degree; those of the ideal surface for None."""
+    return (control_points(heliostat), DEGREE) if surface is None else surface
+
+
+def _find_surface(
+    folder: MeasurementFolder, heliostat: Heliostat, surfaces: str
+) -> tuple[Array, int] | None:
     if surfaces == "ideal":
         return None
     if surfaces == "measured":
-        root, found = folder.root, folder.measured_surface(heliostat.name)
-    else:
-        root, found = Path(surfaces), read_surface(Path(surfaces), heliostat)
-    if found is None:
-        raise InvalidInputError(f"no surface in {root / heliostat.name / 'Deflectometry'}")
-    return found
+        return folder.measured_surface(heliostat.name)
+    return read_surface(Path(surfaces), heliostat)
+
+
+def ideal_mirror_warnings(without_surface: Collection[str], n_heliostats: int) -> list[str]:
+    """Warnings for a forecast if some of its ``n_heliostats`` have no surface."""
+    if not without_surface:
+        return []
+    return [
+        f"{len(without_surface)} of {n_heliostats} heliostats have no surface and are forecast as"
+        " ideal mirrors; heliotwin predict predicts surfaces, and --surfaces reads them"
+    ]
+
+
+def predicted_from(surfaces: str) -> dict[str, list[str]]:
+    """Photographs, by heliostat, that a folder of predictions was computed from:
+    their identifiers.
+    """
+    path = Path(surfaces) / "predictions.json"
+    if surfaces in ("measured", "ideal") or not path.is_file():
+        return {}
+    try:
+        return {
+            name: list(entry["images"]) for name, entry in read_json(path)["heliostats"].items()
+        }
+    except (KeyError, TypeError, AttributeError):
+        raise InvalidInputError(f"{path} is not as `heliotwin predict` writes it") from None

@@ -1,4 +1,4 @@
-"""``heliotwin forecast`` on a measurement folder: light over whole targets, and how well it agrees with photographs."""
+"""``heliotwin forecast`` on a measurement folder: flux on targets, compared with photographs."""
 
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -8,87 +8,104 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from model.effects import Effect, effect_to_json, model_version
+from model.effects import Effect
 from model.errors import InvalidInputError, ModelError
+from model.frames import sun_direction
 from model.images import clipped_alike
 from model.imaging import MeasuredFlux
 from model.metrics import FluxComparison, accuracy_window, compare_on_target
 from model.plant import TargetPlane
-from service.base.progress import Progress, quiet
-from service.cli.folder import ROUGHEST_FIRST, check_surfaces, finish, measure, with_surfaces
-from service.cli.folder_pointing import Mounts, motors_of
-from service.sources.documents import Measurement, optics_to_json
+from model.setup import Setup
+from service import store
+from service.base.progress import Progress, no_progress
+from service.cli.folder import (
+    check_surfaces,
+    finish,
+    forecast_report,
+    ideal_mirror_warnings,
+    points_of,
+    predicted_from,
+    surfaces_of,
+)
+from service.cli.folder_store import FolderStore, open_folder
 from service.sources.folder import MeasurementFolder
-from service.twin import compute
+from service.store.tables import MeasurementRow
+from service.twin.heliostats.measurements import (
+    AcceptedMeasurement,
+    HeliostatContext,
+    accepted_measurement,
+    spot_position,
+)
+from service.twin.heliostats.stored_mount import load_mount
+from service.twin.pointing.calibration import motors_of
+from service.twin.runtime import operations
 
 Array = NDArray[np.float64]
 
 SPILL = 0.01
-"""Share of the measured energy that may lie outside the accuracy's window, up to one of `WIDEST` [m]."""
+"""Share of the measured energy that may lie outside the accuracy window, up to `WIDEST` [m]."""
 
 WIDEST = 8.0
 
-# Side [m] of a window that no target reaches.
+# Side [m] of a window that is larger than any target.
 _WIDEST_WINDOW = 1000.0
 
 
 def forecast_measurement(
-    folder: MeasurementFolder,
-    measurement: Measurement,
+    opened: FolderStore,
+    twin: HeliostatContext,
+    row: MeasurementRow,
     surface: tuple[Array, int] | None,
-    effects: Sequence[Effect] = (),
-    mounts: Mounts | None = None,
-) -> compute.Forecast:
-    """Light over a measurement's whole target, and what the camera shows of it; ``effects`` add to the declared ones.
+) -> operations.Forecast:
+    """Forecast the flux on a measurement's whole target, and its camera view.
 
-    The heliostat is aligned by its measured spot; without one by its motors, on its mount of that time; without those
-    at the target's centre.
+    The heliostat is aligned to its spot. Without a spot it is aligned by its motor positions, with
+    its mount of that time. Without motor positions it aims at the target's centre.
     """
-    heliostat, plane = folder.plant.heliostats[measurement.heliostat], folder.plant.targets[measurement.target]
-    if mounts is not None:
-        heliostat = mounts.stand(heliostat, measurement)
-    motors = None
-    if measurement.spot is None and measurement.motor_position is not None and heliostat.mount.actuators:
-        motors = motors_of(heliostat, measurement)
-    return compute.forecast(
+    heliostat, plane, angles = twin.heliostat, store.target_plane(row.target), None
+    spot = spot_position(row, plane, twin.origin)
+    if spot is None and row.motor_axis_1 is not None and heliostat.mount.actuators is not None:
+        heliostat = load_mount(opened.session, heliostat.name).turned(row.taken_at)
+        angles = heliostat.mount.angles_from_motors(motors_of(heliostat, row))
+    points, degree = points_of(heliostat, surface)
+    setup = Setup(
         heliostat,
-        None,
-        measurement.sun,
+        points,
+        sun_direction(row.sun_azimuth_deg, row.sun_elevation_deg),
         plane,
-        spot=measurement.spot,
-        angles=None if motors is None else heliostat.mount.angles_from_motors(motors),
-        optics=folder.optics,
-        surface=surface,
-        effects=[*folder.effects, *effects],
-        latitude_deg=float(folder.plant.origin[0]),
-        taken_at=measurement.taken_at,
+        spot=spot,
+        angles=angles,
+        degree=degree,
+        taken_at=row.taken_at,
     )
+    with opened.runtime.computing("forecast") as operations:
+        return operations.forecast(setup, twin.model)
 
 
-def compare(
-    folder: MeasurementFolder, measurement: Measurement, traced: compute.Forecast, window: float | None
-) -> dict[str, Any] | None:
-    """Accuracy of a forecast against the measurement's flux; None without an image of its target, or a refused one."""
-    if not any(kind in measurement.images for kind in ROUGHEST_FIRST[:-1]):
-        return None
-    measured = measure(folder, measurement)
-    if measured.flux is None:
-        return None
-    return asdict(agreement(measured, traced, folder.plant.targets[measurement.target], window))
+def _compare(
+    twin: HeliostatContext, row: MeasurementRow, traced: operations.Forecast, window: float | None
+) -> dict[str, Any]:
+    """Accuracy of a forecast compared with the measurement's flux.
+
+    Empty if the measurement has no image of its target, or if the image is rejected.
+    """
+    if row.arrays is None or row.kind == "flux-centered":
+        return {}
+    taken = accepted_measurement(row, twin.origin)
+    return asdict(agreement(taken, traced, taken.target, window))
 
 
 def agreement(
-    measured: MeasuredFlux, traced: compute.Forecast, plane: TargetPlane, window: float | None = None
+    measured: MeasuredFlux | AcceptedMeasurement,
+    traced: operations.Forecast,
+    plane: TargetPlane,
+    window: float | None = None,
 ) -> FluxComparison:
-    """A forecast against the flux that was measured on a target; in a window [m] by the spot if none is given.
+    """Compare a forecast with the flux that was measured on a target.
 
-    Raises
-    ------
-    InvalidInputError
-        Where the photograph was refused.
+    Without ``window`` [m], its side is chosen from the size of the spot.
     """
-    if measured.flux is None:
-        raise InvalidInputError(f"{measured.quality.reason}: {measured.quality.detail}")
+    assert measured.flux is not None
     flux, forecast = measured.flux.astype(np.float64), traced.camera_view.astype(np.float64)
     if measured.clipped is not None:
         forecast = clipped_alike(forecast, flux, measured.clipped.astype(np.float64))
@@ -102,58 +119,104 @@ def forecast_folder(
     out: Path,
     surfaces: str = "measured",
     window: float | None = None,
-    progress: Progress = quiet,
+    progress: Progress = no_progress,
     effects: Sequence[Effect] = (),
-    mounts: Mounts | None = None,
+    mounts: Path | None = None,
 ) -> dict[str, Any]:
     """Forecast every measurement of a folder; ``OUT/H/ID-forecast.npz`` and ``OUT/forecast.json``.
 
-    ``effects`` come in addition to those that the folder declares; without ``mounts`` heliostats stand as their
-    properties say.
+    Heliostats without a surface are forecast as ideal mirrors; the report's ``warnings`` say so.
+    ``effects`` are added to those that the folder declares. ``mounts`` is a file of `heliotwin
+    calibrate`; without it the heliostats have the mounts of their properties.
     """
     check_surfaces(surfaces)
+    used = predicted_from(surfaces)
     if window is not None and not 0 < window <= _WIDEST_WINDOW:
         raise InvalidInputError(f"--window must lie in 0 to {_WIDEST_WINDOW:g} m, got {window:g}")
-    report: dict[str, Any] = {
-        "surfaces": surfaces,
-        "model_version": model_version([*folder.effects, *effects]),
-        "effects": [effect_to_json(effect) for effect in (*folder.effects, *effects)],
-        "optics": {"dni_w_m2": folder.optics.dni, **optics_to_json(folder.optics)},
-        "measurements": {},
-        "skipped": {},
-    }
-    for heliostat, surface in with_surfaces(folder, surfaces, report["skipped"]):
-        measurements = folder.measurements(heliostat.name, with_images=False)
-        if not measurements:
-            report["skipped"][heliostat.name] = "no measurement"
-        for measurement in measurements:
-            progress(measurement.key)
-            try:
-                entry = _forecast_entry(folder, measurement, surface, effects, mounts, out, window)
-            except ModelError as error:
-                report["skipped"][measurement.key] = str(error)
-                continue
-            report["measurements"][measurement.key] = entry
-    accuracies = [e["accuracy"] for e in report["measurements"].values() if "accuracy" in e]
-    report["accuracy_mean"] = float(np.mean(accuracies)) if accuracies else None
-    report["accuracy_median"] = float(np.median(accuracies)) if accuracies else None
+    report = forecast_report(folder, surfaces, effects, measurements={})
+    source = surfaces if surfaces in ("measured", "ideal") else "predicted"
+    without_surface: set[str] = set()
+    with open_folder(folder, effects=effects, mounts_file=mounts, progress=progress) as opened:
+        report["skipped"] |= opened.refused
+        for heliostat, surface in surfaces_of(folder, surfaces, report["skipped"], without_surface):
+            name = heliostat.name
+            twin, rows = opened.context(name), opened.measurements(name)
+            if not rows:
+                report["skipped"][name] = "no measurement"
+            for row in rows:
+                key = f"{name}/{row.identifier}"
+                try:
+                    traced = forecast_measurement(opened, twin, row, surface)
+                except ModelError as error:
+                    report["skipped"][key] = str(error)
+                    continue
+                entry = _entry(out / name, row, traced) | _compare(twin, row, traced, window)
+                entry["surface"] = "ideal" if surface is None else source
+                if name in used and surface is not None:
+                    entry["used_for_surface"] = row.identifier in used[name]
+                report["measurements"][key] = entry
+    forecast = {key.partition("/")[0] for key in report["measurements"]}
+    report["ideal_surfaces"] = sorted(without_surface & forecast)
+    report["warnings"] = ideal_mirror_warnings(report["ideal_surfaces"], len(forecast))
+    compared = [entry for entry in report["measurements"].values() if "accuracy" in entry]
+    report |= _accuracy_by_surface(compared)
+    if used:
+        report["accuracy_by_use"] = {
+            name: _accuracy_of(
+                [entry for entry in compared if entry.get("used_for_surface") is was_used]
+            )
+            for name, was_used in (("used_for_surface", True), ("not_used", False))
+        }
     return finish(folder, report, out / "forecast.json", "measurements")
 
 
-def _forecast_entry(
-    folder: MeasurementFolder,
-    measurement: Measurement,
-    surface: tuple[Array, int] | None,
-    effects: Sequence[Effect],
-    mounts: Mounts | None,
-    out: Path,
-    window: float | None,
-) -> dict[str, Any]:
-    """Write the forecast of one measurement and give back its entry in ``forecast.json``."""
-    traced = forecast_measurement(folder, measurement, surface, effects, mounts)
-    path = out / measurement.heliostat / f"{measurement.identifier}-forecast.npz"
-    path.parent.mkdir(parents=True, exist_ok=True)
+def _accuracy_of(compared: Sequence[dict[str, Any]]) -> dict[str, float | None]:
+    """Mean and median accuracy of some measurements; None if there are none."""
+    accuracies = [entry["accuracy"] for entry in compared]
+    return {
+        "accuracy_mean": float(np.mean(accuracies)) if accuracies else None,
+        "accuracy_median": float(np.median(accuracies)) if accuracies else None,
+    }
+
+
+def _accuracy_by_surface(compared: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Accuracy of all measurements.
+
+    If ideal mirrors replace only some of the surfaces, they are counted separately.
+    """
+    by_surface = {
+        surface: _accuracy_of([entry for entry in compared if entry["surface"] == surface])
+        for surface in sorted({entry["surface"] for entry in compared})
+    }
+    found: dict[str, Any] = next(
+        (accuracy for surface, accuracy in by_surface.items() if surface != "ideal"),
+        by_surface.get("ideal", _accuracy_of([])),
+    )
+    return found | ({"accuracy_by_surface": by_surface} if len(by_surface) > 1 else {})
+
+
+def circularity(report: dict[str, Any]) -> str | None:
+    """Warning if surfaces are tested on images that they were predicted from, or None."""
+    compared = [entry for entry in report["measurements"].values() if "accuracy" in entry]
+    n_used = sum(entry.get("used_for_surface", False) for entry in compared)
+    if not n_used:
+        return None
+    used, others = (
+        report["accuracy_by_use"][name]["accuracy_mean"]
+        for name in ("used_for_surface", "not_used")
+    )
+    said = (
+        f"{n_used} of {len(compared)} images were used for the surfaces that they judge: accuracy"
+        f" {used:.3f}"
+    )
+    if others is None:
+        return f"{said}; no image is left that was not used, so that the accuracy is too favourable"
+    return f"{said} by them, {others:.3f} by those not used"
+
+
+def _entry(out: Path, row: MeasurementRow, traced: operations.Forecast) -> dict[str, Any]:
+    """Write the forecast of one measurement and return its entry in ``forecast.json``."""
+    out.mkdir(parents=True, exist_ok=True)
+    path = out / f"{row.identifier}-forecast.npz"
     np.savez_compressed(path, flux=traced.flux, camera_view=traced.camera_view)
-    entry: dict[str, Any] = {"target": measurement.target, "peak_w_m2": traced.peak, "power_w": traced.power}
-    comparison = compare(folder, measurement, traced, window)
-    return entry if comparison is None else {**entry, **comparison}
+    return {"target": row.target.name, "peak_w_m2": traced.peak, "power_w": traced.power}

@@ -6,21 +6,22 @@ from pathlib import Path
 from typing import Any
 
 from model.effects import Effect, effect_to_json
-from model.errors import InvalidInputError, ModelError
-from model.study import FluxImage, Study, StudyOptions, study
-from model.surface import DEGREE, control_points
-from service.base.progress import Progress, quiet
-from service.cli.folder import check_surfaces, clock_fault_of, evidence_of, with_surfaces
-from service.cli.folder_pointing import Mounts
-from service.sources.documents import Measurement, read_json
+from model.errors import InvalidInputError
+from model.study import FluxImage, Study, StudyOptions, study_to_json
+from service.base.progress import Progress, no_progress
+from service.cli.folder import check_surfaces, points_of, predicted_from, surfaces_of
+from service.cli.folder_store import FolderStore, open_folder
 from service.sources.folder import MeasurementFolder
+from service.twin.studies.study import StudyInputs, add_photographs
 
 
 @dataclass(frozen=True, eq=False)
 class FolderStudy:
-    """A study, what of the folder it left out, with the reasons, and the effects that it took for known.
+    """A study of a folder, what it skipped, and the model's effects before it.
 
-    ``clocks``: measurements whose time and sun disagree, with the likely reason.
+    ``skipped``: parts of the folder that were left out, with reasons. ``known``: the effects of the
+    model before the study. ``clocks``: measurements whose time and sun disagree, with the likely
+    reason.
     """
 
     study: Study
@@ -29,9 +30,9 @@ class FolderStudy:
     clocks: dict[str, str] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
-        """The study's report, the model it was made with, and what was skipped where something was."""
+        """The study's report with the model's effects, skipped items and clock faults."""
         return {
-            **self.study.to_json(),
+            **study_to_json(self.study),
             "model": {"effects": [effect_to_json(effect) for effect in self.known]},
             **({"skipped": self.skipped} if self.skipped else {}),
             **({"clocks": self.clocks} if self.clocks else {}),
@@ -39,45 +40,22 @@ class FolderStudy:
 
 
 def photographs_of(
-    folder: MeasurementFolder, surfaces: str = "measured", mounts: Mounts | None = None
+    opened: FolderStore, surfaces: str = "measured"
 ) -> tuple[list[FluxImage], dict[str, str]]:
-    """What a folder gives a study, and what it does not: heliostats and measurements with the reasons.
+    """Photographs of a folder for a study, and skipped heliostats and measurements with reasons.
 
-    On calibrated ``mounts`` photographs that these have not seen say, besides, where their motors sent the light.
+    With calibrated mounts, a photograph that is newer than them also has the pointing from its
+    motors.
     """
-    known = mounts or Mounts(folder, None)
-    photographs: list[FluxImage] = []
-    skipped, seen = dict(folder.skipped), predicted_from(surfaces)
-    for nominal, surface in with_surfaces(folder, surfaces, skipped):
-        heliostat = known.stand(nominal)
-        points, degree = (control_points(heliostat), DEGREE) if surface is None else surface
-        for measurement in folder.measurements(heliostat.name):
-            try:
-                _require_on_target(folder, measurement)
-                was_used = measurement.identifier in seen.get(heliostat.name, ())
-                taken = evidence_of(folder, measurement).photograph(heliostat, points, degree, was_used)
-                photographs.append(known.photograph(nominal, measurement, taken))
-            except ModelError as error:
-                skipped[measurement.key] = str(error)
-    return photographs, skipped
-
-
-def _require_on_target(folder: MeasurementFolder, measurement: Measurement) -> None:
-    """A spot that is said to lie elsewhere makes a photograph of another target, or of another heliostat, likely."""
-    target = folder.plant.targets[measurement.target]
-    if measurement.spot is not None and not target.holds(measurement.spot):
-        raise InvalidInputError(f"{measurement.key}: 'focal_spot' lies off its target {measurement.target}")
-
-
-def predicted_from(surfaces: str) -> dict[str, list[str]]:
-    """Identifiers of the photographs, by heliostat, that the surfaces of a folder of predictions were made from."""
-    path = Path(surfaces) / "predictions.json"
-    if surfaces in ("measured", "ideal") or not path.is_file():
-        return {}
-    try:
-        return {name: list(entry["images"]) for name, entry in read_json(path)["heliostats"].items()}
-    except (KeyError, TypeError, AttributeError):
-        raise InvalidInputError(f"{path} is not as `heliotwin predict` writes it") from None
+    folder, seen = opened.folder, predicted_from(surfaces)
+    inputs = StudyInputs(skipped=folder.skipped | opened.refused)
+    for heliostat, surface in surfaces_of(folder, surfaces, inputs.skipped):
+        name = heliostat.name
+        twin, (rows, refused) = opened.context(name), opened.photographs(name)
+        inputs.skipped |= {f"{name}/{key}": reason for key, reason in refused.items()}
+        points, degree = points_of(twin.heliostat, surface)
+        add_photographs(opened.session, inputs, twin, rows, points, degree, seen.get(name, ()))
+    return inputs.photographs, inputs.skipped
 
 
 def study_folder(
@@ -85,27 +63,25 @@ def study_folder(
     surfaces: str = "measured",
     options: StudyOptions | None = None,
     effects: Sequence[Effect] = (),
-    progress: Progress = quiet,
-    mounts: Mounts | None = None,
+    progress: Progress = no_progress,
+    mounts: Path | None = None,
 ) -> FolderStudy:
-    """Which effect a folder's photographs demand beyond its declared model and ``effects``, at its plant's latitude.
+    """Find effects in a folder's photographs that the declared model and ``effects`` lack.
 
-    Heliostats stand on calibrated ``mounts`` where there are any.
+    ``mounts`` is a file of `heliotwin calibrate`.
 
     Raises
     ------
     InvalidInputError
-        Where too few photographs have a surface; it says what was left out.
+        If too few photographs have a surface; the message lists what was skipped.
     """
     check_surfaces(surfaces)
-    photographs, skipped = photographs_of(folder, surfaces, mounts)
-    known = [*folder.effects, *effects]
-    try:
-        latitude_deg = float(folder.plant.origin[0])
-        found = study(photographs, folder.optics, known, options, progress, latitude_deg=latitude_deg)
-    except InvalidInputError as error:
-        reasons = "; ".join(f"{name}: {reason}" for name, reason in list(skipped.items())[:5])
-        raise InvalidInputError(f"{error}" + (f" ({reasons})" if reasons else "")) from None
-    every = [one for name in folder.plant.heliostats for one in folder.measurements(name)]
-    faults = {one.key: clock_fault_of(folder, one) for one in every}
-    return FolderStudy(found, skipped, known, {key: fault for key, fault in faults.items() if fault is not None})
+    with open_folder(folder, effects=effects, mounts_file=mounts) as opened:
+        model, clocks = opened.model, opened.clocks()
+        photographs, skipped = photographs_of(opened, surfaces)
+        try:
+            found = opened.runtime.operations.study(photographs, model, options, progress)
+        except InvalidInputError as error:
+            reasons = "; ".join(f"{name}: {reason}" for name, reason in list(skipped.items())[:5])
+            raise InvalidInputError(f"{error}" + (f" ({reasons})" if reasons else "")) from None
+    return FolderStudy(found, skipped, list(model.effects), clocks)

@@ -10,12 +10,15 @@ from typer.core import TyperGroup
 
 from model.errors import InvalidInputError, ModelError
 from service.base.discovery import modules_of
-from service.base.faults import ServiceError
-from service.base.wording import told
+from service.base.errors import ServiceError
+from service.base.validation_messages import format_validation_error
 
 
 class _Group(TyperGroup):
-    """Says what is wrong with an option in one line, as `main` does of all bad input, and not in a box."""
+    """Reports an invalid option in one line, without typer's frame.
+
+    `main` does the same for all bad input.
+    """
 
     def invoke(self, ctx: Any) -> Any:
         """Run the verb."""
@@ -23,8 +26,11 @@ class _Group(TyperGroup):
             return super().invoke(ctx)
         except typer.BadParameter as error:
             said = error.format_message()
-            if error.param is not None and error.message:  # there is none for what is missing
-                said = f"{error.param.opts[0]} must be valid: {error.message.removeprefix('Value error, ')}"
+            if error.param is not None and error.message:  # a missing option has no message
+                said = (
+                    f"{error.param.opts[0]} must be valid:"
+                    f" {error.message.removeprefix('Value error, ')}"
+                )
             raise InvalidInputError(" ".join(said.split())) from None
 
 
@@ -39,10 +45,13 @@ def _say_version(is_asked: bool) -> None:
 
 def _options(
     _version: Annotated[
-        bool, typer.Option("--version", callback=_say_version, is_eager=True, help="Print the version and end.")
+        bool,
+        typer.Option(
+            "--version", callback=_say_version, is_eager=True, help="Print the version and end."
+        ),
     ] = False,
 ) -> None:
-    """What stands before a verb; without a word for help, so that the group's own text stays."""
+    """Options before the verb; the help text is that of `app`."""
 
 
 app = typer.Typer(
@@ -52,7 +61,7 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
-    rich_markup_mode=None,  # else it takes units, [m], for markup, and drops them
+    rich_markup_mode=None,  # otherwise rich drops units, such as [m], as markup
     context_settings={"help_option_names": ["-h", "--help"]},
     callback=_options,
 )
@@ -63,27 +72,42 @@ for _group in modules_of("service.cli.verbs"):
 
 
 def main() -> None:
-    """Run the command; bad input ends with exit code 2 and one line, other failures, the database's too, with 1."""
+    """Run the command.
+
+    Bad input ends with exit code 2 and one line. Other failures, such as database errors, end with
+    1.
+    """
     try:
         app()
     except InvalidInputError as error:
         _fail(error, 2)
     except ValidationError as error:
-        _fail(f"setting {told(error, 'combination')}", 2)
+        _fail(f"setting {format_validation_error(error, 'combination')}", 2)
     except (ModelError, ServiceError, OSError) as error:
         _fail(error, 1)
     except _database_errors() as error:
-        _fail(f"the database: {' '.join(str(getattr(error, 'orig', None) or error).split())[:_LONGEST]}", 1)
+        _fail(
+            "the database:"
+            f" {' '.join(str(getattr(error, 'orig', None) or error).split())[:_LONGEST]}",
+            1,
+        )
 
 
-# Characters of a database's complaint that are shown.
+# Maximum length of a database error message.
 _LONGEST = 300
 
 
 def _database_errors() -> tuple[type[Exception], ...]:
-    """SQLAlchemy's and Alembic's, where the verb loaded them; loading them for the others' sake takes too long."""
+    """Error classes of SQLAlchemy and Alembic, if the verb loaded them.
+
+    Importing them here would slow down all other verbs.
+    """
     known = {"sqlalchemy.exc": "SQLAlchemyError", "alembic.util.exc": "CommandError"}
-    return tuple(getattr(sys.modules[module], name) for module, name in known.items() if module in sys.modules)
+    return tuple(
+        getattr(sys.modules[module], name)
+        for module, name in known.items()
+        if module in sys.modules
+    )
 
 
 def _fail(error: object, code: int) -> None:

@@ -1,10 +1,10 @@
-"""How every verb prints: a table, progress on standard error, or a report as JSON."""
+"""Output of all verbs: a table, progress on standard error, or a report as JSON."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
@@ -14,21 +14,39 @@ from rich.table import Table
 
 from model.errors import InvalidInputError
 
-# Tables and progress go to standard error, so that --json leaves standard output to the report.
+if TYPE_CHECKING:
+    from service.sources.folder import MeasurementFolder
+
+# Progress goes to standard error, so that --json leaves standard output to the report.
 console = Console(stderr=True)
-AsJson = Annotated[bool, typer.Option("--json", help="Print the report as JSON on standard output.")]
+AsJson = Annotated[
+    bool, typer.Option("--json", help="Print the report as JSON on standard output.")
+]
 
 
 def require_file(path: Path) -> None:
-    """Refuse what names a folder where a report is to be written, before any work is done for it."""
+    """Check, before any work is done, that a report file can be written here."""
     if path.is_dir():
         raise InvalidInputError(f"{path} is a folder; name a file to write to")
+    require_folder(path.parent)
+
+
+def require_folder(path: Path) -> None:
+    """Check, before any work is done, that this is or can become a folder."""
+    there = next(place for place in (path, *path.absolute().parents) if place.exists())
+    if not there.is_dir():
+        raise InvalidInputError(f"{there} is a file; name a folder to write to")
 
 
 @contextmanager
 def progress(total: int | None, label: str) -> Iterator[Any]:
-    """A progress bar; yields a callback that takes the name of what is being done."""
-    columns = (SpinnerColumn(), TextColumn("{task.description:<40}"), BarColumn(), TimeElapsedColumn())
+    """Progress bar; yields a callback that takes the name of the current item."""
+    columns = (
+        SpinnerColumn(),
+        TextColumn("{task.description:<40}"),
+        BarColumn(),
+        TimeElapsedColumn(),
+    )
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task(label, total=total)
 
@@ -38,15 +56,46 @@ def progress(total: int | None, label: str) -> Iterator[Any]:
         yield step
 
 
-def show(report: dict[str, Any], as_json: bool, table: Table | None = None) -> None:
-    """Print the report: JSON, or its table and what was skipped."""
+def show(report: Mapping[str, Any], as_json: bool, table: Table | None = None) -> None:
+    """Print the report as JSON, or its warnings, its table and the skipped items."""
     if as_json:
         typer.echo(json.dumps(report, indent=1))
         return
+    for warning in report.get("warnings", ()):
+        Console().print(warning, style="yellow", highlight=False)
     if table is not None:
         Console().print(table)
-    for name, reason in report.get("skipped", {}).items():
-        console.print(f"skipped {name}: {reason}", style="yellow", highlight=False)
+    _show_skipped(report.get("skipped", {}))
+
+
+# Most items with the same reason that are listed in full; of more items, this many are examples.
+_EXAMPLES = 3
+
+
+def _show_skipped(skipped: Mapping[str, str]) -> None:
+    """Print what was skipped, by reason; ``--json`` lists all of it."""
+    by_reason: dict[str, list[str]] = {}
+    for name, reason in skipped.items():
+        by_reason.setdefault(reason, []).append(name)
+    for reason, names in by_reason.items():
+        if len(names) <= _EXAMPLES:
+            lines = [f"skipped {name}: {reason}" for name in names]
+        else:
+            lines = [f"skipped {len(names):,}: {reason} ({', '.join(names[:_EXAMPLES])}, ..)"]
+        for line in lines:
+            console.print(line, style="yellow", highlight=False)
+
+
+def require_unbroken(folder: "MeasurementFolder") -> None:
+    """Raise InvalidInputError if a file of a heliostat is broken.
+
+    Call it after all other work. A heliostat with missing data is skipped without an error. A file
+    that cannot be read is an error.
+    """
+    if folder.broken:
+        first, others = next(iter(folder.broken.values())), len(folder.broken) - 1
+        more = f", and {others} more such files" if others else ""
+        raise InvalidInputError(f"{first}{more}; all but {', '.join(folder.broken)} is done")
 
 
 def make_table(title: str, *columns: str) -> Table:

@@ -1,6 +1,7 @@
-"""What commands on the store share: a session and who acts."""
+"""Helpers for commands on the store: sessions, the actor, and private file permissions."""
 
 import getpass
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,13 +11,33 @@ if TYPE_CHECKING:
     from sqlalchemy.orm import Session
 
 
-@contextmanager
-def writing() -> Iterator["Session"]:
-    """The store that the settings name; an embedded one is made and migrated first."""
-    from service.base.settings import Settings
-    from service.store.database import Database
+def keep_private() -> None:
+    """Let only this user read what the process writes from now on: 0600 for files, 0700 for
+    folders.
 
+    The store holds hashes of keys, photographs and positions, and so does a backup.
+    """
+    os.umask(0o077)
+
+
+@contextmanager
+def writing(makes: bool = False) -> Iterator["Session"]:
+    """Write session on the store of the settings; an embedded store is migrated first.
+
+    If ``makes`` is true, a missing embedded store is created.
+
+    Raises
+    ------
+    InvalidInputError
+        If there is no store, and ``makes`` is false.
+    """
+    from service.base.settings import Settings
+    from service.store.database import Database, require_store
+
+    keep_private()
     settings = Settings()
+    if not makes:
+        require_store(settings)
     settings.data_dir.mkdir(parents=True, exist_ok=True)
     database = Database(settings.database)
     try:
@@ -31,14 +52,14 @@ def writing() -> Iterator["Session"]:
 
 @contextmanager
 def reading() -> Iterator["Session | None"]:
-    """The store that the settings name, to look at: without the write lock, and as it is.
+    """Read session on the store of the settings, without write lock or migration.
 
-    None where an embedded one was not made yet.
+    Yields None if an embedded store does not exist yet.
 
     Raises
     ------
     SchemaError
-        Where it waits for a migration.
+        If the store needs a migration.
     """
     from service.base.settings import Settings
     from service.store.database import Database
@@ -58,7 +79,7 @@ def reading() -> Iterator["Session | None"]:
 
 
 def actor() -> str:
-    """Who stands in the audit trail."""
+    """Name of the user in the audit trail."""
     try:
         return f"cli {getpass.getuser()}"[:64]
     except (KeyError, OSError):  # a container's user may have no name

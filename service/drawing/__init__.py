@@ -1,1 +1,1 @@
-"""Pictures, charts and the report of a study, which can be mailed."""
+"""Pictures, charts and the HTML report of a study."""

@@ -1,4 +1,7 @@
-"""What the pages draw: maps, colour bars, the field and histories as plain numbers, which templates turn into SVG."""
+"""Charts of the pages as plain numbers: maps, colour bars, time series, histories.
+
+Templates turn them into SVG.
+"""
 
 import base64
 from collections.abc import Mapping, Sequence
@@ -18,10 +21,16 @@ from service.drawing.pictures import map_picture, mirror_heights, series_picture
 
 Array = NDArray[np.floating]
 
-_dates: Any = matplotlib.dates  # it says nothing of its types
+_dates: Any = matplotlib.dates  # matplotlib.dates has no type hints
 
-# From tick to tick at the most, in each unit of time.
-_LONGEST = {_dates.MONTHLY: 12, _dates.DAILY: 31, _dates.HOURLY: 24, _dates.MINUTELY: 60, _dates.SECONDLY: 60}
+# Largest interval between ticks, for each unit of time.
+_LONGEST = {
+    _dates.MONTHLY: 12,
+    _dates.DAILY: 31,
+    _dates.HOURLY: 24,
+    _dates.MINUTELY: 60,
+    _dates.SECONDLY: 60,
+}
 
 
 Sheet = tuple[Sequence[str], Sequence[Sequence[Any]]]
@@ -29,38 +38,41 @@ Sheet = tuple[Sequence[str], Sequence[Sequence[Any]]]
 
 
 class Figure(Protocol):
-    """What is drawn under a ``title``, and the ``formats`` that it is offered in as a file.
+    """A figure with a ``title``, and the file ``formats`` that it can be downloaded in.
 
-    ``csv`` takes ``sheet``, columns and rows; ``npz`` takes ``arrays`` by their names; ``png`` takes ``drawn()``.
+    The format ``csv`` needs ``sheet`` (columns and rows), ``npz`` needs ``arrays`` (by name), and
+    ``png`` needs ``drawn()``.
     """
 
     formats: ClassVar[tuple[str, ...]]
 
     @property
     def title(self) -> str:
-        """What it shows."""
+        """What the figure shows."""
         ...
 
 
 @dataclass(frozen=True)
 class Tick:
-    """A labelled place on an axis: 0 at its low end, 1 at its high end."""
+    """A labelled position on an axis: 0 at its low end, 1 at its high end."""
 
     at: float
     label: str
 
 
 def ticks(low: float, high: float, most: int = 5) -> tuple[Tick, ...]:
-    """Round numbers between ``low`` and ``high``."""
+    """Ticks at round numbers between ``low`` and ``high``, about ``most`` of them."""
     values = MaxNLocator(most, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high)
     slack = 1e-9 * (high - low)
     inside = [value for value in values if low - slack <= value <= high + slack]
-    return tuple(Tick((value - low) / (high - low), f"{round(value, 12) + 0.0:g}") for value in inside)
+    return tuple(
+        Tick((value - low) / (high - low), f"{round(value, 12) + 0.0:g}") for value in inside
+    )
 
 
 @dataclass(frozen=True)
 class Scale:
-    """From numbers to colours: a colour map of matplotlib's between two numbers."""
+    """Colour scale: a colour map of matplotlib between two numbers."""
 
     colours: str
     low: float
@@ -68,45 +80,50 @@ class Scale:
     label: str
 
     def pixels(self, values: Array) -> NDArray[np.uint8]:
-        """Red, green, blue and opacity (..., 4) of numbers; what is not finite is not drawn."""
+        """Red, green, blue and opacity (..., 4) of numbers; NaN and infinity are transparent."""
         shares = (np.ma.masked_invalid(values) - self.low) / (self.high - self.low)
         return np.asarray(matplotlib.colormaps[self.colours](shares, bytes=True))
 
     def names(self, values: Sequence[float]) -> list[str]:
-        """The colours of numbers, as pages write them."""
+        """Colours of numbers as HTML codes."""
         packed = np.ascontiguousarray(self.pixels(np.array(values))).view(np.uint32).ravel()
-        few, places = np.unique(packed, return_inverse=True)  # of many numbers only some hundred colours are different
+        few, places = np.unique(
+            packed, return_inverse=True
+        )  # large arrays have only some hundred different colours
         names = ["#" + pixel.tobytes()[:3].hex() for pixel in few]
         return [names[place] for place in places.tolist()]
 
     @property
     def stops(self) -> list[tuple[float, str]]:
-        """Places [0, 1] and colours for a gradient."""
-        return [(share, to_hex(matplotlib.colormaps[self.colours](share))) for share in np.linspace(0, 1, 12).tolist()]
+        """Positions [0, 1] and colours of a gradient."""
+        return [
+            (share, to_hex(matplotlib.colormaps[self.colours](share)))
+            for share in np.linspace(0, 1, 12).tolist()
+        ]
 
     @property
     def ticks(self) -> tuple[Tick, ...]:
-        """For a colour bar."""
+        """Ticks of a colour bar."""
         return ticks(self.low, self.high)
 
 
 @dataclass(frozen=True, eq=False)
 class HeatMap:
-    """A coloured map over a rectangle.
+    """A coloured map of a rectangle.
 
     Attributes
     ----------
     title : str
-        What a person who does not see it is told.
+        Also the text alternative of the picture.
     picture : str
         The map as a data URL.
     width, height : float [m]
-        Of the rectangle; its middle is the origin.
+        Size of the rectangle; the origin is its centre.
     scale : Scale
     values : (rows, columns)
-        What it shows, rows from the top.
+        Data of the map, rows from the top.
     outline : str
-        What is outlined on it, as a data URL; empty where nothing is.
+        Outline of a region of the map as a data URL; empty if there is none.
     """
 
     formats: ClassVar[tuple[str, ...]] = ("npz", "png")
@@ -121,31 +138,35 @@ class HeatMap:
 
     @property
     def beyond(self) -> tuple[float, float] | None:
-        """The least and the largest value, where any lies beyond the scale and has one of its end colours."""
+        """The smallest and the largest value if any lies beyond the scale, otherwise None."""
         least, most = float(np.nanmin(self.values)), float(np.nanmax(self.values))
         slack = 1e-6 * (self.scale.high - self.scale.low)
-        return (least, most) if least < self.scale.low - slack or most > self.scale.high + slack else None
+        return (
+            (least, most)
+            if least < self.scale.low - slack or most > self.scale.high + slack
+            else None
+        )
 
     @property
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """What it shows, in the unit of its scale, and its size [m]."""
+        """Values in the unit of the scale, and the size [m] of the map."""
         size_m = np.array([self.width, self.height])
         return {"values": self.values, "size_m": size_m, "unit": np.array(self.scale.label)}
 
     def drawn(self) -> bytes:
-        """As PNG, with axes and a colour bar."""
+        """The map as PNG, with axes and a colour bar."""
         scale = self.scale
         size, bounds = (self.width, self.height), (scale.low, scale.high)
         return map_picture(self.values, size, self.title, scale.colours, bounds, scale.label)
 
     @property
     def x_ticks(self) -> tuple[Tick, ...]:
-        """To the right of the middle [m]."""
+        """Ticks to the right of the centre [m]."""
         return ticks(-self.width / 2, self.width / 2)
 
     @property
     def y_ticks(self) -> tuple[Tick, ...]:
-        """Up from the middle [m]."""
+        """Ticks up from the centre [m]."""
         return ticks(-self.height / 2, self.height / 2)
 
 
@@ -155,27 +176,35 @@ def _data_url(pixels: NDArray[np.uint8]) -> str:
 
 
 def heat_map(title: str, values: Array, size: tuple[float, float], scale: Scale) -> HeatMap:
-    """A map of ``values`` (rows from the top, columns) over ``size``, width and height [m]."""
+    """A map of ``values`` (rows from the top, columns).
+
+    ``size`` is its width and height [m].
+    """
     return HeatMap(title, _data_url(scale.pixels(values)), *size, scale, values)
 
 
 def flux_scale(top: float, unit: str) -> Scale:
-    """Of flux: dark where there is none."""
+    """Scale of flux: dark at zero."""
     return Scale("inferno", 0.0, max(top, 1e-9), unit)
 
 
 def difference_scale(bound: float, unit: str) -> Scale:
-    """Of differences, forecast minus photograph: white where there is none, red where the forecast is brighter."""
+    """Scale of forecast minus photograph: white at zero, red if the forecast is brighter."""
     return Scale("RdBu_r", -bound, bound, unit)
 
 
-def flux_map(title: str, flux: Array, size: tuple[float, float], unit: str, top: float | None = None) -> HeatMap:
-    """A flux map, dark where there is none; ``top`` ends its scale, else its own peak."""
+def flux_map(
+    title: str, flux: Array, size: tuple[float, float], unit: str, top: float | None = None
+) -> HeatMap:
+    """A flux map, dark at zero.
+
+    ``top`` is the end of its scale, by default the peak.
+    """
     return heat_map(title, flux, size, flux_scale(float(flux.max()) if top is None else top, unit))
 
 
 def outlined(drawn: HeatMap, mask: NDArray[np.bool_]) -> HeatMap:
-    """A map with the edge of what is in ``mask`` (rows, columns) drawn on it, where anything is."""
+    """A map with the edge of a region, if it is not empty; ``mask`` is (rows, columns)."""
     if not mask.any():
         return drawn
     fine = np.kron(mask, np.ones((8, 8), dtype=bool)).astype(np.uint8)
@@ -185,35 +214,51 @@ def outlined(drawn: HeatMap, mask: NDArray[np.bool_]) -> HeatMap:
     return replace(drawn, outline=_data_url(pixels))
 
 
-def difference_map(title: str, difference: Array, size: tuple[float, float], unit: str, bound: float) -> HeatMap:
-    """A map of differences, white where there is none; ``bound`` ends its scale on both sides."""
+def difference_map(
+    title: str, difference: Array, size: tuple[float, float], unit: str, bound: float
+) -> HeatMap:
+    """A map of differences, white at zero; its scale ends at -``bound`` and ``bound``."""
     return heat_map(title, difference, size, difference_scale(bound, unit))
 
 
 def mirror_image(heights: Array) -> Array:
-    """Heights (4, i along x, j along y) as one image seen from the front, rows from the top, thin gaps between facets.
+    """Heights (4, i, j) as one image seen from the front, rows from the top.
 
-    PAINT's order of facets: upper left, upper right, lower left, lower right.
+    i runs along x, and j along y. There are thin gaps between the facets. The facets are in PAINT's
+    order: upper left, upper right, lower left, lower right.
     """
     upper_left, upper_right, lower_left, lower_right = (facet.T[::-1] for facet in heights)
     gap = np.full((upper_left.shape[0], 1), np.nan)
-    rows = [np.hstack([left, gap, right]) for left, right in ((upper_left, upper_right), (lower_left, lower_right))]
+    rows = [
+        np.hstack([left, gap, right])
+        for left, right in ((upper_left, upper_right), (lower_left, lower_right))
+    ]
     return np.vstack([rows[0], np.full((1, rows[0].shape[1]), np.nan), rows[1]])
 
 
 def surface_map(title: str, z: Array, size: tuple[float, float], bound: float) -> HeatMap:
-    """A surface of control heights (4, 8, 8) [m] in mm, red where it is higher; ``bound`` [mm] ends its scale."""
-    return heat_map(title, mirror_image(mirror_heights(z)), size, Scale("RdBu_r", -bound, bound, "mm"))
+    """A surface of control heights (4, 8, 8) [m] in mm, red if higher.
+
+    ``bound`` [mm] is the end of the scale on both sides.
+    """
+    return heat_map(
+        title, mirror_image(mirror_heights(z)), size, Scale("RdBu_r", -bound, bound, "mm")
+    )
 
 
 def uncertainty_map(title: str, z_std: Array, size: tuple[float, float], top: float) -> HeatMap:
-    """Standard deviations (4, 8, 8) [m] in mm; ``top`` [mm] ends their scale."""
-    return heat_map(title, mirror_image(mirror_heights(z_std)), size, Scale("viridis_r", 0.0, top, "mm"))
+    """Standard deviations (4, 8, 8) [m] in mm.
+
+    ``top`` [mm] is the end of the scale.
+    """
+    return heat_map(
+        title, mirror_image(mirror_heights(z_std)), size, Scale("viridis_r", 0.0, top, "mm")
+    )
 
 
 @dataclass(frozen=True)
 class Dot:
-    """A value of a series: 0 to 1 from left to right and from bottom to top, and what it says."""
+    """A value of a series: its position from 0 to 1, rightwards and upwards, and its label."""
 
     x: float
     y: float
@@ -223,7 +268,7 @@ class Dot:
 
 @dataclass(frozen=True)
 class Value:
-    """A number at a moment; hollow where it proves less than others."""
+    """A number at a time; hollow if it is weaker evidence than others."""
 
     at: datetime
     number: float
@@ -233,10 +278,11 @@ class Value:
 
 @dataclass(frozen=True)
 class Timeline:
-    """Series over time by their names, the first as a line and the second dashed; ``marks`` are upright lines.
+    """Series over time by name: the first is a solid line, the second dashed.
 
-    ``values`` are those of the series. ``when`` says what the labels of the moments leave out, as the year. ``limit``
-    is where a bound lies, 0 to 1 from bottom to top, if there is one.
+    ``marks`` are vertical lines, and ``values`` the data of the series. ``when`` is the part of the
+    date that the tick labels leave out, such as the year. ``limit`` is the height of a horizontal
+    line, 0 to 1 from the bottom, or None.
     """
 
     formats: ClassVar[tuple[str, ...]] = ("csv", "png")
@@ -253,13 +299,20 @@ class Timeline:
 
     @property
     def sheet(self) -> Sheet:
-        """All values by series and moment."""
-        rows = [(name, one.at, one.name, one.number) for name, some in self.values.items() for one in some]
+        """All values by series and time."""
+        rows = [
+            (name, one.at, one.name, one.number)
+            for name, some in self.values.items()
+            for one in some
+        ]
         return ("series", "time", "name", f"{self.title} [{self.unit}]"), rows
 
     def drawn(self) -> bytes:
-        """As PNG, over the time in UTC."""
-        series = {name: ([one.at for one in v], [one.number for one in v]) for name, v in self.values.items()}
+        """The series as PNG, over UTC time."""
+        series = {
+            name: ([one.at for one in v], [one.number for one in v])
+            for name, v in self.values.items()
+        }
         return series_picture(self.title, self.unit, series)
 
 
@@ -275,31 +328,36 @@ def timeline(
     *,
     marks: Sequence[tuple[datetime, str]] = (),
     limit: float | None = None,
-    from_zero: bool = True,
     moments: Sequence[datetime] = (),
 ) -> Timeline | None:
-    """Values over time, wide enough to hold these ``moments`` too, and marks within it; None without any value."""
+    """Values over time, with the marks within their range; None without any value.
+
+    The range also includes these ``moments``. The axis of values begins at zero, except that of
+    percentages.
+    """
     values = [value for some in series.values() for value in some]
     if not values:
         return None
-    first, last = (_dates.date2num(of([*(value.at for value in values), *moments])) for of in (min, max))
+    first, last = (
+        _dates.date2num(of([*(value.at for value in values), *moments])) for of in (min, max)
+    )
     margin = 0.04 * (last - first) or 0.5
     first, last = first - margin, last + margin
     numbers = [value.number for value in values] + ([] if limit is None else [limit])
-    # Less than half a percent of the value is nothing to be seen.
-    room = max(0.1 * (max(numbers) - min(numbers)), 0.005 * abs(max(numbers)))
-    low = 0.0 if from_zero else min(numbers) - room
+    # A change below half a percent of the value must not look large.
+    padding = max(0.1 * (max(numbers) - min(numbers)), 0.005 * abs(max(numbers)))
+    low = min(numbers) - padding if unit == "%" else 0.0
     high = max(max(numbers) + 0.1 * (max(numbers) - low), low + 1e-9)
     locator = _dates.AutoDateLocator(minticks=3, maxticks=5, tz=UTC)
-    for (
-        of_time,
-        longest,
-    ) in _LONGEST.items():  # its own steps end too early for five ticks over almost three of the next
+    # Its default steps are too short to limit the number of ticks.
+    for of_time, longest in _LONGEST.items():
         locator.intervald[of_time] = [*locator.intervald[of_time], longest]
     places = [
-        place for place in locator.tick_values(_dates.num2date(first), _dates.num2date(last)) if first <= place <= last
+        place
+        for place in locator.tick_values(_dates.num2date(first), _dates.num2date(last))
+        if first <= place <= last
     ]
-    # Concise dates leave out what the first of them says already.
+    # Concise dates leave out what the first one already says.
     formatter = _dates.ConciseDateFormatter(locator, tz=UTC)
     names = formatter.format_ticks(places)
 
@@ -330,7 +388,7 @@ def timeline(
 
 @dataclass(frozen=True)
 class Point:
-    """A value in a history: 0 to 1 from left to right and from bottom to top, with what it says."""
+    """A value in a history: its position from 0 to 1, rightwards and upwards, with its label."""
 
     x: float
     y: float
@@ -340,7 +398,10 @@ class Point:
 
 @dataclass(frozen=True)
 class History:
-    """Values in the order they came, for a line; ``ticks`` belong to the upright axis, ``values`` have their names."""
+    """Values in the order they came, as a line.
+
+    ``ticks`` are those of the vertical axis. ``values`` are pairs of a name and a value.
+    """
 
     formats: ClassVar[tuple[str, ...]] = ("csv", "png")
 
@@ -352,11 +413,11 @@ class History:
 
     @property
     def sheet(self) -> Sheet:
-        """All values by their names."""
+        """All values by name."""
         return ("name", f"{self.title} [{self.unit}]"), self.values
 
     def drawn(self) -> bytes:
-        """As PNG."""
+        """The history as PNG."""
         names, numbers = zip(*self.values, strict=True)
         return series_picture(self.title, self.unit, {"": (names, numbers)})
 
@@ -366,7 +427,9 @@ def history(title: str, unit: str, named: Sequence[tuple[str, float]], digits: i
     top = max([value for _, value in named] + [1e-9]) * 1.1
     step = 1 / max(len(named) - 1, 1)
     points = tuple(
-        Point(index * step if len(named) > 1 else 0.5, value / top, f"{value:.{digits}f} {unit}", name)
+        Point(
+            index * step if len(named) > 1 else 0.5, value / top, f"{value:.{digits}f} {unit}", name
+        )
         for index, (name, value) in enumerate(named)
     )
     return History(title, unit, points, ticks(0.0, top, 4), named)

@@ -1,4 +1,4 @@
-"""Pictures of flux maps and surfaces as PNG, drawn without a display and without matplotlib's global state."""
+"""Pictures of flux maps and surfaces as PNG, without matplotlib's global state."""
 
 import io
 from collections.abc import Mapping, Sequence
@@ -21,13 +21,20 @@ def _png(figure: Figure) -> bytes:
 
 
 def _extend(values: NDArray[np.floating], low: float, high: float) -> str:
-    """How a colour bar says on which sides values lie beyond it, in matplotlib's words."""
+    """The ``extend`` of a matplotlib colour bar: the sides on which values lie beyond it."""
     is_below, is_above = bool(np.nanmin(values) < low), bool(np.nanmax(values) > high)
-    return {(True, True): "both", (True, False): "min", (False, True): "max"}.get((is_below, is_above), "neither")
+    return {(True, True): "both", (True, False): "min", (False, True): "max"}.get(
+        (is_below, is_above), "neither"
+    )
 
 
-def flux_picture(flux: NDArray[np.floating], size: tuple[float, float] | None, unit: str, title: str) -> bytes:
-    """A flux map (rows, columns), coloured; ``size`` is its width and height [m], pixels where it is None."""
+def flux_picture(
+    flux: NDArray[np.floating], size: tuple[float, float] | None, unit: str, title: str
+) -> bytes:
+    """A flux map (rows, columns) in colours, with axes in m or pixels.
+
+    ``size`` is its width and height [m]; None gives pixels.
+    """
     return map_picture(flux, size, title, "inferno", (0.0, None), unit)
 
 
@@ -39,7 +46,10 @@ def map_picture(
     bounds: tuple[float, float | None],
     label: str,
 ) -> bytes:
-    """A map (rows from the top, columns) in ``colours`` of matplotlib's between ``bounds``; None: its largest value."""
+    """A map (rows from the top, columns) in a colour map of matplotlib.
+
+    ``bounds`` are the ends of the colour scale; an upper end of None is the largest value.
+    """
     figure = Figure(figsize=(6, 5), layout="constrained")
     axes = figure.subplots()
     extent = None if size is None else (-size[0] / 2, size[0] / 2, -size[1] / 2, size[1] / 2)
@@ -52,22 +62,33 @@ def map_picture(
 
 
 def places_picture(
-    places: NDArray[np.floating], values: NDArray[np.floating], title: str, colours: str, bounds: tuple[float, float]
+    places: NDArray[np.floating],
+    values: NDArray[np.floating],
+    title: str,
+    colours: str,
+    bounds: tuple[float, float],
 ) -> bytes:
-    """Values at ``places`` (n, 2), east and north [m], as coloured dots; hollow where a value is not finite."""
+    """Values at ``places`` (n, 2), east and north [m], as coloured dots.
+
+    Values that are not finite are hollow dots.
+    """
     figure = Figure(figsize=(7, 7), layout="constrained")
     axes = figure.subplots()
     known, (east, north) = np.isfinite(values), places.T
     axes.scatter(east[~known], north[~known], s=14, facecolors="none", edgecolors="gray")
     low, high = bounds
-    shown = axes.scatter(east[known], north[known], s=14, c=values[known], cmap=colours, vmin=low, vmax=high)
+    shown = axes.scatter(
+        east[known], north[known], s=14, c=values[known], cmap=colours, vmin=low, vmax=high
+    )
     axes.set(xlabel="east of the tower [m]", ylabel="north [m]", aspect="equal")
     figure.colorbar(shown, ax=axes, label=title)
     return _png(figure)
 
 
-def series_picture(title: str, unit: str, series: Mapping[str, tuple[Sequence[Any], Sequence[float]]]) -> bytes:
-    """Values over moments or names, a line for each of ``series``."""
+def series_picture(
+    title: str, unit: str, series: Mapping[str, tuple[Sequence[Any], Sequence[float]]]
+) -> bytes:
+    """Values over times or names, one line for each of ``series``."""
     figure = Figure(figsize=(8, 4), layout="constrained")
     axes = figure.subplots()
     for name, (places, values) in series.items():
@@ -80,48 +101,61 @@ def series_picture(title: str, unit: str, series: Mapping[str, tuple[Sequence[An
     return _png(figure)
 
 
-def photograph_picture(pixels: NDArray[np.generic], most: int, corners: NDArray[np.floating] | None = None) -> bytes:
-    """A photograph, gray or RGB, as JPEG of at most ``most`` pixels a side.
+def photograph_picture(
+    pixels: NDArray[np.generic], most: int, corners: NDArray[np.floating] | None = None
+) -> bytes:
+    """A photograph, gray or RGB, as JPEG of at most ``most`` pixels per side.
 
-    ``corners`` (4, 2) [px], upper left, upper right, lower left, lower right, are joined to an outline.
+    ``corners`` (4, 2) [px], upper left, upper right, lower left, lower right, are drawn as an
+    outline.
     """
     image = np.asarray(pixels)
-    if image.dtype != np.uint8:  # deeper ones are as bright as they may be
-        image = (image.astype(np.float32) * (255 / max(float(image.max()), 1.0))).astype(np.uint8)
-    image = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR if image.ndim == 2 else cv2.COLOR_RGB2BGR)
+    largest = 255.0 if image.dtype == np.uint8 else max(float(image.max()), 1.0)
     scale = min(1.0, most / max(image.shape[:2]))
-    if scale < 1:
+    if scale < 1:  # resize first: the next steps need several times the image's memory
         image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    if image.dtype != np.uint8:  # 16-bit images are scaled to their maximum
+        image = (image.astype(np.float32) * (255 / largest)).astype(np.uint8)
+    image = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR if image.ndim == 2 else cv2.COLOR_RGB2BGR)
     if corners is not None:
         outline = np.round((np.asarray(corners) * scale)[[0, 1, 3, 2]]).astype(np.int32)
-        cv2.polylines(image, [outline], isClosed=True, color=(64, 220, 255), thickness=2, lineType=cv2.LINE_AA)
+        cv2.polylines(
+            image, [outline], isClosed=True, color=(64, 220, 255), thickness=2, lineType=cv2.LINE_AA
+        )
     return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 85])[1].tobytes()
 
 
 def mirror_heights(z: NDArray[np.floating], samples: int = 48) -> NDArray[np.float64]:
-    """Heights (4, samples, samples) [mm] of control heights (4, 8, 8) [m], on even steps of each facet.
+    """Heights (4, samples, samples) [mm] of control heights (4, 8, 8) [m], evenly spaced.
 
-    Control heights crowd towards the facet's edges; a picture shall not.
+    Control heights are denser near the facet's edges, which would distort a picture.
     """
-    across, along = (basis(count, DEGREE, np.linspace(0, 1, samples))[0] for count in np.shape(z)[1:])
+    across, along = (
+        basis(count, DEGREE, np.linspace(0, 1, samples))[0] for count in np.shape(z)[1:]
+    )
     return across @ np.asarray(z, dtype=np.float64) @ along.T * 1e3
 
 
 def surface_picture(z: NDArray[np.floating], title: str, bound: float) -> bytes:
-    """A surface of control heights (4, 8, 8) [m] as a map in mm, its facets as they are seen from the front.
+    """A surface of control heights (4, 8, 8) [m] as a map in mm.
 
-    ``bound`` [mm] ends the scale on both sides; heights beyond have its end colours.
+    The facets are seen from the front. ``bound`` [mm] is the end of the scale on both sides;
+    heights beyond it have the end colours.
     """
     figure = Figure(figsize=(6.4, 5), layout="constrained")
     panes = figure.subplots(2, 2).ravel()
     heights = mirror_heights(z)
     for pane, facet, name in zip(panes, heights, _FACETS, strict=True):
-        # i runs with x and j with y, so columns are i and rows, from below, are j
-        image = pane.imshow(facet.T, cmap="RdBu_r", vmin=-bound, vmax=bound, origin="lower", aspect=0.8)
+        # i runs along x and j along y, so columns are i, and rows, from below, are j.
+        image = pane.imshow(
+            facet.T, cmap="RdBu_r", vmin=-bound, vmax=bound, origin="lower", aspect=0.8
+        )
         pane.set(xticks=[], yticks=[], title=name)
     figure.suptitle(title)
     extend = _extend(heights, -bound, bound)
-    figure.colorbar(image, ax=panes.tolist(), label="deviation from the ideal facet [mm]", extend=extend)
+    figure.colorbar(
+        image, ax=panes.tolist(), label="deviation from the ideal facet [mm]", extend=extend
+    )
     return _png(figure)
 
 
@@ -129,15 +163,18 @@ Array = NDArray[np.floating]
 
 
 def of_peak(measured: Array, forecast: Array) -> tuple[Array, Array]:
-    """Two fluxes (n, n) of one sum, in shares of the measured peak."""
+    """Two fluxes (n, n), scaled to the same sum, as shares of the measured peak."""
     a, b = measured / measured.sum(), forecast / forecast.sum()
     return a / a.max(), b / a.max()
 
 
-def comparison_picture(measured: Array, forecast: Array, side: float, title: str, bounds: tuple[float, float]) -> bytes:
-    """Measured and forecast flux (n, n) over ``side`` [m], scaled to one sum, and forecast minus measured.
+def comparison_picture(
+    measured: Array, forecast: Array, side: float, title: str, bounds: tuple[float, float]
+) -> bytes:
+    """Pictures of measured flux, forecast flux (n, n) and their difference, over ``side`` [m].
 
-    ``bounds`` end the scale of the fluxes and that of the difference [of the measured peak].
+    The fluxes are scaled to the same sum. ``bounds`` are the ends of the scales of flux and
+    difference, relative to the measured peak.
     """
     a, b = of_peak(np.asarray(measured), np.asarray(forecast))
     top, bound = bounds
@@ -150,6 +187,8 @@ def comparison_picture(measured: Array, forecast: Array, side: float, title: str
     figure.colorbar(shown, ax=panes[:2].tolist(), label="of the measured peak")
     shown = panes[2].imshow(b - a, cmap="RdBu_r", vmin=-bound, vmax=bound, extent=extent)
     panes[2].set(title="forecast - measured", xlabel="right [m]")
-    figure.colorbar(shown, ax=panes[2], label="of the measured peak", extend=_extend(b - a, -bound, bound))
+    figure.colorbar(
+        shown, ax=panes[2], label="of the measured peak", extend=_extend(b - a, -bound, bound)
+    )
     figure.suptitle(title)
     return _png(figure)

@@ -1,4 +1,4 @@
-"""What the page of a study draws, as plain numbers and small pictures, which its template turns into SVG."""
+"""Charts of a study's page, as plain numbers and small pictures; its template makes SVG."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,14 +9,22 @@ from numpy.typing import NDArray
 from model.study import FluxImage, Study
 from model.study.covariates import covariates_of
 from model.study.judging import rank_correlation
-from service.drawing.charts import HeatMap, Scale, Tick, difference_scale, flux_scale, heat_map, ticks
+from service.drawing.charts import (
+    HeatMap,
+    Scale,
+    Tick,
+    difference_scale,
+    flux_scale,
+    heat_map,
+    ticks,
+)
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Image:
-    """A held-out image: accuracy before and after, and where those lie on the chart, 0 to 1 from left to right."""
+    """A held-out image: accuracy before and after, and both positions on the chart, from 0 to 1."""
 
     photograph: FluxImage
     before: float
@@ -27,7 +35,10 @@ class Image:
 
 @dataclass(frozen=True)
 class Chart:
-    """The accuracy of all held-out images by heliostat; ``noise`` is where noise alone would leave them."""
+    """Accuracy of all held-out images by heliostat.
+
+    ``noise`` is the position of the accuracy that noise alone would give.
+    """
 
     groups: dict[str, list[Image]]
     ticks: tuple[Tick, ...]
@@ -35,12 +46,12 @@ class Chart:
 
     @property
     def images(self) -> list[Image]:
-        """All of them."""
+        """All images."""
         return [image for group in self.groups.values() for image in group]
 
 
 def accuracy_chart(study: Study) -> Chart:
-    """Every held-out image before and after, by heliostat and, within it, by rising sun."""
+    """Accuracy of every held-out image before and after, by heliostat and sun elevation."""
     before, after = study.accuracy_before, study.accuracy_after
     low = float(np.floor(min(before.min(), after.min()) * 20) / 20)
 
@@ -57,7 +68,7 @@ def accuracy_chart(study: Study) -> Chart:
 
 @dataclass(frozen=True)
 class Row:
-    """One image in squares, by what they show."""
+    """One image as square maps, by their content."""
 
     rank: str
     image: Image
@@ -66,9 +77,9 @@ class Row:
 
 @dataclass(frozen=True)
 class Pictures:
-    """Rows of squares of ``window`` [m], and the two scales that all of them share.
+    """Rows of square maps with the side ``window`` [m], and their two common scales.
 
-    ``beyond`` is the largest difference, where it lies beyond its scale.
+    ``beyond`` is the largest difference if it lies beyond its scale, otherwise None.
     """
 
     rows: list[Row]
@@ -79,16 +90,20 @@ class Pictures:
 
 
 def pictures(study: Study, images: Sequence[Image], bound: float) -> Pictures:
-    """The worst, the median and the best image of the declared model, in shares of each one's measured peak.
+    """The worst, the median and the best image of the declared model.
 
-    What an effect changes is shown where one was found. ``bound`` ends the scale of the differences.
+    Fluxes are relative to each image's measured peak. If the study found an effect, the forecasts
+    with it are included. ``bound`` is the end of the scale of the differences.
     """
     order = sorted(images, key=lambda image: image.before)
     chosen = {"Worst": order[0], "Median": order[len(order) // 2], "Best": order[-1]}
     fluxes = [_fluxes(study, image.photograph) for image in chosen.values()]
     top = max(float(flux.max()) for flux in fluxes)
     largest = max(float(np.abs(flux[0] - flux[1 : 2 + bool(study.found)]).max()) for flux in fluxes)
-    shares, differences = flux_scale(top, "of the measured peak"), difference_scale(bound, "of the measured peak")
+    shares, differences = (
+        flux_scale(top, "of the measured peak"),
+        difference_scale(bound, "of the measured peak"),
+    )
 
     def row(rank: str, image: Image, flux: Array) -> Row:
         measured, before, after = flux
@@ -99,27 +114,32 @@ def pictures(study: Study, images: Sequence[Image], bound: float) -> Pictures:
         if study.found:
             shown["difference after"] = (after - measured, differences)
         name = image.photograph.key
-        squares = {what: heat_map(f"{name}, {what}", v, (study.window,) * 2, s) for what, (v, s) in shown.items()}
+        squares = {
+            what: heat_map(f"{name}, {what}", v, (study.window,) * 2, s)
+            for what, (v, s) in shown.items()
+        }
         return Row(rank, image, squares)
 
-    rows = [row(rank, image, flux) for (rank, image), flux in zip(chosen.items(), fluxes, strict=True)]
+    rows = [
+        row(rank, image, flux) for (rank, image), flux in zip(chosen.items(), fluxes, strict=True)
+    ]
     return Pictures(rows, study.window, shares, differences, largest if largest > bound else None)
 
 
 def _fluxes(study: Study, photograph: FluxImage) -> Array:
-    """Measured, before and after (3, 64, 64) of one image, in shares of its measured peak."""
+    """Measured, before and after (3, 64, 64) of one image, relative to its measured peak."""
     place = list(study.images).index(photograph)
     flux = np.stack([study.measured[place], study.before[place], study.after[place]])
     return np.asarray(flux / flux[0].max())
 
 
 DRAWN = ("sun elevation", "slant range", "solar time", "recorded time")
-"""The covariates that the error is drawn against, as far as they are known."""
+"""Covariates that the error is plotted against, if they are known."""
 
 
 @dataclass(frozen=True)
 class Dot:
-    """An image's error before and after: places 0 to 1 from left to right and from bottom to top."""
+    """An image's error before and after: positions from 0 to 1, rightwards and upwards."""
 
     key: str
     x: float
@@ -129,7 +149,7 @@ class Dot:
 
 @dataclass(frozen=True)
 class Scatter:
-    """The error of all held-out images against one quantity, with the rank correlations of the two."""
+    """Error of all held-out images against one quantity, with the rank correlations."""
 
     label: str
     dots: list[Dot]
@@ -140,9 +160,13 @@ class Scatter:
 
 
 def scatters(study: Study) -> list[Scatter]:
-    """The error of all held-out images against each of `DRAWN`."""
-    known = covariates_of(study.images, study.latitude_deg)
-    return [_scatter(study, f"{c.name} [{c.unit}]", values) for c, values in known.items() if c.name in DRAWN]
+    """Error of all held-out images against each of `DRAWN`."""
+    known = covariates_of(study.images, study.site)
+    return [
+        _scatter(study, f"{c.name} [{c.unit}]", values)
+        for c, values in known.items()
+        if c.name in DRAWN
+    ]
 
 
 def _scatter(study: Study, label: str, x: Array) -> Scatter:

@@ -1,4 +1,4 @@
-"""A study as one page that an operator reads: no request to anywhere, no script, its pictures within it."""
+"""A study as one self-contained HTML page, without scripts or requests."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -7,9 +7,9 @@ from typing import Any
 from markupsafe import Markup
 
 from model.effects import CATALOGUE, Parameter
-from model.study import Study
-from model.study.advice import told_apart_by
-from model.study.report import Found
+from model.study import Study, conclude
+from model.study.advice import photographs_to_distinguish
+from model.study.outcome import Found
 from service.drawing.charts import difference_map
 from service.drawing.study_charts import accuracy_chart, pictures, scatters
 from service.drawing.templates import ASSETS, TEMPLATES
@@ -17,12 +17,12 @@ from service.drawing.templates import ASSETS, TEMPLATES
 VERDICTS = {"effect": "Effect found", "none": "Nothing missing", "unexplained": "Not explained"}
 
 FEW = 8
-"""Skipped items up to which they are listed at once."""
+"""Largest number of skipped items that are listed at once."""
 
 
 @dataclass(frozen=True)
 class Value:
-    """A fitted number, its 95 % interval, and whether that excludes the value that changes nothing."""
+    """A fitted number with its 95 % interval; ``telling`` if that excludes the neutral value."""
 
     value: float
     low: float
@@ -32,7 +32,7 @@ class Value:
 
 @dataclass(frozen=True)
 class Fitted:
-    """A parameter for all images, a day or one heliostat: one value, or one a facet."""
+    """A parameter for all images, one day or one heliostat: one value, or one per facet."""
 
     name: str
     unit: str
@@ -42,7 +42,10 @@ class Fitted:
 
 @dataclass(frozen=True)
 class Finding:
-    """An effect that was found: what it is, its parameters, and which photographs tell it from its look-alikes."""
+    """An effect that the study found, with its parameters.
+
+    ``lookalikes`` are similar effects, each with the photographs that would distinguish them.
+    """
 
     found: Found
     about: str
@@ -51,15 +54,25 @@ class Finding:
 
     @classmethod
     def of(cls, found: Found) -> "Finding":
-        """An effect as the page shows it."""
+        """The finding of an effect."""
         kind = CATALOGUE[found.name]
         of = ", ".join(found.scope.get("heliostats") or ["all images"])
-        parameters = [row for p in kind.parameters() for row in _rows(p, found.parameters[p.name], of)]
-        return cls(found, kind.about, parameters, {name: told_apart_by(found.name, name) for name in found.lookalikes})
+        parameters = [
+            row for p in kind.parameters() for row in _rows(p, found.parameters[p.name], of)
+        ]
+        return cls(
+            found,
+            kind.about,
+            parameters,
+            {name: photographs_to_distinguish(found.name, name) for name in found.lookalikes},
+        )
 
 
 def _rows(parameter: Parameter, fitted: Mapping[str, Any], of: str) -> list[Fitted]:
-    """A line for each owner of a parameter's values; one value is ``of`` what the effect's scope names."""
+    """One row for each owner of a parameter's values.
+
+    ``of`` names the owner of a shared value: the effect's scope.
+    """
     value, ci95 = fitted["value"], fitted["ci95"]
     if "by_day" in fitted:
         value, ci95 = (
@@ -71,7 +84,10 @@ def _rows(parameter: Parameter, fitted: Mapping[str, Any], of: str) -> list[Fitt
     if parameter.owner != "facet":
         value, ci95 = ({owner: [one] for owner, one in given.items()} for given in (value, ci95))
     values = {
-        owner: [_value(parameter, one, interval) for one, interval in zip(ones, ci95[owner], strict=True)]
+        owner: [
+            _value(parameter, one, interval)
+            for one, interval in zip(ones, ci95[owner], strict=True)
+        ]
         for owner, ones in value.items()
     }
     return [Fitted(parameter.name, parameter.unit, owner, ones) for owner, ones in values.items()]
@@ -82,7 +98,9 @@ def _value(parameter: Parameter, value: float, ci95: tuple[float, float]) -> Val
     return Value(value, low, high, not low <= parameter.neutral <= high)
 
 
-def study_page(study: Study, title: str, ends: Mapping[str, float], skipped: Mapping[str, str] | None = None) -> str:
+def study_page(
+    study: Study, title: str, ends: Mapping[str, float], skipped: Mapping[str, str] | None = None
+) -> str:
     """The report of a study as one self-contained HTML page.
 
     Parameters
@@ -90,18 +108,19 @@ def study_page(study: Study, title: str, ends: Mapping[str, float], skipped: Map
     title : str
         What was studied: a folder, a plant.
     ends : mapping
-        Where the colours of ``flux_difference`` and ``mean_difference`` end [of the measured peak].
+        Ends of the scales of ``flux_difference`` and ``mean_difference`` [of the measured peak].
     skipped : mapping
         What was left out, with the reasons.
     """
     chart, sides = accuracy_chart(study), (study.window, study.window)
     mean = "Mean of forecast minus photograph"
     left = difference_map(mean, study.residual_map(), sides, "of peak", ends["mean_difference"])
-    # The style is a file of our own, and `>` must stay what it is.
+    # The style is a trusted file, so it is not escaped: CSS needs `>`.
     style = Markup(ASSETS.joinpath("app.css").read_text(encoding="utf-8"))
     return TEMPLATES.get_template("study.html").render(
         style=style,
         study=study,
+        conclusion=conclude(study),
         title=title,
         verdict=VERDICTS[study.verdict],
         findings=[Finding.of(found) for found in study.found],

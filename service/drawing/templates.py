@@ -1,85 +1,124 @@
-"""The templates of pages and reports, and how both write numbers and moments."""
+"""Templates of pages and reports, with their formats of numbers and times."""
 
 from collections.abc import Callable
 from datetime import UTC, datetime
 from importlib.resources import files
-from typing import Any
+from typing import Any, Self
 from urllib.parse import quote
 from zoneinfo import ZoneInfo
 
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from model.times import format_time
+
 ASSETS = files("service.drawing").joinpath("static")
 """Styles and scripts."""
 
-# How print separates thousands and writes a minus.
+# Typographic thousands separator and minus sign.
 _SIGNS = {ord(","): "\N{NARROW NO-BREAK SPACE}", ord("-"): "\N{MINUS SIGN}"}
 
 
-def figure(value: float | None, digits: int = 2, unit: str = "") -> str:
-    """A number with its unit; a dash where there is none."""
+class Quantity(str):
+    """A formatted number, with its ``value`` (None if unknown) and ``unit`` for tables as CSV."""
+
+    value: float | None
+    unit: str
+
+    def __new__(cls, text: str, value: float | None, unit: str) -> Self:
+        """Combine them."""
+        made = super().__new__(cls, text)
+        made.value, made.unit = value, unit
+        return made
+
+
+def figure(value: float | None, digits: int = 2, unit: str = "") -> Quantity:
+    """A number with its unit; a dash for None."""
     if value is None:
-        return "–"
-    # Adding zero takes the sign from what rounds to it.
+        return Quantity("–", None, unit)
+    # Adding zero turns -0 into 0.
     text = f"{round(value, digits) + 0.0:,.{digits}f}".translate(_SIGNS)
-    return f"{text}\N{NO-BREAK SPACE}{unit}" if unit else text
+    space = "\N{NO-BREAK SPACE}" * (unit not in ("", "°"))
+    return Quantity(f"{text}{space}{unit}", float(value), unit)
 
 
-def percent(value: float | None, digits: int = 1) -> str:
+def percent(value: float | None, digits: int = 1) -> Quantity:
     """A share in percent."""
     return figure(None if value is None else value * 100, digits, "%")
 
 
 def moment(value: datetime | None) -> str | Markup:
-    """A moment in UTC; a dash where it is not known, which 1970 stands for."""
+    """A time in UTC; a dash if it is unknown, which includes 1970 and before."""
     if value is None or value.year <= 1970:
         return "–"
     utc = value.astimezone(UTC)
-    return Markup('<time datetime="{}">{}</time>').format(utc.isoformat(), utc.strftime("%Y-%m-%d %H:%M UTC"))
+    return Markup('<time datetime="{}">{}</time>').format(
+        format_time(utc), utc.strftime("%Y-%m-%d %H:%M UTC")
+    )
 
 
 def in_zone(zone: str | None) -> Callable[[datetime], str]:
-    """How a moment is told by the clocks of a zone of the tz database; nothing without one."""
-    return lambda value: "" if zone is None else f"{value.astimezone(ZoneInfo(zone)):%Y-%m-%d %H:%M %Z}"
+    """A function that formats a time in a zone of the tz database.
+
+    Without a zone, it returns an empty text.
+    """
+    return lambda value: (
+        "" if zone is None else f"{value.astimezone(ZoneInfo(zone)):%Y-%m-%d %H:%M %Z}"
+    )
 
 
-def power(watts: float) -> str:
-    """A power, in kW where that reads better."""
-    return figure(watts / 1e3, 2, "kW") if abs(watts) >= 1000 else figure(watts, 0, "W")
+def power(watts: float, unit: str = "W") -> Quantity:
+    """A power in W, or in kW from 1000 W."""
+    text = figure(watts / 1e3, 2, f"k{unit}") if abs(watts) >= 1000 else figure(watts, 0, unit)
+    return Quantity(text, float(watts), unit)
 
 
-def irradiance(watts_m2: float) -> str:
-    """An irradiance, in kW/m² where that reads better."""
-    return figure(watts_m2 / 1e3, 2, "kW/m²") if abs(watts_m2) >= 1000 else figure(watts_m2, 0, "W/m²")
+def irradiance(watts_m2: float) -> Quantity:
+    """An irradiance in W/m², or in kW/m² from 1000 W/m²."""
+    return power(watts_m2, "W/m²")
 
 
-def storage(size_bytes: float) -> str:
-    """A size on the disk, in the unit that reads best."""
+def lasting(seconds: float) -> str:
+    """A rounded duration in s, min or h."""
+    for unit, length in (("h", 3600), ("min", 60)):
+        if seconds >= 1.5 * length:
+            return figure(seconds / length, 0, unit)
+    return figure(max(seconds, 1.0), 0, "s")
+
+
+def storage(size_bytes: float) -> Quantity:
+    """A size of data, in B to TB."""
     for unit, size in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
         if size_bytes >= size:
-            return figure(size_bytes / size, 1, unit)
+            return Quantity(figure(size_bytes / size, 1, unit), float(size_bytes), "B")
     return figure(size_bytes, 0, "B")
 
 
 def in_words(value: Any) -> str:
-    """A value as a sentence has it: no braces, no quotes."""
+    """A value in words, without braces and quotes; a dash for None."""
+    if value is None:
+        return "–"
     if isinstance(value, dict):
-        return ", ".join(f"{name.replace('_', ' ')} {in_words(inner)}" for name, inner in value.items())
+        return ", ".join(
+            f"{name.replace('_', ' ')} {in_words(inner)}" for name, inner in value.items()
+        )
     if isinstance(value, list):
         return ", ".join(in_words(inner) for inner in value)
     return {True: "yes", False: "no"}[value] if isinstance(value, bool) else str(value)
 
 
 def model_in_words(version: str) -> str:
-    """A version of the plant's model, ``2:sun_shape+soiling``, as people read it."""
+    """A version of the plant's model in words; ``2:sun_shape+soiling`` is an example."""
     number, _, effects = version.partition(":")
-    told = "no effects" if effects == "none" else ", ".join(effects.replace("_", " ").split("+"))
-    return f"version {number}, {told}"
+    names = "no effects" if effects == "none" else ", ".join(effects.replace("_", " ").split("+"))
+    return f"version {number}, {names}"
 
 
 def environment(*packages: str) -> Environment:
-    """Templates of these packages, the first one's first, with the filters above."""
+    """Jinja environment with the templates of these packages and the filters above.
+
+    If two packages have the same template, the first package counts.
+    """
     made = Environment(
         loader=ChoiceLoader([PackageLoader(package) for package in packages]),
         autoescape=True,
@@ -93,6 +132,7 @@ def environment(*packages: str) -> Environment:
         moment=moment,
         power=power,
         irradiance=irradiance,
+        lasting=lasting,
         storage=storage,
         in_words=in_words,
         model_in_words=model_in_words,

@@ -1,1 +1,1 @@
-"""Work that outlives a request: one file a kind, and the worker."""
+"""Background jobs: one file per kind, and the worker."""

@@ -1,31 +1,61 @@
-"""What jobs on many heliostats share."""
+"""Common functions of jobs on many heliostats."""
 
-from collections.abc import Sequence
-from typing import Annotated
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any
 
 from pydantic import Field
 from sqlalchemy import select
+from sqlalchemy.orm import Session
 
-from service.base.faults import ConflictError
+from service import store
+from service.base.errors import ConflictError, NotFoundError
 from service.base.fields import Name
 from service.store.tables import HeliostatRow
-from service.twin.runtime import Runtime
+from service.twin.runtime.runtime import Runtime
 
 Heliostats = Annotated[
-    list[Name] | None, Field(min_length=1, max_length=20_000, description="Names of heliostats; all without it.")
+    list[Name] | None,
+    Field(min_length=1, max_length=20_000, description="Names of heliostats; all without it."),
 ]
 
 
-def chosen_names(runtime: Runtime, wanted: Sequence[str] | None) -> list[str]:
-    """The heliostats that are wanted, each once; all of the store where none is named."""
-    if wanted is not None:
-        return list(dict.fromkeys(wanted))
+def chosen_names(runtime: Runtime, names: Sequence[str] | None) -> list[str]:
+    """The requested heliostats without duplicates; all stored ones if ``names`` is None."""
+    if names is not None:
+        return list(dict.fromkeys(names))
     with runtime.database.reading() as session:
         return list(session.scalars(select(HeliostatRow.name).order_by(HeliostatRow.name)))
 
 
-def require_some(done: int, skipped: dict[str, str]) -> None:
-    """ConflictError where nothing could be done, with the first reason."""
-    if not done:
+def require_some(n_successful: int, skipped: dict[str, str]) -> None:
+    """Raise ConflictError with the first reason if ``n_successful`` is 0."""
+    if not n_successful:
         name, reason = next(iter(skipped.items()), ("the store", "it holds no heliostat"))
-        raise ConflictError(f"nothing could be done for any of {len(skipped)} heliostats; {name}: {reason}")
+        raise ConflictError(
+            f"nothing could be done for any of {len(skipped)} heliostats; {name}: {reason}"
+        )
+
+
+_HELIOSTATS = ("heliostats", "aim_points_m", "aim_offsets_m")
+"""Payload fields that name heliostats, in a list or as keys."""
+_LISTED = 5
+"""Maximum number of unknown names that an error lists."""
+
+
+def require_stored(session: Session, payload: Mapping[str, Any]) -> None:
+    """Check that the heliostats and the target that a job's payload names are stored.
+
+    Raises
+    ------
+    NotFoundError
+        With the field and the first unknown names.
+    """
+    for field in _HELIOSTATS:
+        names = dict.fromkeys(payload.get(field) or ())
+        known = set(session.scalars(select(HeliostatRow.name).where(HeliostatRow.name.in_(names))))
+        if unknown := [name for name in names if name not in known]:
+            more = f" and {len(unknown) - _LISTED} more" if len(unknown) > _LISTED else ""
+            listed = f"{', '.join(unknown[:_LISTED])}{more}"
+            raise NotFoundError(f"{field}: {listed} not found; GET /v1/heliostats lists the names")
+    if (target := payload.get("target")) is not None:
+        store.get_target_or_receiver(session, target)

@@ -1,41 +1,47 @@
-"""What a kind of job is: its payload, its function, and the function's view of its job."""
+"""Kinds of jobs: payload, handler function, and the handler's context."""
 
 import math
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel
+from sqlalchemy import event
 from sqlalchemy.orm import Session
 
+from service.base.arrays import pack, unpack
 from service.base.settings import Settings
-from service.store import queue
 from service.store.job_tables import JobRow
-from service.twin.runtime import Runtime
+from service.store.jobs import queue
+from service.twin.runtime.runtime import Runtime
 
-# Seconds between two writes of a job's progress: what a person can follow, and little for the database.
+# Seconds between two writes of a job's progress: often enough for people, rare for the database.
 _REPORT_EVERY_S = 0.5
+
+# Share of a job that must be done, and seconds that must have passed, before the remaining time is
+# estimated.
+_MIN_SHARE, _MIN_S = 0.01, 1.0
 Payload = TypeVar("Payload", bound=BaseModel)
 
 
 class CancelRequestedError(Exception):
-    """Somebody asked for the job's end."""
+    """Somebody requested the cancellation of the job."""
 
 
 class WorkerStoppingError(Exception):
-    """The worker was told to stop; another takes the job up."""
+    """The worker is stopping. Another one continues the job."""
 
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """What a job gives: figures that are JSON, and named arrays where there are some."""
+    """The result of a job: JSON figures, and optional named arrays."""
 
-    figures: dict[str, Any]
+    figures: Mapping[str, object]
     arrays: Mapping[str, NDArray[np.generic]] | None = None
 
 
@@ -43,9 +49,10 @@ class Result:
 class Context:
     """A handler's view of its job.
 
-    A handler calls `report` every second or so: that is where it learns, by an exception that it lets pass, that the
-    job was cancelled, lost or put back; and it is its sign of life, without which it is given up in the end. What must
-    happen once although the job may be started again is written in one transaction together with `keep`.
+    A handler calls `report` about every second. There it receives an exception if the job was
+    cancelled, lost or returned to the queue, and lets this exception pass. The call also shows that
+    the handler is alive. Without it, the worker finally gives the job up. Effects that must happen
+    only once, even if the job restarts, are written in one transaction with `keep`.
     """
 
     runtime: Runtime
@@ -56,14 +63,34 @@ class Context:
     lost: threading.Event = field(default_factory=threading.Event)
     reported_s: float = -math.inf
     alive_s: float = field(default_factory=time.monotonic)
+    has_progressed: threading.Event = field(default_factory=threading.Event)
+    """Set when this attempt has completed a step."""
+    _first: tuple[float, float] | None = None
+    """Time and completed share at the first report of this attempt."""
+    _phase: str = ""
+    _reporting: threading.Lock = field(default_factory=threading.Lock)
+
+    def __post_init__(self) -> None:
+        """Let the job also stop while it waits for a computation slot."""
+        self.runtime = replace(self.runtime, check=self.check)
 
     @property
     def silent_s(self) -> float:
-        """How long ago the last sign of life was [s]."""
+        """Time since the last sign of life [s]."""
         return time.monotonic() - self.alive_s
 
     def check(self) -> None:
-        """Raise `LeaseLostError`, `CancelRequestedError` or `WorkerStoppingError` where the work shall end."""
+        """Stop the work if necessary.
+
+        Raises
+        ------
+        LeaseLostError
+            If another worker holds the job.
+        CancelRequestedError
+            If the job was cancelled.
+        WorkerStoppingError
+            If the worker is stopping.
+        """
         self.alive_s = time.monotonic()
         if self.lost.is_set():
             raise queue.LeaseLostError(f"job {self.lease.job_id}")
@@ -72,45 +99,104 @@ class Context:
         if self.stopping.is_set():
             raise WorkerStoppingError
 
-    def report(self, progress: float, message: str = "") -> None:
-        """Say how far the job is, 0 to 1, and what is being done; raises what `check` raises."""
+    def report(
+        self,
+        share: float,
+        message: str = "",
+        *,
+        phase: str = "",
+        n_done: int | None = None,
+        n_total: int | None = None,
+    ) -> None:
+        """Report the completed share, 0 to 1, and the current activity. Raises the errors of
+        `check`.
+
+        ``phase`` describes the units of ``n_done`` and ``n_total``. May be called from several
+        threads.
+        """
         self.check()
-        if time.monotonic() - self.reported_s < _REPORT_EVERY_S:
-            return
-        self.reported_s = time.monotonic()
+        with self._reporting:
+            if phase == self._phase and time.monotonic() - self.reported_s < _REPORT_EVERY_S:
+                return
+            self.reported_s, self._phase = time.monotonic(), phase
+        progress = queue.Progress(share, message, phase, n_done, n_total, self._remaining_s(share))
         with self.runtime.database.writing() as session:
-            if queue.report(session, self.lease, progress, message):
+            if queue.report(session, self.lease, progress):
                 self.cancelled.set()
         self.check()
 
-    def steps(self) -> dict[str, dict[str, Any]]:
-        """The parts that this or an earlier attempt has done."""
-        with self.runtime.database.reading() as session:
-            return queue.steps(session, self.lease.job_id)
+    def _remaining_s(self, share: float) -> float | None:
+        """Expected time to the end [s] at the pace of this attempt; None while it is unknown."""
+        at = time.monotonic()
+        if self._first is None:
+            self._first = at, share
+        begun_s, begun_share = self._first
+        if share - begun_share < _MIN_SHARE or at - begun_s < _MIN_S:
+            return None
+        return (1 - share) * (at - begun_s) / (share - begun_share)
 
-    def keep(self, session: Session, name: str, result: dict[str, Any]) -> None:
-        """Note a part as done in the transaction that did it; LeaseLostError undoes both."""
+    def steps(self) -> dict[str, dict[str, Any]]:
+        """The completed steps of this and earlier attempts."""
+        with self.runtime.database.reading() as session:
+            return queue.load_checkpoints(session, self.lease.job_id)
+
+    def keep(
+        self,
+        session: Session,
+        name: str,
+        result: Mapping[str, object],
+        arrays: Mapping[str, NDArray[np.generic]] | None = None,
+    ) -> None:
+        """Store a step as completed in its effects' transaction. LeaseLostError undoes both."""
         self.alive_s = time.monotonic()
-        queue.keep_step(session, self.lease, name, result)
+        queue.save_checkpoint(
+            session, self.lease, name, result, None if arrays is None else pack(arrays)
+        )
+        event.listen(session, "after_commit", lambda _: self.has_progressed.set(), once=True)
+
+    def replace(
+        self,
+        session: Session,
+        name: str,
+        result: Mapping[str, object],
+        arrays: Mapping[str, NDArray[np.generic]] | None = None,
+    ) -> None:
+        """Store the progress under a name, in place of an earlier one."""
+        queue.delete_checkpoint(session, self.lease, name)
+        self.keep(session, name, result, arrays)
+
+    def kept_arrays(self, name: str) -> dict[str, NDArray[Any]] | None:
+        """The arrays of a completed step; None if there is no such step or array."""
+        with self.runtime.database.reading() as session:
+            data = queue.checkpoint_arrays(session, self.lease.job_id, name)
+        return None if data is None else unpack(data)
 
     @contextmanager
-    def keeping(self, name: str, made: Callable[[], dict[str, Any]]) -> Iterator[None]:
-        """Where the job is cancelled within the block, note what that had ``made`` by then: it is not begun again."""
+    def keeping(self, name: str, result: Callable[[], Mapping[str, object]]) -> Iterator[None]:
+        """Store the partial result ``result`` if the job is cancelled in the block.
+
+        It will not start again.
+        """
         try:
             yield
         except CancelRequestedError:
             with self.runtime.database.writing() as session:
-                self.keep(session, name, made())
+                self.keep(session, name, result())
             raise
 
 
 @dataclass(frozen=True)
 class Kind(Generic[Payload]):
-    """A kind of job: what it takes, and the function that does it.
+    """A kind of job: its payload and its handler.
 
-    Where it has ``due``, workers ask that every hour: it gives None, or the Idempotency-Key of a job that is due, which
-    is begun once, with nothing in its payload. Where it has ``so_far``, that makes a result of the steps that are done,
-    for a job that did not come to its end. What it needs of the settings it may ``require`` before it is queued.
+    Optional functions:
+
+    - ``due``: workers call it every hour. It returns None, or the Idempotency-Key of a due job.
+      Such a job starts once, with an empty payload.
+    - ``so_far`` makes a result of the completed steps, for a job that did not finish.
+    - ``require`` checks the settings before a job is queued.
+    - ``expected_s`` estimates the duration [s] from the payload and the number of stored
+      heliostats. A kind without it counts as long.
     """
 
     name: str
@@ -118,16 +204,22 @@ class Kind(Generic[Payload]):
     handler: Callable[[Context, Payload], Result]
     summary: str
     due: Callable[[Session, Settings], str | None] | None = None
-    so_far: Callable[[Mapping[str, Mapping[str, Any]]], dict[str, Any]] | None = None
+    so_far: Callable[[Mapping[str, Mapping[str, Any]]], Mapping[str, object]] | None = None
     require: Callable[[Settings], None] | None = None
+    expected_s: Callable[[Payload, int], float] | None = None
 
 
 Kinds = Mapping[str, Kind[Any]]
 
 
-def result_of(kinds: Kinds, session: Session, job: JobRow) -> dict[str, Any] | None:
-    """What a job gave; where it was cancelled or failed, what it had changed until then."""
+def result_of(kinds: Kinds, session: Session, job: JobRow) -> Mapping[str, Any] | None:
+    """The result of a job. For a cancelled or failed one, what it changed until then."""
     kind = kinds.get(job.kind)
-    if job.result is not None or kind is None or kind.so_far is None or job.state not in ("cancelled", "failed"):
+    if (
+        job.result is not None
+        or kind is None
+        or kind.so_far is None
+        or job.state not in ("cancelled", "failed")
+    ):
         return job.result
-    return kind.so_far(queue.steps(session, job.id))
+    return kind.so_far(queue.load_checkpoints(session, job.id))

@@ -1,4 +1,4 @@
-"""Workers: threads that take jobs, run their handlers, and see that each ends exactly once."""
+"""Workers: threads that take jobs, run their handlers, and end each job exactly once."""
 
 import itertools
 import logging
@@ -9,8 +9,7 @@ import signal
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import timedelta
 from functools import partial
@@ -22,33 +21,38 @@ from sqlalchemy.orm import Session
 from model.errors import InvalidInputError, ModelError
 from service.base import logs, memory, telemetry
 from service.base.arrays import pack
-from service.base.faults import ServiceError
-from service.base.meters import JOB_ATTEMPTS, JOB_SECONDS, PROCESS, listening, timed
+from service.base.errors import ServiceError
+from service.base.metrics import JOB_ATTEMPTS, JOB_SECONDS, PROCESS, measure_duration, serve_metrics
 from service.base.settings import Settings
-from service.jobs.asking import begin_due
+from service.jobs.enqueuing import enqueue_due
+from service.jobs.heartbeat import heartbeat
 from service.jobs.kind import CancelRequestedError, Context, Kinds, WorkerStoppingError
-from service.store import queue, retention
+from service.store import record_retention
 from service.store.job_tables import JobRow
-from service.twin.runtime import Operations, Runtime
+from service.store.jobs import queue
+from service.twin.runtime.runtime import Operations, Runtime
 
 logger = logging.getLogger("heliotwin.jobs")
 
-# Seconds between two looks for jobs that are old enough to be deleted.
+# Seconds between two deletions of old records.
 _PURGE_EVERY_S = 3600.0
 
-# Seconds that jobs under way get to reach their next report when the workers are told to stop.
+# Seconds that running jobs have to reach their next report when the workers stop.
 _GRACE_S = 20.0
 
 
 def pause_s(attempt: int, base_s: float, generator: random.Random) -> float:
-    """Seconds before attempt ``attempt`` + 1: doubled each time, and spread so that not all come back at once."""
+    """Seconds before attempt ``attempt`` + 1.
+
+    They double each time, with a random factor, so that not all jobs return at once.
+    """
     longest: float = min(queue.LONGEST_PAUSE_S, base_s * 2 ** (attempt - 1))
     return longest * generator.uniform(0.5, 1.0)
 
 
 @dataclass(frozen=True)
 class _Ending:
-    """How an attempt ended, and what writes that."""
+    """The outcome of an attempt, and the function that stores it."""
 
     outcome: str
     write: Callable[[Session], None]
@@ -58,8 +62,54 @@ def _failed(lease: queue.Lease, reason: str) -> _Ending:
     return _Ending("failed", lambda session: queue.fail(session, lease, reason))
 
 
+def _delete_old_records(runtime: Runtime) -> int:
+    """Delete a batch of each kind of record that the settings do not keep; return their number."""
+    settings, deleted = runtime.settings, 0
+    for records, days, prune in (
+        ("jobs", settings.job_retention_days, record_retention.prune_jobs),
+        ("plans", settings.plan_retention_days, record_retention.prune_plans),
+        ("forecasts", settings.forecast_retention_days, record_retention.prune_forecasts),
+        ("audit entries", settings.audit_retention_days, record_retention.prune_audit),
+    ):
+        if days:
+            with runtime.database.writing() as session:
+                count = prune(session, timedelta(days=days))
+            if count:
+                logger.info("%d %s deleted that were older than %g days", count, records, days)
+            deleted += count
+    return deleted
+
+
+def _store(context: Context, write: Callable[[Session], None]) -> None:
+    """Store the outcome of a job. Retry with pauses until it succeeds or the lease is lost."""
+    lease, runtime = context.lease, context.runtime
+    reason = "its result cannot be stored; the worker's log has more"
+    failed = partial(queue.fail, lease=lease, reason=reason)
+    while True:
+        # A missing database does not mean that the job hangs.
+        context.alive_s = time.monotonic()
+        try:
+            with runtime.database.writing() as session:
+                write(session)
+            return
+        except OperationalError as error:
+            logger.error("the end of job %d is not stored yet: %s", lease.job_id, error)
+        # The database does not accept the result.
+        except (StatementError, ValueError):
+            logger.exception("the end of job %d cannot be stored", lease.job_id)
+            if write is not failed:
+                write = failed
+                continue
+        if context.lost.is_set() or context.stopping.wait(runtime.settings.job_poll_s):
+            return  # the lease expires, and another worker repeats the job
+
+
 class Worker:
-    """Takes one job after the other until it is told to stop, or hangs; ``on_stuck`` is told then."""
+    """A worker that takes jobs one by one until it is stopped or hangs. It then calls ``on_stuck``.
+
+    With ``only_short`` it takes only jobs that are expected to take seconds, so that they need not
+    wait for long ones.
+    """
 
     def __init__(
         self,
@@ -68,18 +118,20 @@ class Worker:
         name: str,
         stopping: threading.Event,
         on_stuck: Callable[[], None] = lambda: None,
+        only_short: bool = False,
     ) -> None:
         self.runtime = runtime
         self.kinds = kinds
         self.name = name
         self.stopping = stopping
+        self.only_short = only_short
         self._on_stuck = on_stuck
         self._stuck = threading.Event()
         self._random = random.Random(name)
         self._purged_s = -math.inf
 
     def run(self) -> None:
-        """Work; a database that is away is waited for."""
+        """Take jobs until stopped, and wait while the database does not answer."""
         while not (self.stopping.is_set() or self._stuck.is_set()):
             try:
                 self._purge()
@@ -91,43 +143,35 @@ class Worker:
                 self.runtime.job_came.acquire(timeout=self.runtime.settings.job_poll_s)
 
     def _purge(self) -> None:
-        """Delete what is kept for a time only, now and then, a few rows at a time, and begin jobs that are due."""
+        """Delete old records from time to time, in batches, and queue periodic jobs."""
         if time.monotonic() - self._purged_s < _PURGE_EVERY_S:
             return
-        settings, deleted = self.runtime.settings, 0
-        for what, days, purge in (
-            ("jobs", settings.job_retention_days, retention.prune_jobs),
-            ("forecasts", settings.forecast_retention_days, retention.prune_forecasts),
-            ("audit entries", settings.audit_retention_days, retention.prune_audit),
-        ):
-            if days:
-                with self.runtime.database.writing() as session:
-                    count = purge(session, timedelta(days=days))
-                if count:
-                    logger.info("%s: %d %s deleted that were older than %g days", self.name, count, what, days)
-                deleted += count
-        begin_due(self.runtime, self.kinds)
-        if not deleted:  # else there may be more
+        deleted = _delete_old_records(self.runtime)
+        enqueue_due(self.runtime, self.kinds)
+        if not deleted:  # otherwise there may be more
             self._purged_s = time.monotonic()
 
     def work(self) -> bool:
-        """Take a job, if there is one, and bring it to an end; whether there was one."""
+        """Take and finish a job, and return whether there was one."""
         job = self._claim()
         if job is None:
             return False
         context = Context(self.runtime, queue.lease_of(job), job.created_by, self.stopping)
-        with logs.bound(job=job.id, kind=job.kind), timed(JOB_SECONDS.labels(job.kind), f"job {job.kind}"):
+        with (
+            logs.log_context(job=job.id, kind=job.kind),
+            measure_duration(JOB_SECONDS.labels(job.kind), f"job {job.kind}"),
+        ):
             logger.info("%s: job %d (%s), attempt %d", self.name, job.id, job.kind, job.attempts)
             outcome = self._attempt(context, job)
         JOB_ATTEMPTS.labels(job.kind, outcome).inc()
         return True
 
     def _attempt(self, context: Context, job: JobRow) -> str:
-        """Work at the job, store how that ended, and name it."""
+        """Run the job, store its outcome, and return the outcome's name."""
         try:
-            with self._heart(context, job):
+            with heartbeat(context, self.name, partial(self._return_stuck, context, job)):
                 ending = self._ending(context, job)
-                self._store(context, ending.write)
+                _store(context, ending.write)
                 return ending.outcome
         except queue.LeaseLostError:
             logger.warning("%s: job %d went to another worker", self.name, job.id)
@@ -135,180 +179,164 @@ class Worker:
 
     def _claim(self) -> JobRow | None:
         settings, database = self.runtime.settings, self.runtime.database
+        lease_s, attempts = settings.job_lease_s, settings.job_attempts
         with database.reading() as session:
-            if not queue.has_claimable(session, self.kinds, settings.job_lease_s):
+            if not queue.has_claimable(session, self.kinds, lease_s, self.only_short):
                 return None
         with database.writing() as session:
-            return queue.claim(session, self.kinds, self.name, settings.job_lease_s, settings.job_attempts)
+            return queue.claim(session, self.kinds, self.name, lease_s, attempts, self.only_short)
 
-    @contextmanager
-    def _heart(self, context: Context, job: JobRow) -> Iterator[None]:
-        """Renew the lease from a thread of its own, until the block ends or the work in it gives no sign of life."""
-        ended = threading.Event()
-        arguments = (context, job, ended)
-        thread = threading.Thread(target=self._beat, args=arguments, name=f"{self.name}-heart", daemon=True)
-        thread.start()
-        try:
-            yield
-        finally:
-            ended.set()
-            thread.join()
+    def _return_stuck(self, context: Context, job: JobRow) -> None:
+        """End a stuck attempt, and return its job to the queue.
 
-    def _beat(self, context: Context, job: JobRow, ended: threading.Event) -> None:
-        settings = self.runtime.settings
-        while not ended.wait(min(settings.job_lease_s, settings.job_silence_s) / 3):
-            if context.silent_s > settings.job_silence_s:
-                self._give_up(context, job)
-                return
-            if not context.lost.is_set():
-                self._renew(context)
-
-    def _renew(self, context: Context) -> None:
-        lease_s = self.runtime.settings.job_lease_s
-        try:
-            with self.runtime.database.writing() as session:
-                if queue.renew(session, context.lease, lease_s):
-                    context.cancelled.set()
-        except queue.LeaseLostError:
-            context.lost.set()
-        except SQLAlchemyError as error:  # the next beat may succeed before the lease runs out
-            logger.warning("%s: no heartbeat of job %d: %s", self.name, context.lease.job_id, error)
-
-    def _give_up(self, context: Context, job: JobRow) -> None:
-        """End the attempt from outside: that this thread lives proves nothing of the one that works."""
+        The heartbeat thread calls this, because its activity does not prove that the work
+        continues.
+        """
         context.lost.set()
-        why = f"no sign of life for {self.runtime.settings.job_silence_s:g} s"
-        logger.error("%s: job %d (%s) hangs, %s in attempt %d", self.name, job.id, job.kind, why, job.attempts)
+        reason = f"no sign of life for {self.runtime.settings.job_silence_s:g} s"
+        logger.error("job %d (%s) hangs, %s in attempt %d", job.id, job.kind, reason, job.attempts)
         try:
             with self.runtime.database.writing() as session:
-                self._again(context.lease, job.attempts, why).write(session)
+                self._retry_or_fail(context, job, reason).write(session)
         except queue.LeaseLostError:
             logger.warning("%s: job %d went to another worker", self.name, job.id)
-        except SQLAlchemyError as error:  # the work may hold SQLite's lock
+        # The work may hold SQLite's lock.
+        except SQLAlchemyError as error:
             logger.error("%s: job %d is left to its lease: %s", self.name, job.id, error)
         JOB_ATTEMPTS.labels(job.kind, "stuck").inc()
         self._stuck.set()
         self._on_stuck()
 
     def _ending(self, context: Context, job: JobRow) -> _Ending:
-        """Run the handler; how that ended."""
+        """Run the handler, and return the outcome."""
         lease, kind = context.lease, self.kinds[job.kind]
         try:
             result = kind.handler(context, kind.payload.model_validate(job.payload))
             arrays = None if result.arrays is None else pack(result.arrays)
-            return _Ending("done", lambda session: queue.finish(session, lease, result.figures, arrays))
+            return _Ending(
+                "done", lambda session: queue.finish(session, lease, result.figures, arrays)
+            )
         except queue.LeaseLostError:
             raise
         except CancelRequestedError:
             return _Ending("cancelled", lambda session: queue.stop(session, lease))
         except WorkerStoppingError:
             return _Ending("released", lambda session: queue.release(session, lease))
-        except (ModelError, ServiceError) as error:  # trying again would find the same
+        except (ModelError, ServiceError) as error:  # a retry would find the same error
             return _failed(lease, str(error))
         except ValidationError:
             return _failed(lease, "its payload is not one that this version takes")
-        except Exception as error:  # a handler's fault must end with its job, not with the worker
+        # A handler's error must end its job, not the worker.
+        except Exception as error:
             logger.exception("%s: job %d failed in attempt %d", self.name, job.id, job.attempts)
-            return self._again(lease, job.attempts, type(error).__name__)
+            return self._retry_or_fail(context, job, type(error).__name__)
 
-    def _again(self, lease: queue.Lease, attempts: int, fault: str) -> _Ending:
-        """Try again later, or give up; ``fault`` names no more than its type, the log has the rest."""
-        settings = self.runtime.settings
+    def _retry_or_fail(self, context: Context, job: JobRow, fault: str) -> _Ending:
+        """Retry later, or fail. ``fault`` names only the error's type, and the log has the details.
+
+        Attempts count from the last one that completed a step.
+        """
+        settings, lease = self.runtime.settings, context.lease
+        attempts = (
+            1 if context.has_progressed.is_set() else job.attempts - job.attempts_before_progress
+        )
         if attempts >= settings.job_attempts:
             return _failed(
                 lease,
-                f"failed {attempts} times, the last time by {fault}; the worker's log has more of job {lease.job_id}",
+                f"failed {attempts} times, the last time by {fault}; the worker's log has more of"
+                f" job {lease.job_id}",
             )
         delay = pause_s(attempts, settings.job_retry_s, self._random)
-        reason = f"attempt {attempts} failed by {fault}; tried again in {delay:.0f} s"
+        reason = f"attempt {job.attempts} failed by {fault}; tried again in {delay:.0f} s"
         return _Ending("retried", lambda session: queue.retry(session, lease, reason, delay))
-
-    def _store(self, context: Context, write: Callable[[Session], None]) -> None:
-        """Write how the job ended; while that cannot be, again and again, with pauses, until the lease is lost."""
-        reason = "its result cannot be stored; the worker's log has more"
-        failed = partial(queue.fail, lease=context.lease, reason=reason)
-        while True:
-            context.alive_s = time.monotonic()  # a database that is away makes nothing hang
-            try:
-                with self.runtime.database.writing() as session:
-                    write(session)
-                return
-            except OperationalError as error:
-                logger.error("%s: the end of job %d is not stored yet: %s", self.name, context.lease.job_id, error)
-            except (StatementError, ValueError):  # a result that the database does not take
-                logger.exception("%s: the end of job %d cannot be stored", self.name, context.lease.job_id)
-                if write is not failed:
-                    write = failed
-                    continue
-            if context.lost.is_set() or self.stopping.wait(self.runtime.settings.job_poll_s):
-                return  # the lease runs out, and another worker does it again
 
 
 class Workers:
-    """Some workers as threads of this process.
+    """Worker threads of this process, with additional ones for short jobs only.
 
-    A thread that hangs cannot be ended. ``on_stuck`` is told of it; without that another thread takes its place, also
-    before the model, and it keeps its memory and whatever else it holds until the process ends.
+    A thread that hangs cannot be stopped. ``on_stuck`` handles this case. Without it, another
+    thread takes over the worker and its computation slots. The stuck thread keeps its memory and
+    other resources until the process ends.
     """
 
-    def __init__(self, runtime: Runtime, kinds: Kinds, count: int, on_stuck: Callable[[], None] | None = None) -> None:
+    def __init__(
+        self, runtime: Runtime, kinds: Kinds, count: int, on_stuck: Callable[[], None] | None = None
+    ) -> None:
         self.stopping = threading.Event()
         self._runtime = runtime
         self._kinds = kinds
-        self._count = count
+        self._lanes = [False] * count + [True] * (
+            runtime.settings.short_job_workers if count else 0
+        )
         self._on_stuck = on_stuck
         self._numbers = itertools.count()
         self._threads: dict[int, threading.Thread] = {}
+        self._changing = threading.Lock()
 
     def start(self) -> None:
-        """Begin to take jobs."""
-        for _ in range(self._count):
-            self._start_one()
+        """Start to take jobs."""
+        for only_short in self._lanes:
+            self._start_one(only_short)
 
-    def _start_one(self) -> None:
+    def _start_one(self, only_short: bool) -> None:
+        """Start a thread, unless the workers are stopping. `stop` waits for each started thread."""
         number = next(self._numbers)
         name = f"{socket.gethostname()[:48]}-{os.getpid()}-{number}"
-        on_stuck = self._on_stuck or partial(self._replace, number)
-        worker = Worker(self._runtime, self._kinds, name, self.stopping, on_stuck)
-        self._threads[number] = threading.Thread(target=worker.run, name=f"job-{number}", daemon=True)
-        self._threads[number].start()
+        on_stuck = self._on_stuck or partial(self._replace, number, only_short)
+        worker = Worker(self._runtime, self._kinds, name, self.stopping, on_stuck, only_short)
+        thread = threading.Thread(target=worker.run, name=f"job-{number}", daemon=True)
+        with self._changing:
+            if not self.stopping.is_set():
+                self._threads[number] = thread
+                thread.start()
 
-    def _replace(self, number: int) -> None:
-        stuck = self._threads.pop(number)
+    def _replace(self, number: int, only_short: bool) -> None:
+        with self._changing:
+            stuck = self._threads.pop(number)
         assert stuck.ident is not None
-        self._runtime.gate.forget(stuck.ident)
-        logger.error("another thread takes the place of %s; what that one holds it keeps until a restart", stuck.name)
-        self._start_one()
+        self._runtime.compute_slots.forget(stuck.ident)
+        self._runtime.decoding_slots.forget(stuck.ident)
+        self._runtime.large_image_slots.forget(stuck.ident)
+        logger.error(
+            "another thread takes the place of %s; what that one holds it keeps until a restart",
+            stuck.name,
+        )
+        self._start_one(only_short)
 
     def stop(self) -> None:
-        """Take no more jobs and wait a while for those under way to be put back.
+        """Take no more jobs, and wait some time until running ones return to the queue.
 
-        One that does not report in time is left to its lease.
+        If a job does not report in time, another worker takes it after its lease expires.
         """
         self.stopping.set()
-        self._runtime.job_came.release(max(1, self._count))  # wakes those that wait for work
+        self._runtime.job_came.release(max(1, len(self._lanes)))  # wakes idle workers
+        with self._changing:  # no thread starts after this
+            threads = list(self._threads.values())
         until = time.monotonic() + _GRACE_S
-        for thread in list(self._threads.values()):
+        for thread in threads:
             thread.join(max(0.0, until - time.monotonic()))
 
 
 def work(settings: Settings, kinds: Kinds, operations: Operations | None = None) -> None:
-    """Work at the store's jobs, ``job_workers`` at a time, until SIGTERM or SIGINT; one under way is put back.
+    """Run ``job_workers`` workers until SIGTERM or SIGINT. Running jobs return to the queue.
 
-    Where a job hangs the process ends by exit code 1, so that its supervisor starts it again: a thread cannot be ended.
+    If a job hangs, the process ends with exit code 1, so that its supervisor restarts it. A thread
+    cannot be stopped.
 
     Raises
     ------
     InvalidInputError
-        Where ``job_workers`` is 0.
+        If ``job_workers`` is 0.
     SchemaError
-        Where nobody migrated the store.
+        If the store's schema is not current.
     """
     if not settings.job_workers:
-        raise InvalidInputError("job_workers: 0 works at nothing; give --count or HELIOTWIN_JOB_WORKERS")
-    memory.limit()
-    logs.set_up(settings)
-    telemetry.set_up(settings, "heliotwin-worker")
+        raise InvalidInputError(
+            "job_workers: 0 works at nothing; give --count or HELIOTWIN_JOB_WORKERS"
+        )
+    memory.limit_memory()
+    logs.configure_logging(settings)
+    telemetry.configure_tracing(settings, "heliotwin-worker")
     stopping, stuck = threading.Event(), threading.Event()
 
     def on_stuck() -> None:
@@ -321,13 +349,14 @@ def work(settings: Settings, kinds: Kinds, operations: Operations | None = None)
         workers = Workers(runtime, kinds, settings.job_workers, on_stuck)
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: stopping.set())
-        with listening(settings, PROCESS):
+        with serve_metrics(settings, PROCESS):
             workers.start()
             stopping.wait()
             workers.stop()
         if stuck.is_set():
             logger.critical("a job hangs and cannot be ended: this process ends, start it again")
             logging.shutdown()
-            os._exit(1)  # an ordinary end would wait for threads that the job may have started
+            # A normal exit would wait for threads that the job may have started.
+            os._exit(1)
     finally:
         runtime.close()

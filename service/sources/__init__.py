@@ -1,1 +1,1 @@
-"""Other people's data: what reads measurement folders and documents that the plant sends."""
+"""Readers of external data: measurement folders and documents that the plant sends."""

@@ -1,39 +1,79 @@
-"""Decoding an uploaded photograph safely: what the bytes claim is checked before any pixel is decoded.
+"""Decode untrusted photographs in separate processes with limits of time and memory.
 
-The container is walked first. A file that is no PNG, JPEG, TIFF or BMP, that claims too many pixels, that ends early or
-that carries something after its image is refused with one clear line; only then does OpenCV see it.
+If a file breaks a decoder or keeps it busy, only that process is lost. Processes start when they
+are needed, stay for the next photograph, and end with the service.
+`service.sources.decoder_process` is their program.
 """
 
+import atexit
+import os
+import signal
 import struct
-import zlib
-from collections.abc import Callable
+import subprocess
+import sys
+import tempfile
+import threading
+from io import FileIO
+from pathlib import Path
+from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from model.errors import InvalidInputError
+from service.base.errors import BusyError
 
 MAX_PIXELS = 32_000_000
 
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 
-_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_PNG_NEEDED = {b"IHDR", b"PLTE", b"IDAT", b"IEND"}
-# Start-of-frame markers of JPEG: C0 to CF without DHT (C4), JPG (C8) and DAC (CC).
-_JPEG_FRAMES = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-# Markers without a length: TEM and the restarts; SOI and EOI have no business before the scan.
-_JPEG_BARE = {0x01, *range(0xD0, 0xD8)}
-_JPEG_SCAN = 0xDA
-# Sizes [bytes] of TIFF's field types BYTE, SHORT and LONG, the only ones of the fields read here.
-_TIFF_TYPES = {1: ("B", 1), 3: ("H", 2), 4: ("I", 4)}
-_TIFF_WIDTH, _TIFF_HEIGHT, _TIFF_SAMPLES, _TIFF_BITS = 256, 257, 277, 258
-_TIFF_TILE_WIDTH, _TIFF_TILE_HEIGHT = 322, 323
-_TIFF_PLACES = ((273, 279), (324, 325))  # (offsets, byte counts) of strips and of tiles
+REQUEST = struct.Struct("<QQ")
+"""A request: size [bytes] of the file in the shared memory, and the most pixels to decode."""
+
+REFUSED, DECODED, LARGER = 0, 1, 2
+
+ANSWER = struct.Struct("<BQQQQ")
+"""An answer, whose content is in the shared memory.
+
+- `REFUSED`, or `LARGER` if the image has too many pixels: size [bytes] of the reason (UTF-8), then
+  zeros.
+- `DECODED`: rows, columns, channels (1 or 3) and bytes per sample (1 or 2) of the pixels.
+"""
+
+CPU_S = 10
+"""Most CPU time [s] for one file; the slowest of 50 million pixels take 2 to 3 s."""
+
+# Most wall time [s] for one file, on a busy machine.
+_WALL_S = 60.0
+
+# Idle processes that stay, each with about 60 MB.
+_MAX_IDLE = 2
+
+# Memory [bytes] that an idle process keeps for the next photograph, both in its heap and in the
+# shared memory. The thresholds of glibc's heap cannot be larger.
+_MAX_KEPT = 32 * 2**20
+
+# Signals that end a process if a file breaks the decoder.
+_FAULTS = {signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGILL, signal.SIGFPE}
+
+_PROGRAM = ("-m", "service.sources.decoder_process")
+
+# OpenCV logs nothing, and the heap keeps its memory.
+_ENVIRONMENT = {
+    "OPENCV_LOG_LEVEL": "SILENT",
+    "MALLOC_MMAP_THRESHOLD_": str(_MAX_KEPT),
+    "MALLOC_TRIM_THRESHOLD_": str(_MAX_KEPT),
+}
+
+_REMEDY = "save it again, as a plain PNG or JPEG, and send that"
+
+
+class TooManyPixelsError(InvalidInputError):
+    """An image has too many pixels, according to its header; nothing else was read."""
 
 
 def decode_image(data: bytes, *, max_pixels: int = MAX_PIXELS) -> Pixels:
-    """The pixels of a PNG, JPEG, TIFF or BMP file.
+    """Decode the pixels of a PNG, JPEG, TIFF or BMP file.
 
     Parameters
     ----------
@@ -44,154 +84,160 @@ def decode_image(data: bytes, *, max_pixels: int = MAX_PIXELS) -> Pixels:
 
     Returns
     -------
-    ndarray uint8 or uint16, (rows, columns) for a gray file and (rows, columns, 3) in RGB order for a colour file
-        As deep as the file's samples, up to 16 bits; transparency is dropped, and an EXIF orientation is ignored: marks
-        and configured corner pixels refer to the sensor.
+    ndarray uint8 or uint16
+        (rows, columns) for a gray file and (rows, columns, 3) in RGB order for a colour file.
+        The depth is that of the file's samples, up to 16 bits. Transparency is dropped. EXIF
+        orientation is ignored, because marks and configured corner pixels refer to the sensor.
 
     Raises
     ------
+    TooManyPixelsError
+        If it has more pixels than ``max_pixels``.
     InvalidInputError
-        If the bytes are not such a file, are cut off, carry something else behind the image, or are too large.
+        If the bytes are no such file, are incomplete, have other data behind the image, or take too
+        much time or memory to decode.
+    BusyError
+        If something else ended the process, such as the system when memory is short.
     """
-    checked, (width, height) = _container(data)(data)
-    if width < 1 or height < 1:
-        raise InvalidInputError("image: it claims no pixels; send a photograph")
-    if width * height > max_pixels:
-        raise InvalidInputError(f"image: {width} x {height} pixels is more than {max_pixels} allowed; scale it down")
-    return _pixels(checked, (height, width))
+    return _DECODERS.decode(data, max_pixels)
 
 
-def _container(data: bytes) -> Callable[[bytes], tuple[bytes, tuple[int, int]]]:
-    """The reader of the container that the first bytes announce."""
-    if data.startswith(_PNG_SIGNATURE):
-        return _read_png
-    if data.startswith(b"\xff\xd8\xff"):
-        return _read_jpeg
-    if data.startswith((b"II*\x00", b"MM\x00*")):
-        return _read_tiff
-    if data.startswith(b"BM"):
-        return _read_bmp
-    raise InvalidInputError("image: not a PNG, JPEG, TIFF or BMP file; send the camera's photograph in one of them")
+def _shared_memory() -> FileIO:
+    """A file without a name; in memory, if the system has such files."""
+    if hasattr(os, "memfd_create"):
+        return FileIO(os.memfd_create("decoder", 0), "r+")
+    return tempfile.TemporaryFile(buffering=0)
 
 
-def _truncated() -> InvalidInputError:
-    return InvalidInputError("image: the file ends early or is damaged; send it again")
+class DecoderEndedError(Exception):
+    """A decoder process ended before it answered; ``returncode`` as in `subprocess.Popen`."""
+
+    def __init__(self, returncode: int) -> None:
+        super().__init__(f"a decoder ended by {returncode}")
+        self.returncode = returncode
 
 
-def _trailing() -> InvalidInputError:
-    return InvalidInputError("image: there is other data behind the image; send the image alone")
+class DecoderProcess:
+    """A process that decodes one file after the other."""
+
+    def __init__(self) -> None:
+        paths = (str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH"))
+        self.is_late = False
+        self._memory = _shared_memory()
+        self._process = subprocess.Popen(
+            [sys.executable, "-P", *_PROGRAM, str(self._memory.fileno())],
+            bufsize=0,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            pass_fds=[self._memory.fileno()],
+            env=os.environ | _ENVIRONMENT | {"PYTHONPATH": os.pathsep.join(filter(None, paths))},
+            process_group=0,  # Ctrl-C goes to the service only
+        )
+
+    def decode(self, data: bytes, max_pixels: int) -> Pixels:
+        """Decode as `decode_image` does.
+
+        Raises DecoderEndedError if the process ends; then it can only be closed.
+        """
+        timer = threading.Timer(_WALL_S, self._end_late)
+        timer.daemon = True
+        timer.start()
+        try:
+            return self._exchange(data, max_pixels)
+        except (BrokenPipeError, EOFError):
+            raise DecoderEndedError(self._process.wait()) from None
+        finally:
+            timer.cancel()
+
+    def _exchange(self, data: bytes, max_pixels: int) -> Pixels:
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._memory.seek(0)
+        self._memory.write(data)
+        self._process.stdin.write(REQUEST.pack(len(data), max_pixels))
+        answer = self._process.stdout.read(ANSWER.size)
+        if len(answer) < ANSWER.size:
+            raise EOFError
+        kind, rows, columns, channels, width = ANSWER.unpack(answer)
+        if kind in (REFUSED, LARGER):
+            refusal = TooManyPixelsError if kind == LARGER else InvalidInputError
+            raise refusal(self._read(np.empty(rows, np.uint8)).tobytes().decode())
+        shape = (rows, columns) if channels == 1 else (rows, columns, channels)
+        pixels: Pixels = self._read(np.empty(shape, {1: np.uint8, 2: np.uint16}[width]))
+        if pixels.nbytes > _MAX_KEPT:
+            self._memory.truncate(0)
+        return pixels
+
+    def _read(self, array: Any) -> Any:
+        """Fill an array from the shared memory."""
+        self._memory.seek(0)
+        if self._memory.readinto(memoryview(array).cast("B")) < array.nbytes:
+            raise EOFError
+        return array
+
+    def _end_late(self) -> None:
+        self.is_late = True
+        self._process.kill()
+
+    def close(self) -> None:
+        """End the process immediately."""
+        self._process.kill()
+        with self._process, self._memory:  # closes the pipes and waits
+            pass
 
 
-def _pixels(data: bytes, shape: tuple[int, int]) -> Pixels:
-    flags = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    try:
-        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
-    except cv2.error:
-        image = None
-    if image is None or image.shape[:2] != shape:
-        raise _truncated()
-    return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)  # type: ignore[return-value]
+class DecoderPool:
+    """Decoder processes, one for each concurrent call."""
+
+    def __init__(self) -> None:
+        self._idle: list[DecoderProcess] = []
+        self._lock = threading.Lock()
+
+    def decode(self, data: bytes, max_pixels: int) -> Pixels:
+        """Decode as `decode_image` does."""
+        for _ in range(2):  # an idle process may have ended in the meantime
+            decoder = self._take()
+            try:
+                pixels = decoder.decode(data, max_pixels)
+            except DecoderEndedError as error:
+                decoder.close()
+                if error.returncode == -signal.SIGXCPU or decoder.is_late:
+                    raise InvalidInputError(
+                        f"image: it takes more than {CPU_S} s to decode; {_REMEDY}"
+                    ) from None
+                if -error.returncode in _FAULTS:
+                    raise InvalidInputError(f"image: it breaks the decoder; {_REMEDY}") from None
+            except InvalidInputError:
+                self._put_back(decoder)
+                raise
+            except BaseException:
+                decoder.close()
+                raise
+            else:
+                self._put_back(decoder)
+                return pixels
+        raise BusyError("image: the machine ended its decoding; send it again")
+
+    def _take(self) -> DecoderProcess:
+        with self._lock:
+            if self._idle:
+                return self._idle.pop()
+        return DecoderProcess()
+
+    def _put_back(self, decoder: DecoderProcess) -> None:
+        with self._lock:
+            if len(self._idle) < _MAX_IDLE:
+                self._idle.append(decoder)
+                return
+        decoder.close()
+
+    def close(self) -> None:
+        """End the idle processes; the next photograph starts one again."""
+        with self._lock:
+            idle, self._idle = self._idle, []
+        for decoder in idle:
+            decoder.close()
 
 
-def _read_png(data: bytes) -> tuple[bytes, tuple[int, int]]:
-    """The chunks that make the pixels, with their checksums verified; texts and profiles are left out."""
-    kept, position, size = [_PNG_SIGNATURE], len(_PNG_SIGNATURE), None
-    while position + 12 <= len(data):
-        (length,) = struct.unpack_from(">I", data, position)
-        end = position + 12 + length
-        kind, body = data[position + 4 : position + 8], data[position + 8 : end - 4]
-        if end > len(data):
-            raise _truncated()
-        if kind in _PNG_NEEDED:
-            if zlib.crc32(kind + body) != struct.unpack_from(">I", data, end - 4)[0]:
-                raise _truncated()
-            kept.append(data[position:end])
-        if kind == b"IHDR" and length == 13:
-            size = struct.unpack_from(">II", body)
-        position = end
-        if kind == b"IEND":
-            if position != len(data):
-                raise _trailing()
-            if size is None:
-                raise _truncated()
-            return b"".join(kept), size
-    raise _truncated()
-
-
-def _read_jpeg(data: bytes) -> tuple[bytes, tuple[int, int]]:
-    if not data.rstrip(b"\x00").endswith(b"\xff\xd9"):
-        raise _trailing() if b"\xff\xd9" in data[-(1 << 16) :] else _truncated()
-    position, size = 2, None
-    while position + 9 <= len(data) and data[position] == 0xFF:
-        marker = data[position + 1]
-        if marker == 0xFF:  # a fill byte
-            position += 1
-            continue
-        if marker in _JPEG_BARE:
-            position += 2
-            continue
-        if marker in _JPEG_FRAMES:
-            # Two sizes, of which the decoder takes the one that was not looked at, are a trap.
-            if size is not None:
-                raise InvalidInputError("image: a JPEG of more than one frame is not supported; send a photograph")
-            height, width = struct.unpack_from(">HH", data, position + 5)
-            size = (width, height)
-        if marker in (0xD8, 0xD9):
-            raise _truncated()
-        if marker == _JPEG_SCAN:
-            if size is None:
-                raise _truncated()
-            return data, size
-        position += 2 + max(2, struct.unpack_from(">H", data, position + 2)[0])
-    raise _truncated()
-
-
-def _read_bmp(data: bytes) -> tuple[bytes, tuple[int, int]]:
-    if len(data) < 54:
-        raise _truncated()
-    claimed, offset, header = struct.unpack_from("<I4xII", data, 2)
-    if header < 40:
-        raise InvalidInputError("image: an OS/2 bitmap is not supported; send PNG or JPEG")
-    width, height, bits, compression = struct.unpack_from("<ii2xHI", data, 18)
-    if compression in (0, 3):
-        row = (width * bits + 31) // 32 * 4
-        if width > 0 and len(data) < offset + row * abs(height):
-            raise _truncated()
-    if claimed > len(data):
-        raise _truncated()
-    if claimed and claimed < len(data):
-        raise _trailing()
-    return data, (width, abs(height))
-
-
-def _tiff_fields(data: bytes, order: str) -> dict[int, tuple[int, ...]]:
-    """The integer fields of the first directory, by tag."""
-    (start,) = struct.unpack_from(order + "I", data, 4)
-    (count,) = struct.unpack_from(order + "H", data, start)
-    fields: dict[int, tuple[int, ...]] = {}
-    for entry in range(start + 2, start + 2 + 12 * count, 12):
-        tag, kind, number = struct.unpack_from(order + "HHI", data, entry)
-        code, width = _TIFF_TYPES.get(kind, ("", 0))
-        if not code or number * width > len(data):
-            continue
-        place = entry + 8 if number * width <= 4 else struct.unpack_from(order + "I", data, entry + 8)[0]
-        fields[tag] = struct.unpack_from(f"{order}{number}{code}", data, place)
-    return fields
-
-
-def _read_tiff(data: bytes) -> tuple[bytes, tuple[int, int]]:
-    try:
-        fields = _tiff_fields(data, "<" if data.startswith(b"II") else ">")
-        size = fields[_TIFF_WIDTH][0], fields[_TIFF_HEIGHT][0]
-    except (struct.error, KeyError, IndexError) as error:
-        raise _truncated() from error
-    # Samples and bits multiply the memory that the decoder takes for each pixel.
-    if fields.get(_TIFF_SAMPLES, (1,))[0] > 4 or max(fields.get(_TIFF_BITS, (1,)), default=1) > 16:
-        raise InvalidInputError("image: a TIFF of more than 4 samples or 16 bits is not supported; send PNG or JPEG")
-    if fields.get(_TIFF_TILE_WIDTH, (0,))[0] > 4096 or fields.get(_TIFF_TILE_HEIGHT, (0,))[0] > 4096:
-        raise InvalidInputError("image: a TIFF with tiles above 4096 pixels is not supported; send PNG or JPEG")
-    for offsets, counts in _TIFF_PLACES:
-        for offset, count in zip(fields.get(offsets, ()), fields.get(counts, ()), strict=False):
-            if offset + count > len(data):
-                raise _truncated()
-    return data, size
+_DECODERS = DecoderPool()
+atexit.register(_DECODERS.close)

@@ -1,30 +1,70 @@
-"""Files of other people's folders: a regular one of a bearable size, or none is opened."""
+"""Safe access to external files: only regular files of a bounded size are opened."""
 
 import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 
 from model.errors import InvalidInputError
 
-# The largest file of a measurement folder is deflectometry, some tens of megabytes.
-_MOST_BYTES = 2**30
+# The largest files of a measurement folder are deflectometry, some tens of megabytes.
+_MAX_BYTES = 2**30
+
+MAX_JSON_BYTES = 2**26
+"""Largest JSON document [bytes]."""
+
+MAX_JSON_VALUES = 2_000_000
+"""Most values of one: parsed and validated, each takes up to 300 bytes. Ten years of a heliostat
+have some hundred thousand.
+"""
+
+_ROOT: ContextVar[Path | None] = ContextVar("root", default=None)
 
 
-def require_regular(path: Path, name: str | None = None) -> Path:
-    """``path``, where it is a regular file, or leads to one, that can be read into memory; nothing is opened for it.
+@contextmanager
+def confined_to(root: Path) -> Iterator[None]:
+    """Refuse files outside of ``root`` in this thread while the block runs.
+
+    Links and ``..`` may lead to such files.
+    """
+    token = _ROOT.set(root.resolve())
+    try:
+        yield
+    finally:
+        _ROOT.reset(token)
+
+
+def require_regular(path: Path, name: str | None = None, max_bytes: int | None = None) -> Path:
+    """Return ``path`` if it is or leads to a regular file of at most ``max_bytes``.
+
+    The file is not opened.
 
     Raises
     ------
     InvalidInputError
-        Where it is missing, too large, or anything else: who opens a pipe waits without end. ``name`` stands for the
-        path in what it says.
+        If it is missing, too large, outside of what `confined_to` allows, or not a regular file.
+        Opening a pipe, for example, would block forever. ``name`` replaces the path in the message.
     """
-    shown = str(path) if name is None else name
+    shown, root, most = str(path) if name is None else name, _ROOT.get(), max_bytes or _MAX_BYTES
     try:
+        if root is not None and not path.resolve().is_relative_to(root):
+            raise InvalidInputError(f"{shown}: leads outside of the folder; copy what it links to")
         found = path.stat()
     except FileNotFoundError:
         raise InvalidInputError(f"{shown}: no such file") from None
+    except OSError as error:
+        raise InvalidInputError(f"{shown}: {error.strerror}") from None
     if not stat.S_ISREG(found.st_mode):
         raise InvalidInputError(f"{shown}: no regular file")
-    if found.st_size > _MOST_BYTES:
-        raise InvalidInputError(f"{shown}: {found.st_size} bytes, {_MOST_BYTES} are the most")
+    if found.st_size > most:
+        raise InvalidInputError(f"{shown}: {found.st_size} bytes, {most} are the most")
     return path
+
+
+def read_file(path: Path, max_bytes: int | None = None) -> bytes:
+    """Read a file that `require_regular` accepts; InvalidInputError if it cannot be read."""
+    try:
+        return require_regular(path, max_bytes=max_bytes).read_bytes()
+    except OSError as error:
+        raise InvalidInputError(f"{path}: {error.strerror}") from None

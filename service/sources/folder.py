@@ -1,10 +1,12 @@
 """Measurement folders: the plant, its heliostats, measurements, measured surfaces, declared model.
 
-Whose folder it is and what its files look like `service.sources.importers` know. See DESIGN.md, section 6.
+`service.sources.importers` reads the folders of each source.
 """
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,77 +14,91 @@ from typing import Any
 import h5py
 import numpy as np
 
-from model.effects import Effect
 from model.errors import InvalidInputError
-from model.imaging import Camera
 from model.plant import Heliostat, Plant
+from model.plant_model import PlantModel
 from model.surface import control_points, fit_heights, heights
-from model.tracing import Optics
+from service.base.arrays import unpack_untrusted
 from service.base.discovery import modules_of
 from service.sources.documents import Array, Declared, Measurement, get, parse_declared, read_json
-from service.sources.files import require_regular
+from service.sources.files import read_file, require_regular
+
+# PAINT's splines have 240 kB.
+_MAX_SPLINE_BYTES = 2**22
+_MAX_DEGREE = 7
+# Most deflectometry points per facet: each needs 1 kB for the fit.
+_MAX_POINTS = 500_000
 
 
 @dataclass(frozen=True, eq=False)
 class MeasurementFolder(ABC):
-    """A folder of measurements, whatever its layout: each importer derives its own.
+    """A folder of measurements in any layout; each importer derives a class.
 
     Attributes
     ----------
     root : Path
     plant : Plant
-        Its targets, and every heliostat that could be read.
-    optics : Optics
-        The declared model (``twin.json``), Buie's sun with 0.02 without one.
-    effects : tuple of Effect
-    cameras : tuple of Camera
-        Those of the declared model.
+        With its targets, and every heliostat that could be read.
+    model : PlantModel
+        The declared model (``twin.json``); a Buie sun with 0.02 if there is none.
     skipped : dict
-        Heliostats and measurements that are there but could not be read, with the reason.
+        Heliostats and measurements that could not be read, with the reason.
+    broken : dict
+        Skipped heliostats whose properties file exists but is wrong: the path and the reason, by
+        heliostat.
     properties : dict
-        The heliostats' property documents, by name, in PAINT's form: the store keeps them.
+        The heliostats' property documents in PAINT's form, by name; the store keeps them.
     """
 
     root: Path
     plant: Plant
-    optics: Optics
-    effects: tuple[Effect, ...]
-    cameras: tuple[Camera, ...]
+    model: PlantModel
     skipped: dict[str, str]
     properties: dict[str, Any] = field(default_factory=dict)
+    broken: dict[str, str] = field(default_factory=dict)
 
     def measurements(self, heliostat: str, with_images: bool = True) -> list[Measurement]:
-        """All measurements of a heliostat by identifier, or only those that have an image.
+        """All measurements of a heliostat by identifier, or only those with an image.
 
-        A file that cannot be read is noted in ``skipped`` with its reason and costs none of the others.
+        A file that cannot be read is added to ``skipped``; the others are still read.
         """
         return [m for m in self.read_measurements(heliostat) if m.images or not with_images]
 
     @abstractmethod
     def read_measurements(self, heliostat: str) -> Iterator[Measurement]:
-        """All measurements of a heliostat by identifier, with the files of their images."""
+        """Iterate over all measurements of a heliostat by identifier, with their image files."""
 
     def measured_surface(self, heliostat: str) -> tuple[Array, int] | None:
-        """Control points (F, I, J, 3) [m] in mirror coordinates and degree of a measured surface, None without one.
+        """Control points (F, I, J, 3) [m] and degree of a measured surface, or None.
 
-        By default they lie where PAINT has them.
+        The points are in mirror coordinates. By default they are read from the paths of PAINT's
+        layout.
         """
         return read_surface(self.root, self.plant.heliostats[heliostat])
 
 
 def read_surface(root: Path, heliostat: Heliostat) -> tuple[Array, int] | None:
-    """Control points (F, I, J, 3) [m] and spline degree from ``root/H/Deflectometry``, None where there are none."""
+    """Control points (F, I, J, 3) [m] and spline degree from ``root/H/Deflectometry``, or None."""
     folder = root / heliostat.name / "Deflectometry"
     spline = folder / f"{heliostat.name}-nurbs-surface.npz"
     if spline.exists():
-        with np.load(require_regular(spline)) as data:
-            if "control_points" not in data:
-                raise InvalidInputError(f"{spline}: 'control_points' is missing")
-            points = np.asarray(data["control_points"], dtype=np.float64)
-            degree = int(data["degrees"][0]) if "degrees" in data else 3
+        data = unpack_untrusted(
+            read_file(spline, _MAX_SPLINE_BYTES), _MAX_SPLINE_BYTES, str(spline)
+        )
+        if "control_points" not in data:
+            raise InvalidInputError(f"{spline}: 'control_points' is missing")
+        points, degree = (
+            np.asarray(data["control_points"], dtype=np.float64),
+            _degree(data.get("degrees")),
+        )
         if points.ndim != 4 or points.shape[-1] != 3 or not np.isfinite(points).all():
             raise InvalidInputError(
-                f"{spline}: 'control_points' must be finite and (facets, i, j, 3), got {points.shape}"
+                f"{spline}: 'control_points' must be finite and (facets, i, j, 3), got"
+                f" {points.shape}"
+            )
+        if not 1 <= degree < min(_MAX_DEGREE + 1, *points.shape[1:3]):
+            raise InvalidInputError(
+                f"{spline}: 'degrees' must be 1 to {_MAX_DEGREE}, and less than there are points"
             )
         return points, degree
     for file in sorted(folder.glob("*deflectometry.h5")):
@@ -90,42 +106,110 @@ def read_surface(root: Path, heliostat: Heliostat) -> tuple[Array, int] | None:
     return None
 
 
+def _degree(given: Array | None) -> int:
+    """Degree of the splines; 3 if it is not given, 0 if it is invalid."""
+    if given is None:
+        return 3
+    first = given.ravel()[:1]
+    return int(first[0]) if first.size and np.isfinite(first[0]) else 0
+
+
 def read_deflectometry(file: Path, heliostat: Heliostat) -> Array:
-    """Heights z (F, 8, 8) [m] fitted to the (n, 3) points and normals of each facet, in mirror coordinates."""
+    """Fit heights z (F, 8, 8) [m] to the deflectometry of each facet.
+
+    The file has points and normals (n, 3) of each facet in mirror coordinates.
+    """
     centers, axes, half_sizes = heliostat.facet_frames
     facets = []
-    with h5py.File(require_regular(file), "r") as data:
-        for index, (center, frame, half_size) in enumerate(zip(centers, axes, half_sizes, strict=True), start=1):
+    with _opened(file) as data:
+        for index, (center, frame, half_size) in enumerate(
+            zip(centers, axes, half_sizes, strict=True), start=1
+        ):
             where = f"{file}, facet{index}"
             points, normals = (
-                np.asarray(get(data, where, f"facet{index}", name), dtype=np.float64).reshape(-1, 3) @ frame.T
+                _vectors(data, where, f"facet{index}", name) @ frame.T
                 for name in ("surface_points", "surface_normals")
             )
             u, v = ((points - frame @ center)[:, :2] / (2 * half_size) + 0.5).T
             inside = (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1) & np.isfinite(normals).all(axis=-1)
             if inside.sum() < 256:
-                raise InvalidInputError(f"{where}: only {inside.sum()} usable points on the facet, 256 are needed")
+                raise InvalidInputError(
+                    f"{where}: only {inside.sum()} usable points on the facet, 256 are needed"
+                )
             facets.append(fit_heights(u[inside], v[inside], normals[inside], half_size))
     return np.array(facets)
 
 
+@contextmanager
+def _opened(file: Path) -> Iterator[h5py.File]:
+    """Open an HDF5 file; InvalidInputError if it is none, or damaged."""
+    try:
+        with h5py.File(require_regular(file), "r") as data:
+            yield data
+    except InvalidInputError:
+        raise
+    except (OSError, KeyError, RuntimeError, ValueError) as error:
+        raise InvalidInputError(f"{file}: no readable HDF5 file ({error})") from None
+
+
+def _vectors(data: h5py.File, where: str, group: str, name: str) -> Array:
+    """Read the vectors (n, 3) of a dataset, after its size and storage are checked.
+
+    Links to other files are rejected before they are followed.
+    """
+    _require_own(data, where, group)
+    _require_own(data[group], where, name)
+    found = data[group][name]
+    if not isinstance(found, h5py.Dataset):
+        raise InvalidInputError(f"{where}: '{name}' must be a dataset")
+    if found.external or found.is_virtual:
+        raise InvalidInputError(
+            f"{where}: the numbers of '{name}' are in another file; copy them into this one"
+        )
+    if found.dtype.kind not in "fiu" or found.shape is None or found.shape[-1:] != (3,):
+        raise InvalidInputError(
+            f"{where}: '{name}' must be numbers of shape (n, 3), got {found.dtype} {found.shape}"
+        )
+    if (
+        max(math.prod(found.shape), math.prod(found.chunks or (0,))) > 3 * _MAX_POINTS
+        or found.dtype.itemsize > 8
+    ):
+        raise InvalidInputError(
+            f"{where}: '{name}' declares the shape {found.shape}; at most {_MAX_POINTS} points are"
+            " read per facet"
+        )
+    return np.asarray(found, dtype=np.float64).reshape(-1, 3)
+
+
+def _require_own(group: h5py.Group, where: str, name: str) -> None:
+    """Raise InvalidInputError if ``name`` is missing, or a link instead of an object."""
+    link = group.get(name, getlink=True) if isinstance(group, h5py.Group) else None
+    if link is None:
+        raise InvalidInputError(f"{where}: '{name}' is missing")
+    if not isinstance(link, h5py.HardLink):
+        raise InvalidInputError(
+            f"{where}: '{name}' is a link; copy what it links to into this file"
+        )
+
+
 def measured_heights(heliostat: Heliostat, surface: tuple[Array, int]) -> Array:
-    """Heights z (F, 8, 8) [m] of a measured surface as `MeasurementFolder.measured_surface` gives it."""
+    """Heights z (F, 8, 8) [m] of a surface from `MeasurementFolder.measured_surface`."""
     return heights(heliostat, surface[0], surface[1])
 
 
 @dataclass(frozen=True)
 class Importer:
-    """Reads the folders of one source.
+    """Reader of one source's folders.
 
     Attributes
     ----------
     recognises : callable
-        Whether a folder is one of them.
+        True if a folder is from this source.
     read : callable
-        The folder, with these heliostats or, for None, all; raises `InvalidInputError` where nothing can be read.
+        Reads a folder with these heliostats, or with all for None; raises `InvalidInputError` if
+        nothing can be read.
     otherwise : str
-        What to say of a folder that it does not recognise.
+        Message for a folder that it does not recognise.
     """
 
     recognises: Callable[[Path], bool]
@@ -134,17 +218,19 @@ class Importer:
 
 
 def read_folder(root: Path, heliostats: list[str] | None = None) -> MeasurementFolder:
-    """Read the plant of a measurement folder by the first importer that recognises it.
+    """Read a measurement folder with the first importer that recognises it.
 
     Raises
     ------
     InvalidInputError
-        Where none does, or no heliostat can be read.
+        If no importer does, or no heliostat can be read.
     """
     if not root.is_dir():
         raise InvalidInputError(f"{root}: no such folder")
-    # Importers build on this module, so they are looked for only now.
-    importers: list[Importer] = [module.IMPORTER for module in modules_of("service.sources.importers")]
+    # Importers depend on this module, so they are imported here.
+    importers: list[Importer] = [
+        module.IMPORTER for module in modules_of("service.sources.importers")
+    ]
     for importer in importers:
         if importer.recognises(root):
             return importer.read(root, heliostats)
@@ -152,10 +238,10 @@ def read_folder(root: Path, heliostats: list[str] | None = None) -> MeasurementF
 
 
 def read_declared(path: Path) -> Declared:
-    """What ``twin.json`` declares; the defaults where there is no such file."""
+    """The declared model of ``twin.json``; the defaults if there is no such file."""
     return parse_declared(declared_json(path), str(path))
 
 
 def declared_json(path: Path) -> Any:
-    """What ``twin.json`` declares; an empty object where there is no such file."""
+    """The JSON content of ``twin.json``; an empty object if there is no such file."""
     return get(read_json(path), str(path), "declared") if path.exists() else {}

@@ -1,14 +1,14 @@
-"""What is known of photographs of the Solar Tower Juelich, which PAINT publishes: marks on targets, sides of crops.
+"""Photographs of the Solar Tower Juelich as PAINT publishes them: marks and crops.
 
-Targets are told apart by their names. Where two share an edge (the tower's upper and lower), T bars stand at the ends
-of that edge and L brackets only at the corners of the pair, so the pair's marks together serve either target. A target
-that is alone has four brackets.
+The name of a target gives its layout of marks. The tower's upper and lower targets share an edge. T
+bars are at the ends of that edge, and L brackets only at the corners of the pair. The marks of the
+pair together locate either target. A separate target has four brackets.
 """
 
 from model.imaging.rectify import BRACKETS, Layout, MarkPlace
 
 CENTERED_WINDOW = 6.1
-"""Side [m] of what PAINT's ``flux-centered`` images show about the centre of mass."""
+"""Side [m] of PAINT's ``flux-centered`` images, which are centered on the centroid."""
 
 _UPPER: Layout = (
     MarkPlace("L", 0, 0, 0),
@@ -20,7 +20,7 @@ _UPPER: Layout = (
     MarkPlace("L", 2, 1, 2),
     MarkPlace("T", 2, 0.5, 2),
 )
-# The lower one has the same marks, one side further up; its own corners come first.
+# The lower target has the same marks, shifted up by one side; its own corners come first.
 _LOWER: Layout = tuple(
     MarkPlace(place.kind, place.quarter, place.x, place.y - 1)
     for place in (*_UPPER[2:4], *_UPPER[5:7], *_UPPER[:2], _UPPER[4], _UPPER[7])
@@ -28,7 +28,10 @@ _LOWER: Layout = tuple(
 
 
 def mark_layouts(target_name: str) -> tuple[Layout, ...]:
-    """The layouts of marks to try for a target, in order; one of a pair is named ``..._upper`` or ``..._lower``."""
+    """Layouts of marks to try for a target, in order.
+
+    The targets of a pair are named ``..._upper`` and ``..._lower``.
+    """
     name = target_name.lower()
     if name.endswith("upper"):
         return _UPPER, BRACKETS

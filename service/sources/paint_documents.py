@@ -1,4 +1,4 @@
-"""PAINT's documents as they are written: what `service.sources.documents` reads, and STAC items beside them."""
+"""Write PAINT's documents, which `service.sources.documents` reads, and STAC items."""
 
 from collections.abc import Iterable, Mapping
 from datetime import datetime
@@ -7,32 +7,69 @@ from typing import Any
 import numpy as np
 
 from model.plant import Cylinder, Plant, TargetPlane
+from model.times import format_time
 from service.sources.photograph import Photograph
 
 STAC_VERSION = "1.1.0"
-"""Of https://github.com/radiantearth/stac-spec; its Item holds ``datetime`` or, for null, a period around it."""
+"""Version of https://github.com/radiantearth/stac-spec.
+
+Its Item has a ``datetime`` or, if that is null, a period.
+"""
 
 CATALOGUE = "catalog.json"
 
+
+def azimuth_from_north(paint_deg: float) -> float:
+    """Convert PAINT's azimuth, from south and positive to the east, to one from north over east.
+
+    Both directions round to 1e-12 degrees, so that a value that is written and read is the same.
+    """
+    return round(180 - paint_deg, 12) % 360
+
+
+def azimuth_from_south(azimuth_deg: float) -> float:
+    """Convert an azimuth from north over east to PAINT's; inverts `azimuth_from_north`."""
+    return round(180 - azimuth_deg, 12)
+
+
 When = datetime | tuple[datetime, datetime]
-"""A moment, or the first and the last that it may be."""
+"""A time, or the first and the last possible time."""
 
 
 def tower_json(plant: Plant, corners: Mapping[str, dict[str, Any] | None]) -> dict[str, Any]:
-    """``tower-measurements.json`` of a plant; ``corners`` are WGS84 corners of targets that are known as they came."""
+    """``tower-measurements.json`` of a plant.
+
+    ``corners`` are the WGS84 corners of targets as they were received, or None.
+    """
     return {
         "power_plant_properties": {"ID": plant.name, "coordinates": plant.origin.tolist()},
-        **{name: _target_json(plane, plant, corners.get(name)) for name, plane in plant.targets.items()},
+        **{
+            name: _target_json(plane, plant, corners.get(name))
+            for name, plane in plant.targets.items()
+        },
         **{name: _receiver_json(cylinder, plant) for name, cylinder in plant.receivers.items()},
     }
 
 
-def _target_json(plane: TargetPlane, plant: Plant, corners: dict[str, Any] | None) -> dict[str, Any]:
+def _target_json(
+    plane: TargetPlane, plant: Plant, corners: dict[str, Any] | None
+) -> dict[str, Any]:
     right, up = plane.right * plane.width / 2, plane.up * plane.height / 2
-    made = {"upper_left": up - right, "upper_right": up + right, "lower_left": -up - right, "lower_right": right - up}
-    places = corners or {name: plant.to_wgs84(plane.center + offset).tolist() for name, offset in made.items()}
+    made = {
+        "upper_left": up - right,
+        "upper_right": up + right,
+        "lower_left": -up - right,
+        "lower_right": right - up,
+    }
+    places = corners or {
+        name: plant.to_wgs84(plane.center + offset).tolist() for name, offset in made.items()
+    }
     center = plant.to_wgs84(plane.center).tolist()
-    return {"type": "planar", "normal_vector": plane.normal.tolist(), "coordinates": {"center": center, **places}}
+    return {
+        "type": "planar",
+        "normal_vector": plane.normal.tolist(),
+        "coordinates": {"center": center, **places},
+    }
 
 
 def _receiver_json(cylinder: Cylinder, plant: Plant) -> dict[str, Any]:
@@ -56,27 +93,36 @@ def measurement_json(photograph: Photograph) -> dict[str, Any]:
     """``calibration-properties.json`` of a photograph."""
     document: dict[str, Any] = {
         "target_name": photograph.target_name,
-        "sun_azimuth": photograph.sun_azimuth_deg,
-        "sun_elevation": photograph.sun_elevation_deg,
+        "sun_azimuth": azimuth_from_south(photograph.sun.azimuth_deg),
+        "sun_elevation": photograph.sun.elevation_deg,
     }
     if photograph.motor_position is not None:
         motors = zip((1, 2), photograph.motor_position, strict=True)
-        document["motor_position"] = {f"axis_{axis}_motor_position": position for axis, position in motors}
+        document["motor_position"] = {
+            f"axis_{axis}_motor_position": position for axis, position in motors
+        }
     used, helios = photograph.focal_spot_wgs84, photograph.helios_spot_wgs84
     spots = {"UTIS": None if used == helios else used, "HeliOS": helios}
     if used is not None:
-        document["focal_spot"] = {method: list(spot) for method, spot in spots.items() if spot is not None}
+        document["focal_spot"] = {
+            method: list(spot) for method, spot in spots.items() if spot is not None
+        }
     weather = vars(photograph.weather)
     return document | {name: value for name, value in weather.items() if value is not None}
 
 
 def stac_item(
-    path: str, identifier: str, when: When, wgs84: Iterable[float], assets: Mapping[str, tuple[str, str]], **more: Any
+    path: str,
+    identifier: str,
+    when: When,
+    wgs84: Iterable[float],
+    assets: Mapping[str, tuple[str, str]],
+    **more: Any,
 ) -> dict[str, Any]:
-    """A STAC item at a place, latitude [deg], longitude [deg], altitude [m], to be written under ``path``.
+    """A STAC item at latitude [deg], longitude [deg], altitude [m], to be written to ``path``.
 
-    ``when`` is its moment or, where that is not known, the first and the last that it may be. ``assets`` are names with
-    files beside the item and their media types, ``more`` its properties.
+    ``when`` is its time, or the first and the last possible time. ``assets`` are names with files
+    next to the item and their media types. ``more`` are its properties.
     """
     latitude, longitude, altitude = wgs84
     root = "../" * path.count("/") + CATALOGUE
@@ -87,29 +133,35 @@ def stac_item(
         "geometry": {"type": "Point", "coordinates": [longitude, latitude, altitude]},
         "bbox": [longitude, latitude, altitude, longitude, latitude, altitude],
         "properties": {**_when_json(when), **more},
-        "links": [{"rel": rel, "href": root, "type": "application/json"} for rel in ("root", "parent")],
-        "assets": {name: {"href": f"./{file}", "type": kind} for name, (file, kind) in assets.items()},
+        "links": [
+            {"rel": rel, "href": root, "type": "application/json"} for rel in ("root", "parent")
+        ],
+        "assets": {
+            name: {"href": f"./{file}", "type": kind} for name, (file, kind) in assets.items()
+        },
     }
 
 
 def _when_json(when: When) -> dict[str, str | None]:
     if isinstance(when, datetime):
-        return {"datetime": _rfc3339(when)}
+        return {"datetime": format_time(when)}
     first, last = when
-    return {"datetime": None, "start_datetime": _rfc3339(first), "end_datetime": _rfc3339(last)}
-
-
-def _rfc3339(moment: datetime) -> str:
-    return moment.isoformat().replace("+00:00", "Z")
+    return {
+        "datetime": None,
+        "start_datetime": format_time(first),
+        "end_datetime": format_time(last),
+    }
 
 
 def stac_catalog(name: str, items: Iterable[str]) -> dict[str, Any]:
-    """A STAC catalogue of items by their paths below it."""
+    """A STAC catalogue of items, given by their paths below it."""
     links = [{"rel": "item", "href": f"./{path}", "type": "application/geo+json"} for path in items]
     return {
         "type": "Catalog",
         "stac_version": STAC_VERSION,
         "id": name,
-        "description": f"Heliostats of {name}: photographs, properties and surfaces, as heliotwin keeps them.",
+        "description": (
+            f"Heliostats of {name}: photographs, properties and surfaces, as heliotwin keeps them."
+        ),
         "links": [{"rel": "root", "href": f"./{CATALOGUE}", "type": "application/json"}, *links],
     }

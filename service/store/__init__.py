@@ -1,11 +1,16 @@
-"""What the service keeps: tables, queries by resource, the queue, images, back-up.
+"""Persistent storage: tables, queries by resource, the job queue, images and back-ups.
 
-`from service import store` has the queries: functions on a SQLAlchemy session, each doing one thing.
+`from service import store` gives the queries: functions on a SQLAlchemy session.
 """
 
-from service.store.measurements import (
+from service.store.photographs.measurements import (
+    add_alias,
     add_measurement,
+    add_position,
+    find_known_image,
+    find_measurement,
     find_measurement_of_image,
+    find_position,
     get_measurement,
     get_measurements,
     list_identifiers,
@@ -13,8 +18,7 @@ from service.store.measurements import (
     recent_measurements,
     use_image,
 )
-from service.store.plant import (
-    add_heliostat,
+from service.store.plant.geometry import (
     find_heliostat,
     find_receiver,
     get_heliostat,
@@ -33,7 +37,7 @@ from service.store.plant import (
     require_same_properties,
     target_plane,
 )
-from service.store.removal import remove_heliostat, remove_receiver, remove_target
+from service.store.plant.removal import remove_heliostat, remove_receiver, remove_target
 from service.store.results import (
     add_forecast,
     add_study,
@@ -47,15 +51,16 @@ from service.store.results import (
     recent_field_forecasts,
     recent_forecasts,
 )
-from service.store.rows import Change, insert, one_at_a_time
-from service.store.surfaces import (
+from service.store.rows import Change, insert, serialize_writers
+from service.store.surfaces.surface_versions import (
     NewSurface,
     Outdated,
     Trust,
     add_surface,
     current_surfaces,
-    find_alike,
+    find_candidate,
     find_measured_surface,
+    find_same_content,
     find_surface_at,
     get_surface,
     get_surface_at,
@@ -69,18 +74,23 @@ __all__ = [
     "NewSurface",
     "Outdated",
     "Trust",
+    "add_alias",
     "add_forecast",
-    "add_heliostat",
     "add_measurement",
+    "add_position",
     "add_study",
     "add_surface",
     "counts",
     "current_surfaces",
-    "find_alike",
+    "find_candidate",
     "find_heliostat",
+    "find_known_image",
     "find_measured_surface",
+    "find_measurement",
     "find_measurement_of_image",
+    "find_position",
     "find_receiver",
+    "find_same_content",
     "find_surface_at",
     "get_forecast",
     "get_heliostat",
@@ -106,7 +116,6 @@ __all__ = [
     "list_surfaces",
     "list_targets",
     "newest_prediction",
-    "one_at_a_time",
     "outdated_surfaces",
     "put_heliostat",
     "put_plant",
@@ -119,6 +128,7 @@ __all__ = [
     "remove_receiver",
     "remove_target",
     "require_same_properties",
+    "serialize_writers",
     "target_plane",
     "use_image",
 ]

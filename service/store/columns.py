@@ -1,4 +1,4 @@
-"""What the columns of all tables share: moments in UTC, JSON, names of constraints."""
+"""Column types that all tables share: UTC times, JSON, and names of constraints."""
 
 from datetime import UTC, datetime
 from typing import Any
@@ -18,22 +18,24 @@ _NAMING = {
 _Json = JSON(none_as_null=True)
 
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
-"""Since when something holds that holds from before anything is known of it."""
+"""Placeholder for an unknown start time."""
 
 
 def one_of(column: str, values: tuple[str, ...]) -> CheckConstraint:
-    """A column holds one of these."""
-    return CheckConstraint(f"{column} IN ({', '.join(repr(value) for value in values)})", name=column)
+    """Constrain a column to these values."""
+    return CheckConstraint(
+        f"{column} IN ({', '.join(repr(value) for value in values)})", name=column
+    )
 
 
 class UtcDateTime(TypeDecorator[datetime]):
-    """A moment in UTC; SQLite keeps no zone, so it is put back on the way out."""
+    """A time in UTC. SQLite stores no time zone, so it is restored when a value is read."""
 
     impl = DateTime(timezone=True)
     cache_ok = True
 
     def process_bind_param(self, value: datetime | None, dialect: Dialect) -> datetime | None:
-        """In UTC; a moment without a zone is a programming error."""
+        """Convert to UTC. A time without a zone is a programming error."""
         if value is None:
             return None
         if value.tzinfo is None:
@@ -41,19 +43,19 @@ class UtcDateTime(TypeDecorator[datetime]):
         return value.astimezone(UTC)
 
     def process_result_value(self, value: datetime | None, dialect: Dialect) -> datetime | None:
-        """With its zone."""
+        """Restore the time zone."""
         if value is None:
             return None
         return value.replace(tzinfo=UTC) if value.tzinfo is None else value.astimezone(UTC)
 
 
 def now() -> datetime:
-    """The present moment in UTC."""
+    """The current time in UTC."""
     return datetime.now(UTC)
 
 
 class Base(DeclarativeBase):
-    """What all tables share: constraint names that migrations can refer to."""
+    """Base class of all tables, with constraint names that migrations can refer to."""
 
     metadata = MetaData(naming_convention=_NAMING)
     type_annotation_map = {  # noqa: RUF012

@@ -1,10 +1,11 @@
-"""The database: connections to SQLite or PostgreSQL, transactions, and the schema's version."""
+"""The database: connections to SQLite or PostgreSQL, transactions, and schema versions."""
 
 import logging
 import sqlite3
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -17,33 +18,40 @@ from sqlalchemy.orm import Session
 
 import migrations
 from model.errors import InvalidInputError
-from service.base.faults import SchemaError, StoreDamagedError
+from service.base.errors import SchemaError, StoreDamagedError
 from service.base.settings import WEB_CONNECTIONS, Settings
 
-# Seconds that a writer waits for another on SQLite, and that a connection to PostgreSQL may take.
+# Seconds that a writer waits for another on SQLite, and that connecting to PostgreSQL may take.
 _PATIENCE_S = 15
 
-# A PostgreSQL server that vanished without a word is given up after about a minute, not after the system's two hours.
-_ALIVE = {"keepalives_idle": 30, "keepalives_interval": 10, "keepalives_count": 3, "tcp_user_timeout": 60_000}
+# Notice after about a minute, not the system's two hours, that PostgreSQL no longer answers.
+_ALIVE = {
+    "keepalives_idle": 30,
+    "keepalives_interval": 10,
+    "keepalives_count": 3,
+    "tcp_user_timeout": 60_000,
+}
 
-# Connections that are kept open; those beyond are closed after use.
+# Connections that stay open. Further connections are closed after use.
 _KEPT_CONNECTIONS = 5
 
-# How often a deed is begun that PostgreSQL ended because it and another waited for each other.
+# How often a transaction is tried that PostgreSQL ended because of a deadlock.
 _ATTEMPTS = 5
 _DEADLOCK = "40P01"
 Done = TypeVar("Done")
 
 logger = logging.getLogger("heliotwin.service")
 
-# Alembic keeps its context in module globals: one migration at a time in a process.
+# Alembic keeps its context in module globals, so a process runs one migration at a time.
 _alembic = threading.Lock()
 
 
 def alembic_config() -> Config:
-    """The Alembic configuration whose scripts are the installed `migrations` package."""
+    """The Alembic configuration for the scripts of the installed `migrations` package."""
     config = Config()
-    config.set_main_option("script_location", str(Path(migrations.__file__).parent).replace("%", "%%"))
+    config.set_main_option(
+        "script_location", str(Path(migrations.__file__).parent).replace("%", "%%")
+    )
     config.set_main_option("path_separator", "os")
     return config
 
@@ -51,20 +59,29 @@ def alembic_config() -> Config:
 def _prepare_sqlite(engine: Engine) -> None:
     @event.listens_for(engine, "connect")
     def _on_connect(connection: Any, _record: Any) -> None:
-        connection.isolation_level = None  # SQLAlchemy's "begin" below starts transactions, not the driver
-        for pragma in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON", f"busy_timeout={_PATIENCE_S * 1000}"):
+        # SQLAlchemy's "begin" below starts transactions, not the driver.
+        connection.isolation_level = None
+        for pragma in (
+            "journal_mode=WAL",
+            "synchronous=FULL",
+            "foreign_keys=ON",
+            f"busy_timeout={_PATIENCE_S * 1000}",
+        ):
             connection.execute(f"PRAGMA {pragma}")
 
     @event.listens_for(engine, "begin")
     def _on_begin(connection: Connection) -> None:
-        # A deferred transaction that reads and then writes fails at once when another wrote in between; one that
-        # will write therefore takes the lock first and waits its turn.
+        # A deferred transaction that reads and then writes fails at once if another one wrote in
+        # between. A transaction that will write therefore takes the lock first.
         writes = connection.get_execution_options().get("writes", False)
         connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
 
 
 def make_engine(url: URL, connections: int = WEB_CONNECTIONS) -> Engine:
-    """A pool of ``connections`` for ``url``; SQLite with write-ahead log, durable commits and foreign keys."""
+    """Create an engine with a pool of ``connections`` for ``url``.
+
+    SQLite gets a write-ahead log, durable commits and foreign keys.
+    """
     kept = min(_KEPT_CONNECTIONS, connections)
     pool = {"pool_size": kept, "max_overflow": connections - kept, "pool_timeout": _PATIENCE_S}
     if url.get_backend_name() != "sqlite":
@@ -78,21 +95,22 @@ def make_engine(url: URL, connections: int = WEB_CONNECTIONS) -> Engine:
 
 
 def is_deadlock(error: BaseException) -> bool:
-    """Whether PostgreSQL ended a transaction that waited for another, and that for it; begun again it may pass."""
+    """Whether PostgreSQL ended a transaction because of a deadlock, so that a retry may succeed."""
     return isinstance(error, DBAPIError) and getattr(error.orig, "sqlstate", None) == _DEADLOCK
 
 
 def _damage(error: DBAPIError) -> str | None:
-    """What SQLite says of its file where that is none of its own any more."""
-    code = getattr(error.orig, "sqlite_errorcode", 0) & 0xFF  # the lowest byte is the kind, the others say more of it
+    """SQLite's message if the error means that its file is damaged, else None."""
+    # The lowest byte is the primary code; the others give details.
+    code = getattr(error.orig, "sqlite_errorcode", 0) & 0xFF
     return str(error.orig) if code in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB) else None
 
 
 class Database:
     """A connection pool and its transactions.
 
-    Use ``with database.reading() as session`` to look and ``with database.writing() as session`` to change; the
-    latter commits at the end of its block, or rolls back when the block raises.
+    Use ``with database.reading() as session`` to read and ``with database.writing() as session`` to
+    write. The latter commits at the end of its block, or rolls back if the block raises.
     """
 
     def __init__(self, url: URL, connections: int = WEB_CONNECTIONS) -> None:
@@ -102,36 +120,39 @@ class Database:
 
     @contextmanager
     def reading(self) -> Iterator[Session]:
-        """A session that is rolled back at the end."""
+        """Open a session that is rolled back at the end."""
         with Session(self.engine, expire_on_commit=False) as session:
             yield session
 
     @contextmanager
     def writing(self) -> Iterator[Session]:
-        """A session in one transaction; on SQLite it holds the only write lock, so compute before entering."""
+        """Open a session in one transaction.
+
+        On SQLite it holds the only write lock, so finish computations before entering.
+        """
         with Session(self._writer, expire_on_commit=False) as session, session.begin():
             yield session
 
-    def written(self, deed: Callable[[Session], Done]) -> Done:
-        """Do ``deed`` in a session of `writing`, and again where that was ended as a deadlock; what it returns."""
+    def run_in_transaction(self, fn: Callable[[Session], Done]) -> Done:
+        """Return the function's result in a session of `writing`; retry it after a deadlock."""
         for _ in range(_ATTEMPTS - 1):
             try:
                 with self.writing() as session:
-                    return deed(session)
+                    return fn(session)
             except OperationalError as error:
                 if not is_deadlock(error):
                     raise
                 logger.info("a write and another waited for each other; it is begun again")
         with self.writing() as session:
-            return deed(session)
+            return fn(session)
 
     def upgrade(self, revision: str = "head") -> None:
-        """Bring the schema up to ``revision``."""
+        """Upgrade the schema to ``revision``."""
         with self._migrating() as config:
             command.upgrade(config, revision)
 
     def downgrade(self, revision: str) -> None:
-        """Take the schema down to ``revision`` ("base" for nothing)."""
+        """Downgrade the schema to ``revision`` ("base" for an empty database)."""
         with self._migrating() as config:
             command.downgrade(config, revision)
 
@@ -143,12 +164,12 @@ class Database:
             yield config
 
     def ping(self) -> None:
-        """Ask the database for an answer; raises SQLAlchemy's error where there is none.
+        """Test whether the database answers. Raises SQLAlchemy's error if it does not.
 
         Raises
         ------
         StoreDamagedError
-            Where SQLite's file is damaged at the head of a table. Deeper down `heliotwin check` looks.
+            If SQLite's file is damaged at the start of a table. `heliotwin check` reads all of it.
         """
         with self.telling_damage():
             with self.engine.connect() as connection:
@@ -157,14 +178,15 @@ class Database:
                 self._look_at_file()
 
     def _look_at_file(self) -> None:
-        fresh = create_engine(self.url, poolclass=NullPool)  # the pool's would answer out of their memory of the file
+        # Pooled connections would answer from their cached pages.
+        fresh = create_engine(self.url, poolclass=NullPool)
         with fresh.connect() as connection:
             for name in inspect(connection).get_table_names():
                 connection.execute(text(f'SELECT 1 FROM "{name}" NOT INDEXED LIMIT 1'))
 
     @contextmanager
     def telling_damage(self) -> Iterator[None]:
-        """Say in one line, as `StoreDamagedError`, where SQLite's file proves damaged inside the block."""
+        """Convert errors from a damaged SQLite file to `StoreDamagedError` inside the block."""
         try:
             yield
         except DBAPIError as error:
@@ -175,28 +197,34 @@ class Database:
             ) from error
 
     def revision(self) -> str | None:
-        """The schema's present version."""
-        # Alembic's own question writes two lines to the log, and readiness is asked for every few seconds.
+        """The current version of the schema, or None."""
+        # Alembic's function writes two lines to the log, and readiness probes come every few
+        # seconds.
         with self.engine.connect() as connection:
             if not inspect(connection).has_table("alembic_version"):
                 return None
-            found: str | None = connection.execute(text("SELECT version_num FROM alembic_version")).scalar_one_or_none()
-            return found
+            revision: str | None = connection.execute(
+                text("SELECT version_num FROM alembic_version")
+            ).scalar_one_or_none()
+            return revision
 
     def revisions(self) -> list[str]:
-        """All versions of the schema that this code knows, the oldest first."""
-        return [script.revision for script in ScriptDirectory.from_config(alembic_config()).walk_revisions()][::-1]
+        """All schema versions that this code knows, oldest first."""
+        return [
+            script.revision
+            for script in ScriptDirectory.from_config(alembic_config()).walk_revisions()
+        ][::-1]
 
     def is_current(self) -> bool:
         """Whether the schema is at the newest version that this code knows."""
-        return self.revision() == ScriptDirectory.from_config(alembic_config()).get_current_head()
+        return self.revision() == _newest_revision()
 
     def require_current(self) -> None:
         """Raise `SchemaError` unless the schema is at the newest version that this code knows."""
         if not self.is_current():
             raise SchemaError(
-                f"the store's schema is at {self.revision()}, this version works with {self.revisions()[-1]}: run "
-                "`heliotwin migrate`, or the version that fits"
+                f"the store's schema is at {self.revision()}, this version works with"
+                f" {self.revisions()[-1]}: run `heliotwin migrate`, or the version that fits"
             )
         logger.info("the store's schema is at %s, its newest version", self.revisions()[-1])
 
@@ -205,13 +233,32 @@ class Database:
         self.engine.dispose()
 
 
+@cache
+def _newest_revision() -> str | None:
+    """Return the newest schema version that this code knows.
+
+    Cached, because Alembic reads all its scripts to find it.
+    """
+    return ScriptDirectory.from_config(alembic_config()).get_current_head()
+
+
+def require_store(settings: Settings) -> None:
+    """Raise `InvalidInputError` if the embedded database does not exist, without creating it."""
+    file = settings.database.database
+    if settings.database.get_backend_name() == "sqlite" and not (file and Path(file).is_file()):
+        raise InvalidInputError(
+            f"{file}: there is no store; `heliotwin import` or `heliotwin serve` makes one, or set"
+            " HELIOTWIN_DATA_DIR or HELIOTWIN_DATABASE_URL to where it is"
+        )
+
+
 def migrate(settings: Settings, to: str = "head") -> str:
-    """Bring the store's schema to its newest version, or back to an older one, and return that version.
+    """Migrate the schema to version ``to``, newer or older, and return the resulting version.
 
     Raises
     ------
     InvalidInputError
-        Where this version knows no such revision.
+        If this code knows no such version.
     """
     database = Database(settings.database)
     try:

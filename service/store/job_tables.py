@@ -1,9 +1,9 @@
-"""The tables of work and of who asks for it: jobs and their steps, keys, acknowledgements, the audit trail."""
+"""Tables of jobs, their steps, API keys, sessions, acknowledgements and the audit trail."""
 
 from datetime import datetime
 from typing import Any, get_args
 
-from sqlalchemy import ForeignKey, Index, LargeBinary, String, UniqueConstraint
+from sqlalchemy import ForeignKey, Index, LargeBinary, String, UniqueConstraint, false, text
 from sqlalchemy.orm import Mapped, mapped_column
 
 from service.base.choices import RoleName
@@ -14,16 +14,23 @@ ROLES: tuple[str, ...] = get_args(RoleName)
 
 
 class JobRow(Base):
-    """A piece of work that outlives the request that asked for it; `service.store.queue` says how it changes.
+    """A background job; see `service.store.jobs.queue` for its states.
 
-    ``lease_token`` names the one worker that may write to it until ``lease_until``; ``revision`` counts what a watcher
-    may see of it; npz ``arrays`` is the part of the result that is no JSON.
+    - ``lease_token`` identifies the one worker that may write to the job until ``lease_until``.
+    - ``revision`` counts visible changes.
+    - ``arrays`` is the npz part of the result.
+    - ``is_short`` jobs are expected to take seconds.
+    - ``attempted_at`` is the start of the newest attempt.
+    - ``attempts_before_progress`` counts the attempts before the one that last completed a step.
+    - ``n_done`` of ``n_total`` units of the current ``phase`` are done.
+    - ``remaining_s`` is the expected time to the end.
     """
 
     __tablename__ = "jobs"
     __table_args__ = (
         UniqueConstraint("created_by", "idempotency_key"),
         Index(None, "state", "not_before"),
+        Index(None, "created_by", "attempted_at"),
         one_of("state", STATES),
     )
 
@@ -37,10 +44,17 @@ class JobRow(Base):
     not_before: Mapped[datetime] = mapped_column(default=now)
     started_at: Mapped[datetime | None]
     finished_at: Mapped[datetime | None]
+    attempted_at: Mapped[datetime | None]
     attempts: Mapped[int] = mapped_column(default=0)
+    attempts_before_progress: Mapped[int] = mapped_column(default=0, server_default="0")
+    is_short: Mapped[bool] = mapped_column(default=False, server_default=false())
     cancel_requested: Mapped[bool] = mapped_column(default=False)
     progress: Mapped[float] = mapped_column(default=0.0)
     message: Mapped[str] = mapped_column(String(200), default="")
+    phase: Mapped[str] = mapped_column(String(100), default="", server_default=text("''"))
+    n_done: Mapped[int | None]
+    n_total: Mapped[int | None]
+    remaining_s: Mapped[float | None]
     revision: Mapped[int] = mapped_column(default=1)
     worker: Mapped[str | None] = mapped_column(String(96))
     lease_token: Mapped[str | None] = mapped_column(String(32))
@@ -51,17 +65,24 @@ class JobRow(Base):
 
 
 class JobStepRow(Base):
-    """A part of a job that is done for good: stored in one transaction with what it did, never done again."""
+    """A completed step of a job, stored with its effects and never repeated.
+
+    Both are stored in one transaction. ``arrays`` is the npz part of its result.
+    """
 
     __tablename__ = "job_steps"
 
     job_id: Mapped[int] = mapped_column(ForeignKey("jobs.id"), primary_key=True)
     name: Mapped[str] = mapped_column(String(96), primary_key=True)
     result: Mapped[dict[str, Any]]
+    arrays: Mapped[bytes | None] = mapped_column(LargeBinary, deferred=True)
 
 
 class KeyRow(Base):
-    """An API key by its hash; a withdrawn one stays, so that its name keeps its meaning in the audit trail."""
+    """An API key by its hash.
+
+    A withdrawn key remains, so that its name stays unambiguous in the audit trail.
+    """
 
     __tablename__ = "api_keys"
     __table_args__ = (one_of("role", ROLES),)
@@ -75,10 +96,22 @@ class KeyRow(Base):
     withdrawn_at: Mapped[datetime | None]
 
 
-class AcknowledgementRow(Base):
-    """That somebody has seen what needed attention, of a heliostat or of the plant (`service.twin.attention`).
+class SessionRow(Base):
+    """A browser session by the hash of its token. The row is deleted when the session ends."""
 
-    It holds while the same thing, by its ``mark``, is the reason.
+    __tablename__ = "sessions"
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    key_id: Mapped[int] = mapped_column(ForeignKey("api_keys.id"), index=True)
+    sha256: Mapped[str] = mapped_column(String(64), unique=True)
+    created_at: Mapped[datetime] = mapped_column(default=now)
+    expires_at: Mapped[datetime]
+
+
+class AcknowledgementRow(Base):
+    """An acknowledged alert of a heliostat or of the plant (`service.twin.alerts.alerts`).
+
+    It applies while the alert's fingerprint equals ``fingerprint``.
     """
 
     __tablename__ = "acknowledgements"
@@ -86,18 +119,21 @@ class AcknowledgementRow(Base):
     id: Mapped[int] = mapped_column(primary_key=True)
     heliostat_id: Mapped[int | None] = mapped_column(ForeignKey("heliostats.id"), index=True)
     reason: Mapped[str] = mapped_column(String(32))
-    mark: Mapped[str] = mapped_column(String(96))
+    fingerprint: Mapped[str] = mapped_column(String(96))
     made_at: Mapped[datetime] = mapped_column(default=now)
     made_by: Mapped[str] = mapped_column(String(64))
 
 
 class AuditRow(Base):
-    """Who did what when; rows are only ever added, and go when they are old (`service.store.retention`)."""
+    """An entry of the audit trail: who did what, and when.
+
+    Rows never change. Old ones are deleted (`service.store.record_retention`).
+    """
 
     __tablename__ = "audit"
 
     id: Mapped[int] = mapped_column(primary_key=True)
-    at: Mapped[datetime] = mapped_column(default=now)
+    created_at: Mapped[datetime] = mapped_column(default=now)
     actor: Mapped[str] = mapped_column(String(64))
     action: Mapped[str] = mapped_column(String(64))
     subject: Mapped[str] = mapped_column(String(128))

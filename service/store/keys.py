@@ -1,8 +1,8 @@
-"""API keys: made once, kept as a hash, withdrawn for good.
+"""API keys: shown once, stored as a hash, withdrawn permanently.
 
-A key is ``htw_PREFIX_SECRET``. The secret is 256 random bits, so nobody can guess it or find it by trying hashes: a
-plain SHA-256 is as safe as it is long, and the slow, salted hashes that passwords need would only slow every request.
-The prefix is no secret; it finds the row, and tells people in lists and logs which key is meant.
+A key is ``htw_PREFIX_SECRET``. The secret has 256 random bits, so nobody can guess it. A plain
+SHA-256 is therefore safe, and the slow, salted hashes that passwords need would only slow down
+requests. The prefix is not secret: it finds the row, and identifies the key in lists and logs.
 """
 
 import hashlib
@@ -16,17 +16,20 @@ from sqlalchemy.orm import Session
 
 from model.errors import InvalidInputError
 from service.base import names
-from service.base.faults import ConflictError, NotFoundError
-from service.store import audit
+from service.base.errors import ConflictError, NotFoundError
+from service.store import audit, sessions
 from service.store.columns import now
 from service.store.job_tables import ROLES, KeyRow
 from service.store.rows import insert
 
 RESERVED = "local"
-"""Who acts where no key is demanded; no key may bear this name."""
+"""The actor if no key is required. No key may have this name."""
 
 ITSELF = "the service"
-"""Who acts where nobody asked; no key can bear this name, which holds a space, and so none can take its job's key."""
+"""The actor of the service's automatic actions.
+
+No key can have this name, because it contains a space. So no key can use its idempotency keys.
+"""
 
 _KEY = re.compile(r"htw_([0-9a-f]{12})_([A-Za-z0-9_-]{43})")
 
@@ -36,18 +39,20 @@ def _sha256(key: str) -> str:
 
 
 def create(session: Session, name: str, role: str, actor: str) -> str:
-    """Make a key and return it; it is shown here once and cannot be read back.
+    """Create a key and return it. It cannot be read again later.
 
     Raises
     ------
     InvalidInputError
-        For a bad name or an unknown role.
+        For an invalid name or an unknown role.
     ConflictError
-        Where the name was given before, even to a key that is withdrawn.
+        If a key has or had this name, even if it is withdrawn.
     """
-    names.require(names.NAME, name, "key")
+    names.require_name(names.NAME, name, "key")
     if name == RESERVED:
-        raise InvalidInputError(f"key {name!r}: this name stands for access without a key; choose another")
+        raise InvalidInputError(
+            f"key {name!r}: this name is reserved for access without a key; choose another"
+        )
     if role not in ROLES:
         raise InvalidInputError(f"role {role!r}: must be one of {', '.join(ROLES)}")
     prefix = secrets.token_hex(6)
@@ -59,35 +64,50 @@ def create(session: Session, name: str, role: str, actor: str) -> str:
 
 
 def withdraw(session: Session, name: str, actor: str) -> None:
-    """Make a key useless from now on; NotFoundError where there is none, or it is withdrawn already."""
-    row = session.scalar(select(KeyRow).where(KeyRow.name == name, KeyRow.withdrawn_at.is_(None)).with_for_update())
+    """Withdraw a key and end its sessions.
+
+    Raises
+    ------
+    NotFoundError
+        If there is no such key, or it is already withdrawn.
+    """
+    row = session.scalar(
+        select(KeyRow).where(KeyRow.name == name, KeyRow.withdrawn_at.is_(None)).with_for_update()
+    )
     if row is None:
         raise NotFoundError(f"there is no key {name}, or it is withdrawn already")
     row.withdrawn_at = now()
+    sessions.end_all(session, row)
     audit.record(session, actor, "key.withdrawn", f"key {name}")
 
 
 def list_keys(session: Session) -> Sequence[KeyRow]:
-    """All keys in the order they were made, withdrawn ones too."""
+    """All keys in the order of their creation, including withdrawn ones."""
     return session.scalars(select(KeyRow).order_by(KeyRow.id)).all()
 
 
 def find(session: Session, presented: str) -> KeyRow | None:
-    """The key that was presented, unless it is malformed, unknown or withdrawn."""
+    """The row of a presented key; None if the key is malformed, unknown or withdrawn."""
     match = _KEY.fullmatch(presented)
     if match is None:
         return None
-    row = session.scalar(select(KeyRow).where(KeyRow.prefix == match[1], KeyRow.withdrawn_at.is_(None)))
+    row = session.scalar(
+        select(KeyRow).where(KeyRow.prefix == match[1], KeyRow.withdrawn_at.is_(None))
+    )
     if row is None or not hmac.compare_digest(row.sha256, _sha256(presented)):
         return None
     return row
 
 
 def any_made(session: Session) -> bool:
-    """Whether a key was ever made: from then on nobody comes in without one, even when all are withdrawn."""
+    """Whether a key was ever created. From then on every request needs one, even if all are
+    withdrawn.
+    """
     return session.scalar(select(KeyRow.id).limit(1)) is not None
 
 
 def any_valid(session: Session) -> bool:
-    """Whether there is a key that opens something."""
-    return session.scalar(select(KeyRow.id).where(KeyRow.withdrawn_at.is_(None)).limit(1)) is not None
+    """Whether there is a valid key."""
+    return (
+        session.scalar(select(KeyRow.id).where(KeyRow.withdrawn_at.is_(None)).limit(1)) is not None
+    )

@@ -1,23 +1,51 @@
-"""Rows as documents, and documents as rows: every column but keys and bytes, each checked by its type on the way in."""
+"""Conversion of rows to documents: all columns except keys and bytes, with checked types."""
 
 from datetime import datetime
-from types import GenericAlias, UnionType
-from typing import Any, get_args, get_type_hints
+from types import GenericAlias, NoneType, UnionType
+from typing import Annotated, Any, get_args, get_type_hints
 
-from pydantic import AwareDatetime, ConfigDict, create_model
-from sqlalchemy import LargeBinary, inspect
+from pydantic import AliasChoices, ConfigDict, FailFast, Field, create_model
+from sqlalchemy import ColumnElement, LargeBinary, String, inspect
 
+from service.base.fields import Moment
 from service.store.columns import Base
+from service.store.tables import CorrectionRow, DecisionRow, StudyRow, SurfaceRow
+
+FORMER_NAMES: dict[tuple[type[Base], str], str] = {
+    (SurfaceRow, "is_candidate"): "set_aside",
+    (SurfaceRow, "warnings"): "doubts",
+    (SurfaceRow, "warned_since"): "doubted_since",
+    (SurfaceRow, "mahalanobis_distance"): "strangeness",
+    (SurfaceRow, "acknowledged_at"): "seen_at",
+    (SurfaceRow, "acknowledged_by"): "seen_by",
+    (DecisionRow, "became_active"): "taken",
+    (DecisionRow, "candidates_before"): "set_aside_before",
+    (DecisionRow, "created_at"): "made_at",
+    (DecisionRow, "created_by"): "made_by",
+    (CorrectionRow, "created_at"): "made_at",
+    (CorrectionRow, "created_by"): "made_by",
+    (StudyRow, "first_taken_at"): "taken_from",
+    (StudyRow, "last_taken_at"): "taken_to",
+}
+"""Names of columns in documents of versions before migration 0020, which are still read."""
 
 
 def record(table: type[Base], without: tuple[str, ...] = (), **more: Any) -> Any:
-    """The documents of a table's rows, a pydantic model: `read` makes one of a row, its ``model_dump`` the columns.
+    """Create the pydantic model for the documents of a table's rows.
 
-    ``without`` are columns that it leaves out, beside arrays, keys that only this database knows, and what it works
-    out; ``more`` are fields that it has beside them, each its type and default as `pydantic.create_model` takes them.
+    `read` makes a document from a row; ``model_dump`` gives the columns.
+
+    Parameters
+    ----------
+    table
+        The table. Arrays, keys that only this database knows, and computed columns are left out.
+    without
+        Further columns to leave out.
+    more
+        Additional fields, each a type and a default as in `pydantic.create_model`.
     """
-    hints: dict[str, Any] = get_type_hints(table)
-    fields: dict[str, Any] = {}
+    hints: dict[str, object] = get_type_hints(table)
+    fields: dict[str, object] = {}
     for column in inspect(table).columns:
         is_key = column.key == "id" or any(key.column.name == "id" for key in column.foreign_keys)
         if (
@@ -27,23 +55,35 @@ def record(table: type[Base], without: tuple[str, ...] = (), **more: Any) -> Any
             and not isinstance(column.type, LargeBinary)
         ):
             (kind,) = get_args(hints[column.key])
-            fields[column.key] = (_aware(kind), None if column.nullable else ...)
-    return create_model(table.__name__, __config__=ConfigDict(extra="forbid"), **{**fields, **more})
+            names = AliasChoices(column.key, FORMER_NAMES.get((table, column.key), column.key))
+            default = None if column.nullable else ...
+            fields[column.key] = (_bounded(kind, column), Field(default, validation_alias=names))
+    config = ConfigDict(extra="forbid", allow_inf_nan=False)
+    return create_model(table.__name__, __config__=config, **{**fields, **more})
 
 
 def many(document: Any) -> Any:
-    """The type of a list of documents."""
-    return GenericAlias(list, document)
+    """Return the type of a list of documents; validation ends at the first that is wrong, for a
+    list may be long.
+    """
+    return Annotated[GenericAlias(list, document), FailFast()]
 
 
-def _aware(kind: Any) -> Any:
-    """Moments have a zone, as columns demand."""
+def _bounded(kind: Any, column: ColumnElement[Any]) -> Any:
+    """A column's type with the database's limits: time zones, text lengths, integer ranges."""
+    if isinstance(kind, UnionType):
+        (inner,) = set(get_args(kind)) - {NoneType}
+        return _bounded(inner, column) | None
     if kind is datetime:
-        return AwareDatetime
-    return AwareDatetime | None if isinstance(kind, UnionType) and datetime in get_args(kind) else kind
+        return Moment
+    if kind is int:
+        return Annotated[int, Field(ge=-(2**31), lt=2**31)]
+    if kind is str and isinstance(column.type, String) and column.type.length:
+        return Annotated[str, Field(max_length=column.type.length)]
+    return kind
 
 
 def read(document: Any, row: Base, **more: Any) -> Any:
-    """The document of a row, with what it has ``more``."""
+    """The document of a row, with ``more`` fields."""
     columns = {name: getattr(row, name) for name in document.model_fields if name not in more}
     return document.model_validate({**columns, **more})

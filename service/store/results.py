@@ -1,4 +1,4 @@
-"""Forecasts and studies, as they are kept and found again, and how many of everything there are."""
+"""Storage of forecasts and studies, and row counts."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,23 +8,42 @@ from typing import cast
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session, joinedload, lazyload, load_only, undefer
 
-from service.base.faults import NotFoundError
+from service.base.errors import NotFoundError
 from service.store.columns import Base
 from service.store.job_tables import JobRow
-from service.store.queue import KEPT
-from service.store.rows import hold
-from service.store.tables import ForecastRow, HeliostatRow, ImageRow, MeasurementRow, StudyRow, SurfaceRow, TargetRow
+from service.store.jobs.queue import KEPT
+from service.store.listing import NEWEST_FIRST, Order, Period, select_after
+from service.store.plant.geometry import get_target
+from service.store.rows import lock_row
+from service.store.tables import (
+    ForecastRow,
+    HeliostatRow,
+    ImageRow,
+    MeasurementRow,
+    StudyRow,
+    SurfaceRow,
+    TargetRow,
+)
 
-# What a forecast tells of its heliostat and surface is a name and a number; the rest would be megabytes in a list.
+# A list of forecasts needs only the heliostat's name and the surface's version. Full rows would be
+# megabytes.
 _NAMES = (
     joinedload(ForecastRow.heliostat, innerjoin=True).load_only(HeliostatRow.name),
-    joinedload(ForecastRow.surface).options(load_only(SurfaceRow.version), lazyload(SurfaceRow.measurements)),
+    joinedload(ForecastRow.surface).options(
+        load_only(SurfaceRow.version), lazyload(SurfaceRow.measurements)
+    ),
 )
 
 
 def add_forecast(session: Session, row: ForecastRow) -> ForecastRow:
-    """Store a forecast; NotFoundError where its heliostat was deleted since it was read."""
-    hold(session, HeliostatRow, row.heliostat_id, "its heliostat")
+    """Store a forecast.
+
+    Raises
+    ------
+    NotFoundError
+        If its heliostat was deleted since it was read.
+    """
+    lock_row(session, HeliostatRow, row.heliostat_id, "its heliostat")
     session.add(row)
     session.flush()
     session.refresh(row, ["heliostat", "surface"])
@@ -32,9 +51,11 @@ def add_forecast(session: Session, row: ForecastRow) -> ForecastRow:
 
 
 def get_forecast(session: Session, number: int) -> ForecastRow:
-    """A forecast with its flux; NotFoundError where there is none."""
+    """A forecast with its flux; NotFoundError if there is none."""
     row = session.scalar(
-        select(ForecastRow).where(ForecastRow.id == number).options(undefer(ForecastRow.flux), *_NAMES)
+        select(ForecastRow)
+        .where(ForecastRow.id == number)
+        .options(undefer(ForecastRow.flux), *_NAMES)
     )
     if row is None:
         raise NotFoundError(f"there is no forecast {number}")
@@ -42,23 +63,41 @@ def get_forecast(session: Session, number: int) -> ForecastRow:
 
 
 def list_forecasts(
-    session: Session, limit: int, after: int | None = None, heliostat: HeliostatRow | None = None
+    session: Session,
+    limit: int,
+    after: int | None = None,
+    heliostat: HeliostatRow | None = None,
+    *,
+    target: str | None = None,
+    created: Period = Period(),
+    order: Order = Order(),
 ) -> Sequence[ForecastRow]:
-    """Up to ``limit`` forecasts in the order they were made, those after number ``after``."""
-    query = select(ForecastRow).options(*_NAMES).order_by(ForecastRow.id).limit(limit)
+    """Up to ``limit`` forecasts after number ``after``, in order of creation or in another
+    ``order``.
+    """
+    query = (
+        select(ForecastRow)
+        .options(*_NAMES)
+        .where(*created.conditions(ForecastRow.created_at))
+        .limit(limit)
+    )
     if heliostat is not None:
         query = query.where(ForecastRow.heliostat_id == heliostat.id)
-    return session.scalars(query.where(ForecastRow.id > after) if after else query).all()
+    if target is not None:
+        query = query.where(ForecastRow.target_name == get_target(session, target).name)
+    return session.scalars(select_after(session, query, ForecastRow, order, after)).all()
 
 
 def recent_forecasts(session: Session, limit: int) -> Sequence[ForecastRow]:
-    """The newest ``limit`` forecasts, the newest first."""
-    return session.scalars(select(ForecastRow).options(*_NAMES).order_by(ForecastRow.id.desc()).limit(limit)).all()
+    """The newest ``limit`` forecasts, newest first."""
+    return session.scalars(
+        select(ForecastRow).options(*_NAMES).order_by(ForecastRow.id.desc()).limit(limit)
+    ).all()
 
 
 @dataclass(frozen=True)
 class FieldForecast:
-    """A forecast of many heliostats in short: a job's, without its map."""
+    """Summary of a forecast of many heliostats: its job, without the flux map."""
 
     job: int
     created_at: datetime
@@ -70,7 +109,10 @@ class FieldForecast:
 
 
 def recent_field_forecasts(session: Session, limit: int) -> list[FieldForecast]:
-    """The newest ``limit`` forecasts of many heliostats, the newest first; the database picks them out of results."""
+    """The newest ``limit`` forecasts of many heliostats, newest first.
+
+    The database extracts the values from the JSON results.
+    """
     result, payload = JobRow.result, JobRow.payload
     query = select(
         JobRow.id,
@@ -81,17 +123,20 @@ def recent_field_forecasts(session: Session, limit: int) -> list[FieldForecast]:
         result["sun"]["elevation_deg"].as_float(),
         result["peak_w_m2"].as_float(),
     ).where(JobRow.kind == "forecasts", JobRow.state == "done")
-    return [FieldForecast(*row) for row in session.execute(query.order_by(JobRow.id.desc()).limit(limit))]
+    return [
+        FieldForecast(*row)
+        for row in session.execute(query.order_by(JobRow.id.desc()).limit(limit))
+    ]
 
 
 @dataclass(frozen=True)
 class Plan:
-    """A plan in short: a job's, without its series."""
+    """Summary of a plan: its job, without the time series."""
 
     job: int
     name: str
     target: str | None
-    begin: str
+    first_at: str
     state: str
     peak_w_m2: float | None
     created_at: datetime
@@ -99,13 +144,15 @@ class Plan:
 
 
 def list_plans(session: Session, limit: int, after: int | None = None) -> list[Plan]:
-    """Up to ``limit`` plans, the newest first, those before the job ``after``; not what was deleted or cancelled."""
+    """Up to ``limit`` plans before the job ``after``, newest first, without deleted or cancelled
+    ones.
+    """
     payload = JobRow.payload
     query = select(
         JobRow.id,
         payload["name"].as_string(),
         payload["target"].as_string(),
-        payload["begin"].as_string(),
+        payload["first_at"].as_string(),
         JobRow.state,
         JobRow.result["peak_w_m2"].as_float(),
         JobRow.created_at,
@@ -124,8 +171,12 @@ def add_study(session: Session, row: StudyRow) -> StudyRow:
 
 
 def get_study(session: Session, number: int, page: bool = False) -> StudyRow:
-    """A study with its report, and its ``page`` where wanted; NotFoundError where there is none."""
-    columns = [undefer(StudyRow.report), undefer(StudyRow.skipped), *([undefer(StudyRow.html)] if page else [])]
+    """A study with its report, and its HTML if ``page``; NotFoundError if there is none."""
+    columns = [
+        undefer(StudyRow.report),
+        undefer(StudyRow.skipped),
+        *([undefer(StudyRow.html)] if page else []),
+    ]
     row = session.scalar(select(StudyRow).where(StudyRow.id == number).options(*columns))
     if row is None:
         raise NotFoundError(f"there is no study {number}")
@@ -133,15 +184,25 @@ def get_study(session: Session, number: int, page: bool = False) -> StudyRow:
 
 
 def has_study_page(session: Session, number: int) -> bool:
-    """Whether a study came with a page, told without its megabytes."""
+    """Whether a study has an HTML page, without loading it."""
     query = select(StudyRow.id).where(StudyRow.id == number, StudyRow.html.is_not(None))
     return session.scalar(query) is not None
 
 
-def list_studies(session: Session, limit: int, after: int | None = None) -> Sequence[StudyRow]:
-    """Up to ``limit`` studies without their reports, newest first, those older than study ``after``."""
-    query = select(StudyRow).order_by(StudyRow.id.desc()).limit(limit)
-    return session.scalars(query.where(StudyRow.id < after) if after else query).all()
+def list_studies(
+    session: Session,
+    limit: int,
+    after: int | None = None,
+    *,
+    verdict: str | None = None,
+    created: Period = Period(),
+    order: Order = NEWEST_FIRST,
+) -> Sequence[StudyRow]:
+    """Up to ``limit`` studies after study ``after``, without reports, newest first by default."""
+    query = select(StudyRow).where(*created.conditions(StudyRow.created_at)).limit(limit)
+    if verdict is not None:
+        query = query.where(StudyRow.verdict == verdict)
+    return session.scalars(select_after(session, query, StudyRow, order, after)).all()
 
 
 _COUNTED: dict[str, type[Base]] = {
@@ -155,7 +216,8 @@ _COUNTED: dict[str, type[Base]] = {
 
 
 def counts(session: Session) -> dict[str, int]:
-    """How many of each there are."""
+    """The number of rows of the main tables."""
     return {
-        name: cast(int, session.scalar(select(func.count()).select_from(table))) for name, table in _COUNTED.items()
+        name: cast(int, session.scalar(select(func.count()).select_from(table)))
+        for name, table in _COUNTED.items()
     }

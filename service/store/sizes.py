@@ -1,4 +1,7 @@
-"""How much the store holds: totals that every write keeps up, so that nobody has to walk millions of files for them."""
+"""Storage totals that every write updates.
+
+So no query has to count millions of files.
+"""
 
 from dataclasses import dataclass
 from datetime import datetime
@@ -11,8 +14,8 @@ from service.store.tables import ImageRow, ImageTotalRow
 
 
 @dataclass(frozen=True)
-class Kept:
-    """The images of one verdict whose files are kept; ``oldest`` is when the first of them came."""
+class ImageTotals:
+    """Stored images of one verdict; ``oldest`` is when the first of them arrived."""
 
     images: int = 0
     size_bytes: int = 0
@@ -21,49 +24,57 @@ class Kept:
 
 @dataclass(frozen=True)
 class Sizes:
-    """What lies on the disk."""
+    """Disk usage."""
 
-    accepted: Kept
-    refused: Kept
+    accepted: ImageTotals
+    refused: ImageTotals
     database_bytes: int
 
     @property
     def image_bytes(self) -> int:
-        """Of all image files together."""
+        """Size of all image files."""
         return self.accepted.size_bytes + self.refused.size_bytes
 
 
 def count(session: Session, accepted: bool, images: int, size_bytes: int) -> None:
-    """So many images of a verdict, and bytes, came; negative numbers went.
+    """Add images of a verdict and their bytes to the totals; negative numbers subtract.
 
-    Writers wait for each other from here to the end of their transactions: let it be their last statement or so.
+    Other writers wait from here to the end of the transaction, so make it one of the last
+    statements.
     """
     row = ImageTotalRow
     begun = inserting(session, row).values(accepted=accepted, images=images, size_bytes=size_bytes)
-    added = {"images": row.images + begun.excluded.images, "size_bytes": row.size_bytes + begun.excluded.size_bytes}
+    added = {
+        "images": row.images + begun.excluded.images,
+        "size_bytes": row.size_bytes + begun.excluded.size_bytes,
+    }
     session.execute(begun.on_conflict_do_update(index_elements=[row.accepted], set_=added))
 
 
 def image_bytes(session: Session) -> int:
-    """The size of all image files that are kept."""
+    """The size of all stored image files."""
     return int(session.scalars(select(func.coalesce(func.sum(ImageTotalRow.size_bytes), 0))).one())
 
 
 def sizes(session: Session) -> Sizes:
-    """What lies on the disk, by a few rows."""
+    """Disk usage, from a few rows."""
     return Sizes(_kept(session, True), _kept(session, False), _database_bytes(session))
 
 
-def _kept(session: Session, accepted: bool) -> Kept:
+def _kept(session: Session, accepted: bool) -> ImageTotals:
     row = session.get(ImageTotalRow, accepted)
     if row is None or not row.images:
-        return Kept()
-    came = select(func.min(ImageRow.created_at)).where(ImageRow.pruned_at.is_(None), ImageRow.accepted == accepted)
-    return Kept(row.images, row.size_bytes, session.scalar(came))
+        return ImageTotals()
+    came = select(func.min(ImageRow.created_at)).where(
+        ImageRow.pruned_at.is_(None), ImageRow.accepted == accepted
+    )
+    return ImageTotals(row.images, row.size_bytes, session.scalar(came))
 
 
 def _database_bytes(session: Session) -> int:
     if session.get_bind().dialect.name == "postgresql":
         return int(session.scalars(select(func.pg_database_size(func.current_database()))).one())
-    pages = (session.execute(text(f"PRAGMA {name}")).scalar_one() for name in ("page_count", "page_size"))
+    pages = (
+        session.execute(text(f"PRAGMA {name}")).scalar_one() for name in ("page_count", "page_size")
+    )
     return int(next(pages)) * int(next(pages))

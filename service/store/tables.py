@@ -1,7 +1,7 @@
-"""The tables: one typed class each; a column says its unit in its name.
+"""The database tables, one typed class each. Column names include units.
 
-Arrays live in compressed npz blobs that are loaded only when asked for; images live in files (`service.store.images`)
-and are referred to by their SHA-256.
+Arrays are compressed npz blobs that load on demand. Images are files
+(`service.store.photographs.image_files`), referred to by their SHA-256.
 """
 
 from datetime import datetime
@@ -11,7 +11,6 @@ from sqlalchemy import (
     BigInteger,
     CheckConstraint,
     Column,
-    Computed,
     ForeignKey,
     Index,
     LargeBinary,
@@ -20,24 +19,35 @@ from sqlalchemy import (
     Text,
     UniqueConstraint,
     false,
+    text,
 )
 from sqlalchemy.orm import Mapped, mapped_column, relationship
 
+from service.base.fields import Sun
 from service.store.columns import Base, now, one_of
 
-KINDS = ("raw", "cropped", "flux", "flux-centered")
+NO_IMAGE = "none"
+"""Kind of a measurement without an image: motor positions and a focal spot."""
+
+KINDS = ("raw", "cropped", "flux", "flux-centered", NO_IMAGE)
+SUN_CONTRADICTS_TIME = "sun_contradicts_time"
+"""Warning type: the sent sun position contradicts the sent time."""
+
+UNLIKE_HELIOSTAT = "unlike_heliostat"
+"""Warning type: another heliostat's surface predicts the photograph much better."""
+
 SOURCES = ("measured", "network", "refined", "imported")
 VERDICTS = ("effect", "none", "unexplained")
 
 MODEL_VERSION = 256
-"""Characters that name a version of the plant's model: its number and all effects of the catalogue."""
+"""Maximum length of a model version: its number and the names of all effects."""
 
 
 class PlantRow(Base):
-    """The plant: one row, written before anything that needs its origin.
+    """The plant: a single row, written before anything that needs its origin.
 
-    ``declared`` is what ``twin.json`` declared of the first version of its model (DESIGN.md, section 6); the defaults
-    without it.
+    ``declared`` is what ``twin.json`` declares for the first version of the plant's model
+    (DESIGN.md, section 6). None means the defaults.
     """
 
     __tablename__ = "plant"
@@ -57,7 +67,10 @@ class PlantRow(Base):
 
 
 class HeliostatRow(Base):
-    """A heliostat: its PAINT properties as they came, and its position in ENU [m] for queries."""
+    """A heliostat: its PAINT properties as received, and its ENU position [m] for queries.
+
+    ``photographs_changed_at`` is when a stored photograph was last completed or deleted.
+    """
 
     __tablename__ = "heliostats"
 
@@ -69,10 +82,11 @@ class HeliostatRow(Base):
     up_m: Mapped[float]
     created_at: Mapped[datetime] = mapped_column(default=now)
     updated_at: Mapped[datetime] = mapped_column(default=now, onupdate=now)
+    photographs_changed_at: Mapped[datetime | None]
 
 
 class TargetRow(Base):
-    """A target plane in ENU [m]; ``corners`` are the WGS84 corners that it was made from, where it was."""
+    """A target plane in ENU [m]; ``corners`` are its WGS84 corners, if known."""
 
     __tablename__ = "targets"
 
@@ -104,10 +118,12 @@ class ReceiverRow(Base):
 
 
 class ImageRow(Base):
-    """An image file in the store, by its content; ``accepted`` where a measurement of it was.
+    """A stored image file by its hash; ``accepted`` if any of its measurements was.
 
-    ``pruned_at`` says since when the file is given up (`service.store.photographs`), ``pruned_for`` why, ``removed_at``
-    since when it is gone. ``created_at`` is when it came, or came anew after it was given up.
+    - ``pruned_at`` is when the file was marked for deletion
+      (`service.store.photographs.image_retention`), and ``pruned_for`` is why.
+    - ``removed_at`` is when the file was deleted.
+    - ``created_at`` is when it arrived, or arrived again after it was marked.
     """
 
     __tablename__ = "images"
@@ -126,7 +142,7 @@ class ImageRow(Base):
 
 
 class ImageTotalRow(Base):
-    """How many images the store keeps, of one verdict, and their size: every write of `ImageRow` keeps it up."""
+    """Number and total size of stored images per verdict, updated by every write of `ImageRow`."""
 
     __tablename__ = "image_totals"
 
@@ -135,14 +151,24 @@ class ImageTotalRow(Base):
     size_bytes: Mapped[int] = mapped_column(BigInteger)
 
 
-class MeasurementRow(Base):
-    """One photograph of one heliostat's spot and what was measured in it.
+_WARNED = text("warnings IS NOT NULL")
 
-    ``arrays`` holds npz ``flux`` and ``centered``; a refused image has neither and keeps its ``reason``.
-    ``center_right_m``, ``center_up_m``: centre of mass from the target's centre. ``corrected_at``: since when it stands
-    as it does, where it was corrected (`CorrectionRow`); an excluded one is not accepted for the reason `excluded`.
-    ``forecast_accuracy`` [1]: how the surface of its day forecast it when it came, which had not seen it. ``moment`` is
-    when it was taken or else came; the database works it out.
+
+class MeasurementRow(Base):
+    """A measurement of a heliostat's focal spot in one photograph, or from motor positions only.
+
+    - ``arrays`` holds npz ``flux`` and ``centered``. A refused image has neither, but a ``reason``.
+    - ``kind`` is `NO_IMAGE` without an image. Such a measurement serves only mount calibration.
+    - ``taken_at`` is None if the time is unknown.
+    - ``warnings`` are documents with a ``type`` and a ``detail``; None if there are none.
+    - ``center_right_m``, ``center_up_m`` are the centre of mass from the target's centre.
+    - ``corrected_at`` is the time of the newest correction (`CorrectionRow`). An excluded
+      measurement is not accepted, for the reason `excluded`.
+    - ``sent_by`` is the name of the sender's key, or of the user who imported it. Old rows have
+      none.
+    - ``forced`` is why it is stored although another heliostat has the same image.
+    - ``forecast_accuracy`` [1] is that of the surface of its day, computed when the photograph
+      arrived. That surface had not used the photograph.
     """
 
     __tablename__ = "measurements"
@@ -151,17 +177,21 @@ class MeasurementRow(Base):
         UniqueConstraint("heliostat_id", "identifier"),
         Index(None, "heliostat_id", "accepted"),
         Index(None, "heliostat_id", "external_id"),
-        Index(None, "moment", "id"),
-        Index(None, "accepted", "moment", "id"),
-        Index(None, "target_id", "moment", "id"),
+        Index(None, "taken_at", "id"),
+        Index(None, "accepted", "taken_at", "id"),
+        Index(None, "target_id", "taken_at", "id"),
+        Index(
+            "ix_measurements_warned", "heliostat_id", postgresql_where=_WARNED, sqlite_where=_WARNED
+        ),
         one_of("kind", KINDS),
+        CheckConstraint(f"(kind = '{NO_IMAGE}') = (image_sha256 IS NULL)", name="image"),
     )
 
     id: Mapped[int] = mapped_column(primary_key=True)
     heliostat_id: Mapped[int] = mapped_column(ForeignKey("heliostats.id"))
     identifier: Mapped[str] = mapped_column(String(96))
     external_id: Mapped[str | None] = mapped_column(String(64))
-    image_sha256: Mapped[str] = mapped_column(ForeignKey("images.sha256"), index=True)
+    image_sha256: Mapped[str | None] = mapped_column(ForeignKey("images.sha256"), index=True)
     kind: Mapped[str] = mapped_column(String(16))
     target_id: Mapped[int] = mapped_column(ForeignKey("targets.id"))
     sun_azimuth_deg: Mapped[float]
@@ -178,27 +208,49 @@ class MeasurementRow(Base):
     accepted: Mapped[bool]
     reason: Mapped[str | None] = mapped_column(String(64))
     quality: Mapped[dict[str, Any]]
+    warnings: Mapped[list[dict[str, Any]] | None]
     center_right_m: Mapped[float | None]
     center_up_m: Mapped[float | None]
     arrays: Mapped[bytes | None] = mapped_column(LargeBinary, deferred=True)
     created_at: Mapped[datetime] = mapped_column(default=now)
+    sent_by: Mapped[str | None] = mapped_column(Text)  # See migration 0015.
     corrected_at: Mapped[datetime | None]
     forecast_accuracy: Mapped[float | None]
-    moment: Mapped[datetime] = mapped_column(Computed("coalesce(taken_at, created_at)", True), nullable=True)
+    forced: Mapped[str | None] = mapped_column(Text)  # See migration 0018.
 
     target: Mapped[TargetRow] = relationship(lazy="joined", innerjoin=True)
-    image: Mapped[ImageRow] = relationship(lazy="joined", innerjoin=True)
+    image: Mapped[ImageRow | None] = relationship(lazy="joined")
+
+    @property
+    def sun(self) -> Sun:
+        """The recorded sun."""
+        return Sun(azimuth_deg=self.sun_azimuth_deg, elevation_deg=self.sun_elevation_deg)
+
+    @property
+    def has_file(self) -> bool:
+        """Whether the store has an image file of it."""
+        return self.image is not None and self.image.pruned_at is None
+
+
+class AliasRow(Base):
+    """Another identifier of a measurement, from sending its image again."""
+
+    __tablename__ = "measurement_aliases"
+
+    heliostat_id: Mapped[int] = mapped_column(ForeignKey("heliostats.id"), primary_key=True)
+    identifier: Mapped[str] = mapped_column(String(96), primary_key=True)
+    measurement_id: Mapped[int] = mapped_column(ForeignKey("measurements.id"), index=True)
 
 
 class CorrectionRow(Base):
-    """What somebody corrected of a photograph, or that it was excluded: what stood there ``before``, and ``after``."""
+    """A correction or exclusion of a photograph: the values ``before`` and ``after``."""
 
     __tablename__ = "corrections"
 
     id: Mapped[int] = mapped_column(primary_key=True)
     measurement_id: Mapped[int] = mapped_column(ForeignKey("measurements.id"), index=True)
-    made_at: Mapped[datetime] = mapped_column(default=now)
-    made_by: Mapped[str] = mapped_column(String(64))
+    created_at: Mapped[datetime] = mapped_column(default=now)
+    created_by: Mapped[str] = mapped_column(String(64))
     reason: Mapped[str] = mapped_column(String(200))
     before: Mapped[dict[str, Any]]
     after: Mapped[dict[str, Any]]
@@ -213,14 +265,20 @@ surface_measurements = Table(
 
 
 class SurfaceRow(Base):
-    """One version of a heliostat's surface; npz ``z``, ``z_std`` (4, 8, 8) and ``control_points`` (4, 8, 8, 3) [m].
+    """One version of a heliostat's surface.
 
-    ``content_sha256`` is set where the same content must not be stored twice (imports); predictions leave it empty.
-    What is ``set_aside`` is never current (`service.store.decisions`). ``model`` names the weights, ``model_version``
-    the plant's model with its effects that a prediction was made by. Whether a prediction is ``trusted``
-    (`model.observation.SurfacePrediction`) stands with its ``doubts`` in words, since when the heliostat has had any,
-    and who has seen that; of a measured surface all of it is empty. ``sun_span_deg`` is the largest angle between the
-    suns of its photographs.
+    - ``arrays`` holds npz ``z``, ``z_std`` (4, 8, 8) and ``control_points`` (4, 8, 8, 3) [m].
+    - ``content_sha256`` is set if the same content must not be stored twice (imports). Predictions
+      leave it empty.
+    - ``valid_from`` is None if its start is unknown: measured surfaces, photographs without a time.
+    - ``is_candidate``: a candidate is never active (`service.store.surfaces.decisions`).
+    - ``model`` names the network weights, ``model_version`` the plant's model with its effects.
+    - ``trusted``, ``warnings`` (sentences), ``warned_since``, ``acknowledged_at`` and
+      ``acknowledged_by`` assess a prediction (`model.observation.SurfacePrediction`). Measured
+      surfaces have none.
+    - ``warned_since`` is when the heliostat's warnings began.
+    - ``sun_span_deg`` is the largest angle between the sun directions of its photographs.
+    - ``deleted`` names photographs that were used for it and deleted since.
     """
 
     __tablename__ = "surfaces"
@@ -235,21 +293,22 @@ class SurfaceRow(Base):
     heliostat_id: Mapped[int] = mapped_column(ForeignKey("heliostats.id"))
     version: Mapped[int]
     created_at: Mapped[datetime] = mapped_column(default=now)
-    valid_from: Mapped[datetime]
+    valid_from: Mapped[datetime | None]
     source: Mapped[str] = mapped_column(String(16))
     model: Mapped[str | None] = mapped_column(String(128))
     model_version: Mapped[str | None] = mapped_column(String(MODEL_VERSION))
     misfit: Mapped[float | None]
     content_sha256: Mapped[str | None] = mapped_column(String(64))
-    set_aside: Mapped[bool] = mapped_column(server_default=false())
+    is_candidate: Mapped[bool] = mapped_column(server_default=false())
     trusted: Mapped[bool | None]
-    doubts: Mapped[list[str] | None]
-    doubted_since: Mapped[datetime | None]
+    warnings: Mapped[list[str] | None]
+    warned_since: Mapped[datetime | None]
     suspicious: Mapped[list[str] | None]
-    strangeness: Mapped[float | None]
+    mahalanobis_distance: Mapped[float | None]
     sun_span_deg: Mapped[float | None]
-    seen_at: Mapped[datetime | None]
-    seen_by: Mapped[str | None] = mapped_column(String(64))
+    acknowledged_at: Mapped[datetime | None]
+    acknowledged_by: Mapped[str | None] = mapped_column(String(64))
+    deleted: Mapped[list[str] | None]
     arrays: Mapped[bytes] = mapped_column(LargeBinary, deferred=True)
 
     measurements: Mapped[list[MeasurementRow]] = relationship(
@@ -258,15 +317,20 @@ class SurfaceRow(Base):
 
     @property
     def outdated(self) -> list[MeasurementRow]:
-        """Photographs that it was made from, and that were corrected or excluded since."""
-        return [row for row in self.measurements if row.corrected_at is not None and row.corrected_at > self.created_at]
+        """Photographs used for it that were corrected or excluded since."""
+        return [
+            row
+            for row in self.measurements
+            if row.corrected_at is not None and row.corrected_at > self.created_at
+        ]
 
 
 class DecisionRow(Base):
-    """That a version became a heliostat's surface of today, or did not, and on what grounds.
+    """A decision whether a surface version became active, and why.
 
-    ``previous`` is the version that was today's; ``set_aside_before`` are those that were set aside until then, which
-    is what taking the decision back restores. Accuracies [1] are those of the former surface and of this one.
+    - ``previous`` is the version that was active before.
+    - ``candidates_before`` lists the candidates until then, which undoing the decision restores.
+    - ``accuracy_before`` and ``accuracy_after`` [1] are those of the former and of this surface.
     """
 
     __tablename__ = "surface_decisions"
@@ -275,43 +339,57 @@ class DecisionRow(Base):
     heliostat_id: Mapped[int] = mapped_column(ForeignKey("heliostats.id"), index=True)
     surface_id: Mapped[int] = mapped_column(ForeignKey("surfaces.id"))
     previous: Mapped[int | None]
-    taken: Mapped[bool]
-    made_at: Mapped[datetime] = mapped_column(default=now)
-    made_by: Mapped[str] = mapped_column(String(64))
+    became_active: Mapped[bool]
+    created_at: Mapped[datetime] = mapped_column(default=now)
+    created_by: Mapped[str] = mapped_column(String(64))
     reason: Mapped[str] = mapped_column(String(200))
     accuracy_before: Mapped[float | None]
     accuracy_after: Mapped[float | None]
     photographs: Mapped[int]
-    set_aside_before: Mapped[list[int]]
+    candidates_before: Mapped[list[int]]
 
     surface: Mapped[SurfaceRow] = relationship(lazy="joined", innerjoin=True)
 
 
 class MountRow(Base):
-    """One calibration of a mount, `model.pointing.report.mount_to_json`; since when its newest state is valid."""
+    """One calibration of a mount, as in `model.pointing.report.mount_to_json`.
+
+    ``valid_from`` is the start of its newest state. It is None if no measurement of the calibration
+    has a time.
+    """
 
     __tablename__ = "mounts"
-    __table_args__ = (UniqueConstraint("heliostat_id", "version"), Index(None, "heliostat_id", "valid_from"))
+    __table_args__ = (
+        UniqueConstraint("heliostat_id", "version"),
+        Index(None, "heliostat_id", "valid_from"),
+    )
 
     id: Mapped[int] = mapped_column(primary_key=True)
     heliostat_id: Mapped[int] = mapped_column(ForeignKey("heliostats.id"))
     version: Mapped[int]
     created_at: Mapped[datetime] = mapped_column(default=now)
-    valid_from: Mapped[datetime]
+    valid_from: Mapped[datetime | None]
     document: Mapped[dict[str, Any]] = mapped_column(deferred=True)
 
 
 class DriftRow(Base):
-    """Flux accuracy [1] of a heliostat's surface on its newest photograph, when that came (`service.twin.accuracy`).
+    """Flux accuracy [1] of a heliostat's surface on its newest photograph, on arrival.
 
-    ``poor_since`` is the first of all its last photographs that were forecast worse than the settings bear. ``recent``
-    and ``earlier`` are medians of its newest photographs and of those before, each when it came; that fell by
-    ``least_drop`` at least (95 %), and ``fell_since`` then by more than the settings bear.
+    See `service.twin.surfaces.accuracy`.
+
+    - ``poor_since`` is the first of the latest consecutive photographs below the accuracy limit of
+      the settings.
+    - ``recent`` and ``earlier`` are medians of the accuracies on arrival: of the newest photographs
+      and of those before.
+    - ``min_drop`` is the lower bound (95 %) of the drop between both.
+    - ``fell_since`` is when the drop first exceeded the limit of the settings.
     """
 
     __tablename__ = "drift"
 
-    heliostat_id: Mapped[int] = mapped_column(ForeignKey("heliostats.id"), primary_key=True, autoincrement=False)
+    heliostat_id: Mapped[int] = mapped_column(
+        ForeignKey("heliostats.id"), primary_key=True, autoincrement=False
+    )
     measurement_id: Mapped[int] = mapped_column(ForeignKey("measurements.id"))
     surface_id: Mapped[int] = mapped_column(ForeignKey("surfaces.id"))
     taken_at: Mapped[datetime]
@@ -319,14 +397,15 @@ class DriftRow(Base):
     poor_since: Mapped[datetime | None]
     recent: Mapped[float | None]
     earlier: Mapped[float | None]
-    least_drop: Mapped[float | None]
+    min_drop: Mapped[float | None]
     fell_since: Mapped[datetime | None]
 
 
 class ForecastRow(Base):
-    """A computed flux map: its inputs, its npz ``flux`` (rows, columns) float32 [W/m2] and its figures.
+    """A computed flux map: its inputs, npz ``flux`` (rows, columns) float32 [W/m2] and key figures.
 
-    ``sun_at`` is the time that was asked for, where the sun was not asked for by its position.
+    ``sun_at`` is the requested time, or None if the request gave a sun position. ``warnings`` are
+    notes for readers of the forecast.
     """
 
     __tablename__ = "forecasts"
@@ -351,6 +430,7 @@ class ForecastRow(Base):
     center_right_m: Mapped[float | None]
     center_up_m: Mapped[float | None]
     model_version: Mapped[str] = mapped_column(String(MODEL_VERSION))
+    warnings: Mapped[list[str] | None]
     flux: Mapped[bytes] = mapped_column(LargeBinary, deferred=True)
     created_at: Mapped[datetime] = mapped_column(default=now)
 
@@ -359,11 +439,12 @@ class ForecastRow(Base):
 
 
 class StudyRow(Base):
-    """A study of stored photographs: what was asked, what of it was looked at, and what it found.
+    """A study of stored photographs: its options, the data that it used, and its results.
 
-    ``model`` is the number of the plant's model that it was made with, ``report`` that of `model.study.Study.to_json`,
-    ``html`` the same as a page; a report from a file has no page. ``taken_from`` and ``taken_to`` are the first and the
-    last moment of its photographs.
+    - ``model`` is the number of the plant's model at that time.
+    - ``report`` is that of `model.study.study_to_json`.
+    - ``html`` is the report as a page. A report imported from a file has none.
+    - ``first_taken_at`` and ``last_taken_at`` are the times of its first and last photograph.
     """
 
     __tablename__ = "studies"
@@ -374,8 +455,8 @@ class StudyRow(Base):
     created_by: Mapped[str] = mapped_column(String(64))
     options: Mapped[dict[str, Any]]
     heliostats: Mapped[list[str]]
-    taken_from: Mapped[datetime | None]
-    taken_to: Mapped[datetime | None]
+    first_taken_at: Mapped[datetime | None]
+    last_taken_at: Mapped[datetime | None]
     model: Mapped[int]
     model_version: Mapped[str] = mapped_column(String(MODEL_VERSION))
     verdict: Mapped[str] = mapped_column(String(16))
@@ -386,11 +467,12 @@ class StudyRow(Base):
 
 
 class ModelRow(Base):
-    """A version of the plant's model from the second on: all its adopted ``effects`` upon what was ``declared`` then.
+    """A version of the plant's model after the first: adopted ``effects`` and the ``declared``
+    model.
 
-    ``study_id`` names the study that it was adopted from; without it the version came of another declaration. The first
-    version is what the plant began with; it has no row, and the plant's ``declared`` is its own. Rows never change but
-    for their withdrawal, and are never deleted.
+    ``study_id`` is the study that it was adopted from. Without one, the version came from a changed
+    declaration. The first version has no row; its declaration is in the plant's row. Rows are never
+    deleted, and change only by withdrawal.
     """
 
     __tablename__ = "models"

@@ -1,1 +1,1 @@
-"""What the service does with the model: ingest, predict, forecast, study, versions, accuracy."""
+"""Use of the model by the service: ingest, prediction, forecasts, studies, versions, accuracy."""

@@ -1,1 +1,1 @@
-"""HTTP: the application, its door, its answers, one file a resource, and the pages."""
+"""HTTP interface: the application, authentication, responses, API resources and pages."""

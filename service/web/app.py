@@ -1,4 +1,4 @@
-"""The application: settings in, FastAPI out."""
+"""The FastAPI application, built from the settings."""
 
 import threading
 from collections.abc import AsyncIterator
@@ -6,41 +6,45 @@ from contextlib import asynccontextmanager
 from importlib.metadata import PackageNotFoundError, version
 
 from anyio import to_thread
-from fastapi import APIRouter, FastAPI
+from fastapi import APIRouter, Depends, FastAPI
 from fastapi.routing import APIRoute
+from starlette.routing import BaseRoute
 
 from service.base.discovery import modules_of
-from service.base.meters import listening
+from service.base.metrics import serve_metrics
 from service.base.settings import Settings
 from service.jobs.kind import Kinds
 from service.jobs.kinds import KINDS
 from service.jobs.worker import Workers
 from service.store.database import Database
-from service.twin.accuracy import ComparisonBook
-from service.twin.attention import AttentionCount
-from service.twin.field import FieldBook
-from service.twin.gate import MOST_WAITING
-from service.twin.runtime import Operations, Runtime
-from service.web.answers import openapi, problems
-from service.web.answers.watching import Watchers
+from service.twin.alerts.alerts import AlertCount
+from service.twin.alerts.field_overview import FieldOverviewCache
+from service.twin.runtime.runtime import Operations, Runtime
+from service.twin.runtime.slots import MAX_WAITING
+from service.twin.surfaces.accuracy import ComparisonCache
 from service.web.api import jobs
-from service.web.door import security
-from service.web.door.turns import Turns
-from service.web.metrics import registry
+from service.web.auth import security
+from service.web.auth.bodies import BodyLimiter
+from service.web.auth.fair_limiter import FairLimiter
+from service.web.auth.queries import require_known_query
 from service.web.middleware import (
+    AuthMiddleware,
     BodyLimitMiddleware,
-    DoorMiddleware,
     HeadMiddleware,
     PartMiddleware,
     RequestIdMiddleware,
     SecurityHeadersMiddleware,
     StoppingMiddleware,
 )
+from service.web.responses import openapi, problems
+from service.web.responses.job_events import Watchers
+from service.web.root.health import SharedCheck
+from service.web.store_metrics import registry
 
 _DESCRIPTION = (
-    "Post the target photographs of a solar tower, read back each heliostat's flux and surface, and forecast the "
-    "flux that it throws on any plane. Metres, degrees where a name says so, east-north-up from the tower base. HEAD "
-    "is answered wherever GET is."
+    "Post the target photographs of a solar tower, read back each heliostat's flux and surface, and"
+    " forecast the flux that it throws on any plane. Metres, degrees where a name says so,"
+    " east-north-up from the tower base. HEAD is answered wherever GET is."
 )
 
 
@@ -56,24 +60,47 @@ def _operation_id(route: APIRoute) -> str:
 
 
 def require_fit(settings: Settings, database: Database) -> None:
-    """Migrate an embedded store; refuse one that nobody migrated, and a door that would stand open to others.
+    """Check that the service may start, and migrate an embedded store.
 
     Raises
     ------
-    SchemaError, OpenDoorError
+    SchemaError
+        If the store is not at the newest version and is not migrated automatically.
+    UnauthenticatedExposureError
+        If other machines can connect and no key exists.
     """
     if settings.migrates_on_start:
         database.upgrade()
     database.require_current()
-    security.require_closed_door(settings, database)
+    security.refuse_unauthenticated_exposure(settings, database)
 
 
-def create_app(settings: Settings, operations: Operations | None = None, kinds: Kinds = KINDS) -> FastAPI:
-    """The service for these settings.
+def collect_routes(kinds: Kinds) -> list[BaseRoute]:
+    """Collect the routes of the API, the pages and the paths next to them."""
+    root = APIRouter(generate_unique_id_function=_operation_id)
+    v1 = APIRouter(prefix="/v1", dependencies=[Depends(require_known_query)])
+    v1.include_router(
+        jobs.creators(kinds)
+    )  # before the routes of a job, which would read the names of kinds as numbers
+    for resource in modules_of("service.web.api"):
+        v1.include_router(resource.router)
+    root.include_router(v1)
+    for place in (*modules_of("service.web.root"), *modules_of("service.web.pages")):
+        if hasattr(place, "router"):
+            root.include_router(place.router)
+        if hasattr(place, "MOUNT"):  # static files; the page in the router takes precedence
+            root.mount(*place.MOUNT)
+    return root.routes
 
-    ``operations`` stands in for the model (`service.twin.compute`) in tests. The store is opened, and an embedded
-    SQLite one migrated, when the application starts; a store that nobody migrated keeps it from starting, and so does
-    a door that would stand open to other machines. Jobs of ``kinds`` can be asked for, and are worked at where the
+
+def create_app(
+    settings: Settings, operations: Operations | None = None, kinds: Kinds = KINDS
+) -> FastAPI:
+    """Create the application for these settings.
+
+    ``operations`` replaces the model (`service.twin.runtime.operations`) in tests. The store is
+    opened when the application starts, and an embedded SQLite store is migrated. The application
+    does not start if `require_fit` raises. It accepts jobs of ``kinds``, and runs them if the
     settings say so.
     """
 
@@ -83,14 +110,14 @@ def create_app(settings: Settings, operations: Operations | None = None, kinds: 
         try:
             await to_thread.run_sync(require_fit, settings, runtime.database)
             app.state.runtime = runtime.for_requests()
-            app.state.field = FieldBook(runtime)
-            app.state.attention = AttentionCount(runtime, app.state.field)
+            app.state.field = FieldOverviewCache(runtime)
+            app.state.attention = AlertCount(runtime, app.state.field)
             app.state.watchers = Watchers(runtime)
-            app.state.comparisons = ComparisonBook(runtime)
+            app.state.comparisons = ComparisonCache(runtime)
             workers = Workers(runtime, kinds, settings.job_workers)
             workers.start()
             try:
-                with listening(settings, registry(runtime, app.state.field)):
+                with serve_metrics(settings, registry(runtime, app.state.field)):
                     yield
             finally:
                 await to_thread.run_sync(workers.stop)
@@ -104,33 +131,28 @@ def create_app(settings: Settings, operations: Operations | None = None, kinds: 
         version=_version(),
         description=_DESCRIPTION,
         lifespan=lifespan,
-        generate_unique_id_function=_operation_id,
+        routes=collect_routes(kinds),
         redirect_slashes=False,
-        docs_url=None,  # service.web.root.documentation has its own page
+        docs_url=None,  # service.web.root.documentation serves its own page
         redoc_url=None,
     )
     app.state.stopping = threading.Event()
-    app.state.turns = Turns()
+    app.state.readiness = SharedCheck()
+    app.state.render_limiter = FairLimiter()
+    app.state.overview_limiter = FairLimiter()
     app.state.kinds = kinds
-    app.state.computing = Turns(settings.parallel_computations + MOST_WAITING)  # as many as the model's gate takes
-    v1 = APIRouter(prefix="/v1")
-    v1.include_router(jobs.creators(kinds))  # before the routes of a job, which would take their names for numbers
-    for resource in modules_of("service.web.api"):
-        v1.include_router(resource.router)
-    app.include_router(v1)
-    for place in (*modules_of("service.web.root"), *modules_of("service.web.pages")):
-        if hasattr(place, "router"):
-            app.include_router(place.router)
-        if hasattr(place, "MOUNT"):  # files, at a path; its page, in the router, comes first
-            app.mount(*place.MOUNT)
+    app.state.bodies = BodyLimiter(settings)
+    app.state.compute_limiter = FairLimiter(
+        settings.parallel_computations + MAX_WAITING
+    )  # as many as the compute slots of the model accept
     security.require_declared_roles(app)
     problems.install(app)
     openapi.install(app)
     app.add_middleware(PartMiddleware)
     app.add_middleware(StoppingMiddleware)
-    app.add_middleware(BodyLimitMiddleware, settings=settings)
-    app.add_middleware(DoorMiddleware, settings=settings)
+    app.add_middleware(BodyLimitMiddleware, settings=settings, limiter=app.state.bodies)
+    app.add_middleware(AuthMiddleware, settings=settings)
     app.add_middleware(HeadMiddleware)
     app.add_middleware(SecurityHeadersMiddleware)
-    app.add_middleware(RequestIdMiddleware)  # added last, it comes first
+    app.add_middleware(RequestIdMiddleware)  # the middleware that is added last runs first
     return app

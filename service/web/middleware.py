@@ -1,4 +1,8 @@
-"""What stands before every route: a request id, a log line, headers for browsers, the door, bounds on body and end."""
+"""Middleware for every request.
+
+It adds a request id, a log line and security headers, checks the key, and limits the body and the
+time to stop.
+"""
 
 import asyncio
 import logging
@@ -9,7 +13,7 @@ import time
 import uuid
 from functools import partial
 from http import HTTPStatus
-from urllib.parse import urlsplit
+from typing import NamedTuple
 
 from anyio import CancelScope, CapacityLimiter, move_on_after, to_thread
 from fastapi import HTTPException, Response
@@ -19,37 +23,43 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.base import logs
-from service.base.meters import REQUEST_SECONDS, REQUESTS
-from service.base.settings import Settings, is_loopback
-from service.twin.gate import STOPPING
-from service.web.answers import pages, problems
-from service.web.answers.parts import take_part
-from service.web.answers.problems import SECURITY_HEADERS, problem
-from service.web.door import security
-from service.web.door.limits import Buckets
+from service.base.fair_queue import as_caller
+from service.base.metrics import REQUEST_SECONDS, REQUESTS
+from service.base.settings import Settings
+from service.twin.runtime.slots import STOPPING
+from service.web.auth import security
+from service.web.auth.bodies import BodyLimiter, HeldBody, JsonShape
+from service.web.auth.dependencies import takes_upload
+from service.web.auth.rate_limiter import RateLimiter, sender_of
+from service.web.responses import pages, problems
+from service.web.responses.fragments import take_part
+from service.web.responses.problems import SECURITY_HEADERS, problem
 
 logger = logging.getLogger("heliotwin.access")
 
 _REQUEST_ID = re.compile(r"[A-Za-z0-9_-]{8,64}")
-# Methods that are told apart in metrics, and paths that are asked for too often to log each time.
+# Methods with a separate label in metrics, and frequent paths that are logged at debug level.
 _METHODS = ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS")
 _PROBES = ("/livez", "/readyz", "/metrics")
-# Bytes of an answer that count as another request: a map of 1024 x 1024 as JSON counts as some three hundred.
+# Bytes of a response that cost as much as a request. A map of 1024 x 1024 as JSON costs about 300.
 _BYTES_A_TOKEN = 64 * 1024
-# Largest body where no key is needed [bytes], and its only media type: a form with a key.
+# Largest body on a public path [bytes], and its only media type: a form with a key.
 _PUBLIC_BYTES = 4096
 _FORM = "application/x-www-form-urlencoded"
-# Time that requests get to be done when the service is told to stop, and how often they look whether it was [s].
+# Time to finish requests during shutdown, and interval between checks [s].
 _FINISH_S = 5.0
 _LOOK_EVERY_S = 0.25
 # Longest pause before the next part of a body [s].
 _BODY_PAUSE_S = 30.0
-# What multipart boundaries, part headers and the metadata may add to an image [bytes].
+# Size that multipart boundaries, part headers and the metadata may add to an image [bytes].
 _MULTIPART_OVERHEAD = 64 * 1024
 
 
 class RequestIdMiddleware:
-    """Gives every request an id, the caller's where it is well-formed, sends it back and logs the request with it."""
+    """Middleware that assigns an id to every request and logs it.
+
+    A well-formed id from the client is used. The response has the id, too.
+    """
 
     def __init__(self, app: ASGIApp) -> None:
         self.app = app
@@ -70,12 +80,12 @@ class RequestIdMiddleware:
                 _note(scope, method, message["status"], time.perf_counter() - started)
             await send(message)
 
-        with logs.bound(request_id=identity):
+        with logs.log_context(request_id=identity):
             await self.app(scope, receive, send_with_id)
 
 
 def _note(scope: Scope, method: str, status: int, took_s: float) -> None:
-    """Log a request and count it."""
+    """Log and count a request."""
     path, identity = scope["path"], scope["state"].get("identity")
     level = logging.DEBUG if path in _PROBES else logging.INFO
     extra = {"method": method, "path": path, "status": status, "ms": round(took_s * 1e3, 1)}
@@ -88,16 +98,19 @@ def _note(scope: Scope, method: str, status: int, took_s: float) -> None:
 
 
 def _template(scope: Scope) -> str:
-    """The path as its route declares it, ``/v1/heliostats/{name}``; "none" where there is no route."""
+    """The path template of the route, such as ``/v1/heliostats/{name}``; "none" without a route."""
     path: str | None = getattr(scope.get("route"), "path", None)
     if path is None:
         return "none"
-    # A router that was included tells its own path only.
+    # A route of an included router reports only its path within the router.
     return path if not scope["path"].startswith("/v1/") or path.startswith("/v1/") else f"/v1{path}"
 
 
 class HeadMiddleware:
-    """Answers HEAD as GET, without the body; what is made part by part, such as events, ends with its head."""
+    """Middleware that answers HEAD like GET, without the body.
+
+    A streamed response, such as events, is cancelled after its headers.
+    """
 
     def __init__(self, app: ASGIApp) -> None:
         self.app = app
@@ -117,7 +130,8 @@ class HeadMiddleware:
             if message.get("more_body", False):
                 making.cancel()
 
-        # The scope itself, for the server and the log look into it; the server must know again what it answers.
+        # Change the scope itself, because the server and the log read it. The server must see HEAD
+        # again afterwards.
         scope["method"] = "GET"
         try:
             with making:
@@ -127,7 +141,7 @@ class HeadMiddleware:
 
 
 class PartMiddleware:
-    """Takes from a page's query which part of it is asked for as a file."""
+    """Middleware that moves the requested part of a page from the query to the request state."""
 
     def __init__(self, app: ASGIApp) -> None:
         self.app = app
@@ -140,7 +154,11 @@ class PartMiddleware:
 
 
 class SecurityHeadersMiddleware:
-    """Tells browsers to load nothing from elsewhere, to guess no types and to show nothing in foreign frames."""
+    """Middleware that adds security headers.
+
+    Browsers then load nothing from other origins, guess no media types, and show no page in a
+    frame of another site.
+    """
 
     def __init__(self, app: ASGIApp) -> None:
         self.app = app
@@ -158,19 +176,30 @@ class SecurityHeadersMiddleware:
         await self.app(scope, receive, send_with_headers)
 
 
-class DoorMiddleware:
-    """Finds out who asks, before anything of the body is read, and turns away who may not come in.
+class _Bucket(NamedTuple):
+    """A rate limiter, and the name of a bucket in it."""
 
-    The request's `service.web.door.security.Identity` is left in its state for the routes. Whoever may come in is
-    let in as often as the settings allow. Attempts that fail count for the client's address in a bucket of their own:
-    they shut out neither what is public nor supervisors, who are never refused for asking too often.
+    limiter: RateLimiter
+    name: str
+
+
+class AuthMiddleware:
+    """Middleware that identifies the sender before the body is read.
+
+    It refuses unknown senders, and stores the `service.web.auth.security.Identity` in the request
+    state. Each key may send requests at the rate of the settings. Failed attempts count in a
+    separate bucket of the client address. They block neither public paths nor probes, which have no
+    rate limit.
     """
 
     def __init__(self, app: ASGIApp, settings: Settings) -> None:
         self.app = app
         self.settings = settings
-        self.buckets = Buckets(settings.requests_per_s, settings.requests_burst)
-        # Its own threads: a service that is busy with predictions still knows its keys.
+        self.of_keys = RateLimiter(settings.requests_per_s, settings.requests_burst)
+        self.of_addresses = RateLimiter(
+            settings.public_requests_per_s, settings.public_requests_burst
+        )
+        # Separate threads, so that keys are checked even while predictions take all others.
         self.threads = CapacityLimiter(8)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -180,18 +209,22 @@ class DoorMiddleware:
             if refusal is not None:
                 await refusal(scope, receive, send)
                 return
-            send = self._charging(scope, send)
+            identity = scope.get("state", {}).get("identity")
+            with as_caller("" if identity is None else identity.name):
+                await self.app(scope, receive, self._charging(scope, send))
+            return
         await self.app(scope, receive, send)
 
     def _charging(self, scope: Scope, send: Send) -> Send:
-        """The same ``send``, which charges whoever asked for what is sent, so that large answers cost what they are."""
-        bucket, paid = _bucket(scope), _BYTES_A_TOKEN  # the request's own token pays for the first ones
+        """Wrap ``send`` so that the sender pays for the response by its size."""
+        buckets, name = self._bucket(scope)
+        paid = _BYTES_A_TOKEN  # the token of the request covers the first bytes
 
         async def charging(message: Message) -> None:
             nonlocal paid
             size = len(message.get("body", b""))
             if size > paid:
-                self.buckets.charge(bucket, (size - paid) / _BYTES_A_TOKEN)
+                buckets.charge(name, (size - paid) / _BYTES_A_TOKEN)
             paid = max(0, paid - size)
             await send(message)
 
@@ -200,24 +233,26 @@ class DoorMiddleware:
     async def _refusal(self, scope: Scope) -> Response | None:
         headers = Headers(scope=scope)
         if scope["method"] not in ("GET", "HEAD", "OPTIONS") and _is_cross_site(headers):
-            return problem(scope, HTTPStatus.FORBIDDEN, "another site's page may not change anything here")
+            return problem(
+                scope, HTTPStatus.FORBIDDEN, "another site's page may not change anything here"
+            )
         identity = None
         if not security.is_public(scope["path"]):
             try:
                 identity = await self._identify(scope, headers)
             except (OperationalError, PoolTimeoutError) as error:
                 return problems.database_away(scope, error)
-        if identity == security.LOCAL and self._is_rebound(headers):
-            return problem(scope, HTTPStatus.FORBIDDEN, "Host: without a key use one of this machine's own names")
+        if identity == security.LOCAL and not self.settings.is_own_host(headers.get("host", "")):
+            detail = (
+                "Host: no name of this service; use its address, add the name to"
+                " HELIOTWIN_ALLOWED_HOSTS, or a key"
+            )
+            return problem(scope, HTTPStatus.MISDIRECTED_REQUEST, detail)
         return self._too_often(scope) or self._unknown(scope, identity)
-
-    def _is_rebound(self, headers: Headers) -> bool:
-        """Whether a page may have reached this machine by a name that its owner lets point here (DNS rebinding)."""
-        return is_loopback(self.settings.host) and not _is_loopback_name(headers.get("host", ""))
 
     async def _identify(self, scope: Scope, headers: Headers) -> security.Identity | None:
         database, presented = scope["app"].state.runtime.database, security.presented_key(headers)
-        # Proxies of the sort that adds no header often speak HTTP/1.0 to what stands behind them, which clients do not.
+        # Proxies that add no header often speak HTTP/1.0 to the service. Clients do not.
         is_direct = not security.is_forwarded(headers) and scope.get("http_version") != "1.0"
         asked = partial(security.identify, database, self.settings, presented, is_direct)
         identity = await to_thread.run_sync(asked, limiter=self.threads)
@@ -227,11 +262,29 @@ class DoorMiddleware:
     def _too_often(self, scope: Scope) -> Response | None:
         if scope["path"] in security.HEALTH:
             return None
-        wait_s = self.buckets.wait_s(_bucket(scope))
+        buckets, name = self._bucket(scope)
+        wait_s = buckets.wait_s(name)
         if not wait_s:
             return None
         headers = {"Retry-After": str(math.ceil(wait_s))}
-        return problem(scope, HTTPStatus.TOO_MANY_REQUESTS, "too many requests; wait as Retry-After says", headers)
+        return problem(
+            scope,
+            HTTPStatus.TOO_MANY_REQUESTS,
+            "too many requests; wait as Retry-After says",
+            headers,
+        )
+
+    def _bucket(self, scope: Scope) -> _Bucket:
+        """The bucket of a request.
+
+        It belongs to the key, to the address, or to wrong keys of that address.
+        """
+        identity, client = scope.get("state", {}).get("identity"), scope.get("client")
+        if identity is not None:
+            return _Bucket(self.of_keys, identity.name)
+        address = sender_of(client[0]) if client else ""
+        is_public = security.is_public(scope["path"])
+        return _Bucket(self.of_addresses, address if is_public else f"wrong keys of {address}")
 
     def _unknown(self, scope: Scope, identity: security.Identity | None) -> Response | None:
         if identity is not None or security.is_public(scope["path"]):
@@ -242,31 +295,21 @@ class DoorMiddleware:
         return problem(scope, HTTPStatus.UNAUTHORIZED, detail, {"WWW-Authenticate": "Bearer"})
 
     def _login(self, scope: Scope) -> Response:
-        """A browser is sent to the page for keys; htmx, which would show that page inside of another, goes there."""
+        """Send a browser to the login page.
+
+        htmx gets a header instead, because it would show the login page inside the current one.
+        """
         path = pages.login_path(scope)
         if "hx-request" in Headers(scope=scope):
             return Response(status_code=HTTPStatus.UNAUTHORIZED, headers={"HX-Redirect": path})
         return pages.go_to(path)
 
 
-def _bucket(scope: Scope) -> str:
-    """The name of the bucket that a request takes from: its key's, its address's, or its address's for failures."""
-    identity, client = scope.get("state", {}).get("identity"), scope.get("client")
-    if identity is not None:
-        return f"key {identity.name}"
-    address = client[0] if client else ""
-    return f"address {address}" if security.is_public(scope["path"]) else f"failures of {address}"
-
-
-def _is_loopback_name(host: str) -> bool:
-    try:
-        return is_loopback(urlsplit(f"//{host}").hostname or "")
-    except ValueError:
-        return False
-
-
 def _is_cross_site(headers: Headers) -> bool:
-    """Whether a browser says that the request comes from a page of another origin; other clients say nothing."""
+    """Whether the browser reports that another origin sent the request.
+
+    Other clients send no such header.
+    """
     fetched = headers.get("sec-fetch-site")
     if fetched is not None:
         return fetched not in ("same-origin", "none")
@@ -275,9 +318,10 @@ def _is_cross_site(headers: Headers) -> bool:
 
 
 class StoppingMiddleware:
-    """Answers 503 where a route does not answer soon after the service was told to stop.
+    """Middleware that answers 503 if a route takes too long during shutdown.
 
-    A thread at the model cannot be ended: it is left behind, what it finds is not kept, the process ends without it.
+    A thread that runs the model cannot be ended. It is abandoned, its result is lost, and the
+    process ends without it.
     """
 
     def __init__(self, app: ASGIApp) -> None:
@@ -299,17 +343,26 @@ class StoppingMiddleware:
         try:
             await _until_done_or_late(work, scope["app"].state.stopping)
             if work.done() or has_begun:
-                await work  # an answer that has begun is sent to its end, as long as the server waits
+                await (
+                    work  # a started response is sent completely, while the server waits
+                )
                 return
         finally:
             work.cancel()
-        scope["app"].state.runtime.gate.close()
-        logger.warning("%s %s is not done in time: the service stops", scope["method"], scope["path"])
-        await problem(scope, HTTPStatus.SERVICE_UNAVAILABLE, STOPPING, {"Retry-After": "10"})(scope, receive, send)
+        runtime = scope["app"].state.runtime
+        runtime.compute_slots.close()
+        runtime.decoding_slots.close()
+        runtime.large_image_slots.close()
+        logger.warning(
+            "%s %s is not done in time: the service stops", scope["method"], scope["path"]
+        )
+        await problem(scope, HTTPStatus.SERVICE_UNAVAILABLE, STOPPING, {"Retry-After": "10"})(
+            scope, receive, send
+        )
 
 
 async def _until_done_or_late(work: asyncio.Future[None], stopping: threading.Event) -> None:
-    """Until the work is done, or was not soon after ``stopping``."""
+    """Wait until ``work`` is done, or for a short time after ``stopping`` is set."""
     while not stopping.is_set():
         done, _ = await asyncio.wait({work}, timeout=_LOOK_EVERY_S)
         if done:
@@ -318,23 +371,22 @@ async def _until_done_or_late(work: asyncio.Future[None], stopping: threading.Ev
 
 
 class BodyLimitMiddleware:
-    """Stops reading a body at its bound: at once where its length is announced, else when the bound is passed.
+    """Middleware that limits request bodies, and checks the role before it reads them.
 
-    Who comes without a key may send a small form and nothing else. No part of a body may be long in coming, and the
-    whole has that pause once and then as long as the settings' least rate gives what has come.
+    The role is checked before the first byte is read. A body that is too large is refused at once
+    if its length is announced, else when it exceeds the limit. A request without a key may send
+    only a small form.
+
+    Each part must arrive within a fixed time. The whole body has that time once, and additionally
+    the time of the received bytes at the minimum rate of the settings. `service.web.auth.bodies`
+    limits the bytes of a key that are not answered yet.
     """
 
-    def __init__(self, app: ASGIApp, settings: Settings) -> None:
+    def __init__(self, app: ASGIApp, settings: Settings, limiter: BodyLimiter) -> None:
         self.app = app
         self.settings = settings
-        self.patience_s = _BODY_PAUSE_S
-
-    def _limit(self, scope: Scope, headers: Headers) -> int:
-        if security.is_public(scope["path"]):
-            return _PUBLIC_BYTES
-        if headers.get("content-type", "").lower().startswith("multipart/form-data"):
-            return self.settings.max_image_bytes + _MULTIPART_OVERHEAD
-        return self.settings.max_json_bytes
+        self.limiter = limiter
+        self.timeout_s = _BODY_PAUSE_S
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """One ASGI call."""
@@ -342,33 +394,114 @@ class BodyLimitMiddleware:
             await self.app(scope, receive, send)
             return
         headers = Headers(scope=scope)
-        limit = self._limit(scope, headers)
-        detail = f"body: larger than the {limit} bytes allowed; send less"
+        limit = self._largest(scope, headers)
         announced = headers.get("content-length", "0")
-        if announced.isdecimal() and int(announced[:20]) > limit:
-            await problem(scope, HTTPStatus.REQUEST_ENTITY_TOO_LARGE, detail)(scope, receive, send)
+        size = int(announced[:20]) if announced.isdecimal() else 0
+        if size > limit:
+            await problem(scope, HTTPStatus.REQUEST_ENTITY_TOO_LARGE, _larger_than(limit))(
+                scope, receive, send
+            )
             return
-        if security.is_public(scope["path"]) and headers.get("content-type", _FORM).partition(";")[0].strip() != _FORM:
+        if (
+            security.is_public(scope["path"])
+            and headers.get("content-type", _FORM).partition(";")[0].strip() != _FORM
+        ):
             refused = f"Content-Type: send {_FORM}"
             await problem(scope, HTTPStatus.UNSUPPORTED_MEDIA_TYPE, refused)(scope, receive, send)
             return
-        received, waited_s, is_whole = 0, 0.0, False
+        identity = scope.get("state", {}).get("identity")
+        with self.limiter.body("" if identity is None else identity.name) as held:
+            bounded = _BoundedBody(self, scope, receive, held, size)
+            await self.app(scope, bounded.receive, send)
 
-        async def bounded() -> Message:
-            nonlocal received, waited_s, is_whole
-            # What the service itself takes between two parts is not the sender's.
-            left_s = min(self.patience_s, self.patience_s + received / self.settings.least_bytes_per_s - waited_s)
-            began = time.monotonic()
-            # After the body only the client's going is waited for, however long that takes.
-            with move_on_after(None if is_whole else left_s) as waiting:
-                message = await receive()
-            waited_s += time.monotonic() - began
-            if waiting.cancelled_caught:
-                raise HTTPException(HTTPStatus.REQUEST_TIMEOUT, "body: it did not come in time; send it again")
-            is_whole = not message.get("more_body", False)
-            received += len(message.get("body", b""))
-            if received > limit:
-                raise HTTPException(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, detail)
-            return message
+    def _largest(self, scope: Scope, headers: Headers) -> int:
+        """Largest body of this kind that any route accepts [bytes]."""
+        if security.is_public(scope["path"]):
+            return _PUBLIC_BYTES
+        return self.largest_upload if _is_upload(headers) else self.settings.max_json_bytes
 
-        await self.app(scope, bounded, send)
+    @property
+    def largest_upload(self) -> int:
+        """Largest form of a photograph [bytes]."""
+        return self.settings.max_image_bytes + _MULTIPART_OVERHEAD
+
+
+def _is_upload(headers: Headers) -> bool:
+    return headers.get("content-type", "").lower().startswith("multipart/form-data")
+
+
+def _larger_than(limit: int) -> str:
+    return f"body: larger than the {limit} bytes allowed; send less"
+
+
+class _BoundedBody:
+    """The body of one request as its route receives it.
+
+    It raises HTTPException, which routes do not catch.
+    """
+
+    def __init__(
+        self,
+        bounds: BodyLimitMiddleware,
+        scope: Scope,
+        receive: Receive,
+        held: HeldBody,
+        announced: int,
+    ) -> None:
+        self._bounds = bounds
+        self._scope = scope
+        self._receive = receive
+        self._held = held
+        self._announced = announced
+        self._received = 0
+        self._waited_s = 0.0
+        self._is_begun = self._is_whole = False
+        self._limit = 0
+        self._shape: JsonShape | None = None
+
+    async def receive(self) -> Message:
+        """Return the next part."""
+        if not self._is_begun:
+            self._begin()
+        message = await self._next()
+        part = message.get("body", b"")
+        self._is_whole = not message.get("more_body", False)
+        self._received += len(part)
+        if self._received > self._limit:
+            raise HTTPException(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, _larger_than(self._limit))
+        self._held.grow_to(self._received)
+        if self._shape is not None:
+            self._shape.add(part)
+        return message
+
+    def _begin(self) -> None:
+        """Check the role, and choose the limits of the route. The route is known only now."""
+        self._is_begun = True
+        route, headers = self._scope.get("route"), Headers(scope=self._scope)
+        security.require_role(self._scope.get("state", {}).get("identity"), security.role_of(route))
+        takes_file, settings = takes_upload(route), self._bounds.settings
+        is_public = security.is_public(self._scope["path"])
+        rest = _PUBLIC_BYTES if is_public else settings.max_json_bytes
+        self._limit = self._bounds.largest_upload if takes_file and _is_upload(headers) else rest
+        if self._announced > self._limit:
+            raise HTTPException(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, _larger_than(self._limit))
+        if takes_file:
+            self._held.begin_upload()
+        elif "json" in headers.get("content-type", ""):
+            self._shape = JsonShape()
+        self._held.grow_to(self._announced)
+
+    async def _next(self) -> Message:
+        # Only the time of the sender counts, not the time of the service between two parts.
+        timeout_s, rate = self._bounds.timeout_s, self._bounds.settings.min_bytes_per_s
+        left_s = min(timeout_s, timeout_s + self._received / rate - self._waited_s)
+        began = time.monotonic()
+        # After the body, the only remaining message is the disconnect, which has no timeout.
+        with move_on_after(None if self._is_whole else left_s) as waiting:
+            message = await self._receive()
+        self._waited_s += time.monotonic() - began
+        if waiting.cancelled_caught:
+            raise HTTPException(
+                HTTPStatus.REQUEST_TIMEOUT, "body: it did not come in time; send it again"
+            )
+        return message

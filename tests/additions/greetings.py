@@ -2,7 +2,7 @@
 
 from fastapi import APIRouter
 
-from service.web.door.dependencies import READ
+from service.web.auth.dependencies import READ
 
 router = APIRouter(prefix="/greetings", tags=["health"])
 

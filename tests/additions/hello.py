@@ -3,8 +3,8 @@
 from fastapi import APIRouter, Request
 from fastapi.responses import HTMLResponse
 
-from service.web.answers.pages import render
-from service.web.door.dependencies import READ
+from service.web.auth.dependencies import READ
+from service.web.responses.pages import render
 
 router = APIRouter(include_in_schema=False)
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from model.plant import Plant, TargetPlane
+from model.plant_model import PlantModel
 from model.surface import control_points
 from service.sources.documents import Measurement, read_heliostat, read_json
 from service.sources.folder import Importer, MeasurementFolder, read_declared
@@ -27,10 +28,16 @@ def read(root: Path, heliostats: list[str] | None) -> NotesFolder:
     origin = np.array(notes["origin"])
     names = [name for name in notes["heliostats"] if heliostats is None or name in heliostats]
     properties = {name: notes["heliostats"][name] for name in names}
-    wall = TargetPlane("wall", np.array([0.0, 0, 40]), np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), 8, 8)
+    wall = TargetPlane(
+        "wall", np.array([0.0, 0, 40]), np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), 8, 8
+    )
     found = {name: read_heliostat(name, document, origin) for name, document in properties.items()}
     plant = Plant("notes", origin, {"wall": wall}, found)
-    return NotesFolder(root, plant, *read_declared(root / "twin.json"), {}, properties)
+    return NotesFolder(
+        root, plant, PlantModel(plant.site, *read_declared(root / "twin.json")), {}, properties
+    )
 
 
-IMPORTER = Importer(lambda root: (root / "notes.json").is_file(), read, "no 'notes.json' at the root")
+IMPORTER = Importer(
+    lambda root: (root / "notes.json").is_file(), read, "no 'notes.json' at the root"
+)

@@ -4,13 +4,15 @@ import io
 
 import numpy as np
 
-from service.web.answers.representation import Maps, Representation
+from service.web.responses.representation import Maps, Representation
 
 
 def write(maps: Maps) -> bytes:
     buffer = io.StringIO()
     for name, array in maps.arrays.items():
-        np.savetxt(buffer, array.reshape(len(array), -1), delimiter=",", header=f"{maps.title}: {name}")
+        np.savetxt(
+            buffer, array.reshape(len(array), -1), delimiter=",", header=f"{maps.title}: {name}"
+        )
     return buffer.getvalue().encode()
 
 

@@ -44,5 +44,7 @@ class Wedge:
             normal = np.cos(fold) * self.normal + side * np.sin(fold) * self.middle.right
             along = np.cross(self.up, normal) * side
             width = self.width * (part.stop - part.start) / columns
-            plane = TargetPlane(self.name, self.center + along * width / 2, normal, self.up, width, self.height)
+            plane = TargetPlane(
+                self.name, self.center + along * width / 2, normal, self.up, width, self.height
+            )
             yield Patch(part, np.ones(part.stop - part.start), plane)

@@ -1,6 +1,7 @@
 """Measured comparisons: ``make bench`` prints the figures of RESULTS.md.
 
-They compute in as many threads as the service does, which says so when it is imported: before NumPy and torch are.
+They compute in as many threads as the service does, which says so when it is imported: before NumPy
+and torch are.
 """
 
 import os

@@ -1,8 +1,10 @@
-"""What a busy machine costs: ``python -m tests.benchmarks.busy``. Run it without OMP_NUM_THREADS in the environment.
+"""What a busy machine costs: ``python -m tests.benchmarks.busy``. Run it without OMP_NUM_THREADS in
+the environment.
 
-Every work runs in a process of its own, as the command would start it, alone and beside a process that computes on all
-cores. Whatever else the machine does weighs on both; its load is told. Processor time tells what the work itself takes:
-a thread that waits for its turn takes none, one that spins for another does.
+Each task runs in a separate process, as the command would start it: once alone, and once next to a
+process that computes on all cores. Other programs of the machine slow down both, so its load is
+printed. Processor time is the cost of the task itself: a thread that waits uses none, a thread that
+spins does.
 """
 
 import multiprocessing
@@ -15,13 +17,13 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from model.plant import JUELICH_LATITUDE
+from model.plant_model import JUELICH_MODEL
 from tests.benchmarks import data_folder
 
 HELIOSTAT = "AA39"
 
 FLUXES, REPEATS = 200, 20
-"""Convolution fluxes, and predictions by the network, whose median is told."""
+"""Numbers of convolution fluxes and of network predictions, whose median is printed."""
 
 
 Times = tuple[float, float]
@@ -31,7 +33,10 @@ Times = tuple[float, float]
 def now() -> Times:
     """Of the clock, and of this process and those that it waited for."""
     children = os.times()
-    return time.perf_counter(), time.process_time() + children.children_user + children.children_system
+    return (
+        time.perf_counter(),
+        time.process_time() + children.children_user + children.children_system,
+    )
 
 
 def prediction(out: Path) -> Times:
@@ -44,7 +49,9 @@ def prediction(out: Path) -> Times:
             (plant / name).symlink_to(root / name)
     command = ("predict", str(plant), "--out", str(out / "predicted"), "--method", "refined")
     began = now()
-    subprocess.run([sys.executable, "-m", "service", *command], check=True, stdout=subprocess.DEVNULL)
+    subprocess.run(
+        [sys.executable, "-m", "service", *command], check=True, stdout=subprocess.DEVNULL
+    )
     ended = now()
     return ended[0] - began[0], ended[1] - began[1]
 
@@ -54,7 +61,9 @@ def in_process(work: str) -> Callable[[Path], Times]:
 
     def run(out: Path) -> Times:
         command = [sys.executable, "-m", "tests.benchmarks.busy", work]
-        wall, cpu = subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()
+        wall, cpu = subprocess.run(
+            command, check=True, capture_output=True, text=True
+        ).stdout.split()
         return float(wall), float(cpu)
 
     return run
@@ -74,7 +83,8 @@ def medians(work: Callable[[], object], repeats: int) -> Times:
 
 def measure(work: str) -> Times:
     """What `in_process` runs."""
-    import service  # first, as the command does: how many threads libraries take is settled before they are loaded
+    # First, as the command does: it limits the threads of libraries before they are loaded.
+    import service
 
     assert service
     import torch
@@ -85,17 +95,22 @@ def measure(work: str) -> Times:
     from model.prior import default_prior
     from model.tracing import Window, trace
     from tests.benchmarks.speed import TARGET, np, scene
-    from training.render import CleanCamera, Situations, observe, places
+    from training.render import CleanCamera, SceneSampler, observe, places
 
     if work == "flux":
         with torch.no_grad():
             one = scene(1, "cpu")
-            return medians(lambda: trace(one, Window(on_spot=True), samples=24, padding=0.25), FLUXES)
-    mirror, rng = Heliostat.juelich("synthetic", np.array([20.0, 95.0, 1.8]), 100.0), np.random.default_rng(0)
-    setups = places(Situations().suns(MAX_IMAGES, rng), [TARGET] * MAX_IMAGES)
+            return medians(
+                lambda: trace(one, Window(on_spot=True), samples=24, padding=0.25), FLUXES
+            )
+    mirror, rng = (
+        Heliostat.juelich("synthetic", np.array([20.0, 95.0, 1.8]), 100.0),
+        np.random.default_rng(0),
+    )
+    setups = places(SceneSampler().suns(MAX_IMAGES, rng), [TARGET] * MAX_IMAGES)
     images = observe(mirror, default_prior().mean, setups, CleanCamera(), rng)
     predictor = SurfacePredictor()
-    return medians(lambda: predictor.heights(mirror, images, latitude_deg=JUELICH_LATITUDE), REPEATS)
+    return medians(lambda: predictor.heights(mirror, images, JUELICH_MODEL), REPEATS)
 
 
 def burn() -> None:
@@ -107,7 +122,9 @@ def burn() -> None:
 @contextmanager
 def burning() -> Iterator[None]:
     """As many processes that compute without end as there are cores."""
-    processes = [multiprocessing.Process(target=burn, daemon=True) for _ in range(os.cpu_count() or 1)]
+    processes = [
+        multiprocessing.Process(target=burn, daemon=True) for _ in range(os.cpu_count() or 1)
+    ]
     for process in processes:
         process.start()
     try:
@@ -127,7 +144,10 @@ WORKS: dict[str, Callable[[Path], Times]] = {
 
 def main() -> None:
     """Print every work's times and their ratio."""
-    print(f"Beside a process on all {os.cpu_count()} cores (load of the machine before: {os.getloadavg()[0]:.1f})")
+    print(
+        f"Beside a process on all {os.cpu_count()} cores (load of the machine before:"
+        f" {os.getloadavg()[0]:.1f})"
+    )
     with tempfile.TemporaryDirectory() as folder:
         for name, work in WORKS.items():
             load = os.getloadavg()[0]
@@ -137,7 +157,11 @@ def main() -> None:
             print(f"  {name} (load before: {load:.1f}):")
             for kind, idle, busy in zip(("wall", "processor"), alone, beside, strict=True):
                 ratio = busy / idle
-                print(f"    {kind} time {idle:.4g} s alone, {busy:.4g} s beside it: {ratio:.1f} times", flush=True)
+                print(
+                    f"    {kind} time {idle:.4g} s alone, {busy:.4g} s beside it: {ratio:.1f}"
+                    " times",
+                    flush=True,
+                )
 
 
 if __name__ == "__main__":

@@ -1,8 +1,9 @@
-"""The watch of cameras on real photographs: ``python -m tests.benchmarks.cameras [../shared/stj-years]``.
+"""The watch of cameras on real photographs: ``python -m tests.benchmarks.cameras
+[../shared/stj-years]``.
 
-Prints by target how much days differ, whether the days as they came tell of a change (no camera of theirs is known to
-have changed), how often days drawn from them by chance do, and how often a change of a factor on the last seven of 45
-days is found.
+Prints for each target how much days differ, and whether a change is found in the days as recorded
+(no change of their cameras is known). It also prints how often a change is found in days drawn at
+random from them, and how often a change by a factor on the last seven of 45 days is found.
 """
 
 import argparse
@@ -13,11 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from model.errors import ModelError
 from service.base.settings import Settings
-from service.cli.folder import measure
+from service.cli.folder_store import open_folder
 from service.sources.folder import read_folder
-from service.twin.cameras import FIGURES, Change, find_change
+from service.twin.studies.camera_watch import FIGURES, CameraChange, find_camera_change
 
 DRAWS, LONG, DAYS, LAST = 200, 60, 45, 7
 FACTORS = (1.5, 2.0, 3.0)
@@ -27,37 +27,48 @@ def medians(root: Path) -> dict[str, dict[date, Any]]:
     """The medians of each day by target."""
     folder = read_folder(root)
     found: dict[str, dict[date, list[Any]]] = defaultdict(lambda: defaultdict(list))
-    for heliostat in folder.plant.heliostats:
-        for measurement in folder.measurements(heliostat):
-            try:
-                quality = measure(folder, measurement).quality
-            except ModelError as error:
-                print(f"{measurement.identifier}: {error}")
-                continue
-            if quality.accepted and measurement.taken_at is not None:
-                figures = np.log([getattr(quality, name) for name in FIGURES])
-                found[measurement.target][measurement.taken_at.date()].append(figures)
-    return {target: {day: np.median(all_, axis=0) for day, all_ in days.items()} for target, days in found.items()}
+    with open_folder(folder) as opened:
+        for heliostat in opened.names:
+            for row in opened.photographs(heliostat)[0]:
+                if row.taken_at is not None:
+                    figures = np.log([row.quality[name] for name in FIGURES])
+                    found[row.target.name][row.taken_at.date()].append(figures)
+    return {
+        target: {day: np.median(all_, axis=0) for day, all_ in days.items()}
+        for target, days in found.items()
+    }
 
 
-def _change(values: Any) -> Change | None:
+def _change(values: Any) -> CameraChange | None:
     days = {date(2024, 1, 1) + timedelta(days=number): one for number, one in enumerate(values)}
-    return find_change("", days, Settings())
+    return find_camera_change("", days, Settings())
 
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("folder", nargs="?", type=Path, default=Path("../shared/stj-years"))
     rng = np.random.default_rng(1)
     print("| target | days | spread of days | as they came | by chance, 60 days |", end="")
-    print("".join(f" found, x {factor:g} |" for factor in FACTORS), "\n|", " --- |" * (5 + len(FACTORS)), sep="")
+    print(
+        "".join(f" found, x {factor:g} |" for factor in FACTORS),
+        "\n|",
+        " --- |" * (5 + len(FACTORS)),
+        sep="",
+    )
     for target, by_day in sorted(medians(parser.parse_args().folder).items()):
         values = np.array([by_day[day] for day in sorted(by_day)])
         if len(values) < 15:
             continue
         alarms = np.mean([_change(rng.choice(values, LONG)) is not None for _ in range(DRAWS)])
-        row = [target, len(values), values.std(axis=0).round(2).tolist(), find_change(target, by_day, Settings())]
+        row = [
+            target,
+            len(values),
+            values.std(axis=0).round(2).tolist(),
+            find_camera_change(target, by_day, Settings()),
+        ]
         row.append(f"{alarms:.1%}")
         for factor in FACTORS:
             drawn = (rng.choice(values, DAYS) for _ in range(DRAWS))

@@ -1,8 +1,9 @@
 """Whether a real mirror changed: ``python -m tests.benchmarks.changed``.
 
-AA39's photographs of two years are parted at a date. From photographs of either side a surface is refined, and both
-forecast the other photographs. A mirror that changed is forecast better by the surface of its own side: by that
-advantage, with its interval over days. As a control days are dealt out in turn, where there can be none.
+AA39's photographs of two years are split at a date. A surface is refined from photographs of each
+side, and both surfaces forecast the other photographs. If the mirror changed, the surface of the
+same side forecasts better. The advantage is printed with its interval over days. As a control, the
+days are assigned to the sides alternately, so that there is no advantage.
 """
 
 import sys
@@ -14,11 +15,12 @@ from numpy.typing import NDArray
 from model.metrics import surface_error
 from model.network.predictor import default_predictor
 from model.observation import Observation, misfits
-from model.plant import JUELICH_LATITUDE, Heliostat
+from model.plant import Heliostat
+from model.plant_model import JUELICH_MODEL
 from model.refinement import refine
-from service.cli.folder import observations_of
 from service.sources.folder import read_folder
 from tests.benchmarks import data_folder
+from tests.benchmarks.folders import read_observations
 from tests.benchmarks.surfaces import BRIGHT, spread
 from tests.benchmarks.years import interval
 
@@ -36,8 +38,8 @@ def day_of(observation: Observation) -> str:
 
 def surface_from(heliostat: Heliostat, fitted: Sequence[Observation]) -> Array:
     """The refined surface (4, 8, 8) [m] of some photographs."""
-    start = default_predictor().predict(heliostat, spread(list(fitted), 8), latitude_deg=JUELICH_LATITUDE)
-    return refine(heliostat, fitted, start.z, latitude_deg=JUELICH_LATITUDE).z
+    start = default_predictor().predict(heliostat, spread(list(fitted), 8), JUELICH_MODEL)
+    return refine(heliostat, fitted, JUELICH_MODEL, start.z).z
 
 
 def row(name: str, heliostat: Heliostat, sides: Sequence[list[Observation]]) -> None:
@@ -46,14 +48,14 @@ def row(name: str, heliostat: Heliostat, sides: Sequence[list[Observation]]) -> 
     used = {o.identifier for side in fitted for o in side}
     judges = [[o for o in side if o.identifier not in used] for side in sides]
     surfaces = [surface_from(heliostat, side) for side in fitted]
-    missed = [[np.array(misfits(heliostat, j, z, latitude_deg=JUELICH_LATITUDE)) for j in judges] for z in surfaces]
+    missed = [[np.array(misfits(heliostat, j, z, JUELICH_MODEL)) for j in judges] for z in surfaces]
     advantage = np.concatenate([missed[1][0] - missed[0][0], missed[0][1] - missed[1][1]])
     worth = [[1 - each.mean() for each in of_surface] for of_surface in missed]
     low, high = interval(advantage, [day_of(o) for side in judges for o in side])
     print(
-        f"| {name} | {len(judges[0])}, {len(judges[1])} | {worth[0][0]:.3f} / {worth[1][0]:.3f} | "
-        f"{worth[1][1]:.3f} / {worth[0][1]:.3f} | {advantage.mean():+.4f} [{low:+.4f}, {high:+.4f}] | "
-        f"{1e3 * surface_error(*surfaces):.3f} |",
+        f"| {name} | {len(judges[0])}, {len(judges[1])} | {worth[0][0]:.3f} / {worth[1][0]:.3f} |"
+        f" {worth[1][1]:.3f} / {worth[0][1]:.3f} | {advantage.mean():+.4f} [{low:+.4f},"
+        f" {high:+.4f}] | {1e3 * surface_error(*surfaces):.3f} |",
         flush=True,
     )
 
@@ -66,17 +68,25 @@ def main() -> int:
         return 0
     years = read_folder(root)
     heliostat = years.plant.heliostats["AA39"]
-    dated = [o for o in observations_of(years, "AA39")[0] if o.clipped_share < BRIGHT and o.taken_at is not None]
+    dated = [
+        o
+        for o in read_observations(years, "AA39")
+        if o.clipped_share < BRIGHT and o.taken_at is not None
+    ]
     taken = sorted(dated, key=day_of)
     days = sorted({day_of(o) for o in taken})
     print(
-        "| parted | judges | before: by their own side's surface / by the other's | after: likewise "
-        "| advantage of the own side's, 95 % over days | surfaces differ by [mm] |\n"
-        "| --- | --- | --- | --- | --- | --- |"
+        "| parted | judges | before: by their own side's surface / by the other's | after: likewise"
+        " | advantage of the own side's, 95 % over days | surfaces differ by [mm] |\n| --- | --- |"
+        " --- | --- | --- | --- |"
     )
     for part in range(1, PARTS):
         date = day_of(taken[len(taken) * part // PARTS])
-        row(f"at {date}", heliostat, [[o for o in taken if (day_of(o) >= date) == later] for later in (False, True)])
+        row(
+            f"at {date}",
+            heliostat,
+            [[o for o in taken if (day_of(o) >= date) == later] for later in (False, True)],
+        )
     in_turn = [[o for o in taken if days.index(day_of(o)) % 2 == odd] for odd in (0, 1)]
     row("day by day, in turn", heliostat, in_turn)
     return 0

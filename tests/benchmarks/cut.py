@@ -1,9 +1,10 @@
 """Spots that run over their target's edge, on real photographs: ``python -m tests.benchmarks.cut``.
 
-Photographs of AA39 (``../shared/stj-years``) lose one side, in turn, as if the target ended within the spot, so that a
-share of its light lies beside it. What is left is measured and held against the forecast by the measured surface, the
-mirror turned until the light on the target has its centre where it was measured, and, for comparison, until all its
-light has. What the photograph's quality takes the share for stands beside them.
+Photographs of AA39 (``../shared/stj-years``) are cropped on one side after the other. It is as if
+the target ended within the spot, so that a share of its light misses the target. The rest is
+measured and compared with the forecast by the measured surface. The mirror is turned until the
+centre of the light on the target is where it was measured and, for comparison, until the centre of
+all light is there. The photograph's quality has an estimate of the share, which is printed too.
 """
 
 import argparse
@@ -12,10 +13,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from model.forecast import Setup, View, align
+from model.forecast import View, align
 from model.imaging import MeasuredFlux, measure, quality
 from model.metrics import compare_on_target
 from model.plant import TargetPlane
+from model.plant_model import PlantModel
+from model.setup import Setup
+from model.site import Site
 from model.sunshape import Buie
 from model.tracing import Optics
 from service.sources.decode import decode_image
@@ -30,21 +34,27 @@ Array = NDArray[np.float64]
 
 
 def line_at(flux: NDArray[np.float32], side: str, share: float) -> float:
-    """Where, in shares of the target from its left or top, a line cuts that share of the light off at a side."""
+    """Where, in shares of the target from its left or top, a line cuts that share of the light off
+    at a side.
+    """
     line = flux.sum(axis=0 if side in ("left", "right") else 1, dtype=np.float64)
     before = np.concatenate([[0.0], np.cumsum(line)]) / line.sum()
     wanted = share if side in ("left", "top") else 1 - share
     return 0.0 if share == 0 else float(np.interp(wanted, before, np.linspace(0, 1, len(before))))
 
 
-def shortened(plane: TargetPlane, image: NDArray[np.uint8], side: str, at: float) -> tuple[TargetPlane, Array]:
+def shortened(
+    plane: TargetPlane, image: NDArray[np.uint8], side: str, at: float
+) -> tuple[TargetPlane, Array]:
     """The target that ends at a line, and what is left of an image of it."""
     rows, columns = image.shape[:2]
     low, high = (at, 1.0) if side in ("left", "top") else (0.0, at or 1.0)
     if side in ("left", "right"):
         edges = round(low * columns), round(high * columns)
         size, left = (edges[1] - edges[0]) / columns, image[:, slice(*edges)]
-        center = plane.to_enu(np.array([((edges[0] + edges[1]) / 2 / columns - 0.5) * plane.width, 0.0]))
+        center = plane.to_enu(
+            np.array([((edges[0] + edges[1]) / 2 / columns - 0.5) * plane.width, 0.0])
+        )
         return replace(plane, center=center, width=size * plane.width), left
     edges = round(low * rows), round(high * rows)
     size, left = (edges[1] - edges[0]) / rows, image[slice(*edges)]
@@ -52,35 +62,47 @@ def shortened(plane: TargetPlane, image: NDArray[np.uint8], side: str, at: float
     return replace(plane, center=center, height=size * plane.height), left
 
 
-def accuracies(setup: Setup, whole: TargetPlane, taken: MeasuredFlux, latitude_deg: float) -> tuple[float, float]:
-    """Of the forecast whose light on the target, and of that whose light in all, has its centre where it was seen."""
+def accuracies(
+    setup: Setup, whole: TargetPlane, taken: MeasuredFlux, site: Site
+) -> tuple[float, float]:
+    """Of the forecast whose light on the target, and of that whose light in all, has its centre
+    where it was seen.
+    """
     assert taken.flux is not None
     large = replace(whole, width=20.0, height=20.0, center=setup.plane.center)
+    model = PlantModel(site, Optics(Buie(0.02)))
     size, scores = (setup.plane.width, setup.plane.height), []
     for plane in (setup.plane, large):
-        aligned = align([replace(setup, plane=plane)], latitude_deg=latitude_deg)
+        aligned = align([replace(setup, plane=plane)], model)
         if plane is large:  # the mount of the large target before the one that ends early
             mount = aligned.angles[0]
-            aligned = align([replace(setup, spot=None, angles=mount)], latitude_deg=latitude_deg)
-        forecast = aligned.flux(Optics(Buie(0.02)), (), VIEW)[0].clamp(min=0).numpy()
+            aligned = align([replace(setup, spot=None, angles=mount)], model)
+        forecast = aligned.flux(VIEW)[0].clamp(min=0).numpy()
         scores.append(compare_on_target(taken.flux, forecast, size).accuracy)
     return scores[0], scores[1]
 
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--every", type=int, default=4, help="every so-manieth photograph")
     options = parser.parse_args()
     quality._LIMIT_CUT = 1.0  # the limit is what is looked for
     folder = read_folder(data_folder().parent / "stj-years")
-    surface, latitude_deg = folder.measured_surface("AA39"), float(folder.plant.origin[0])
+    surface = folder.measured_surface("AA39")
     assert surface is not None
     points, degree = surface
-    crops = [one for one in folder.measurements("AA39") if "cropped" in one.images][:: options.every]
+    crops = [one for one in folder.measurements("AA39") if "cropped" in one.images][
+        :: options.every
+    ]
     found: dict[float, list[tuple[float, float, float]]] = {share: [] for share in SHARES}
     for number, one in enumerate(crops):
-        image, plane = decode_image(one.images["cropped"].read_bytes()), folder.plant.targets[one.target]
+        image, plane = (
+            decode_image(one.images["cropped"].read_bytes()),
+            folder.plant.targets[one.target],
+        )
         whole = measure(image, "cropped", plane)
         if whole.flux is None:
             continue
@@ -91,9 +113,16 @@ def main() -> None:
             if taken.center_of_mass is None:
                 continue
             spot = target.to_enu(taken.center_of_mass)
-            setup = Setup(folder.plant.heliostats["AA39"], points, one.sun, target, spot=spot, degree=degree)
-            found[share].append((taken.quality.cut_share, *accuracies(setup, plane, taken, latitude_deg)))
-    print("| light beside the target | photographs | taken for | accuracy, aligned by the part shown | by all light |")
+            setup = Setup(
+                folder.plant.heliostats["AA39"], points, one.sun, target, spot=spot, degree=degree
+            )
+            found[share].append(
+                (taken.quality.cut_share, *accuracies(setup, plane, taken, folder.model.site))
+            )
+    print(
+        "| light beside the target | photographs | taken for | accuracy, aligned by the part shown"
+        " | by all light |"
+    )
     print("| --- | --- | --- | --- | --- |")
     for share, rows in found.items():
         cut, shown, old = np.mean(rows, axis=0)

@@ -1,4 +1,6 @@
-"""What it costs to write a flux map as JSON: ``python -m tests.benchmarks.encoding``. Compare the ratio."""
+"""What it costs to write a flux map as JSON: ``python -m tests.benchmarks.encoding``. Compare the
+ratio.
+"""
 
 import json
 import os
@@ -7,11 +9,13 @@ import numpy as np
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel
 
-from service.web.answers.formats import json_answer
+from service.web.responses.formats import json_answer
 from tests.benchmarks.speed import seconds
 
 SIDE, REPEATS = 1024, 5
-"""Pixels along each side of the map, the most that the service gives, and how often it is written."""
+"""Pixels along each side of the map, the most that the service gives, and how often it
+is written.
+"""
 
 
 class Nothing(BaseModel):
@@ -19,17 +23,29 @@ class Nothing(BaseModel):
 
 
 def main() -> None:
-    """Print median times and sizes: number by number through Python's json, and as the service writes."""
+    """Print median times and sizes: number by number through Python's json, and as the service
+    writes.
+    """
     y, x = np.mgrid[-2 : 2 : SIDE * 1j, -2 : 2 : SIDE * 1j]
-    flux = (3e4 * np.exp(-(x**2) - y**2) + np.random.default_rng(0).random((SIDE, SIDE))).astype(np.float32)
+    flux = (3e4 * np.exp(-(x**2) - y**2) + np.random.default_rng(0).random((SIDE, SIDE))).astype(
+        np.float32
+    )
     before = JSONResponse({"flux": flux.tolist()}).body
     after = json_answer(Nothing(), flux=flux).body
     slow = seconds(lambda: JSONResponse({"flux": flux.tolist()}), REPEATS)
     fast = seconds(lambda: json_answer(Nothing(), flux=flux), REPEATS)
-    same = all(np.array_equal(np.array(json.loads(b)["flux"], np.float32), flux) for b in (before, after))
-    print(f"A {SIDE} x {SIDE} float32 map as JSON, median of {REPEATS} (load of the machine: {os.getloadavg()[0]:.1f})")
+    same = all(
+        np.array_equal(np.array(json.loads(b)["flux"], np.float32), flux) for b in (before, after)
+    )
+    print(
+        f"A {SIDE} x {SIDE} float32 map as JSON, median of {REPEATS} (load of the machine:"
+        f" {os.getloadavg()[0]:.1f})"
+    )
     print(f"  Python's json: {slow:.3f} s, {len(before) / 1e6:.1f} MB")
-    print(f"  orjson, as the service answers: {fast:.3f} s, {len(after) / 1e6:.1f} MB, {slow / fast:.0f} times as fast")
+    print(
+        f"  orjson, as the service answers: {fast:.3f} s, {len(after) / 1e6:.1f} MB,"
+        f" {slow / fast:.0f} times as fast"
+    )
     print(f"  both read back as float32 bit by bit: {same}")
 
 

@@ -1,7 +1,9 @@
-"""Time and memory that ``heliotwin export`` takes: ``python -m tests.benchmarks.exporting [--heliostats N ...]``.
+"""Time and memory that ``heliotwin export`` takes: ``python -m tests.benchmarks.exporting
+[--heliostats N ...]``.
 
-Fills stores of so many heliostats with photographs of random bytes, a surface each, and exports each store by a process
-of its own. Where the memory is the same for all, it does not grow with the field.
+Fills stores of N heliostats with photographs of random bytes and one surface per heliostat. Each
+store is exported by a separate process. If the memory is the same for all, it does not grow with
+the field.
 """
 
 import argparse
@@ -16,21 +18,26 @@ import numpy as np
 
 from model.imaging import MeasuredFlux, Quality
 from service import store
+from service.base.fields import Sun
 from service.base.settings import Settings
 from service.sources.documents import read_targets
 from service.sources.photograph import Photograph
-from service.store.backup import images_of
 from service.store.columns import now
 from service.store.database import Database
-from service.store.surfaces import NewSurface
+from service.store.recovery.backup import images_of
+from service.store.surfaces.surface_versions import NewSurface
 from service.store.tables import ImageRow
-from service.twin.ingest import row_of
+from service.twin.photographs.ingest import measurement_row
 from tests.service.conftest import ORIGIN, properties_document, tower_document
 
 
 def fill(settings: Settings, heliostats: int, photographs: int, size: int) -> None:
     """A store with photographs of ``size`` bytes."""
-    database, images, rng = Database(settings.database), images_of(settings), np.random.default_rng(1)
+    database, images, rng = (
+        Database(settings.database),
+        images_of(settings),
+        np.random.default_rng(1),
+    )
     database.upgrade()
     flux = np.full((256, 256), 100 / 256**2, dtype=np.float32)
     measured = MeasuredFlux(Quality(accepted=True), flux, flux[96:160, 96:160], np.zeros(2))
@@ -42,15 +49,20 @@ def fill(settings: Settings, heliostats: int, photographs: int, size: int) -> No
             place = (float(number % 50), float(number // 50), 1.0)
             row = store.put_heliostat(session, f"H{number:05d}", properties_document(), place)[0]
             for one in range(photographs):
-                about = Photograph(target.name, "cropped", 5.0 * one, 30.0, f"{one}", now(), (31234.0, 45012.0))
-                kept = row_of(about, measured, target.id, None)
-                image = ImageRow(sha256=images.put(rng.bytes(size)), media_type="image/png", size_bytes=size)
+                sun = Sun(azimuth_deg=5.0 * one, elevation_deg=30.0)
+                about = Photograph(target.name, "cropped", sun, f"{one}", now(), (31234.0, 45012.0))
+                kept = measurement_row(about, measured, target.id, None)
+                image = ImageRow(
+                    sha256=images.put(rng.bytes(size)), media_type="image/png", size_bytes=size
+                )
                 image.width_px, image.height_px = 1000, 800
                 store.add_measurement(session, row, image, kept)
             z = rng.normal(0, 2e-4, (4, 8, 8))
             points = np.stack([z, z, z], axis=-1)
             store.add_surface(
-                session, row, NewSurface("network", z, abs(z), points, now(), "network", "1:none", [], 0.05)
+                session,
+                row,
+                NewSurface("network", z, abs(z), points, now(), "network", "1:none", [], 0.05),
             )
     database.close()
 
@@ -60,7 +72,9 @@ def export(settings: Settings, folder: Path) -> tuple[float, float]:
     environment = os.environ | {"HELIOTWIN_DATA_DIR": str(settings.data_dir)}
     started = time.perf_counter()
     process = subprocess.Popen(
-        [sys.executable, "-m", "service", "export", str(folder), "--json"], env=environment, stdout=subprocess.DEVNULL
+        [sys.executable, "-m", "service", "export", str(folder), "--json"],
+        env=environment,
+        stdout=subprocess.DEVNULL,
     )
     _, status, used = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
@@ -70,7 +84,9 @@ def export(settings: Settings, folder: Path) -> tuple[float, float]:
 
 def main() -> None:
     """Print a line a size."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--heliostats", type=int, nargs="+", default=[215, 2153])
     parser.add_argument("--photographs", type=int, default=8)
     parser.add_argument("--kilobytes", type=int, default=100, help="of a photograph")
@@ -82,7 +98,8 @@ def main() -> None:
             seconds, megabytes = export(settings, Path(folder) / "out")
             files = sum(len(names) for _, _, names in os.walk(Path(folder) / "out"))
         print(
-            f"{heliostats} heliostats x {options.photographs}: {files} files, {seconds:.0f} s, {megabytes:.0f} MB",
+            f"{heliostats} heliostats x {options.photographs}: {files} files, {seconds:.0f} s,"
+            f" {megabytes:.0f} MB",
             flush=True,
         )
 

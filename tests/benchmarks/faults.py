@@ -1,4 +1,6 @@
-"""Faults tried for real, each with its outcome: ``python -m tests.benchmarks.faults [sqlite|postgres] [NAME ...]``."""
+"""Faults tried for real, each with its outcome: ``python -m tests.benchmarks.faults
+[sqlite|postgres] [NAME ...]``.
+"""
 
 import sys
 import tempfile
@@ -12,7 +14,9 @@ ENGINES = ("sqlite", "postgres")
 
 
 def main(arguments: list[str]) -> int:
-    """Try every fault on both databases, or those that are named; 1 where something acknowledged was lost."""
+    """Try every fault on both databases, or those that are named; 1 where something acknowledged
+    was lost.
+    """
     engines = [engine for engine in ENGINES if engine in arguments] or list(ENGINES)
     names = [name for name in SCENARIOS if name in arguments] or list(SCENARIOS)
     lost = 0
@@ -20,7 +24,10 @@ def main(arguments: list[str]) -> int:
         for engine in engines:
             started = time.monotonic()
             try:
-                with tempfile.TemporaryDirectory() as folder, new_store(engine, Path(folder)) as store:
+                with (
+                    tempfile.TemporaryDirectory() as folder,
+                    new_store(engine, Path(folder)) as store,
+                ):
                     outcome = SCENARIOS[name](store)
             except NotTriedError as reason:
                 outcome = f"not tried: {reason}"

@@ -1,8 +1,10 @@
-"""Pages of a large field: ``python -m tests.benchmarks.field [--database postgres] [--heliostats N]``.
+"""Pages of a large field: ``python -m tests.benchmarks.field [--database postgres] [--heliostats
+N]``.
 
-Fills a store with heliostats, each with photographs in several kinds, and two surfaces, and prints what the field's
-page, its filters and its listing take on the server: the first time after a start, and from then on. Accuracies are
-drawn, not traced: they are worked out beside the pages, each once.
+Fills a store with heliostats, each with photographs of several kinds and two surfaces. Prints the
+server's time for the field's page, its filters and its listing: for the first request after a
+start, and for later ones. Accuracies are random numbers, not traced: the service computes each only
+once, in the background.
 """
 
 import argparse
@@ -25,10 +27,17 @@ from service.sources.documents import read_targets
 from service.store.columns import now
 from service.store.database import Database
 from service.store.tables import HeliostatRow, ImageRow, MeasurementRow, SurfaceRow
-from service.twin.accuracy import AccuracyBook, Rank, State
+from service.twin.surfaces.accuracy import AccuracyCache, AccuracyState, Rank
 from service.web.app import create_app
 from tests.faults.harness import new_store
-from tests.service.conftest import ORIGIN, QUIET, FakeOperations, client_of, properties_document, tower_document
+from tests.service.conftest import (
+    ORIGIN,
+    QUIET,
+    FakeOperations,
+    client_of,
+    properties_document,
+    tower_document,
+)
 
 PHOTOGRAPHS = 8
 """Of each heliostat, images of the same measurement in two kinds; every tenth is refused."""
@@ -36,9 +45,9 @@ PHOTOGRAPHS = 8
 PATHS = {
     "the page": "/",
     "a search": "/?search=H012",
-    "a filter": "/?show=doubted&sort=photographs",
-    "sorted, page 50": "/?sort=uncertainty&page=50",
-    "another colour": "/?metric=deviation",
+    "a filter": "/?show=flagged&sort=photographs",
+    "sorted, page 50": "/?sort=uncertainty_mm&page=50",
+    "another colour": "/?metric=deviation_mm",
     "photographs": "/photographs",
     "photographs that are refused": "/photographs?verdict=refused",
     "photographs that are excluded, of which there are none": "/photographs?verdict=excluded",
@@ -48,7 +57,7 @@ PATHS = {
     "photographs, far back": "/photographs?before=2000",
     "names": "/v1/heliostats?limit=100",
     "names, by a part": "/v1/heliostats?limit=100&search=99",
-    "the field over REST": "/v1/field?limit=100&show=doubted",
+    "the field over REST": "/v1/field?limit=100&show=flagged",
 }
 
 
@@ -62,7 +71,10 @@ def fill(database: Database, count: int) -> None:
     properties = properties_document()
     with database.writing() as session:
         store.put_plant(session, "plant", ORIGIN)
-        targets = [store.put_target(session, plane)[0].id for plane in read_targets(tower_document())[1].values()]
+        targets = [
+            store.put_target(session, plane)[0].id
+            for plane in read_targets(tower_document())[1].values()
+        ]
     side = round(count**0.5)
     for numbers in _chunks(count):
         with database.writing() as session:
@@ -81,11 +93,16 @@ def fill(database: Database, count: int) -> None:
                 ],
             )
             session.execute(
-                insert(ImageRow), [_image(number, shot) for number in numbers for shot in range(PHOTOGRAPHS)]
+                insert(ImageRow),
+                [_image(number, shot) for number in numbers for shot in range(PHOTOGRAPHS)],
             )
             session.execute(
                 insert(MeasurementRow),
-                [_measurement(number, shot, targets[0]) for number in numbers for shot in range(PHOTOGRAPHS)],
+                [
+                    _measurement(number, shot, targets[0])
+                    for number in numbers
+                    for shot in range(PHOTOGRAPHS)
+                ],
             )
             session.execute(
                 insert(SurfaceRow),
@@ -100,7 +117,12 @@ def fill(database: Database, count: int) -> None:
 
 def _image(number: int, shot: int) -> dict[str, Any]:
     size = {"size_bytes": 1000, "width_px": 100, "height_px": 80}
-    return {"sha256": f"{number:032x}{shot:032x}", "media_type": "image/png", "accepted": bool(shot), **size}
+    return {
+        "sha256": f"{number:032x}{shot:032x}",
+        "media_type": "image/png",
+        "accepted": bool(shot),
+        **size,
+    }
 
 
 def _measurement(number: int, shot: int, target: int) -> dict[str, Any]:
@@ -111,7 +133,7 @@ def _measurement(number: int, shot: int, target: int) -> dict[str, Any]:
         "image_sha256": f"{number:032x}{shot:032x}",
         "kind": ("flux", "cropped")[shot % 2],
         "target_id": target,
-        "sun_azimuth_deg": 10.0 * shot,
+        "sun_azimuth_deg": 180 - 10.0 * shot,
         "sun_elevation_deg": 40.0,
         "accepted": shot % 10 != 0,
         "quality": {"signal_to_noise": 30.0},
@@ -128,13 +150,15 @@ def _surface(rng: np.random.Generator, number: int, version: int, at: Any) -> di
         "source": "refined",
         "misfit": 0.05,
         "trusted": is_trusted,
-        "doubts": [] if is_trusted else ["its photographs show the mirror under suns that are too much alike"],
-        "doubted_since": None if is_trusted else at,
+        "warnings": []
+        if is_trusted
+        else ["its photographs show the mirror under suns that are too much alike"],
+        "warned_since": None if is_trusted else at,
         "arrays": pack({"z": z, "z_std": abs(z), "control_points": np.stack([z, z, z], axis=-1)}),
     }
 
 
-def _drawn_rank(_: AccuracyBook, state: State) -> Rank:
+def _drawn_rank(_: AccuracyCache, state: AccuracyState) -> Rank:
     return Rank(0.8 + 0.2 * (state.surface * 7919 % 1000) / 1000, 3)
 
 
@@ -147,31 +171,41 @@ def _timed(client: TestClient, path: str) -> tuple[float, Any]:
 
 
 def _settle(client: TestClient) -> None:
-    while "being worked out" in client.get("/").text:
+    while "being computed" in client.get("/").text:
         time.sleep(1)
 
 
 def pages(settings: Settings) -> None:
-    """A row for each path: the first answer after the start, then the median of five, and how large it is."""
+    """A row for each path: the first answer after the start, then the median of five, and how large
+    it is.
+    """
     print("| asked | first [s] | then [s] | size [kB] |\n| --- | --- | --- | --- |")
     with client_of(create_app(settings, FakeOperations())) as client:
         client.headers["Accept"] = "text/html"
         took, answer = _timed(client, "/")
-        print(f"| the page after a start | {took:.2f} | | {len(answer.content) / 1e3:.0f} |", flush=True)
+        print(
+            f"| the page after a start | {took:.2f} | | {len(answer.content) / 1e3:.0f} |",
+            flush=True,
+        )
         _settle(client)
         for name, path in PATHS.items():
             first, answer = _timed(client, path)
             then = statistics.median(_timed(client, path)[0] for _ in range(5))
-            print(f"| {name} | {first:.2f} | {then:.2f} | {len(answer.content) / 1e3:.0f} |", flush=True)
+            print(
+                f"| {name} | {first:.2f} | {then:.2f} | {len(answer.content) / 1e3:.0f} |",
+                flush=True,
+            )
 
 
 def main() -> None:
     """Fill a store and print what its pages take."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--database", choices=("sqlite", "postgres"), default="sqlite")
     parser.add_argument("--heliostats", type=int, default=20_000)
     options = parser.parse_args()
-    AccuracyBook._rank = _drawn_rank  # type: ignore[method-assign]
+    AccuracyCache._rank = _drawn_rank  # type: ignore[method-assign]
     with tempfile.TemporaryDirectory() as folder, new_store(options.database, Path(folder)) as made:
         settings = made.settings.model_copy(update=QUIET)
         database = Database(settings.database)

@@ -1,6 +1,8 @@
-"""A field's light on one receiver: ``python -m tests.benchmarks.fleet``. The machine is shared: compare CPU times.
+"""A field's light on one receiver: ``python -m tests.benchmarks.fleet``. The machine is shared:
+compare CPU times.
 
-``--part N`` heliostats at most, of 200,000, are traced; what all of them take is projected from those.
+``--part N`` heliostats at most, of 200,000, are traced; what all of them take is projected from
+those.
 """
 
 import argparse
@@ -16,23 +18,25 @@ import numpy as np
 import torch
 
 from model.fleet import Superposition, aligned_field, superpose, tiles
-from model.forecast import Setup
 from model.frames import sun_direction
-from model.plant import JUELICH_LATITUDE, Cylinder, Heliostat, Plant, Receiver, TargetPlane
+from model.plant import Cylinder, Heliostat, Plant, Receiver, TargetPlane
+from model.plant_model import JUELICH_MODEL, PlantModel
 from model.prior import default_prior
+from model.setup import Setup
+from model.site import JUELICH
 from model.sunshape import Pillbox
 from model.surface import control_points
 from model.tracing import Optics
 from service import store
 from service.base.settings import Settings
 from service.cli.demo_plant import ORIGIN, properties
-from service.jobs.asking import ask_for
-from service.jobs.kinds import KINDS
+from service.jobs.enqueuing import enqueue
+from service.jobs.kinds import KINDS, field_forecasts
 from service.jobs.worker import Worker
-from service.store import queue
-from service.store.surfaces import NewSurface
-from service.twin.engines import Threads
-from service.twin.runtime import Runtime
+from service.store.jobs import queue
+from service.store.surfaces.surface_versions import NewSurface
+from service.twin.runtime.engines import Threads
+from service.twin.runtime.runtime import Runtime
 from tests.field_rays import Land, onto_cylinder, onto_plane, trace_field
 
 AREA = 33.0
@@ -43,7 +47,9 @@ SUN = (-30.0, 35.0)
 
 
 class Field:
-    """``count`` heliostats to the north of a tower, from ``near`` [m] on, evenly dense by the golden angle."""
+    """``count`` heliostats to the north of a tower, from ``near`` [m] on, evenly dense by the
+    golden angle.
+    """
 
     def __init__(self, count: int, near: float) -> None:
         turns = np.arange(4 * count)
@@ -64,7 +70,14 @@ class Field:
 
 def plane(height: float, side: float) -> TargetPlane:
     """A square that faces the field, [m]."""
-    return TargetPlane("plane", np.array([0.0, 0, height]), np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), side, side)
+    return TargetPlane(
+        "plane",
+        np.array([0.0, 0, height]),
+        np.array([0.0, 1, 0]),
+        np.array([0.0, 0, 1]),
+        side,
+        side,
+    )
 
 
 @dataclass
@@ -91,7 +104,7 @@ def peak_mib() -> float:
 
 
 def setups(field: Field, aim: TargetPlane, every: int = 1) -> Iterator[Setup]:
-    """Each ``every``-th heliostat of a field with a mirror of its own."""
+    """Each ``every``-th heliostat of a field, with an individual mirror."""
     rng, prior, sun = np.random.default_rng(0), default_prior(), sun_direction(*SUN)
     for heliostat in field.every(every):
         z = prior.surface(rng.normal(size=len(prior.basis)))
@@ -99,11 +112,15 @@ def setups(field: Field, aim: TargetPlane, every: int = 1) -> Iterator[Setup]:
 
 
 def against_monte_carlo() -> None:
-    """A dense field under a low sun, on a plane and on a cylinder, against a Monte Carlo of its own."""
-    sun, square, half_angle = sun_direction(35.0, 15.0), plane(30.0, 9.0), 4.65e-3
+    """A dense field under a low sun, on a plane and on a cylinder, against a Monte Carlo of its
+    own.
+    """
+    sun, square, half_angle = sun_direction(145.0, 15.0), plane(30.0, 9.0), 4.65e-3
     drum = Cylinder("drum", square.center + [0, 3, 0], square.normal, square.up, 3.0, 8.0)
     heliostats = [
-        Heliostat.juelich(f"{row}-{column}", np.array([4.4 * column - 8.8, 55 + 3.8 * row, 1.8]), 70.0)
+        Heliostat.juelich(
+            f"{row}-{column}", np.array([4.4 * column - 8.8, 55 + 3.8 * row, 1.8]), 70.0
+        )
         for row in range(5)
         for column in range(5)
     ]
@@ -115,20 +132,30 @@ def against_monte_carlo() -> None:
         aim, size = np.asarray(receiver.center), (receiver.width, receiver.height)
         traced = {
             shadows: trace_field(
-                heliostats, sun, aim, land, size, (18, 18), half_angle=half_angle, rays=40_000, seed=1, shadows=shadows
+                heliostats,
+                sun,
+                aim,
+                land,
+                size,
+                (18, 18),
+                half_angle=half_angle,
+                rays=40_000,
+                seed=1,
+                shadows=shadows,
             )
             for shadows in (True, False)
         }
         expected, powers = traced[True]
-        task = Superposition(receiver, (72, 72), Optics(Pillbox(half_angle)), latitude_deg=JUELICH_LATITUDE)
+        task = Superposition(receiver, PlantModel(JUELICH, Optics(Pillbox(half_angle))), (72, 72))
         some = [Setup(one, control_points(one), sun, square, aim=aim) for one in heliostats]
-        neighbours = aligned_field([(one, aim) for one in heliostats], sun, latitude_deg=JUELICH_LATITUDE)
+        neighbours = aligned_field([(one, aim) for one in heliostats], sun, JUELICH_MODEL)
         found = superpose(task, tiles(some, neighbours))
         coarse = found.irradiance.reshape(18, 4, 18, 4).mean(axis=(1, 3))
         print(
-            f"  25 dense heliostats, {name}: neighbours leave {powers.sum() / traced[False][1].sum():.3f} of the light "
-            f"(forecast over Monte Carlo {found.power / powers.sum():.4f}); land {coarse.sum() / expected.sum():.4f}, "
-            f"L1 of the maps {np.abs(coarse - expected).sum() / expected.sum():.4f}"
+            f"  25 dense heliostats, {name}: neighbours leave"
+            f" {powers.sum() / traced[False][1].sum():.3f} of the light (forecast over Monte Carlo"
+            f" {found.power / powers.sum():.4f}); land {coarse.sum() / expected.sum():.4f}, L1 of"
+            f" the maps {np.abs(coarse - expected).sum() / expected.sum():.4f}"
         )
 
 
@@ -148,20 +175,28 @@ def field_of_2000() -> None:
             neighbours = None
             if has_neighbours:
                 neighbours = aligned_field(
-                    [(setup.heliostat, square.center) for setup in some], some[0].sun, latitude_deg=JUELICH_LATITUDE
+                    [(setup.heliostat, square.center) for setup in some], some[0].sun, JUELICH_MODEL
                 )
             total = superpose(
-                Superposition(receiver, (side, side), latitude_deg=JUELICH_LATITUDE),
+                Superposition(receiver, JUELICH_MODEL, (side, side)),
                 tiles(some, neighbours),
                 Threads(2),
             )
         landed = total.irradiance.mean() * receiver.width * receiver.height
-        print(f"  2,000 heliostats, {name}: {meter}; {total.power / 1e6:.2f} MW thrown, {landed / 1e6:.2f} MW land")
+        print(
+            f"  2,000 heliostats, {name}: {meter}; {total.power / 1e6:.2f} MW thrown,"
+            f" {landed / 1e6:.2f} MW land"
+        )
 
 
 def stored_field() -> None:
     """The same from a store, as a job of the service."""
-    field, square, rng, prior = Field(2000, 60.0), plane(50.0, 10.0), np.random.default_rng(0), default_prior()
+    field, square, rng, prior = (
+        Field(2000, 60.0),
+        plane(50.0, 10.0),
+        np.random.default_rng(0),
+        default_prior(),
+    )
     place = Plant("bench", np.array(ORIGIN))
     with tempfile.TemporaryDirectory() as folder:
         runtime = Runtime.from_settings(Settings(data_dir=Path(folder)))
@@ -170,16 +205,24 @@ def stored_field() -> None:
             store.put_plant(session, "bench", ORIGIN)
             store.put_target(session, square)
             for one in field.every():
-                row, _ = store.put_heliostat(session, one.name, properties(one, place), one.position)
+                row, _ = store.put_heliostat(
+                    session, one.name, properties(one, place), one.position
+                )
                 z = prior.surface(rng.normal(size=len(prior.basis)))
-                store.add_surface(session, row, NewSurface("measured", z, 0 * z, control_points(one, z)))
+                store.add_surface(
+                    session, row, NewSurface("measured", z, 0 * z, control_points(one, z))
+                )
         sun = {"azimuth_deg": SUN[0], "elevation_deg": SUN[1]}
-        job = ask_for(runtime, "forecasts", {"target": "plane", "sun": sun}, "bench", None)
+        payload = field_forecasts.FleetForecastIn.model_validate({"target": "plane", "sun": sun})
+        job = enqueue(runtime, field_forecasts.KIND, payload, "bench")
         with Meter() as meter:
             Worker(runtime, KINDS, "bench", threading.Event()).work()
         with runtime.database.reading() as session:
             result = queue.get_job(session, job.id).result or {}
-        print(f"  the same as a job of the service, SQLite: {meter}; {result['heliostats']} heliostats")
+        print(
+            f"  the same as a job of the service, SQLite: {meter}; {result['heliostats']}"
+            " heliostats"
+        )
         runtime.close()
 
 
@@ -189,7 +232,7 @@ def field_of_200000(part: int) -> None:
     print(f"  200,000 heliostats: memory before {peak_mib():.0f} MiB")
     with Meter() as meter:
         neighbours = aligned_field(
-            ((one, square.center) for one in field.every()), sun_direction(*SUN), latitude_deg=JUELICH_LATITUDE
+            ((one, square.center) for one in field.every()), sun_direction(*SUN), JUELICH_MODEL
         )
     print(f"  where all 200,000 mirrors stand: {meter}; memory {peak_mib():.0f} MiB")
     rates = []
@@ -197,7 +240,9 @@ def field_of_200000(part: int) -> None:
         some = setups(field, square, every=200_000 // count)
         with Meter() as meter:
             total = superpose(
-                Superposition(square, (128, 128), latitude_deg=JUELICH_LATITUDE), tiles(some, neighbours), Threads(2)
+                Superposition(square, JUELICH_MODEL, (128, 128)),
+                tiles(some, neighbours),
+                Threads(2),
             )
         rates.append((total.heliostats, meter.cpu))
         print(
@@ -205,15 +250,20 @@ def field_of_200000(part: int) -> None:
             f"{1e3 * meter.cpu / total.heliostats:.2f} ms each; memory {peak_mib():.0f} MiB"
         )
     slope, start = np.polyfit(*np.array(rates).T, 1)
-    print(f"  projected, linear in the number: {(start + slope * 200_000) / 60:.1f} min of CPU for all 200,000")
+    print(
+        f"  projected, linear in the number: {(start + slope * 200_000) / 60:.1f} min of CPU for"
+        " all 200,000"
+    )
 
 
 def main() -> None:
     """Print times and memory."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--part", type=int, default=8000, help="most of the 200,000 heliostats that are traced")
+    parser.add_argument(
+        "--part", type=int, default=8000, help="most of the 200,000 heliostats that are traced"
+    )
     options = parser.parse_args()
-    torch.set_num_threads(1)  # the engine has threads of its own
+    torch.set_num_threads(1)  # the engine has separate threads
     print("Fleet (2 threads)")
     field_of_200000(options.part)  # first: memory is what the process ever held
     against_monte_carlo()

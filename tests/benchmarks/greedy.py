@@ -1,33 +1,54 @@
 """A victim beside a greedy key: ``python -m tests.benchmarks.greedy [--database postgres]``.
 
-On the service with the real model, which knows two mirrors of the Solar Tower Juelich, sixteen connections ask with one
-key, each as soon as it has its answer: for a forecast of 1024 x 1024 as JSON, for pages with it, for predictions, or
-with photographs. Meanwhile another key reads plain routes and /readyz. Prints its times, alone and beside each, and
-what the greedy one was answered. All clients run on the same machine as the service.
+On the service with the real model, which knows two mirrors of the Solar Tower Juelich, sixteen
+connections ask with one key, each as soon as it has its answer: for a forecast of 1024 x 1024 as
+JSON, for pages with it, for predictions, or with photographs, frames of 5 and of 48 megapixels
+among them. Meanwhile another key reads plain routes and /readyz, or asks for forecasts
+(``--victim model``), or sends photographs (``--victim photographs``). Prints its times, alone and
+beside each, and what the greedy one was answered. ``--heliostats N`` adds so many with photographs
+and surfaces. All clients run on the same machine as the service.
 """
 
 import argparse
 import asyncio
 import itertools
+import json
 import sys
 import tempfile
 import time
+import uuid
 from collections import Counter
 from collections.abc import Awaitable, Callable
+from functools import cache
 from pathlib import Path
+from typing import Any
 
+import cv2
 import httpx
 import numpy as np
 
 from service.store import keys
-from service.store.database import Database
-from tests.benchmarks import data_folder
+from service.store.database import Database, migrate
+from tests.benchmarks import data_folder, field
 from tests.benchmarks.load import HELIOSTATS, SUN, Tally, Visitor, import_two
 from tests.faults.harness import Process, Store, new_store
 
 CONNECTIONS = 16
-PLAIN = ("/v1/heliostats", "/v1/heliostats/AA39", "/v1/forecasts?limit=20", "/v1/jobs", "/v1/targets", "/readyz")
-FORECAST = {"heliostat": "AA39", "target": "multi_focus_tower", "sun": SUN, "surface": "ideal", "resolution": 1024}
+PLAIN = (
+    "/v1/heliostats",
+    "/v1/heliostats/AA39",
+    "/v1/forecasts?limit=20",
+    "/v1/jobs",
+    "/v1/targets",
+    "/readyz",
+)
+FORECAST = {
+    "heliostat": "AA39",
+    "target": "multi_focus_tower",
+    "sun": SUN,
+    "surface": "ideal",
+    "resolution": 1024,
+}
 
 Ask = Callable[[Visitor], Awaitable[httpx.Response]]
 
@@ -41,11 +62,48 @@ async def _page(visitor: Visitor) -> httpx.Response:
     return await visitor.http.get(path, headers={"Accept": "text/html"})
 
 
+@cache
+def _frame_file(rows: int, columns: int, levels: int) -> bytes:
+    """A noisy camera frame; the next one differs by what is put behind its end."""
+    pixels = np.random.default_rng(0).integers(0, levels, (rows, columns), dtype=np.uint8)
+    return cv2.imencode(".png", pixels)[1].tobytes()
+
+
+async def _post_frame(visitor: Visitor, rows: int, columns: int, levels: int) -> httpx.Response:
+    identifier = uuid.uuid4().hex
+    sent = {"kind": "raw", "id": identifier, "target": "multi_focus_tower"}
+    image = _frame_file(rows, columns, levels) + identifier.encode()
+    return await visitor.http.post(
+        "/v1/heliostats/AA39/measurements",
+        files={"image": ("frame.png", image, "image/png")},
+        data={
+            "metadata": json.dumps({**sent, "sun": {"azimuth_deg": 180.0, "elevation_deg": 45.0}})
+        },
+    )
+
+
+async def _frame(visitor: Visitor) -> httpx.Response:
+    """A frame of 5 megapixels and some 5 MB."""
+    return await _post_frame(visitor, 2048, 2448, 255)
+
+
+async def _largest_frame(visitor: Visitor) -> httpx.Response:
+    """A frame of 48 megapixels, which is nearly the largest accepted, and some 13 MB."""
+    return await _post_frame(visitor, 6000, 8000, 4)
+
+
+async def _field(visitor: Visitor) -> httpx.Response:
+    return await visitor.http.get(visitor.random.choice(["/v1/field", "/v1/attention", "/metrics"]))
+
+
 GREEDY: dict[str, tuple[str, Ask]] = {
     "maps": ("read", _map),
     "pages": ("read", _page),
     "predictions": ("operate", Visitor.surface),
     "photographs": ("ingest", Visitor.photograph),
+    "frames": ("ingest", _frame),
+    "frames48": ("ingest", _largest_frame),
+    "field": ("read", _field),
 }
 """What a greedy key asks for, and its role."""
 
@@ -64,43 +122,79 @@ async def _greedy(base: str, key: str, ask: Ask, seed: int, answers: Counter[str
                 answers[type(error).__name__] += 1
 
 
-async def _victim(base: str, key: str, seconds: float, pause_s: float) -> tuple[list[float], Counter[str]]:
+async def _photograph(http: httpx.AsyncClient, turn: int) -> httpx.Response:
+    return await Visitor(http, Tally(), 10**7 + turn).photograph()
+
+
+async def _plain(http: httpx.AsyncClient, turn: int) -> httpx.Response:
+    return await http.get(PLAIN[turn % len(PLAIN)])
+
+
+async def _model(http: httpx.AsyncClient, turn: int) -> httpx.Response:
+    return await http.post(
+        "/v1/forecasts", json={**FORECAST, "resolution": 64, "dni_w_m2": 500 + turn % 1000}
+    )
+
+
+VICTIMS = {"plain": _plain, "model": _model, "photographs": _photograph}
+"""What the victim asks for: plain routes, a forecast, which needs the model, or photographs."""
+
+
+async def _victim(
+    base: str, key: str, ask: Any, seconds: float, pause_s: float
+) -> tuple[list[float], Counter[str]]:
     """Its times [s] and what it was answered."""
     times, answers, until_s = [], Counter[str](), time.monotonic() + seconds
     async with _client(base, key) as http:
-        for path in itertools.cycle(PLAIN):
+        for turn in itertools.count():
             if time.monotonic() > until_s:
                 return times, answers
             began = time.perf_counter()
-            answers[str((await http.get(path)).status_code)] += 1
+            answers[str((await ask(http, turn)).status_code)] += 1
             times.append(time.perf_counter() - began)
             await asyncio.sleep(pause_s)
     raise AssertionError
 
 
-async def _beside(base: str, made: dict[str, str], name: str | None, options: argparse.Namespace) -> str:
+async def _beside(
+    base: str, made: dict[str, str], name: str | None, options: argparse.Namespace
+) -> str:
     """A row: the victim alone, or beside the greedy key that asks for ``name``."""
     met: Counter[str] = Counter()
     crowd = []
     if name is not None:
         role, ask = GREEDY[name]
-        crowd = [asyncio.create_task(_greedy(base, made[role], ask, seed, met)) for seed in range(CONNECTIONS)]
+        crowd = [
+            asyncio.create_task(_greedy(base, made[role], ask, seed, met))
+            for seed in range(CONNECTIONS)
+        ]
         await asyncio.sleep(2)  # its burst is over
-    times, answers = await _victim(base, made["victim"], options.seconds, options.pause)
+    times, answers = await _victim(
+        base, made["victim"], VICTIMS[options.victim], options.seconds, options.pause
+    )
     for one in crowd:
         one.cancel()
     await asyncio.gather(*crowd, return_exceptions=True)
     p50, p99 = np.percentile(times, [50, 99]) * 1e3
-    told = [", ".join(f"{count} x {kind}" for kind, count in sorted(some.items())) or "-" for some in (answers, met)]
-    return f"| {name or 'alone'} | {told[0]} | {p50:.0f} | {p99:.0f} | {max(times) * 1e3:.0f} | {told[1]} |"
+    sent = [
+        ", ".join(f"{count} x {kind}" for kind, count in sorted(some.items())) or "-"
+        for some in (answers, met)
+    ]
+    return (
+        f"| {name or 'alone'} | {sent[0]} | {p50:.0f} | {p99:.0f} | {max(times) * 1e3:.0f} |"
+        f" {sent[1]} |"
+    )
 
 
 def _keys(store: Store) -> dict[str, str]:
     """A key of each role, and the victim's."""
     database = Database(store.settings.database)
     with database.writing() as session:
-        made = {role: keys.create(session, role, role, "bench") for role in ("read", "ingest", "operate")}
-        made["victim"] = keys.create(session, "victim", "read", "bench")
+        made = {
+            role: keys.create(session, role, role, "bench")
+            for role in ("read", "ingest", "operate")
+        }
+        made["victim"] = keys.create(session, "victim", "operate", "bench")
     database.close()
     return made
 
@@ -119,7 +213,9 @@ async def _fill(base: str, made: dict[str, str]) -> None:
 
 async def _run(base: str, made: dict[str, str], options: argparse.Namespace) -> None:
     await _fill(base, made)
-    print("| beside | victim's answers | p50 [ms] | p99 [ms] | longest [ms] | greedy one's answers |")
+    print(
+        "| beside | victim's answers | p50 [ms] | p99 [ms] | longest [ms] | greedy one's answers |"
+    )
     print("| --- | --- | --- | --- | --- | --- |")
     for name in (None, *options.greedy):
         print(await _beside(base, made, name, options), flush=True)
@@ -128,20 +224,45 @@ async def _run(base: str, made: dict[str, str], options: argparse.Namespace) -> 
 def main(arguments: list[str]) -> None:
     """Run each and print what the victim met."""
     parser = argparse.ArgumentParser(
-        prog="python -m tests.benchmarks.greedy", description="A victim's times beside a greedy key."
+        prog="python -m tests.benchmarks.greedy",
+        description="A victim's times beside a greedy key.",
     )
     parser.add_argument("--database", choices=("sqlite", "postgres"), default="sqlite")
     parser.add_argument("--seconds", type=float, default=20.0, help="of each")
-    parser.add_argument("--pause", type=float, default=0.05, help="of the victim between two requests [s]")
+    parser.add_argument(
+        "--pause", type=float, default=0.05, help="of the victim between two requests [s]"
+    )
     parser.add_argument("--greedy", nargs="+", choices=tuple(GREEDY), default=list(GREEDY))
-    parser.add_argument("--unlimited", action="store_true", help="let each key ask as often as it likes")
+    parser.add_argument("--heliostats", type=int, default=0, help="that the store has besides")
+    parser.add_argument(
+        "--victim", choices=tuple(VICTIMS), default="plain", help="what the victim asks for"
+    )
+    parser.add_argument(
+        "--unlimited", action="store_true", help="let each key ask as often as it likes"
+    )
     options = parser.parse_args(arguments)
     if not data_folder().is_dir():
         parser.error(f"no real measurements at {data_folder()}; set HELIOTWIN_STJ")
-    limits = {} if options.unlimited else {"HELIOTWIN_REQUESTS_PER_S": "200", "HELIOTWIN_REQUESTS_BURST": "400"}
+    limits = (
+        {}
+        if options.unlimited
+        else {"HELIOTWIN_REQUESTS_PER_S": "200", "HELIOTWIN_REQUESTS_BURST": "400"}
+    )
     load = Path("/proc/loadavg").read_text().split()[0]
-    print(f"{options.database}, {options.seconds:.0f} s each, load {load}{', unlimited' * options.unlimited}")
-    with tempfile.TemporaryDirectory() as folder, new_store(options.database, Path(folder)) as store:
+    print(
+        f"{options.database}, {options.seconds:.0f} s each, load"
+        f" {load}{', unlimited' * options.unlimited}"
+    )
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        new_store(options.database, Path(folder)) as store,
+    ):
+        if options.heliostats:
+            store.folder.mkdir(exist_ok=True)
+            migrate(store.settings)
+            database = Database(store.settings.database)
+            field.fill(database, options.heliostats)
+            database.close()
         import_two(store)
         with Process(store, "serve", module="service", **limits) as service:
             asyncio.run(_run(service.base, _keys(store), options))

@@ -1,8 +1,10 @@
-"""What a year of a plant takes on the disk: ``python -m tests.benchmarks.growth [--database postgres] [--share S]``.
+"""What a year of a plant takes on the disk: ``python -m tests.benchmarks.growth [--database
+postgres] [--share S]``.
 
-Fills a store with a share of a year, spread over the year, by the store's own functions: rows as the service writes
-them, with fluxes that it measured on real photographs. Prints the bytes of a row of each table, what a year comes to,
-with and without the default retention, and how long the main queries and the pruning take at the size that was filled.
+Fills a store with a share of a year, spread over the year, by the store's own functions: rows as
+the service writes them, with fluxes that it measured on real photographs. Prints the bytes of a row
+of each table, what a year comes to, with and without the default retention, and how long the main
+queries and the pruning take at the size that was filled.
 """
 
 import argparse
@@ -25,20 +27,23 @@ from model.imaging import ImageKind, MeasuredFlux
 from model.imaging.quality import refused
 from service import store
 from service.base.arrays import pack
+from service.base.fields import Sun
 from service.base.settings import Settings
 from service.sources.documents import read_targets
 from service.sources.photograph import Photograph
-from service.store import audit, photographs, queue, retention, sizes
-from service.store.backup import images_of
+from service.store import audit, record_retention, sizes
 from service.store.columns import Base, now
 from service.store.database import Database
-from service.store.images import digest
 from service.store.job_tables import JobStepRow
-from service.store.surfaces import NewSurface
+from service.store.jobs import queue
+from service.store.photographs import image_retention
+from service.store.photographs.image_files import digest
+from service.store.recovery.backup import images_of
+from service.store.surfaces.surface_versions import NewSurface
 from service.store.tables import ForecastRow, ImageRow, MeasurementRow
-from service.twin import compute
-from service.twin.field import read_lines
-from service.twin.ingest import row_of
+from service.twin.alerts.field_overview import read_summaries
+from service.twin.photographs.ingest import measurement_row
+from service.twin.runtime import operations
 from tests.benchmarks import data_folder
 from tests.faults.harness import new_store
 from tests.service.conftest import ORIGIN, properties_document, tower_document
@@ -50,7 +55,9 @@ IMAGE_KB = 360.0
 
 @dataclass(frozen=True)
 class Rate:
-    """How much of something comes in a year, by assumption, and for how many days its rows are kept."""
+    """How much of something comes in a year, by assumption, and for how many days its rows are
+    kept.
+    """
 
     what: str
     a_year: float
@@ -59,7 +66,9 @@ class Rate:
 
 
 def rates(settings: Settings) -> list[Rate]:
-    """Eight photographs of each heliostat a day, a surface a week; forecasts and jobs as an operator's day has them."""
+    """Eight photographs of each heliostat a day, a surface a week; forecasts and jobs as an
+    operator's day has them.
+    """
     photographed = HELIOSTATS * 8 * 365
     jobs = 50 * 365
     return [
@@ -68,23 +77,35 @@ def rates(settings: Settings) -> list[Rate]:
         Rate("surfaces", HELIOSTATS * 52, "surfaces"),
         Rate("forecasts", 500 * 365, "forecasts", settings.forecast_retention_days),
         Rate("jobs", jobs, "jobs", settings.job_retention_days),
-        Rate("audit entries", jobs + HELIOSTATS * 52 + 200 * 365, "audit", settings.audit_retention_days),
+        Rate(
+            "audit entries",
+            jobs + HELIOSTATS * 52 + 200 * 365,
+            "audit",
+            settings.audit_retention_days,
+        ),
     ]
 
 
-# --- filling ----------------------------------------------------------------------------------------------------------
+# --- filling
+# --------------------------------------------------------------------------------------------------
 
 
 def measured_fluxes(plane: Any) -> list[tuple[ImageKind, MeasuredFlux]]:
-    """What the service measures on real photographs, each made another by a little of a camera's noise."""
+    """What the service measures on real photographs, each made another by a little of a camera's
+    noise.
+    """
     rng, found = np.random.default_rng(7), list[tuple[ImageKind, MeasuredFlux]]()
     kinds: tuple[ImageKind, ...] = ("flux", "cropped")
-    files = [(kind, file) for kind in kinds for file in sorted(data_folder().glob(f"*/Calibration/*-{kind}.png"))]
+    files = [
+        (kind, file)
+        for kind in kinds
+        for file in sorted(data_folder().glob(f"*/Calibration/*-{kind}.png"))
+    ]
     for kind, file in islice(cycle(files), 2 * len(files)):
         pixels = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
         assert pixels is not None
         noisy = np.clip(pixels + rng.normal(0, 1, pixels.shape), 0, 255).astype(np.uint8)
-        measured = compute.measure(noisy, kind, plane)
+        measured = operations.measure(noisy, kind, plane)
         if measured.quality.accepted:
             found.append((kind, measured))
     return found
@@ -100,7 +121,10 @@ class Filler:
         self.counts = {rate.what: max(1, round(rate.a_year * share)) for rate in rates(settings)}
 
     def moments(self, what: str) -> list[datetime]:
-        return [self.begin + timedelta(days=365) * float(part) for part in np.linspace(0, 1, self.counts[what])]
+        return [
+            self.begin + timedelta(days=365) * float(part)
+            for part in np.linspace(0, 1, self.counts[what])
+        ]
 
     def plant(self) -> None:
         with self.database.writing() as session:
@@ -108,14 +132,21 @@ class Filler:
             for plane in read_targets(tower_document())[1].values():
                 self.target = store.put_target(session, plane)[0]
             self.heliostats = [
-                store.put_heliostat(session, f"H{number:04d}", properties_document(), (number % 50, number // 50, 1))[0]
+                store.put_heliostat(
+                    session, f"H{number:04d}", properties_document(), (number % 50, number // 50, 1)
+                )[0]
                 for number in range(HELIOSTATS)
             ]
 
     def photographs(self) -> float:
-        """All photographs, with files of the refused ones; seconds that writing such a file took in the mean."""
+        """All photographs, with files of the refused ones; seconds that writing such a file took in
+        the mean.
+        """
         fluxes = measured_fluxes(store.target_plane(self.target))
-        accepted, turned_down = self.moments("photographs, accepted"), self.moments("photographs, refused")
+        accepted, turned_down = (
+            self.moments("photographs, accepted"),
+            self.moments("photographs, refused"),
+        )
         coming = sorted([(at, True) for at in accepted] + [(at, False) for at in turned_down])
         file_s = 0.0
         for first in range(0, len(coming), 200):
@@ -127,18 +158,31 @@ class Filler:
                     file_s += time.perf_counter() - started
                     kind, measured = fluxes[number % len(fluxes)]
                     if not is_good:
-                        measured = MeasuredFlux(refused("no_spot", "no spot stands out from the background"))
+                        measured = MeasuredFlux(
+                            refused("no_spot", "no spot is brighter than the background")
+                        )
                     self._measurement(session, number, at, sha256, kind, measured)
         return file_s / len(turned_down)
 
     def _measurement(
-        self, session: Session, number: int, at: datetime, sha256: str, kind: ImageKind, measured: MeasuredFlux
+        self,
+        session: Session,
+        number: int,
+        at: datetime,
+        sha256: str,
+        kind: ImageKind,
+        measured: MeasuredFlux,
     ) -> None:
-        sun = float(self.rng.uniform(-90, 90)), float(self.rng.uniform(5, 65))
-        about = Photograph(self.target.name, kind, *sun, f"{200_000 + number}", at, (31234.0, 45012.0))
-        row = row_of(about, measured, self.target.id, None)
+        azimuth, elevation = float(self.rng.uniform(90, 270)), float(self.rng.uniform(5, 65))
+        sun = Sun(azimuth_deg=azimuth, elevation_deg=elevation)
+        about = Photograph(
+            self.target.name, kind, sun, f"{200_000 + number}", at, (31234.0, 45012.0)
+        )
+        row = measurement_row(about, measured, self.target.id, None)
         row.created_at = at
-        image = ImageRow(sha256=sha256, media_type="image/png", size_bytes=round(IMAGE_KB * 1e3), created_at=at)
+        image = ImageRow(
+            sha256=sha256, media_type="image/png", size_bytes=round(IMAGE_KB * 1e3), created_at=at
+        )
         image.width_px, image.height_px = 1000, 800
         store.add_measurement(session, self.heliostats[number % HELIOSTATS], image, row)
 
@@ -146,7 +190,9 @@ class Filler:
         """Each of eight photographs of its heliostat, as far as a share of a year has them."""
         moments, by_heliostat = self.moments("surfaces"), dict[int, list[MeasurementRow]]()
         with self.database.reading() as session:
-            query = select(MeasurementRow).where(MeasurementRow.accepted).order_by(MeasurementRow.id)
+            query = (
+                select(MeasurementRow).where(MeasurementRow.accepted).order_by(MeasurementRow.id)
+            )
             for row in session.scalars(query):
                 by_heliostat.setdefault(row.heliostat_id, []).append(row)
         chosen = [heliostat for heliostat in self.heliostats if heliostat.id in by_heliostat]
@@ -155,23 +201,55 @@ class Filler:
                 z = self.rng.normal(0, 2e-4, (4, 8, 8))
                 points = np.stack([z, z, z], axis=-1) + self.rng.normal(0, 1, (4, 8, 8, 3))
                 used = [session.merge(row, load=False) for row in by_heliostat[heliostat.id][:8]]
-                new = NewSurface("network", z, abs(z), points, at, "surface-network-0123456789ab", "1:none", used, 0.05)
+                new = NewSurface(
+                    "network",
+                    z,
+                    abs(z),
+                    points,
+                    at,
+                    "surface-network-0123456789ab",
+                    "1:none",
+                    used,
+                    0.05,
+                )
                 store.add_surface(session, heliostat, new)
 
     def forecasts(self) -> None:
-        fluxes = [measured.flux for _, measured in measured_fluxes(store.target_plane(self.target))[:20]]
+        fluxes = [
+            measured.flux for _, measured in measured_fluxes(store.target_plane(self.target))[:20]
+        ]
         maps = [pack({"flux": 1e4 * flux}) for flux in fluxes if flux is not None]
         for chunk in _chunks(self.moments("forecasts")):
             with self.database.writing() as session:
                 for number, at in enumerate(chunk):
-                    store.add_forecast(session, self._forecast(number, at, maps[number % len(maps)]))
+                    store.add_forecast(
+                        session, self._forecast(number, at, maps[number % len(maps)])
+                    )
 
     def _forecast(self, number: int, at: datetime, flux: bytes) -> ForecastRow:
-        plane = {"center": [0.0, 0.0, 50.0], "normal": [0.0, 1.0, 0.0], "up": [0.0, 0.0, 1.0], "width": 8.0}
-        row = ForecastRow(heliostat_id=self.heliostats[number % HELIOSTATS].id, target_name=self.target.name)
-        row.plane, row.flux, row.model_version, row.created_at = plane | {"height": 7.0}, flux, "1:none", at
-        row.sun_azimuth_deg, row.sun_elevation_deg, row.dni_w_m2 = -20.0, 45.0, 1000.0
-        row.normalised, row.rows, row.columns, row.peak_w_m2, row.power_w = False, 256, 256, 9e3, 8e3
+        plane = {
+            "center": [0.0, 0.0, 50.0],
+            "normal": [0.0, 1.0, 0.0],
+            "up": [0.0, 0.0, 1.0],
+            "width": 8.0,
+        }
+        row = ForecastRow(
+            heliostat_id=self.heliostats[number % HELIOSTATS].id, target_name=self.target.name
+        )
+        row.plane, row.flux, row.model_version, row.created_at = (
+            plane | {"height": 7.0},
+            flux,
+            "1:none",
+            at,
+        )
+        row.sun_azimuth_deg, row.sun_elevation_deg, row.dni_w_m2 = 200.0, 45.0, 1000.0
+        row.normalised, row.rows, row.columns, row.peak_w_m2, row.power_w = (
+            False,
+            256,
+            256,
+            9e3,
+            8e3,
+        )
         return row
 
     def jobs(self) -> None:
@@ -181,18 +259,29 @@ class Filler:
                 for at in chunk:
                     names = [heliostat.name for heliostat in self.heliostats[:20]]
                     row, _ = queue.add_job(
-                        session, "predictions", {"heliostats": names, "method": "network"}, "operator"
+                        session,
+                        "predictions",
+                        {"heliostats": names, "method": "network"},
+                        "operator",
                     )
                     row.state, row.created_at, row.finished_at = "done", at, at
                     row.result = {"surfaces": dict.fromkeys(names, 3), "skipped": {}}
-                    session.add_all(JobStepRow(job_id=row.id, name=name, result={"version": 3}) for name in names)
+                    session.add_all(
+                        JobStepRow(job_id=row.id, name=name, result={"version": 3})
+                        for name in names
+                    )
 
     def audit(self) -> None:
         for chunk in _chunks(self.moments("audit entries")):
             with self.database.writing() as session:
                 for _ in chunk:
                     audit.record(
-                        session, "calibration", "surface.predicted", "heliostat H0001", version=3, method="network"
+                        session,
+                        "calibration",
+                        "surface.predicted",
+                        "heliostat H0001",
+                        version=3,
+                        method="network",
                     )
 
 
@@ -200,7 +289,8 @@ def _chunks(moments: list[datetime], size: int = 500) -> list[list[datetime]]:
     return [moments[first : first + size] for first in range(0, len(moments), size)]
 
 
-# --- measuring --------------------------------------------------------------------------------------------------------
+# --- measuring
+# --------------------------------------------------------------------------------------------------
 
 
 def table_bytes(database: Database) -> dict[str, int]:
@@ -210,10 +300,18 @@ def table_bytes(database: Database) -> dict[str, int]:
         if connection.dialect.name == "postgresql":
             asked = text("SELECT pg_total_relation_size(CAST(:name AS regclass))")
             return {name: connection.execute(asked, {"name": name}).scalar_one() for name in names}
-        owners = {index["name"]: name for name in names for index in inspect(connection).get_indexes(name)}
+        owners = {
+            index["name"]: name for name in names for index in inspect(connection).get_indexes(name)
+        }
         taken = dict.fromkeys(names, 0)
-        for name, size in connection.execute(text("SELECT name, sum(pgsize) FROM dbstat GROUP BY name")):
-            owner = owners.get(name) or name.removeprefix("sqlite_autoindex_").rpartition("_")[0] or name
+        for name, size in connection.execute(
+            text("SELECT name, sum(pgsize) FROM dbstat GROUP BY name")
+        ):
+            owner = (
+                owners.get(name)
+                or name.removeprefix("sqlite_autoindex_").rpartition("_")[0]
+                or name
+            )
             owner = name if name in taken else owner
             if owner in taken:
                 taken[owner] += size
@@ -245,14 +343,16 @@ def questions(filler: Filler) -> dict[str, Callable[[Session], Any]]:
         "100 photographs of a heliostat": lambda s: store.list_measurements(s, heliostat, 100),
         "its 32 newest accepted": lambda s: store.recent_measurements(s, heliostat, 32),
         "its surface of today": lambda s: store.find_surface_at(s, heliostat),
-        "the field's page, all statements": lambda s: read_lines(s),
+        "the field's page, all statements": lambda s: read_summaries(s),
         "100 heliostats, 100 jobs, 100 forecasts": lambda s: (
             store.list_heliostats(s, 100),
             queue.list_jobs(s, 100),
             store.list_forecasts(s, 100),
         ),
-        "sizes, as /jobs and /metrics tell them": lambda s: sizes.sizes(s),
-        "is a pruning due, for age or quota": lambda s: photographs.has_some(s, photographs.rules(s, settings)),
+        "sizes, as /jobs and /metrics report them": lambda s: sizes.sizes(s),
+        "is a pruning due, for age or quota": lambda s: image_retention.has_candidates(
+            s, image_retention.retention_rules(s, settings)
+        ),
     }
 
 
@@ -261,23 +361,26 @@ def pruning(filler: Filler) -> dict[str, float]:
     settings, database, taken = filler.settings, filler.database, dict[str, float]()
     tight = settings.model_copy(update={"image_quota_gb": 1e-6, "image_retention_days": 90.0})
     with database.reading() as session:
-        rules = {f"{rule.name}, {rule.reason}": rule for rule in photographs.rules(session, tight)}
+        rules = {
+            f"{rule.name}, {rule.reason}": rule
+            for rule in image_retention.retention_rules(session, tight)
+        }
     for name, rule in rules.items():
         with database.reading() as session:
             started = time.perf_counter()
-            photographs.give_up(session, tight, rule, "benchmark")
-            taken[f"give up 500 images ({name})"] = time.perf_counter() - started
+            image_retention.mark_for_deletion(session, tight, rule, "benchmark")
+            taken[f"delete 500 images ({name})"] = time.perf_counter() - started
     with database.writing() as session:
-        photographs.give_up(session, tight, rules["refused, age"], "benchmark")
+        image_retention.mark_for_deletion(session, tight, rules["refused, age"], "benchmark")
     started = time.perf_counter()
     with filler.images.removing() as is_free, database.writing() as session:
         assert is_free
-        photographs.remove(session, filler.images)
+        image_retention.remove_marked(session, filler.images)
     taken["remove their files"] = time.perf_counter() - started
     for name, prune in (
-        ("500 old forecasts", retention.prune_forecasts),
+        ("500 old forecasts", record_retention.prune_forecasts),
         ("500 old jobs", queue.purge),
-        ("500 old audit entries", retention.prune_audit),
+        ("500 old audit entries", record_retention.prune_audit),
     ):
         with database.reading() as session:
             started = time.perf_counter()
@@ -286,7 +389,8 @@ def pruning(filler: Filler) -> dict[str, float]:
     return taken
 
 
-# --- telling ----------------------------------------------------------------------------------------------------------
+# --- telling
+# --------------------------------------------------------------------------------------------------
 
 
 def _gb(size: float) -> str:
@@ -294,11 +398,18 @@ def _gb(size: float) -> str:
 
 
 def project(filler: Filler, taken: dict[str, int], rows: dict[str, int]) -> None:
-    """A table: bytes of one, a year's, and what stands there after one year and five with the default settings."""
+    """Print a table of bytes: of one row, of a year's rows, and of those stored after one and five
+    years with the default settings.
+    """
     settings = filler.settings
-    beside = {"surfaces": ("surface_measurements",), "jobs": ("job_steps",), "measurements": ("images",)}
+    beside = {
+        "surfaces": ("surface_measurements",),
+        "jobs": ("job_steps",),
+        "measurements": ("images",),
+    }
     print(
-        f"\n{'what':26} {'a year':>10} {'bytes each':>11} {'GB a year':>10} {'kept, 1 year':>13} {'kept, 5 years':>14}"
+        f"\n{'what':26} {'a year':>10} {'bytes each':>11} {'GB a year':>10} {'kept, 1 year':>13}"
+        f" {'kept, 5 years':>14}"
     )
     year = kept_1 = kept_5 = 0.0
     arrays, plain = _measurement_bytes(filler, taken, rows)
@@ -310,14 +421,19 @@ def project(filler: Filler, taken: dict[str, int], rows: dict[str, int]) -> None
         standing = [rate.a_year * each * min(days, 365 * years) / 365 for years in (1, 5)]
         year, kept_1, kept_5 = year + rate.a_year * each, kept_1 + standing[0], kept_5 + standing[1]
         print(
-            f"{rate.what:26} {rate.a_year:10,.0f} {each:11,.0f} {_gb(rate.a_year * each):>10} {_gb(standing[0]):>13} "
-            f"{_gb(standing[1]):>14}"
+            f"{rate.what:26} {rate.a_year:10,.0f} {each:11,.0f} {_gb(rate.a_year * each):>10}"
+            f" {_gb(standing[0]):>13} {_gb(standing[1]):>14}"
         )
-    print(f"{'database, together':26} {'':10} {'':11} {_gb(year):>10} {_gb(kept_1):>13} {_gb(kept_5):>14}")
+    print(
+        f"{'database, together':26} {'':10} {'':11} {_gb(year):>10} {_gb(kept_1):>13}"
+        f" {_gb(kept_5):>14}"
+    )
     _project_images(settings)
 
 
-def _measurement_bytes(filler: Filler, taken: dict[str, int], rows: dict[str, int]) -> tuple[float, float]:
+def _measurement_bytes(
+    filler: Filler, taken: dict[str, int], rows: dict[str, int]
+) -> tuple[float, float]:
     """Of an accepted photograph's rows and of a refused one's: they differ by the fluxes."""
     with filler.database.reading() as session:
         size = session.scalars(select(func.sum(func.length(MeasurementRow.arrays)))).one() or 0
@@ -335,10 +451,13 @@ def _project_images(settings: Settings) -> None:
         bad = a_year * REFUSED * min(years, settings.refused_image_retention_days / 365)
         standing.append((good + bad, min(good + bad, settings.image_quota_gb * 1e9)))
     print(
-        f"{'images, by age alone':26} {HELIOSTATS * 8 * 365:10,} {IMAGE_KB * 1e3:11,.0f} {_gb(a_year):>10} "
-        f"{_gb(standing[0][0]):>13} {_gb(standing[1][0]):>14}"
+        f"{'images, by age alone':26} {HELIOSTATS * 8 * 365:10,} {IMAGE_KB * 1e3:11,.0f}"
+        f" {_gb(a_year):>10} {_gb(standing[0][0]):>13} {_gb(standing[1][0]):>14}"
     )
-    print(f"{'images, quota too':26} {'':10} {'':11} {'':10} {_gb(standing[0][1]):>13} {_gb(standing[1][1]):>14}")
+    print(
+        f"{'images, quota too':26} {'':10} {'':11} {'':10} {_gb(standing[0][1]):>13}"
+        f" {_gb(standing[1][1]):>14}"
+    )
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -360,13 +479,19 @@ def main(arguments: list[str] | None = None) -> None:
         filler.audit()
         filled_s = time.perf_counter() - started
         if options.database == "postgres":
-            with filler.database.engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
+            with filler.database.engine.connect().execution_options(
+                isolation_level="AUTOCOMMIT"
+            ) as connection:
                 connection.execute(text("VACUUM ANALYZE"))
         rows, taken = rows_of(filler.database), table_bytes(filler.database)
-        print(f"{options.database}: {options.share:g} of a year at {HELIOSTATS} heliostats in {filled_s:.0f} s; rows:")
+        print(
+            f"{options.database}: {options.share:g} of a year at {HELIOSTATS} heliostats in"
+            f" {filled_s:.0f} s; rows:"
+        )
         print(", ".join(f"{name} {count:,}" for name, count in rows.items() if count > 1))
         print(
-            f"an image's file, on the disk for good: {1e3 * file_s:.1f} ms; images are taken for {IMAGE_KB:g} kB each"
+            f"an image's file, on the disk for good: {1e3 * file_s:.1f} ms; images are taken for"
+            f" {IMAGE_KB:g} kB each"
         )
         project(filler, taken, rows)
         print(f"\n{'ms at this size':44}")

@@ -1,8 +1,9 @@
 """The photograph pipeline on real images: ``python -m tests.benchmarks.imaging [--out DIR]``.
 
-Every AA23 set is measured from its raw frame and from PAINT's crop, and compared with what PAINT published: the crop
-(normalised cross-correlation), the flux (accuracy 1 - sum|a - b| / sum, equal sums) and the focal spot (distance of the
-centres of mass). The data are read from ``HELIOTWIN_STJ`` (default ``../shared/stj``).
+Every AA23 set is measured from its raw frame and from PAINT's crop, and compared with what PAINT
+published: the crop (normalised cross-correlation), the flux (accuracy 1 - sum|a - b| / sum, equal
+sums) and the focal spot (distance of the centres of mass). The data are read from ``HELIOTWIN_STJ``
+(default ``../shared/stj``).
 """
 
 import argparse
@@ -31,7 +32,9 @@ Image = NDArray[np.generic]
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One calibration set: PAINT's images and focal spot, and what was measured from the raw frame and the crop."""
+    """One calibration set: PAINT's images and focal spot, and what was measured from the raw frame
+    and the crop.
+    """
 
     name: str
     target: str
@@ -66,7 +69,11 @@ def read_case(properties: Path, plant: Plant) -> Case:
     raw = image("raw") if (properties.parent / f"{stem}-raw.png").exists() else None
     start = perf_counter()
     linear = Camera(LINEAR)  # PAINT's fluxes are differences of counts
-    from_raw = None if raw is None else measure(raw, "raw", plane, layouts=mark_layouts(plane.name), camera=linear)
+    from_raw = (
+        None
+        if raw is None
+        else measure(raw, "raw", plane, layouts=mark_layouts(plane.name), camera=linear)
+    )
     return Case(
         name=stem,
         target=plane.name,
@@ -113,7 +120,9 @@ def figures(case: Case) -> dict[str, float]:
 
 
 def mark_shift(case: Case) -> float:
-    """How far PAINT's crop lies from ours [crop px], the largest of its corners, by registering one onto the other."""
+    """How far PAINT's crop lies from ours [crop px], the largest of its corners, by registering one
+    onto the other.
+    """
     assert case.from_raw is not None
     ours = case.from_raw.crop
     _, warp = cv2.findTransformECC(
@@ -127,16 +136,26 @@ def mark_shift(case: Case) -> float:
 def print_table(cases: list[Case]) -> None:
     rows = {case.name: figures(case) for case in cases}
     names = list(next(iter(rows.values())))
-    print(f"{'AA23 set':>10} {'target':28}" + "".join(f"{name:>11}" for name in names) + "  refused")
+    print(
+        f"{'AA23 set':>10} {'target':28}" + "".join(f"{name:>11}" for name in names) + "  refused"
+    )
     for case in cases:
-        reasons = {m.quality.reason for m in (case.from_raw, case.from_crop) if m is not None} - {None}
+        reasons = {m.quality.reason for m in (case.from_raw, case.from_crop) if m is not None} - {
+            None
+        }
         values = "".join(f"{value:11.3f}" for value in rows[case.name].values())
-        print(f"{case.name:>10} {case.target:28}{values}  {', '.join(sorted(map(str, reasons))) or '-'}")
-    medians = "".join(f"{np.nanmedian([row[name] for row in rows.values()]):11.3f}" for name in names)
+        print(
+            f"{case.name:>10} {case.target:28}{values} "
+            f" {', '.join(sorted(map(str, reasons))) or '-'}"
+        )
+    medians = "".join(
+        f"{np.nanmedian([row[name] for row in rows.values()]):11.3f}" for name in names
+    )
     print(f"{'median':>10} {'':28}{medians}")
     print("goals: crop NCC >= 0.97, flux >= 0.85 (median), CoM <= 0.10 m (median)")
     print(
-        "raw: from the camera frame; crop: from PAINT's crop (separation alone); paint dx: shift of PAINT's crop [px]"
+        "raw: from the camera frame; crop: from PAINT's crop (separation alone); paint dx: shift of"
+        " PAINT's crop [px]"
     )
 
 
@@ -145,7 +164,9 @@ def contact_sheet(cases: list[Case], path: Path) -> None:
     mpl.use("Agg")
     from matplotlib import pyplot as plt
 
-    order = sorted(cases, key=lambda case: np.nan_to_num(accuracy(case.best.flux, case.paint_flux), nan=-1.0))
+    order = sorted(
+        cases, key=lambda case: np.nan_to_num(accuracy(case.best.flux, case.paint_flux), nan=-1.0)
+    )
     fig, axes = plt.subplots(len(order), 5, figsize=(15, 3 * len(order)), squeeze=False)
     for row, case in zip(axes, order, strict=True):
         kind = "raw" if case.from_raw else "crop"
@@ -162,7 +183,11 @@ def contact_sheet(cases: list[Case], path: Path) -> None:
 
 
 def pictures(case: Case) -> dict[str, NDArray[np.generic] | None]:
-    raw = None if case.raw is None else cv2.resize(case.raw, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
+    raw = (
+        None
+        if case.raw is None
+        else cv2.resize(case.raw, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
+    )
     if raw is not None and case.best.corners is not None:
         ring = np.round(case.best.corners[[0, 1, 3, 2]] / 4).astype(np.int32)
         cv2.polylines(raw, [ring], True, (255, 0, 0), 2)
@@ -179,14 +204,16 @@ def measure_folder(folder: Path, plane: TargetPlane) -> Counter[str]:
     """How often each verdict falls on the crops of a folder."""
     paths = sorted(folder.glob("*.png"))
     return Counter(
-        measure(decode_image(path.read_bytes()), "cropped", plane).quality.reason or "accepted" for path in paths
+        measure(decode_image(path.read_bytes()), "cropped", plane).quality.reason or "accepted"
+        for path in paths
     )
 
 
 def composite(
     rng: np.random.Generator, empties: list[Path], fluxes: list[Path], *, foreign: bool
 ) -> tuple[Image, Image]:
-    """A real empty target with a real flux somewhere on it, beside a foreign spot of half the size; and that flux.
+    """A real empty target with a real flux somewhere on it, beside a foreign spot of half the size;
+    and that flux.
 
     Light is added to light, and encoded as the camera does it.
     """
@@ -197,7 +224,10 @@ def composite(
         flux = decode_image(fluxes[rng.integers(len(fluxes))].read_bytes()).astype(np.float32)
         flux = cv2.warpAffine(flux, np.array([[scale, 0, 0], [0, scale, 0]]), (256, 256))
         rows, columns = np.nonzero(flux > 0.02 * flux.max())
-        shift = rng.integers(-columns.min(), 256 - columns.max()), rng.integers(-rows.min(), 256 - rows.max())
+        shift = (
+            rng.integers(-columns.min(), 256 - columns.max()),
+            rng.integers(-rows.min(), 256 - rows.max()),
+        )
         moved = cv2.warpAffine(flux, np.array([[1.0, 0, shift[0]], [0, 1, shift[1]]]), (256, 256))
         return np.asarray(moved / flux.max(), dtype=np.float32)
 
@@ -227,8 +257,9 @@ def composites(folder: Path, plane: TargetPlane, count: int, *, foreign: bool) -
         rows.append((accuracy(result.flux, truth), float(np.linalg.norm(miss))))
     score, miss = np.array(rows).T
     return (
-        f"accuracy median {np.median(score):.3f}, 5 % below {np.percentile(score, 5):.3f}; centre of mass median "
-        f"{np.median(miss):.3f} m, 95 % within {np.percentile(miss, 95):.3f} m; refused {dict(refusals) or 'none'}"
+        f"accuracy median {np.median(score):.3f}, 5 % below {np.percentile(score, 5):.3f}; centre"
+        f" of mass median {np.median(miss):.3f} m, 95 % within {np.percentile(miss, 95):.3f} m;"
+        f" refused {dict(refusals) or 'none'}"
     )
 
 
@@ -236,14 +267,22 @@ def main(argv: list[str] | None = None) -> int:
     """Print the figures and write the contact sheet."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("out/imaging"))
-    parser.add_argument("--composites", type=int, default=150, help="how many are made of fluxes and empty targets")
+    parser.add_argument(
+        "--composites", type=int, default=150, help="how many are made of fluxes and empty targets"
+    )
     options = parser.parse_args(argv)
     folder = data_folder()
     if not (folder / TOWER).exists():
-        print(f"no data in {folder}: set HELIOTWIN_STJ to the folder of real measurements; nothing was measured")
+        print(
+            f"no data in {folder}: set HELIOTWIN_STJ to the folder of real measurements; nothing"
+            " was measured"
+        )
         return 0
     plant = read_plant(folder)
-    cases = [read_case(path, plant) for path in sorted((folder / "AA23/Calibration").glob("*-properties.json"))]
+    cases = [
+        read_case(path, plant)
+        for path in sorted((folder / "AA23/Calibration").glob("*-properties.json"))
+    ]
     print_table(cases)
     options.out.mkdir(parents=True, exist_ok=True)
     contact_sheet(cases, options.out / "aa23.png")
@@ -252,10 +291,16 @@ def main(argv: list[str] | None = None) -> int:
     for name in ("target-samples", "empty-targets"):
         verdicts = measure_folder(folder / name, lower)
         total = sum(verdicts.values())
-        print(f"{name}: " + ", ".join(f"{reason} {count}/{total}" for reason, count in verdicts.most_common()))
+        print(
+            f"{name}: "
+            + ", ".join(f"{reason} {count}/{total}" for reason, count in verdicts.most_common())
+        )
     for foreign in (False, True):
         label = "real fluxes on real empty targets" + (", a foreign spot beside" if foreign else "")
-        print(f"{label} ({options.composites}): {composites(folder, lower, options.composites, foreign=foreign)}")
+        print(
+            f"{label} ({options.composites}):"
+            f" {composites(folder, lower, options.composites, foreign=foreign)}"
+        )
     return 0
 
 

@@ -1,8 +1,10 @@
-"""Fifty clients on the service with the real model: ``python -m tests.benchmarks.load [--database postgres]``.
+"""Fifty clients on the service with the real model: ``python -m tests.benchmarks.load [--database
+postgres]``.
 
-Each client does what clients of a plant do, one thing after the other with a pause between: posts photographs (real
-ones of the Solar Tower Juelich, each made another by a little noise), reads, predicts, forecasts, looks at pages.
-Prints answers, errors and times by what was asked, and the memory of the service. The clients run on the same machine.
+Each client does what clients of a plant do, one thing after the other with a pause between: posts
+photographs (real ones of the Solar Tower Juelich, each made another by a little noise), reads,
+predicts, forecasts, looks at pages. Prints answers, errors and times by what was asked, and the
+memory of the service. The clients run on the same machine.
 """
 
 import argparse
@@ -27,9 +29,10 @@ import numpy as np
 
 from tests.benchmarks import data_folder
 from tests.faults.harness import ROOT, Process, Store, new_store
+from tests.service.conftest import metadata_of
 
 HELIOSTATS = ("AA39", "AC43")
-SUN = {"azimuth_deg": -20.0, "elevation_deg": 45.0}
+SUN = {"azimuth_deg": 200.0, "elevation_deg": 45.0}
 
 
 @dataclass
@@ -52,7 +55,8 @@ class Visitor:
     async def photograph(self) -> httpx.Response:
         name = self.random.choice(HELIOSTATS)
         file = self.random.choice(sorted((data_folder() / name / "Calibration").glob("*-flux.png")))
-        document = json.loads(file.with_name(f"{file.name.split('-')[0]}-calibration-properties.json").read_bytes())
+        paint = file.with_name(f"{file.name.split('-')[0]}-calibration-properties.json")
+        document = metadata_of(json.loads(paint.read_bytes()))
         pixels = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
         assert pixels is not None
         noisy = np.clip(pixels + self.noise.normal(0, 1, pixels.shape), 0, 255).astype(np.uint8)
@@ -60,7 +64,9 @@ class Visitor:
         answer = await self.http.post(
             f"/v1/heliostats/{name}/measurements",
             files={"image": ("spot.png", cv2.imencode(".png", noisy)[1].tobytes(), "image/png")},
-            data={"metadata": json.dumps(document | {"kind": "flux", "id": identifier})},
+            data={
+                "metadata": json.dumps(metadata_of(document) | {"kind": "flux", "id": identifier})
+            },
         )
         if answer.status_code == 201:
             self.tally.acknowledged.add(identifier)
@@ -81,14 +87,22 @@ class Visitor:
         return await self.http.get(f"/v1/{path}")
 
     async def surface(self) -> httpx.Response:
-        return await self.http.post(f"/v1/heliostats/{self.random.choice(HELIOSTATS)}/surfaces", json={"images": 8})
+        return await self.http.post(
+            f"/v1/heliostats/{self.random.choice(HELIOSTATS)}/surfaces", json={"images": 8}
+        )
 
     async def forecast(self) -> httpx.Response:
-        asked = {"heliostat": self.random.choice(HELIOSTATS), "target": "multi_focus_tower", "sun": SUN}
+        asked = {
+            "heliostat": self.random.choice(HELIOSTATS),
+            "target": "multi_focus_tower",
+            "sun": SUN,
+        }
         return await self.http.post("/v1/forecasts", json=asked)
 
     async def page(self) -> httpx.Response:
-        path = self.random.choice(["/", f"/heliostats/{self.random.choice(HELIOSTATS)}", "/forecast", "/jobs"])
+        path = self.random.choice(
+            ["/", f"/heliostats/{self.random.choice(HELIOSTATS)}", "/forecast", "/jobs"]
+        )
         return await self.http.get(path, headers={"Accept": "text/html"})
 
     async def metrics(self) -> httpx.Response:
@@ -129,7 +143,13 @@ async def _visit(base: str, tally: Tally, seed: int, until_s: float, pause_s: fl
 async def _warm_up(base: str) -> None:
     async with httpx.AsyncClient(base_url=base, timeout=120) as http:
         visitor = Visitor(http, Tally(), 10**6)
-        for action in (visitor.photograph, visitor.surface, visitor.forecast, visitor.page, visitor.read):
+        for action in (
+            visitor.photograph,
+            visitor.surface,
+            visitor.forecast,
+            visitor.page,
+            visitor.read,
+        ):
             for _ in range(5):
                 await visitor.ask(action)
         assert not visitor.tally.failures, visitor.tally.failures
@@ -144,7 +164,9 @@ async def _visits(service: Process, tally: Tally, options: argparse.Namespace) -
             await asyncio.sleep(options.seconds / 5)
             memory.append(_status(service.number, "VmRSS"))
 
-    visits = (_visit(service.base, tally, seed, until_s, options.pause) for seed in range(options.clients))
+    visits = (
+        _visit(service.base, tally, seed, until_s, options.pause) for seed in range(options.clients)
+    )
     await asyncio.gather(watch(), *visits)
     return memory
 
@@ -165,26 +187,41 @@ def import_two(store: Store) -> None:
     with tempfile.TemporaryDirectory() as folder:
         for name in (*HELIOSTATS, "WRI1030197-tower-measurements.json"):
             (Path(folder) / name).symlink_to((data_folder() / name).resolve())
-        environment = {"HELIOTWIN_DATA_DIR": str(store.folder), "HELIOTWIN_DATABASE_URL": store.url or ""}
-        environment |= {"HELIOTWIN_MIGRATE_ON_START": "true", "PATH": "/usr/bin:/bin", "OMP_NUM_THREADS": "1"}
+        environment = {
+            "HELIOTWIN_DATA_DIR": str(store.folder),
+            "HELIOTWIN_DATABASE_URL": store.url or "",
+        }
+        environment |= {
+            "HELIOTWIN_MIGRATE_ON_START": "true",
+            "PATH": "/usr/bin:/bin",
+            "OMP_NUM_THREADS": "1",
+        }
         command = [sys.executable, "-m", "service", "import", folder, "--json"]
         subprocess.run(command, cwd=ROOT, env=environment, check=True, stdout=subprocess.DEVNULL)
 
 
 def _row(name: str, times: list[float], failures: Counter[str]) -> str:
     p50, p99 = np.percentile(times, [50, 99]) * 1e3
-    told = ", ".join(f"{count} x {kind}" for kind, count in failures.items()) or "0"
-    return f"| {name} | {len(times)} | {told} | {p50:.0f} | {p99:.0f} | {max(times) * 1e3:.0f} |"
+    counts = ", ".join(f"{count} x {kind}" for kind, count in failures.items()) or "0"
+    return f"| {name} | {len(times)} | {counts} | {p50:.0f} | {p99:.0f} | {max(times) * 1e3:.0f} |"
 
 
-def _report(tally: Tally, seconds: float, memory: dict[str, float], cpu_s: tuple[float, float]) -> None:
+def _report(
+    tally: Tally, seconds: float, memory: dict[str, float], cpu_s: tuple[float, float]
+) -> None:
     everything = [taken for times in tally.times.values() for taken in times]
     failures: Counter[str] = sum(tally.failures.values(), Counter())
-    print("| asked | answers | errors | p50 [ms] | p99 [ms] | longest [ms] |\n| --- | --- | --- | --- | --- | --- |")
+    print(
+        "| asked | answers | errors | p50 [ms] | p99 [ms] | longest [ms] |\n| --- | --- | --- | ---"
+        " | --- | --- |"
+    )
     for name in sorted(tally.times):
         print(_row(name, tally.times[name], tally.failures[name]))
     print(_row("all", everything, failures))
-    print(f"{len(everything) / seconds:.1f} answers/s; CPU: service {cpu_s[0]:.0f} s, clients {cpu_s[1]:.0f} s")
+    print(
+        f"{len(everything) / seconds:.1f} answers/s; CPU: service {cpu_s[0]:.0f} s, clients"
+        f" {cpu_s[1]:.0f} s"
+    )
     print("memory [MB]: " + ", ".join(f"{name} {value:.0f}" for name, value in memory.items()))
 
 
@@ -193,32 +230,49 @@ def _require_all(store: Store, base: str, acknowledged: set[str]) -> None:
     for name in HELIOSTATS:
         after: dict[str, Any] = {}
         while True:
-            page = httpx.get(f"{base}/v1/heliostats/{name}/measurements", params={"limit": 500, **after}).json()
+            page = httpx.get(
+                f"{base}/v1/heliostats/{name}/measurements", params={"limit": 500, **after}
+            ).json()
             stored |= {item["id"] for item in page["items"]}
             if page["next"] is None:
                 break
             after = {"after": page["next"]}
     report = store.check()
-    print(f"{len(acknowledged)} photographs acknowledged, {len(acknowledged - stored)} lost, {len(report['bad'])} bad")
+    print(
+        f"{len(acknowledged)} photographs acknowledged, {len(acknowledged - stored)} lost,"
+        f" {len(report['bad'])} bad"
+    )
 
 
 def main(arguments: list[str]) -> None:
     """Run the clients and print what they met."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--database", choices=("sqlite", "postgres"), default="sqlite")
     parser.add_argument("--seconds", type=float, default=300.0)
     parser.add_argument("--clients", type=int, default=50)
-    parser.add_argument("--pause", type=float, default=2.0, help="mean pause of a client between two requests [s]")
+    parser.add_argument(
+        "--pause", type=float, default=2.0, help="mean pause of a client between two requests [s]"
+    )
     options = parser.parse_args(arguments)
     if not data_folder().is_dir():
         parser.error(f"no real measurements at {data_folder()}; set HELIOTWIN_STJ")
     load = Path("/proc/loadavg").read_text().split()[0]
     print(
-        f"{options.database}, {options.clients} clients, {options.seconds:.0f} s, pause {options.pause} s, load {load}"
+        f"{options.database}, {options.clients} clients, {options.seconds:.0f} s, pause"
+        f" {options.pause} s, load {load}"
     )
-    with tempfile.TemporaryDirectory() as folder, new_store(options.database, Path(folder)) as store:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        new_store(options.database, Path(folder)) as store,
+    ):
         import_two(store)
-        extra = {"HELIOTWIN_JOB_WORKERS": "1", "HELIOTWIN_JOB_LEASE_S": "30", "HELIOTWIN_JOB_POLL_S": "0.5"}
+        extra = {
+            "HELIOTWIN_JOB_WORKERS": "1",
+            "HELIOTWIN_JOB_LEASE_S": "30",
+            "HELIOTWIN_JOB_POLL_S": "0.5",
+        }
         with Process(store, "serve", module="service", **extra) as service:
             asyncio.run(_warm_up(service.base))
             tally, number = Tally(), service.number
@@ -227,7 +281,10 @@ def main(arguments: list[str]) -> None:
             grown = asyncio.run(_visits(service, tally, options))
             memory |= {f"after {part}/5": value for part, value in enumerate(grown, start=1)}
             memory["highest"] = _status(number, "VmHWM")
-            spent = (_cpu_s(number) - cpu_s, resource.getrusage(resource.RUSAGE_SELF).ru_utime - own)
+            spent = (
+                _cpu_s(number) - cpu_s,
+                resource.getrusage(resource.RUSAGE_SELF).ru_utime - own,
+            )
             _report(tally, options.seconds, memory, spent)
             _require_all(store, service.base, tally.acknowledged)
 

@@ -1,7 +1,8 @@
-"""Pictures of a running service's pages at a desk and on a phone: ``python -m tests.benchmarks.pages [--url URL]``.
+"""Pictures of a running service's pages at a desk and on a phone: ``python -m
+tests.benchmarks.pages [--url URL]``.
 
-They are there to be looked at: ``results/pages`` has those of the demonstration's store, for which a plan, a forecast,
-mounts and a study are asked for first. Needs Chromium and playwright.
+They are there to be looked at: ``results/pages`` has those of the demonstration's store, for which
+a plan, a forecast, mounts and a study are asked for first. Needs Chromium and playwright.
 """
 
 import argparse
@@ -13,7 +14,10 @@ from typing import Any, Literal
 import httpx
 from playwright.sync_api import ViewportSize, sync_playwright
 
-SIZES: dict[str, ViewportSize] = {"desk": {"width": 1440, "height": 900}, "phone": {"width": 390, "height": 844}}
+SIZES: dict[str, ViewportSize] = {
+    "desk": {"width": 1440, "height": 900},
+    "phone": {"width": 390, "height": 844},
+}
 
 
 SCHEMES: dict[str, Literal["light", "dark"]] = {"": "light", "-dark": "dark"}
@@ -36,22 +40,39 @@ def done(client: httpx.Client, kind: str, asked: dict[str, Any]) -> dict[str, An
 
 
 def asked_for(client: httpx.Client, heliostat: str) -> dict[str, str]:
-    """Pages of a plan, a forecast and a study that are made for the pictures, by name; mounts are calibrated, too."""
+    """Pages of a plan, a forecast and a study that are made for the pictures, by name; mounts are
+    calibrated, too.
+    """
     target = client.get("/v1/targets").raise_for_status().json()["items"][0]["name"]
-    day = {"begin": "2026-06-21T06:00:00Z", "end": "2026-06-21T16:00:00Z", "step_minutes": 60}
+    day = {
+        "first_at": "2026-06-21T06:00:00Z",
+        "last_at": "2026-06-21T16:00:00Z",
+        "step_minutes": 60,
+    }
     plan = done(client, "plans", {"name": "June", "target": target, "allowed_w_m2": 8000.0, **day})
-    sun = {"azimuth_deg": -20.0, "elevation_deg": 45.0}
-    forecast = client.post("/v1/forecasts", json={"heliostat": heliostat, "target": target, "sun": sun})
+    sun = {"azimuth_deg": 200.0, "elevation_deg": 45.0}
+    forecast = client.post(
+        "/v1/forecasts", json={"heliostat": heliostat, "target": target, "sun": sun}
+    )
     done(client, "calibrations", {})
     study = done(client, "studies", {})
-    paths = {"plan": f"/plans/{plan['id']}", "forecast": f"/forecasts/{forecast.raise_for_status().json()['id']}"}
+    paths = {
+        "plan": f"/plans/{plan['id']}",
+        "forecast": f"/forecasts/{forecast.raise_for_status().json()['id']}",
+    }
     found = client.get("/v1/studies").raise_for_status().json()["items"]
-    return paths | {"job": f"/jobs/{study['id']}"} | ({"study": f"/studies/{found[0]['id']}"} if found else {})
+    return (
+        paths
+        | {"job": f"/jobs/{study['id']}"}
+        | ({"study": f"/studies/{found[0]['id']}"} if found else {})
+    )
 
 
 def main() -> None:
     """Take them."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--url", default="http://127.0.0.1:8000")
     parser.add_argument("--heliostat", default="AA39")
     parser.add_argument("--photograph", default="1", help="an identifier of the heliostat's")
@@ -76,11 +97,13 @@ def main() -> None:
     }
     with httpx.Client(base_url=options.url, timeout=120) as client:
         pages |= asked_for(client, options.heliostat)
-        while "being worked out" in client.get("/", headers={"Accept": "text/html"}).text:
+        while "being computed" in client.get("/", headers={"Accept": "text/html"}).text:
             time.sleep(1)
     options.out.mkdir(parents=True, exist_ok=True)
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
+        browser = playwright.chromium.launch(
+            executable_path=shutil.which("chromium"), args=["--no-sandbox"]
+        )
         for label, size in SIZES.items():
             for suffix, scheme in SCHEMES.items():
                 page = browser.new_page(viewport=size, color_scheme=scheme, bypass_csp=True)

@@ -1,10 +1,13 @@
-"""Where light lands: mounts calibrated from real photographs, judged by measurements left out, and how fast that is.
+"""Where light lands: mounts calibrated from real photographs, judged by measurements left out, and
+how fast that is.
 
-    python -m tests.benchmarks.pointing [--data ../shared/stj-pointing ...] [--only TABLE] [--out results/pointing.png]
+    python -m tests.benchmarks.pointing [--data ../shared/stj-pointing ...] [--only TABLE] [--out
+    results/pointing.png]
 
-Beam errors are angles at the heliostat between forecast and measured spot; a figure is the median over heliostats of
-each one's median, with a 90 % interval from resampled heliostats. The spreads in `model.pointing.drives.Noise` were
-chosen on half of the heliostats (`DEVELOPED_ON`); the table has the other half apart.
+Beam errors are angles at the heliostat between forecast and measured spot; a figure is the median
+over heliostats of each one's median, with a 90 % interval from resampled heliostats. The spreads in
+`model.pointing.drives.Noise` were chosen on half of the heliostats (`DEVELOPED_ON`); the table has
+the other half apart.
 """
 
 import argparse
@@ -15,14 +18,16 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import bootstrap
 
 from model.frames import sun_angles
 from model.plant import Heliostat, TargetPlane
-from model.pointing import CalibratedMount, Field, Reading, calibrate_field, off_by
-from model.pointing.readings import later
-from service.cli.folder_pointing import read_readings
+from model.pointing import CalibratedMount, FieldPrior, Reading, calibrate_field, pointing_error
+from model.pointing.spots import spot_covariance
+from model.site import JUELICH, Site
 from service.sources.folder import read_folder
 from tests.benchmarks import data_folder
+from tests.benchmarks.folders import read_readings
 
 Array = NDArray[np.float64]
 
@@ -38,7 +43,7 @@ TRIALS = 40
 # Times at which a clock is put wrong.
 CLOCK_TRIALS = 12
 
-# How often the last third is calibrated anew as it comes in.
+# How often the mounts are calibrated again as the last third comes in.
 PARTS = 4
 
 Series = dict[str, list[Reading]]
@@ -51,22 +56,25 @@ class Plant:
         self.heliostats: dict[str, Heliostat] = {}
         self.readings: Series = {}
         self.targets: dict[str, TargetPlane] = {}
-        self.latitude_deg = 0.0
-        self.odd: tuple[str, ...] = ()
+        self.site = JUELICH
+        self.unusual: tuple[str, ...] = ()
         for path in folders:
             folder = read_folder(path)
             self.heliostats |= folder.plant.heliostats
             self.targets |= folder.plant.targets
-            self.latitude_deg = float(folder.plant.origin[0])
+            self.site = folder.model.site
             self.readings |= {
-                name: sorted(own, key=lambda one: one.day) for name, own in read_readings(folder)[0].items()
+                name: sorted(own, key=lambda one: one.day)
+                for name, own in read_readings(folder).items()
             }
 
-    def calibrate(self, readings: Series, field: Field | None = None) -> tuple[dict[str, CalibratedMount], Field]:
+    def calibrate(
+        self, readings: Series, prior: FieldPrior | None = None
+    ) -> tuple[dict[str, CalibratedMount], FieldPrior]:
         """Mounts of some readings, and the field's prior."""
-        done = calibrate_field(self.heliostats, readings, self.targets, latitude_deg=self.latitude_deg, field=field)
-        self.odd = tuple({*self.odd, *done.odd})
-        return done.mounts, done.field
+        done = calibrate_field(self.heliostats, readings, self.targets, self.site, prior=prior)
+        self.unusual = tuple({*self.unusual, *done.unusual})
+        return done.mounts, done.prior
 
 
 def random_third(own: Sequence[Reading], generator: np.random.Generator) -> NDArray[np.intp]:
@@ -80,7 +88,9 @@ def last_third(own: Sequence[Reading], _: np.random.Generator) -> NDArray[np.int
 
 
 def far_third(own: Sequence[Reading], _: np.random.Generator) -> NDArray[np.intp]:
-    """The third of suns that are farthest from all others: by the mean angle to the three nearest."""
+    """The third of suns that are farthest from all others: by the mean angle to the
+    three nearest.
+    """
     suns = np.array([one.sun for one in own])
     apart = np.arccos(np.clip(suns @ suns.T, -1, 1))
     np.fill_diagonal(apart, np.inf)
@@ -94,19 +104,27 @@ def split(own: Sequence[Reading], judged: NDArray[np.intp]) -> tuple[list[Readin
     return kept, [own[place] for place in sorted(apart)]
 
 
-def errors_mrad(plant: Plant, mounts: dict[str, CalibratedMount], judged: Series) -> dict[str, Array]:
+def errors_mrad(
+    plant: Plant, mounts: dict[str, CalibratedMount], judged: Series
+) -> dict[str, Array]:
     """Beam errors [mrad] of each heliostat's judges."""
-    return {name: 1e3 * off_by(plant.heliostats[name], mounts[name], own) for name, own in judged.items() if own}
+    return {
+        name: 1e3 * pointing_error(plant.heliostats[name], mounts[name], own)
+        for name, own in judged.items()
+        if own
+    }
 
 
 def covered(plant: Plant, mounts: dict[str, CalibratedMount], judged: Series) -> float:
     """Share of judges within their 90 % ellipse."""
     inside = []
     for name, own in judged.items():
-        motors, suns, spots = (np.array([getattr(one, key) for one in own]) for key in ("motors", "sun", "spot"))
+        motors, suns, spots = (
+            np.array([getattr(one, key) for one in own]) for key in ("motors", "sun", "spot")
+        )
         days = np.array([one.day for one in own])
-        cov = mounts[name].covariance_at(plant.heliostats[name], motors, suns, spots, days)
-        off = off_by(plant.heliostats[name], mounts[name], own)
+        cov = spot_covariance(mounts[name], plant.heliostats[name], motors, suns, spots, days)
+        off = pointing_error(plant.heliostats[name], mounts[name], own)
         inside.extend(off**2 < 4.605 * np.trace(cov, axis1=1, axis2=2) / 2)
     return float(np.mean(inside))
 
@@ -116,20 +134,27 @@ def median_row(label: str, errors: dict[str, Array]) -> str:
     medians = {name: float(np.median(error)) for name, error in errors.items()}
     apart = [value for name, value in medians.items() if name not in DEVELOPED_ON]
     values = np.array(list(medians.values()))
-    drawn = np.random.default_rng(0).choice(values, (4000, len(values)))
-    low, high = np.percentile(np.median(drawn, axis=1), [5, 95])
-    return f"| {label} | {np.median(values):.2f} ({low:.2f} to {high:.2f}) | {np.median(apart):.2f} | {len(values)} |"
+    low, high = bootstrap(
+        (values,), np.median, n_resamples=4000, confidence_level=0.9, method="percentile", rng=0
+    ).confidence_interval
+    return (
+        f"| {label} | {np.median(values):.2f} ({low:.2f} to {high:.2f}) | {np.median(apart):.2f} |"
+        f" {len(values)} |"
+    )
 
 
 def accuracy(plant: Plant) -> None:
     """Beam errors of measurements left out."""
-    print("| left out | median [mrad] (90 % of heliostats drawn) | heliostats not developed on | heliostats |")
+    print(
+        "| left out | median [mrad] (90 % of heliostats drawn) | heliostats not developed on |"
+        " heliostats |"
+    )
     print("| --- | --- | --- | --- |")
     many = {name: own for name, own in plant.readings.items() if len(own) >= LEAST}
     plant.calibrate(plant.readings)
     nominal = dict.fromkeys(many, CalibratedMount.uncalibrated())
     # One property file has drives that could not stand where its motors were.
-    kind = {name: own for name, own in many.items() if name not in plant.odd}
+    kind = {name: own for name, own in many.items() if name not in plant.unusual}
     print(median_row("nothing: PAINT's kinematics, uncorrected", errors_mrad(plant, nominal, kind)))
     rules: dict[str, Callable[[Sequence[Reading], np.random.Generator], NDArray[np.intp]]] = {
         "a random third": random_third,
@@ -145,7 +170,11 @@ def accuracy(plant: Plant) -> None:
         judged = {name: apart for name, (_, apart) in parts.items()}
         print(median_row(label, errors_mrad(plant, mounts, judged)))
         shares[label] = covered(plant, mounts, judged)
-    print(median_row(f"the last third, each of {PARTS} parts by all before it", as_it_comes(plant, many)))
+    print(
+        median_row(
+            f"the last third, each of {PARTS} parts by all before it", as_it_comes(plant, many)
+        )
+    )
     print(median_row("all but five in a row, prior of the others", five_only(plant, many)))
     print()
     for label, share in shares.items():
@@ -153,12 +182,15 @@ def accuracy(plant: Plant) -> None:
 
 
 def as_it_comes(plant: Plant, many: Series) -> dict[str, Array]:
-    """Errors of the newest third by mounts that are calibrated anew before each of its parts."""
+    """Errors of the newest third by mounts that are calibrated again before each of its parts."""
     found: dict[str, list[Array]] = {name: [] for name in many}
     for part in range(PARTS):
         known, judged = dict(plant.readings), {}
         for name, own in many.items():
-            first, last = (len(own) - len(own) // 3 + place * (len(own) // 3) // PARTS for place in (part, part + 1))
+            first, last = (
+                len(own) - len(own) // 3 + place * (len(own) // 3) // PARTS
+                for place in (part, part + 1)
+            )
             known[name], judged[name] = own[:first], own[first:last]
         mounts, _ = plant.calibrate(known)
         for name, errors in errors_mrad(plant, mounts, judged).items():
@@ -167,10 +199,14 @@ def as_it_comes(plant: Plant, many: Series) -> dict[str, Array]:
 
 
 def five_only(plant: Plant, many: Series) -> dict[str, Array]:
-    """Errors of the next thirty measurements after five, at three times, with a prior that others made."""
+    """Errors of the next thirty measurements after five, at three times, with a prior that others
+    made.
+    """
     errors = {}
     for name, own in many.items():
-        _, field = plant.calibrate({other: series for other, series in plant.readings.items() if other != name})
+        _, field = plant.calibrate(
+            {other: series for other, series in plant.readings.items() if other != name}
+        )
         found = []
         for begin in np.linspace(0, len(own) - 15, 3).astype(int):
             mounts, _ = plant.calibrate({name: own[begin : begin + 5]}, field)
@@ -180,9 +216,16 @@ def five_only(plant: Plant, many: Series) -> dict[str, Array]:
 
 
 def with_step(
-    heliostat: Heliostat, mount: CalibratedMount, own: Sequence[Reading], place: int, axis: int, size: float
+    heliostat: Heliostat,
+    mount: CalibratedMount,
+    own: Sequence[Reading],
+    place: int,
+    axis: int,
+    size: float,
 ) -> list[Reading]:
-    """A series whose drive has an angle ``size`` [rad] more than its motor says, from a measurement on."""
+    """A series whose drive has an angle ``size`` [rad] more than its motor says, from a measurement
+    on.
+    """
     zeros = np.zeros(2)
     zeros[axis] = size
     drives = mount.mount(heliostat.mount)
@@ -190,29 +233,46 @@ def with_step(
     for after in range(place, len(own)):
         motors = drives.motors_from_angles(drives.angles_from_motors(own[after].motors) - zeros)
         changed[after] = Reading(
-            own[after].name, own[after].target, motors, own[after].sun, own[after].spot, own[after].day
+            own[after].name,
+            own[after].target,
+            motors,
+            own[after].sun,
+            own[after].spot,
+            own[after].day,
         )
     return changed
 
 
 def steps(plant: Plant) -> None:
-    """Steps put into real series: found within one measurement, and others found that were not there before."""
+    """Steps put into real series: found within one measurement, and others found that were not
+    there before.
+    """
     generator = np.random.default_rng(1)
     many = {name: own for name, own in plant.readings.items() if len(own) >= LEAST}
     _, field = plant.calibrate(plant.readings)
     before = {name: plant.calibrate({name: own}, field)[0][name] for name, own in many.items()}
     real = sum(len(mount.steps) for mount in before.values())
     moved = [name for name, mount in before.items() if mount.steps]
-    print(f"steps in the series as they are: {real} in {_years(many.values()):.1f} heliostat-years, all of {moved}")
-    print("| step [mrad] | found within one measurement | others that came with it, a heliostat-year |")
+    print(
+        f"steps in the series as they are: {real} in {_years(many.values()):.1f} heliostat-years,"
+        f" all of {moved}"
+    )
+    print(
+        "| step [mrad] | found within one measurement | others that came with it, a"
+        " heliostat-year |"
+    )
     print("| --- | --- | --- |")
     for size in STEPS_MRAD:
         found, others, looked = 0, 0, 0.0
         for _ in range(TRIALS):
             name = str(generator.choice(list(many)))
             own, mount = many[name], before[name]
-            believed = [place for place in range(3, len(own) - 3) if not mount.foreign[place - 1 : place + 2].any()]
-            place, axis = int(generator.choice(believed)), int(generator.integers(2))
+            probable = [
+                place
+                for place in range(3, len(own) - 3)
+                if not mount.foreign[place - 1 : place + 2].any()
+            ]
+            place, axis = int(generator.choice(probable)), int(generator.integers(2))
             angle = 1e-3 * size * generator.choice([-1.0, 1.0])
             changed = with_step(plant.heliostats[name], mount, own, place, axis, angle)
             places = [step.after for step in plant.calibrate({name: changed}, field)[0][name].steps]
@@ -227,24 +287,31 @@ def clocks(plant: Plant) -> None:
     """A clock that goes a minute wrong from a measurement of real series on."""
     generator = np.random.default_rng(3)
     days = np.sort([one.day for own in plant.readings.values() for one in own])
-    found = calibrate_field(plant.heliostats, plant.readings, plant.targets, latitude_deg=plant.latitude_deg).clock
+    found = calibrate_field(plant.heliostats, plant.readings, plant.targets, plant.site).clock
     print(f"fault of the clock in the series as they are: {found}")
     errors, late = [], []
     for trial in range(CLOCK_TRIALS):
         since, minutes = generator.choice(days[len(days) // 10 : -len(days) // 10]), (-1.0) ** trial
-        changed = with_clock(plant.readings, float(since), minutes, plant.latitude_deg)
-        done = calibrate_field(plant.heliostats, changed, plant.targets, latitude_deg=plant.latitude_deg)
+        changed = with_clock(plant.readings, float(since), minutes, plant.site)
+        done = calibrate_field(plant.heliostats, changed, plant.targets, plant.site)
         if done.clock is not None:
             errors.append(done.clock.minutes + minutes)
             late.append(done.clock.since - np.floor(since))
-    said = f"off by {np.sqrt(np.mean(np.square(errors))):.2f} minutes (root mean square)" if errors else ""
+    said = (
+        f"off by {np.sqrt(np.mean(np.square(errors))):.2f} minutes (root mean square)"
+        if errors
+        else ""
+    )
     dated = sum(apart == 0 for apart in late)
-    print(f"a minute, at {CLOCK_TRIALS} times: {len(errors)} found, {dated} of them on its day, {said}")
+    print(
+        f"a minute, at {CLOCK_TRIALS} times: {len(errors)} found, {dated} of them on its day,"
+        f" {said}"
+    )
 
 
 def covariates(plant: Plant) -> None:
     """What time of day, season and weather explain of errors of measurements left out."""
-    done = calibrate_field(plant.heliostats, plant.readings, plant.targets, latitude_deg=plant.latitude_deg)
+    done = calibrate_field(plant.heliostats, plant.readings, plant.targets, plant.site)
     print("| covariate | measurements | sidewards, share of squared errors (95 %) | upwards |")
     print("| --- | --- | --- | --- |")
     for name, one in done.covariates.items():
@@ -252,13 +319,19 @@ def covariates(plant: Plant) -> None:
             f"{100 * share:.1f} % ({100 * one.ci95[way][0]:.1f} to {100 * one.ci95[way][1]:.1f})"
             for way, share in one.share.items()
         ]
-        print(f"| {name} | {one.measurements} | {' | '.join(shares or ['not stored', 'not stored'])} |")
+        print(
+            f"| {name} | {one.measurements} |"
+            f" {' | '.join(shares or ['not stored', 'not stored'])} |"
+        )
 
 
-def with_clock(readings: Series, since: float, minutes: float, latitude_deg: float) -> Series:
+def with_clock(readings: Series, since: float, minutes: float, site: Site) -> Series:
     """Series whose suns are computed by a clock that goes so many minutes fast from a day on."""
     return {
-        name: [replace(one, sun=later(one.sun, minutes, latitude_deg)) if one.day >= since else one for one in own]
+        name: [
+            replace(one, sun=site.advance_sun(one.sun, minutes)) if one.day >= since else one
+            for one in own
+        ]
         for name, own in readings.items()
     }
 
@@ -267,7 +340,9 @@ def _years(series: Iterable[Sequence[Reading]]) -> float:
     return sum((own[-1].day - own[0].day) / 365.25 for own in series)
 
 
-def synthetic(plant: Plant, heliostats: int, measurements: int) -> tuple[dict[str, Heliostat], Series]:
+def synthetic(
+    plant: Plant, heliostats: int, measurements: int
+) -> tuple[dict[str, Heliostat], Series]:
     """A field of copies of real heliostats, with a part of each one's measurements."""
     generator = np.random.default_rng(2)
     names = [name for name, own in plant.readings.items() if len(own) >= measurements]
@@ -281,24 +356,67 @@ def synthetic(plant: Plant, heliostats: int, measurements: int) -> tuple[dict[st
     return copies, series
 
 
+def spots(plant: Plant) -> None:
+    """AA39's mounts by the spots that its photographs show, and by those that PAINT gives."""
+    folder = read_folder(data_folder().parent / "stj-years")
+    others = {name: own for name, own in plant.readings.items() if name != "AA39"}
+    mirror, prior = folder.plant.heliostats["AA39"], plant.calibrate(others)[1]
+    shown = {one.name: one for one in read_readings(folder)["AA39"]}
+    given = {one.name: one for one in read_readings(folder, kinds=())["AA39"]}
+    uncut = {name: one for name, one in given.items() if name in shown}
+    print(f"{len(given)} spots given, {len(given) - len(uncut)} of them cut by the target's edge")
+    print("| calibrated by | judged by | a random third | the last third | the far suns |")
+    print("| --- | --- | --- | --- | --- |")
+    for label, judge, fitted, judges in (
+        ("shown", "shown", shown, shown),
+        ("given", "given", given, uncut),
+        ("given, without the cut", "given", uncut, uncut),
+        ("shown", "given", shown, uncut),
+        ("given", "shown", given, shown),
+    ):
+        medians = []
+        for rule, draws in ((random_third, 8), (last_third, 1), (far_third, 1)):
+            found = []
+            for draw in range(draws):
+                own = sorted(uncut.values(), key=lambda one: np.nan_to_num(one.day))
+                apart = {own[place].name for place in rule(own, np.random.default_rng(draw))}
+                kept = [one for name, one in fitted.items() if name not in apart]
+                done = calibrate_field(
+                    {"AA39": mirror}, {"AA39": kept}, plant.targets, plant.site, prior=prior
+                )
+                held_out = [judges[name] for name in sorted(apart)]
+                found.append(1e3 * pointing_error(mirror, done.mounts["AA39"], held_out))
+            medians.append(f"{np.median(np.concatenate(found)):.2f}")
+        print(f"| {label} | {judge} | {' | '.join(medians)} |")
+
+
 def speed(plant: Plant, heliostats: int = 2000, measurements: int = 60) -> None:
     """Time of a calibration of a large field."""
     copies, series = synthetic(plant, heliostats, measurements)
     began = time.perf_counter(), time.process_time()
-    done = calibrate_field(copies, series, plant.targets, latitude_deg=plant.latitude_deg)
+    done = calibrate_field(copies, series, plant.targets, plant.site)
     wall, busy = time.perf_counter() - began[0], time.process_time() - began[1]
     found = sum(len(mount.steps) for mount in done.mounts.values())
-    print(f"{heliostats} heliostats x {measurements} measurements: {wall:.1f} s, {busy:.1f} s of a core, {found} steps")
+    print(
+        f"{heliostats} heliostats x {measurements} measurements: {wall:.1f} s, {busy:.1f} s of a"
+        f" core, {found} steps"
+    )
 
 
 def left_out(plant: Plant) -> dict[str, Array]:
-    """Beam errors [mrad] of all measurements, each by mounts that a third of them, and it, had no part in."""
+    """Beam errors [mrad] of all measurements, each by mounts that a third of them, and it, had no
+    part in.
+    """
     errors = {name: np.zeros(len(own)) for name, own in plant.readings.items()}
-    order = {name: np.random.default_rng(0).permutation(len(own)) for name, own in plant.readings.items()}
+    order = {
+        name: np.random.default_rng(0).permutation(len(own)) for name, own in plant.readings.items()
+    }
     for fold in range(3):
         parts = {name: split(own, order[name][fold::3]) for name, own in plant.readings.items()}
         mounts, _ = plant.calibrate({name: kept for name, (kept, _) in parts.items()})
-        for name, found in errors_mrad(plant, mounts, {name: apart for name, (_, apart) in parts.items()}).items():
+        for name, found in errors_mrad(
+            plant, mounts, {name: apart for name, (_, apart) in parts.items()}
+        ).items():
             errors[name][np.sort(order[name][fold::3])] = found
     return errors
 
@@ -313,16 +431,24 @@ def picture(plant: Plant, path: Path) -> None:
     names = [name for name in ("BE36", "BF57", "BG16", "AA39") if name in plant.readings]
     mounts, _ = plant.calibrate(plant.readings)
     after, uncorrected = left_out(plant), CalibratedMount.uncalibrated()
-    figure, axes = plt.subplots(len(names), 3, figsize=(15, 3 * len(names)), squeeze=False, layout="constrained")
+    figure, axes = plt.subplots(
+        len(names), 3, figsize=(15, 3 * len(names)), squeeze=False, layout="constrained"
+    )
     for row, name in zip(axes, names, strict=True):
         own, mount = plant.readings[name], mounts[name]
         azimuth, elevation = sun_angles(np.array([one.sun for one in own]))
-        before = 1e3 * off_by(plant.heliostats[name], uncorrected, own)
+        before = 1e3 * pointing_error(plant.heliostats[name], uncorrected, own)
         for panel, label, off in zip(
             row, ("uncorrected", "left out of calibration"), (before, after[name]), strict=False
         ):
-            shown = panel.scatter(azimuth, elevation, c=np.log10(off + 1e-3), vmin=-1, vmax=2, s=12, cmap="viridis")
-            panel.set(title=f"{name}, {label}", xlabel="sun azimuth from south [deg]", ylabel="elevation [deg]")
+            shown = panel.scatter(
+                azimuth, elevation, c=np.log10(off + 1e-3), vmin=-1, vmax=2, s=12, cmap="viridis"
+            )
+            panel.set(
+                title=f"{name}, {label}",
+                xlabel="sun azimuth from north [deg]",
+                ylabel="elevation [deg]",
+            )
             bar = figure.colorbar(shown, ax=panel, ticks=[-1, 0, 1, 2])
             bar.ax.set_yticklabels(["0.1", "1", "10", "100 mrad"])
         days, known = mount.days - mount.days[0], ~mount.foreign
@@ -334,7 +460,12 @@ def picture(plant: Plant, path: Path) -> None:
         ticks = [-100, -10, -1, 0, 1, 10, 100]
         row[2].set_yscale("symlog", linthresh=2)
         row[2].set_yticks(ticks, [f"{tick}" for tick in ticks])
-        row[2].set(title=f"{name}: zeros of its drives, steps grey", xlabel="days", ylabel="mrad", ylim=(-200, 200))
+        row[2].set(
+            title=f"{name}: zeros of its drives, steps grey",
+            xlabel="days",
+            ylabel="mrad",
+            ylim=(-200, 200),
+        )
         row[2].legend(fontsize=8)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=70)
@@ -343,10 +474,16 @@ def picture(plant: Plant, path: Path) -> None:
 
 def main() -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     default = [data_folder().parent / name for name in ("stj-pointing", "stj-years")]
     parser.add_argument("--data", type=Path, nargs="+", default=default)
-    parser.add_argument("--only", choices=("accuracy", "steps", "clock", "covariates", "speed", "picture"), nargs="*")
+    parser.add_argument(
+        "--only",
+        choices=("accuracy", "steps", "clock", "covariates", "spots", "speed", "picture"),
+        nargs="*",
+    )
     parser.add_argument("--out", type=Path, default=Path("results/pointing.png"))
     options = parser.parse_args()
     plant = Plant(options.data)
@@ -355,6 +492,7 @@ def main() -> None:
         "steps": lambda: steps(plant),
         "clock": lambda: clocks(plant),
         "covariates": lambda: covariates(plant),
+        "spots": lambda: spots(plant),
         "speed": lambda: speed(plant),
         "picture": lambda: picture(plant, options.out),
     }

@@ -1,10 +1,12 @@
-"""What the study finds in a season's photographs, in which effects come and go: ``python -m tests.benchmarks.scopes``.
+"""What the study finds in a season's photographs, in which effects come and go: ``python -m
+tests.benchmarks.scopes``.
 
-Each case of `tests.undeclared.changes` is written as a measurement folder of 8-bit photographs of a sunlit sheet, with
-times, and studied as ``heliotwin study`` does. An answer is right if it names the effect and its scope: the day of a
-change within one photograph of those concerned, and the heliostat. Nothing may be found in calm seasons, and no date
-where a target has had another camera from the beginning. As in `tests.benchmarks.study`, answers are kept in
-``OUT/cases.jsonl``, and a later call does what is missing; ``OUT/scopes.md`` and ``OUT/scopes.png`` show them all.
+Each case of `tests.undeclared.changes` is written as a measurement folder of 8-bit photographs of a
+sunlit sheet, with times, and studied as ``heliotwin study`` does. An answer is right if it names
+the effect and its scope: the day of a change within one photograph of those concerned, and the
+heliostat. Nothing may be found in calm seasons, and no date where a target has had another camera
+from the beginning. As in `tests.benchmarks.study`, answers are kept in ``OUT/cases.jsonl``, and a
+later call does what is missing; ``OUT/scopes.md`` and ``OUT/scopes.png`` show them all.
 """
 
 import argparse
@@ -44,14 +46,16 @@ from tests.undeclared.generator import generate_season
 ALIKE = {"law_since": ("camera_response", "camera_shoulder")}
 """Cases that the catalogue has only approximately, and the effects that come near."""
 
-LEAST_CHANGE = 1e-3
+MIN_CHANGE = 1e-3
 """Change of a forecast from which on a photograph counts as one that an effect acts on."""
 
 CALM_SEEDS = 20
 
 
 def answer(case: Case) -> Record:
-    """The study's answer to a case, with the truth and the calendar of the photographs beside it."""
+    """The study's answer to a case, with the truth and the calendar of the photographs
+    beside it.
+    """
     torch.set_num_threads(1)
     made = generate_season(case.name, case.level, case.seed)
     with TemporaryDirectory() as root:
@@ -60,7 +64,7 @@ def answer(case: Case) -> Record:
         found = study_folder(folder)
     report = found.to_json()
     true, change = upper_bound(made, found.study)
-    moved = change[change > LEAST_CHANGE]
+    moved = change[change > MIN_CHANGE]
     return {
         **asdict(case),
         "code": code(),
@@ -81,18 +85,23 @@ def answer(case: Case) -> Record:
     }
 
 
-# --- right or wrong ---------------------------------------------------------------------------------------------------
+# --- right or wrong
+# --------------------------------------------------------------------------------------------------
 
 
 def named(r: Record) -> bool:
     """Whether the first effect is the true one, or none is reported where there is none."""
     if not r["truth"]:
         return r["name"] == "two_cameras" or not r["effects"]
-    return bool(r["effects"]) and r["effects"][0]["name"] in ALIKE.get(r["name"], (r["truth"][0]["name"],))
+    return bool(r["effects"]) and r["effects"][0]["name"] in ALIKE.get(
+        r["name"], (r["truth"][0]["name"],)
+    )
 
 
 def scoped(r: Record) -> bool:
-    """Whether the first effect's kind of scope is the true one; without an effect, that no date is made up."""
+    """Whether the first effect's kind of scope is the true one; without an effect, that no date is
+    made up.
+    """
     if not r["truth"]:
         return all(effect["scope"]["kind"] != "since" for effect in r["effects"])
     return bool(r["effects"]) and r["effects"][0]["scope"]["kind"] == r["truth"][0]["scope"]["kind"]
@@ -101,7 +110,8 @@ def scoped(r: Record) -> bool:
 def whose(r: Record) -> bool:
     """Whether it is said to be of the right heliostats."""
     return scoped(r) and (
-        not r["truth"] or _scope(r["truth"]).get("heliostats") == _scope(r["effects"]).get("heliostats")
+        not r["truth"]
+        or _scope(r["truth"]).get("heliostats") == _scope(r["effects"]).get("heliostats")
     )
 
 
@@ -111,7 +121,9 @@ def dated(r: Record) -> bool:
         return scoped(r)
     concerned = _scope(r["truth"])["heliostats"]
     days = [day for day, name in r["calendar"] if concerned is None or name in concerned]
-    begins = [np.searchsorted(days, _scope(effects)["since"]) for effects in (r["truth"], r["effects"])]
+    begins = [
+        np.searchsorted(days, _scope(effects)["since"]) for effects in (r["truth"], r["effects"])
+    ]
     return bool(abs(begins[0] - begins[1]) <= 1)
 
 
@@ -125,7 +137,8 @@ def _scope(effects: Sequence[Record]) -> dict[str, Any]:
     return scope
 
 
-# --- what comes of it -------------------------------------------------------------------------------------------------
+# --- what comes of it
+# -------------------------------------------------------------------------------------------------
 
 
 def line(r: Record) -> str:
@@ -133,7 +146,10 @@ def line(r: Record) -> str:
     case = f"{r['name']}, {STRENGTHS[r['level']]}, seed {r['seed']}"
     truth = said(r["truth"]) if r["truth"] else "nothing"
     accuracy = f"{r['before']:.3f} -> {r['after']:.3f}, {r['seconds']:.0f} s"
-    return f"{'right' if right(r) else 'WRONG'} {case}: {r['verdict']} {said(r['effects'])}; truth {truth}; {accuracy}"
+    return (
+        f"{'right' if right(r) else 'WRONG'} {case}: {r['verdict']} {said(r['effects'])}; truth"
+        f" {truth}; {accuracy}"
+    )
 
 
 def said(effects: Sequence[Record]) -> str:
@@ -149,8 +165,8 @@ def said(effects: Sequence[Record]) -> str:
 def table(records: Sequence[Record]) -> Iterator[str]:
     """A row for each case, its figures by strength."""
     yield (
-        "| case | sets | forecast changes where it acts, % "
-        "| effect, % | kind of scope, % | heliostat, % | date, % | all of it, % | before | after | truth |"
+        "| case | sets | forecast changes where it acts, % | effect, % | kind of scope, % |"
+        " heliostat, % | date, % | all of it, % | before | after | truth |"
     )
     yield "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |"
     for name in CHANGES:
@@ -159,8 +175,12 @@ def table(records: Sequence[Record]) -> Iterator[str]:
             # What the catalogue has only approximately has no truth to forecast with.
             known = bool(own[0]["truth"]) and name not in ALIKE
             change = by_strength(own, lambda r: r["change"], decimal) if known else ""
-            shares = " | ".join(by_strength(own, rule, percent) for rule in (named, scoped, whose, dated, right))
-            accuracy = " | ".join(by_strength(own, lambda r, k=key: r[k], mean) for key in ("before", "after"))
+            shares = " | ".join(
+                by_strength(own, rule, percent) for rule in (named, scoped, whose, dated, right)
+            )
+            accuracy = " | ".join(
+                by_strength(own, lambda r, k=key: r[k], mean) for key in ("before", "after")
+            )
             true = by_strength(own, lambda r: r["true"], mean) if known or name == "calm" else ""
             yield f"| `{name}` | {len(own)} | {change} | {shares} | {accuracy} | {true} |"
 
@@ -168,7 +188,10 @@ def table(records: Sequence[Record]) -> Iterator[str]:
 def summary(records: Sequence[Record]) -> Iterator[str]:
     """The figures that the study is measured by."""
     changed = [r for r in records if r["truth"] and _scope(r["truth"])["kind"] != "set"]
-    yield f"Effects that come and go: {len(changed)} sets, all right in {percent([right(r) for r in changed])} %,"
+    yield (
+        f"Effects that come and go: {len(changed)} sets, all right in"
+        f" {percent([right(r) for r in changed])} %,"
+    )
     yield f"by strength {by_strength(changed, right, percent) if changed else '-'} %."
     always = [r for r in records if r["truth"] and _scope(r["truth"])["kind"] == "set"]
     for what, named in (("Effects of the whole set", False), ("Effects of one heliostat", True)):
@@ -176,10 +199,16 @@ def summary(records: Sequence[Record]) -> Iterator[str]:
         yield f"{what}: {len(some)} sets, right in {percent([right(r) for r in some])} %."
     calm = [r for r in records if r["name"] == "calm"]
     quiet = [r["verdict"] == "none" for r in calm]
-    yield f"Calm seasons: {len(calm)}, false alarms {percent([not right(r) for r in calm])} %, none {percent(quiet)} %."
+    yield (
+        f"Calm seasons: {len(calm)}, false alarms {percent([not right(r) for r in calm])} %, none"
+        f" {percent(quiet)} %."
+    )
     if records:
         sheets = sorted({r.get("sheet", "drawn") for r in records})
-        yield f"Sheets of photographs: {' and '.join(sheets)} (real where ../shared/stj/empty-targets is there)."
+        yield (
+            f"Sheets of photographs: {' and '.join(sheets)} (real where ../shared/stj/empty-targets"
+            " is there)."
+        )
         yield f"A study takes {np.median([r['seconds'] for r in records]):.0f} s of one core."
 
 
@@ -188,26 +217,39 @@ def column(r: Record) -> str:
     if not r["effects"]:
         return str(r["verdict"])
     scope = _scope(r["effects"])
-    return f"{r['effects'][0]['name']}, {'one' if scope['kind'] == 'set' and 'heliostats' in scope else scope['kind']}"
+    return (
+        f"{r['effects'][0]['name']},"
+        f" {'one' if scope['kind'] == 'set' and 'heliostats' in scope else scope['kind']}"
+    )
 
 
 def matrix(records: Sequence[Record]) -> Figure:
     """The confusion matrix of all strengths."""
     rows = [name for name in CHANGES if any(r["name"] == name for r in records)]
-    columns = ["none", "unexplained", *sorted({column(r) for r in records} - {"none", "unexplained"})]
+    columns = [
+        "none",
+        "unexplained",
+        *sorted({column(r) for r in records} - {"none", "unexplained"}),
+    ]
     counts = np.zeros((len(rows), len(columns)))
     for r in records:
         counts[rows.index(r["name"]), columns.index(column(r))] += 1
     figure = Figure(figsize=(3 + 0.5 * len(columns), 3 + 0.4 * len(rows)), layout="constrained")
     axes = figure.subplots()
     draw(axes, rows, columns, counts / counts.sum(axis=1, keepdims=True))
-    axes.set(title="what comes and goes [%]", xlabel="effect and scope found first, or verdict", ylabel="undeclared")
+    axes.set(
+        title="what comes and goes [%]",
+        xlabel="effect and scope found first, or verdict",
+        ylabel="undeclared",
+    )
     return figure
 
 
 def main() -> None:
     """Run the cases that are missing and show all."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--cases", default=",".join(CHANGES))
@@ -222,7 +264,9 @@ def main() -> None:
     if not options.show:
         wanted = list(cases(names, levels, seeds))
         if "calm" in names:
-            wanted += cases(["calm"], levels, range(seeds.stop, seeds.stop + CALM_SEEDS - options.seeds))
+            wanted += cases(
+                ["calm"], levels, range(seeds.stop, seeds.stop + CALM_SEEDS - options.seeds)
+            )
         run(wanted, path, options.jobs, answer, line)
     records = list(read(path).values())
     states = len({r["code"] for r in records})

@@ -1,9 +1,11 @@
-"""Whether surfaces that should not be trusted are told from good ones: ``python -m tests.benchmarks.selfcheck``.
+"""Whether predictions that should not be trusted are flagged: ``python -m
+tests.benchmarks.selfcheck``.
 
-Mirrors held out of training are photographed at places of the field, as they should be and with something wrong, and
-refined as the product does it. A prediction is trusted where it explains all its images by a mirror like those known,
-and nothing else speaks against it (`model.doubts`): how often each doubt is named is printed below.
-Real photographs follow: AA39's and AC43's as their own and as each other's.
+Mirrors held out of training are photographed at places of the field, as they should be and with
+something wrong, and refined as the product does it. A prediction is trusted where it explains all
+its images by a mirror like those known, and it has no other warning
+(`model.prediction_warnings`): how often each warning occurs is printed below. Real photographs
+follow: AA39's and AC43's as their own and as each other's.
 """
 
 import argparse
@@ -17,12 +19,12 @@ from model.effects.soiling import Soiling
 from model.images import normalized
 from model.metrics import surface_error
 from model.observation import SurfacePrediction, render_observations
-from model.plant import JUELICH_LATITUDE
-from service.cli.folder import observations_of
+from model.plant_model import JUELICH_MODEL
 from service.sources.folder import read_folder
-from service.twin.compute import predict
-from service.twin.evidence import choose
+from service.twin.heliostats.measurements import choose_diverse
+from service.twin.runtime.operations import predict
 from tests.benchmarks import data_folder
+from tests.benchmarks.folders import read_observations
 from tests.benchmarks.surfaces import IMAGES
 from training.cases import Case, make_cases
 from training.render import CleanCamera, load_field
@@ -40,11 +42,13 @@ Fault = Callable[[Case, Case, np.random.Generator], Case]
 
 
 def seen(case: Case, images: Array, rng: np.random.Generator) -> Case:
-    """The case with images (M, 64, 64), to which noise and 8 bits are added, in place of its own."""
+    """The case with other images (M, 64, 64), to which noise and rounding to 8 bits are added."""
     peak = images.max(axis=(1, 2), keepdims=True)
     noisy = np.round((images / peak + rng.normal(0, NOISE, images.shape)).clip(0, 1) * 255)
     fluxes = normalized(noisy).astype(np.float32)
-    observations = [replace(o, flux=flux) for o, flux in zip(case.observations, fluxes, strict=True)]
+    observations = [
+        replace(o, flux=flux) for o, flux in zip(case.observations, fluxes, strict=True)
+    ]
     return replace(case, observations=observations)
 
 
@@ -60,7 +64,7 @@ def canted(case: Case, other: Case, rng: np.random.Generator) -> Case:
     z[facet] += np.tensordot(slopes, tilt_modes(), axes=1)
     return seen(
         replace(case, truth=z),
-        render_observations(case.heliostat, case.observations, z, latitude_deg=JUELICH_LATITUDE),
+        render_observations(case.heliostat, case.observations, z, JUELICH_MODEL),
         rng,
     )
 
@@ -73,15 +77,17 @@ def broken(case: Case, other: Case, rng: np.random.Generator) -> Case:
     return seen(
         case,
         render_observations(
-            case.heliostat, case.observations, case.truth, effects=effects, latitude_deg=JUELICH_LATITUDE
+            case.heliostat, case.observations, case.truth, JUELICH_MODEL.with_effects(effects)
         ),
         rng,
     )
 
 
 def of_another(case: Case, other: Case, rng: np.random.Generator) -> Case:
-    """All images show another heliostat, which stands elsewhere."""
-    shown = [replace(o, flux=p.flux) for o, p in zip(case.observations, other.observations, strict=True)]
+    """All images show another heliostat, at another place."""
+    shown = [
+        replace(o, flux=p.flux) for o, p in zip(case.observations, other.observations, strict=True)
+    ]
     return replace(case, observations=shown)
 
 
@@ -109,52 +115,65 @@ FAULTS: dict[str, Fault] = {
 
 
 def line(label: str, cases: list[Case], predictions: list[SurfacePrediction]) -> str:
-    """How many predictions were doubted, how often over the third image alone; misfits; errors of the heights."""
+    """Format the numbers of flagged predictions, and of those flagged for the third image alone,
+    with misfits and errors of the heights.
+    """
     mean, worst = (np.array([f(p.misfits) for p in predictions]) for f in (np.mean, np.max))
-    doubted = sum(not p.trusted for p in predictions)
-    errors = [surface_error(p.z, case.truth) * 1e3 for p, case in zip(predictions, cases, strict=True)]
-    distances = [p.mahalanobis for p in predictions]
-    named = Counter(" ".join(doubt.split()[:3]) for p in predictions for doubt in p.doubts)
+    untrusted = sum(not p.trusted for p in predictions)
+    errors = [
+        surface_error(p.z, case.truth) * 1e3 for p, case in zip(predictions, cases, strict=True)
+    ]
+    distances = [p.mahalanobis_distance for p in predictions]
+    named = Counter(" ".join(reason.split()[:3]) for p in predictions for reason in p.warnings)
     third = sum(p.suspicious == p.used[2:3] for p in predictions)
     return (
-        f"  {label:<32} doubted {doubted:>2} of {len(mean):<3} third image alone {third:>2}   "
-        f"misfit median {np.median(mean):.3f}   "
-        f"worst image min {worst.min():.3f} median {np.median(worst):.3f} max {worst.max():.3f}   "
-        f"mahalanobis min {min(distances):.2f} median {np.median(distances):.2f} max {max(distances):.2f}   "
-        f"error [mm] median {np.median(errors):.3f}   {dict(named) or ''}"
+        f"  {label:<32} untrusted {untrusted:>2} of {len(mean):<3} third image alone {third:>2}  "
+        f" misfit median {np.median(mean):.3f}   worst image min {worst.min():.3f} median"
+        f" {np.median(worst):.3f} max {worst.max():.3f}   mahalanobis min {min(distances):.2f}"
+        f" median {np.median(distances):.2f} max {max(distances):.2f}   error [mm] median"
+        f" {np.median(errors):.3f}   {dict(named) or ''}"
     )
 
 
 def rendered(count: int) -> None:
     """Print a line for each fault."""
     surfaces, names = load_part(data_folder(), "test")
-    cases = make_cases(surfaces, names, load_field(data_folder()), count, CleanCamera(NOISE), seed=300)
+    cases = make_cases(
+        surfaces, names, load_field(data_folder()), count, CleanCamera(NOISE), seed=300
+    )
     for label, fault in FAULTS.items():
         pairs = zip(cases, cases[1:] + cases[:1], strict=True)
-        wrong = [fault(case, other, np.random.default_rng((301, i))) for i, (case, other) in enumerate(pairs)]
+        wrong = [
+            fault(case, other, np.random.default_rng((301, i)))
+            for i, (case, other) in enumerate(pairs)
+        ]
         print(
             line(
                 label,
                 wrong,
-                [predict(c.heliostat, c.observations, "refined", latitude_deg=JUELICH_LATITUDE) for c in wrong],
+                [predict(c.heliostat, c.observations, JUELICH_MODEL, "refined") for c in wrong],
             ),
             flush=True,
         )
 
 
 def photographed() -> None:
-    """Print what is made of AA39's and AC43's photographs, by their own models and by each other's."""
+    """Print what is made of AA39's and AC43's photographs, by their own models and by
+    each other's.
+    """
     folder = read_folder(data_folder(), ["AA39", "AC43"])
-    seen_of = {name: observations_of(folder, name)[0] for name in folder.plant.heliostats}
+    seen_of = {name: read_observations(folder, name) for name in folder.plant.heliostats}
     for heliostat in folder.plant.heliostats.values():
         for owner, observations in seen_of.items():
-            predicted = predict(heliostat, choose(observations, IMAGES), "refined", latitude_deg=JUELICH_LATITUDE)
+            predicted = predict(
+                heliostat, choose_diverse(observations, IMAGES), JUELICH_MODEL, "refined"
+            )
             verdict, shown = (
-                "trusted" if predicted.trusted else "doubted",
+                "trusted" if predicted.trusted else "untrusted",
                 " ".join(f"{m:.3f}" for m in predicted.misfits),
             )
             print(f"  {heliostat.name} from photographs of {owner}: {verdict}", end="   ")
-            print(f"mahalanobis {predicted.mahalanobis:.2f}   misfits {shown}")
+            print(f"mahalanobis {predicted.mahalanobis_distance:.2f}   misfits {shown}")
 
 
 def main() -> None:

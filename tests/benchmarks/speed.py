@@ -8,19 +8,23 @@ import torch
 
 from model.frames import sun_direction
 from model.network.architecture import MAX_IMAGES
-from model.network.predictor import INPUTS, LOOKS, SurfacePredictor
-from model.plant import JUELICH_LATITUDE, Heliostat, TargetPlane
+from model.network.predictor import INPUTS, N_ITERATIONS, SurfacePredictor
+from model.plant import Heliostat, TargetPlane
+from model.plant_model import JUELICH_MODEL
 from model.prior import default_prior
 from model.refinement import refine
+from model.setup import Setup
 from model.surface import control_points
 from model.tracing import Scene, Window, trace
 from model.tracing.montecarlo import trace_montecarlo
 from training.export import example
-from training.render import CleanCamera, Situations, observe, places
+from training.render import CleanCamera, SceneSampler, observe, places
 
 BATCH = 64
 
-TARGET = TargetPlane("t", np.array([0.0, 0, 40]), np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), 8, 8)
+TARGET = TargetPlane(
+    "t", np.array([0.0, 0, 40]), np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), 8, 8
+)
 
 
 def seconds(work: Callable[[], object], repeats: int) -> float:
@@ -38,10 +42,14 @@ def scene(count: int, device: str) -> Scene:
     """Random mirrors at 100 m under one sun."""
     rng, prior = np.random.default_rng(0), default_prior()
     heliostat = Heliostat.juelich("synthetic", np.array([20.0, 95.0, 1.8]), 100.0)
-    suns = np.tile(sun_direction(25.0, 40.0), (count, 1))
+    suns = np.tile(sun_direction(155.0, 40.0), (count, 1))
     angles = np.tile(heliostat.mount.align(heliostat.position, suns[0], TARGET.center), (count, 1))
-    points = [control_points(heliostat, prior.surface(rng.normal(size=len(prior.basis)))) for _ in range(count)]
-    return Scene.build([heliostat] * count, points, angles, suns, [TARGET] * count, device=device)
+    points = [
+        control_points(heliostat, prior.surface(rng.normal(size=len(prior.basis))))
+        for _ in range(count)
+    ]
+    setups = [Setup(heliostat, p, sun, TARGET) for p, sun in zip(points, suns, strict=True)]
+    return Scene.from_setups(setups, angles, device=device)
 
 
 def main() -> None:
@@ -52,11 +60,19 @@ def main() -> None:
         batch, one = scene(BATCH, "cpu"), scene(1, "cpu")
         reference = trace(batch, window, samples=96, padding=1.0).normalized()
         for samples in (16, 24, 32):
-            error = (trace(batch, window, samples=samples, padding=0.25).normalized() - reference).abs().sum((1, 2))
-            each = seconds(lambda s=samples: trace(batch, window, samples=s, padding=0.25), 20) / BATCH * 1e3
+            error = (
+                (trace(batch, window, samples=samples, padding=0.25).normalized() - reference)
+                .abs()
+                .sum((1, 2))
+            )
+            each = (
+                seconds(lambda s=samples: trace(batch, window, samples=s, padding=0.25), 20)
+                / BATCH
+                * 1e3
+            )
             print(
-                f"  convolution, {samples}^2 points a facet, batch {BATCH}: {each:.3f} ms a 64 x 64 flux, "
-                f"L1 to the converged image {float(error.mean()):.2f} %"
+                f"  convolution, {samples}^2 points a facet, batch {BATCH}: {each:.3f} ms a 64 x 64"
+                f" flux, L1 to the converged image {float(error.mean()):.2f} %"
             )
         rays = seconds(lambda: trace_montecarlo(one, window, rays=1_000_000), 3)
         print(f"  Monte Carlo, 1e6 rays: {rays:.2f} s a flux")
@@ -67,24 +83,47 @@ def main() -> None:
                 trace(many, window, samples=24, padding=0.25)
                 torch.cuda.synchronize()
 
-            print(f"  convolution on {torch.cuda.get_device_name()}: {seconds(on_gpu, 10) / 4096 * 1e3:.4f} ms a flux")
-    predictor, mirror = SurfacePredictor(threads=1), Heliostat.juelich("synthetic", np.array([20.0, 95.0, 1.8]), 100.0)
+            print(
+                f"  convolution on {torch.cuda.get_device_name()}:"
+                f" {seconds(on_gpu, 10) / 4096 * 1e3:.4f} ms a flux"
+            )
+    predictor, mirror = (
+        SurfacePredictor(threads=1),
+        Heliostat.juelich("synthetic", np.array([20.0, 95.0, 1.8]), 100.0),
+    )
     rng = np.random.default_rng(0)
-    setups = places(Situations().suns(MAX_IMAGES, rng), [TARGET] * MAX_IMAGES)
+    setups = places(SceneSampler().suns(MAX_IMAGES, rng), [TARGET] * MAX_IMAGES)
     images = observe(mirror, default_prior().mean, setups, CleanCamera(), rng)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
-    one, two = ({n: v.numpy() for n, v in zip(INPUTS, example(batch, MAX_IMAGES), strict=True)} for batch in (1, 2))
-    # The looks before the last, which is taken at two worlds at once.
-    taken = seconds(lambda: [predictor.look(inputs) for inputs in [one] * (LOOKS - 1) + [two]], 20) * 1e3
-    print(f"  network, one heliostat, 8 images, 1 core, {LOOKS} looks: {taken:.1f} ms")
-    for looks in (1, LOOKS):
-        taken = (
-            seconds(lambda n=looks: predictor.heights(mirror, images, looks=n, latitude_deg=JUELICH_LATITUDE), 20) * 1e3
+    one, two = (
+        {n: v.numpy() for n, v in zip(INPUTS, example(batch, MAX_IMAGES), strict=True)}
+        for batch in (1, 2)
+    )
+    # The iterations before the last, which is made for the mirrored world, too.
+    taken = (
+        seconds(
+            lambda: [predictor.iterate(inputs) for inputs in [one] * (N_ITERATIONS - 1) + [two]], 20
         )
-        print(f"  the same with alignment and tracing of its guesses, looks {looks}: {taken:.1f} ms")
+        * 1e3
+    )
+    print(f"  network, one heliostat, 8 images, 1 core, {N_ITERATIONS} iterations: {taken:.1f} ms")
+    for n_iterations in (1, N_ITERATIONS):
+        taken = (
+            seconds(
+                lambda n=n_iterations: predictor.heights(
+                    mirror, images, JUELICH_MODEL, n_iterations=n
+                ),
+                20,
+            )
+            * 1e3
+        )
+        print(
+            f"  the same with alignment and tracing of its guesses, iterations {n_iterations}:"
+            f" {taken:.1f} ms"
+        )
     torch.set_num_threads(threads)
-    taken = seconds(lambda: refine(mirror, images, latitude_deg=JUELICH_LATITUDE), 3)
+    taken = seconds(lambda: refine(mirror, images, JUELICH_MODEL), 3)
     print(f"  refinement, one heliostat, 8 images: {taken:.1f} s")
 
 

@@ -1,4 +1,5 @@
-"""How long the command takes to start: ``python -m tests.benchmarks.startup``. Compare the ratios; machines are shared.
+"""How long the command takes to start: ``python -m tests.benchmarks.startup``. Compare the ratios;
+machines are shared.
 
 The time of the clock grows with whatever else runs; that of the processor is the start's own.
 """
@@ -13,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 PROCESSES = 5
-"""Processes of each command whose median is told."""
+"""Number of processes per command, whose median is printed."""
 
 COMMANDS = (("-c", "pass"), ("-m", "service", "--help"), ("-m", "service", "keys", "list"))
 
@@ -23,7 +24,9 @@ def start(command: tuple[str, ...], data_dir: Path) -> tuple[float, float]:
     environment = os.environ | {"HELIOTWIN_DATA_DIR": str(data_dir)}
     environment.pop("HELIOTWIN_DATABASE_URL", None)
     began, used = time.perf_counter(), os.times()
-    subprocess.run([sys.executable, *command], env=environment, check=True, stdout=subprocess.DEVNULL)
+    subprocess.run(
+        [sys.executable, *command], env=environment, check=True, stdout=subprocess.DEVNULL
+    )
     now = os.times()
     cpu = now.children_user + now.children_system - used.children_user - used.children_system
     return time.perf_counter() - began, cpu
@@ -31,16 +34,20 @@ def start(command: tuple[str, ...], data_dir: Path) -> tuple[float, float]:
 
 def main() -> None:
     """Print the medians, and how often each is that of an interpreter that does nothing."""
-    print(f"Start-up, median of {PROCESSES} processes (load of the machine: {os.getloadavg()[0]:.1f})")
+    print(
+        f"Start-up, median of {PROCESSES} processes (load of the machine: {os.getloadavg()[0]:.1f})"
+    )
     base = None
     with tempfile.TemporaryDirectory() as folder:
         for command in COMMANDS:
-            start(command, Path(folder))  # compiled files, the disk's cache, and the store are there from now on
+            start(
+                command, Path(folder)
+            )  # compiled files, the disk's cache, and the store are there from now on
             wall, cpu = np.median([start(command, Path(folder)) for _ in range(PROCESSES)], axis=0)
             base = base or (wall, cpu)
             print(
-                f"  python {' '.join(command)}: {wall:.2f} s of wall time ({wall / base[0]:.0f} times), "
-                f"{cpu:.2f} s of processor time ({cpu / base[1]:.0f} times)"
+                f"  python {' '.join(command)}: {wall:.2f} s of wall time ({wall / base[0]:.0f}"
+                f" times), {cpu:.2f} s of processor time ({cpu / base[1]:.0f} times)"
             )
 
 

@@ -1,10 +1,12 @@
-"""What the study finds in sets whose undeclared effects are known: ``python -m tests.benchmarks.study``.
+"""What the study finds in sets whose undeclared effects are known: ``python -m
+tests.benchmarks.study``.
 
-Every disturbance of `tests.undeclared.world` at three strengths, pairs of them, and clean sets; each seed is another
-plant. Each case adds a line of JSON to ``OUT/cases.jsonl``; a later call does what is missing, or was answered by
-another state of the code. ``OUT/study.md`` and ``OUT/matrix.png`` show them all. With ``--folders`` the sets of
-``../shared/undeclared``, whose effects are not known here, are studied instead; with ``--moving`` worlds whose effects
-move spots, with and without what encoders said.
+Every disturbance of `tests.undeclared.world` at three strengths, pairs of them, and clean sets;
+each seed is another plant. Each case adds a line of JSON to ``OUT/cases.jsonl``; a later call does
+what is missing, or was answered by another state of the code. ``OUT/study.md`` and
+``OUT/matrix.png`` show them all. With ``--folders`` the sets of ``../shared/undeclared``, whose
+effects are not known here, are studied instead; with ``--moving`` worlds whose effects move spots,
+with and without what encoders said.
 """
 
 import argparse
@@ -28,10 +30,9 @@ from numpy.typing import NDArray
 
 from model.effects import CATALOGUE as KINDS
 from model.metrics import flux_accuracies
-from model.plant import JUELICH_LATITUDE
-from model.study import Study, StudyOptions, study
+from model.plant_model import JUELICH_MODEL
+from model.study import Study, StudyOptions, study, study_to_json
 from model.study.flux_images import Forecaster
-from model.tracing import Optics
 from service.cli.folder_study import study_folder
 from service.sources.folder import read_folder
 from tests.benchmarks import data_folder
@@ -69,7 +70,8 @@ class Case:
     seed: int
 
 
-# --- one case ---------------------------------------------------------------------------------------------------------
+# --- one case
+# --------------------------------------------------------------------------------------------------
 
 
 def answer(case: Case) -> Record:
@@ -77,9 +79,9 @@ def answer(case: Case) -> Record:
     torch.set_num_threads(1)
     made = generate(case.name, case.level, case.seed)
     start = process_time()
-    found = study(flux_images(made), Optics(), latitude_deg=JUELICH_LATITUDE)
+    found = study(flux_images(made), JUELICH_MODEL)
     seconds = process_time() - start
-    report = found.to_json()
+    report = study_to_json(found)
     true, change = upper_bound(made, found)
     return {
         **asdict(case),
@@ -92,7 +94,7 @@ def answer(case: Case) -> Record:
         "change": round(float(change.mean()), 5),
         "noise": report["noise_floor"],
         "unexplained": report["unexplained_share"],
-        "incomplete": found.incomplete,
+        "incomplete": found.has_unexplained_error,
         "lookalikes": [effect["lookalikes"] for effect in report["effects"]],
         "errors": [error for effect in report["effects"] for error in errors(effect, made.truth)],
         "truth": made.truth,
@@ -103,16 +105,20 @@ def answer(case: Case) -> Record:
 
 
 def upper_bound(made: MeasurementSet, found: Study) -> tuple[Array, Array]:
-    """Accuracies (H,) of the held-out images with the true effects, and by how much those change the forecast (H,)."""
-    forecaster = Forecaster(
-        found.images, Optics(), [], found.window, StudyOptions().view, latitude_deg=JUELICH_LATITUDE
-    )
+    """Accuracies (H,) of the held-out images with the true effects, and by how much those change
+    the forecast (H,).
+    """
+    forecaster = Forecaster(found.images, JUELICH_MODEL, found.window, StudyOptions().view)
     with_truth = forecaster.cuts(effects_of(made))
-    return flux_accuracies(found.measured, with_truth), 1 - flux_accuracies(found.before, with_truth)
+    return flux_accuracies(found.measured, with_truth), 1 - flux_accuracies(
+        found.before, with_truth
+    )
 
 
 def errors(effect: Record, truth: Sequence[Record]) -> Iterator[Record]:
-    """For each parameter of a true effect that was found: its relative error, and the share within the intervals."""
+    """For each parameter of a true effect that was found: its relative error, and the share within
+    the intervals.
+    """
     true = next((t["parameters"] for t in truth if t["name"] == effect["name"]), {})
     for parameter in KINDS[effect["name"]].parameters():
         expected = flat(true.get(parameter.name, parameter.neutral))
@@ -120,7 +126,9 @@ def errors(effect: Record, truth: Sequence[Record]) -> Iterator[Record]:
         if size > 0:
             estimate = effect["parameters"][parameter.name]
             value, interval = flat(estimate["value"]), flat(estimate["ci95"]).reshape(-1, 2)
-            if effect["name"] == "facet_canting":  # the tilt of the whole mirror is nobody's to find
+            if (
+                effect["name"] == "facet_canting"
+            ):  # the tilt of the whole mirror is nobody's to find
                 common = value.reshape(-1, 4).mean(axis=1).repeat(4)
                 value, interval = value - common, interval - common[:, None]
             inside = (interval[:, 0] <= expected) & (expected <= interval[:, 1])
@@ -138,7 +146,8 @@ def flat(value: Any) -> Array:
     return np.asarray(value, dtype=np.float64).ravel()
 
 
-# --- all cases --------------------------------------------------------------------------------------------------------
+# --- all cases
+# --------------------------------------------------------------------------------------------------
 
 
 @lru_cache(maxsize=1)
@@ -147,15 +156,26 @@ def code() -> str:
     root = Path(__file__).parents[2]
     folders = [root / "model" / "effects", root / "model" / "study", root / "model" / "imaging"]
     folders += [root / "tests" / "undeclared"]
-    files = sorted(file for folder in folders for file in folder.glob("*.py") if not file.name.startswith("test_"))
+    files = sorted(
+        file
+        for folder in folders
+        for file in folder.glob("*.py")
+        if not file.name.startswith("test_")
+    )
     return sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:12]
 
 
 def cases(names: Sequence[str], levels: Sequence[int], seeds: Sequence[int]) -> Iterator[Case]:
-    """Seed by seed, the strongest first, so that a run cut short has seen every effect; quiet ones once a seed."""
+    """Seed by seed, the strongest first, so that a run cut short has seen every effect; quiet ones
+    once a seed.
+    """
     for seed in seeds:
         for level in sorted(levels, reverse=True):
-            yield from (Case(name, level, seed) for name in names if name not in QUIET or level == max(levels))
+            yield from (
+                Case(name, level, seed)
+                for name in names
+                if name not in QUIET or level == max(levels)
+            )
 
 
 def read(path: Path) -> dict[Case, Record]:
@@ -166,13 +186,20 @@ def read(path: Path) -> dict[Case, Record]:
 
 
 def run(
-    wanted: Sequence[Case], path: Path, jobs: int, answer: Callable[[Case], Record], line: Callable[[Record], str]
+    wanted: Sequence[Case],
+    path: Path,
+    jobs: int,
+    answer: Callable[[Case], Record],
+    line: Callable[[Record], str],
 ) -> None:
     """Answer the cases that have none, a line each."""
     path.parent.mkdir(parents=True, exist_ok=True)
     done = read(path)
     left = [case for case in wanted if done.get(case, {}).get("code") != code()]
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool, path.open("a", encoding="utf-8") as file:
+    with (
+        ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool,
+        path.open("a", encoding="utf-8") as file,
+    ):
         for work in as_completed([pool.submit(answer, case) for case in left]):
             record = work.result()
             file.write(json.dumps(record) + "\n")
@@ -184,10 +211,13 @@ def line(r: Record) -> str:
     """A record in one line."""
     case = f"{r['name']}, {STRENGTHS[r['level']]}, seed {r['seed']}"
     accuracy = f"{r['before']:.3f} -> {r['after']:.3f} (truth {r['true']:.3f})"
-    return f"{case:<44} {r['verdict']:<12} {'+'.join(r['found']):<30} {accuracy} {r['seconds']:.0f} s"
+    return (
+        f"{case:<44} {r['verdict']:<12} {'+'.join(r['found']):<30} {accuracy} {r['seconds']:.0f} s"
+    )
 
 
-# --- what comes of it -------------------------------------------------------------------------------------------------
+# --- what comes of it
+# -------------------------------------------------------------------------------------------------
 
 
 def column(record: Record) -> str:
@@ -210,7 +240,7 @@ def among(record: Record) -> bool:
 
 
 def undecided(record: Record) -> bool:
-    """Whether the true effect is not the first, but the report says that these images cannot tell the two apart."""
+    """Whether the true effect is not the first, but the report lists it as a look-alike of it."""
     alike = record["lookalikes"][0] if record["lookalikes"] else []
     return not first(record) and bool(set(record["name"].split("+")) & set(alike))
 
@@ -230,14 +260,23 @@ def by_strength(
 
 def table(records: Sequence[Record]) -> Iterator[str]:
     """A row for each disturbance."""
-    yield "| undeclared | sets | forecast changes, % | found first, % | among those found, % | before | after | truth |"
+    yield (
+        "| undeclared | sets | forecast changes, % | found first, % | among those found, % | before"
+        " | after | truth |"
+    )
     yield "| --- | --- | --- | --- | --- | --- | --- | --- |"
     for name in CASES:
         own = [r for r in records if r["name"] == name]
         if own:
-            change = "" if name == "clean" or name in OUTSIDE else by_strength(own, lambda r: r["change"], decimal)
+            change = (
+                ""
+                if name == "clean" or name in OUTSIDE
+                else by_strength(own, lambda r: r["change"], decimal)
+            )
             shares = " | ".join(by_strength(own, rule, percent) for rule in (first, among))
-            accuracy = " | ".join(by_strength(own, lambda r, k=key: r[k], mean) for key in ("before", "after"))
+            accuracy = " | ".join(
+                by_strength(own, lambda r, k=key: r[k], mean) for key in ("before", "after")
+            )
             truth = "" if name in OUTSIDE else by_strength(own, lambda r: r["true"], mean)
             yield f"| `{name}` | {len(own)} | {change} | {shares} | {accuracy} | {truth} |"
 
@@ -253,14 +292,22 @@ def mean(values: Sequence[float]) -> str:
 
 
 def parameters(records: Sequence[Record]) -> Iterator[str]:
-    """A row for each parameter that was found: median of the relative error, share of the truth within intervals."""
-    yield "| parameter | times found | error relative to the truth, median, % | truth within the 95 % interval, % |"
+    """A row for each parameter that was found: median of the relative error, share of the truth
+    within intervals.
+    """
+    yield (
+        "| parameter | times found | error relative to the truth, median, % | truth within the 95 %"
+        " interval, % |"
+    )
     yield "| --- | --- | --- | --- |"
     found = [error for r in records if "+" not in r["name"] for error in r["errors"]]
     for name in dict.fromkeys(error["name"] for error in found):
         own = [error for error in found if error["name"] == name]
         relative = 100 * np.median([error["relative"] for error in own])
-        yield f"| `{name}` | {len(own)} | {relative:.1f} | {percent([error['inside'] for error in own])} |"
+        yield (
+            f"| `{name}` | {len(own)} | {relative:.1f} |"
+            f" {percent([error['inside'] for error in own])} |"
+        )
 
 
 def summary(records: Sequence[Record]) -> Iterator[str]:
@@ -270,16 +317,31 @@ def summary(records: Sequence[Record]) -> Iterator[str]:
     clean = [r for r in records if r["name"] == "clean"]
     outside = [r for r in records if r["name"] in OUTSIDE]
     yield f"Noise alone costs {decimal([r['noise'] for r in records])} % of accuracy."
-    yield f"Effects that change the forecast by more than twice that: {len(large)} sets; found first in"
-    yield f"{percent([first(r) for r in large])} %, among those found in {percent([among(r) for r in large])} %;"
-    told = percent([undecided(r) for r in large])
-    yield f"named as a look-alike that these images cannot tell from the first in {told} %."
-    yield f"Clean sets: {len(clean)}, false alarms {percent([r['verdict'] != 'none' for r in clean])} %."
+    yield (
+        f"Effects that change the forecast by more than twice that: {len(large)} sets; found"
+        " first in"
+    )
+    yield (
+        f"{percent([first(r) for r in large])} %, among those found in"
+        f" {percent([among(r) for r in large])} %;"
+    )
+    undecided_share = percent([undecided(r) for r in large])
+    yield f"named as a look-alike of the first in {undecided_share} %."
+    yield (
+        f"Clean sets: {len(clean)}, false alarms"
+        f" {percent([r['verdict'] != 'none' for r in clean])} %."
+    )
     if outside:
         answers = Counter(r["verdict"] for r in outside)
         rest = [r["incomplete"] for r in outside if r["verdict"] == "effect"]
-        yield f"Outside the catalogue: {len(outside)} sets, " + ", ".join(f"{v} {n}" for v, n in answers.items()) + ";"
-        yield f"of those effects {percent(rest)} % are reported with an error that stays unexplained."
+        yield (
+            f"Outside the catalogue: {len(outside)} sets, "
+            + ", ".join(f"{v} {n}" for v, n in answers.items())
+            + ";"
+        )
+        yield (
+            f"of those effects {percent(rest)} % are reported with an error that stays unexplained."
+        )
     yield f"A study takes {np.median([r['seconds'] for r in records]):.0f} s of one core."
 
 
@@ -298,30 +360,42 @@ def draw(axes: Axes, rows: Sequence[str], columns: Sequence[str], shares: Array)
     axes.imshow(shares, cmap="Blues", vmin=0, vmax=1)
     for (row, place), share in np.ndenumerate(shares):
         if share > 0:
-            axes.text(place, row, f"{100 * share:.0f}", ha="center", va="center", color="w" if share > 0.5 else "k")
+            axes.text(
+                place,
+                row,
+                f"{100 * share:.0f}",
+                ha="center",
+                va="center",
+                color="w" if share > 0.5 else "k",
+            )
     axes.set_xticks(range(len(columns)), columns, rotation=60, ha="right")
     axes.set_yticks(range(len(rows)), rows)
 
 
 def matrix(records: Sequence[Record]) -> Figure:
-    """The confusion matrix of all strengths, beside that of the sets with more change than twice the noise."""
+    """The confusion matrix of all strengths, beside that of the sets with more change than twice
+    the noise.
+    """
     known = [r for r in records if r["name"] not in CATALOGUE or r["change"] > 2 * r["noise"]]
     figure = Figure(figsize=(18, 9), layout="constrained")
     titles = "all strengths", "effects that change the forecast by more than twice the noise"
     for axes, some, title in zip(figure.subplots(1, 2), (records, known), titles, strict=True):
         draw(axes, *confusion(some))
-        axes.set(title=f"{title} [%]", xlabel="verdict, or the effect found first", ylabel="undeclared")
+        axes.set(
+            title=f"{title} [%]", xlabel="verdict, or the effect found first", ylabel="undeclared"
+        )
     return figure
 
 
-# --- what moves spots -------------------------------------------------------------------------------------------------
+# --- what moves spots
+# -------------------------------------------------------------------------------------------------
 
 
 def moving(seeds: Sequence[int]) -> None:
-    """Print what worlds in which spots are moved are taken for, by spot and shape and by shape alone.
+    """Print which effects are found if spots are moved, by spot and shape and by shape alone.
 
-    Three heliostats with twelve photographs each; a row's numbers are sets in which an effect was found first, with
-    those in brackets that the report cannot tell from another.
+    Three heliostats have twelve photographs each. A row's numbers are sets in which an effect was
+    found first. In brackets: those in which the report cannot distinguish it from another.
     """
     columns = ("axis_tilt", "sun_position", "pylon_bending", "encoder_offset", "another", "none")
     for by_spot in (True, False):
@@ -333,26 +407,37 @@ def moving(seeds: Sequence[int]) -> None:
             for seed in seeds:
                 made = generate(case, len(STRENGTHS) - 1, seed, heliostats=3, setups=12, side=96)
                 images = flux_images(made, made.encoders(seed) if by_spot else None)
-                report = study(images, Optics(), latitude_deg=JUELICH_LATITUDE).to_json()
+                report = study_to_json(study(images, JUELICH_MODEL))
                 first = (report["effects"] or [{"name": "none", "lookalikes": []}])[0]
                 name = first["name"] if first["name"] in columns else "another"
                 found.update([name, *(["?" + name] if first["lookalikes"] else [])])
                 before.append(report["before"].get("position_error_mrad", np.nan))
                 after.append(report["after"].get("position_error_mrad", np.nan))
-            counts = [f"{found[c] or ''}" + (f" ({found['?' + c]})" if found["?" + c] else "") for c in columns]
-            print(f"| `{case}` | {' | '.join(counts)} | {np.mean(before):.1f} | {np.mean(after):.1f} |", flush=True)
+            counts = [
+                f"{found[c] or ''}" + (f" ({found['?' + c]})" if found["?" + c] else "")
+                for c in columns
+            ]
+            print(
+                f"| `{case}` | {' | '.join(counts)} | {np.mean(before):.1f} |"
+                f" {np.mean(after):.1f} |",
+                flush=True,
+            )
         print()
 
 
-# --- sets whose effects are not known ---------------------------------------------------------------------------------
+# --- sets whose effects are not known
+# ---------------------------------------------------------------------------------
 
 
 def folders(root: Path) -> None:
     """Print what the study says of each set of a folder."""
     for folder in sorted(root.glob("set-*")):
-        report = study_folder(read_folder(folder)).study.to_json()
+        report = study_to_json(study_folder(read_folder(folder)).study)
         before, after = (report[when]["accuracy_mean"] for when in ("before", "after"))
-        print(f"{folder.name}: {report['verdict']}, {before:.3f} -> {after:.3f}, noise {report['noise_floor']:.3f}")
+        print(
+            f"{folder.name}: {report['verdict']}, {before:.3f} -> {after:.3f}, noise"
+            f" {report['noise_floor']:.3f}"
+        )
         for effect in report["effects"]:
             print(f"  {effect['name']}")
             for name, found in effect["parameters"].items():
@@ -362,16 +447,26 @@ def folders(root: Path) -> None:
 
 def main() -> None:
     """Run the cases that are missing and show all."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--first-seed", type=int, default=0)
-    parser.add_argument("--effects", default=",".join(CASES), help="names and pairs a+b, with commas between them")
+    parser.add_argument(
+        "--effects", default=",".join(CASES), help="names and pairs a+b, with commas between them"
+    )
     parser.add_argument("--strengths", default=",".join(STRENGTHS))
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--out", type=Path, default=Path("out/study-proof"))
     parser.add_argument("--show", action="store_true", help="only show what is there")
-    parser.add_argument("--folders", action="store_true", help="study the sets of ../shared/undeclared instead")
-    parser.add_argument("--moving", action="store_true", help="only worlds in which spots are moved, by their motors")
+    parser.add_argument(
+        "--folders", action="store_true", help="study the sets of ../shared/undeclared instead"
+    )
+    parser.add_argument(
+        "--moving",
+        action="store_true",
+        help="only worlds in which spots are moved, by their motors",
+    )
     options = parser.parse_args()
     if options.moving:
         moving(range(options.first_seed, options.first_seed + options.seeds))
@@ -383,7 +478,9 @@ def main() -> None:
     levels = [STRENGTHS.index(name) for name in options.strengths.split(",")]
     seeds = range(options.first_seed, options.first_seed + options.seeds)
     if not options.show:
-        run(list(cases(options.effects.split(","), levels, seeds)), path, options.jobs, answer, line)
+        run(
+            list(cases(options.effects.split(","), levels, seeds)), path, options.jobs, answer, line
+        )
     records = list(read(path).values())
     states = len({r["code"] for r in records})
     text = [*summary(records), "", *table(records), "", *parameters(records)]

@@ -1,23 +1,25 @@
 """Surfaces against deflectometry: ``python -m tests.benchmarks.surfaces``.
 
-Rendered: AA28, AA39 and AC43 as deflectometry has them, 20 x 20 heights a facet, at their own places, under suns and
-on targets of real photographs, traced by Monte Carlo with one per cent of noise; by the network and refined, from the
-prior's mean and from the truth, without ripples, and by the generic prior; then the same mirrors, larger by half, of
-whose facets there is no other prior; then smoothed to the 8 x 8 heights that errors are of.
+Rendered: AA28, AA39 and AC43 as deflectometry has them, 20 x 20 heights a facet, at their own
+places, under suns and on targets of real photographs, traced by Monte Carlo with one per cent of
+noise; by the network and refined, from the prior's mean and from the truth, without ripples, and by
+the generic prior; then the same mirrors, larger by half, of whose facets there is no other prior;
+then smoothed to the 8 x 8 heights that errors are of.
 
-Real: AA39 of two years, from sets of its photographs, some of which contradict the others; flux accuracy on
-photographs that no set holds. Errors are those of the control heights, the mirror's tilt and canting counted. AC43 is
-STJ-012 of the measured surfaces, from which neither network nor prior has learnt.
+Real: AA39 of two years, from sets of its photographs, some of which contradict the others; flux
+accuracy on photographs that no set holds. Errors are those of the control heights, the mirror's
+tilt and canting counted. AC43 is STJ-012 of the measured surfaces, from which neither network nor
+prior has learnt.
 
 ``--only scaling``: the time that AA39 takes from 8 to 64 images.
 
-``--only far``: the same surfaces on heliostats 300 to 600 m away, whose spots spill out of the smallest window, by
-images of that and of the one that is chosen, on a target that holds all.
+``--only far``: the same surfaces on heliostats 300 to 600 m away, whose spots spill out of the
+smallest window, by images of that and of the one that is chosen, on a target that holds all.
 
-``--only photographs``: what AA39's surfaces gain by photographs that the camera's range clipped or the target cut, and
-by leaving out those that contradict the others, as the service does; and whether photographs of other days take its
-deflectometry nearer to those of a day. Days are dealt out to two halves; surfaces from photographs of either are judged
-by all photographs of the other.
+``--only photographs``: what AA39's surfaces gain by photographs that the camera's range clipped or
+the target cut, and by leaving out those that contradict the others, as the service does; and
+whether photographs of other days take its deflectometry nearer to those of a day. Days are dealt
+out to two halves; surfaces from photographs of either are judged by all photographs of the other.
 """
 
 import argparse
@@ -30,7 +32,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from model.doubts import spilt
 from model.images import FLUX_SHAPE, FLUX_WINDOW, normalized
 from model.metrics import WINDOWS, surface_error
 from model.network.predictor import default_predictor
@@ -39,20 +40,23 @@ from model.observation import (
     SurfacePrediction,
     align_observations,
     misfits,
-    scene_of,
+    observed_scene,
     spread_suns,
 )
-from model.plant import JUELICH_LATITUDE, Facet, Heliostat
+from model.plant import Facet, Heliostat
+from model.plant_model import JUELICH_MODEL
+from model.prediction_warnings import has_excess_spillage
 from model.prior import default_prior, generic_prior
 from model.refinement import RefinementOptions, refine
 from model.surface import heights
 from model.tracing import Window
 from model.tracing.montecarlo import trace_montecarlo
-from service.cli.folder import observations_of, surface_errors
+from service.cli.folder import surface_errors
 from service.sources.folder import MeasurementFolder, measured_heights, read_folder
-from service.twin import compute
-from service.twin.consensus import agreeing
+from service.twin.heliostats.outliers import reject_outliers
+from service.twin.runtime import operations
 from tests.benchmarks import data_folder
+from tests.benchmarks.folders import read_observations
 from tests.benchmarks.years import interval
 
 Array = NDArray[np.float64]
@@ -66,8 +70,8 @@ BRIGHT = 0.3
 """Share of a spot's brighter half that may be cut off for a photograph to be taken here."""
 
 HEAD = (
-    "| | error [mm] | canting | waviness | mean sigma | within 90 % | processor [s] | wall [s] | left out |\n"
-    "| --- | --- | --- | --- | --- | --- | --- | --- | --- |"
+    "| | error [mm] | canting | waviness | mean sigma | within 90 % | processor [s] | wall [s] |"
+    " left out |\n| --- | --- | --- | --- | --- | --- | --- | --- | --- |"
 )
 
 
@@ -79,20 +83,26 @@ def row(name: str, predict: Callable[[], SurfacePrediction], truth: Array) -> Su
     errors = surface_errors(found.z, truth)
     covered = np.mean(np.abs(found.z - truth) < WITHIN_90 * found.z_std)
     print(
-        f"| {name} | {errors['mae_mm']:.3f} | {errors['mae_canting_mm']:.3f} | {errors['mae_waviness_mm']:.3f} | "
-        f"{1e3 * found.z_std.mean():.3f} | {covered:.0%} | {seconds:.1f} | {wall:.1f} | "
-        f"{', '.join(found.contradicting)} |",
+        f"| {name} | {errors['mae_mm']:.3f} | {errors['mae_canting_mm']:.3f} |"
+        f" {errors['mae_waviness_mm']:.3f} | {1e3 * found.z_std.mean():.3f} | {covered:.0%} |"
+        f" {seconds:.1f} | {wall:.1f} | {', '.join(found.contradicting)} |",
         flush=True,
     )
     return found
 
 
 def truth_of(folder: MeasurementFolder, name: str) -> tuple[Heliostat, Array, Array]:
-    """A heliostat, its measured heights (4, 8, 8) [m], and all that deflectometry has of them (4, I, J) [m]."""
+    """A heliostat, its measured heights (4, 8, 8) [m], and all that deflectometry has of them (4,
+    I, J) [m].
+    """
     heliostat, measured = folder.plant.heliostats[name], folder.measured_surface(name)
     assert measured is not None
     _, rows, columns, _ = measured[0].shape
-    return heliostat, measured_heights(heliostat, measured), heights(heliostat, *measured, shape=(rows, columns))
+    return (
+        heliostat,
+        measured_heights(heliostat, measured),
+        heights(heliostat, *measured, shape=(rows, columns)),
+    )
 
 
 def photographed(
@@ -104,17 +114,21 @@ def photographed(
     side: float = FLUX_WINDOW,
 ) -> list[Observation]:
     """What an 8-bit camera with noise sees of Monte Carlo light in squares of ``side`` [m]."""
-    images, _ = trace_montecarlo(scene_of(heliostat, setups, [z]), Window(side, side, on_spot=True), rays=rays)
+    images, _ = trace_montecarlo(
+        observed_scene(heliostat, setups, z), Window(side, side, on_spot=True), rays=rays
+    )
     seen = images / images.max(axis=(1, 2), keepdims=True) + rng.normal(0, NOISE, images.shape)
     flux = normalized(np.round(seen.clip(0, 1) * 255)).astype(np.float32)
-    return [replace(setup, flux=image, side=side) for setup, image in zip(setups, flux, strict=True)]
+    return [
+        replace(setup, flux=image, side=side) for setup, image in zip(setups, flux, strict=True)
+    ]
 
 
 def held(heliostat: Heliostat, z: Array, setups: list[Observation], rays: int) -> list[Observation]:
     """`photographed` in the smallest window that holds the spots, or the largest there is."""
     for side in WINDOWS:
         seen = photographed(heliostat, z, setups, rays, np.random.default_rng(1), side)
-        if not spilt(seen):
+        if not has_excess_spillage(seen):
             break
     return seen
 
@@ -139,19 +153,21 @@ def rendered(folder: MeasurementFolder, years: MeasurementFolder, rays: int) -> 
     print(f"Rendered by Monte Carlo, {rays:.0e} rays, {NOISE:.0%} noise, {IMAGES} images\n{HEAD}")
     for name in MIRRORS:
         heliostat, truth, fine = truth_of(folder, name)
-        seen = photographed(heliostat, fine, places_of(years, IMAGES), rays, np.random.default_rng(1))
+        seen = photographed(
+            heliostat, fine, places_of(years, IMAGES), rays, np.random.default_rng(1)
+        )
         row(
             f"{name} network",
-            lambda h=heliostat, o=seen: default_predictor().predict(h, o, latitude_deg=JUELICH_LATITUDE),
+            lambda h=heliostat, o=seen: default_predictor().predict(h, o, JUELICH_MODEL),
             truth,
         )
         ends = {
             "refined from the mean": row(
-                f"{name} refined", lambda h=heliostat, o=seen: refine(h, o, latitude_deg=JUELICH_LATITUDE), truth
+                f"{name} refined", lambda h=heliostat, o=seen: refine(h, o, JUELICH_MODEL), truth
             ),
             "from the truth": row(
                 f"{name} refined from the truth",
-                lambda h=heliostat, o=seen, t=truth: refine(h, o, t, latitude_deg=JUELICH_LATITUDE),
+                lambda h=heliostat, o=seen, t=truth: refine(h, o, JUELICH_MODEL, t),
                 truth,
             ),
         }
@@ -160,32 +176,34 @@ def rendered(folder: MeasurementFolder, years: MeasurementFolder, rays: int) -> 
         row(
             f"{name} refined without ripples",
             lambda h=heliostat, o=seen: refine(
-                h, o, latitude_deg=JUELICH_LATITUDE, options=RefinementOptions(rippled=False)
+                h, o, JUELICH_MODEL, options=RefinementOptions(with_ripples=False)
             ),
             truth,
         )
         generic = generic_prior(heliostat.facet_frames[2])
         row(
             f"{name} refined, generic prior",
-            lambda h=heliostat, o=seen, p=generic: refine(h, o, prior=p, latitude_deg=JUELICH_LATITUDE),
+            lambda h=heliostat, o=seen, p=generic: refine(h, o, JUELICH_MODEL, prior=p),
             truth,
         )
         larger, shape = enlarged(heliostat, 1.5), 1.5 * truth
         images = held(larger, 1.5 * fine, places_of(years, IMAGES), rays)
         row(
             f"{name} with facets half as large again, refined",
-            lambda h=larger, o=images: refine(h, o, latitude_deg=JUELICH_LATITUDE),
+            lambda h=larger, o=images: refine(h, o, JUELICH_MODEL),
             shape,
         )
-        smooth = photographed(heliostat, truth, places_of(years, IMAGES), rays, np.random.default_rng(1))
+        smooth = photographed(
+            heliostat, truth, places_of(years, IMAGES), rays, np.random.default_rng(1)
+        )
         row(
             f"{name} of 8 x 8 heights, network",
-            lambda h=heliostat, o=smooth: default_predictor().predict(h, o, latitude_deg=JUELICH_LATITUDE),
+            lambda h=heliostat, o=smooth: default_predictor().predict(h, o, JUELICH_MODEL),
             truth,
         )
         row(
             f"{name} of 8 x 8 heights, refined",
-            lambda h=heliostat, o=smooth: refine(h, o, latitude_deg=JUELICH_LATITUDE),
+            lambda h=heliostat, o=smooth: refine(h, o, JUELICH_MODEL),
             truth,
         )
         print(f"| | both ends {apart:.3f} mm apart, misfit {left} | | | | | | | |")
@@ -193,29 +211,42 @@ def rendered(folder: MeasurementFolder, years: MeasurementFolder, rays: int) -> 
 
 def enlarged(heliostat: Heliostat, factor: float) -> Heliostat:
     """A heliostat whose facets, and the distances between them, are so many times as large."""
-    facets = (Facet(factor * f.position, factor * f.canting_x, factor * f.canting_y) for f in heliostat.facets)
+    facets = (
+        Facet(factor * f.position, factor * f.canting_x, factor * f.canting_y)
+        for f in heliostat.facets
+    )
     return replace(heliostat, facets=tuple(facets))
 
 
 def far(folder: MeasurementFolder, years: MeasurementFolder, rays: int) -> None:
     """Print errors of heliostats whose spots are larger than the smallest window."""
-    print(f"North of the tower, canted to their distance; Monte Carlo, {rays:.0e} rays, {IMAGES} images\n{HEAD}")
-    places = [replace(o, target=replace(o.target, width=16.0, height=16.0)) for o in places_of(years, IMAGES)]
+    print(
+        f"North of the tower, canted to their distance; Monte Carlo, {rays:.0e} rays, {IMAGES}"
+        f" images\n{HEAD}"
+    )
+    places = [
+        replace(o, target=replace(o.target, width=16.0, height=16.0))
+        for o in places_of(years, IMAGES)
+    ]
     for distance in FAR:
         heliostat = Heliostat.juelich("far", (0.0, distance, 1.8), distance)
         for name in MIRRORS:
             _, truth, fine = truth_of(folder, name)
             smallest = photographed(heliostat, fine, places, rays, np.random.default_rng(1))
-            for taken in (smallest, held(heliostat, fine, places, rays)) if spilt(smallest) else (smallest,):
+            for taken in (
+                (smallest, held(heliostat, fine, places, rays))
+                if has_excess_spillage(smallest)
+                else (smallest,)
+            ):
                 label = f"{name} at {distance:.0f} m, {taken[0].side:g} m"
                 row(
                     f"{label}, network",
-                    lambda h=heliostat, o=taken: default_predictor().predict(h, o, latitude_deg=JUELICH_LATITUDE),
+                    lambda h=heliostat, o=taken: default_predictor().predict(h, o, JUELICH_MODEL),
                     truth,
                 )
                 row(
                     f"{label}, refined",
-                    lambda h=heliostat, o=taken: refine(h, o, latitude_deg=JUELICH_LATITUDE),
+                    lambda h=heliostat, o=taken: refine(h, o, JUELICH_MODEL),
                     truth,
                 )
 
@@ -226,17 +257,15 @@ def scaling(folder: MeasurementFolder, years: MeasurementFolder, rays: int) -> N
     seen = photographed(heliostat, fine, places_of(years, 64), rays, np.random.default_rng(1))
     print(f"From 8 to 64 images\n{HEAD}")
     for count in (8, 16, 32, 64):
-        row(
-            f"{count} images",
-            lambda n=count: refine(heliostat, seen[:n], latitude_deg=JUELICH_LATITUDE),
-            truth,
-        )
+        row(f"{count} images", lambda n=count: refine(heliostat, seen[:n], JUELICH_MODEL), truth)
 
 
 def real(years: MeasurementFolder) -> None:
-    """Print errors of AA39 from real photographs, and the flux accuracy on photographs that no set holds."""
+    """Print errors of AA39 from real photographs, and the flux accuracy on photographs that no set
+    holds.
+    """
     heliostat, truth, _ = truth_of(years, "AA39")
-    taken = [o for o in observations_of(years, "AA39")[0] if o.clipped_share < BRIGHT]
+    taken = [o for o in read_observations(years, "AA39") if o.clipped_share < BRIGHT]
     sets = {
         "8, suns far apart": spread(taken, 8),
         "8 over the years": taken[:: len(taken) // 8][:8],
@@ -247,21 +276,22 @@ def real(years: MeasurementFolder) -> None:
     others = [o for o in taken if o.identifier not in used]
 
     def accuracy(z: Array) -> float:
-        found = misfits(heliostat, others, z, latitude_deg=JUELICH_LATITUDE)
+        found = misfits(heliostat, others, z, JUELICH_MODEL)
         return 1 - float(np.median(found))
 
     print(f"AA39, real photographs; median flux accuracy on {len(others)} others\n{HEAD}")
     for name, chosen in sets.items():
-        start = default_predictor().predict(heliostat, spread(chosen, 8), latitude_deg=JUELICH_LATITUDE)
-        found = row(name, lambda c=chosen, s=start: refine(heliostat, c, s.z, latitude_deg=JUELICH_LATITUDE), truth)
+        start = default_predictor().predict(heliostat, spread(chosen, 8), JUELICH_MODEL)
+        found = row(name, lambda c=chosen, s=start: refine(heliostat, c, JUELICH_MODEL, s.z), truth)
         print(
-            f"| | accuracy {accuracy(found.z):.3f}, network {accuracy(start.z):.3f}, deflectometry "
-            f"{accuracy(truth):.3f}; network's error {1e3 * surface_error(start.z, truth):.3f} | | | | | | | |"
+            f"| | accuracy {accuracy(found.z):.3f}, network {accuracy(start.z):.3f}, deflectometry"
+            f" {accuracy(truth):.3f}; network's error {1e3 * surface_error(start.z, truth):.3f} | |"
+            " | | | | | |"
         )
 
 
 def day_of(observation: Observation) -> str:
-    """The day of a photograph; one of no known time has one of its own."""
+    """The day of a photograph, or its identifier if its time is not known."""
     taken_at = observation.taken_at
     return observation.identifier if taken_at is None else taken_at.date().isoformat()
 
@@ -270,40 +300,48 @@ def whole(heliostat: Heliostat, z: Array, taken: list[Observation]) -> list[Obse
     """Photographs of which neither the camera's range nor the target's edge takes anything."""
     cut = {
         row
-        for group in align_observations(heliostat, taken, z, latitude_deg=JUELICH_LATITUDE).groups
-        for row, over_edge in zip(group.rows, group.cut, strict=True)
-        if over_edge
+        for group in align_observations(heliostat, taken, z, JUELICH_MODEL).groups
+        for row, is_truncated in zip(group.rows, group.is_truncated, strict=True)
+        if is_truncated
     }
     return [o for i, o in enumerate(taken) if i not in cut and o.clipped_share == 0]
 
 
 def photographs(years: MeasurementFolder) -> None:
-    """Print what surfaces from all photographs are worth beside those from whole ones, by other days' photographs."""
+    """Print what surfaces from all photographs are worth beside those from whole ones, by other
+    days' photographs.
+    """
     heliostat, truth, _ = truth_of(years, "AA39")
-    taken = observations_of(years, "AA39")[0]
+    taken = read_observations(years, "AA39")
     days = sorted({day_of(o) for o in taken})
     sides = [[o for o in taken if days.index(day_of(o)) % 2 == half] for half in (0, 1)]
-    agree = [o for side in sides for o in agreeing(compute, heliostat, side, latitude_deg=JUELICH_LATITUDE)[0]]
+    agree = [
+        o for side in sides for o in reject_outliers(operations, heliostat, side, JUELICH_MODEL)[0]
+    ]
     faultless = whole(heliostat, truth, taken)
     corrected = replace(default_prior(), mean=truth)
 
     def found(chosen: list[Observation]) -> Array:
-        start = default_predictor().predict(heliostat, spread(chosen, IMAGES), latitude_deg=JUELICH_LATITUDE)
-        return refine(heliostat, chosen, start.z, latitude_deg=JUELICH_LATITUDE).z
+        start = default_predictor().predict(heliostat, spread(chosen, IMAGES), JUELICH_MODEL)
+        return refine(heliostat, chosen, JUELICH_MODEL, start.z).z
 
     ways: dict[str, Callable[[list[Observation]], Array]] = {
-        f"{IMAGES} whole ones": lambda side: found(spread([o for o in side if o in faultless], IMAGES)),
+        f"{IMAGES} whole ones": lambda side: found(
+            spread([o for o in side if o in faultless], IMAGES)
+        ),
         f"{IMAGES} of all": lambda side: found(spread(side, IMAGES)),
         f"{IMAGES} that agree": lambda side: found(spread([o for o in side if o in agree], IMAGES)),
-        f"{2 * IMAGES} that agree": lambda side: found(spread([o for o in side if o in agree], 2 * IMAGES)),
+        f"{2 * IMAGES} that agree": lambda side: found(
+            spread([o for o in side if o in agree], 2 * IMAGES)
+        ),
         "none: deflectometry": lambda side: truth,
         f"{2 * IMAGES} that agree, about deflectometry": lambda side: (
             refine(
                 heliostat,
                 spread([o for o in side if o in agree], 2 * IMAGES),
+                JUELICH_MODEL,
                 truth,
                 prior=corrected,
-                latitude_deg=JUELICH_LATITUDE,
             ).z
         ),
     }
@@ -317,7 +355,7 @@ def photographs(years: MeasurementFolder) -> None:
     for name, way in ways.items():
         surfaces = [way(side) for side in sides]
         missed = [
-            misfits(heliostat, judged, z, latitude_deg=JUELICH_LATITUDE)
+            misfits(heliostat, judged, z, JUELICH_MODEL)
             for z, judged in zip(surfaces, reversed(sides), strict=True)
         ]
         accuracy = 1 - np.concatenate(missed)
@@ -338,12 +376,16 @@ TABLES: dict[str, Callable[[MeasurementFolder, MeasurementFolder, int], None]] =
     "far": far,
     "photographs": lambda folder, years, rays: photographs(years),
 }
-"""What can be printed, of the folder of many heliostats, that of one over years, and so many rays an image."""
+"""What can be printed, of the folder of many heliostats, that of one over years, and so many rays
+an image.
+"""
 
 
 def main(arguments: list[str]) -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--rays", type=int, default=3_000_000)
     parser.add_argument("--only", choices=TABLES)
     options = parser.parse_args(arguments)

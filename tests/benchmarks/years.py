@@ -1,15 +1,18 @@
-"""The closed loop on two years of photographs, by date: ``python -m tests.benchmarks.years [--out REPORT.json]``.
+"""The closed loop on two years of photographs, by date: ``python -m tests.benchmarks.years [--out
+REPORT.json]``.
 
-AA39 in ``../shared/stj-years`` and, with AC43, in ``../shared/stj``, with the surfaces that deflectometry measured. The
-days are dealt out to two halves. A study sees one half only: it chooses effects, fits them, and the photographs of the
-other half's days, which had no say in anything, judge them; then the halves change places. Intervals are over days:
-photographs of a day err together. What comes by day cannot be carried to other days: it is judged by photographs of the
-same days, as the study itself does it, and its usual value by the others.
+AA39 in ``../shared/stj-years`` and, with AC43, in ``../shared/stj``, with the surfaces that
+deflectometry measured. The days are dealt out to two halves. A study sees one half only: it chooses
+effects, fits them, and the photographs of the other half's days, which had no say in anything,
+judge them; then the halves change places. Intervals are over days: photographs of a day err
+together. What comes by day cannot be carried to other days: it is judged by photographs of the same
+days, as the study itself does it, and its usual value by the others.
 
-What each of the best effects gives alone, and all of them jointly, is fitted to each half and judged by the other; only
-which these are was chosen by all photographs.
+What each of the best effects gives alone, and all of them jointly, is fitted to each half and
+judged by the other; only which these are was chosen by all photographs.
 
-With ``--moved DATE`` instead what has moved spots since a calibration by the photographs before that day.
+With ``--moved DATE`` instead what has moved spots since a calibration by the photographs before
+that day.
 """
 
 import argparse
@@ -21,19 +24,19 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import bootstrap
 
 from model.effects import CATALOGUE, Effect, effect_to_json
 from model.metrics import flux_accuracies
-from model.plant import JUELICH_LATITUDE
-from model.study import FluxImage, Study, StudyOptions, study
+from model.plant_model import JUELICH_MODEL
+from model.study import FluxImage, Study, StudyOptions, conclude, study, study_to_json
 from model.study.fitting import Fitter
 from model.study.flux_images import Forecaster
-from model.study.unknowns import Term, Unknowns
-from model.tracing import Optics
-from service.cli.folder_pointing import Mounts, calibrate_folder
-from service.cli.folder_study import photographs_of
+from model.study.parameters import ParameterVector, Term
+from service.cli.folder_pointing import calibrate_folder
 from service.sources.folder import read_folder
 from tests.benchmarks import data_folder
+from tests.benchmarks.folders import read_photographs
 
 Array = NDArray[np.float64]
 
@@ -46,9 +49,9 @@ FEW = 4
 def photographs() -> list[FluxImage]:
     """Those of both folders, each once: as a crop where there is one."""
     root = data_folder()
-    crops, _ = photographs_of(read_folder(root.parent / "stj-years"))
+    crops, _ = read_photographs(read_folder(root.parent / "stj-years"))
     known = {p.key for p in crops}
-    others, _ = photographs_of(read_folder(root, ["AA39", "AC43"]))
+    others, _ = read_photographs(read_folder(root, ["AA39", "AC43"]))
     return [*crops, *(p for p in others if p.key not in known)]
 
 
@@ -59,17 +62,22 @@ def day_of(photograph: FluxImage) -> str:
 
 def accuracies(taken: Sequence[FluxImage], effects: Sequence[Effect]) -> Array:
     """Of photographs (N,) in a window of 4 m."""
-    judge = Forecaster(taken, Optics(), [], WINDOW, StudyOptions().view, latitude_deg=JUELICH_LATITUDE)
+    judge = Forecaster(taken, JUELICH_MODEL, WINDOW, StudyOptions().view)
     return flux_accuracies(judge.measured(), judge.cuts(effects))
 
 
 def interval(values: Array, days: Sequence[str], rounds: int = 2000) -> tuple[float, float]:
-    """The 95 % interval of the mean of ``values`` (N,), days drawn anew."""
-    rng, names = np.random.default_rng(0), sorted(set(days))
-    sums = np.array([[values[[d == name for d in days]].sum(), sum(d == name for d in days)] for name in names])
-    drawn = sums[rng.integers(len(names), size=(rounds, len(names)))].sum(axis=1)
-    low, high = np.quantile(drawn[:, 0] / drawn[:, 1], [0.025, 0.975])
-    return float(low), float(high)
+    """The 95 % interval of the mean of ``values`` (N,), with days resampled."""
+    _, place = np.unique(days, return_inverse=True)
+    sums, counts = np.bincount(place, values), np.bincount(place)
+
+    def mean(sums: Array, counts: Array, axis: int) -> Array:
+        return np.asarray(sums.sum(axis=axis) / counts.sum(axis=axis))
+
+    drawn = bootstrap(
+        (sums, counts), mean, paired=True, n_resamples=rounds, method="percentile", rng=0
+    )
+    return float(drawn.confidence_interval.low), float(drawn.confidence_interval.high)
 
 
 def halves(taken: Sequence[FluxImage]) -> list[list[FluxImage]]:
@@ -81,9 +89,9 @@ def halves(taken: Sequence[FluxImage]) -> list[list[FluxImage]]:
 def fitted(taken: Sequence[FluxImage], names: Sequence[str]) -> list[Effect]:
     """Effects that are always there, fitted to photographs together."""
     views = StudyOptions().fit_view, StudyOptions().view
-    pair = [Forecaster(taken, Optics(), [], WINDOW, view, latitude_deg=JUELICH_LATITUDE) for view in views]
+    pair = [Forecaster(taken, JUELICH_MODEL, WINDOW, view) for view in views]
     facets = tuple(sorted({(p.heliostat, len(p.setup.control_points)) for p in taken}))
-    unknowns = Unknowns(tuple(Term(CATALOGUE[name]) for name in names), facets)
+    unknowns = ParameterVector(tuple(Term(CATALOGUE[name]) for name in names), facets)
     return unknowns.effects(Fitter(*pair).fit(unknowns, unknowns.neutral).values)
 
 
@@ -100,7 +108,10 @@ def gains(both: Sequence[Sequence[FluxImage]], names: Sequence[str]) -> str:
 
 def described(found: Study) -> str:
     """The effects of a study in one line."""
-    names = [f"{f.described} ({f.gain.mean:.3f} [{f.gain.low:.3f}, {f.gain.high:.3f}])" for f in found.found]
+    names = [
+        f"{f.described} ({f.gain.mean:.3f} [{f.gain.low:.3f}, {f.gain.high:.3f}])"
+        for f in found.found
+    ]
     return "; ".join(names) or "none"
 
 
@@ -108,36 +119,55 @@ MOVING = ("axis_tilt", "sun_position", "pylon_bending", "encoder_offset")
 
 
 def moved(until: datetime) -> None:
-    """Print what has moved AA39's spots since a mount was calibrated by its photographs before a day."""
+    """Print what has moved AA39's spots since a mount was calibrated by its photographs before a
+    day.
+    """
     folder = read_folder(data_folder().parent / "stj-years")
     with TemporaryDirectory() as root:
         report = calibrate_folder(folder, Path(root) / "mounts.json", until=until)
-        mounts = Mounts(folder, Path(root) / "mounts.json")
-    taken, _ = photographs_of(folder, mounts=mounts)
+        taken, _ = read_photographs(folder, Path(root) / "mounts.json")
     newer = [p for p in taken if p.setup.angles is not None]
-    doubts = [np.linalg.norm(p.spot_doubts_rad) for p in newer if p.spot_doubts_rad is not None]
-    print(f"{report['heliostats']['AA39']['measurements']} measurements before {until.date()}, {len(newer)} newer;")
-    print(f"their spots: {1e3 * np.median([p.spot_std_rad for p in newer]):.1f} mrad each,", end=" ")
-    print(f"{1e3 * np.median(doubts) / 2**0.5:.1f} mrad in common by what the calibration leaves open", flush=True)
+    deviations = [np.linalg.norm(p.spot_shifts_rad) for p in newer if p.spot_shifts_rad is not None]
+    print(
+        f"{report['heliostats']['AA39']['measurements']} measurements before {until.date()},"
+        f" {len(newer)} newer;"
+    )
+    print(
+        f"their spots: {1e3 * np.median([p.spot_std_rad for p in newer]):.1f} mrad each,", end=" "
+    )
+    print(
+        f"{1e3 * np.median(deviations) / 2**0.5:.1f} mrad in common by what the calibration leaves"
+        " open",
+        flush=True,
+    )
     options = StudyOptions(candidates=MOVING, window=WINDOW)
-    found = study(taken, Optics(), options=options, latitude_deg=JUELICH_LATITUDE)
-    print(f"{found.conclusion()}\nfound: {described(found)}; from motors [mrad]: {found.position_error_mrad}")
+    found = study(taken, JUELICH_MODEL, options=options)
+    print(
+        f"{conclude(found)}\nfound: {described(found)}; from motors [mrad]:"
+        f" {found.position_error_mrad}"
+    )
     print(f"  {json.dumps([effect_to_json(e) for e in found.effects])[:400]}")
     print("alone: " + ", ".join(f"{c.name} {c.gain.mean:+.4f}" for c in found.candidates))
 
 
 def main() -> None:
     """Print what the whole says, and what each half of the days finds for the other."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--out", type=Path, help="write the report of the whole there")
-    parser.add_argument("--moved", metavar="DATE", help="only what has moved spots since a calibration up to that day")
+    parser.add_argument(
+        "--moved",
+        metavar="DATE",
+        help="only what has moved spots since a calibration up to that day",
+    )
     options = parser.parse_args()
     if options.moved:
         moved(datetime.fromisoformat(options.moved).replace(tzinfo=UTC))
         return
     taken, asked = photographs(), StudyOptions(window=WINDOW)
-    whole = study(taken, Optics(), options=asked, latitude_deg=JUELICH_LATITUDE)
-    print(f"{len(taken)} photographs on {len({day_of(p) for p in taken})} days: {whole.conclusion()}")
+    whole = study(taken, JUELICH_MODEL, options=asked)
+    print(f"{len(taken)} photographs on {len({day_of(p) for p in taken})} days: {conclude(whole)}")
     before, after = whole.accuracy_before.mean(), whole.accuracy_after.mean()
     print(f"found: {described(whole)}; without effects {before:.4f}, with {after:.4f}")
     both, best = halves(taken), [c.name for c in whole.candidates[:FEW]]
@@ -147,15 +177,21 @@ def main() -> None:
         print(f"| {names[0]} alone | {gains(both, names)} |", flush=True)
     print(f"| {' and '.join(best)} jointly | {gains(both, best)} |", flush=True)
     if options.out:
-        options.out.write_text(json.dumps(whole.to_json(), indent=1), encoding="utf-8")
-    print("| a study of | finds | photographs of the other days | before | after | gain, 95 % over days |")
+        options.out.write_text(json.dumps(study_to_json(whole), indent=1), encoding="utf-8")
+    print(
+        "| a study of | finds | photographs of the other days | before | after | gain, 95 % over"
+        " days |"
+    )
     print("| --- | --- | --- | --- | --- | --- |")
     for name, seen, unseen in (("even days", *both), ("odd days", *reversed(both))):
-        found = study(seen, Optics(), options=asked, latitude_deg=JUELICH_LATITUDE)
+        found = study(seen, JUELICH_MODEL, options=asked)
         before, after = accuracies(unseen, []), accuracies(unseen, found.effects)
         low, high = interval(after - before, [day_of(p) for p in unseen])
         gain = f"{(after - before).mean():+.4f} [{low:+.4f}, {high:+.4f}]"
-        print(f"| {name} | {described(found)} | {len(unseen)} | {before.mean():.4f} | {after.mean():.4f} | {gain} |")
+        print(
+            f"| {name} | {described(found)} | {len(unseen)} | {before.mean():.4f} |"
+            f" {after.mean():.4f} | {gain} |"
+        )
         print(f"  {json.dumps([effect_to_json(e) for e in found.effects])[:400]}", flush=True)
 
 

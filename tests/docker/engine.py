@@ -1,4 +1,6 @@
-"""A container engine, where there is one: images of this checkout, and compositions that leave nothing behind."""
+"""A container engine, where there is one: images of this checkout, and compositions that leave
+nothing behind.
+"""
 
 import json
 import os
@@ -14,8 +16,8 @@ from typing import Any
 
 import httpx
 
-from tests.faults.harness import until
 from tests.service.conftest import free_port
+from tests.waiting import WAIT_LIMIT_S, until
 
 ROOT = Path(__file__).parents[2]
 
@@ -28,7 +30,8 @@ USER heliotwin
 """
 
 
-# As the official images start: their program, its configuration, where it keeps what it knows, and as whom.
+# As the official images start: their program, its configuration, where it keeps what it knows, and
+# as whom.
 _MONITOR = """
 FROM python:3.11-slim
 COPY program /bin/{name}
@@ -46,18 +49,33 @@ def absent() -> str | None:
         return "no container engine: there is no docker"
     asked = subprocess.run(["docker", "info"], capture_output=True, text=True, check=False)
     if asked.returncode:
-        return f"no container engine: docker info says {asked.stderr.strip() or asked.stdout.strip()}"
-    return None if _compose_is_new() or shutil.which("docker-compose") else "neither docker compose nor docker-compose"
+        return (
+            f"no container engine: docker info says {asked.stderr.strip() or asked.stdout.strip()}"
+        )
+    return (
+        None
+        if _compose_is_new() or shutil.which("docker-compose")
+        else "neither docker compose nor docker-compose"
+    )
 
 
 def _compose_is_new() -> bool:
-    return subprocess.run(["docker", "compose", "version"], capture_output=True, check=False).returncode == 0
+    return (
+        subprocess.run(
+            ["docker", "compose", "version"], capture_output=True, check=False
+        ).returncode
+        == 0
+    )
 
 
-def run(*command: str | Path, folder: Path = ROOT, environment: Mapping[str, str] | None = None) -> str:
+def run(
+    *command: str | Path, folder: Path = ROOT, environment: Mapping[str, str] | None = None
+) -> str:
     """What a command prints; where it fails, the test fails with all that it said."""
     settings = os.environ | (environment or {})
-    done = subprocess.run(command, cwd=folder, env=settings, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command, cwd=folder, env=settings, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, (
         f"{command} ended with {done.returncode}:\n{done.stdout[-4000:]}\n{done.stderr[-4000:]}"
     )
@@ -67,7 +85,9 @@ def run(*command: str | Path, folder: Path = ROOT, environment: Mapping[str, str
 def clone(folder: Path) -> Path:
     """A clean clone of this checkout, with what is changed in it and not yet committed."""
     run("git", "clone", "--quiet", ROOT, folder)
-    for name in run("git", "ls-files", "-z", "--modified", "--others", "--exclude-standard").split("\0"):
+    for name in run("git", "ls-files", "-z", "--modified", "--others", "--exclude-standard").split(
+        "\0"
+    ):
         if name and (ROOT / name).is_file():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(ROOT / name, folder / name)
@@ -77,17 +97,39 @@ def clone(folder: Path) -> Path:
     return folder
 
 
+def stand_in_index() -> str:
+    """Where a stand-in for the base image has torch's wheel; nothing where the image is the
+    official one.
+    """
+    ask = ["docker", "run", "--rm", "--entrypoint", "ls", "python:3.11-slim", "/wheels"]
+    done = subprocess.run(ask, capture_output=True, text=True, check=False)
+    return "file:///wheels" if "+cpu" in done.stdout else ""
+
+
 def build(context: Path, dockerfile: Path, image: str) -> str:
     """Build an image with the builder that every engine has."""
-    index = os.environ.get("TORCH_INDEX_URL", "")
+    index = os.environ.get("TORCH_INDEX_URL", "") or stand_in_index()
     arguments = ["--build-arg", f"TORCH_INDEX_URL={index}"] if index else []
-    command = ["docker", "build", "--quiet", "--network", "host", *arguments, "-f", str(dockerfile), "-t", image]
+    command = [
+        "docker",
+        "build",
+        "--quiet",
+        "--network",
+        "host",
+        *arguments,
+        "-f",
+        str(dockerfile),
+        "-t",
+        image,
+    ]
     run(*command, str(context), environment={"DOCKER_BUILDKIT": "0"})
     return image
 
 
 def build_monitor(program: str, name: str, kind: str, folder: Path, image: str) -> str:
-    """A stand-in for an official image, ``prometheus`` or ``alertmanager``, with this machine's program of a Debian."""
+    """A stand-in for an official image, ``prometheus`` or ``alertmanager``, with this machine's
+    program of a Debian.
+    """
     folder.mkdir()
     shutil.copy2(program, folder / "program")
     shutil.copytree("/usr/share/prometheus", folder / "share")  # a Debian's has its templates there
@@ -102,13 +144,16 @@ def newest_revision() -> str:
 
 
 def before_newest_schema() -> str | None:
-    """The last commit whose schema is the one before the newest; None where the history does not reach so far.
+    """The last commit whose schema is the one before the newest; None where the history does not
+    reach so far.
 
     Of the main line: a merge may have given a migration its number.
     """
     (path,) = (ROOT / "migrations" / "versions").glob(f"{newest_revision()}_*.py")
     inside = str(path.relative_to(ROOT))
-    added = run("git", "log", "--first-parent", "-m", "--diff-filter=A", "--format=%H", "--", inside).split()
+    added = run(
+        "git", "log", "--first-parent", "-m", "--diff-filter=A", "--format=%H", "--", inside
+    ).split()
     if not added:
         return None
     parent = ["git", "rev-parse", "--quiet", "--verify", f"{added[-1]}^"]
@@ -117,8 +162,10 @@ def before_newest_schema() -> str | None:
 
 
 def build_previous(commit: str, folder: Path, image: str) -> str:
-    """``image`` with the code of an older commit in place of its own."""
-    content = subprocess.run(["git", "archive", commit], cwd=ROOT, capture_output=True, check=True).stdout
+    """Build ``image`` with the code of an older commit."""
+    content = subprocess.run(
+        ["git", "archive", commit], cwd=ROOT, capture_output=True, check=True
+    ).stdout
     with tarfile.open(fileobj=BytesIO(content)) as archive:
         archive.extractall(folder, filter="data")
     dockerfile = folder / "Dockerfile"
@@ -127,7 +174,10 @@ def build_previous(commit: str, folder: Path, image: str) -> str:
 
 
 class Composition:
-    """docker/compose.yaml of a clone under a name, and on a port, of its own; ``version`` is the image's tag."""
+    """docker/compose.yaml of a clone, with a separate project name and port.
+
+    ``version`` is the image's tag.
+    """
 
     def __init__(self, checkout: Path, version: str, imports: Path) -> None:
         self.project = f"heliotwin-test-{uuid.uuid4().hex[:8]}"
@@ -149,16 +199,28 @@ class Composition:
 
     def _of_this_engine(self) -> list[str]:
         if _compose_is_new():
-            return ["docker", "compose", "-p", self.project, "-f", str(self.folder / "compose.yaml")]
-        # docker-compose 1.29 takes no name in the file and wants a version; all else of it it understands.
+            return [
+                "docker",
+                "compose",
+                "-p",
+                self.project,
+                "-f",
+                str(self.folder / "compose.yaml"),
+            ]
+        # docker-compose 1.29 takes no name in the file and wants a version; all else of it it
+        # understands.
         lines = (self.folder / "compose.yaml").read_text(encoding="utf-8").splitlines()
         old = self.folder / f".{self.project}.yaml"
-        old.write_text("\n".join(['version: "3.9"', *(line for line in lines if not line.startswith("name:"))]))
+        old.write_text(
+            "\n".join(['version: "3.9"', *(line for line in lines if not line.startswith("name:"))])
+        )
         return ["docker-compose", "-p", self.project, "-f", str(old)]
 
     def __call__(self, *arguments: str) -> str:
         """What a command of compose prints."""
-        return run(*self._command, *arguments, folder=self.folder.parent, environment=self.environment)
+        return run(
+            *self._command, *arguments, folder=self.folder.parent, environment=self.environment
+        )
 
     def instead(self, images: Mapping[str, str]) -> None:
         """Start services from other images than the file names."""
@@ -168,7 +230,7 @@ class Composition:
         self._command += ["-f", str(file)]
 
     def verb(self, *words: str, mounted: Path | None = None) -> str:
-        """What ``heliotwin WORDS`` prints in a container of its own; ``mounted`` is its /backup."""
+        """Output of ``heliotwin WORDS`` in a separate container; ``mounted`` is its /backup."""
         volume = [] if mounted is None else ["-v", f"{mounted}:/backup"]
         return self("run", "--rm", "--no-deps", "-T", *volume, "service", *words)
 
@@ -176,7 +238,7 @@ class Composition:
         """Start, and wait until all is well."""
         self("up", "-d", *services)
         for name in services or ("database", "service", "worker"):
-            until(lambda name=name: self.health(name) == "healthy", f"{name} is healthy", 180)
+            until(lambda name=name: self.health(name) == "healthy", f"{name} is healthy")
 
     def health(self, name: str) -> str:
         """What the health check of a service's container says."""
@@ -194,7 +256,9 @@ class Composition:
     def client(self, key: str) -> Iterator["Client"]:
         """Somebody with a key."""
         headers = {"Authorization": f"Bearer {key}"}
-        with httpx.Client(base_url=f"http://127.0.0.1:{self.port}", headers=headers, timeout=60) as http:
+        with httpx.Client(
+            base_url=f"http://127.0.0.1:{self.port}", headers=headers, timeout=WAIT_LIMIT_S
+        ) as http:
             yield Client(http)
 
 
@@ -217,7 +281,7 @@ class Client:
         return answer
 
     def job(self, path: str) -> dict[str, Any]:
-        """A job as it stands; nothing while the service is away."""
+        """The current state of a job, "unknown" while the service is away."""
         try:
             document: dict[str, Any] = self.get(path)
         except httpx.TransportError:
@@ -227,7 +291,11 @@ class Client:
     def done(self, path: str) -> dict[str, Any]:
         """A job when it is done."""
         ended = until(
-            lambda: (job := self.job(path))["state"] not in ("unknown", "queued", "running") and job, path, 400
+            lambda: (
+                (job := self.job(path))["state"] not in ("unknown", "queued", "running") and job
+            ),
+            path,
+            3 * WAIT_LIMIT_S,
         )
         assert ended["state"] == "done", json.dumps(ended, indent=1)
         return dict(ended)

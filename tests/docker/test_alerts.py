@@ -1,7 +1,7 @@
-"""What needs attention, told by real Prometheus and Alertmanager: the files that the composition mounts, and their way.
+"""Alerts by real Prometheus and Alertmanager, with the files that the composition mounts.
 
-Needs their binaries on the path, or in the folder `HELIOTWIN_TEST_PROMETHEUS`: of Debian the packages prometheus and
-prometheus-alertmanager.
+Needs their binaries on the path, or in the folder `HELIOTWIN_TEST_PROMETHEUS`. Debian's packages
+are prometheus and prometheus-alertmanager.
 """
 
 import http.server
@@ -23,8 +23,8 @@ import yaml
 from sqlalchemy import update
 
 from service.base.settings import Settings
-from service.store import queue
 from service.store.columns import now
+from service.store.jobs import queue
 from service.store.tables import HeliostatRow
 from service.web.app import create_app
 from tests.docker.test_docker import drawn_expressions
@@ -37,9 +37,9 @@ from tests.service.conftest import (
     properties_document,
     serving,
     tower_document,
-    until,
 )
 from tests.service.spots import photographs
+from tests.waiting import child_process, until
 
 DOCKER = Path(__file__).parents[2] / "docker"
 
@@ -64,21 +64,30 @@ def test_rules_and_configurations_are_sound():
 
 
 def test_the_dashboard_asks_what_prometheus_understands(tmp_path: Path):
-    asked = [{"record": f"drawn:{place}", "expr": expression} for place, expression in enumerate(drawn_expressions())]
+    asked = [
+        {"record": f"drawn:{place}", "expr": expression}
+        for place, expression in enumerate(drawn_expressions())
+    ]
     rules = tmp_path / "drawn.yml"
-    rules.write_text(yaml.safe_dump({"groups": [{"name": "drawn", "rules": asked}]}), encoding="utf-8")
-    done = subprocess.run((binary("promtool"), "check", "rules", rules), capture_output=True, text=True, check=False)
+    rules.write_text(
+        yaml.safe_dump({"groups": [{"name": "drawn", "rules": asked}]}), encoding="utf-8"
+    )
+    done = subprocess.run(
+        (binary("promtool"), "check", "rules", rules), capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stdout + done.stderr
 
 
 @contextmanager
-def told(port: int) -> Iterator[list[dict[str, Any]]]:
+def webhook_receiver(port: int) -> Iterator[list[dict[str, Any]]]:
     """Alerts that come in at a webhook on this port."""
     alerts: list[dict[str, Any]] = []
 
     class Handler(http.server.BaseHTTPRequestHandler):
         def do_POST(self) -> None:
-            alerts.extend(json.loads(self.rfile.read(int(self.headers["Content-Length"])))["alerts"])
+            alerts.extend(
+                json.loads(self.rfile.read(int(self.headers["Content-Length"])))["alerts"]
+            )
             self.send_response(200)
             self.end_headers()
 
@@ -97,13 +106,9 @@ def told(port: int) -> Iterator[list[dict[str, Any]]]:
 
 @contextmanager
 def running(folder: Path, *command: str) -> Iterator[None]:
-    with (folder / f"{Path(command[0]).name}.log").open("wb") as log:
-        process = subprocess.Popen(command, cwd=folder, stdout=log, stderr=log)
-        try:
-            yield
-        finally:
-            process.terminate()
-            process.wait(20)
+    place = folder / f"{Path(command[0]).name}.log"
+    with place.open("wb") as log, child_process(command, cwd=folder, stdout=log, stderr=log):
+        yield
 
 
 def configure(folder: Path, service: str, alertmanager: int, webhook: int) -> None:
@@ -116,23 +121,29 @@ def configure(folder: Path, service: str, alertmanager: int, webhook: int) -> No
         "rule_files": ["rules.yml"],
         "scrape_configs": [{"job_name": "heliotwin", "static_configs": [{"targets": [service]}]}],
     }
-    prometheus["alerting"]["alertmanagers"][0]["static_configs"][0]["targets"] = [f"127.0.0.1:{alertmanager}"]
+    prometheus["alerting"]["alertmanagers"][0]["static_configs"][0]["targets"] = [
+        f"127.0.0.1:{alertmanager}"
+    ]
     (folder / "prometheus.yml").write_text(yaml.safe_dump(prometheus), encoding="utf-8")
     sending = yaml.safe_load((DOCKER / "alertmanager.yml").read_text(encoding="utf-8"))
     sending["route"] |= {"group_wait": "0s", "group_interval": "1s"}
-    sending["receivers"][0]["webhook_configs"] = [{"url": f"http://127.0.0.1:{webhook}/", "send_resolved": True}]
+    sending["receivers"][0]["webhook_configs"] = [
+        {"url": f"http://127.0.0.1:{webhook}/", "send_resolved": True}
+    ]
     (folder / "alertmanager.yml").write_text(yaml.safe_dump(sending), encoding="utf-8")
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(180)
 def test_alert_is_delivered_and_ends_when_it_is_acknowledged(tmp_path: Path):
-    prometheus, alertmanager = binary("prometheus"), binary("alertmanager", "prometheus-alertmanager")
+    prometheus, alertmanager = (
+        binary("prometheus"),
+        binary("alertmanager", "prometheus-alertmanager"),
+    )
     app = create_app(Settings(data_dir=tmp_path / "data", **QUIET), FakeOperations())
     port, sender, webhook = free_port(), free_port(), free_port()
     listen = "--web.listen-address=127.0.0.1:"
     with ExitStack() as stack:
-        alerts = stack.enter_context(told(webhook))
+        alerts = stack.enter_context(webhook_receiver(webhook))
         address = stack.enter_context(serving(app))
         service = stack.enter_context(httpx.Client(base_url=address))
         service.put("/v1/plant", json=tower_document())
@@ -140,24 +151,36 @@ def test_alert_is_delivered_and_ends_when_it_is_acknowledged(tmp_path: Path):
         with app.state.runtime.database.writing() as session:
             session.execute(update(HeliostatRow).values(created_at=now() - timedelta(days=40)))
         configure(tmp_path, address.removeprefix("http://"), sender, webhook)
-        sends = ("--config.file=alertmanager.yml", "--storage.path=sent", "--cluster.listen-address=")
+        sends = (
+            "--config.file=alertmanager.yml",
+            "--storage.path=sent",
+            "--cluster.listen-address=",
+        )
         stack.enter_context(running(tmp_path, alertmanager, *sends, f"{listen}{sender}"))
         asks = ("--config.file=prometheus.yml", "--storage.tsdb.path=series")
         stack.enter_context(running(tmp_path, prometheus, *asks, f"{listen}{port}"))
 
         def of(status: str) -> list[dict[str, Any]]:
             wanted = ("HeliotwinNoPhotograph", status)
-            return [alert for alert in alerts if (alert["labels"]["alertname"], alert["status"]) == wanted]
+            return [
+                alert
+                for alert in alerts
+                if (alert["labels"]["alertname"], alert["status"]) == wanted
+            ]
 
-        until(lambda: bool(of("firing")), 60)
-        assert of("firing")[0]["annotations"]["summary"].startswith("1 heliostats were not photographed for long")
+        until(lambda: bool(of("firing")), "the alert is delivered")
+        assert of("firing")[0]["annotations"]["summary"].startswith(
+            "1 heliostats have no recent photograph"
+        )
         (item,) = service.get("/v1/attention").json()["items"]
         service.post("/v1/attention/acknowledgements", json={"ids": [item["id"]]})
-        until(lambda: bool(of("resolved")), 60)
+        until(lambda: bool(of("resolved")), "its end is delivered")
 
 
 def fill(service: httpx.Client) -> None:
-    """Some of everything that the dashboard draws: photographs, a surface that is judged, a mount, jobs."""
+    """Some of everything that the dashboard draws: photographs, a surface that is judged, a mount,
+    jobs.
+    """
     service.put("/v1/plant", json=tower_document())
     service.put("/v1/heliostats/AA39", json=properties_document())
     send = poster(service)
@@ -165,7 +188,10 @@ def fill(service: httpx.Client) -> None:
     for number, one in enumerate(taken[:12]):
         assert send(png(number), **one).status_code == 201
     send(png(90, refused=True), id="refused")
-    assert service.post("/v1/heliostats/AA39/surfaces", json={"measurements": ["0", "1"]}).status_code == 201
+    assert (
+        service.post("/v1/heliostats/AA39/surfaces", json={"measurements": ["0", "1"]}).status_code
+        == 201
+    )
     for kind in ("calibrations", "predictions"):
         path = service.post(f"/v1/jobs/{kind}", json={}).headers["Location"]
         until(lambda path=path: service.get(path).json()["state"] in ("done", "failed"))  # type: ignore[misc]
@@ -174,11 +200,12 @@ def fill(service: httpx.Client) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(180)
 def test_each_panel_of_the_dashboard_draws_something(tmp_path: Path):
     """Of a live service, as a real Prometheus has it."""
     program, port = binary("prometheus"), free_port()
-    settings = Settings(data_dir=tmp_path / "data", image_quota_gb=1.0, **QUIET | {"job_workers": 1})
+    settings = Settings(
+        data_dir=tmp_path / "data", image_quota_gb=1.0, **QUIET | {"job_workers": 1}
+    )
     with ExitStack() as stack:
         app = create_app(settings, FakeOperations())
         address = stack.enter_context(serving(app))
@@ -188,7 +215,9 @@ def test_each_panel_of_the_dashboard_draws_something(tmp_path: Path):
             queue.add_job(session, "other", {}, "tester")  # no worker takes it: it waits
         configure(tmp_path, address.removeprefix("http://"), free_port(), free_port())
         asks = ("--config.file=prometheus.yml", "--storage.tsdb.path=series")
-        stack.enter_context(running(tmp_path, program, *asks, f"--web.listen-address=127.0.0.1:{port}"))
+        stack.enter_context(
+            running(tmp_path, program, *asks, f"--web.listen-address=127.0.0.1:{port}")
+        )
         prometheus = stack.enter_context(httpx.Client(base_url=f"http://127.0.0.1:{port}"))
 
         def drawn(expression: str) -> bool:
@@ -208,5 +237,5 @@ def test_each_panel_of_the_dashboard_draws_something(tmp_path: Path):
             return not empty
 
         with suppress(AssertionError):
-            until(all_drawn, 60)
+            until(all_drawn)
         assert not empty

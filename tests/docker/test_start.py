@@ -1,4 +1,6 @@
-"""The composition by hand: what its containers run, as processes with its environment, from an empty PostgreSQL."""
+"""The composition by hand: what its containers run, as processes with its environment, from an
+empty PostgreSQL.
+"""
 
 import os
 import re
@@ -14,33 +16,42 @@ import httpx
 import psycopg
 import pytest
 
-from tests.faults.harness import ROOT, postgres_database, until
+from tests.faults.harness import ROOT, postgres_database
 from tests.service.conftest import free_port
+from tests.waiting import WAIT_LIMIT_S, child_process, until
 
 from .test_docker import SECRET, compose  # noqa: F401  # a fixture
 
 
 def environment(service: dict[str, Any], changes: dict[str, str]) -> dict[str, str]:
     """The container's environment with the places of this machine in it."""
-    given = {**service.get("environment", {}), "HELIOTWIN_HOST": "127.0.0.1", "HELIOTWIN_METRICS_HOST": "127.0.0.1"}
-    inherited = {name: value for name, value in os.environ.items() if not name.startswith("HELIOTWIN_")}
+    given = {
+        **service.get("environment", {}),
+        "HELIOTWIN_HOST": "127.0.0.1",
+        "HELIOTWIN_METRICS_HOST": "127.0.0.1",
+    }
+    inherited = {
+        name: value for name, value in os.environ.items() if not name.startswith("HELIOTWIN_")
+    }
     return inherited | given | changes
 
 
 @contextmanager
-def running(service: dict[str, Any], changes: dict[str, str], folder: Path) -> Iterator[subprocess.Popen[bytes]]:
+def running(
+    service: dict[str, Any], changes: dict[str, str], folder: Path
+) -> Iterator[subprocess.Popen[bytes]]:
     command = [sys.executable, "-m", "service", *service["command"]]
-    with (folder / "log").open("ab") as log:
-        settings = environment(service, changes) | {"PYTHONPATH": str(ROOT)}
-        process = subprocess.Popen(command, cwd=folder, env=settings, stderr=log)
-    try:
+    settings = environment(service, changes) | {"PYTHONPATH": str(ROOT)}
+    with (
+        (folder / "log").open("ab") as log,
+        child_process(command, cwd=folder, env=settings, stderr=log) as process,
+    ):
         yield process
-    finally:
-        process.terminate()
-        process.wait(60)
 
 
-def healthy(service: dict[str, Any], changes: dict[str, str], process: subprocess.Popen[bytes]) -> None:
+def healthy(
+    service: dict[str, Any], changes: dict[str, str], process: subprocess.Popen[bytes]
+) -> None:
     """Wait for the container's own health check."""
     ports = {"8000": changes["HELIOTWIN_PORT"], "9100": changes["HELIOTWIN_METRICS_PORT"]}
     command = [
@@ -50,7 +61,12 @@ def healthy(service: dict[str, Any], changes: dict[str, str], process: subproces
 
     def ask() -> bool:
         assert process.poll() is None, "it ended"
-        return subprocess.run([sys.executable, *command[1:]], capture_output=True, check=False).returncode == 0
+        return (
+            subprocess.run(
+                [sys.executable, *command[1:]], capture_output=True, check=False
+            ).returncode
+            == 0
+        )
 
     until(ask, "healthy")
 
@@ -80,22 +96,24 @@ def test_composition_starts_from_empty(compose: dict[str, Any], tmp_path: Path):
                 if name in ("migrate", "service", "worker")
             )
             with running(services["service"], changes, tmp_path) as early:
-                assert early.wait(90) == 1  # not before the migration
+                assert early.wait(WAIT_LIMIT_S) == 1  # not before the migration
             with running(services["migrate"], changes, tmp_path) as migration:
-                assert migration.wait(90) == 0
+                assert migration.wait(WAIT_LIMIT_S) == 0
             with (
                 running(services["service"], changes, tmp_path) as service,
                 running(services["worker"], of_worker, tmp_path) as worker,
             ):
                 healthy(services["service"], changes, service)
                 healthy(services["worker"], of_worker, worker)
-                with httpx.Client(base_url=f"http://127.0.0.1:{changes['HELIOTWIN_PORT']}", timeout=30) as http:
+                with httpx.Client(
+                    base_url=f"http://127.0.0.1:{changes['HELIOTWIN_PORT']}", timeout=WAIT_LIMIT_S
+                ) as http:
                     job = http.post("/v1/jobs/predictions", json={}).headers["Location"]
                     until(lambda: http.get(job).json()["state"] == "failed", "the worker works")
-                    assert "no heliostat" in http.get(job).json()["reason"]
+                    assert "the plant is not set yet" in http.get(job).json()["reason"]
                     assert "heliotwin_database_up 1.0" in http.get("/metrics").text
                 for process in (worker, service):
                     process.terminate()
-                    assert process.wait(60) in (0, -signal.SIGTERM)
+                    assert process.wait(WAIT_LIMIT_S) in (0, -signal.SIGTERM)
     except psycopg.OperationalError as error:
         pytest.skip(f"no PostgreSQL server: {error}")

@@ -1,4 +1,6 @@
-"""A store and its database, processes on it that can be killed, and a client that remembers what it was promised."""
+"""A store and its database, processes on it that can be killed, and a client that remembers what it
+was promised.
+"""
 
 import json
 import os
@@ -7,10 +9,9 @@ import socket
 import subprocess
 import sys
 import threading
-import time
 import uuid
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
@@ -20,22 +21,22 @@ import psycopg
 from sqlalchemy import make_url
 
 from service.base.settings import Settings
-from service.store.backup import images_of
-from service.store.check import inspect_store
 from service.store.database import Database
-from tests.service.conftest import POSTGRES, free_port, metadata, properties_document, tower_document
+from service.store.recovery.backup import images_of
+from service.store.recovery.check import StoreReport, inspect_store
+from tests.forked import ForkedProcess, forked_process
+from tests.service.conftest import (
+    POSTGRES,
+    free_port,
+    metadata,
+    properties_document,
+    tower_document,
+)
+from tests.waiting import WAIT_LIMIT_S, child_process, until
+
+from .process import run
 
 ROOT = Path(__file__).parents[2]
-PATIENCE_S = 90.0
-
-
-def until(condition: Callable[[], Any], what: str, patience_s: float = PATIENCE_S) -> Any:
-    """Wait until ``condition`` gives something, and return it."""
-    end = time.monotonic() + patience_s
-    while not (found := condition()):
-        assert time.monotonic() < end, f"{what}: it does not happen"
-        time.sleep(0.05)
-    return found
 
 
 @dataclass
@@ -50,7 +51,7 @@ class Store:
     def settings(self) -> Settings:
         return Settings(data_dir=self.folder, database_url=self.url)
 
-    def check(self) -> dict[str, Any]:
+    def check(self) -> StoreReport:
         """What `heliotwin check` finds."""
         database = Database(self.settings.database)
         try:
@@ -61,9 +62,9 @@ class Store:
 
 @contextmanager
 def postgres_database() -> Iterator[str]:
-    """The URL of a database of our own, dropped at the end."""
+    """The URL of a separate database, dropped at the end."""
     name = f"heliotwin_fault_{uuid.uuid4().hex[:12]}"
-    with psycopg.connect(POSTGRES, autocommit=True, connect_timeout=3) as connection:
+    with psycopg.connect(POSTGRES, autocommit=True, connect_timeout=60) as connection:
         connection.execute(f'CREATE DATABASE "{name}"')
     try:
         yield make_url(POSTGRES).set(database=name).render_as_string(hide_password=False)
@@ -83,14 +84,19 @@ def new_store(engine: str, folder: Path) -> Iterator[Store]:
 
 
 class Process:
-    """A service, or a worker, on a store; `kill` ends it by SIGKILL."""
+    """A service, or a worker, on a store, from `__enter__` on; `kill` ends it by SIGKILL.
+
+    ``module`` is what ``python -m`` runs; without it, a copy of `tests.faults.process` runs, which
+    starts in a fraction of a second.
+    """
 
     def __init__(
         self,
         store: Store,
         what: str = "serve",
-        module: str = "tests.faults.process",
+        module: str | None = None,
         port: int | None = None,
+        start_limit_s: float = WAIT_LIMIT_S,
         **environment: str,
     ) -> None:
         self.port = port or free_port()
@@ -101,42 +107,58 @@ class Process:
             "HELIOTWIN_MIGRATE_ON_START": "true",
             "HELIOTWIN_PORT": str(self.port),
             "HELIOTWIN_JOB_WORKERS": "1" if what == "worker" else "0",
-            "HELIOTWIN_JOB_LEASE_S": "2",
+            "HELIOTWIN_JOB_LEASE_S": "5",
             "HELIOTWIN_JOB_POLL_S": "0.1",
+            # A worker that a busy machine keeps from renewing its lease loses an attempt, and
+            # nothing else.
+            "HELIOTWIN_JOB_ATTEMPTS": "20",
             "HELIOTWIN_REQUESTS_PER_S": "1000000",
             "HELIOTWIN_REQUESTS_BURST": "1000000",
+            "HELIOTWIN_PUBLIC_REQUESTS_PER_S": "1000000",
+            "HELIOTWIN_PUBLIC_REQUESTS_BURST": "1000000",
             "HELIOTWIN_LOG_LEVEL": "error",
         }
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", module, what],
-            cwd=ROOT,
-            env=os.environ | settings | store.environment | environment,
-            stderr=subprocess.DEVNULL,
-        )
+        self._command = [sys.executable, "-m", module, what] if module else None
+        self._environment = os.environ | settings | store.environment | environment
         self._what = what
-        self._clients: list[Client] = []
+        self._start_limit_s = start_limit_s
+        self._held = ExitStack()
 
     def __enter__(self) -> Self:
-        if self._what == "serve":
-            until(self.is_alive, "the service answers")
+        with ExitStack() as starting:  # a service that does not come up leaves no process behind
+            self._process = starting.enter_context(self._start())
+            if self._what == "serve":
+                until(self.is_alive, "the service answers", self._start_limit_s)
+            self._held = starting.pop_all()
         return self
 
+    def _start(self) -> AbstractContextManager[subprocess.Popen[Any] | ForkedProcess]:
+        if self._command is None:
+            return forked_process(run, self._environment, self._what)
+        options = {"cwd": ROOT, "env": self._environment, "stderr": subprocess.DEVNULL}
+        return child_process(self._command, **options)
+
     def __exit__(self, *_: object) -> None:
-        for client in self._clients:
-            client.http.close()
-        self.end(signal.SIGTERM)
+        with self._held:
+            self.end(signal.SIGTERM)
 
     def client(self) -> "Client":
         """A client of this service, closed with it."""
-        self._clients.append(Client(self.base))
-        return self._clients[-1]
+        client = Client(self.base)
+        self._held.enter_context(client.http)
+        return client
 
     def is_alive(self) -> bool:
         assert self._process.poll() is None, "the process ended by itself"
         try:
-            return httpx.get(f"{self.base}/livez", timeout=10).status_code == 200
+            return httpx.get(f"{self.base}/livez", timeout=60).status_code == 200
         except httpx.TransportError:
             return False
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether the process is over, and was waited for."""
+        return self._process.returncode is not None
 
     @property
     def number(self) -> int:
@@ -149,14 +171,14 @@ class Process:
     def end(self, number: int) -> None:
         if self._process.poll() is None:
             self._process.send_signal(number)
-        self._process.wait(60)
+        self._process.wait(WAIT_LIMIT_S)
 
 
 class Client:
     """Posts photographs and remembers those that were acknowledged, by the measurement's id."""
 
     def __init__(self, base: str) -> None:
-        self.http = httpx.Client(base_url=base, timeout=60)
+        self.http = httpx.Client(base_url=base, timeout=WAIT_LIMIT_S)
         self.kept: dict[str, bytes] = {}
 
     def set_up(self, heliostats: int = 1) -> list[str]:
@@ -164,7 +186,10 @@ class Client:
         assert self.http.put("/v1/plant", json=tower_document()).status_code == 200
         names = [f"H{number}" for number in range(heliostats)]
         for name in names:
-            assert self.http.put(f"/v1/heliostats/{name}", json=properties_document()).status_code == 201
+            assert (
+                self.http.put(f"/v1/heliostats/{name}", json=properties_document()).status_code
+                == 201
+            )
         return names
 
     def post(self, image: bytes, heliostat: str = "H0", **changes: Any) -> httpx.Response:

@@ -1,11 +1,14 @@
-"""The service or a worker on a stand-in for the model: ``python -m tests.faults.process serve|worker``.
+"""The service or a worker on a stand-in for the model: ``python -m tests.faults.process
+serve|worker``.
 
-The faults are real, the model is not: it answers at once, and predictions take as long as they are told. The clock is
-the machine's, moved by as many seconds as the file ``HELIOTWIN_FAULTS_CLOCK`` says.
+The faults are real, the model is not. It answers at once, and predictions take a configured time.
+The clock is the machine's, shifted by the number of seconds in the file
+``HELIOTWIN_FAULTS_CLOCK``.
 """
 
 import os
 import sys
+import threading
 import time
 from datetime import datetime, timedelta, tzinfo
 from pathlib import Path
@@ -15,16 +18,22 @@ from service.base.settings import Settings
 from service.jobs.kinds import KINDS
 from service.jobs.worker import work
 from service.store import columns
-from service.twin import runtime
+from service.twin.runtime import runtime
 from service.web import server
 from tests.service.conftest import FakeOperations
 
 
 class SlowOperations(FakeOperations):
-    """Takes its time for a prediction."""
+    """Takes its time for a prediction, and for one more than ``HELIOTWIN_FAULTS_MOST_PREDICTIONS``
+    all there is.
+    """
 
     def predict(self, *arguments: Any, **options: Any) -> Any:
         time.sleep(float(os.environ.get("HELIOTWIN_FAULTS_PAUSE_S", "0")))
+        if len(self.predictions) >= float(
+            os.environ.get("HELIOTWIN_FAULTS_MOST_PREDICTIONS", "inf")
+        ):
+            threading.Event().wait()
         return super().predict(*arguments, **options)
 
 
@@ -38,10 +47,15 @@ class ShiftedClock(datetime):
         return datetime.now(tz) + timedelta(seconds=offset_s)
 
 
-if __name__ == "__main__":
+def run(what: str) -> None:
+    """Serve, or work as a worker, until a signal ends it."""
     columns.datetime = ShiftedClock  # type: ignore[misc]
     runtime.load_operations = SlowOperations  # type: ignore[assignment]
-    if sys.argv[1] == "worker":
+    if what == "worker":
         work(Settings(), KINDS)
     else:
         server.serve(Settings())
+
+
+if __name__ == "__main__":
+    run(sys.argv[1])

@@ -1,4 +1,6 @@
-"""Every fault on both databases; ``python -m tests.benchmarks.faults`` prints what comes of them."""
+"""Every fault on both databases; ``python -m tests.benchmarks.faults`` prints what
+comes of them.
+"""
 
 from pathlib import Path
 

@@ -27,21 +27,33 @@ def test_a_transfer_function_rises_from_black_to_white_and_back(curve):
 
 
 def test_srgb_is_that_of_the_standard():
-    """IEC 61966-2-1: half of the counts is 21.4 % of the light, 18 % of the light 46.1 % of the counts."""
+    """IEC 61966-2-1: half of the counts is 21.4 % of the light, 18 % of the light 46.1 % of the
+    counts.
+    """
     np.testing.assert_allclose(Srgb().light([0.02, 0.5]), [0.02 / 12.92, 0.21404], atol=1e-5)
     np.testing.assert_allclose(Srgb().counts([0.001, 0.18]), [0.01292, 0.46136], atol=1e-5)
 
 
-def test_a_photograph_of_a_lit_sheet_is_turned_into_light_before_the_sheet_is_taken_off(plane, spot):
-    """Taken as counts the same spot is fat and flat: that is what once looked like a camera's shoulder."""
-    frame = photograph(spot, plane, np.random.default_rng(1), CameraOptions(daylight=0.25, peak=0.7))
-    right, wrong = (measure(frame, "raw", plane, camera=Camera(curve)) for curve in (Srgb(), LINEAR))
+def test_a_photograph_of_a_lit_sheet_is_turned_into_light_before_the_sheet_is_taken_off(
+    plane, spot
+):
+    """Taken as counts the same spot is fat and flat: that is what once looked like a camera's
+    shoulder.
+    """
+    frame = photograph(
+        spot, plane, np.random.default_rng(1), CameraOptions(daylight=0.25, peak=0.7)
+    )
+    right, wrong = (
+        measure(frame, "raw", plane, camera=Camera(curve)) for curve in (Srgb(), LINEAR)
+    )
     assert accuracy(right.flux, spot) > 0.95
     assert accuracy(wrong.flux, spot) < 0.90
     assert np.array_equal(measure(frame, "raw", plane).flux, right.flux)
 
 
-def test_differences_of_counts_are_turned_into_light_by_the_ambient_they_were_taken_from(plane, spot):
+def test_differences_of_counts_are_turned_into_light_by_the_ambient_they_were_taken_from(
+    plane, spot
+):
     """counts(spot + ambient) - counts(ambient), stretched to 255, as PAINT's ``flux`` is."""
     ambient = float(Srgb().counts(0.25))
     counts = Srgb().counts(0.25 + 0.75 * spot) - ambient
@@ -52,16 +64,19 @@ def test_differences_of_counts_are_turned_into_light_by_the_ambient_they_were_ta
 
 
 def test_the_counts_of_a_difference_s_brightest_place_part_ambient_from_exposure(plane, spot):
-    """A dim spot's difference is stretched like a bright one's; taken for that it is turned into too fat a light."""
+    """A dim spot's difference is stretched like a bright one's; taken for that it is turned into
+    too fat a light.
+    """
     day, peak = 0.25, 0.2
     ambient, brightest = (float(Srgb().counts(light)) for light in (day, day + peak))
     counts = Srgb().counts(day + peak * spot) - ambient
     for largest, depth in ((255, np.uint8), (65535, np.uint16)):
         image = np.round(largest * counts / counts.max()).astype(depth)
-        told, full = (
-            measure(image, "flux", plane, camera=Camera(Srgb(), ambient, peak_counts=top)) for top in (brightest, 1.0)
+        declared_flux, full = (
+            measure(image, "flux", plane, camera=Camera(Srgb(), ambient, peak_counts=top))
+            for top in (brightest, 1.0)
         )
-        assert accuracy(told.flux, spot) > 0.985 > 0.96 > accuracy(full.flux, spot)
+        assert accuracy(declared_flux.flux, spot) > 0.985 > 0.96 > accuracy(full.flux, spot)
 
 
 def test_sixteen_bits_are_light_already(plane, spot):
@@ -77,22 +92,32 @@ def test_a_declared_curve_is_that_of_sixteen_bits_too(plane, spot, curve):
     crop = np.round(65535 * curve.counts(light)).astype(np.uint16)
     assert accuracy(measure(crop, "cropped", plane, camera=Camera(curve)).flux, spot) > 0.97
     counts = curve.counts(0.25 + 0.75 * spot) - curve.counts(0.25)
-    flux, camera = np.round(65535 * counts / counts.max()).astype(np.uint16), Camera(curve, float(curve.counts(0.25)))
+    flux, camera = (
+        np.round(65535 * counts / counts.max()).astype(np.uint16),
+        Camera(curve, float(curve.counts(0.25))),
+    )
     assert accuracy(measure(flux, "flux", plane, camera=camera).flux, spot) > 0.98
 
 
 def test_where_unscaled_counts_lie_on_a_declared_curve_is_asked(plane, spot):
-    """A power has no scale of its own; any other curve bends elsewhere for 14 bits than for 16."""
+    """A power function is scale-free; any other curve differs between 14 bits and 16."""
     crop = np.round(16383 * Srgb().counts(0.25 + 0.7 * spot)).astype(np.uint16)
     with pytest.raises(InvalidInputError, match=r"declared curve.*declare the camera's 'bits'"):
         measure(crop, "cropped", plane, camera=Camera(Srgb()))
-    assert accuracy(measure(crop, "cropped", plane, camera=Camera(Srgb(), bits=14)).flux, spot) > 0.97
+    assert (
+        accuracy(measure(crop, "cropped", plane, camera=Camera(Srgb(), bits=14)).flux, spot) > 0.97
+    )
     assert measure(crop, "cropped", plane, camera=Camera(Power(2.2))).quality.accepted
 
 
 def test_light_beyond_the_cameras_range_is_known_to_be_at_least_so_much(plane):
     spot = gaussian(plane, 0.0, 0.0, 0.6, 0.5)
-    frame = photograph(spot, plane, np.random.default_rng(1), CameraOptions(daylight=0.3, peak=1.2, gradient=(0, 0)))
+    frame = photograph(
+        spot,
+        plane,
+        np.random.default_rng(1),
+        CameraOptions(daylight=0.3, peak=1.2, gradient=(0, 0)),
+    )
     taken = measure(frame, "raw", plane)
     assert taken.quality.accepted
     assert taken.quality.saturated_share > 0.3
@@ -125,8 +150,14 @@ def test_the_camera_of_the_time_and_the_target_counts():
 
 def test_cameras_are_declared():
     table = {"counts": [0, 0.5, 1], "light": [0, 0.2, 1]}
-    given = [{}, {"transfer": "linear", "ambient": 0.4}, {"transfer": {"gamma": 2}, "since": "2024-03-01T00:00:00Z"}]
-    plain, linear, power, measured = cameras_from_json([*given, {"transfer": table, "targets": ["upper"]}])
+    given = [
+        {},
+        {"transfer": "linear", "ambient": 0.4},
+        {"transfer": {"gamma": 2}, "since": "2024-03-01T00:00:00Z"},
+    ]
+    plain, linear, power, measured = cameras_from_json(
+        [*given, {"transfer": table, "targets": ["upper"]}]
+    )
     assert plain == Camera()
     (deep,) = cameras_from_json([{"transfer": "srgb", "bits": 12, "peak_counts": 0.9}])
     assert (deep.transfer, deep.bits, deep.peak_counts) == (Srgb(), 12, 0.9)
@@ -138,8 +169,14 @@ def test_cameras_are_declared():
 @pytest.mark.parametrize(
     ("camera", "says"),
     [
-        ({"transfer": {"counts": [0, 0.6, 0.5, 1], "light": [0, 0.1, 0.2, 1]}}, "'counts' must rise"),
-        ({"transfer": {"counts": [0, 0.5, 1], "light": [0, 0.5, 0.5]}}, "'light' must be at least two"),
+        (
+            {"transfer": {"counts": [0, 0.6, 0.5, 1], "light": [0, 0.1, 0.2, 1]}},
+            "'counts' must rise",
+        ),
+        (
+            {"transfer": {"counts": [0, 0.5, 1], "light": [0, 0.5, 0.5]}},
+            "'light' must be at least two",
+        ),
         ({"transfer": {"counts": [0, 0.5, 1], "light": [0, 1]}}, "of one length"),
         ({"transfer": {"gamma": 9}}, "gamma must lie in"),
         ({"transfer": {"gamma": "two"}}, "must hold numbers"),
@@ -167,7 +204,9 @@ def test_a_plateau_below_the_largest_count_is_the_cameras_range_too(plane):
     """A frame that was scaled after it was taken: real ones pile up at 245 to 253."""
     spot = gaussian(plane, 0.0, 0.0, 0.6, 0.5)
     light = np.minimum(0.26 + 1.2 * spot, 1)
-    crop, scaled = (np.round(largest * Srgb().counts(light)).astype(np.uint8) for largest in (255, 247))
+    crop, scaled = (
+        np.round(largest * Srgb().counts(light)).astype(np.uint8) for largest in (255, 247)
+    )
     assert (ceiling(crop), ceiling(scaled)) == (SATURATED_GRAY, 245)
     whole, taken = measure(crop, "cropped", plane), measure(scaled, "cropped", plane)
     assert taken.quality.saturated_share == pytest.approx(whole.quality.saturated_share, abs=0.05)
@@ -182,7 +221,9 @@ def test_a_bright_peak_without_a_plateau_is_no_ceiling(plane):
 def test_a_difference_of_counts_tells_by_its_plateau_where_the_camera_was_cut_off(plane):
     spot = gaussian(plane, 0.0, 0.0, 0.6, 0.5)
     ambient = float(Srgb().counts(0.25))
-    counts = np.round(246 * (Srgb().counts(np.minimum(0.25 + 1.2 * spot, 1)) - ambient) / (1 - ambient))
+    counts = np.round(
+        246 * (Srgb().counts(np.minimum(0.25 + 1.2 * spot, 1)) - ambient) / (1 - ambient)
+    )
     counts[0, 0] = 255  # a single pixel to which the image was stretched
     taken = measure(counts.astype(np.uint8), "flux", plane, camera=Camera(Srgb(), ambient))
     assert taken.clipped.any()

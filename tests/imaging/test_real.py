@@ -1,4 +1,6 @@
-"""On photographs of the Solar Tower Juelich; ``python -m tests.benchmarks.imaging`` prints the full figures."""
+"""On photographs of the Solar Tower Juelich; ``python -m tests.benchmarks.imaging`` prints the full
+figures.
+"""
 
 import numpy as np
 import pytest
@@ -34,7 +36,9 @@ def test_the_goals_hold(cases):
 def test_empty_targets_hold_no_spot(stj, plant):
     plane = plant.targets["solar_tower_juelich_lower"]
     paths = sorted((stj / "empty-targets").glob("*.png"))[::15]
-    assert {measure(decode_image(path.read_bytes()), "cropped", plane).quality.reason for path in paths} == {"no_spot"}
+    assert {
+        measure(decode_image(path.read_bytes()), "cropped", plane).quality.reason for path in paths
+    } == {"no_spot"}
 
 
 def test_without_data_the_command_says_so(monkeypatch, tmp_path, capsys):

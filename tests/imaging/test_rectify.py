@@ -35,7 +35,18 @@ def light(image):
         CameraOptions(fill=0.4),
         CameraOptions(foreign_spot=(-2.2, 2.7, 0.5, 1.0)),
     ],
-    ids=["plain", "large", "small", "slanted", "uneven", "dim", "noisy", "blurred", "far", "spot on a mark"],
+    ids=[
+        "plain",
+        "large",
+        "small",
+        "slanted",
+        "uneven",
+        "dim",
+        "noisy",
+        "blurred",
+        "far",
+        "spot on a mark",
+    ],
 )
 def test_corners_are_found_within_a_pixel(plane, spot, options):
     frame = photograph(spot, plane, np.random.default_rng(2), options)
@@ -44,7 +55,9 @@ def test_corners_are_found_within_a_pixel(plane, spot, options):
 
 
 def two_targets():
-    """A frame of two stacked targets with L and T marks, and the corners of the upper and the lower one [px]."""
+    """A frame of two stacked targets with L and T marks, and the corners of the upper and the lower
+    one [px].
+    """
     width, height, scale = 8.6, 7.2, 60.0
     sheet = np.full((int(scale * (2 * height + 2)), int(scale * (width + 2))), 150, np.uint8)
     sheet[::80] = 135
@@ -52,7 +65,10 @@ def two_targets():
 
     def bar(x, y, dx, dy):
         """A dark rectangle from a point in metres, by pixels."""
-        xs, ys = sorted((scale * (x + 1), scale * (x + 1) + dx)), sorted((scale * (y + 1), scale * (y + 1) + dy))
+        xs, ys = (
+            sorted((scale * (x + 1), scale * (x + 1) + dx)),
+            sorted((scale * (y + 1), scale * (y + 1) + dy)),
+        )
         sheet[round(ys[0]) : round(ys[1]), round(xs[0]) : round(xs[1])] = 25
 
     for x, inward in ((0, 1), (width, -1)):
@@ -61,17 +77,23 @@ def two_targets():
             bar(x, y, inward * stroke, down * arm)
         bar(x, height - arm / scale / 2, inward * stroke, arm)
         bar(x, height - stroke / scale / 2, inward * arm, stroke)
-    corners = scale * (np.array([[x, y] for y in (0, height, 2 * height) for x in (0, width)]) + 1) - 0.5
+    corners = (
+        scale * (np.array([[x, y] for y in (0, height, 2 * height) for x in (0, width)]) + 1) - 0.5
+    )
     tilt = np.array([[0.98, 0.03, 60], [-0.04, 1.0, 90], [1e-5, 2e-5, 1]])
-    frame = cv2.warpPerspective(sheet, tilt, (820, 1100), borderValue=(90.0,), flags=cv2.INTER_LINEAR)
+    frame = cv2.warpPerspective(
+        sheet, tilt, (820, 1100), borderValue=(90.0,), flags=cv2.INTER_LINEAR
+    )
     seen = cv2.perspectiveTransform(corners[None], tilt)[0]
     return cv2.GaussianBlur(frame, (0, 0), 0.8), seen[:4], seen[2:]
 
 
 @pytest.mark.parametrize("which", ["upper", "lower"])
-def test_targets_that_share_an_edge_are_told_apart_by_name(which):
+def test_targets_that_share_an_edge_are_distinguished_by_name(which):
     frame, upper, lower = two_targets()
-    plane = TargetPlane(f"solar_tower_{which}", np.zeros(3), np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), 8.6, 7.2)
+    plane = TargetPlane(
+        f"solar_tower_{which}", np.zeros(3), np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), 8.6, 7.2
+    )
     found = find_corners(frame, plane, mark_layouts(plane.name))
     assert np.abs(found - (upper if which == "upper" else lower)).max() < 1.0
 
@@ -116,8 +138,13 @@ def test_a_target_of_another_shape_is_not_taken(spot, plane):
 
 
 def test_rectifying_puts_the_corners_into_the_corners(plane, spot):
-    options = CameraOptions(noise=0.0, grid_step=0.0, gradient=(0.0, 0.0), daylight=0.3, peak=0.5, blur_px=0.3)
-    crop = rectify(light(photograph(spot, plane, np.random.default_rng(0), options)), target_corners(plane, options))
+    options = CameraOptions(
+        noise=0.0, grid_step=0.0, gradient=(0.0, 0.0), daylight=0.3, peak=0.5, blur_px=0.3
+    )
+    crop = rectify(
+        light(photograph(spot, plane, np.random.default_rng(0), options)),
+        target_corners(plane, options),
+    )
     assert crop.shape == (256, 256)
     inner = crop[40:-40, 40:-40].astype(float)
     expected = 255 * (0.3 + 0.5 * spot[40:-40, 40:-40] * 0.94)

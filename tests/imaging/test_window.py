@@ -43,7 +43,9 @@ def test_axes_point_right_and_up():
 
 def test_a_sub_pixel_shift_moves_the_centre_of_mass_by_it(image):
     padded = np.pad(image, 30)
-    shifted = flux_window(padded, (4.0, 4.0), (0.0123, -0.0077), window=4.0, resolution=padded.shape)
+    shifted = flux_window(
+        padded, (4.0, 4.0), (0.0123, -0.0077), window=4.0, resolution=padded.shape
+    )
     before, after = center_of_mass(padded, (4.0, 4.0)), center_of_mass(shifted, (4.0, 4.0))
     assert np.allclose(after - before, [-0.0123, 0.0077], atol=1e-12)
 

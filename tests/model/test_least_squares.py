@@ -5,10 +5,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from model.least_squares import Descent, broyden, damped_step, minimize
+from model.least_squares import Bounds, MinimizerOptions, Quadratic, damped_step, minimize
 
-ANEW = Descent(steps=100, jacobians=100, patience=5, least_share=1e-12)
-CORRECTED = Descent(steps=100, jacobians=10, corrected=True, most_damping=1e8, least_gain=1e-20)
+OPTIONS = MinimizerOptions(max_steps=100, max_jacobians=100, patience=5, min_relative_gain=1e-12)
 
 
 @dataclass
@@ -22,22 +21,19 @@ class Problem:
     taken: list = field(default_factory=list)
 
     def cost(self, x):
-        return float(self.response(x) @ self.response(x)) / 2
-
-    def response(self, x):
-        return self.residuals(x)
+        return float(self.residuals(x) @ self.residuals(x)) / 2
 
     def jacobian(self, x):
         self.taken.append(x)
         return self.derivatives(x)
 
     def quadratic(self, x, jacobian):
-        return -jacobian @ self.response(x), jacobian @ jacobian.T
+        return Quadratic(-jacobian @ self.residuals(x), jacobian @ jacobian.T)
 
     def bounds(self, x):
-        return None if self.low is None else (self.low - x, self.high - x)
+        return None if self.low is None else Bounds(self.low - x, self.high - x)
 
-    def moved(self, x, change):
+    def step(self, x, change):
         return x + change
 
 
@@ -50,34 +46,24 @@ def linear(**bounds):
 def rosenbrock():
     """Its minimum lies at (1, 1), in a curved valley (Rosenbrock 1960)."""
     return Problem(
-        lambda x: np.array([10 * (x[1] - x[0] ** 2), 1 - x[0]]), lambda x: np.array([[-20 * x[0], -1], [10, 0]])
+        lambda x: np.array([10 * (x[1] - x[0] ** 2), 1 - x[0]]),
+        lambda x: np.array([[-20 * x[0], -1], [10, 0]]),
     )
 
 
-@pytest.mark.parametrize("descent", [ANEW, CORRECTED])
-def test_linear_problem_is_solved(descent):
+def test_linear_problem_is_solved():
     problem, matrix, data = linear()
-    found = minimize(problem, np.zeros(4), descent)
+    found = minimize(problem, np.zeros(4), OPTIONS)
     expected = np.linalg.lstsq(matrix, data, rcond=None)[0]
     np.testing.assert_allclose(found.state, expected, atol=1e-6)
     assert found.cost == pytest.approx(np.sum((matrix @ expected - data) ** 2) / 2)
 
 
-@pytest.mark.parametrize("descent", [ANEW, CORRECTED])
-def test_curved_valley_is_followed_to_its_end(descent):
+def test_curved_valley_is_followed_to_its_end():
     problem = rosenbrock()
-    found = minimize(problem, np.array([-1.2, 1.0]), descent)
+    found = minimize(problem, np.array([-1.2, 1.0]), OPTIONS)
     np.testing.assert_allclose(found.state, [1, 1], atol=1e-5)
     assert found.cost < 1e-10
-
-
-def test_corrections_save_jacobians():
-    taken = []
-    for descent in (ANEW, CORRECTED):
-        problem = rosenbrock()
-        minimize(problem, np.array([-1.2, 1.0]), descent)
-        taken.append(len(problem.taken))
-    assert taken[1] < taken[0] / 1.5
 
 
 def test_bounds_hold_and_the_rest_makes_the_best_of_it():
@@ -86,18 +72,20 @@ def test_bounds_hold_and_the_rest_makes_the_best_of_it():
     free = np.linalg.lstsq(matrix, data, rcond=None)[0]
     high = np.array([free[0] - 0.2, 9, 9, 9])
     problem, *_ = linear(low=np.full(4, -9.0), high=high)
-    found = minimize(problem, np.full(4, -1.0), ANEW)
+    found = minimize(problem, np.full(4, -1.0), OPTIONS)
     rest = np.linalg.lstsq(matrix[:, 1:], data - matrix[:, 0] * high[0], rcond=None)[0]
     np.testing.assert_allclose(found.state, [high[0], *rest], atol=1e-6)
 
 
 def test_no_more_steps_and_jacobians_than_allowed():
     problem = rosenbrock()
-    minimize(problem, np.array([-1.2, 1.0]), replace(ANEW, jacobians=3))
+    minimize(problem, np.array([-1.2, 1.0]), replace(OPTIONS, max_jacobians=3))
     assert len(problem.taken) == 3
     given = rosenbrock()
     start = np.array([-1.2, 1.0])
-    found = minimize(given, start, replace(CORRECTED, steps=1, jacobians=0), given.derivatives(start))
+    found = minimize(
+        given, start, replace(OPTIONS, max_steps=1, max_jacobians=0), given.derivatives(start)
+    )
     assert not given.taken
     assert found.cost < given.cost(start)
 
@@ -105,22 +93,13 @@ def test_no_more_steps_and_jacobians_than_allowed():
 def test_a_state_without_answer_is_not_entered():
     """Half of the line has none: the steps become shorter."""
     problem = Problem(lambda x: np.where(x > 0.5, np.inf, 1 - x), lambda x: -np.ones((1, 1)))
-    found = minimize(problem, np.array([-1.0]), replace(ANEW, patience=50))
+    found = minimize(problem, np.array([-1.0]), replace(OPTIONS, patience=50))
     assert 0 < found.state[0] <= 0.5
 
 
 def test_damping_shortens_the_step():
-    gradient, curvature = np.array([1.0, 2.0]), np.diag([2.0, 1.0])
-    np.testing.assert_allclose(damped_step(gradient, curvature, 0.0), [0.5, 2.0])
-    np.testing.assert_allclose(damped_step(gradient, curvature, 1.0), [0.25, 1.0])
-    bounded = damped_step(gradient, curvature, 0.0, (np.array([-1.0, -1.0]), np.array([1.0, 1.0])))
+    quadratic = Quadratic(np.array([1.0, 2.0]), np.diag([2.0, 1.0]))
+    np.testing.assert_allclose(damped_step(quadratic, 0.0), [0.5, 2.0])
+    np.testing.assert_allclose(damped_step(quadratic, 1.0), [0.25, 1.0])
+    bounded = damped_step(quadratic, 0.0, Bounds(np.array([-1.0, -1.0]), np.array([1.0, 1.0])))
     np.testing.assert_allclose(bounded, [0.5, 1.0])
-
-
-def test_corrected_jacobian_tells_the_step_and_keeps_the_rest():
-    rng = np.random.default_rng(1)
-    jacobian, change, response = rng.normal(size=(3, 2, 5)), np.array([1.0, -2.0, 0.5]), rng.normal(size=(2, 5))
-    corrected = broyden(jacobian, change, response)
-    np.testing.assert_allclose(np.tensordot(change, corrected, axes=1), response)
-    across = np.array([2.0, 1.0, 0.0])  # perpendicular to the change
-    np.testing.assert_allclose(np.tensordot(across, corrected, axes=1), np.tensordot(across, jacobian, axes=1))

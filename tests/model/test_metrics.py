@@ -2,7 +2,14 @@ import numpy as np
 import pytest
 
 from model.errors import InvalidInputError
-from model.metrics import WINDOWS, accuracy_window, compare_on_target, flux_accuracies, flux_accuracy, surface_error
+from model.metrics import (
+    WINDOWS,
+    accuracy_window,
+    compare_on_target,
+    flux_accuracies,
+    flux_accuracy,
+    surface_error,
+)
 
 
 def spot(center, size=(8.0, 7.0), pixels=(128, 160), sigma=0.6) -> np.ndarray:
@@ -23,7 +30,7 @@ def test_comparison_ignores_where_the_spot_lies_and_how_it_is_sampled():
     assert compared.window == 4.0
 
 
-def test_energy_outside_the_window_is_told():
+def test_energy_outside_the_window_is_reported():
     compared = compare_on_target(spot((0, 0), sigma=1.2), spot((0, 0), sigma=0.3), (8.0, 7.0))
     assert compared.measured_outside > 0.1
     assert compared.forecast_outside < 1e-6
@@ -37,13 +44,20 @@ def test_bad_flux_is_refused(bad):
 
 def test_many_accuracies_at_once_are_those_of_each():
     a, b = np.random.default_rng(0).uniform(size=(2, 3, 8, 8))
-    np.testing.assert_allclose(flux_accuracies(a, b), [flux_accuracy(*pair) for pair in zip(a, b, strict=True)])
+    np.testing.assert_allclose(
+        flux_accuracies(a, b), [flux_accuracy(*pair) for pair in zip(a, b, strict=True)]
+    )
 
 
 def test_window_grows_with_the_spot():
-    """Beyond w / 2 of a Gaussian, right and left, lies the share erfc(w / (sqrt(8) sigma)); up and down as much."""
+    """Beyond w / 2 of a Gaussian, right and left, lies the share erfc(w / (sqrt(8) sigma)); up and
+    down as much.
+    """
     size = (16.0, 16.0)
-    chosen = [accuracy_window([spot((0, 0), size, sigma=sigma)], [size]) for sigma in (0.7, 1.0, 1.4, 2.2, 4.0)]
+    chosen = [
+        accuracy_window([spot((0, 0), size, sigma=sigma)], [size])
+        for sigma in (0.7, 1.0, 1.4, 2.2, 4.0)
+    ]
     assert chosen == [4.0, 6.0, 8.0, 12.0, WINDOWS[-1]]
     wide = spot((0, 0), size, sigma=2.2)
     assert accuracy_window([wide], [size], widest=8.0) == 8.0

@@ -1,4 +1,7 @@
-"""What stands still on the target while spots move is the target's; what moves with the spots is the light's."""
+"""Residuals that stay at the same place on the target while spots move are the target's pattern.
+
+Residuals that move with the spots belong to the flux.
+"""
 
 from types import SimpleNamespace
 from typing import Any
@@ -23,7 +26,9 @@ def spot(center: tuple[int, int], size: int) -> Array:
 
 
 def found(shade: Array, own: Array, grain: float = 0.0) -> Pattern:
-    """Of spots at eight places on a target that keeps ``shade`` of the light, while the light lacks ``own``."""
+    """Of spots at eight places on a target that keeps ``shade`` of the light, while the light lacks
+    ``own``.
+    """
     generator = np.random.default_rng(1)
     plane = SimpleNamespace(name="target", width=8.0, height=8.0)
     images, measured = [], []
@@ -35,7 +40,9 @@ def found(shade: Array, own: Array, grain: float = 0.0) -> Pattern:
         seen = seen * (1 - shade[row - half : row + half, column - half : column + half])
         measured.append(seen * (1 + grain * generator.standard_normal(seen.shape)))
     forecast = np.tile(spot((SIZE // 2, SIZE // 2), SIZE), (8, 1, 1))
-    cuts = [stack / stack.sum(axis=(1, 2), keepdims=True) for stack in (np.array(measured), forecast)]
+    cuts = [
+        stack / stack.sum(axis=(1, 2), keepdims=True) for stack in (np.array(measured), forecast)
+    ]
     return pattern_of(np.array(images, dtype=object).tolist(), *cuts, WINDOW)
 
 

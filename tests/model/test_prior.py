@@ -19,8 +19,10 @@ from model.surface import halved
 from tests.conftest import flat_heliostat
 
 
-def test_a_mirror_unlike_those_known_is_strange():
-    """Half of the facets turned by three milliradians, five times what the prior expects of canting."""
+def test_mirror_unlike_those_known_has_a_large_mahalanobis_distance():
+    """Half of the facets turned by three milliradians, five times what the prior expects of
+    canting.
+    """
     prior = default_prior()
     truth = prior.surface(np.random.default_rng(2).normal(0, 0.5, len(prior.basis)))
     assert prior.mahalanobis(prior.mean) == pytest.approx(0, abs=1e-6)
@@ -36,11 +38,16 @@ def test_prior_inverts_its_own_coefficients():
 
 
 def test_a_rough_mirror_has_wider_scales():
-    """As wide as it is rough where its coefficients are known; as it was where nothing is known of them."""
+    """As wide as it is rough where its coefficients are known; as it was where nothing is known of
+    them.
+    """
     prior = default_prior()
     counts = len(prior.basis)
     rough = 4 * np.random.default_rng(1).normal(size=counts)
-    known, unknown = prior.precision(rough, np.zeros(counts)), prior.precision(np.zeros(counts), np.ones(counts))
+    known, unknown = (
+        prior.precision(rough, np.zeros(counts)),
+        prior.precision(np.zeros(counts), np.ones(counts)),
+    )
     np.testing.assert_allclose(known[GROUPS[-1]] ** -0.5, 4, rtol=0.2)
     np.testing.assert_allclose(unknown, 1)
 
@@ -52,7 +59,9 @@ def test_facets_of_another_size_have_the_generic_prior():
     twice = tuple(Facet(2 * f.position, 2 * f.canting_x, 2 * f.canting_y) for f in known.facets)
     found, same = prior_of(replace(known, facets=twice)), generic_prior(known.facet_frames[2])
     assert found.name == "generic"
-    np.testing.assert_allclose((found.basis**2).sum(axis=0), 4 * (same.basis**2).sum(axis=0), rtol=1e-6)
+    np.testing.assert_allclose(
+        (found.basis**2).sum(axis=0), 4 * (same.basis**2).sum(axis=0), rtol=1e-6
+    )
 
 
 def test_a_generic_mirror_has_no_tilt_of_its_own_and_facets_that_are_alike():
@@ -62,7 +71,9 @@ def test_a_generic_mirror_has_no_tilt_of_its_own_and_facets_that_are_alike():
     np.testing.assert_allclose(np.einsum("kfij,tfij->kt", prior.basis, tilts), 0, atol=1e-9)
     bent = tilt_modes()[0] ** 2
     first, last = np.einsum("kfij,ij->fk", prior.basis, bent - bent.mean())[[0, -1]]
-    assert first @ last / (np.linalg.norm(first) * np.linalg.norm(last)) == pytest.approx(FacetKind().alike, abs=0.02)
+    assert first @ last / (np.linalg.norm(first) * np.linalg.norm(last)) == pytest.approx(
+        FacetKind().alike, abs=0.02
+    )
 
 
 def test_ripples_are_what_heights_do_not_reach():

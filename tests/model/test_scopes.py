@@ -15,22 +15,26 @@ from model.effects.facet_canting import FacetCanting
 from model.effects.slope_error import SlopeError
 from model.effects.sun_shape import SunShapeEffect
 from model.errors import InvalidInputError
-from model.forecast import Setup, View, forecast_setups
+from model.forecast import View, align
 from model.frames import sun_direction
-from model.plant import JUELICH_LATITUDE, Heliostat
-from model.study import FluxImage, Study, StudyOptions, study
+from model.plant import Heliostat
+from model.plant_model import JUELICH_MODEL
+from model.setup import Setup
+from model.study import FluxImage, Study, StudyOptions, conclude, study, study_to_json
 from model.study.judging import few_gain, split
-from model.study.scopes import alone, change, promises
-from model.study.unknowns import Term, Unknowns, copied
+from model.study.parameters import ParameterVector, Term, copied
+from model.study.scopes import StartDay, best_start_day, single_heliostat_scopes, time_scopes
 from model.surface import control_points
-from model.tracing import Optics
 from service.base.settings import FIGURE_SCALES
 from service.drawing.study_report import study_page
 from tests.conftest import target
 
 FIRST = datetime(2024, 6, 1, 12, tzinfo=UTC)
 CHANGE = date(2024, 6, 16)
-HAZY = {date(2024, 6, 7): {"circumsolar_ratio": 0.15}, date(2024, 6, 16): {"circumsolar_ratio": 0.2}}
+HAZY = {
+    date(2024, 6, 7): {"circumsolar_ratio": 0.15},
+    date(2024, 6, 16): {"circumsolar_ratio": 0.2},
+}
 PLACES = {"near": (-8.0, 45.0, 1.8), "far": (35.0, 110.0, 1.8), "middle": (-40.0, 75.0, 1.8)}
 TILTS = {"far": np.array([0.5, -0.3, 0.0, -0.2])}, {"far": np.array([-0.4, 0.4, 0.2, -0.2])}
 CANTED = FacetCanting(*TILTS, scope=Since(CHANGE, ("far",)))
@@ -42,22 +46,34 @@ def photographs(effects: Sequence[Effect] = (), days: int = 8) -> list[FluxImage
     """What the forecaster expects of three mirrors, once every third day each, with some noise."""
     rng, plane, made = np.random.default_rng(3), target(), []
     for name, place in PLACES.items():
-        mirror = Heliostat.juelich(name, place, float(np.linalg.norm(np.array(place) - plane.center)), facet_depth=0.0)
+        mirror = Heliostat.juelich(
+            name, place, float(np.linalg.norm(np.array(place) - plane.center)), facet_depth=0.0
+        )
         points = control_points(mirror, rng.normal(0, 2e-4, (4, 8, 8)))
         for day in range(days):
             azimuth, spot = rng.uniform(-60, 60), plane.to_enu(rng.uniform(-0.3, 0.3, 2))
-            sun, moment = sun_direction(azimuth, 50 - abs(azimuth) / 2), FIRST + timedelta(days=3 * day)
-            made.append(Setup(mirror, points, sun, plane, spot, identifier=f"{name}/{day}", taken_at=moment))
-    images = forecast_setups(made, Optics(), effects, View(256, 256, samples=12), latitude_deg=JUELICH_LATITUDE).numpy()
-    images = images + 0.003 * images.max(axis=(1, 2), keepdims=True) * rng.standard_normal(images.shape)
+            sun, moment = (
+                sun_direction(180 - azimuth, 50 - abs(azimuth) / 2),
+                FIRST + timedelta(days=3 * day),
+            )
+            made.append(
+                Setup(mirror, points, sun, plane, spot, identifier=f"{name}/{day}", taken_at=moment)
+            )
+    images = (
+        align(made, JUELICH_MODEL.with_effects(effects)).images(View(256, 256, samples=12)).numpy()
+    )
+    images = images + 0.003 * images.max(axis=(1, 2), keepdims=True) * rng.standard_normal(
+        images.shape
+    )
     return [FluxImage(setup, image) for setup, image in zip(made, images, strict=True)]
 
 
 def found_in(effects: Sequence[Effect], *candidates: str) -> Study:
-    return study(photographs(effects), Optics(), options=StudyOptions(candidates), latitude_deg=JUELICH_LATITUDE)
+    return study(photographs(effects), JUELICH_MODEL, options=StudyOptions(candidates))
 
 
-# --- when effects act -------------------------------------------------------------------------------------------------
+# --- when effects act
+# -------------------------------------------------------------------------------------------------
 
 
 def test_an_effect_acts_since_its_day_and_in_the_plant_of_today():
@@ -81,7 +97,11 @@ def test_an_effect_by_day_has_values_of_its_own_on_some_days():
     assert isinstance(there, SunShapeEffect)
     assert there.circumsolar_ratio == 0.15
     assert acting([hazy], datetime(2024, 6, 7, 15, tzinfo=UTC), "near") == (there,)
-    assert acting([hazy], datetime(2024, 6, 8, 9, tzinfo=UTC), "far") == acting([hazy], None, None) == (hazy,)
+    assert (
+        acting([hazy], datetime(2024, 6, 8, 9, tzinfo=UTC), "far")
+        == acting([hazy], None, None)
+        == (hazy,)
+    )
 
 
 @pytest.mark.parametrize(
@@ -93,11 +113,11 @@ def test_forecasts_hold_each_effect_when_and_where_it_acts(effect: Effect):
     """All photographs at once are what each is with the effects of its time."""
     setups = [p.setup for p in photographs(days=6)]
     view = View(24, 24, samples=8)
-    together = forecast_setups(setups, None, [effect], view, latitude_deg=JUELICH_LATITUDE)
+    together = align(setups, JUELICH_MODEL.with_effects([effect])).images(view)
     for setup, image in zip(setups, together, strict=True):
         there = acting([effect], setup.taken_at, setup.heliostat.name)
         there = tuple(replace(one, scope=Always()) for one in there)
-        (alone,) = forecast_setups([setup], None, there, view, latitude_deg=JUELICH_LATITUDE)
+        (alone,) = align([setup], JUELICH_MODEL.with_effects(there)).images(view)
         np.testing.assert_allclose(image, alone, rtol=1e-3, atol=1e-3 * float(alone.max()))
 
 
@@ -120,7 +140,10 @@ def test_scopes_survive_json():
         ({"kind": "set", "heliostats": "far"}, "must be a list of names, or null for all, got far"),
         ({"kind": "set", "heliostats": []}, "must be a list of names"),
         ({"kind": "day", "heliostats": ["far"]}, "a scope by day is of all heliostats"),
-        ({"kind": "set", "heliostats": ["far"]}, "sun_shape: the sun and the camera are the same for all heliostats"),
+        (
+            {"kind": "set", "heliostats": ["far"]},
+            "sun_shape: the sun and the camera are the same for all heliostats",
+        ),
     ],
 )
 def test_a_malformed_scope_is_refused(scope: object, says: str):
@@ -132,7 +155,9 @@ def test_a_scope_names_no_other_heliostats_than_the_parameters():
     canted = effect_to_json(CANTED)
     assert canted["scope"] == {"kind": "since", "since": "2024-06-16", "heliostats": ["far"]}
     assert effect_from_json({**canted, "scope": {"kind": "set"}}).heliostats == ["far"]
-    with pytest.raises(InvalidInputError, match="must be those that its parameters name, or null, got near"):
+    with pytest.raises(
+        InvalidInputError, match="must be those that its parameters name, or null, got near"
+    ):
         effect_from_json({**canted, "scope": {**canted["scope"], "heliostats": ["near"]}})
 
 
@@ -155,12 +180,13 @@ def test_copies_keep_the_scope():
     assert copied(ROUGH, 2).scope == Always(("far#0", "far#1"))
 
 
-# --- unknowns with a scope --------------------------------------------------------------------------------------------
+# --- unknowns with a scope
+# --------------------------------------------------------------------------------------------
 
 
 def test_unknowns_of_days_are_moved_at_once_and_become_one_effect():
     days = tuple(sorted(HAZY))
-    unknowns = Unknowns((Term(SunShapeEffect, days=days),), (("near", 4), ("far", 4)))
+    unknowns = ParameterVector((Term(SunShapeEffect, days=days),), (("near", 4), ("far", 4)))
     assert list(unknowns.groups.values()) == [[0, 1]]
     (effect,) = unknowns.effects(np.array([0.1, 0.2]))
     assert effect_to_json(effect)["parameters"]["circumsolar_ratio"]["value"] == pytest.approx(0.15)
@@ -171,7 +197,7 @@ def test_unknowns_of_days_are_moved_at_once_and_become_one_effect():
 
 def test_unknowns_of_one_heliostat_touch_its_later_photographs():
     term = Term(FacetCanting, since=CHANGE, heliostats=("far",))
-    unknowns = Unknowns((term,), (("near", 4), ("far", 4)))
+    unknowns = ParameterVector((term,), (("near", 4), ("far", 4)))
     assert len(unknowns.all) == 8
     (effect,) = unknowns.effects(np.zeros(8))
     assert effect.heliostats == ["far"]
@@ -182,64 +208,81 @@ def test_unknowns_of_one_heliostat_touch_its_later_photographs():
 def test_the_day_of_a_change_is_the_one_after_which_most_is_saved():
     days = [date(2024, 6, 1 + n) for n in range(8)]
     saved = np.array([[-1.0, 0.5, -1, -1, 3, 2, -0.5, 3], [-4.0, 0, -4, -4, 2, 1, -2, 2]])
-    assert change(saved, days) == (date(2024, 6, 5), 7.5)
-    assert change(saved[:, :1], days[:1]) is None
-    since, by_day = promises(CameraResponse, saved, [days[0]] * 4 + [days[1]] * 4, np.array(["a"] * 8))
+    assert best_start_day(saved, days) == StartDay(date(2024, 6, 5), 7.5)
+    assert best_start_day(saved[:, :1], days[:1]) is None
+    since, by_day = time_scopes(
+        CameraResponse, saved, [days[0]] * 4 + [days[1]] * 4, np.array(["a"] * 8)
+    )
     assert since.term == Term(CameraResponse, since=days[1])
     assert by_day.term == Term(CameraResponse, days=tuple(days[:2]))
 
 
 def test_one_heliostat_is_promising_where_the_others_lose_or_save_nothing():
-    """What all share must save clearly more at one; what is each one's own, hardly less there than everywhere."""
+    """What all share must save clearly more at one; what is each one's own, hardly less there than
+    everywhere.
+    """
     names = np.array(["far", "far", "near", "near"])
-    (found,) = alone(SlopeError, np.array([[1.0, 1.0, -0.5, 0.0], [2.0, 3.0, -2.0, -3.0]]), names)
+    (found,) = single_heliostat_scopes(
+        SlopeError, np.array([[1.0, 1.0, -0.5, 0.0], [2.0, 3.0, -2.0, -3.0]]), names
+    )
     assert (found.term, found.saved) == (Term(SlopeError, heliostats=("far",)), 5.0)
-    assert not list(alone(SlopeError, np.array([[1.0, 1.0, 0.1, 0.0]]), names))
-    assert not list(alone(SunShapeEffect, np.array([[1.0, 1.0, -0.5, 0.0]]), names))
-    (found,) = alone(FacetCanting, np.array([[1.0, 1.0, 0.1, 0.0]]), names)
+    assert not list(single_heliostat_scopes(SlopeError, np.array([[1.0, 1.0, 0.1, 0.0]]), names))
+    assert not list(
+        single_heliostat_scopes(SunShapeEffect, np.array([[1.0, 1.0, -0.5, 0.0]]), names)
+    )
+    (found,) = single_heliostat_scopes(FacetCanting, np.array([[1.0, 1.0, 0.1, 0.0]]), names)
     assert found.term == Term(FacetCanting, heliostats=("far",))
-    assert not list(alone(FacetCanting, np.array([[1.0, 1.0, 0.5, 0.0]]), names))
-    assert not list(alone(SlopeError, np.array([[1.0, 1.0]]), names[:2]))
+    assert not list(single_heliostat_scopes(FacetCanting, np.array([[1.0, 1.0, 0.5, 0.0]]), names))
+    assert not list(single_heliostat_scopes(SlopeError, np.array([[1.0, 1.0]]), names[:2]))
 
 
 def test_what_one_heliostat_has_is_fitted_to_its_photographs():
     term = Term(SlopeError, heliostats=("far",))
-    unknowns = Unknowns((Term(SunShapeEffect), term), (("near", 4), ("far", 4)))
-    assert [u.term for u in unknowns.own.all] == [term]
-    assert [u.term.kind for u in unknowns.of(["near"]).all] == [SunShapeEffect]
+    unknowns = ParameterVector((Term(SunShapeEffect), term), (("near", 4), ("far", 4)))
+    assert [u.term for u in unknowns.per_heliostat.all] == [term]
+    assert [u.term.kind for u in unknowns.for_heliostats(["near"]).all] == [SunShapeEffect]
     _, rough = unknowns.effects(np.array([0.02, 1.0]))
     assert effect_to_json(rough) == effect_to_json(ROUGH)
-    assert {p.heliostat for p in photographs(days=1) if term.touches(p.heliostat, p.taken_at)} == {"far"}
-    assert term.is_apart_from(Term(FacetCanting, since=CHANGE, heliostats=("near",)))
-    assert not term.is_apart_from(Term(FacetCanting))
-    assert not term.is_apart_from(term)
+    assert {p.heliostat for p in photographs(days=1) if term.touches(p.heliostat, p.taken_at)} == {
+        "far"
+    }
+    assert term.is_disjoint_from(Term(FacetCanting, since=CHANGE, heliostats=("near",)))
+    assert not term.is_disjoint_from(Term(FacetCanting))
+    assert not term.is_disjoint_from(term)
 
 
 def test_few_gains_are_worth_less():
     assert few_gain(np.array([0.05])).low <= 0
     assert few_gain(np.array([0.05, 0.01])).low < 0
     assert few_gain(np.array([0.05, 0.04])).low > 0
-    assert few_gain(np.array([0.05, 0.01, 0.03])).low > 0 > few_gain(np.array([0.05, 0.01, 0.03]), among=5).low
+    assert (
+        few_gain(np.array([0.05, 0.01, 0.03])).low
+        > 0
+        > few_gain(np.array([0.05, 0.01, 0.03]), among=5).low
+    )
 
 
 def test_of_every_day_some_photographs_are_fitted_and_some_judge():
     taken = photographs(days=4)
     parts = split(taken)
-    fitted, judging = ({taken[row].taken_at for row in rows} for rows in (parts.fit, parts.held_out))
+    fitted, judging = (
+        {taken[row].taken_at for row in rows} for rows in (parts.fit, parts.held_out)
+    )
     assert fitted == judging == {p.taken_at for p in taken}
 
 
-# --- what studies find ------------------------------------------------------------------------------------------------
+# --- what studies find
+# ------------------------------------------------------------------------------------------------
 
 
 def test_nothing_comes_or_goes_in_calm_photographs():
-    calm = found_in([], "sun_shape", "camera_response", "facet_canting").to_json()
+    calm = study_to_json(found_in([], "sun_shape", "camera_response", "facet_canting"))
     assert calm["verdict"] == "none"
     assert calm["effects"] == []
 
 
-def test_a_mirror_that_was_canted_anew_is_found_with_its_date():
-    report = found_in([CANTED], "facet_canting", "slope_error").to_json()
+def test_recanted_mirror_is_found_with_its_date():
+    report = study_to_json(found_in([CANTED], "facet_canting", "slope_error"))
     (found,) = report["effects"]
     assert found["scope"] == {"kind": "since", "since": "2024-06-16", "heliostats": ["far"]}
     assert "facet canting of far since 2024-06-16" in report["conclusion"]
@@ -249,15 +292,19 @@ def test_a_mirror_that_was_canted_anew_is_found_with_its_date():
     assert effect_from_json(found).scope == Since(CHANGE, ("far",))
 
 
-def test_a_camera_that_was_set_anew_is_found_with_its_date():
-    report = found_in([CameraResponse(1.1, scope=Since(CHANGE))], "camera_response", "camera_blur").to_json()
+def test_changed_camera_is_found_with_its_date():
+    report = study_to_json(
+        found_in([CameraResponse(1.1, scope=Since(CHANGE))], "camera_response", "camera_blur")
+    )
     (found,) = report["effects"]
     assert found["scope"] == {"kind": "since", "since": "2024-06-16", "heliostats": None}
     assert found["parameters"]["gamma"]["value"] == pytest.approx(1.1, abs=0.02)
 
 
 def test_hazy_days_are_found_and_named():
-    report = found_in([SunShapeEffect(0.02, scope=ByDay(HAZY))], "sun_shape", "slope_error").to_json()
+    report = study_to_json(
+        found_in([SunShapeEffect(0.02, scope=ByDay(HAZY))], "sun_shape", "slope_error")
+    )
     (found,) = report["effects"]
     assert found["scope"] == {"kind": "day"}
     assert "sun shape by day (most on 2024-06-07, 2024-06-16)" in report["conclusion"]
@@ -269,13 +316,15 @@ def test_hazy_days_are_found_and_named():
 @pytest.mark.parametrize("is_dated", [True, False])
 def test_a_rough_mirror_is_found_by_name(is_dated: bool):
     taken = photographs([ROUGH])
-    taken = taken if is_dated else [replace(p, setup=replace(p.setup, taken_at=None)) for p in taken]
+    taken = (
+        taken if is_dated else [replace(p, setup=replace(p.setup, taken_at=None)) for p in taken]
+    )
     options = StudyOptions(("slope_error", "camera_blur"))
-    found = study(taken, Optics(), options=options, latitude_deg=JUELICH_LATITUDE)
-    (effect,) = found.to_json()["effects"]
+    found = study(taken, JUELICH_MODEL, options=options)
+    (effect,) = study_to_json(found)["effects"]
     assert effect["scope"] == {"kind": "set", "heliostats": ["far"]}
     assert effect["parameters"]["sigma_mrad"]["value"] == pytest.approx(1.0, abs=0.05)
-    assert "demand slope error of far: accuracy" in found.conclusion()
+    assert "demand slope error of far: accuracy" in conclude(found)
     assert effect_from_json(effect).scope == found.effects[0].scope == Always(("far",))
     assert "<td>far</td>" in study_page(found, "a plant", FIGURE_SCALES)
 
@@ -284,30 +333,34 @@ def test_what_one_heliostat_is_known_to_have_another_may_have():
     """The declared one is not sought again, and the other one's is found beside it."""
     both = [ROUGH, SlopeError(1.5, scope=Always(("near",)))]
     options = StudyOptions(("slope_error", "camera_blur"))
-    found = study(photographs(both), Optics(), [ROUGH], options, latitude_deg=JUELICH_LATITUDE)
-    (effect,) = found.to_json()["effects"]
+    found = study(photographs(both), JUELICH_MODEL.with_effects([ROUGH]), options)
+    (effect,) = study_to_json(found)["effects"]
     assert effect["scope"] == {"kind": "set", "heliostats": ["near"]}
     assert effect["parameters"]["sigma_mrad"]["value"] == pytest.approx(1.5, abs=0.1)
 
 
 def test_a_mirror_that_is_canted_otherwise_is_found_by_name():
-    report = found_in([replace(CANTED, scope=Always())], "facet_canting", "slope_error").to_json()
+    report = study_to_json(
+        found_in([replace(CANTED, scope=Always())], "facet_canting", "slope_error")
+    )
     (found,) = report["effects"]
     assert found["scope"] == {"kind": "set", "heliostats": ["far"]}
     assert list(found["parameters"]["x_mrad"]["value"]) == ["far"]
 
 
 def test_what_is_always_there_is_not_dated():
-    (found,) = found_in([SunShapeEffect(0.12)], "sun_shape", "camera_response").to_json()["effects"]
+    (found,) = study_to_json(found_in([SunShapeEffect(0.12)], "sun_shape", "camera_response"))[
+        "effects"
+    ]
     assert found["scope"] == {"kind": "set"}
 
 
-def test_two_mirrors_that_were_canted_anew_on_different_days_are_both_found():
+def test_two_mirrors_recanted_on_different_days_are_both_found():
     other = FacetCanting(
         {"near": np.array([-1.0, 0.8, 0.6, -0.4])},
         {"near": np.array([0.8, -1.0, -0.6, 0.8])},
         scope=Since(date(2024, 6, 10)),
     )
-    found = found_in([CANTED, other], "facet_canting").to_json()["effects"]
+    found = study_to_json(found_in([CANTED, other], "facet_canting"))["effects"]
     scopes = {tuple(effect["scope"]["heliostats"]): effect["scope"]["since"] for effect in found}
     assert scopes == {("far",): "2024-06-16", ("near",): "2024-06-10"}

@@ -18,7 +18,13 @@ from model.sunshape import (
 from model.tracing import Optics
 
 CPU = torch.device("cpu")
-SHAPES = [Pillbox(), Gaussian(2.5e-3), Buie(0.02), Buie(0.2), Tabulated((0.0, 4e-3, 5e-3), (1.0, 0.8, 0.0))]
+SHAPES = [
+    Pillbox(),
+    Gaussian(2.5e-3),
+    Buie(0.02),
+    Buie(0.2),
+    Tabulated((0.0, 4e-3, 5e-3), (1.0, 0.8, 0.0)),
+]
 
 
 def table(shape):
@@ -32,7 +38,9 @@ def test_pillbox_transfer_is_an_airy_pattern():
 
 def test_gaussian_transfer_is_a_gaussian():
     frequency = FREQUENCY_STEP * np.arange(4096)
-    np.testing.assert_allclose(table(Gaussian(2e-3)), np.exp(-2 * (np.pi * 2e-3 * frequency) ** 2), atol=2e-7)
+    np.testing.assert_allclose(
+        table(Gaussian(2e-3)), np.exp(-2 * (np.pi * 2e-3 * frequency) ** 2), atol=2e-7
+    )
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=repr)
@@ -44,7 +52,9 @@ def test_transfer_keeps_the_energy(shape):
 
 @pytest.mark.parametrize("shape", SHAPES, ids=repr)
 def test_random_angles_have_the_profiles_transfer(shape):
-    """The mean of J0(2 pi f theta) over random rays is the transfer function: both tracers see one sun."""
+    """The mean of J0(2 pi f theta) over random rays is the transfer function: both tracers see one
+    sun.
+    """
     angles = torch.as_tensor(random_angles(shape, 200_000, np.random.default_rng(0)))
     for index in (10, 40, 100):
         mean = torch.special.bessel_j0(2 * np.pi * FREQUENCY_STEP * index * angles).mean()
@@ -53,7 +63,9 @@ def test_random_angles_have_the_profiles_transfer(shape):
 
 @pytest.mark.parametrize("chi", [0.05, 0.1, 0.2])
 def test_buies_chi_is_about_the_circumsolar_share(chi):
-    """Buie et al. 2003: the energy beyond the disc is about chi; far below 0.05 the formula gives less."""
+    """Buie et al. 2003: the energy beyond the disc is about chi; far below 0.05 the formula gives
+    less.
+    """
     angles = random_angles(Buie(chi), 400_000, np.random.default_rng(1))
     assert (angles > SOLAR_DISC).mean() == pytest.approx(chi, rel=0.25)
 
@@ -95,7 +107,10 @@ def test_haze_before_a_pillbox_takes_light_from_the_disc_into_the_aureole():
 
 
 def test_light_beyond_an_end_is_lost_and_the_rest_stays():
-    whole, near = table(Buie(0.3)), transfer_table(Buie(0.3), torch.float64, CPU, (20e-3, 0.1)).numpy()
+    whole, near = (
+        table(Buie(0.3)),
+        transfer_table(Buie(0.3), torch.float64, CPU, (20e-3, 0.1)).numpy(),
+    )
     np.testing.assert_allclose(near[1], whole, atol=1e-12)
     angles = random_angles(Buie(0.3), 400_000, np.random.default_rng(3))
     assert (angles < 18e-3).mean() < near[0, 0] < (angles < 20e-3).mean()

@@ -47,7 +47,9 @@ def test_area_of_the_ideal_surface_is_that_of_its_facets():
 
 
 def test_area_does_not_depend_on_the_parametrisation():
-    """Evenly spaced control points crowd samples in the middle of the facet; the weights make up for it."""
+    """Evenly spaced control points crowd samples in the middle of the facet; the weights make up
+    for it.
+    """
     u = np.linspace(0, 1, 8)
     even = np.stack(np.broadcast_arrays(u[:, None] * 1.6, u[None, :] * 1.3, 0.0), axis=-1)
     samples = sample(torch.as_tensor(even).movedim(-1, -3)[None], 200)
@@ -77,11 +79,13 @@ def test_normals_are_those_of_the_tracer():
     np.testing.assert_allclose(unit.T.numpy(), normals.reshape(-1, 3), atol=1e-12)
 
 
-def test_canting_is_told_from_waviness():
+def test_canting_is_separated_from_waviness():
     x = (2 * greville(8) - 1)[:, None] * np.ones((1, 8))
     waviness = np.sin(3 * x) * 1e-4
     canting, rest = split_canting(np.stack([x * 2e-4, x * 2e-4 + waviness, waviness, 0 * x]))
-    np.testing.assert_allclose(canting + rest, np.stack([x * 2e-4, x * 2e-4 + waviness, waviness, 0 * x]), atol=1e-15)
+    np.testing.assert_allclose(
+        canting + rest, np.stack([x * 2e-4, x * 2e-4 + waviness, waviness, 0 * x]), atol=1e-15
+    )
     np.testing.assert_allclose(canting[1] - canting[0], canting[2], atol=1e-15)
     np.testing.assert_allclose(rest[0], 0, atol=1e-15)
 
@@ -98,11 +102,15 @@ def test_halved_spans_leave_the_surface_as_it_is():
     places = np.linspace(0, 1, 31)
     for coarse_facet, fine_facet in zip(z, fine, strict=True):
         coarse, finer = (basis(n, 3, places)[0] for n in (8, 13))
-        np.testing.assert_allclose(finer @ fine_facet @ finer.T, coarse @ coarse_facet @ coarse.T, atol=1e-12)
+        np.testing.assert_allclose(
+            finer @ fine_facet @ finer.T, coarse @ coarse_facet @ coarse.T, atol=1e-12
+        )
 
 
 def test_heights_of_another_grid_are_those_of_its_control_points():
     heliostat = flat_heliostat((0.0, 50.0, 1.8))
     z = np.random.default_rng(2).normal(0, 1e-4, (4, 13, 13))
     z -= z.mean(axis=(1, 2), keepdims=True)
-    np.testing.assert_allclose(heights(heliostat, control_points(heliostat, z), shape=(13, 13)), z, atol=1e-9)
+    np.testing.assert_allclose(
+        heights(heliostat, control_points(heliostat, z), shape=(13, 13)), z, atol=1e-9
+    )

@@ -1,11 +1,13 @@
-"""A service on SQLite or PostgreSQL with a stand-in for the model, and small makers of what it takes."""
+"""A service on SQLite or PostgreSQL with a stand-in for the model, and small makers of what it
+takes.
+"""
 
 import json
 import os
 import random
+import shutil
 import socket
 import threading
-import time
 import uuid
 import warnings
 from collections.abc import Callable, Iterator
@@ -21,32 +23,48 @@ import pytest
 import uvicorn
 from fastapi import FastAPI
 from sqlalchemy import URL, make_url
+from starlette.routing import BaseRoute
 
 from model.errors import UnreachableError
-from model.fleet import FleetFlux
+from model.fleet import FleetFlux, Superposition
+from model.frames import wgs84_to_enu
 from model.imaging import MeasuredFlux, Quality
 from model.mount import Mount
 from model.observation import Observation, SurfacePrediction
 from model.plant import Heliostat, TargetPlane
+from model.plant_model import PlantModel
+from model.setup import Setup
+from model.surface import control_points
 from service.base.settings import Settings
+from service.jobs.kind import Kinds
+from service.sources.paint_documents import azimuth_from_north
 from service.store.columns import Base
 from service.store.database import Database
-from service.twin.compute import Forecast
+from service.twin.runtime.operations import Forecast
+from service.web import app as web_app
 from service.web.app import create_app
+from tests.conftest import made_once
+from tests.waiting import WAIT_LIMIT_S, until
 
 with warnings.catch_warnings():
     # Starlette's client prefers the successor of httpx, which the environment does not hold.
     warnings.simplefilter("ignore")
     from fastapi.testclient import TestClient
 
-POSTGRES = os.environ.get("HELIOTWIN_TEST_POSTGRES", "postgresql://postgres@127.0.0.1:5432/postgres")
+POSTGRES = os.environ.get(
+    "HELIOTWIN_TEST_POSTGRES", "postgresql://postgres@127.0.0.1:5432/postgres"
+)
 # No workers beside the test, and no bound on how fast it asks.
-QUIET: dict[str, Any] = {"job_workers": 0, "requests_per_s": 1e6, "requests_burst": 10**6}
+QUIET: dict[str, Any] = {"job_workers": 0} | {
+    f"{whose}requests_{what}": 10**6 for whose in ("", "public_") for what in ("per_s", "burst")
+}
 ORIGIN = (50.913421122592574, 6.387824755874856, 87.0)
 
 
 def free_port() -> int:
-    """A port to listen on, below those that the system gives to outgoing connections at any moment."""
+    """A port to listen on, below those that the system gives to outgoing connections at
+    any moment.
+    """
     while True:
         port = random.randint(20_000, 30_000)
         with socket.socket() as probe:
@@ -54,47 +72,108 @@ def free_port() -> int:
                 return port
 
 
-def until(condition: Callable[[], bool], timeout_s: float = 30.0) -> None:
-    end = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < end, "it does not happen"
-        time.sleep(0.02)
-
-
 @contextmanager
 def serving(app: FastAPI, port: int | None = None, **options: Any) -> Iterator[str]:
     """The service behind a real socket; yields its address."""
-    port = free_port() if port is None else port
-    server = uvicorn.Server(uvicorn.Config(app, host="127.0.0.1", port=port, log_config=None, **options))
+    config = uvicorn.Config(app, host="127.0.0.1", port=port or 0, log_config=None, **options)
+    with listening(config, app) as address:
+        yield address
+
+
+@contextmanager
+def listening(config: uvicorn.Config, app: FastAPI) -> Iterator[str]:
+    """The same with a server that is configured already."""
+    server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run)
     thread.start()
     try:
-        until(lambda: server.started)
-        yield f"http://127.0.0.1:{port}"
+        until(lambda: server.started or not thread.is_alive(), "the service listens")
+        yield f"http://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}"
     finally:
         app.state.stopping.set()
         server.should_exit = True
-        thread.join(30)
+        thread.join(WAIT_LIMIT_S)
     assert not thread.is_alive()
 
 
-# --- databases --------------------------------------------------------------------------------------------------------
+# --- what is expensive to make and the same for every test
+# --------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="session")
-def postgres_url() -> Iterator[URL]:
-    """A database of our own on the PostgreSQL server, dropped at the end."""
+@pytest.fixture(scope="session", autouse=True)
+def shared_routes() -> Iterator[None]:
+    """Services with the same job kinds share their routes, which hold no state."""
+    made: list[tuple[Kinds, list[BaseRoute]]] = []
+    collect = web_app.collect_routes
+
+    def collect_once(kinds: Kinds) -> list[BaseRoute]:
+        for known, routes in made:
+            if known == kinds:
+                return routes
+        made.append((kinds, collect(kinds)))
+        return made[-1][1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(web_app, "collect_routes", collect_once)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def copied_schema(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """A SQLite store whose file does not exist begins as a copy of an empty migrated one.
+
+    Tests of the migrations use a file that exists (`empty_url`).
+    """
+    template = tmp_path_factory.mktemp("schema") / "store.sqlite"
+    migrated = Database(URL.create("sqlite", database=str(template)))
+    migrated.upgrade()
+    migrated.close()
+    upgrade = Database.upgrade
+
+    def copy_and_upgrade(self: Database, revision: str = "head") -> None:
+        if revision == "head" and self.url.get_backend_name() == "sqlite" and self.url.database:
+            file = Path(self.url.database)
+            if not file.exists():
+                shutil.copyfile(template, file)
+        upgrade(self, revision)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Database, "upgrade", copy_and_upgrade)
+        yield
+
+
+# --- databases
+# --------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def _postgres_database() -> Iterator[URL]:
+    """A separate database on the PostgreSQL server, dropped at the end."""
     server = make_url(POSTGRES).set(drivername="postgresql")
     address = server.render_as_string(hide_password=False)
     name = f"heliotwin_test_{uuid.uuid4().hex[:12]}"
     try:
-        with psycopg.connect(address, autocommit=True, connect_timeout=3) as connection:
+        with psycopg.connect(address, autocommit=True, connect_timeout=60) as connection:
             connection.execute(f'CREATE DATABASE "{name}"')
     except psycopg.OperationalError as error:
         pytest.skip(f"no PostgreSQL server at {server}: {str(error).splitlines()[0]}")
     yield server.set(drivername="postgresql+psycopg", database=name)
     with psycopg.connect(address, autocommit=True) as connection:
         connection.execute(f'DROP DATABASE "{name}" WITH (FORCE)')
+
+
+@pytest.fixture(scope="session")
+def postgres_url() -> Iterator[URL]:
+    """A database with or without a schema, whose tables are empty."""
+    with _postgres_database() as url:
+        yield url
+
+
+@pytest.fixture(scope="session")
+def unmigrated_postgres_url() -> Iterator[URL]:
+    """A second database, for tests of the migrations."""
+    with _postgres_database() as url:
+        yield url
 
 
 def _empty_postgres(url: URL) -> None:
@@ -109,14 +188,16 @@ def _empty_postgres(url: URL) -> None:
 def empty_url(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[URL]:
     """A database without a schema, on each of the two engines."""
     if request.param == "sqlite":
-        yield URL.create("sqlite", database=str(tmp_path / "store.sqlite"))
+        file = tmp_path / "store.sqlite"
+        file.touch()
+        yield URL.create("sqlite", database=str(file))
         return
-    url: URL = request.getfixturevalue("postgres_url")
-    database = Database(url)
-    database.downgrade("base")  # from where another test left it
+    url: URL = request.getfixturevalue("unmigrated_postgres_url")
+    address = url.set(drivername="postgresql").render_as_string(hide_password=False)
+    with psycopg.connect(address, autocommit=True) as connection:
+        connection.execute("DROP SCHEMA public CASCADE")  # what another test left
+        connection.execute("CREATE SCHEMA public")
     yield url
-    database.downgrade("base")
-    database.close()
 
 
 @pytest.fixture(params=["sqlite", pytest.param("postgres", marks=pytest.mark.postgres)])
@@ -141,19 +222,20 @@ def database(store_url: URL) -> Iterator[Database]:
     opened.close()
 
 
-# --- the model's stand-in ---------------------------------------------------------------------------------------------
+# --- the model's stand-in
+# ---------------------------------------------------------------------------------------------
 
 
 @dataclass
 class FakeOperations:
-    """Answers like `service.twin.compute` at no cost, and remembers what it was asked.
+    """Answers like `service.twin.runtime.operations` at no cost, and remembers what it was asked.
 
-    An image whose first pixel is 0 is refused; a forecast that aims below the ground is out of reach.
+    An image whose first pixel is 0 is refused; a forecast that aims below the ground is out of
+    reach. Surfaces forecast every photograph exactly, the ideal mirror a little worse.
     """
 
     predictions: list[list[Observation]] = field(default_factory=list)
-    believed: list[Any] = field(default_factory=list)
-    latitudes: list[float] = field(default_factory=list)
+    models: list[PlantModel] = field(default_factory=list)
     forecasts: list[dict[str, Any]] = field(default_factory=list)
     fleets: list[dict[str, Any]] = field(default_factory=list)
     mounts: dict[str, Mount] = field(default_factory=dict)
@@ -165,7 +247,9 @@ class FakeOperations:
     ) -> MeasuredFlux:
         self.measured += 1
         if np.ravel(image)[0] == 0:
-            return MeasuredFlux(Quality(accepted=False, reason="no_spot", detail="no spot stands out"))
+            return MeasuredFlux(
+                Quality(accepted=False, reason="no_spot", detail="no spot was found")
+            )
         flux = np.full((256, 256), 100 / 256**2, dtype=np.float32)
         centered = np.full((64, 64), 100 / 64**2, dtype=np.float32)
         if kind == "flux-centered":
@@ -176,16 +260,13 @@ class FakeOperations:
         self,
         heliostat: Heliostat,
         observations: list[Observation],
+        model: PlantModel,
         method: str = "network",
-        optics: Any = None,
-        effects: Any = (),
-        *,
-        latitude_deg: float,
+        progress: Any = None,
     ) -> SurfacePrediction:
-        self.latitudes.append(latitude_deg)
+        self.models.append(model)
         self.predictions.append(list(observations))
         self.mounts["predict"] = heliostat.mount
-        self.believed.append(effects)
         z = np.linspace(-1e-3, 1e-3, 256).reshape(4, 8, 8)
         return SurfacePrediction(
             z=z,
@@ -198,34 +279,66 @@ class FakeOperations:
         )
 
     def render(
-        self,
-        heliostat: Heliostat,
-        observations: list[Observation],
-        z: Any,
-        optics: Any = None,
-        effects: Any = (),
-        *,
-        latitude_deg: float,
+        self, heliostat: Heliostat, observations: list[Observation], z: Any, model: PlantModel
     ) -> Any:
-        self.latitudes.append(latitude_deg)
         self.rendered += 1
         self.mounts["render"] = heliostat.mount
-        return np.stack([observation.flux for observation in observations])
+        right = np.stack([observation.flux for observation in observations])
+        if z is not None:
+            return right
+        wrong = np.zeros_like(right)
+        wrong[:, 0, 0] = 100
+        return 0.9 * right + 0.1 * wrong
 
-    def forecast(self, heliostat: Heliostat, z: Any, sun: Any, plane: TargetPlane, **options: Any) -> Forecast:
-        asked = {"heliostat": heliostat.name, "mount": heliostat.mount, "z": z, "sun": sun, "plane": plane}
-        self.forecasts.append(asked | options)
-        if options["aim"] is not None and options["aim"][2] < 0:
+    def forecast(
+        self,
+        setup: Setup,
+        model: PlantModel,
+        resolution: tuple[int, int],
+        window: float | None = None,
+    ) -> Forecast:
+        heliostat = setup.heliostat
+        asked = vars(setup) | {
+            "heliostat": heliostat.name,
+            "mount": heliostat.mount,
+            "model": model,
+        }
+        is_ideal = np.array_equal(setup.control_points, control_points(heliostat))
+        self.forecasts.append(
+            asked | {"is_ideal": is_ideal, "resolution": resolution, "window": window}
+        )
+        if setup.aim is not None and setup.aim[2] < 0:
             raise UnreachableError("the aim point lies behind the mirror")
-        flux = np.full(options["resolution"], 2.0, dtype=np.float32)
+        flux = np.full(resolution, 2.0, dtype=np.float32)
         center = np.array([0.1, 0.2])
-        return Forecast(flux=flux, center_of_mass=center, peak=2.0, power=50.0, camera_view=flux, model_version="fake")
+        return Forecast(
+            flux=flux,
+            center_of_mass=center,
+            peak=2.0,
+            power=50.0,
+            camera_view=flux,
+            model_version="fake",
+        )
 
-    def superpose(self, receiver: Any, tiles: Any, **options: Any) -> FleetFlux:
-        tiles = list(tiles)
-        self.fleets.append({"receiver": receiver, "tiles": tiles, **options})
-        count = sum(len(tile) for tile in tiles)
-        return FleetFlux(np.full(options["resolution"], 2.0 * count), 60.0 * count, count)
+    def superpose(
+        self,
+        task: Superposition,
+        parts: Any,
+        engine: Any = None,
+        before: Any = None,
+        done: Any = lambda _: None,
+    ) -> FleetFlux:
+        asked: list[Any] = []
+        self.fleets.append(
+            {"receiver": task.receiver, "resolution": task.resolution, "tiles": asked}
+        )
+        made = before or FleetFlux(np.zeros(task.resolution))
+        for tile in parts:
+            asked.append(tile)
+            count = len(tile)
+            made += FleetFlux(np.full(task.resolution, 2.0 * count), 60.0 * count, count)
+            done(made)
+        return made
 
 
 @pytest.fixture
@@ -233,12 +346,15 @@ def operations() -> FakeOperations:
     return FakeOperations()
 
 
-# --- the service ------------------------------------------------------------------------------------------------------
+# --- the service
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
 def settings(tmp_path: Path) -> Settings:
-    return Settings(data_dir=tmp_path / "data", max_image_bytes=200_000, max_image_pixels=500_000, **QUIET)
+    return Settings(
+        data_dir=tmp_path / "data", max_image_bytes=200_000, max_image_pixels=500_000, **QUIET
+    )
 
 
 def client_of(app: FastAPI) -> TestClient:
@@ -268,16 +384,28 @@ def client(bare: TestClient, tower: dict[str, Any], properties: dict[str, Any]) 
 
 @pytest.fixture(scope="session")
 def refusing(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
-    """A service for requests that must be refused: shared, because they change nothing; checked at the end."""
+    """A service for requests that must be refused: shared, because they change nothing; checked at
+    the end.
+    """
     settings = Settings(
-        data_dir=tmp_path_factory.mktemp("refusing"), max_image_bytes=200_000, max_image_pixels=500_000, **QUIET
+        data_dir=tmp_path_factory.mktemp("refusing"),
+        max_image_bytes=200_000,
+        max_image_pixels=500_000,
+        **QUIET,
     )
     with client_of(create_app(settings, FakeOperations())) as client:
         client.put("/v1/plant", json=tower_document())
         client.put("/v1/heliostats/AA39", json=properties_document())
 
         def state() -> list[str]:
-            paths = ("plant", "targets", "heliostats", "heliostats/AA39", "heliostats/AA39/measurements", "forecasts")
+            paths = (
+                "plant",
+                "targets",
+                "heliostats",
+                "heliostats/AA39",
+                "heliostats/AA39/measurements",
+                "forecasts",
+            )
             return [client.get(f"/v1/{path}").text for path in paths]
 
         before = state()
@@ -286,7 +414,8 @@ def refusing(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
         assert not [path for path in (settings.data_dir / "images").rglob("*") if path.is_file()]
 
 
-# --- things to send ---------------------------------------------------------------------------------------------------
+# --- things to send
+# --------------------------------------------------------------------------------------------------
 
 
 def _target(altitude: float) -> dict[str, Any]:
@@ -328,7 +457,11 @@ def _actuator(clockwise: int, initial_angle: float) -> dict[str, Any]:
 
 
 def _facet(x: float, y: float) -> dict[str, Any]:
-    return {"translation_vector": [x, y, 0.04], "canting_e": [0.8025, 0.0, 0.0], "canting_n": [0.0, 0.6375, 0.0]}
+    return {
+        "translation_vector": [x, y, 0.04],
+        "canting_e": [0.8025, 0.0, 0.0],
+        "canting_n": [0.0, 0.6375, 0.0],
+    }
 
 
 @pytest.fixture
@@ -350,7 +483,12 @@ def properties_document() -> dict[str, Any]:
         },
         "facet_properties": {
             "number_of_facets": 4,
-            "facets": [_facet(-0.8, 0.64), _facet(0.8, 0.64), _facet(-0.8, -0.64), _facet(0.8, -0.64)],
+            "facets": [
+                _facet(-0.8, 0.64),
+                _facet(0.8, 0.64),
+                _facet(-0.8, -0.64),
+                _facet(0.8, -0.64),
+            ],
         },
         "renovation": "2021-04-15",
     }
@@ -369,16 +507,42 @@ def png(seed: int = 1, size: tuple[int, int] = (32, 32), refused: bool = False) 
     return cv2.imencode(".png", pixels)[1].tobytes()
 
 
+def sun_at(azimuth_deg: Any = 160.0, elevation_deg: Any = 45.0) -> dict[str, Any]:
+    """A sun position as JSON."""
+    return {"azimuth_deg": azimuth_deg, "elevation_deg": elevation_deg}
+
+
+def spot_of(latitude_deg: float, longitude_deg: float, altitude_m: float) -> list[float]:
+    """A place in the plant's frame: east, north, up [m], to a micrometre."""
+    spot: list[float] = (
+        wgs84_to_enu((latitude_deg, longitude_deg, altitude_m), ORIGIN).round(6).tolist()
+    )
+    return spot
+
+
 def metadata(**changes: Any) -> dict[str, Any]:
     """What goes with an image."""
-    return {"kind": "flux", "target_name": "lower", "sun_azimuth": 20.0, "sun_elevation": 45.0, **changes}
+    return {"kind": "flux", "target": "lower", "sun": sun_at(160.0), **changes}
+
+
+def paint_measurement() -> dict[str, Any]:
+    """The same as PAINT's ``calibration-properties.json``."""
+    return {"target_name": "lower", "sun_azimuth": 20.0, "sun_elevation": 45.0}
+
+
+def metadata_of(paint: dict[str, Any]) -> dict[str, Any]:
+    """Metadata of REST, without an image's, of PAINT's ``calibration-properties.json``."""
+    azimuth_deg = azimuth_from_north(paint["sun_azimuth"])
+    return {"target": paint["target_name"], "sun": sun_at(azimuth_deg, paint["sun_elevation"])}
 
 
 Post = Callable[..., Any]
 
 
 def poster(client: TestClient) -> Post:
-    def send(image: bytes | None = None, heliostat: str = "AA39", raw: str | None = None, **changes: Any) -> Any:
+    def send(
+        image: bytes | None = None, heliostat: str = "AA39", raw: str | None = None, **changes: Any
+    ) -> Any:
         document = json.dumps(metadata(**changes)) if raw is None else raw
         return client.post(
             f"/v1/heliostats/{heliostat}/measurements",
@@ -399,3 +563,30 @@ def post(client: TestClient) -> Post:
 def refused_post(refusing: TestClient) -> Post:
     """The same to a service that must refuse it."""
     return poster(refusing)
+
+
+# --- what the product made of real photographs
+# ------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="session")
+def real_store(stj: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a store that the product filled (`tests.service.real.fill`); read it only."""
+    from tests.service import real  # it needs this module
+
+    return made_once(tmp_path_factory, "real-store", lambda folder: real.fill(stj, folder))
+
+
+@pytest.fixture
+def real_copy(real_store: Path, tmp_path: Path) -> Path:
+    """A copy of it, which a test may change."""
+    return Path(shutil.copytree(real_store, tmp_path / "real"))
+
+
+@pytest.fixture
+def real_client(real_copy: Path) -> Iterator[TestClient]:
+    """The service, with the real model, on that copy; it works at no job by itself."""
+    from tests.service import real  # it needs this module
+
+    with real.client_on(real_copy) as client:
+        yield client

@@ -9,7 +9,7 @@ import torch
 from model.metrics import surface_error
 from model.network.architecture import MAX_IMAGES, NetworkConfig
 from model.network.predictor import default_predictor
-from model.plant import JUELICH_LATITUDE
+from model.plant_model import JUELICH_MODEL
 from training import crossvalidate, plots
 from training.cases import ELSEWHERE, MAX_DISTANCE, SOURCE, Case, make_cases, within_reach
 from training.config import TrainConfig
@@ -38,7 +38,9 @@ def cases(stj, surfaces) -> list[Case]:
 def run(stj, tmp_path_factory) -> Run:
     config = TrainConfig(data=str(stj), steps=1, batch=2, network=SMALL, bfloat16=False)
     run = Run(config, tmp_path_factory.mktemp("run"), torch.device("cpu"))
-    torch.nn.init.normal_(run.average.decoder[-1].weight, std=0.1)  # untrained it answers with the guess
+    torch.nn.init.normal_(
+        run.average.decoder[-1].weight, std=0.1
+    )  # untrained it answers with the guess
     run.save()
     return run
 
@@ -100,14 +102,17 @@ def test_a_runs_folder_is_evaluated_from_as_many_images_as_asked(run, cases):
     assert z.shape == (4, 8, 8)
     assert z_std is None
     assert np.abs(z - method(cases[0], 4)[0]).max() > 0
-    np.testing.assert_allclose(by_run(run, looks=1)(cases[0], 3)[0], by_network(run.folder, looks=1)(cases[0], 3)[0])
+    np.testing.assert_allclose(
+        by_run(run, n_iterations=1)(cases[0], 3)[0],
+        by_network(run.folder, n_iterations=1)(cases[0], 3)[0],
+    )
     assert set(held_out_of(run.folder)) == set(run.names) - set(run.learnt)
 
 
 def test_the_exported_network_is_asked_as_the_product_asks_it(cases):
-    z, z_std = by_onnx(default_predictor(), looks=1)(cases[0], 2)
+    z, z_std = by_onnx(default_predictor(), n_iterations=1)(cases[0], 2)
     expected = default_predictor().predict(
-        cases[0].heliostat, cases[0].observations[:2], looks=1, latitude_deg=JUELICH_LATITUDE
+        cases[0].heliostat, cases[0].observations[:2], JUELICH_MODEL, n_iterations=1
     )
     np.testing.assert_array_equal(z, expected.z)
     assert z_std is not None
@@ -116,7 +121,9 @@ def test_the_exported_network_is_asked_as_the_product_asks_it(cases):
 def test_tables_and_plots_of_an_evaluation(run, cases, tmp_path):
     mean = run.mean.double().numpy()
     methods = compared(run.folder, run.folder, mean)
-    methods.update(dict.fromkeys(SLOW, lambda case, images: (case.truth / images, np.full((4, 8, 8), 1e-4))))
+    methods.update(
+        dict.fromkeys(SLOW, lambda case, images: (case.truth / images, np.full((4, 8, 8), 1e-4)))
+    )
     evaluation = evaluate(methods, cases, few=3)
     assert evaluation.figures[REFINEMENT].cases == 3
     assert evaluation.figures["network"].cases == COUNT
@@ -162,7 +169,7 @@ def test_every_heliostat_but_those_apart_is_held_out_in_one_fold(stj):
             fold_of(names, fold, 5)
 
 
-def test_cross_validation_tells_the_spread_between_folds(surfaces, cases):
+def test_cross_validation_reports_the_spread_between_folds(surfaces, cases):
     ideal = outcomes_of(always(np.zeros((4, 8, 8))), cases)
     folds = [{"ideal surface": Figures.of(part, part)} for part in (ideal[:3], ideal[3:])]
     values = [fold["ideal surface"].mae_mm["mean"] for fold in folds]

@@ -39,7 +39,9 @@ def test_a_surface_of_its_own_kind_is_found_again(measured, truth):
 
 
 def test_residuals_are_the_noise_of_the_normals(measured):
-    """Angles of two normal components of 0.2 mrad are Rayleigh-distributed; 64 heights take little of them away."""
+    """Angles of two normal components of 0.2 mrad are Rayleigh-distributed; 64 heights take little
+    of them away.
+    """
     rng = np.random.default_rng(0)
     noisy = replace(measured, normals=[n + rng.normal(0, 2e-4, n.shape) for n in measured.normals])
     residuals = fit(noisy).residuals_mrad
@@ -67,7 +69,9 @@ def test_flux_is_lost_by_what_the_heights_leave_out(heliostat, truth, measured):
 
 def test_ripples_are_what_the_heights_leave_out(heliostat, truth, measured):
     directions = ripples(heliostat.facet_frames[2])
-    rippled = halved(truth) + np.tensordot(np.random.default_rng(4).normal(size=len(directions)), directions, axes=1)
+    rippled = halved(truth) + np.tensordot(
+        np.random.default_rng(4).normal(size=len(directions)), directions, axes=1
+    )
     line = row(replace(measured, fine=control_points(heliostat, rippled)), fit(measured))
     assert float(line[-1]) == pytest.approx(1e3 * (rippled - halved(truth)).std(), abs=0.004)
     assert row(measured, fit(measured))[-2:] == ["", ""]
@@ -78,7 +82,11 @@ def test_both_kinds_of_files_are_read(tmp_path, measured, truth):
         "heliostat_position": [50.9140, 6.3878, 88.8],
         "facet_properties": {
             "facets": [
-                {"translation_vector": list(f.position), "canting_e": list(f.canting_x), "canting_n": list(f.canting_y)}
+                {
+                    "translation_vector": list(f.position),
+                    "canting_e": list(f.canting_x),
+                    "canting_n": list(f.canting_y),
+                }
                 for f in measured.heliostat.facets
             ]
         },
@@ -88,8 +96,12 @@ def test_both_kinds_of_files_are_read(tmp_path, measured, truth):
     for name in ("AA01", "AA02", "AA03"):
         for part in ("Properties", "Deflectometry"):
             (tmp_path / name / part).mkdir(parents=True)
-        (tmp_path / name / "Properties" / f"{name}-heliostat-properties.json").write_text(json.dumps(properties))
-    with h5py.File(tmp_path / "AA01" / "Deflectometry" / "AA01-filled-deflectometry.h5", "w") as file:
+        (tmp_path / name / "Properties" / f"{name}-heliostat-properties.json").write_text(
+            json.dumps(properties)
+        )
+    with h5py.File(
+        tmp_path / "AA01" / "Deflectometry" / "AA01-filled-deflectometry.h5", "w"
+    ) as file:
         for index in range(4):
             file[f"facet{index + 1}/surface_points"] = measured.points[index]
             file[f"facet{index + 1}/surface_normals"] = measured.normals[index]

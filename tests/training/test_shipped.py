@@ -20,13 +20,13 @@ COUNT = 14
 """Two places of each test mirror."""
 
 
-@pytest.mark.parametrize(("camera", "most_mm"), [(CleanCamera(), 0.125), (Camera(), 0.145)])
-def test_shipped_weights_predict_test_mirrors_as_well_as_it_is_said(stj, camera, most_mm):
+@pytest.mark.parametrize(("camera", "max_mm"), [(CleanCamera(), 0.125), (Camera(), 0.145)])
+def test_shipped_weights_predict_test_mirrors_as_well_as_it_is_said(stj, camera, max_mm):
     surfaces, names = load_part(stj, "test")
     cases = make_cases(surfaces, names, load_field(stj), COUNT, camera)
     ideal = outcomes_of(always(np.zeros((4, 8, 8))), cases)
     found = Figures.of(outcomes_of(by_onnx(default_predictor()), cases), ideal)
-    assert found.mae_mm["mean"] < most_mm
+    assert found.mae_mm["mean"] < max_mm
     assert found.flux_accuracy > 0.94
     assert found.covered is not None
     assert 0.85 < found.covered < 0.96
@@ -43,5 +43,5 @@ def test_the_card_is_of_the_shipped_weights_and_of_the_training_that_the_reposit
     assert set(card["trained_on"]["learnt"]).isdisjoint(card["trained_on"]["held_out"])
 
 
-def test_it_tells_no_path_of_the_machine_that_exported_it():
+def test_exported_network_has_no_path_of_its_machine():
     assert b'File "' not in WEIGHTS.read_bytes()

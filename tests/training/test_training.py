@@ -11,11 +11,10 @@ import torch
 from model.effects import effect_to_json
 from model.errors import InvalidInputError
 from model.network.architecture import NetworkConfig
-from model.network.catalogue import sizes_of
 from model.surface import mirrored, split_canting
 from training.config import TrainConfig
 from training.prior import estimate
-from training.render import Camera, Situations, load_field, render
+from training.render import Camera, SceneSampler, load_field, render
 from training.surfaces import (
     Augmentation,
     load_surfaces,
@@ -25,7 +24,7 @@ from training.surfaces import (
     untilted,
     with_symmetries,
 )
-from training.train import Run, commit_of, loss_terms
+from training.train import Run, commit_of, loss_terms, validate
 
 SMALL = NetworkConfig(channels=(8, 16, 16), features=32, hidden=32)
 
@@ -55,18 +54,25 @@ def test_turning_twice_and_mirroring_twice_change_nothing(surfaces):
 
 
 def test_a_mirrored_surface_throws_a_mirrored_spot(surfaces):
-    """On a heliostat due north under a noon sun the flux of the mirrored surface is the mirrored flux."""
+    """On a heliostat due north under a noon sun the flux of the mirrored surface is the mirrored
+    flux.
+    """
     from model.plant import Heliostat, TargetPlane
+    from model.setup import Setup
     from model.surface import control_points
     from model.tracing import Scene, Window, trace
 
     heliostat = Heliostat.juelich("synthetic", np.array([0.0, 80.0, 1.8]), 90.0)
-    plane = TargetPlane("t", np.array([0.0, 0, 40]), np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), 8, 8)
+    plane = TargetPlane(
+        "t", np.array([0.0, 0, 40]), np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), 8, 8
+    )
     sun = np.array([0.0, -0.6, 0.8])
     angles = heliostat.mount.align(heliostat.position, sun, plane.center)
     flux = []
     for z in (surfaces[3], mirrored(surfaces[3])):
-        scene = Scene.build([heliostat], [control_points(heliostat, z)], [angles], [sun], [plane])
+        scene = Scene.from_setups(
+            [Setup(heliostat, control_points(heliostat, z), sun, plane)], [angles]
+        )
         flux.append(trace(scene, Window(8, 8)).normalized()[0])
     assert float((flux[1].flip(1) - flux[0]).abs().sum()) < 0.1
 
@@ -75,12 +81,16 @@ def test_samples_resemble_the_measured_surfaces(surfaces):
     drawn = Augmentation().sample(surfaces, 400, np.random.default_rng(0))
     mean = surfaces.mean(axis=0)
     for part, (low, high) in zip((0, 1), ((0.8, 3.0), (0.8, 2.0)), strict=True):
-        sizes = [np.median(split_canting(z - mean)[part].std(axis=(1, 2, 3))) for z in (drawn, surfaces)]
+        sizes = [
+            np.median(split_canting(z - mean)[part].std(axis=(1, 2, 3))) for z in (drawn, surfaces)
+        ]
         assert low < sizes[0] / sizes[1] < high
 
 
 def test_some_samples_are_many_times_as_rough_as_most(surfaces):
-    waviness = split_canting(Augmentation().sample(surfaces, 1000, np.random.default_rng(0)) - surfaces.mean(axis=0))[1]
+    waviness = split_canting(
+        Augmentation().sample(surfaces, 1000, np.random.default_rng(0)) - surfaces.mean(axis=0)
+    )[1]
     size = waviness.std(axis=(1, 2, 3))
     assert 0.01 < (size > 3 * np.median(size)).mean() < 0.15
 
@@ -100,7 +110,9 @@ def test_fresh_samples_are_no_mixtures_of_the_measured_surfaces(surfaces):
 
 def test_rendered_images_are_normalised_and_reproducible(surfaces, stj):
     field, device = load_field(stj), torch.device("cpu")
-    first, again, other = (render(surfaces[:3], 4, field, Situations(), Camera(), device, seed) for seed in (1, 1, 2))
+    first, again, other = (
+        render(surfaces[:3], 4, field, SceneSampler(), Camera(), device, seed) for seed in (1, 1, 2)
+    )
     assert first.flux.shape == first.clipped.shape == (3, 4, 64, 64)
     assert first.setups.conditions().shape == (3, 4, 12)
     torch.testing.assert_close(first.flux.sum(dim=(2, 3)), torch.full((3, 4), 100.0))
@@ -109,19 +121,43 @@ def test_rendered_images_are_normalised_and_reproducible(surfaces, stj):
 
 
 def test_a_perfect_camera_sees_what_was_traced(surfaces, stj):
-    perfect = Camera(0.02, 0.0, gamma=1.0, compression=0.0, warp=0.0, background=0.0, noise=0.0, exposure=(0.9, 1.0))
+    perfect = Camera(
+        0.02,
+        0.0,
+        gamma=1.0,
+        compression=0.0,
+        warp=0.0,
+        background=0.0,
+        noise=0.0,
+        exposure=(0.9, 1.0),
+    )
     seen, traced = (
-        render(surfaces[:2], 4, load_field(stj), Situations(), camera, torch.device("cpu"), 3).flux
+        render(
+            surfaces[:2], 4, load_field(stj), SceneSampler(), camera, torch.device("cpu"), 3
+        ).flux
         for camera in (perfect, None)
     )
-    assert float((seen - traced).abs().sum(dim=(2, 3)).max()) < 2.5  # of 100: the sun's haze is drawn, and 8 bits
+    assert (
+        float((seen - traced).abs().sum(dim=(2, 3)).max()) < 2.5
+    )  # of 100: the sun's haze is drawn, and 8 bits
     assert not torch.equal(seen, traced)
 
 
 def test_what_a_camera_cuts_off_is_cut_off_of_guesses_too(surfaces, stj):
-    """Light above the range is no error of a surface: the true one still explains the photograph."""
-    bright = Camera(0.02, 0.0, gamma=1.0, compression=0.0, warp=0.0, background=0.0, noise=0.0, exposure=(1.4, 1.5))
-    seen = render(surfaces[:2], 4, load_field(stj), Situations(), bright, torch.device("cpu"), 3)
+    """Light above the range is no error of a surface: the true one still explains the
+    photograph.
+    """
+    bright = Camera(
+        0.02,
+        0.0,
+        gamma=1.0,
+        compression=0.0,
+        warp=0.0,
+        background=0.0,
+        noise=0.0,
+        exposure=(1.4, 1.5),
+    )
+    seen = render(surfaces[:2], 4, load_field(stj), SceneSampler(), bright, torch.device("cpu"), 3)
     assert 0.005 < float(seen.clipped.mean()) < 0.3
     truth = torch.as_tensor(surfaces[:2], dtype=torch.float32)
     misfit = [
@@ -132,14 +168,17 @@ def test_what_a_camera_cuts_off_is_cut_off_of_guesses_too(surfaces, stj):
     assert misfit[1] > 3 * misfit[0]
 
 
-def test_worlds_of_a_camera_stay_within_its_limits():
+def test_conditions_of_a_camera_stay_within_its_limits():
     camera, rng = Camera(gamma=1.2, compression=1.0), np.random.default_rng(0)
-    worlds = [{e.name: effect_to_json(e)["parameters"] for e in camera.effects(0.5, rng)} for _ in range(200)]
-    gammas = [world["camera_response"]["gamma"] for world in worlds]
+    conditions = [
+        {e.name: effect_to_json(e)["parameters"] for e in camera.effects(0.5, rng)}
+        for _ in range(200)
+    ]
+    gammas = [world["camera_response"]["gamma"] for world in conditions]
     assert 1.2**-0.5 <= min(gammas) < 0.93
     assert 1.07 < max(gammas) <= 1.2**0.5
-    assert 0.4 < max(world["camera_shoulder"]["compression"] for world in worlds) <= 0.5
-    assert max(world["sun_shape"]["circumsolar_ratio"] for world in worlds) <= (0.02 + 0.15) / 2
+    assert 0.4 < max(world["camera_shoulder"]["compression"] for world in conditions) <= 0.5
+    assert max(world["sun_shape"]["circumsolar_ratio"] for world in conditions) <= (0.02 + 0.15) / 2
 
 
 def test_prior_explains_measured_surfaces_and_holds_no_tilt_of_the_whole_mirror(surfaces):
@@ -154,7 +193,9 @@ def test_prior_explains_measured_surfaces_and_holds_no_tilt_of_the_whole_mirror(
 def test_prior_hides_as_much_tilt_as_the_measured_surfaces_have(surfaces):
     hidden = estimate(surfaces).hidden
     np.testing.assert_allclose(untilted(hidden), 0, atol=1e-12)
-    np.testing.assert_allclose((hidden**2).sum(axis=0).mean(), ((surfaces - untilted(surfaces)) ** 2).mean(), rtol=0.05)
+    np.testing.assert_allclose(
+        (hidden**2).sum(axis=0).mean(), ((surfaces - untilted(surfaces)) ** 2).mean(), rtol=0.05
+    )
 
 
 def test_a_run_learns_saves_and_resumes(stj, tmp_path):
@@ -174,7 +215,7 @@ def test_a_run_learns_saves_and_resumes(stj, tmp_path):
     for a, b in zip(whole.network.parameters(), resumed.network.parameters(), strict=True):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-6)
     assert TrainConfig.read(tmp_path / "half" / "config.json") == config
-    assert np.isfinite(resumed.validate(repeats=1)).all()
+    assert np.isfinite(validate(resumed, repeats=1)).all()
 
 
 def test_rough_mirrors_weigh_less_and_their_spread_all_the_same():
@@ -188,14 +229,11 @@ def test_rough_mirrors_weigh_less_and_their_spread_all_the_same():
 
 
 def test_unfinished_training_stops_when_time_is_up(stj, tmp_path):
-    run = Run(TrainConfig(data=str(stj), steps=5, batch=2, network=SMALL), tmp_path, torch.device("cpu"))
+    run = Run(
+        TrainConfig(data=str(stj), steps=5, batch=2, network=SMALL), tmp_path, torch.device("cpu")
+    )
     run.train(minutes=0.0)
     assert run.step == 0
     resumed = Run(run.config, tmp_path, torch.device("cpu"))
     assert resumed.commit == run.commit == commit_of(Path(__file__).parent)
     assert json.loads(Path(tmp_path / "config.json").read_text())["steps"] == 5
-
-
-def test_a_network_of_no_catalogue_is_refused_by_name():
-    with pytest.raises(InvalidInputError, match="'architecture' 'magic' is unknown; it must be one of ours"):
-        sizes_of("magic", {})

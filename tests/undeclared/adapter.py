@@ -1,4 +1,5 @@
-"""A generated set as the product takes it: its own types, or a measurement folder in PAINT's layout.
+"""A generated set as the product takes it: its own types, or a measurement folder in PAINT's
+layout.
 
 Of all modules of the generator only this one knows the product.
 """
@@ -14,12 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.effects import Effect, effects_from_json
-from model.forecast import Setup
 from model.frames import enu_to_wgs84, sun_angles
 from model.mount import Mount
 from model.plant import Facet, Heliostat, TargetPlane
+from model.setup import Setup
 from model.study import FluxImage
 from model.surface import control_points, fit_heights
+from service.sources.paint_documents import azimuth_from_south
 from tests.undeclared import plant, sky
 from tests.undeclared.generator import MeasurementSet
 from tests.undeclared.plan import Plan
@@ -32,7 +34,9 @@ SAMPLES = 48
 
 def target_of(target: plant.Target) -> TargetPlane:
     """A target."""
-    return TargetPlane(target.name, target.center, target.normal, target.up, target.width, target.height)
+    return TargetPlane(
+        target.name, target.center, target.normal, target.up, target.width, target.height
+    )
 
 
 def heliostat_of(heliostat: plant.Heliostat) -> Heliostat:
@@ -77,19 +81,27 @@ def setups_of(made: MeasurementSet) -> list[Setup]:
 def flux_images(made: MeasurementSet, encoders: Sequence[Array] | None = None) -> list[FluxImage]:
     """Images of light alone, without times, and with what encoders said where that is given."""
     said = encoders or [None] * len(made.plans)
-    setups = [replace(setup, angles=angles) for setup, angles in zip(setups_of(made), said, strict=True)]
+    setups = [
+        replace(setup, angles=angles) for setup, angles in zip(setups_of(made), said, strict=True)
+    ]
     return [FluxImage(setup, image) for setup, image in zip(setups, made.images, strict=True)]
 
 
-# --- a folder ---------------------------------------------------------------------------------------------------------
+# --- a folder
+# --------------------------------------------------------------------------------------------------
 
 
 def write_folder(made: MeasurementSet, root: Path) -> Path:
     """A measurement folder in PAINT's layout, with surfaces and times."""
-    _write(root / "WRI0000001-tower-measurements.json", _tower({p.target.name: p.target for p in made.plans}))
+    _write(
+        root / "WRI0000001-tower-measurements.json",
+        _tower({p.target.name: p.target for p in made.plans}),
+    )
     _write(root / "twin.json", {"declared": {"sun": {"shape": "buie", "circumsolar_ratio": 0.02}}})
     for name, mirror in {plan.heliostat.name: plan.heliostat for plan in made.plans}.items():
-        _write(root / name / "Properties" / f"{name}-heliostat-properties.json", _properties(mirror))
+        _write(
+            root / name / "Properties" / f"{name}-heliostat-properties.json", _properties(mirror)
+        )
         surface = root / name / "Deflectometry" / f"{name}-nurbs-surface.npz"
         surface.parent.mkdir(parents=True)
         np.savez_compressed(surface, control_points=surface_of(mirror))
@@ -116,11 +128,15 @@ def _wgs84(place: Array) -> list[float]:
 
 def _tower(targets: dict[str, plant.Target]) -> dict[str, Any]:
     """The contents of ``tower-measurements.json``."""
-    tower: dict[str, Any] = {"power_plant_properties": {"ID": "WRI0000001", "coordinates": sky.PLACE.tolist()}}
+    tower: dict[str, Any] = {
+        "power_plant_properties": {"ID": "WRI0000001", "coordinates": sky.PLACE.tolist()}
+    }
     for name, target in targets.items():
         right, up, normal = target.axes
         corners = {
-            f"{row}_{column}": _wgs84(target.center + (y * target.height * up + x * target.width * right) / 2)
+            f"{row}_{column}": _wgs84(
+                target.center + (y * target.height * up + x * target.width * right) / 2
+            )
             for row, y in (("upper", 1), ("lower", -1))
             for column, x in (("left", -1), ("right", 1))
         }
@@ -130,7 +146,9 @@ def _tower(targets: dict[str, plant.Target]) -> dict[str, Any]:
 
 def _properties(heliostat: plant.Heliostat) -> dict[str, Any]:
     """The contents of ``heliostat-properties.json``; nothing is known of its drives."""
-    kinematics: dict[str, Any] = {f"joint_translation_{axis}_{stage}": 0.0 for axis in "enu" for stage in (1, 2)}
+    kinematics: dict[str, Any] = {
+        f"joint_translation_{axis}_{stage}": 0.0 for axis in "enu" for stage in (1, 2)
+    }
     kinematics |= {"concentrator_translation_n": 0.175, "actuators": []}
     facets = [
         {
@@ -154,7 +172,7 @@ def _measurement(plan: Plan) -> dict[str, Any]:
     azimuth, elevation = sun_angles(plan.sun())
     return {
         "target_name": plan.target.name,
-        "sun_azimuth": float(azimuth),
+        "sun_azimuth": azimuth_from_south(float(azimuth)),
         "sun_elevation": float(elevation),
         "focal_spot": {"UTIS": _wgs84(plan.goal)},
     }

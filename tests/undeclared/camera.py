@@ -1,7 +1,9 @@
-"""Cameras before the target: what the rays' hits become as light, as counts of light alone, and as a photograph.
+"""Cameras before the target: what the rays' hits become as light, as counts of light alone, and as
+a photograph.
 
-A photograph shows a white sheet by daylight, with its seams, marks and stains, and the mirror's light upon it; the
-camera is exposed as cameras are, encodes light for human eyes, clips what is too bright and keeps 8 bits.
+A photograph shows a white sheet by daylight, with its seams, marks and stains, and the mirror's
+light upon it; the camera is exposed as cameras are, encodes light for human eyes, clips what is too
+bright and keeps 8 bits.
 """
 
 from collections.abc import Iterable, Sequence
@@ -31,14 +33,17 @@ WELL = 2e4
 """Electrons that make the largest count."""
 
 AVERAGED = 30
-"""Photographs that a real sheet is averaged of: what is left of their own noise is 0.4 %."""
+"""Number of photographs that are averaged for a real sheet: the remaining noise is 0.4 %."""
 
 DAYLIGHT, EXPOSURE = (0.2, 0.34), (0.5, 0.95)
-"""Light of the sheet by day, and of the spot's peak over it, in shares of what the camera can tell."""
+"""Intensity of the sheet by day, and of the spot's peak over it: shares of the camera's range."""
 
 
-def light(rays: Iterable[tuple[Rays, Rays]], target: Target, world: World, rng: np.random.Generator) -> Array:
-    """What a sensor says (256, 256) of hits (2, n) [m] and their light (n,) alone, of the brightest place.
+def light(
+    rays: Iterable[tuple[Rays, Rays]], target: Target, world: World, rng: np.random.Generator
+) -> Array:
+    """What a sensor says (256, 256) of hits (2, n) [m] and their light (n,) alone, of the brightest
+    place.
 
     Over a whole target, row 0 at the top.
     """
@@ -53,24 +58,34 @@ def light(rays: Iterable[tuple[Rays, Rays]], target: Target, world: World, rng: 
 
 def counts(light: Array, rng: np.random.Generator) -> Array:
     """An 8-bit image of light alone: no daylight, no curve."""
-    return np.round(255 * light / light.max() + READ_NOISE * rng.standard_normal(light.shape)).clip(0, 255)
+    return np.round(255 * light / light.max() + READ_NOISE * rng.standard_normal(light.shape)).clip(
+        0, 255
+    )
 
 
 def photograph(light: Array, target: Target, world: World, rng: np.random.Generator) -> Photograph:
     """An 8-bit photograph (256, 256) of light on the sheet by day."""
     across, down = rng.uniform(-0.2, 0.2, 2)
     x = np.linspace(-1, 1, PIXELS)
-    day = rng.uniform(*DAYLIGHT) * (1 + across * x + down * x[:, None] - 0.05 * (x**2 + x[:, None] ** 2))
+    day = rng.uniform(*DAYLIGHT) * (
+        1 + across * x + down * x[:, None] - 0.05 * (x**2 + x[:, None] ** 2)
+    )
     sensed = sheet(target.name) * (day + rng.uniform(*EXPOSURE) * light)
     sensed = rng.poisson(WELL * sensed.clip(min=0)) / WELL
     encoded = _encoded(sensed.clip(max=1) ** world.law)
-    return np.round(255 * encoded + READ_NOISE * rng.standard_normal(encoded.shape)).clip(0, 255).astype(np.uint8)
+    return (
+        np.round(255 * encoded + READ_NOISE * rng.standard_normal(encoded.shape))
+        .clip(0, 255)
+        .astype(np.uint8)
+    )
 
 
 def _seen(
     hits: Rays, power: Rays, target: Target, world: World, rng: np.random.Generator
 ) -> Iterable[tuple[Rays, Rays]]:
-    """Where light that hits the target appears on the photograph, still in metres, and how bright."""
+    """Where light that hits the target appears on the photograph, still in metres, and
+    how bright.
+    """
     half = np.array([[target.width], [target.height]], dtype=np.float32) / 2
     power = power * (np.abs(hits) < half).all(axis=0)
     if world.blur_m:
@@ -99,9 +114,13 @@ def _histogram(hits: Rays, power: Rays, target: Target) -> Array:
 
 
 def _sensed(photons: Array, target: Target, world: World, rng: np.random.Generator) -> Array:
-    """Of an image in photons, whose noise is the rays' own: with stray light, and the sensor's response."""
+    """Of an image in photons, whose noise is the rays' own: with stray light, and the sensor's
+    response.
+    """
     level, gradient_x, gradient_y = world.stray
-    x, y = (size * ((np.arange(PIXELS) + 0.5) / PIXELS - 0.5) for size in (target.width, target.height))
+    x, y = (
+        size * ((np.arange(PIXELS) + 0.5) / PIXELS - 0.5) for size in (target.width, target.height)
+    )
     stray = _peak(photons) * (level + gradient_x * x - gradient_y * y[:, None])
     photons = photons + rng.poisson(stray.clip(min=0))
     share = (photons / _peak(photons)).clip(max=world.saturation) ** world.gamma
@@ -124,7 +143,8 @@ def _decoded(counts: Array) -> Array:
     return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
 
 
-# --- the sheet --------------------------------------------------------------------------------------------------------
+# --- the sheet
+# --------------------------------------------------------------------------------------------------
 
 
 def empty_targets() -> list[Path]:
@@ -134,25 +154,34 @@ def empty_targets() -> list[Path]:
 
 @lru_cache(maxsize=8)
 def sheet(target: str) -> Array:
-    """Reflectance (256, 256) of a target's sheet: that of Juelich, or a drawn one where the data are not there."""
+    """Reflectance (256, 256) of a target's sheet: that of Juelich, or a drawn one where the data
+    are not there.
+    """
     crops = empty_targets()
     return real_sheet(target, crops) if crops else drawn_sheet(target)
 
 
 def real_sheet(target: str, crops: Sequence[Path]) -> Array:
-    """Reflectance (256, 256) of the sheet on photographs: the mean of their light, each without its daylight.
+    """Reflectance (256, 256) of the sheet on photographs: the mean of their light, each without its
+    daylight.
 
     There are such of one target only: the other has its pattern too, the other way round.
     """
     chosen = crops[:: -(-len(crops) // AVERAGED)]
-    lights = _decoded(np.stack([cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in chosen]).astype(np.float64))
+    lights = _decoded(
+        np.stack([cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in chosen]).astype(
+            np.float64
+        )
+    )
     paint = np.mean([light / _daylight(light) for light in lights], axis=0)
     paint /= np.median(paint)
     return paint[:, ::-1] if target == "upper" else paint
 
 
 def _daylight(light: Array) -> Array:
-    """The smooth light on a photograph (256, 256) of an empty target: a square's best fit to what is no mark."""
+    """The smooth light on a photograph (256, 256) of an empty target: a square's best fit to what
+    is no mark.
+    """
     y, x = np.mgrid[-1 : 1 : 1j * PIXELS, -1 : 1 : 1j * PIXELS]
     terms = np.stack([x**0, x, y, x * x, x * y, y * y])
     sheet = light > 0.8 * np.median(light)
@@ -163,14 +192,18 @@ def _daylight(light: Array) -> Array:
 def drawn_sheet(target: str) -> Array:
     """Reflectance (256, 256) of panels, seams with rivets, stains, grain, marks at the corners.
 
-    As strong as on 300 photographs of the empty targets of Juelich: grain and stains 1 to 2 %, seams 5 to 30 %.
+    As strong as on 300 photographs of the empty targets of Juelich: grain and stains 1 to 2 %,
+    seams 5 to 30 %.
     """
     rng = np.random.default_rng(crc32(target.encode()))
     paint = 1 + 0.015 * rng.standard_normal((PIXELS, PIXELS))
     for size, strength in ((2.5, 0.006), (14.0, 0.007)):
         stains = gaussian_filter(rng.standard_normal((PIXELS, PIXELS)), size)
         paint *= 1 + strength * stains / stains.std()
-    rows, columns = (np.round(np.linspace(0, PIXELS, n) + rng.uniform(-4, 4, n)).astype(int)[1:-1] for n in (5, 9))
+    rows, columns = (
+        np.round(np.linspace(0, PIXELS, n) + rng.uniform(-4, 4, n)).astype(int)[1:-1]
+        for n in (5, 9)
+    )
     paint[rows[-1] :] *= 0.94
     paint[rows[-1] :, :14] *= 0.9
     paint[rows] *= 1 - rng.uniform(0.15, 0.35, (len(rows), 1))

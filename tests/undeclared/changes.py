@@ -1,7 +1,9 @@
-"""Worlds that change while a season's photographs are taken: days of haze and wind, new cantings, new cameras.
+"""Worlds that change while a season's photographs are taken: days of haze and wind, new cantings,
+new cameras.
 
-As in `tests.undeclared.world`, at three strengths. The truth of a change is as a study ought to report it (DESIGN.md,
-section 7): an effect of the catalogue with its ``scope``, and values ``by_day`` where it differs from day to day.
+As in `tests.undeclared.world`, at three strengths. The truth of a change is as a study ought to
+report it (DESIGN.md, section 7): an effect of the catalogue with its ``scope``, and values
+``by_day`` where it differs from day to day.
 """
 
 from collections.abc import Callable, Sequence
@@ -62,37 +64,64 @@ def since(name: str, of_one: bool = False) -> Change:
         chosen = [names[rng.integers(len(names))]] if of_one else names
         begins = _begin([plan for plan in plans if plan.heliostat.name in chosen], rng)
         changed = World(**fields)
-        worlds = [changed if plan.day >= begins and plan.heliostat.name in chosen else World() for plan in plans]
+        worlds = [
+            changed if plan.day >= begins and plan.heliostat.name in chosen else World()
+            for plan in plans
+        ]
         own = {key: _of(chosen, value) for key, value in parameters.items()}
-        scope = {"kind": "since", "since": begins.isoformat(), "heliostats": chosen if of_one else None}
+        scope = {
+            "kind": "since",
+            "since": begins.isoformat(),
+            "heliostats": chosen if of_one else None,
+        }
         return worlds, [_truth(name, own, scope)]
 
     return change
 
 
 def law_since(level: int, plans: Sequence[Plan], rng: np.random.Generator) -> Changing:
-    """A camera is set anew: sheet and spot together go through another curve. No effect of the catalogue is just so."""
+    """A camera's settings change: sheet and spot together have another response curve.
+
+    No effect of the catalogue is exactly like that.
+    """
     begins = _begin(plans, rng)
     changed = World(law=_law(level, rng))
     scope = {"kind": "since", "since": begins.isoformat(), "heliostats": None}
-    return [changed if plan.day >= begins else World() for plan in plans], [_truth("camera_response", {}, scope)]
+    return [changed if plan.day >= begins else World() for plan in plans], [
+        _truth("camera_response", {}, scope)
+    ]
 
 
 def two_cameras(level: int, plans: Sequence[Plan], rng: np.random.Generator) -> Changing:
-    """The camera before one of the targets has another curve from the beginning: there is no date to find."""
+    """The camera before one of the targets has another curve from the beginning: there is no date
+    to find.
+    """
     other = World(law=_law(level, rng))
     target = plans[rng.integers(len(plans))].target.name
     return [other if plan.target.name == target else World() for plan in plans], []
 
 
-def by_day(name: str, parameter: str, neutral: float, sizes: Sequence[float], fields: Callable[[float], Any]) -> Change:
-    """An effect of one parameter that has another size on some days; ``fields`` are those of `World` for it."""
+def by_day(
+    name: str,
+    parameter: str,
+    neutral: float,
+    sizes: Sequence[float],
+    fields: Callable[[float], Any],
+) -> Change:
+    """An effect of one parameter that has another size on some days; ``fields`` are those of
+    `World` for it.
+    """
 
     def change(level: int, plans: Sequence[Plan], rng: np.random.Generator) -> Changing:
         days = sorted({plan.day for plan in plans})
         bad = rng.choice(len(days), round(HAZY * len(days)), replace=False)
-        values = dict.fromkeys(days, neutral) | {days[i]: round(sizes[level] * rng.uniform(0.7, 1.3), 4) for i in bad}
-        each = {"value": neutral, "by_day": {day.isoformat(): value for day, value in values.items()}}
+        values = dict.fromkeys(days, neutral) | {
+            days[i]: round(sizes[level] * rng.uniform(0.7, 1.3), 4) for i in bad
+        }
+        each = {
+            "value": neutral,
+            "by_day": {day.isoformat(): value for day, value in values.items()},
+        }
         truth = [_truth(name, {parameter: each}, {"kind": "day"})]
         return [World(**fields(values[plan.day])) for plan in plans], truth
 
@@ -101,9 +130,15 @@ def by_day(name: str, parameter: str, neutral: float, sizes: Sequence[float], fi
 
 CHANGES: dict[str, Change] = {
     "calm": calm,
-    "haze_by_day": by_day("sun_shape", "circumsolar_ratio", 0.02, (0.1, 0.2, 0.35), lambda v: {"circumsolar_ratio": v}),
-    "jitter_by_day": by_day("tracking_jitter", "sigma_mrad", 0.0, (0.7, 1.0, 1.5), lambda v: {"first_axis_mrad": v}),
-    "background_by_day": by_day("background", "level", 0.0, (0.0015, 0.003, 0.006), lambda v: {"stray": (v, 0.0, 0.0)}),
+    "haze_by_day": by_day(
+        "sun_shape", "circumsolar_ratio", 0.02, (0.1, 0.2, 0.35), lambda v: {"circumsolar_ratio": v}
+    ),
+    "jitter_by_day": by_day(
+        "tracking_jitter", "sigma_mrad", 0.0, (0.7, 1.0, 1.5), lambda v: {"first_axis_mrad": v}
+    ),
+    "background_by_day": by_day(
+        "background", "level", 0.0, (0.0015, 0.003, 0.006), lambda v: {"stray": (v, 0.0, 0.0)}
+    ),
     "response_since": since("camera_response"),
     "shoulder_since": since("camera_shoulder"),
     "law_since": law_since,
@@ -113,11 +148,14 @@ CHANGES: dict[str, Change] = {
     "two_cameras": two_cameras,
     "slope_error_of_one": of_one("slope_error"),
     "jitter_of_one": of_one("tracking_jitter"),
-    **{f"{name}_always": always(name) for name in ("sun_shape", "slope_error", "facet_canting", "camera_response")},
+    **{
+        f"{name}_always": always(name)
+        for name in ("sun_shape", "slope_error", "facet_canting", "camera_response")
+    },
 }
 
 MOVED: dict[str, Change] = {"encoder_since": since("encoder_offset", of_one=True)}
-"""Changes that motors tell, and shapes do not."""
+"""Changes that are visible by motor positions, but not by shapes."""
 
 WITHOUT_SHEET = ("background_by_day", *MOVED)
 """Changes that a sheet's own light would hide: their images are of light alone."""

@@ -1,4 +1,6 @@
-"""What is planned for a measurement set: which heliostat is photographed when, on which target, and where on it."""
+"""What is planned for a measurement set: which heliostat is photographed when, on which target, and
+where on it.
+"""
 
 from dataclasses import dataclass
 from datetime import UTC, date, datetime, timedelta
@@ -26,8 +28,8 @@ HOURS = (7.0, 17.0)
 class Plan:
     """What is planned for one photograph of the heliostat ``index``.
 
-    ``moment`` has its time zone; ``goal`` (3,) [m] is where the light's centre of mass goes; ``warmth`` is in standard
-    deviations.
+    ``moment`` has its time zone; ``goal`` (3,) [m] is where the light's centre of mass goes;
+    ``warmth`` is in standard deviations.
     """
 
     index: int
@@ -57,12 +59,18 @@ def scattered(heliostats: int, each: int, rng: np.random.Generator) -> list[Plan
     plans = []
     for index, heliostat in enumerate(field(heliostats, RANGES, rng)):
         for _ in range(each):
-            plans.append(_plan(index, heliostat, date(2023, 1, 1) + timedelta(days=int(rng.integers(365))), rng))
+            plans.append(
+                _plan(
+                    index, heliostat, date(2023, 1, 1) + timedelta(days=int(rng.integers(365))), rng
+                )
+            )
     return plans
 
 
 def season(days: tuple[int, int], rng: np.random.Generator) -> list[Plan]:
-    """Photographs of 3 to 5 heliostats in the order of time, about one a day each, on so many days over weeks."""
+    """Photographs of 3 to 5 heliostats in the order of time, about one a day each, on so many days
+    over weeks.
+    """
     heliostats = field(int(rng.integers(3, 6)), RANGES, rng)
     day, pace = date(2023, 3, 15) + timedelta(days=int(rng.integers(500))), rng.uniform(1, 6)
     plans: list[Plan] = []

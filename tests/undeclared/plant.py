@@ -1,8 +1,10 @@
-"""A generated plant: targets on a tower, heliostats before them, and mirrors as smooth or as rough as real ones.
+"""A generated plant: targets on a tower, heliostats before them, and mirrors as smooth or as rough
+as real ones.
 
-A mirror is no spline: each facet's deviation from its place in the plans is a sum of tilts, bending, a roll of the
-edges, and waves. Sizes follow what deflectometry shows of 47 heliostats of the Solar Tower Juelich (in the median 0.5
-mm rms of height, 0.25 mm without the tilts, and slopes of 0.75 mrad) and of a rough one, AA39 (1.15 mm, 0.4 mm).
+A mirror is no spline: each facet's deviation from its place in the plans is a sum of tilts,
+bending, a roll of the edges, and waves. Sizes follow what deflectometry shows of 47 heliostats of
+the Solar Tower Juelich (in the median 0.5 mm rms of height, 0.25 mm without the tilts, and slopes
+of 0.75 mrad) and of a rough one, AA39 (1.15 mm, 0.4 mm).
 """
 
 from collections.abc import Sequence
@@ -21,7 +23,9 @@ def unit(vectors: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """A white rectangle: its ``center`` (3,) [m], lit side's ``normal`` (3,), upward direction, and size [m]."""
+    """A white rectangle: its ``center`` (3,) [m], lit side's ``normal`` (3,), upward direction, and
+    size [m].
+    """
 
     name: str
     center: Array
@@ -46,13 +50,18 @@ TARGETS = (
 )
 """The two calibration targets of the Solar Tower Juelich."""
 
-# --- mirrors ----------------------------------------------------------------------------------------------------------
+# --- mirrors
+# --------------------------------------------------------------------------------------------------
 
 WAVES = np.array([1.5, 2.25, 3.0])
-"""Half waves along a facet; shorter ones would be beyond the splines that deflectometry is kept in."""
+"""Half waves along a facet; shorter ones would be beyond the splines that deflectometry
+is kept in.
+"""
 
 TILT, BEND, EDGE, WAVE = 0.6e-3, 0.15e-3, 0.05e-3, 0.12e-3
-"""Usual sizes: of tilts [rad]; of bending, of the edges' roll and of the longest waves over half a facet [m]."""
+"""Usual sizes: of tilts [rad]; of bending, of the edges' roll and of the longest waves over half a
+facet [m].
+"""
 
 SPECTRUM = -1.0
 """Power of the waves' amplitude in their number."""
@@ -62,15 +71,21 @@ ROUGH_WITHIN = 150.0
 
 
 def shapes(t: Array) -> tuple[Array, Array]:
-    """What surfaces are made of and its slopes, each (n, 7), at ``t`` (n,) in [-1, 1]: 1, t, t^2, t^6 and waves."""
+    """What surfaces are made of and its slopes, each (n, 7), at ``t`` (n,) in [-1, 1]: 1, t, t^2,
+    t^6 and waves.
+    """
     phase = np.pi / 2 * np.outer(t + 1, WAVES)
     values = np.column_stack([t**0, t, t**2, t**6, np.cos(phase)])
-    return values, np.column_stack([0 * t, t**0, 2 * t, 6 * t**5, -np.pi / 2 * WAVES * np.sin(phase)])
+    return values, np.column_stack(
+        [0 * t, t**0, 2 * t, 6 * t**5, -np.pi / 2 * WAVES * np.sin(phase)]
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class Facet:
-    """A facet: its centre (3,) [m], half its width and half its height as vectors (3,), how it is bent (7, 7) [m]."""
+    """A facet: its centre (3,) [m], half its width and half its height as vectors (3,), how it is
+    bent (7, 7) [m].
+    """
 
     position: Array
     along: Array
@@ -89,7 +104,9 @@ class Facet:
         return np.column_stack([x, np.cross(z, x), z])
 
     def surface(self, u: Array, v: Array) -> tuple[Array, Array, Array]:
-        """Heights [m] and slopes along x and y, each (n, m), on the grid ``u`` (n,) by ``v`` (m,) in [-1, 1]."""
+        """Heights [m] and slopes along x and y, each (n, m), on the grid ``u`` (n,) by ``v`` (m,)
+        in [-1, 1].
+        """
         (value_u, slope_u), (value_v, slope_v) = shapes(u), shapes(v)
         by_x, by_y = slope_u @ self.bending @ value_v.T, value_u @ self.bending @ slope_v.T
         return value_u @ self.bending @ value_v.T, by_x / self.half[0], by_y / self.half[1]
@@ -97,9 +114,10 @@ class Facet:
 
 @dataclass(frozen=True, eq=False)
 class Heliostat:
-    """Where it stands (3,) [m], and its four facets: upper left, upper right, lower left, lower right from the front.
+    """A heliostat: position (3,) [m] and four facets.
 
-    It turns about an axis that points east, then about one perpendicular to that.
+    Seen from the front, the facets are upper left, upper right, lower left and lower right. The
+    first axis points east, the second is perpendicular to it.
     """
 
     name: str
@@ -113,7 +131,10 @@ def field(count: int, ranges: tuple[float, float], rng: np.random.Generator) -> 
     """Heliostats spread over slant ranges [m], evenly in their logarithm."""
     shares = (np.arange(count) + rng.random(count)) / count
     distances = ranges[0] * (ranges[1] / ranges[0]) ** shares
-    return [_heliostat(f"A{chr(65 + i)}{rng.integers(10, 60)}", d, rng) for i, d in enumerate(distances.tolist())]
+    return [
+        _heliostat(f"A{chr(65 + i)}{rng.integers(10, 60)}", d, rng)
+        for i, d in enumerate(distances.tolist())
+    ]
 
 
 def _heliostat(name: str, distance: float, rng: np.random.Generator) -> Heliostat:
@@ -126,13 +147,18 @@ def _heliostat(name: str, distance: float, rng: np.random.Generator) -> Heliosta
         roughness = rng.uniform(1.8, 3)
     focus = 2 * float(np.linalg.norm(aim - position))
     places = ((-0.8075, 0.6425), (0.8075, 0.6425), (-0.8075, -0.6425), (0.8075, -0.6425))
-    return Heliostat(name, position, tuple(_facet(place, focus, roughness * _bending(rng)) for place in places))
+    return Heliostat(
+        name, position, tuple(_facet(place, focus, roughness * _bending(rng)) for place in places)
+    )
 
 
 def _facet(place: Sequence[float], focus: float, bending: Array) -> Facet:
     """A facet that touches, about, a sphere of radius ``focus`` [m]."""
     x, y = place
-    along, across = np.array([0.8025, 0.0, 0.8025 * x / focus]), np.array([0.0, 0.6375, 0.6375 * y / focus])
+    along, across = (
+        np.array([0.8025, 0.0, 0.8025 * x / focus]),
+        np.array([0.0, 0.6375, 0.6375 * y / focus]),
+    )
     return Facet(np.array([x, y, 0.0402]), along, across, bending)
 
 

@@ -1,8 +1,9 @@
 """Light thrown ray by ray through a disturbed world.
 
-Written from the physics alone: no effect and no tracer of the model takes part, and attitude, surface and sun have
-their own formulas here. A mirror is strewn with points; at each of them the normal is drawn, and how the mirror swings
-just then; and each sends on the light of random directions of the sun's disc and aureole by the law of reflection.
+Written from the physics alone: no effect and no tracer of the model takes part, and attitude,
+surface and sun have their own formulas here. A mirror is strewn with points; at each of them the
+normal is drawn, and how the mirror swings just then; and each sends on the light of random
+directions of the sun's disc and aureole by the law of reflection.
 """
 
 from collections.abc import Iterator
@@ -28,42 +29,56 @@ MEASURED_AT = np.radians(30.0)
 """Elevation of the normal at which mirrors were measured, under their own weight."""
 
 TUBE = 0.4
-"""Sag of a mirror's left and right edges, which the torque tube bears, to that of the upper and lower ones."""
+"""Sag of a mirror's left and right edges, which the torque tube bears, to that of the upper and
+lower ones.
+"""
 
 CHUNK = 1024
 """Mirror points whose rays are traced at a time: what fits into a core's cache."""
 
 
-# --- sun --------------------------------------------------------------------------------------------------------------
+# --- sun
+# --------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
 class Sun:
     """Random directions near +z (3, n), and the light (n,) of each.
 
-    A quarter of them lie in the aureole, however little light that has, so that faint tails are smooth as well.
+    A quarter of them lie in the aureole, however little light that has, so that faint tails are
+    smooth as well.
     """
 
     directions: Rays
     light: Rays
 
     @classmethod
-    def of(cls, ratio: float, clouded: float, rng: np.random.Generator, count: int = 1 << 20) -> "Sun":
-        """Buie's sun (Buie, Monger, Dey, Solar Energy 74 (2003), eqs. 6 to 9), half of it ``clouded`` by a share."""
+    def of(
+        cls, ratio: float, clouded: float, rng: np.random.Generator, count: int = 1 << 20
+    ) -> "Sun":
+        """Buie's sun (Buie, Monger, Dey, Solar Energy 74 (2003), eqs. 6 to 9), half of it
+        ``clouded`` by a share.
+        """
         shares = np.array([3 * count // 4, count // 4])
         rings = np.linspace(0, DISC, 2001), np.geomspace(DISC, AUREOLE, 4001)
-        thrown = [_ring(edges, ratio, share, rng) for edges, share in zip(rings, shares, strict=True)]
+        thrown = [
+            _ring(edges, ratio, share, rng) for edges, share in zip(rings, shares, strict=True)
+        ]
         energy = np.array([ring[0] for ring in thrown])
         light = np.repeat(energy / energy.sum() * count / shares, shares)
         angle, turn = np.concatenate([ring[1] for ring in thrown]), rng.uniform(0, 2 * np.pi, count)
-        directions = np.array([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.cos(angle)])
+        directions = np.array(
+            [np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.cos(angle)]
+        )
         light *= 1 - clouded * (directions[0] > 0)
         order = rng.permutation(count)
         return cls(directions[:, order].astype(np.float32), light[order].astype(np.float32))
 
 
 def _ring(edges: Array, ratio: float, count: int, rng: np.random.Generator) -> tuple[float, Array]:
-    """Energy between the first and the last of ``edges`` [rad], and random angles (count,) that share it evenly."""
+    """Energy between the first and the last of ``edges`` [rad], and random angles (count,) that
+    share it evenly.
+    """
     theta = 1e3 * (edges[1:] + edges[:-1]) / 2
     if edges[-1] <= DISC:
         radiance = np.cos(0.326 * theta) / np.cos(0.308 * theta)
@@ -75,7 +90,8 @@ def _ring(edges: Array, ratio: float, count: int, rng: np.random.Generator) -> t
     return float(energy[-1]), np.interp(rng.random(count) * energy[-1], energy, edges)
 
 
-# --- mirror -----------------------------------------------------------------------------------------------------------
+# --- mirror
+# --------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,13 +110,19 @@ class Points:
 def _bent(places: Array, areas: Array, hessian: Array) -> tuple[Array, Array]:
     slopes = hessian @ places[:2]
     rise = (places[:2] * slopes).sum(axis=0) / 2
-    return np.vstack([places[:2], places[2] + rise]), np.vstack([areas[:2] - areas[2] * slopes, areas[2]])
+    return np.vstack([places[:2], places[2] + rise]), np.vstack(
+        [areas[:2] - areas[2] * slopes, areas[2]]
+    )
 
 
 def _facet(facet: Facet, tilt: Array, curvature: float, u: Array, v: Array) -> tuple[Array, Array]:
-    """Points and area vectors of a facet in mirror coordinates at the grid ``u`` by ``v``; ``tilt`` (2,) [rad]."""
+    """Points and area vectors of a facet in mirror coordinates at the grid ``u`` by ``v``; ``tilt``
+    (2,) [rad].
+    """
     heights, by_x, by_y = (values.ravel() for values in facet.surface(u, v))
-    x, y = (axis.ravel() for axis in np.meshgrid(u * facet.half[0], v * facet.half[1], indexing="ij"))
+    x, y = (
+        axis.ravel() for axis in np.meshgrid(u * facet.half[0], v * facet.half[1], indexing="ij")
+    )
     cell = 4 * facet.half.prod() / (len(u) * len(v))
     areas = cell * np.array([-by_x, -by_y, np.ones_like(x)])
     places, areas = _bent(np.array([x, y, heights]), areas, curvature * np.eye(2))
@@ -108,14 +130,17 @@ def _facet(facet: Facet, tilt: Array, curvature: float, u: Array, v: Array) -> t
     return turn @ places + facet.position[:, None], turn @ areas
 
 
-# --- the mirror before the sun ----------------------------------------------------------------------------------------
+# --- the mirror before the sun
+# ----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
 class Exposure:
-    """One heliostat of a world, its ``index`` there, as it throws its light onto ``goal`` (3,) [m] on a target.
+    """One heliostat of a world, its ``index`` there, as it throws its light onto ``goal`` (3,) [m]
+    on a target.
 
-    ``sun`` (3,) is the true one; ``warmth`` says by how many standard deviations the day is warmer than usual.
+    ``sun`` (3,) is the true one; ``warmth`` says by how many standard deviations the day is warmer
+    than usual.
     """
 
     world: World
@@ -127,16 +152,23 @@ class Exposure:
     warmth: float = 0.0
 
     def mirror(self, side: int, rng: np.random.Generator | None = None) -> Points:
-        """Points of the mirror at rest, in its own coordinates, ``side`` squared a facet in even cells."""
+        """Points of the mirror at rest, in its own coordinates, ``side`` squared a facet in even
+        cells.
+        """
         tilts = 1e-3 * self._own(self.world.canting_mrad, 4, 2)
         curvatures = self._own(self.world.curvature, 4)
         parts = []
         for part in zip(self.heliostat.facets, tilts, curvatures, strict=True):
-            u, v = (2 * (np.arange(side) + (0.5 if rng is None else rng.random(side))) / side - 1 for _ in "uv")
+            u, v = (
+                2 * (np.arange(side) + (0.5 if rng is None else rng.random(side))) / side - 1
+                for _ in "uv"
+            )
             parts.append(_facet(*part, u, v))
         places, areas = (np.concatenate(arrays, axis=1) for arrays in zip(*parts, strict=True))
         twist = 1e-3 * self.world.twist_mrad_m * self.warmth
-        return Points(places, areas, np.repeat(np.arange(4), side**2)).bent(twist * np.array([[0.0, 1], [1, 0]]))
+        return Points(places, areas, np.repeat(np.arange(4), side**2)).bent(
+            twist * np.array([[0.0, 1], [1, 0]])
+        )
 
     def light(self, points: Points) -> Array:
         """Share (n,) of the light that points reflect and that nothing takes away."""
@@ -159,14 +191,22 @@ class Exposure:
         return self.ground.apply([1.0, 0.0, 0.0])
 
     def leaning(self, normal: Array) -> Rotation:
-        """How a mirror that faces ``normal`` (3,), which hangs before its pylon, pulls that over."""
-        return Rotation.from_rotvec(1e-3 * self.world.pylon_mrad * np.cross([0.0, 0.0, 1.0], normal))
+        """How a mirror that faces ``normal`` (3,), which hangs before its pylon, pulls
+        that over.
+        """
+        return Rotation.from_rotvec(
+            1e-3 * self.world.pylon_mrad * np.cross([0.0, 0.0, 1.0], normal)
+        )
 
     def encoders(self, pose: "Pose") -> Array:
-        """What the encoders of both axes (2,) [rad] say; zeros where the mirror faces south by the plans, upright."""
+        """What the encoders of both axes (2,) [rad] say; zeros where the mirror faces south by the
+        plans, upright.
+        """
         normal = pose.attitude[:, 2]
         east, north, up = self.ground.inv().apply(self.leaning(normal).inv().apply(normal))
-        return np.array([np.arctan2(-up, -north), np.arcsin(east)]) - np.radians(self._own(self.world.encoder_deg, 2))
+        return np.array([np.arctan2(-up, -north), np.arcsin(east)]) - np.radians(
+            self._own(self.world.encoder_deg, 2)
+        )
 
     def facing(self, aim: Array) -> "Pose":
         """The mirror turned so that its centre sends the sun to ``aim`` (3,) [m]."""
@@ -179,7 +219,9 @@ class Exposure:
         return Pose(np.column_stack([np.cross(upward, normal), upward, normal]), center)
 
     def sagging(self, points: Points, pose: "Pose") -> Points:
-        """Points of a mirror whose edges hang by the share of its weight that presses on it more than when measured."""
+        """Points of a mirror whose edges hang by the share of its weight that presses on it more
+        than when measured.
+        """
         pressing = pose.attitude[2, 2] - np.sin(MEASURED_AT)
         edges = np.array([self.heliostat.width, self.heliostat.height]) / 2
         return points.bent(-2e-3 * self.world.sag_mm * pressing * np.diag([TUBE, 1.0] / edges**2))
@@ -209,7 +251,10 @@ class Pose:
 
     def in_sight(self, points: Points, target: Target) -> tuple[Array, Array]:
         """Points [m] from the target's centre and area vectors, each (3, n), in east-north-up."""
-        return self.attitude @ points.places + (self.center - target.center)[:, None], self.attitude @ points.areas
+        return (
+            self.attitude @ points.places + (self.center - target.center)[:, None],
+            self.attitude @ points.areas,
+        )
 
 
 def reflected(normals: Array, suns: Array) -> Array:
@@ -222,8 +267,11 @@ def land(places: Array, directions: Array) -> Array:
     return np.asarray(places[:2] - places[2] / directions[2] * directions[:2])
 
 
-def throw(exposure: Exposure, sun: Sun, side: int, fan: int, rng: np.random.Generator) -> Iterator[tuple[Rays, Rays]]:
-    """Hits (2, n) [m], right and up of the target's centre, and their light (n,), some thousand at a time.
+def throw(
+    exposure: Exposure, sun: Sun, side: int, fan: int, rng: np.random.Generator
+) -> Iterator[tuple[Rays, Rays]]:
+    """Hits (2, n) [m], right and up of the target's centre, and their light (n,), some thousand at
+    a time.
 
     ``side`` squared points a facet send on ``fan`` rays each.
     """
@@ -246,17 +294,28 @@ def throw(exposure: Exposure, sun: Sun, side: int, fan: int, rng: np.random.Gene
 
 
 def _swung(exposure: Exposure, side: int, rng: np.random.Generator) -> tuple[Array, Array, Array]:
-    """Places (3, n) [m], normals (3, n) and collected light (n,) of mirror points in the target's frame."""
+    """Places (3, n) [m], normals (3, n) and collected light (n,) of mirror points in the target's
+    frame.
+    """
     world, pose, axes = exposure.world, exposure.stand(), exposure.target.axes
     points = exposure.sagging(exposure.mirror(side, rng), pose)
     places, areas = (axes @ a for a in pose.in_sight(points, exposure.target))
-    weight = exposure.light(points) * (areas * (axes @ exposure.sun)[:, None]).sum(axis=0).clip(min=0)
+    weight = exposure.light(points) * (areas * (axes @ exposure.sun)[:, None]).sum(axis=0).clip(
+        min=0
+    )
     count = weight.size
-    swings = [(exposure.first_axis, world.first_axis_mrad), (pose.attitude[:, 1], world.second_axis_mrad)]
-    swing = 1e-3 * sum(np.outer(axes @ axis, sigma * rng.standard_normal(count)) for axis, sigma in swings)
+    swings = [
+        (exposure.first_axis, world.first_axis_mrad),
+        (pose.attitude[:, 1], world.second_axis_mrad),
+    ]
+    swing = 1e-3 * sum(
+        np.outer(axes @ axis, sigma * rng.standard_normal(count)) for axis, sigma in swings
+    )
     center = (axes @ (pose.center - exposure.target.center))[:, None]
     normals = unit(areas)
     normals = unit(
-        normals + np.cross(swing, normals, axis=0) + 1e-3 * world.roughness_mrad * rng.standard_normal((3, count))
+        normals
+        + np.cross(swing, normals, axis=0)
+        + 1e-3 * world.roughness_mrad * rng.standard_normal((3, count))
     )
     return places + np.cross(swing, places - center, axis=0), normals, weight

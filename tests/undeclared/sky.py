@@ -1,7 +1,8 @@
-"""Where the sun stands at a time over the Solar Tower Juelich.
+"""Position of the sun at a time, seen from the Solar Tower Juelich.
 
-Fourier series of declination and equation of time (Spencer, *Fourier series representation of the position of the sun*,
-Search 2 (1971) 172), good to 0.15 degrees: not the almanac that the model has.
+Fourier series of declination and equation of time, accurate to 0.15 degrees (Spencer, *Fourier
+series representation of the position of the sun*, Search 2 (1971) 172). The model uses a different
+algorithm.
 """
 
 from datetime import UTC, datetime
@@ -25,8 +26,15 @@ def sun(moment: datetime) -> Array:
     days = (moment - _NEW_YEAR).total_seconds() / 86400
     turns = 2 * np.pi * (days + _DRIFT_DAYS) / _YEAR_DAYS * np.arange(4)
     cosines, sines = np.cos(turns), np.sin(turns)
-    declination = cosines @ [0.006918, -0.399912, -0.006758, -0.002697] + sines @ [0, 0.070257, 0.000907, 0.00148]
-    minutes = 229.18 * (cosines @ [7.5e-5, 0.001868, -0.014615, 0] - sines @ [0, 0.032077, 0.040849, 0])
+    declination = cosines @ [0.006918, -0.399912, -0.006758, -0.002697] + sines @ [
+        0,
+        0.070257,
+        0.000907,
+        0.00148,
+    ]
+    minutes = 229.18 * (
+        cosines @ [7.5e-5, 0.001868, -0.014615, 0] - sines @ [0, 0.032077, 0.040849, 0]
+    )
     # A turn a day and a degree of longitude each; at noon the hour angle is zero.
     hour = 2 * np.pi * (days % 1 - 0.5) + np.radians(PLACE[1] + minutes / 4)
     east, equator = -np.cos(declination) * np.sin(hour), np.cos(declination) * np.cos(hour)

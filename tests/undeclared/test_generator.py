@@ -1,4 +1,6 @@
-"""The generator by itself: it shares nothing with the product, keeps energy, and the truth explains what it makes."""
+"""The generator by itself: it shares nothing with the product, keeps energy, and the truth explains
+what it makes.
+"""
 
 import ast
 from collections.abc import Callable
@@ -10,15 +12,15 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from model.ephemeris import sun_angles_at
-from model.forecast import View, forecast_setups
+from model.forecast import View, align
 from model.frames import sun_direction
 from model.images import clipped_alike
 from model.metrics import compare_on_target
-from model.plant import JUELICH_LATITUDE
+from model.plant_model import JUELICH_MODEL
 from model.study import FluxImage
-from service.cli.folder import clock_fault_of
-from service.cli.folder_study import photographs_of
+from service.cli.folder_store import open_folder
 from service.sources.folder import MeasurementFolder, read_folder
+from tests.benchmarks.folders import read_photographs
 from tests.undeclared import changes, sky
 from tests.undeclared.adapter import effects_of, write_folder
 from tests.undeclared.camera import drawn_sheet, empty_targets, real_sheet, sheet
@@ -56,13 +58,15 @@ def test_only_the_adapter_knows_the_product():
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
             names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
-            assert not {name.split(".")[0] for name in names} & {"model", "service", "training"}, path.name
+            assert not {name.split(".")[0] for name in names} & {"model", "service", "training"}, (
+                path.name
+            )
 
 
 def test_its_almanac_agrees_with_the_products():
     for plan in plans():
-        stood = sun_direction(*sun_angles_at(plan.moment, *sky.PLACE[:2]))
-        assert np.degrees(np.arccos(plan.sun() @ stood)) < 0.2
+        true_sun = sun_direction(*sun_angles_at(plan.moment, sky.PLACE))
+        assert np.degrees(np.arccos(plan.sun() @ true_sun)) < 0.2
 
 
 def test_rays_carry_what_the_mirror_collects():
@@ -90,7 +94,9 @@ def test_a_drawn_sheet_is_as_real_ones_are(stj: Path):
     assert (real_sheet("upper", empty_targets()) == sheets[1][:, ::-1]).all()
 
 
-def test_a_sheet_is_drawn_where_there_are_no_photographs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_sheet_is_drawn_where_there_are_no_photographs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     monkeypatch.setenv("HELIOTWIN_STJ", str(tmp_path))
     sheet.cache_clear()
     assert (sheet("lower") == drawn_sheet("lower")).all()
@@ -99,14 +105,15 @@ def test_a_sheet_is_drawn_where_there_are_no_photographs(tmp_path: Path, monkeyp
 
 def test_times_agree_with_the_sun(a_season):
     made, folder = a_season("calm")
-    measurements = [one for name in folder.plant.heliostats for one in folder.measurements(name)]
-    assert len(measurements) == len(made.plans)
-    assert {clock_fault_of(folder, one) for one in measurements} == {None}
+    with open_folder(folder) as opened:
+        assert opened.clocks() == {}
+        stored = [opened.measurements(name) for name in opened.names]
+    assert sum(map(len, stored)) == len(made.plans)
 
 
 def test_photographs_are_measured_back_to_the_light_that_was_on_the_sheet(a_season):
     made, folder = a_season("calm")
-    photographs, skipped = photographs_of(folder)
+    photographs, skipped = read_photographs(folder)
     light = {
         f"{plan.heliostat.name}/{identifier}": image
         for plan, identifier, image in zip(made.plans, made.identifiers, made.light, strict=True)
@@ -118,13 +125,19 @@ def test_photographs_are_measured_back_to_the_light_that_was_on_the_sheet(a_seas
 
 @pytest.mark.parametrize("case", [name for name in changes.CHANGES if not name.endswith("always")])
 def test_the_model_with_the_truth_explains_a_season(a_season, case):
-    """At each time by what is in force then; neither a law of sheet and spot together nor two cameras are in words."""
+    """At each time by what is in force then; neither a law of sheet and spot together nor two
+    cameras are in words.
+    """
     made, folder = a_season(case)
-    photographs, _ = photographs_of(folder)
+    photographs, _ = read_photographs(folder)
     setups = [p.setup for p in photographs]
     view = View(256, 256)
     with_truth, without = (
-        forecast_setups(setups, None, effects, view, latitude_deg=JUELICH_LATITUDE).double().clamp(min=0).numpy()
+        align(setups, JUELICH_MODEL.with_effects(effects))
+        .images(view)
+        .double()
+        .clamp(min=0)
+        .numpy()
         for effects in (effects_of(made), [])
     )
     after, before = (

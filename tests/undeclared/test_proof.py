@@ -1,4 +1,6 @@
-"""A small part of ``python -m tests.benchmarks.study``: effects that the model does not declare are found."""
+"""A small part of ``python -m tests.benchmarks.study``: effects that the model does not declare are
+found.
+"""
 
 from dataclasses import replace
 from datetime import timedelta
@@ -9,11 +11,10 @@ import numpy as np
 import pytest
 
 from model.effects import CATALOGUE
-from model.forecast import View, forecast_setups
+from model.forecast import View, align
 from model.metrics import compare_on_target
-from model.plant import JUELICH_LATITUDE
-from model.study import StudyOptions, study
-from model.tracing import Optics
+from model.plant_model import JUELICH_MODEL
+from model.study import StudyOptions, study, study_to_json
 from service.base.settings import FIGURE_SCALES
 from service.cli.folder_study import study_folder
 from service.drawing.study_report import study_page
@@ -25,7 +26,15 @@ from tests.undeclared.generator import MeasurementSet, generate, generate_season
 STRONG = 2
 
 OPTIONS = StudyOptions(
-    candidates=("sun_shape", "slope_error", "camera_response", "camera_blur", "background", "facet_canting"), most=2
+    candidates=(
+        "sun_shape",
+        "slope_error",
+        "camera_response",
+        "camera_blur",
+        "background",
+        "facet_canting",
+    ),
+    most=2,
 )
 """Some of the catalogue, look-alikes among them: enough to be wrong, and few enough for a test."""
 
@@ -47,7 +56,7 @@ def measured(case: str) -> MeasurementSet:
 @cache
 def report(case: str) -> dict[str, Any]:
     """The study of a small set."""
-    return study(flux_images(measured(case)), Optics(), options=OPTIONS, latitude_deg=JUELICH_LATITUDE).to_json()
+    return study_to_json(study(flux_images(measured(case)), JUELICH_MODEL, options=OPTIONS))
 
 
 def test_the_generator_has_every_effect_of_the_catalogue():
@@ -59,7 +68,7 @@ def test_the_model_with_the_truth_explains_what_the_generator_throws(case):
     """Generator and model share no code, so that each is a test of the other."""
     made = generate(case, STRONG, 3, heliostats=2, setups=1, side=128, fan=16)
     setups, effects = setups_of(made), effects_of(made)
-    forecasts = forecast_setups(setups, None, effects, View(96, 96), latitude_deg=JUELICH_LATITUDE).numpy()
+    forecasts = align(setups, JUELICH_MODEL.with_effects(effects)).images(View(96, 96)).numpy()
     for setup, image, forecast in zip(setups, made.images, forecasts, strict=True):
         size = (setup.plane.width, setup.plane.height)
         assert compare_on_target(image, forecast, size, 4.0, 32).accuracy > 0.97
@@ -72,17 +81,16 @@ def test_nothing_is_found_in_clean_images():
 
 @pytest.mark.parametrize(
     ("case", "parameter", "error"),
-    [
-        ("camera_response", "gamma", 0.03),
-        ("sun_shape", "circumsolar_ratio", 0.03),
-    ],
+    [("camera_response", "gamma", 0.03), ("sun_shape", "circumsolar_ratio", 0.03)],
 )
 def test_a_strong_effect_is_found_with_its_parameter(case, parameter, error):
     (truth,) = measured(case).truth
     found = report(case)["effects"]
     assert report(case)["verdict"] == "effect"
     assert [effect["name"] for effect in found] == [case]
-    assert found[0]["parameters"][parameter]["value"] == pytest.approx(truth["parameters"][parameter], abs=error)
+    assert found[0]["parameters"][parameter]["value"] == pytest.approx(
+        truth["parameters"][parameter], abs=error
+    )
     assert report(case)["after"]["accuracy_mean"] > report(case)["before"]["accuracy_mean"] + 0.02
 
 
@@ -102,7 +110,7 @@ def test_what_moves_spots_is_named_by_spot_and_shape_and_not_by_shape_alone(case
     made = generate(case, STRONG, seed, heliostats=3, setups=10, side=24, fan=4)
     name, _ = world.MOVING[case]
     reports = [
-        study(flux_images(made, said), Optics(), options=MOVING, latitude_deg=JUELICH_LATITUDE).to_json()
+        study_to_json(study(flux_images(made, said), JUELICH_MODEL, options=MOVING))
         for said in (made.encoders(seed), None)
     ]
     by_both, by_shape = reports
@@ -114,19 +122,25 @@ def test_what_moves_spots_is_named_by_spot_and_shape_and_not_by_shape_alone(case
 
 
 def test_a_drive_that_lost_steps_since_its_calibration_is_named_with_its_day():
-    """Mounts were calibrated before the first photograph: what is found came thereafter, and of one heliostat."""
+    """Mounts were calibrated before the first photograph: what is found came thereafter, and of one
+    heliostat.
+    """
     made = generate_season("encoder_since", STRONG, 1, days=(8, 8), side=24, fan=4)
     until, images = made.plans[0].day - timedelta(days=30), []
     for plan, image in zip(made.plans, flux_images(made, made.encoders(1)), strict=True):
         heliostat = image.setup.heliostat
         mount = replace(heliostat.mount, is_calibrated=True, calibrated_until=until)
-        setup = replace(image.setup, heliostat=replace(heliostat, mount=mount), taken_at=plan.moment)
+        setup = replace(
+            image.setup, heliostat=replace(heliostat, mount=mount), taken_at=plan.moment
+        )
         images.append(replace(image, setup=setup))
-    done = study(images, Optics(), options=MOVING, latitude_deg=JUELICH_LATITUDE)
-    found, page = done.to_json()["effects"], study_page(done, "season", FIGURE_SCALES)
+    done = study(images, JUELICH_MODEL, options=MOVING)
+    found, page = study_to_json(done)["effects"], study_page(done, "season", FIGURE_SCALES)
     assert "Light from where motors sent it" in page
     assert "mrad from where motors sent it" in page
-    assert [(effect["name"], effect["scope"]) for effect in found] == [(t["name"], t["scope"]) for t in made.truth]
+    assert [(effect["name"], effect["scope"]) for effect in found] == [
+        (t["name"], t["scope"]) for t in made.truth
+    ]
     (heliostat,) = made.truth[0]["scope"]["heliostats"]
     for axis in ("first_deg", "second_deg"):
         value = found[0]["parameters"][axis]["value"][heliostat]
@@ -138,10 +152,12 @@ def test_what_no_effect_describes_is_not_taken_for_nothing():
 
 
 def test_a_change_is_found_with_its_day(tmp_path):
-    """A camera set anew, in photographs of a sunlit sheet, as a user gives them."""
+    """A camera with changed settings, in photographs of a sunlit sheet, as a user gives them."""
     made = generate_season("response_since", STRONG, 2, days=(5, 5), side=128, fan=16)
     folder = read_folder(write_folder(made, tmp_path))
     options = StudyOptions(candidates=("camera_response", "sun_shape"), most=1)
     (found,), (truth,) = study_folder(folder, options=options).to_json()["effects"], made.truth
     assert (found["name"], found["scope"]) == (truth["name"], truth["scope"])
-    assert found["parameters"]["gamma"]["value"] == pytest.approx(truth["parameters"]["gamma"], abs=0.05)
+    assert found["parameters"]["gamma"]["value"] == pytest.approx(
+        truth["parameters"]["gamma"], abs=0.05
+    )

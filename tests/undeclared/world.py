@@ -1,8 +1,9 @@
-"""How the world really is: everything that a measurement set may hold and that the model does not know of.
+"""How the world really is: everything that a measurement set may hold and that the model does not
+know of.
 
-Each disturbance is drawn at one of three strengths, 0 to 2, which change the forecast by some 2, 4 and 8 % where its
-bounds allow: a function gives the fields of `World` that it changes and, for those of the catalogue (DESIGN.md, section
-5), the parameters that a study ought to find.
+Each disturbance is drawn at one of three strengths, 0 to 2, which change the forecast by some 2, 4
+and 8 % where its bounds allow: a function gives the fields of `World` that it changes and, for
+those of the catalogue (DESIGN.md, section 5), the parameters that a study ought to find.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,12 +21,14 @@ Drawn = tuple[dict[str, Any], dict[str, Any]]
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """Disturbances of sky, mount, mirror and camera; the defaults are the declared world, in which there are none.
+    """Disturbances of sky, mount, mirror and camera; the defaults are the declared world, in which
+    there are none.
 
-    Those of mirrors are one value for all, or arrays (heliostat,), (heliostat, facet) or, for ``canting_mrad``,
-    (heliostat, facet, 2); ``encoder_deg`` (heliostat, 2) is what axes stand at beyond what encoders say. ``gamma``,
-    ``saturation`` and ``compression`` bend the mirror's light alone, ``law`` that of sheet and mirror together, on
-    photographs. The last block is in no catalogue.
+    Those of mirrors are one value for all, or arrays (heliostat,), (heliostat, facet) or, for
+    ``canting_mrad``, (heliostat, facet, 2); ``encoder_deg`` (heliostat, 2) is what axes stand at
+    beyond what encoders say. ``gamma``, ``saturation`` and ``compression`` bend the mirror's light
+    alone, ``law`` that of sheet and mirror together, on photographs. The last block is in no
+    catalogue.
     """
 
     circumsolar_ratio: float = 0.02
@@ -82,7 +85,9 @@ def facet_canting(level: int, names: Sequence[str], rng: np.random.Generator) ->
     """Without the tilt of the whole mirror, which the alignment takes back."""
     tilt = (0.19, 0.38, 0.76)[level] * rng.standard_normal((len(names), 4, 2))
     tilt = np.round(np.clip(tilt - tilt.mean(axis=1, keepdims=True), -5, 5), 4)
-    return {"canting_mrad": tilt}, {axis: _by_name(names, tilt[..., i]) for i, axis in enumerate(("x_mrad", "y_mrad"))}
+    return {"canting_mrad": tilt}, {
+        axis: _by_name(names, tilt[..., i]) for i, axis in enumerate(("x_mrad", "y_mrad"))
+    }
 
 
 def gravity_bending(level: int, names: Sequence[str], rng: np.random.Generator) -> Drawn:
@@ -151,14 +156,20 @@ def background(level: int, names: Sequence[str], rng: np.random.Generator) -> Dr
 
 def target_registration(level: int, names: Sequence[str], rng: np.random.Generator) -> Drawn:
     size = (0.011, 0.024, 0.05)[level]
-    scale_x, scale_y = np.round(1 + size * rng.uniform(0.5, 1.5, 2) * rng.choice([-1, 1], 2), 4).tolist()
+    scale_x, scale_y = np.round(
+        1 + size * rng.uniform(0.5, 1.5, 2) * rng.choice([-1, 1], 2), 4
+    ).tolist()
     shear, turn = np.round(size * rng.uniform(-1, 1, 2) * [1, 90], 4).tolist()
     found = {"scale_x": scale_x, "scale_y": scale_y, "shear": shear, "rotation_deg": turn}
     return {"registration": tuple(found.values())}, found
 
 
 def camera_ghost(level: int, names: Sequence[str], rng: np.random.Generator) -> Drawn:
-    share, size, turn = (0.016, 0.035, 0.08)[level], rng.uniform(0.6, 1.2), rng.uniform(0, 2 * np.pi)
+    share, size, turn = (
+        (0.016, 0.035, 0.08)[level],
+        rng.uniform(0.6, 1.2),
+        rng.uniform(0, 2 * np.pi),
+    )
     right, up = round(size * np.cos(turn), 3), round(size * np.sin(turn), 3)
     return {"ghost": (share, right, up)}, {"share": share, "right_m": right, "up_m": up}
 
@@ -171,17 +182,21 @@ def facet_focus(level: int, names: Sequence[str], rng: np.random.Generator) -> D
     """One facet of each heliostat is bent [1/m]."""
     bent = np.zeros((len(names), 4))
     signs = rng.choice([-1.0, 1.0], len(names))
-    bent[np.arange(len(names)), rng.integers(4, size=len(names))] = (0.0006, 0.0012, 0.0024)[level] * signs
+    bent[np.arange(len(names)), rng.integers(4, size=len(names))] = (0.0006, 0.0012, 0.0024)[
+        level
+    ] * signs
     return {"curvature": bent}, {}
 
 
 def thermal_twist(level: int, names: Sequence[str], rng: np.random.Generator) -> Drawn:
-    """Mirrors twist with a temperature that nobody recorded [mrad of slope a metre, per standard deviation]."""
+    """Mirrors twist with a temperature that nobody recorded [mrad of slope a metre, per standard
+    deviation].
+    """
     return {"twist_mrad_m": (0.2, 0.35, 0.6)[level]}, {}
 
 
 def clouded_sun(level: int, names: Sequence[str], rng: np.random.Generator) -> Drawn:
-    """A cloud's edge stands across the sun and takes a share of the light of one half."""
+    """The edge of a cloud crosses the sun and takes a share of the light of one half."""
     return {"clouded": (0.25, 0.45, 0.8)[level]}, {}
 
 
@@ -190,7 +205,7 @@ def barrel_distortion(level: int, names: Sequence[str], rng: np.random.Generator
 
 
 def slight_tilt(level: int, names: Sequence[str], rng: np.random.Generator) -> Drawn:
-    """Of a size that motors tell and shapes do not, as the next."""
+    """Of a size that is visible by motor positions, but not by shapes, as in the next function."""
     size, turn = (0.1, 0.2, 0.4)[level], rng.uniform(0, 2 * np.pi)
     north, up = round(size * np.cos(turn), 4), round(size * np.sin(turn), 4)
     return {"tilt_deg": (north, up)}, {"north_deg": north, "up_deg": up}
@@ -227,7 +242,8 @@ CATALOGUE: dict[str, Draw] = {
 }
 
 OUTSIDE: dict[str, Draw] = {
-    draw.__name__: draw for draw in (second_axis_wobble, facet_focus, thermal_twist, clouded_sun, barrel_distortion)
+    draw.__name__: draw
+    for draw in (second_axis_wobble, facet_focus, thermal_twist, clouded_sun, barrel_distortion)
 }
 
 
@@ -237,13 +253,15 @@ MOVING: dict[str, tuple[str, Draw]] = {
     "pylon_bending": ("pylon_bending", pylon_bending),
     "encoder_offset": ("encoder_offset", encoder_offset),
 }
-"""What motors tell, and its effect of the catalogue."""
+"""Cases that are visible by motor positions, each with its effect of the catalogue."""
 
 
 def disturb(
     case: str, level: int, names: Sequence[str], rng: np.random.Generator
 ) -> tuple[World, list[dict[str, Any]]]:
-    """The world of a case, ``clean`` or disturbances joined by ``+``, and its effects of the catalogue as JSON."""
+    """The world of a case, ``clean`` or disturbances joined by ``+``, and its effects of the
+    catalogue as JSON.
+    """
     fields: dict[str, Any] = {}
     truth = []
     for name in [] if case == "clean" else case.split("+"):

@@ -1,5 +1,4 @@
-"""The verbs of `heliotwin`, one file a group, each with its `app`.
+"""The verbs of `heliotwin`, one file for each group, each with its `app`.
 
-What brings the tracer's libraries along is imported in the verb that needs it: they take seconds to load, and most
-verbs do without them.
+Verbs import the tracer's libraries only when they need them, because these take seconds to load.
 """

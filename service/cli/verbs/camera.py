@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from service.cli.output import AsJson, make_table, progress, require_file, show
+from service.cli.output import AsJson, make_table, progress, require_file, require_unbroken, show
 from service.cli.verbs.photographs import Folder, Surfaces
 
 app = typer.Typer()
@@ -14,16 +14,19 @@ app = typer.Typer()
 @app.command()
 def camera(
     folder: Folder,
-    out: Annotated[Path, typer.Option("--out", help="JSON file to write the law to.", metavar="CAMERA.json")],
+    out: Annotated[
+        Path, typer.Option("--out", help="JSON file to write the law to.", metavar="CAMERA.json")
+    ],
     surfaces: Surfaces = "measured",
     target: Annotated[
-        list[str] | None, typer.Option(help="The camera looks at this target only; may be given again.")
+        list[str] | None,
+        typer.Option(help="The camera looks at this target only; may be given again."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """A camera's curve from counts to light, measured from photographs of 8 bits: CAMERA.json, to be declared.
+    """Camera response curve, measured from 8-bit photographs: CAMERA.json, to be declared.
 
-    Half of the days judge what the others tell; where sRGB is no worse, the file declares sRGB.
+    Half of the days test the curve of the other half; if sRGB is no worse, the file declares sRGB.
     """
     from service.cli.folder_camera import measure_camera
     from service.sources.folder import read_folder
@@ -38,3 +41,4 @@ def camera(
     show(report, as_json, table)
     if not as_json:
         typer.echo(report["conclusion"])
+    require_unbroken(source)

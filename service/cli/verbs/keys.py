@@ -11,7 +11,9 @@ from service.base.choices import RoleName
 from service.cli.output import AsJson
 from service.cli.store import actor, reading, writing
 
-Name = Annotated[str, typer.Argument(help="Who will use it, for example `calibration`.", metavar="NAME")]
+Name = Annotated[
+    str, typer.Argument(help="Who will use it, for example `calibration`.", metavar="NAME")
+]
 
 app = typer.Typer(name="keys", help="API keys: make, list, withdraw.", no_args_is_help=True)
 
@@ -19,20 +21,23 @@ app = typer.Typer(name="keys", help="API keys: make, list, withdraw.", no_args_i
 @app.command()
 def create(
     name: Name,
-    role: Annotated[RoleName, typer.Option(help="read, ingest, operate or admin; each includes those before it.")],
+    role: Annotated[
+        RoleName,
+        typer.Option(help="read, ingest, operate or admin; each includes those before it."),
+    ],
     as_json: AsJson = False,
 ) -> None:
-    """Make a key and print it, this once."""
+    """Create a key and print it, only this once."""
     from service.store import keys
 
-    with writing() as session:
+    with writing(makes=True) as session:
         key = keys.create(session, name, role, actor())
     typer.echo(json.dumps({"name": name, "role": role, "key": key}) if as_json else key)
 
 
 @app.command("list")
 def list_(as_json: AsJson = False) -> None:
-    """All keys, by name and prefix; the keys themselves are not stored."""
+    """List all keys, by name and prefix; the keys themselves are not stored."""
     from service.store import keys
 
     with reading() as session:
@@ -40,7 +45,11 @@ def list_(as_json: AsJson = False) -> None:
     if as_json:
         fields = ("name", "role", "prefix", "created_at", "withdrawn_at")
         typer.echo(
-            json.dumps([{field: getattr(row, field) for field in fields} for row in rows], default=str, indent=1)
+            json.dumps(
+                [{field: getattr(row, field) for field in fields} for row in rows],
+                default=str,
+                indent=1,
+            )
         )
         return
     table = Table("name", "role", "prefix", "made", "withdrawn")
@@ -52,7 +61,7 @@ def list_(as_json: AsJson = False) -> None:
 
 @app.command()
 def withdraw(name: Name, as_json: AsJson = False) -> None:
-    """Make a key useless from now on."""
+    """Withdraw a key: it is invalid from now on."""
     from service.store import keys
 
     with writing() as session:

@@ -11,16 +11,22 @@ from rich.table import Table
 from service.cli.output import AsJson
 from service.cli.store import actor, reading, writing
 
-app = typer.Typer(name="models", help="Versions of the plant's model: list, adopt, withdraw.", no_args_is_help=True)
+app = typer.Typer(
+    name="models",
+    help="Versions of the plant's model: list, adopt, withdraw.",
+    no_args_is_help=True,
+)
 
 
 @app.command("list")
 def list_(as_json: AsJson = False) -> None:
-    """All versions, oldest first; the current one is the newest that is not withdrawn."""
+    """List all versions, oldest first; the current one is the newest that is not withdrawn."""
     from service.web.api.models import all_models, declared_model
 
     with reading() as session:
-        versions = [declared_model(None, is_current=True)] if session is None else all_models(session)
+        versions = (
+            [declared_model(None, is_current=True)] if session is None else all_models(session)
+        )
     if as_json:
         typer.echo(json.dumps([version.model_dump(mode="json") for version in versions], indent=1))
         return
@@ -28,48 +34,60 @@ def list_(as_json: AsJson = False) -> None:
     for version in versions:
         study = "" if version.study is None else str(version.study)
         people = (version.adopted_by or "", version.withdrawn_by or "")
-        table.add_row(version.version, "current" if version.is_current else "", study, *people)
+        table.add_row(str(version.version), "current" if version.is_current else "", study, *people)
     Console().print(table)
 
 
 @app.command()
 def adopt(
-    report: Annotated[Path, typer.Argument(help="Report of `heliotwin study`.", metavar="REPORT.json")],
-    force: Annotated[bool, typer.Option("--force", help="Also where its verdict is not `effect`.")] = False,
+    report: Annotated[
+        Path, typer.Argument(help="Report of `heliotwin study`.", metavar="REPORT.json")
+    ],
+    force: Annotated[
+        bool, typer.Option("--force", help="Also where its verdict is not `effect`.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Add what the study of a folder found to the model it was made with, which is used from then on."""
+    """Add the effects of a folder's study to its model; this model becomes current."""
     from service import store
     from service.sources.documents import read_json
-    from service.twin import versions
-    from service.twin.study import model_of_report, row_of_report
+    from service.twin.plant import model_versions
+    from service.twin.studies.study import model_of_report, parse_report, row_of_report
 
-    document, name = read_json(report), report.name
+    name = report.name
     with writing() as session:
+        document = read_json(report)
+        parse_report(document, name)
         model = model_of_report(session, document, name)
         study = store.add_study(session, row_of_report(document, name, model, actor()))
-        row = versions.adopt(session, study.id, actor(), force)
-        outdated = {one.heliostat: one.version for one in store.outdated_surfaces(session, row.version)}
+        row = model_versions.adopt(session, study.id, actor(), force)
+        outdated = {
+            one.heliostat: one.version for one in store.outdated_surfaces(session, row.version)
+        }
     if as_json:
-        typer.echo(json.dumps({"study": study.id, "version": row.version, "outdated_surfaces": outdated}))
+        typer.echo(
+            json.dumps({"study": study.id, "version": row.number, "outdated_surfaces": outdated})
+        )
         return
-    typer.echo(f"{row.version} is current")
+    typer.echo(f"version {row.number} is current")
     if outdated:
         typer.echo(
-            f"today's surfaces of {', '.join(outdated)} were made by another version; the page of studies, or a "
-            "job `predictions`, makes them anew"
+            f"active surfaces of {', '.join(outdated)} were made by another version; the page of"
+            " studies, or a job `predictions`, makes them again"
         )
 
 
 @app.command()
 def withdraw(
-    study: Annotated[int, typer.Argument(help="The study that it was adopted from.", metavar="STUDY")],
+    study: Annotated[
+        int, typer.Argument(help="The study that it was adopted from.", metavar="STUDY")
+    ],
     as_json: AsJson = False,
 ) -> None:
-    """Take back what was adopted from a study; the version before is current again."""
-    from service.twin import versions
+    """Withdraw what was adopted from a study; the version before is current again."""
+    from service.twin.plant import model_versions
 
     with writing() as session:
-        versions.withdraw(session, study, actor())
-        version = versions.get_model(session).version
-    typer.echo(json.dumps({"version": version}) if as_json else f"{version} is current")
+        model_versions.withdraw(session, study, actor())
+        version = model_versions.current_number(session)
+    typer.echo(json.dumps({"version": version}) if as_json else f"version {version} is current")

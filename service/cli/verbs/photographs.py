@@ -8,27 +8,44 @@ import typer
 from rich.table import Table
 
 from service.base.choices import Method
-from service.cli.output import AsJson, make_table, progress, require_file, show
+from service.cli.output import (
+    AsJson,
+    make_table,
+    progress,
+    require_file,
+    require_folder,
+    require_unbroken,
+    show,
+)
 
-if TYPE_CHECKING:  # what reads folders brings the tracer's libraries with it, which take seconds to load
+if TYPE_CHECKING:  # its libraries take seconds to load
     from service.sources.folder import MeasurementFolder
 
 app = typer.Typer()
 
-Folder = Annotated[Path, typer.Argument(help="Measurement folder in PAINT's layout.", metavar="DIR")]
+Folder = Annotated[
+    Path, typer.Argument(help="Measurement folder in PAINT's layout.", metavar="DIR")
+]
 Out = Annotated[Path, typer.Option("--out", help="Folder to write to.", metavar="OUT")]
 Surfaces = Annotated[str, typer.Option(help="measured, ideal, or a folder that predict wrote.")]
 
 EffectsFile = Annotated[
     Path | None,
-    typer.Option("--effects", help="Effects to add to the declared ones: JSON, or a study's report.", metavar="FILE"),
+    typer.Option(
+        "--effects",
+        help="Effects to add to the declared ones: JSON, or a study's report.",
+        metavar="FILE",
+    ),
 ]
 
 MountsFile = Annotated[
     Path | None,
     typer.Option(
         "--mounts",
-        help="File that calibrate wrote: heliostats stand on its mounts, others as their properties say.",
+        help=(
+            "File that calibrate wrote: heliostats stand on its mounts, others as their properties"
+            " say."
+        ),
         metavar="MOUNTS.json",
     ),
 ]
@@ -36,16 +53,19 @@ MountsFile = Annotated[
 _TIMES = ["%Y-%m-%dT%H:%M", "%Y-%m-%dT%H:%M:%S", "%Y-%m-%dT%H:%M%z", "%Y-%m-%dT%H:%M:%S%z"]
 
 
-def _count(folder: "MeasurementFolder", with_images: bool = True) -> int:
-    return sum(len(folder.measurements(name, with_images)) for name in folder.plant.heliostats)
+def _count(folder: "MeasurementFolder") -> int:
+    return sum(len(folder.measurements(name, False)) for name in folder.plant.heliostats)
 
 
 @app.command()
 def flux(folder: Folder, out: Out, as_json: AsJson = False) -> None:
-    """Camera frames or crops to flux images: OUT/H/ID-flux.png, ID-flux-centered.npz, quality.json."""
+    """Measure flux images from camera frames or crops: OUT/H/ID-flux.png, ID-flux-centered.npz,
+    quality.json.
+    """
     from service.cli.folder import flux_folder
     from service.sources.folder import read_folder
 
+    require_folder(out)
     source = read_folder(folder)
     with progress(_count(source), "flux") as step:
         report = flux_folder(source, out, step)
@@ -59,6 +79,7 @@ def flux(folder: Folder, out: Out, as_json: AsJson = False) -> None:
             f"{entry['energy_outside_window']:.3f}",
         )
     show(report, as_json, table)
+    require_unbroken(source)
 
 
 @app.command()
@@ -68,20 +89,25 @@ def predict(
     method: Annotated[
         Method, typer.Option(help="network, or refined: the network, then MAP through the tracer.")
     ] = "network",
-    images: Annotated[int, typer.Option(help="Most images used for a heliostat: 1 to 8, to 64 where refined.")] = 8,
+    images: Annotated[
+        int, typer.Option(help="Most images used for a heliostat: 1 to 8, to 64 where refined.")
+    ] = 8,
     mounts: MountsFile = None,
     as_json: AsJson = False,
 ) -> None:
-    """Mirror surfaces from images: OUT/H/Deflectometry/H-nurbs-surface.npz and OUT/predictions.json."""
+    """Predict mirror surfaces from images: OUT/H/Deflectometry/H-nurbs-surface.npz and
+    OUT/predictions.json.
+    """
     from service.cli.folder import predict_folder
-    from service.cli.folder_pointing import Mounts
     from service.sources.folder import read_folder
 
+    require_folder(out)
     source = read_folder(folder)
-    source = Mounts(source, mounts).under(source)
-    with progress(len(source.plant.heliostats), "predict") as step:
-        report = predict_folder(source, out, method, images, step)
-    table = make_table("Surfaces", "heliostat", "images", "misfit", "rms [mm]", "error to measured [mm]")
+    with progress(_count(source) + len(source.plant.heliostats), "predict") as step:
+        report = predict_folder(source, out, method, images, step, mounts)
+    table = make_table(
+        "Surfaces", "heliostat", "images", "misfit", "rms [mm]", "error to measured [mm]"
+    )
     for name, entry in report["heliostats"].items():
         error = entry.get("against_measured", {}).get("mae_mm")
         table.add_row(
@@ -92,6 +118,7 @@ def predict(
             "" if error is None else f"{error:.3f}",
         )
     show(report, as_json, table)
+    require_unbroken(source)
 
 
 @app.command()
@@ -102,54 +129,69 @@ def forecast(
     effects: EffectsFile = None,
     mounts: MountsFile = None,
     window: Annotated[
-        float | None, typer.Option(help="Side [m] of the accuracy's window; by the spot if not given.")
+        float | None,
+        typer.Option(help="Side [m] of the accuracy's window; by the spot if not given."),
     ] = None,
     sun: Annotated[
         tuple[float, float] | None,
-        typer.Option(help="A sun in place of the measurements': azimuth from south, elevation [deg].", metavar="AZ EL"),
+        typer.Option(
+            help="A sun in place of the measurements': azimuth from north, elevation [deg].",
+            metavar="AZ EL",
+        ),
     ] = None,
     at: Annotated[
         datetime | None,
-        typer.Option(help="The sun at a time, in UTC unless it has a zone.", metavar="TIME", formats=_TIMES),
+        typer.Option(
+            help="The sun at a time, in UTC unless it has a zone.", metavar="TIME", formats=_TIMES
+        ),
     ] = None,
     target: Annotated[
-        str | None, typer.Option(help="With --sun or --at: the folder's target or receiver to aim at.")
+        str | None,
+        typer.Option(help="With --sun or --at: the folder's target or receiver to aim at."),
     ] = None,
     plane: Annotated[
         Path | None,
-        typer.Option(help="With --sun or --at: JSON with center, normal, width, height [m].", metavar="FILE"),
+        typer.Option(
+            help="With --sun or --at: JSON with center, normal, width, height [m].", metavar="FILE"
+        ),
     ] = None,
     heliostat: Annotated[
-        list[str] | None, typer.Option(help="With --sun or --at: of this heliostat only; may be given again.")
+        list[str] | None,
+        typer.Option(help="With --sun or --at: of this heliostat only; may be given again."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Flux on the whole target for each measurement [W/m2]: OUT/H/ID-forecast.npz and OUT/forecast.json.
+    """Forecast the flux on the whole target for each measurement [W/m2]: OUT/H/ID-forecast.npz and
+    OUT/forecast.json.
 
-    With --sun or --at it takes no photographs: OUT/H/forecast.npz of each heliostat.
+    With --sun or --at it uses no photographs and writes OUT/H/forecast.npz for each heliostat.
     """
-    from service.cli.folder_forecast import forecast_folder
-    from service.cli.folder_pointing import Mounts
+    from service.cli.folder_forecast import circularity, forecast_folder
     from service.sources.documents import read_effects
     from service.sources.folder import read_folder
 
+    require_folder(out)
     added = () if effects is None else read_effects(effects)
     source = read_folder(folder)
-    known = Mounts(source, mounts, added)
     if any(given is not None for given in (sun, at, target, plane, heliostat)):
         from service.cli.folder_sun import asked, forecast_for
 
-        wanted = asked(source, sun, at, target, plane)
+        wanted = asked(source, sun, at, target, plane, heliostat or ())
         with progress(len(heliostat or source.plant.heliostats), "forecast") as step:
-            report = forecast_for(known.under(source), out, wanted, surfaces, added, heliostat or (), step)
+            report = forecast_for(source, out, wanted, surfaces, added, step, mounts)
         table = make_table("Forecasts", "heliostat", "peak [kW/m2]", "power [kW]")
         for name, entry in report["heliostats"].items():
-            table.add_row(name, f"{entry['peak_w_m2'] / 1000:.2f}", f"{entry['power_w'] / 1000:.2f}")
+            table.add_row(
+                name, f"{entry['peak_w_m2'] / 1000:.2f}", f"{entry['power_w'] / 1000:.2f}"
+            )
         show(report, as_json, table)
+        require_unbroken(source)
         return
-    with progress(_count(source, with_images=False), "forecast") as step:
-        report = forecast_folder(source, out, surfaces, window, step, added, known)
-    table = make_table("Forecasts", "measurement", "accuracy", "window [m]", "outside", "peak [kW/m2]")
+    with progress(_count(source), "forecast") as step:
+        report = forecast_folder(source, out, surfaces, window, step, added, mounts)
+    table = make_table(
+        "Forecasts", "measurement", "accuracy", "window [m]", "outside", "peak [kW/m2]"
+    )
     for key, entry in report["measurements"].items():
         compared = "accuracy" in entry
         table.add_row(
@@ -163,24 +205,31 @@ def forecast(
         table.add_section()
         table.add_row("mean", f"{report['accuracy_mean']:.3f}")
     show(report, as_json, table)
+    if not as_json and (said := circularity(report)):
+        typer.echo(said)
+    require_unbroken(source)
 
 
 @app.command()
 def study(
     folder: Folder,
-    out: Annotated[Path, typer.Option("--out", help="JSON file to write the report to.", metavar="REPORT.json")],
+    out: Annotated[
+        Path, typer.Option("--out", help="JSON file to write the report to.", metavar="REPORT.json")
+    ],
     page: Annotated[
-        Path | None, typer.Option("--html", help="Write the report as one web page, too.", metavar="FILE")
+        Path | None,
+        typer.Option("--html", help="Write the report as one web page, too.", metavar="FILE"),
     ] = None,
     surfaces: Surfaces = "measured",
     effects: EffectsFile = None,
     mounts: MountsFile = None,
     as_json: AsJson = False,
 ) -> None:
-    """Which physical effect the photographs demand that the declared model lacks, and what it buys: REPORT.json."""
+    """Find physical effects that the declared model lacks, and their gain in
+    accuracy: REPORT.json.
+    """
     from service.base.settings import Settings
     from service.cli.folder import write_json
-    from service.cli.folder_pointing import Mounts
     from service.cli.folder_study import study_folder
     from service.sources.documents import read_effects
     from service.sources.folder import read_folder
@@ -189,9 +238,9 @@ def study(
         require_file(path)
     added = () if effects is None else read_effects(effects)
     source = read_folder(folder)
-    known, scales = Mounts(source, mounts, added), Settings().figure_scales
+    scales = Settings().figure_scales
     with progress(None, "study") as step:
-        done = study_folder(source, surfaces, effects=added, progress=step, mounts=known)
+        done = study_folder(source, surfaces, effects=added, progress=step, mounts=mounts)
     report = done.to_json()
     write_json(out, report)
     if page is not None:
@@ -202,12 +251,15 @@ def study(
         page.write_text(drawn, encoding="utf-8")
     show(report, as_json, _study_table(report))
     if not as_json:
-        typer.echo(done.study.conclusion())
+        typer.echo(report["conclusion"])
+    require_unbroken(source)
 
 
 def _study_table(report: dict[str, Any]) -> Table:
-    """Every candidate alone, the best first, and where the model stands before and after."""
-    table = make_table(f"Study: {report['verdict']}", "effect", "accuracy", "gain, 95 %", "score", "")
+    """All candidate effects, the best first, and the model's accuracy before and after."""
+    table = make_table(
+        f"Study: {report['verdict']}", "effect", "accuracy", "gain, 95 %", "score", ""
+    )
     found = {effect["name"] for effect in report["effects"]}
     for candidate in report["candidates"]:
         low, high = candidate.get("gain", candidate["accuracy_gain"])["ci95"]

@@ -6,60 +6,101 @@ from typing import Annotated
 
 import typer
 
-from service.cli.output import AsJson, console, make_table, progress, require_file, show
+from service.cli.output import (
+    AsJson,
+    console,
+    make_table,
+    progress,
+    require_file,
+    require_unbroken,
+    show,
+)
+from service.cli.verbs.photographs import Folder
 
 app = typer.Typer()
-
-Folder = Annotated[Path, typer.Argument(help="Measurement folder in PAINT's layout.", metavar="DIR")]
 
 
 @app.command()
 def calibrate(
     folder: Folder,
-    out: Annotated[Path, typer.Option("--out", help="JSON file to write the mounts to.", metavar="MOUNTS.json")],
+    out: Annotated[
+        Path, typer.Option("--out", help="JSON file to write the mounts to.", metavar="MOUNTS.json")
+    ],
     until: Annotated[
         datetime | None,
         typer.Option(
-            help="Only by those before this day: study --mounts says what changed since.", formats=["%Y-%m-%d"]
+            help=(
+                "Only by those before this day: study --mounts says what changed since. Those of an"
+                " unknown time are "
+                "left out."
+            ),
+            formats=["%Y-%m-%d"],
         ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Mounts from motors, sun and spots, with uncertainties, steps, drift and named outliers: MOUNTS.json."""
+    """Calibrate mounts from motors, suns and spots, with uncertainties, steps, drift and outliers:
+    MOUNTS.json.
+    """
     from model.pointing.report import clock_in_words
     from service.cli.folder_pointing import calibrate_folder
     from service.sources.folder import read_folder
+    from service.twin.pointing.calibration import UndatedCount
 
     require_file(out)
     source = read_folder(folder)
-    with progress(len(source.plant.heliostats), "calibrate") as step:
-        report = calibrate_folder(source, out, step, None if until is None else until.replace(tzinfo=UTC))
+    with progress(None, "calibrate") as step:
+        report = calibrate_folder(
+            source, out, step, None if until is None else until.replace(tzinfo=UTC)
+        )
     if report["clock"] is not None:
         console.print(f"clock: {clock_in_words(report['clock'])}", style="yellow", highlight=False)
-    table = make_table("Mounts", "heliostat", "measurements", "residual [mrad]", "90 %", "steps", "outliers")
+    said = UndatedCount(**report["undated"]).in_words()
+    if said is not None:
+        console.print(said, style="yellow", highlight=False)
+    table = make_table(
+        "Mounts", "heliostat", "measurements", "residual [mrad]", "90 %", "steps", "outliers"
+    )
     for name, entry in report["heliostats"].items():
         left = entry["residual_mrad"]
         figures = ("" if left[key] is None else f"{left[key]:.2f}" for key in ("median", "p90"))
-        table.add_row(name, str(entry["measurements"]), *figures, str(len(entry["steps"])), str(len(entry["outliers"])))
+        table.add_row(
+            name,
+            str(entry["measurements"]),
+            *figures,
+            str(len(entry["steps"])),
+            str(len(entry["outliers"])),
+        )
     show(report, as_json, table)
+    require_unbroken(source)
 
 
 @app.command()
 def spot(
     folder: Folder,
-    mounts: Annotated[Path, typer.Option("--mounts", help="File that calibrate wrote.", metavar="MOUNTS.json")],
-    out: Annotated[Path, typer.Option("--out", help="JSON file to write the spots to.", metavar="SPOTS.json")],
+    mounts: Annotated[
+        Path, typer.Option("--mounts", help="File that calibrate wrote.", metavar="MOUNTS.json")
+    ],
+    out: Annotated[
+        Path, typer.Option("--out", help="JSON file to write the spots to.", metavar="SPOTS.json")
+    ],
     as_json: AsJson = False,
 ) -> None:
-    """Where the light of each measurement's motors lands, and how sure that is: SPOTS.json."""
+    """Predict the spot of each measurement from its motors, with its uncertainty: SPOTS.json."""
     from service.cli.folder_pointing import spot_folder
     from service.sources.folder import read_folder
 
     require_file(out)
     source = read_folder(folder)
-    with progress(len(source.plant.heliostats), "spot") as step:
+    with progress(None, "spot") as step:
         report = spot_folder(source, mounts, out, step)
     table = make_table("Spots", "measurement", "east [m]", "north [m]", "up [m]", "± [m]", "target")
     for key, entry in report["spots"].items():
-        table.add_row(key, *(f"{value:.2f}" for value in entry["spot"]), f"{entry['std_m']:.2f}", entry["target"])
+        table.add_row(
+            key,
+            *(f"{value:.2f}" for value in entry["spot"]),
+            f"{entry['std_m']:.2f}",
+            entry["target"],
+        )
     show(report, as_json, table)
+    require_unbroken(source)

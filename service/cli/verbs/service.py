@@ -1,13 +1,22 @@
-"""The verbs that run the service or fill its store: serve, worker, migrate, import, export, demo."""
+"""Verbs that run the service or fill its store: serve, worker, migrate, import, export, demo."""
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from service.cli.output import AsJson, console, make_table, progress, show
-from service.cli.store import actor
+from service.cli.output import (
+    AsJson,
+    console,
+    make_table,
+    progress,
+    require_folder,
+    require_unbroken,
+    show,
+)
+from service.cli.store import actor, keep_private
 from service.cli.verbs.photographs import Folder
 
 app = typer.Typer()
@@ -15,12 +24,13 @@ app = typer.Typer()
 
 @app.command("import")
 def import_(folder: Folder, as_json: AsJson = False) -> None:
-    """A measurement folder into the store; a second run changes nothing."""
+    """Import a measurement folder into the store; a second run changes nothing."""
     from service.base.settings import Settings
     from service.sources.folder import read_folder
-    from service.twin.importing import import_folder
-    from service.twin.runtime import Runtime
+    from service.twin.runtime.runtime import Runtime
+    from service.twin.transfer.importing import import_folder
 
+    keep_private()
     source = read_folder(folder)
     runtime = Runtime.from_settings(Settings())
     try:
@@ -32,18 +42,26 @@ def import_(folder: Folder, as_json: AsJson = False) -> None:
     finally:
         runtime.close()
     _show_counts("Imported", report, as_json)
+    require_unbroken(source)
 
 
 @app.command()
 def export(
-    folder: Annotated[Path, typer.Argument(help="A new folder to write to.", metavar="DIR")], as_json: AsJson = False
+    folder: Annotated[Path, typer.Argument(help="A new folder to write to.", metavar="DIR")],
+    as_json: AsJson = False,
 ) -> None:
-    """The store as a measurement folder in PAINT's layout, with STAC items; `heliotwin import` reads it."""
-    from service.base.settings import Settings
-    from service.twin.exporting import export_folder
-    from service.twin.runtime import Runtime
+    """Export the store as a measurement folder in PAINT's layout, with STAC items.
 
-    runtime = Runtime.from_settings(Settings())
+    `heliotwin import` reads it.
+    """
+    from service.base.settings import Settings
+    from service.store.database import require_store
+    from service.twin.runtime.runtime import Runtime
+    from service.twin.transfer.exporting import export_folder
+
+    settings = Settings()
+    require_store(settings)
+    runtime = Runtime.from_settings(settings)
     try:
         runtime.database.require_current()
         with progress(None, "export") as step:
@@ -53,7 +71,7 @@ def export(
     _show_counts("Exported", report, as_json)
 
 
-def _show_counts(title: str, report: dict[str, Any], as_json: bool) -> None:
+def _show_counts(title: str, report: Mapping[str, Any], as_json: bool) -> None:
     table = make_table(title, "what", "count")
     for what, count in report["counts"].items():
         table.add_row(what, str(count))
@@ -62,15 +80,26 @@ def _show_counts(title: str, report: dict[str, Any], as_json: bool) -> None:
 
 @app.command()
 def serve(
-    host: Annotated[str | None, typer.Option(help="Address to listen on; HELIOTWIN_HOST or 127.0.0.1.")] = None,
-    port: Annotated[int | None, typer.Option(help="Port to listen on; HELIOTWIN_PORT or 8000.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print where it listens as JSON, once it does.")] = False,
+    host: Annotated[
+        str | None, typer.Option(help="Address to listen on; HELIOTWIN_HOST or 127.0.0.1.")
+    ] = None,
+    port: Annotated[
+        int | None, typer.Option(help="Port to listen on; HELIOTWIN_PORT or 8000.")
+    ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print where it listens as JSON, once it does.")
+    ] = False,
 ) -> None:
-    """The REST service, on an embedded SQLite store unless HELIOTWIN_DATABASE_URL names another."""
+    """Run the REST service, on an embedded SQLite store unless HELIOTWIN_DATABASE_URL names
+    another.
+    """
     from service.base.settings import Settings
     from service.web import server
 
-    given: dict[str, Any] = {key: value for key, value in {"host": host, "port": port}.items() if value is not None}
+    keep_private()
+    given: dict[str, Any] = {
+        key: value for key, value in {"host": host, "port": port}.items() if value is not None
+    }
     settings = Settings(**given)
     address = f"http://{settings.host}:{settings.port}"
 
@@ -85,14 +114,19 @@ def serve(
 
 @app.command()
 def worker(
-    count: Annotated[int | None, typer.Option(help="Jobs at a time; HELIOTWIN_JOB_WORKERS or 1.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print what it works at as JSON before it starts.")] = False,
+    count: Annotated[
+        int | None, typer.Option(help="Jobs at a time; HELIOTWIN_JOB_WORKERS or 1.")
+    ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print what it works at as JSON before it starts.")
+    ] = False,
 ) -> None:
-    """Work at the jobs of the store that `serve` uses, in a process of its own."""
+    """Run the jobs of the store that `serve` uses, in a separate process."""
     from service.base.settings import Settings
     from service.jobs.kinds import KINDS
     from service.jobs.worker import work
 
+    keep_private()
     settings = Settings() if count is None else Settings(job_workers=count)
     if as_json:
         typer.echo(json.dumps({"workers": settings.job_workers}))
@@ -102,7 +136,10 @@ def worker(
 @app.command()
 def migrate(
     to: Annotated[
-        str, typer.Option(help="An older revision to go back to; what only newer ones can hold is lost.")
+        str,
+        typer.Option(
+            help="An older revision to go back to; what only newer ones can hold is lost."
+        ),
     ] = "head",
     as_json: AsJson = False,
 ) -> None:
@@ -110,20 +147,24 @@ def migrate(
     from service.base.settings import Settings
     from service.store import database
 
+    keep_private()
     settings = Settings()
     settings.data_dir.mkdir(parents=True, exist_ok=True)
     report = {"revision": database.migrate(settings, to)}
     show(report, as_json)
-    console.print(f"the schema stands at {report['revision']}", highlight=False)
+    console.print(f"the schema is at {report['revision']}", highlight=False)
 
 
 @app.command()
 def demo(
-    data: Annotated[Path | None, typer.Option(help="A measurement folder instead of the embedded plant.")] = None,
+    data: Annotated[
+        Path | None, typer.Option(help="A measurement folder instead of the embedded plant.")
+    ] = None,
     out: Annotated[Path, typer.Option(help="Folder to write to.")] = Path("out/demo"),
     as_json: AsJson = False,
 ) -> None:
-    """The main job on an embedded plant, or on a measurement folder, with pictures and a report."""
+    """Run the main job on an embedded plant or a measurement folder, with pictures and a report."""
     from service.cli.demo import run_demo
 
+    require_folder(out)
     show(run_demo(data, out, console, quiet=as_json), as_json)

@@ -1,10 +1,10 @@
-// The forecast form: what is typed is what is asked for, a time is told by the plant's clocks, too, and what comes of it
-// is brought into view.
+// The forecast form: an input selects its option, a time is also shown in the plant's zone, and the result is scrolled
+// into view.
 "use strict";
 (() => {
   const ways = { azimuth_deg: "position", elevation_deg: "position", moment: "time", sun_by: null };
 
-  const tell = (form) => {
+  const showZone = (form) => {
     const output = form.querySelector("[data-zone]"), moment = form.querySelector("[name=moment]").value;
     if (!output) return;
     const at = new Date(`${moment}Z`);
@@ -20,8 +20,8 @@
     if (!form || !(event.target.name in ways)) return;
     const way = ways[event.target.name] || event.target.value;
     form.querySelector(`[name=sun_by][value=${way}]`).checked = true;
-    if (way === "position") form.querySelector("[name=moment]").value = "";  // both at once are refused
-    tell(form);
+    if (way === "position") form.querySelector("[name=moment]").value = "";  // the service rejects both together
+    showZone(form);
   });
 
   document.addEventListener("htmx:afterSettle", (event) => {

@@ -1,12 +1,12 @@
-// The field map: one link that follows the pointer or the arrow keys from heliostat to heliostat, and zooming.
+// The field map: one link that follows the pointer or the arrow keys from heliostat to heliostat, and zoom.
 "use strict";
 (() => {
   const SVG = "http://www.w3.org/2000/svg";
   const directions = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
   const most = 64, named = 60;
-  // What is seen of the map: its upper left corner and its share; in the address, and kept while parts are replaced.
-  const told = location.hash.match(/^#map=(-?[\d.]+),(-?[\d.]+),([\d.]+)$/);
-  let view = told && { x: Number(told[1]), y: Number(told[2]), share: Number(told[3]) };
+  // The visible part of the map: its upper left corner and its share. It is in the URL, and stays when parts are replaced.
+  const match = location.hash.match(/^#map=(-?[\d.]+),(-?[\d.]+),([\d.]+)$/);
+  let view = match && { x: Number(match[1]), y: Number(match[2]), share: Number(match[3]) };
 
   const add = (parent, name, attributes, text) => {
     const made = parent.appendChild(document.createElementNS(SVG, name));
@@ -18,8 +18,8 @@
   const read = (map) => {
     const half = Number(map.dataset.side) / 2;
     return [...map.querySelectorAll("[data-names]")].flatMap((path) => {
-      const places = [...path.getAttribute("d").matchAll(/M(-?[\d.]+) (-?[\d.]+)/g)], told = path.dataset.told.split("|");
-      return path.dataset.names.split("|").map((name, k) => ({ name, told: told[k], x: Number(places[k][1]) + half, y: Number(places[k][2]) + half }));
+      const places = [...path.getAttribute("d").matchAll(/M(-?[\d.]+) (-?[\d.]+)/g)], texts = path.dataset.texts.split("|");
+      return path.dataset.names.split("|").map((name, k) => ({ name, text: texts[k], x: Number(places[k][1]) + half, y: Number(places[k][2]) + half }));
     });
   };
 
@@ -39,8 +39,8 @@
     const go = (mirror) => {
       at = mirror;
       link.setAttribute("href", `/heliostats/${encodeURIComponent(mirror.name)}`);
-      link.setAttribute("aria-label", `${mirror.name}: ${mirror.told}`);
-      title.textContent = `${mirror.name}: ${mirror.told}`;
+      link.setAttribute("aria-label", `${mirror.name}: ${mirror.text}`);
+      title.textContent = `${mirror.name}: ${mirror.text}`;
       frame.setAttribute("x", mirror.x - side / 2 - 1.5);
       frame.setAttribute("y", mirror.y - side / 2 - 1.5);
     };
@@ -80,7 +80,7 @@
       return [point.x, point.y];
     };
 
-    // Fingers are wider than mirrors: what lies within 20 pixels is meant.
+    // Fingers are wider than mirrors: heliostats within 20 pixels count.
     const near = (x, y) => {
       let best = null, least = Math.max(side, 20 / map.getScreenCTM().a);
       for (const m of mirrors) {
@@ -133,7 +133,7 @@
       event.preventDefault();
       const [dx, dy] = directions[event.key];
       let best = null, least = Infinity;
-      for (const m of mirrors) { // the nearest that lies in the direction; what lies beside it counts as twice as far
+      for (const m of mirrors) { // the nearest one in the direction; sideways distance counts twice
         const along = (m.x - at.x) * dx + (m.y - at.y) * dy, across = Math.abs((m.x - at.x) * dy) + Math.abs((m.y - at.y) * dx);
         if (along > 0.5 && along + 2 * across < least) { best = m; least = along + 2 * across; }
       }
@@ -153,7 +153,7 @@
     if (view) look(view.x, view.y, view.share); else show();
   };
 
-  // What a form leaves empty does not belong into the address.
+  // Empty form fields are left out of the URL.
   document.addEventListener("htmx:configRequest", (event) => {
     if (event.target.id === "find")
       for (const [name, value] of Object.entries(event.detail.parameters)) if (value === "") delete event.detail.parameters[name];

@@ -1,13 +1,13 @@
-// A mirror's surface in space: facets as painted quadrangles, far ones first; drag or arrow keys turn it.
+// A mirror's surface in 3D: facets are coloured quadrilaterals, far ones first; drag or arrow keys turn it.
 "use strict";
 (() => {
   const view = (canvas) => {
     const { size, bound, facets, colours } = JSON.parse(canvas.dataset.surface);
     const context = canvas.getContext("2d"), said = document.querySelector("[data-exaggeration]");
     const highest = Math.max(...facets.flat(2).map(Math.abs), 1e-3);
-    let azimuth = -0.6, tilt = 0.9, factor = 0.12 * size[0] * 1000 / highest; // mm as metres, highest at a tenth of the width
+    let azimuth = -0.6, tilt = 0.9, factor = 0.12 * size[0] * 1000 / highest; // mm are drawn as metres; the highest point is a tenth of the width
 
-    // Facets in PAINT's order: upper left, upper right, lower left, lower right; i runs with x, j with y.
+    // Facets in PAINT's order: upper left, upper right, lower left, lower right; i runs along x, j along y.
     const quads = facets.flatMap((heights, facet) => {
       const n = heights.length, gap = 0.01 * size[0], w = (size[0] - gap) / 2, h = (size[1] - gap) / 2;
       const x0 = facet % 2 ? gap / 2 : -size[0] / 2, y0 = facet < 2 ? gap / 2 : -size[1] / 2;

@@ -1,4 +1,6 @@
-"""The job `calibrations`: mounts from motors and spots."""
+"""The job `calibrations`: mounts from motor positions and focal spots."""
+
+from dataclasses import asdict
 
 from pydantic import Field
 
@@ -6,39 +8,53 @@ from model.pointing.report import clock_to_json
 from service.base.fields import Model, Moment
 from service.jobs.common import Heliostats, chosen_names
 from service.jobs.kind import Context, Kind, Result
-from service.twin.pointing import calibrate_store, keep_mounts
+from service.twin.pointing.calibration import calibrate_store, store_mounts
 
 
 class CalibrationIn(Model):
-    """Calibrate the mounts of many heliostats together, from their stored motor positions and spots."""
+    """Calibrate the mounts of many heliostats together from stored motor positions and spots."""
 
     heliostats: Heliostats = None
-    since: Moment | None = Field(default=None, description="Only photographs from then on (time with zone).")
-    until: Moment | None = Field(default=None, description="Only photographs before then (time with zone).")
+    since: Moment | None = Field(
+        default=None, description="Only measurements of a known time, from then on (with zone)."
+    )
+    until: Moment | None = Field(
+        default=None, description="Only measurements of a known time, before then (with zone)."
+    )
 
 
 def calibrate_many(context: Context, payload: CalibrationIn) -> Result:
-    """A new version of each heliostat's mount, once however often the job is begun."""
+    """Store a new version of each heliostat's mount, once even if the job restarts."""
     if "mounts" not in context.steps():
         names = chosen_names(context.runtime, payload.heliostats)
-        context.report(0.0, f"{len(names)} heliostats")
+        context.report(0.0, f"{len(names)} heliostats", phase="mounts of all heliostats at once")
         calibrated = calibrate_store(context.runtime, names, payload.since, payload.until)
-        done = calibrated.done
+        field = calibrated.done
         with context.runtime.database.writing() as session:
-            kept = keep_mounts(session, calibrated)
+            rows = store_mounts(session, calibrated)
             figures = {
-                "mounts": {name: row.version for name, row in kept.items()},
-                "steps": {name: row.document["steps"] for name, row in kept.items() if row.document["steps"]},
-                "outliers": {
-                    f"{name}/{reading}": {"reason": one.reason, "detail": one.detail}
-                    for name, own in done.contradictions.items()
-                    for reading, one in own.items()
+                "mounts": {name: row.version for name, row in rows.items()},
+                "steps": {
+                    name: row.document["steps"]
+                    for name, row in rows.items()
+                    if row.document["steps"]
                 },
-                "clock": clock_to_json(done.clock),
+                "outliers": {
+                    f"{name}/{reading}": {"reason": outlier.reason, "detail": outlier.detail}
+                    for name, outliers in field.contradictions.items()
+                    for reading, outlier in outliers.items()
+                },
+                "clock": clock_to_json(field.clock),
+                "undated": asdict(calibrated.undated),
                 "skipped": calibrated.skipped,
             }
             context.keep(session, "mounts", figures)
     return Result(context.steps()["mounts"])
 
 
-KIND = Kind("calibrations", CalibrationIn, calibrate_many, "Calibrate mounts from motor positions and spots.")
+KIND = Kind(
+    "calibrations",
+    CalibrationIn,
+    calibrate_many,
+    "Calibrate mounts from motor positions and spots.",
+)

@@ -1,12 +1,16 @@
 """The job `forecasts`: the flux of many heliostats on one receiver."""
 
-from dataclasses import replace
+import json
+import time
+from dataclasses import dataclass, field
+from hashlib import sha256
 from typing import Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 from sqlalchemy.orm import Session
 
+from model.fleet import FleetFlux
 from model.frames import sun_direction
 from model.plant import Receiver
 from service import store
@@ -25,31 +29,46 @@ from service.base.fields import (
 )
 from service.jobs.common import Heliostats, chosen_names, require_some
 from service.jobs.kind import Context, Kind, Result
-from service.twin import versions
-from service.twin.field_light import Fleet, forecast_fleet
-from service.twin.forecast import position_of, receiver_as_json
-from service.twin.runtime import Runtime
+from service.store.jobs import queue
+from service.twin.forecasts.field_forecast import (
+    Checkpoint,
+    HeliostatGroup,
+    forecast_group,
+    group_warnings,
+)
+from service.twin.forecasts.heliostat_forecast import position_of, receiver_as_json
+from service.twin.plant import model_versions
+from service.twin.runtime.runtime import Runtime
 
 
 class FleetIn(Model):
-    """Heliostats, the receiver that they light, and where they aim."""
+    """Heliostats, their common receiver, and their aim points."""
 
     heliostats: Heliostats = None
     target: Name | None = Field(
         default=None, description="A stored target or receiver; either this, `plane` or `receiver`."
     )
-    plane: Plane | None = Field(default=None, description="Any plane; either this, `target` or `receiver`.")
-    receiver: ReceiverIn | None = Field(default=None, description="Any cylinder; either this, `target` or `plane`.")
-    aim_point: Position | None = Field(
+    plane: Plane | None = Field(
+        default=None, description="Any plane; either this, `target` or `receiver`."
+    )
+    receiver: ReceiverIn | None = Field(
+        default=None, description="Any cylinder; either this, `target` or `plane`."
+    )
+    aim_point_m: Position | None = Field(
         default=None, description="Where all heliostats aim [m]; by default the receiver's middle."
     )
-    aim_points: dict[Name, Position] = Field(
-        default_factory=dict, max_length=20_000, description="Where single heliostats aim instead [m], by name."
+    aim_points_m: dict[Name, Position] = Field(
+        default_factory=dict,
+        max_length=20_000,
+        description="Where single heliostats aim instead [m], by name.",
     )
     neighbours: Flag = Field(
-        default=True, description="Whether the mirrors of these heliostats shade and block each other."
+        default=True,
+        description="Whether the mirrors of these heliostats shade and block each other.",
     )
-    dni_w_m2: Number = Field(default=1000.0, gt=0, le=2000, description="Direct normal irradiance [W/m2].")
+    dni_w_m2: Number = Field(
+        default=1000.0, gt=0, le=2000, description="Direct normal irradiance [W/m2]."
+    )
     resolution: Resolution = (256, 256)
     model_version: ModelVersion = None
 
@@ -60,62 +79,127 @@ class FleetIn(Model):
         return self
 
     def on(self, session: Session) -> Receiver:
-        """What the light falls on."""
+        """The receiver or target plane."""
         if self.plane is not None:
             return self.plane.named("plane")
         if self.receiver is not None:
             return self.receiver.named("receiver")
-        assert self.target is not None  # the schema wants one of the three
+        assert self.target is not None  # the schema requires one of the three
         return store.get_target_or_receiver(session, self.target)
 
-    def fleet(self, runtime: Runtime, sun: Sun, ideal: bool) -> Fleet:
-        """The heliostats before a sun, with their current surfaces or ``ideal`` ones."""
+    def fleet(self, runtime: Runtime, sun: Sun, ideal: bool) -> HeliostatGroup:
+        """The heliostats under this sun, with their current surfaces or ``ideal`` ones."""
         names = chosen_names(runtime, self.heliostats)
         with runtime.database.reading() as session:
-            receiver, origin = self.on(session), store.get_plant(session).origin
-            model = versions.get_model(session, self.model_version)
-        return Fleet(
+            receiver = self.on(session)
+            model = model_versions.get_model(session, self.model_version)
+        return HeliostatGroup(
             names=names,
             receiver=receiver,
             sun=sun_direction(sun.azimuth_deg, sun.elevation_deg),
-            optics=replace(model.optics, dni=self.dni_w_m2),
-            model=model,
-            origin=origin,
-            aim=np.array(receiver.center if self.aim_point is None else self.aim_point),
-            aims=self.aim_points,
+            model=model.with_dni(self.dni_w_m2),
+            aim=np.array(receiver.center if self.aim_point_m is None else self.aim_point_m),
+            aims=self.aim_points_m,
             ideal=ideal,
         )
 
 
 class FleetForecastIn(FleetIn):
-    """Superpose the flux of many heliostats on one receiver: a plane, or a cylinder unrolled.
+    """Superpose the flux of many heliostats on one receiver: a plane, or an unrolled cylinder.
 
-    It is light in W/m2: effects that the model has of the camera do not act.
+    The map is in W/m2. Camera effects of the model do not apply.
     """
 
     sun: AnySun
     surface: Literal["current", "ideal"] = Field(
-        default="current", description="The heliostats' current surfaces, where one has none it is skipped; or ideal."
+        default="current",
+        description=(
+            "The heliostats' current surfaces, and the ideal mirror of those that have none; or"
+            " ideal ones."
+        ),
     )
 
 
+# Seconds between checkpoints, the work that a restart may lose.
+_CHECKPOINT_EVERY_S = 15.0
+_CHECKPOINT = "light"
+
+
 def forecast_field(context: Context, payload: FleetForecastIn) -> Result:
-    """The sum of the heliostats' flux maps [W/m2]."""
+    """Sum the heliostats' flux maps [W/m2]. A restarted job continues from its checkpoint."""
     with context.runtime.database.reading() as session:
         sun = position_of(session, payload.sun)
     fleet = payload.fleet(context.runtime, sun, payload.surface == "ideal")
-    made = forecast_fleet(context.runtime, fleet, payload.resolution, payload.neighbours, context.report)
-    require_some(made.heliostats, made.skipped)
-    figures = _figures(made.irradiance, fleet.receiver) | {
-        "model_version": fleet.model.version,
-        "reflected_w": made.power,
-    }
+    saved = _Checkpoints(context, _fingerprint(fleet))
+    total = forecast_group(
+        context.runtime,
+        fleet,
+        payload.resolution,
+        payload.neighbours,
+        context.report,
+        saved.load(),
+        saved.save,
+    )
+    require_some(total.heliostats, total.skipped)
+    ideal = sorted(fleet.without_surface - set(total.skipped))
+    figures = {"warnings": group_warnings(len(ideal), total.heliostats)} | _figures(
+        total.irradiance, fleet.receiver
+    )
+    figures |= {"model_version": fleet.model.number, "reflected_w": total.power}
     figures |= {"sun": sun.model_dump(), "dni_w_m2": payload.dni_w_m2}
-    counts = {"heliostats": made.heliostats, "skipped": made.skipped}
-    return Result(figures | counts, {"flux": made.irradiance.astype(np.float32)})
+    figures |= {"heliostats": total.heliostats, "skipped": total.skipped}
+    figures |= {"ideal_surfaces": ideal}
+    saved.drop()
+    return Result(figures, {"flux": total.irradiance.astype(np.float32)})
 
 
-def _figures(flux: np.ndarray[Any, Any], receiver: Receiver) -> dict[str, Any]:
+def _fingerprint(fleet: HeliostatGroup) -> str:
+    """Fingerprint of the heliostats and the model. A checkpoint is valid only for the same one."""
+    return sha256(json.dumps([*fleet.names, fleet.model.version]).encode()).hexdigest()
+
+
+@dataclass(eq=False)
+class _Checkpoints:
+    """Checkpoints: the flux of a job's first tiles, stored from time to time as a step."""
+
+    context: Context
+    of: str
+    saved_s: float = field(default_factory=time.monotonic)
+
+    def load(self) -> Checkpoint | None:
+        """The checkpoint of an earlier attempt, or None."""
+        figures, arrays = (
+            self.context.steps().get(_CHECKPOINT),
+            self.context.kept_arrays(_CHECKPOINT),
+        )
+        if figures is None or arrays is None or figures["of"] != self.of:
+            return None
+        light = FleetFlux(
+            arrays["irradiance"].astype(np.float64),
+            figures["power"],
+            figures["heliostats"],
+            figures["skipped"],
+        )
+        return Checkpoint(figures["tiles"], light)
+
+    def save(self, checkpoint: Checkpoint) -> None:
+        """Replace the last checkpoint, if it is old enough."""
+        if time.monotonic() - self.saved_s < _CHECKPOINT_EVERY_S:
+            return
+        light = checkpoint.light
+        figures = {"of": self.of, "tiles": checkpoint.tiles, "power": light.power}
+        figures |= {"heliostats": light.heliostats, "skipped": light.skipped}
+        with self.context.runtime.database.writing() as session:
+            self.context.replace(session, _CHECKPOINT, figures, {"irradiance": light.irradiance})
+        self.saved_s = time.monotonic()
+
+    def drop(self) -> None:
+        """Delete the checkpoint, because the result replaces it."""
+        with self.context.runtime.database.writing() as session:
+            queue.delete_checkpoint(session, self.context.lease, _CHECKPOINT)
+
+
+def _figures(flux: np.ndarray[Any, Any], receiver: Receiver) -> dict[str, object]:
     pixel_m2 = receiver.width * receiver.height / flux.size
     return {
         "peak_w_m2": float(flux.max()),
@@ -124,4 +208,21 @@ def _figures(flux: np.ndarray[Any, Any], receiver: Receiver) -> dict[str, Any]:
     }
 
 
-KIND = Kind("forecasts", FleetForecastIn, forecast_field, "Superpose the flux of many heliostats on one receiver.")
+# Seconds per heliostat for a map of 256 x 256 pixels, and at least.
+_MAP_S, _MIN_S = 0.02, 0.005
+
+
+def expected_s(payload: FleetIn, stored: int) -> float:
+    """Estimated duration for one sun position [s]."""
+    heliostats = stored if payload.heliostats is None else len(payload.heliostats)
+    rows, columns = payload.resolution
+    return heliostats * max(_MIN_S, _MAP_S * rows * columns / 256**2)
+
+
+KIND = Kind(
+    "forecasts",
+    FleetForecastIn,
+    forecast_field,
+    "Superpose the flux of many heliostats on one receiver.",
+    expected_s=expected_s,
+)

@@ -1,4 +1,4 @@
-"""The job `imports`: a measurement folder into the store."""
+"""The job `imports`: load a measurement folder into the store."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -7,32 +7,34 @@ from typing import Any
 from pydantic import Field
 
 from model.errors import InvalidInputError
-from service.base.faults import ConflictError
-from service.base.fields import Model
+from service.base.errors import ConflictError
+from service.base.fields import Model, Text
 from service.base.progress import Steps
 from service.base.settings import Settings
 from service.jobs.kind import Context, Kind, Result
-from service.sources.files import require_regular
-from service.sources.folder import read_folder
-from service.twin.importing import Imported, import_folder
+from service.sources.files import confined_to
+from service.sources.folder import MeasurementFolder, read_folder
+from service.twin.transfer.importing import Imported, import_folder
 
 
 class ImportIn(Model):
-    """Load a measurement folder that lies on the service's machine, under the folder that its operator allowed."""
+    """Load a measurement folder on the service's machine, inside the folder that its operator
+    allowed.
+    """
 
-    folder: str = Field(
+    folder: Text = Field(
         min_length=1,
-        max_length=500,
-        pattern=r"^[^\x00-\x1f\x7f]+$",
         description="Path relative to the allowed folder; `.` is that folder itself.",
         examples=["stj"],
     )
 
 
 def allowed_root(settings: Settings) -> Path:
-    """The folder whose subfolders may be imported; ConflictError where the operator allowed none."""
+    """The folder whose subfolders may be imported; ConflictError if the operator allowed none."""
     if settings.import_root is None:
-        raise ConflictError("no folder may be imported: the operator sets HELIOTWIN_IMPORT_ROOT first")
+        raise ConflictError(
+            "no folder may be imported: the operator sets HELIOTWIN_IMPORT_ROOT first"
+        )
     return settings.import_root
 
 
@@ -41,40 +43,51 @@ def _require_root(settings: Settings) -> None:
 
 
 def allowed_folder(root: Path, folder: str) -> Path:
-    """The folder of this name under ``root``; nothing that a link or a ``..`` leads to outside of it.
+    """The folder of this name inside ``root``, with links and ``..`` resolved.
 
     Raises
     ------
     InvalidInputError
-        Where it is none, leads outside, or holds a link that does, or what is no file of a bearable size: a pipe would
-        be waited for without end, and the job with it.
+        If it does not exist or is outside.
     """
     top = root.resolve()
     path = (top / folder).resolve()
-    # The answer is the same for what does not exist and what lies outside: it tells nothing of the rest of the disk.
+    # The answer is the same for missing and outside folders, so that it reveals nothing about the
+    # disk.
     if not path.is_relative_to(top) or not path.is_dir():
-        raise InvalidInputError(f"folder: there is no folder {folder!r} under the one that may be imported")
-    for entry in path.rglob("*"):
-        if entry.is_symlink() and not entry.resolve().is_relative_to(top):
-            raise InvalidInputError(f"folder: {entry.relative_to(top)} leads outside; copy what it links to")
-        if not entry.is_dir():
-            require_regular(entry, f"folder: {entry.relative_to(top)}")
+        raise InvalidInputError(
+            f"folder: there is no folder {folder!r} under the one that may be imported"
+        )
     return path
 
 
 def import_allowed(context: Context, payload: ImportIn) -> Result:
-    """The plant, heliostats, images and measured surfaces of a folder; what is there already stays as it is."""
-    folder = read_folder(allowed_folder(allowed_root(context.runtime.settings), payload.folder))
-    images = [len(item.images) for name in folder.plant.heliostats for item in folder.measurements(name, False)]
-    steps = Steps(len(folder.plant.heliostats) + sum(images), context.report)
-    made = Imported()
-    with context.keeping("import", made.to_json):
-        return Result(import_folder(context.runtime, folder, steps, context.created_by, made))
+    """Import the plant, heliostats, images and measured surfaces of a folder; keep existing ones.
+
+    Files that cannot be read, or that a link leads to outside of the allowed folder, are skipped.
+    """
+    root = allowed_root(context.runtime.settings)
+    with confined_to(root):
+        return _import(context, read_folder(allowed_folder(root, payload.folder)))
 
 
-def _until_then(steps: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """What a cancelled import had done: it is one step."""
-    return next((dict(step) for step in steps.values()), {})
+def _import(context: Context, folder: MeasurementFolder) -> Result:
+    images = [
+        len(item.images)
+        for name in folder.plant.heliostats
+        for item in folder.measurements(name, False)
+    ]
+    steps = Steps(
+        len(folder.plant.heliostats) + sum(images), context.report, "heliostats and images"
+    )
+    imported = Imported()
+    with context.keeping("import", imported.to_json):
+        return Result(import_folder(context.runtime, folder, steps, context.created_by, imported))
+
+
+def _until_then(steps: Mapping[str, Mapping[str, Any]]) -> Mapping[str, object]:
+    """The partial result of a cancelled import, which is a single step."""
+    return next(iter(steps.values()), {})
 
 
 KIND = Kind(

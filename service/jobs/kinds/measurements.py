@@ -1,66 +1,95 @@
-"""The job `measurements`: stored photographs measured anew, by today's cameras and as this version measures."""
+"""The job `measurements`: re-measure stored photographs with the current cameras and version."""
 
 from collections.abc import Mapping
-from functools import partial
-from typing import Any
+from typing import Any, TypedDict
 
 from pydantic import Field
 
 from service import store
-from service.base.faults import SKIPPED, GoneError
-from service.base.fields import Model
+from service.base.errors import SKIPPED, GoneError
+from service.base.fields import Model, Reason
 from service.jobs.common import Heliostats, chosen_names, require_some
 from service.jobs.kind import Context, Kind, Result
-from service.twin.correcting import measure_anew
+from service.twin.photographs.corrections import remeasure
 
 
 class MeasurementsIn(Model):
-    """Measure the stored photographs of many heliostats anew: a camera was declared since, or heliotwin is newer.
+    """Re-measure the stored photographs of many heliostats.
 
-    What changes is kept in each photograph's history. Surfaces that were made from them stay, until they are predicted
-    anew.
+    This is useful after a camera was declared or heliotwin was updated. Each photograph's history
+    records what changed. Surfaces from these photographs remain until they are predicted again.
     """
 
     heliostats: Heliostats = None
-    reason: str = Field(
-        default="measured anew", min_length=1, max_length=500, description="Why; kept in the history of each."
+    reason: Reason = Field(
+        default="measured again", description="Why; kept in the history of each."
     )
 
 
+class Remeasured(TypedDict):
+    """Numbers of measured and changed photographs and of those without image; skipped ones."""
+
+    measured: int
+    changed: int
+    gone: int
+    skipped: dict[str, str]
+
+
 def measure_many(context: Context, payload: MeasurementsIn) -> Result:
-    """Every photograph whose image is kept, heliostat by heliostat; begun again it goes on with what is left."""
+    """Re-measure every photograph that still has its image, by heliostat.
+
+    After a restart the job continues with the remaining ones.
+    """
     names, done = chosen_names(context.runtime, payload.heliostats), context.steps()
     for index, name in enumerate(names):
-        context.report(index / len(names), name)
+        context.report(
+            index / len(names), name, phase="heliostats", n_done=index, n_total=len(names)
+        )
         if name not in done:
-            step: dict[str, Any] = {"measured": 0, "changed": 0, "gone": 0, "skipped": {}}
-            with context.keeping(name, partial(dict, step)):
-                _measure_step(context, name, payload.reason, index / len(names), step)
+            step: Remeasured = {"measured": 0, "changed": 0, "gone": 0, "skipped": {}}
+            with context.keeping(name, step.copy):
+                _measure_step(context, name, payload.reason, (index, len(names)), step)
             with context.runtime.database.writing() as session:
                 context.keep(session, name, step)
-    made = counts(context.steps())
-    require_some(made["measured"] + made["gone"], made["skipped"])
-    return Result(made)
+    figures = counts(context.steps())
+    require_some(figures["measured"] + figures["gone"], figures["skipped"])
+    return Result(figures)
 
 
-def counts(steps: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """How many photographs were measured, changed, or have no image any more; what was skipped, and why."""
-    total = {kind: sum(step[kind] for step in steps.values()) for kind in ("measured", "changed", "gone")}
-    return total | {"skipped": {name: why for step in steps.values() for name, why in step["skipped"].items()}}
+def counts(steps: Mapping[str, Mapping[str, Any]]) -> Remeasured:
+    """Sum the counts of the steps."""
+    each = steps.values()
+    return {
+        "measured": sum(step["measured"] for step in each),
+        "changed": sum(step["changed"] for step in each),
+        "gone": sum(step["gone"] for step in each),
+        "skipped": {name: reason for step in each for name, reason in step["skipped"].items()},
+    }
 
 
-def _measure_step(context: Context, name: str, reason: str, progress: float, step: dict[str, Any]) -> None:
-    """Measure a heliostat's photographs; what came of each is counted in ``step``."""
+def _measure_step(
+    context: Context, name: str, reason: str, place: tuple[int, int], step: Remeasured
+) -> None:
+    """Re-measure the photographs of a heliostat and count the outcomes in ``step``.
+
+    ``place`` is the index of the heliostat and the total number.
+    """
+    index, total = place
     try:
         with context.runtime.database.reading() as session:
             identifiers = store.list_identifiers(session, store.get_heliostat(session, name))
     except SKIPPED as error:
         step["skipped"][name] = str(error)
         return
-    for identifier in identifiers:
-        context.report(progress, f"{name} {identifier}")
+    for number, identifier in enumerate(identifiers):
+        share = (index + number / len(identifiers)) / total
+        context.report(
+            share, f"{name} {identifier}", phase="heliostats", n_done=index, n_total=total
+        )
         try:
-            step["changed"] += measure_anew(context.runtime, name, identifier, reason, context.created_by)
+            step["changed"] += remeasure(
+                context.runtime, name, identifier, reason, context.created_by
+            )
             step["measured"] += 1
         except GoneError:
             step["gone"] += 1
@@ -72,6 +101,6 @@ KIND = Kind(
     "measurements",
     MeasurementsIn,
     measure_many,
-    "Measure stored photographs anew, by today's cameras.",
+    "Measure stored photographs again, by the current cameras.",
     so_far=counts,
 )

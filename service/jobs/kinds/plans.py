@@ -1,7 +1,7 @@
-"""The job `plans`: a day of the field's light on a receiver, by the twin and by ideal mirrors."""
+"""The job `plans`: the field's flux on a receiver over a day, by the twin and by ideal mirrors."""
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from typing import Annotated, Any, Self
 
@@ -9,60 +9,86 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, StringConstraints, model_validator
 
-from model.ephemeris import sun_angles_at
+from model.ephemeris import sun_positions
 from model.fleet import FleetFlux
 from model.plant import Cylinder, Receiver
+from model.times import format_time
 from service import store
-from service.base.fields import Metres, Moment, Name, Number, Resolution, Sun
+from service.base.fields import Metres, Moment, Name, Number, Resolution, Sun, Text
 from service.jobs.common import require_some
 from service.jobs.kind import Context, Kind, Result
-from service.jobs.kinds.field_forecasts import FleetIn
-from service.twin import versions
-from service.twin.field_light import Fleet, forecast_fleet
-from service.twin.forecast import receiver_as_json
+from service.jobs.kinds.field_forecasts import FleetIn, expected_s
+from service.twin.forecasts.field_forecast import HeliostatGroup, forecast_group, group_warnings
+from service.twin.forecasts.heliostat_forecast import receiver_as_json
+from service.twin.plant import model_versions
 
-MOST_TIMES = 100
-"""Times of a plan."""
+MAX_TIMES = 100
+"""Maximum number of times of a plan."""
+
+MAX_PIXELS = 10_000_000
+"""Maximum number of pixels of the twin's maps over all times. With the ideal maps this is 80 MB."""
+
+PlanName = Annotated[Text, StringConstraints(min_length=1, max_length=80, strip_whitespace=True)]
 
 
 class PlanIn(FleetIn):
-    """Forecast the light on a receiver at steps between two times, by the twin and by ideal mirrors, under a name.
+    """Forecast the flux on a receiver over a period, by the twin and by ideal mirrors.
 
-    Times of the night are left out.
+    The plan has a name. Times at night are left out.
     """
 
-    name: Annotated[str, StringConstraints(min_length=1, max_length=80, strip_whitespace=True)]
-    begin: Moment = Field(description="The first time, with zone.")
-    end: Moment = Field(description="The last one, with zone.")
-    step_minutes: Number = Field(default=60.0, ge=1, le=1440, description="From one time to the next [min].")
-    allowed_w_m2: Number | None = Field(
-        default=None, gt=0, le=1e8, description="Flux that the receiver stands [W/m2]; where it is exceeded is told."
+    name: PlanName
+    first_at: Moment = Field(description="The first time, with zone.")
+    last_at: Moment = Field(description="The last one, with zone.")
+    step_minutes: Number = Field(
+        default=60.0, ge=1, le=1440, description="From one time to the next [min]."
     )
-    aim_offsets: dict[Name, tuple[Metres, Metres]] = Field(
+    allowed_w_m2: Number | None = Field(
+        default=None,
+        gt=0,
+        le=1e8,
+        description="Largest flux that the receiver may have [W/m2]; more is reported.",
+    )
+    aim_offsets_m: dict[Name, tuple[Metres, Metres]] = Field(
         default_factory=dict,
         max_length=20_000,
-        description="Where single heliostats aim instead, by name: right and up of the receiver's middle, on it [m].",
+        description=(
+            "Where single heliostats aim instead, by name: right and up of the receiver's middle,"
+            " on it [m]."
+        ),
     )
     resolution: Resolution = (64, 64)
 
     @model_validator(mode="after")
     def _some_times(self) -> Self:
-        if self.end < self.begin:
-            raise ValueError("end: give a time after begin")
-        if len(list(self.times())) > MOST_TIMES:
-            raise ValueError(f"step_minutes: these are more than {MOST_TIMES} times; make the steps longer")
+        if self.last_at < self.first_at:
+            raise ValueError("last_at: give a time after first_at")
+        count, (rows, columns) = self.count(), self.resolution
+        if count > MAX_TIMES or count * rows * columns > MAX_PIXELS:
+            raise ValueError(
+                f"first_at, last_at, step_minutes, resolution: {count} times of {rows} x {columns}"
+                f" pixels are too many; a plan has at most {MAX_TIMES} times, and {MAX_PIXELS}"
+                " pixels in all of them together"
+            )
         return self
 
+    def count(self) -> int:
+        """Number of times including those at night, without creating them."""
+        return (self.last_at - self.first_at) // timedelta(minutes=self.step_minutes) + 1
+
     def times(self) -> Iterator[datetime]:
-        """From ``begin`` to ``end``."""
-        at = self.begin
-        while at <= self.end:
-            yield at
-            at += timedelta(minutes=self.step_minutes)
+        """Times from ``first_at`` to ``last_at``."""
+        return (
+            self.first_at + number * timedelta(minutes=self.step_minutes)
+            for number in range(self.count())
+        )
 
 
 def aim_on(receiver: Receiver, right: float, up: float) -> tuple[float, float, float]:
-    """A place on a receiver (3,) [m] by its coordinates on the map [m]: along the arc on a cylinder."""
+    """Convert map coordinates [m] on a receiver to a point (3,) [m] in ENU.
+
+    On a cylinder, ``right`` is along the arc.
+    """
     plane, across = receiver.middle, right
     if isinstance(receiver, Cylinder):
         plane, across = receiver.tangent(right / receiver.radius, 1.0, 1.0), 0.0
@@ -71,77 +97,165 @@ def aim_on(receiver: Receiver, right: float, up: float) -> tuple[float, float, f
 
 
 def _suns(context: Context, payload: PlanIn) -> list[tuple[datetime, Sun]]:
-    """The times of the day, and where the sun stands then."""
+    """The times with sun above the horizon, and the sun positions."""
     with context.runtime.database.reading() as session:
-        latitude, longitude, _ = store.get_plant(session).origin
-    angles = [(at, *sun_angles_at(at, latitude, longitude)) for at in payload.times()]
-    return [(at, Sun(azimuth_deg=azimuth, elevation_deg=up)) for at, azimuth, up in angles if up > 0]
+        origin = store.get_plant(session).origin
+    times = list(payload.times())
+    angles = zip(times, sun_positions(times, origin).tolist(), strict=True)
+    return [
+        (at, Sun(azimuth_deg=azimuth, elevation_deg=up)) for at, (azimuth, up) in angles if up > 0
+    ]
 
 
-def load_of(made: FleetFlux, receiver: Receiver, allowed_w_m2: float | None) -> dict[str, Any]:
-    """What light does to a receiver.
+def load_of(flux: FleetFlux, receiver: Receiver, allowed_w_m2: float | None) -> dict[str, object]:
+    """Key figures of the flux on a receiver.
 
-    ``intercept`` is the share of what the mirrors reflect that lands on it, ``spillage`` the rest; ``exceeded_m2`` the
-    area that gets more than is allowed.
+    ``intercept`` is the share of the reflected power that hits it, and ``spillage`` the rest.
+    ``exceeded_m2`` is the area above the allowed flux.
     """
-    pixel_m2 = receiver.width * receiver.height / made.irradiance.size
-    power = float(made.irradiance.sum() * pixel_m2)
-    intercept = min(power / made.power, 1.0) if made.power > 0 else None
+    pixel_m2 = receiver.width * receiver.height / flux.irradiance.size
+    power = float(flux.irradiance.sum() * pixel_m2)
+    intercept = min(power / flux.power, 1.0) if flux.power > 0 else None
     return {
-        "peak_w_m2": float(made.irradiance.max()),
+        "peak_w_m2": float(flux.irradiance.max()),
         "power_w": power,
-        "reflected_w": made.power,
+        "reflected_w": flux.power,
         "intercept": intercept,
         "spillage": None if intercept is None else 1 - intercept,
-        "exceeded_m2": None if allowed_w_m2 is None else float((made.irradiance > allowed_w_m2).sum() * pixel_m2),
+        "exceeded_m2": (
+            None
+            if allowed_w_m2 is None
+            else float((flux.irradiance > allowed_w_m2).sum() * pixel_m2)
+        ),
     }
 
 
+_FLEET = "fleet"
+
+
+def map_name(index: int) -> str:
+    """Name of the job step with a plan's maps at one time.
+
+    The maps are `twin` and `ideal`, (rows, columns) [W/m2].
+    """
+    return f"{index:03d}"
+
+
 def plan_day(context: Context, payload: PlanIn) -> Result:
-    """The light at each time, by the twin and by ideal mirrors of the same heliostats."""
+    """Compute the flux at each time, by the twin and by ideal mirrors.
+
+    Both use the same heliostats. Each time is a step of the job.
+    """
     with context.runtime.database.reading() as session:
         receiver = payload.on(session)
-        model = versions.get_model(session, payload.model_version)
-    aims = {name: aim_on(receiver, *offset) for name, offset in payload.aim_offsets.items()}
-    asked = payload.model_copy(update={"model_version": model.number, "aim_points": payload.aim_points | aims})
-    suns, steps, maps = _suns(context, payload), [], []
-    require_some(len(suns), {"the sun": "it is night from begin to end"})
-    skipped: dict[str, str] = {}
-    heliostats = 0
-
-    def light(fleet: Fleet, index: int, begun: float) -> FleetFlux:
-        def report(done: float, what: str) -> None:
-            context.report((index + begun + done / 2) / len(suns), f"{suns[index][0]:%H:%M} UTC, {what}")
-
-        return forecast_fleet(context.runtime, fleet, payload.resolution, payload.neighbours, report)
-
+        model = model_versions.get_model(session, payload.model_version)
+    aims = {name: aim_on(receiver, *offset) for name, offset in payload.aim_offsets_m.items()}
+    request = payload.model_copy(
+        update={"model_version": model.number, "aim_points_m": payload.aim_points_m | aims}
+    )
+    suns, done = _suns(context, payload), context.steps()
+    require_some(len(suns), {"the sun": "it is night from first_at to last_at"})
     for index, (at, sun) in enumerate(suns):
-        twin = light(asked.fleet(context.runtime, sun, ideal=False), index, 0.0)
-        require_some(twin.heliostats, twin.skipped)
-        skipped |= twin.skipped
-        heliostats = max(heliostats, twin.heliostats)
-        fleet = asked.fleet(context.runtime, sun, ideal=True)
-        same = [name for name in fleet.names if name not in twin.skipped]
-        ideal = light(replace(fleet, names=same), index, 0.5)
-        loads = {
-            name: load_of(made, receiver, payload.allowed_w_m2) for name, made in (("twin", twin), ("ideal", ideal))
-        }
-        steps.append({"at": at.isoformat(), "sun": sun.model_dump(), "heliostats": twin.heliostats, **loads})
-        maps.append((twin.irradiance, ideal.irradiance))
-    stacked: NDArray[np.float32] = np.array(maps, dtype=np.float32)
-    peak = stacked[:, 0].max(axis=0)
+        if map_name(index) not in done:
+            _plan_time(_Time(context, request, receiver, index, len(suns), at, sun))
+    steps = context.steps()
+    fleet = steps.pop(_FLEET)
+    peak = _peak(context, len(suns))
+    heliostats = max(step["heliostats"] for step in steps.values())
     figures = {
+        "warnings": group_warnings(len(fleet["ideal_surfaces"]), heliostats),
         "name": payload.name,
         "peak_w_m2": float(peak.max()),
         "heliostats": heliostats,
         "times": len(suns),
-        "left_out": len(list(payload.times())) - len(suns),
-        "model_version": model.version,
+        "left_out": payload.count() - len(suns),
+        "model_version": model.number,
         "plane": receiver_as_json(receiver),
-        "steps": steps,
-        "skipped": skipped,
+        "steps": [steps[map_name(index)] for index in range(len(suns))],
+        **fleet,
     }
-    return Result(figures, {"flux": peak, "twin": stacked[:, 0], "ideal": stacked[:, 1]})
+    return Result(figures, {"flux": peak})
 
 
-KIND = Kind("plans", PlanIn, plan_day, "Forecast a day of the field's light on a receiver, against ideal mirrors.")
+@dataclass(frozen=True, eq=False)
+class _Time:
+    """Time ``index`` of ``total`` of a plan."""
+
+    context: Context
+    asked: PlanIn
+    receiver: Receiver
+    index: int
+    total: int
+    at: datetime
+    sun: Sun
+
+    def light(self, fleet: HeliostatGroup, begun: float) -> FleetFlux:
+        """Compute a fleet's flux, half of the work at this time, from share ``begun`` on."""
+
+        def report(share: float, message: str, **_counts: Any) -> None:
+            whole = (self.index + begun + share / 2) / self.total
+            what = f"{self.at:%H:%M} UTC, {message}"
+            self.context.report(
+                whole, what, phase="times of the plan", n_done=self.index, n_total=self.total
+            )
+
+        return forecast_group(
+            self.context.runtime, fleet, self.asked.resolution, self.asked.neighbours, report
+        )
+
+
+def _plan_time(time: _Time) -> None:
+    """Compute and store the flux maps of the twin and of ideal mirrors at one time."""
+    context, request = time.context, time.asked
+    fleet = request.fleet(context.runtime, time.sun, ideal=False)
+    twin = time.light(fleet, 0.0)
+    require_some(twin.heliostats, twin.skipped)
+    without = fleet.without_surface - set(twin.skipped)
+    fleet = request.fleet(context.runtime, time.sun, ideal=True)
+    ideal = time.light(
+        replace(fleet, names=[name for name in fleet.names if name not in twin.skipped]), 0.5
+    )
+    fluxes = {"twin": twin, "ideal": ideal}
+    loads = {
+        name: load_of(flux, time.receiver, request.allowed_w_m2) for name, flux in fluxes.items()
+    }
+    step = {
+        "at": format_time(time.at),
+        "sun": time.sun.model_dump(),
+        "heliostats": twin.heliostats,
+        **loads,
+    }
+    maps = {name: flux.irradiance.astype(np.float32) for name, flux in fluxes.items()}
+    known = context.steps().get(_FLEET, {"skipped": {}, "ideal_surfaces": []})
+    about = {
+        "skipped": known["skipped"] | twin.skipped,
+        "ideal_surfaces": sorted(without.union(known["ideal_surfaces"])),
+    }
+    with context.runtime.database.writing() as session:
+        context.keep(session, map_name(time.index), step, maps)
+        context.replace(session, _FLEET, about)
+
+
+def _peak(context: Context, times: int) -> NDArray[np.float32]:
+    """Maximum of the twin's flux at each pixel over all times. One map is in memory at a time."""
+    peak: NDArray[np.float32] | None = None
+    for index in range(times):
+        maps = context.kept_arrays(map_name(index))
+        assert maps is not None  # stored in the transaction of its step
+        peak = maps["twin"] if peak is None else np.maximum(peak, maps["twin"])
+    assert peak is not None
+    return peak
+
+
+def expected_plan_s(payload: PlanIn, stored: int) -> float:
+    """Estimated duration of a plan [s]."""
+    return 2 * payload.count() * expected_s(payload, stored)
+
+
+KIND = Kind(
+    "plans",
+    PlanIn,
+    plan_day,
+    "Forecast a day of the field's light on a receiver, against ideal mirrors.",
+    expected_s=expected_plan_s,
+)

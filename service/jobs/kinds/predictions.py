@@ -1,30 +1,38 @@
-"""The job `predictions`: surfaces of many heliostats."""
+"""The job `predictions`: predict the surfaces of many heliostats."""
 
 from collections.abc import Mapping
-from typing import Any, Self
+from dataclasses import dataclass
+from typing import Any, Self, TypedDict
 
 from pydantic import Field, model_validator
 
+from model.progress import Progress
 from service.base.choices import require_images
-from service.base.faults import SKIPPED
+from service.base.errors import SKIPPED
 from service.base.fields import Method, Model, ModelVersion, Whole
 from service.jobs.common import Heliostats, chosen_names, require_some
 from service.jobs.kind import Context, Kind, Result
-from service.twin import versions
-from service.twin.prediction import Kept, compute_surface, keep_surface
-from service.twin.runtime import Runtime
+from service.twin.plant import model_versions
+from service.twin.runtime.runtime import Runtime
+from service.twin.surfaces.prediction import StoredSurface, compute_surface, keep_surface
 
 
 class PredictionsIn(Model):
     """Predict the surfaces of many heliostats, each from its newest accepted measurements.
 
-    A new surface becomes today's unless the one that is forecasts unseen photographs better, or is better founded.
+    A new surface becomes active, unless the active one forecasts unseen photographs better or is
+    from a higher-ranked source.
     """
 
     heliostats: Heliostats = None
-    method: Method = Field(default="network", description="network: at once; refined: fitted through the ray tracer.")
+    method: Method = Field(
+        default="network", description="network: at once; refined: fitted through the ray tracer."
+    )
     images: Whole = Field(
-        default=8, ge=1, le=64, description="How many measurements to take of each heliostat; 8 the network."
+        default=8,
+        ge=1,
+        le=64,
+        description="How many measurements to take of each heliostat; 8 the network.",
     )
     model_version: ModelVersion = None
 
@@ -35,37 +43,83 @@ class PredictionsIn(Model):
 
 
 def predict_many(context: Context, payload: PredictionsIn) -> Result:
-    """A new surface version for each heliostat, once each however often the job is begun."""
+    """Store a new surface version of each heliostat, once each even if the job restarts."""
     names, done = chosen_names(context.runtime, payload.heliostats), context.steps()
     version = _model_number(context.runtime, payload.model_version)
     for index, name in enumerate(names):
-        context.report(index / len(names), name)
+        progress = _Progress(context, name, index, len(names))
+        progress("photographs", 0, 1)
         if name not in done:
-            _predict_step(context, payload, name, version)
-    made = changes(context.steps())
-    require_some(len(made["surfaces"]) + len(made["unchanged"]), made["skipped"])
-    return Result(made)
+            _predict_step(context, payload, name, version, progress)
+    figures = changes(context.steps())
+    require_some(len(figures["surfaces"]) + len(figures["unchanged"]), figures["skipped"])
+    return Result(figures)
 
 
-def changes(steps: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """What was done for each heliostat, by name: new versions, how they compare with today's, and what stays."""
-    kinds = {"surfaces": "version", "unchanged": "unchanged", "judged": "judged", "skipped": "skipped"}
+class PredictionReport(TypedDict):
+    """Results by heliostat: new and unchanged versions, comparisons with the active one, skipped
+    ones.
+    """
+
+    surfaces: dict[str, int]
+    unchanged: dict[str, int]
+    judged: dict[str, object]
+    skipped: dict[str, str]
+
+
+def changes(steps: Mapping[str, Mapping[str, Any]]) -> PredictionReport:
+    """Collect the results of the steps."""
+
+    def by_heliostat(key: str) -> dict[str, Any]:
+        return {name: step[key] for name, step in steps.items() if step.get(key) is not None}
+
     return {
-        kind: {name: step[key] for name, step in steps.items() if step.get(key) is not None}
-        for kind, key in kinds.items()
+        "surfaces": by_heliostat("version"),
+        "unchanged": by_heliostat("unchanged"),
+        "judged": by_heliostat("judged"),
+        "skipped": by_heliostat("skipped"),
     }
 
 
-def _model_number(runtime: Runtime, wanted: int | None) -> int:
-    """The version of the plant's model that is wanted, or the current one: the same for all heliostats of a job."""
+def _model_number(runtime: Runtime, number: int | None) -> int:
+    """The number of the requested or current model version, the same for a whole job."""
     with runtime.database.reading() as session:
-        return versions.get_model(session, wanted).number
+        return model_versions.get_model(session, number).number
 
 
-def _predict_step(context: Context, payload: PredictionsIn, name: str, model_version: int) -> None:
+@dataclass(frozen=True, eq=False)
+class _Progress:
+    """Progress of heliostat ``index`` of ``total``, as a part of the whole job."""
+
+    context: Context
+    name: str
+    index: int
+    total: int
+
+    def __call__(self, what: str, done: int, steps: int) -> None:
+        counts = (
+            ("surfaces of heliostats", self.index, self.total)
+            if self.total > 1
+            else (what, done, steps)
+        )
+        phase, n_done, n_total = counts
+        share = (self.index + done / max(steps, 1)) / self.total
+        self.context.report(
+            share, f"{self.name}: {what}", phase=phase, n_done=n_done, n_total=n_total
+        )
+
+
+def _predict_step(
+    context: Context, payload: PredictionsIn, name: str, model_version: int, progress: Progress
+) -> None:
     try:
         predicted = compute_surface(
-            context.runtime, name, payload.method, images=payload.images, model_version=model_version
+            context.runtime,
+            name,
+            payload.method,
+            images=payload.images,
+            model_version=model_version,
+            progress=progress,
         )
         with context.runtime.database.writing() as session:
             context.keep(session, name, _step(keep_surface(session, predicted, context.created_by)))
@@ -74,16 +128,16 @@ def _predict_step(context: Context, payload: PredictionsIn, name: str, model_ver
             context.keep(session, name, {"skipped": str(error)})
 
 
-def _step(kept: Kept) -> dict[str, Any]:
-    """What was done for a heliostat."""
-    if not kept.is_new:
-        return {"unchanged": kept.row.version}
-    decision = kept.decision
+def _step(stored: StoredSurface) -> dict[str, object]:
+    """The result for a heliostat."""
+    if not stored.is_new:
+        return {"unchanged": stored.row.version}
+    decision = stored.decision
     judged = (
         None
         if decision is None
         else {
-            "taken": decision.taken,
+            "became_active": decision.became_active,
             "against": decision.previous,
             "before": decision.accuracy_before,
             "after": decision.accuracy_after,
@@ -91,7 +145,25 @@ def _step(kept: Kept) -> dict[str, Any]:
             "reason": decision.reason,
         }
     )
-    return {"version": kept.row.version, "judged": judged}
+    return {"version": stored.row.version, "judged": judged}
 
 
-KIND = Kind("predictions", PredictionsIn, predict_many, "Predict the surfaces of many heliostats.", so_far=changes)
+# Duration per heliostat [s] by method.
+_EACH_S: Mapping[Method, float] = {"network": 0.5, "refined": 60.0}
+
+
+def expected_s(payload: PredictionsIn, stored: int) -> float:
+    """Estimated duration [s]."""
+    return _EACH_S[payload.method] * (
+        stored if payload.heliostats is None else len(payload.heliostats)
+    )
+
+
+KIND = Kind(
+    "predictions",
+    PredictionsIn,
+    predict_many,
+    "Predict the surfaces of many heliostats.",
+    so_far=changes,
+    expected_s=expected_s,
+)

@@ -1,38 +1,59 @@
-"""The job `studies`: the effect that photographs demand and the model lacks."""
+"""The job `studies`: find an effect that photographs show and the model lacks."""
 
-from pydantic import Field, field_validator
+from pydantic import Field, ValidationInfo, field_validator
 
 from model.effects import CATALOGUE
 from service import store
-from service.base.fields import Model, Moment, Name, Whole
+from service.base.fields import Model, Moment, Name, Text, Whole
 from service.jobs.kind import Context, Kind, Result
-from service.twin.study import StudyRequest, Surfaces, study_row, study_store
+from service.twin.studies.study import StudyRequest, Surfaces, study_row, study_store
+
+MAX_STUDY_IMAGES = 1600  # bounds the memory of a study
 
 
 class StudyIn(Model):
-    """Find the effect that stored photographs demand and the plant's current model lacks."""
+    """Find the effect that stored photographs show and the plant's current model lacks."""
 
     heliostats: list[Name] | None = Field(
-        default=None, min_length=1, max_length=200, description="Names of heliostats; else some of all over the field."
+        default=None,
+        min_length=1,
+        max_length=200,
+        description="Names of heliostats; else some of all over the field.",
     )
-    most_heliostats: Whole = Field(
-        default=12, ge=1, le=200, description="How many heliostats to take where none is named, near ones and far ones."
+    max_heliostats: Whole = Field(
+        default=12,
+        ge=1,
+        le=200,
+        description="How many heliostats to take where none is named, near ones and far ones.",
     )
     surfaces: Surfaces = Field(
         default="current",
-        description="measured: only heliostats with a measured surface; current: where there is none, the newest "
-        "prediction.",
+        description=(
+            "measured: only heliostats with a measured surface; current: where there is none, the"
+            " newest prediction."
+        ),
     )
     images: Whole = Field(
         default=12,
         ge=2,
         le=64,
-        description="Most photographs of each heliostat: the newest ones, spread over the sun's positions.",
+        validate_default=True,
+        description=(
+            "Most photographs of each heliostat: the newest ones, spread over the sun's positions."
+            f" {MAX_STUDY_IMAGES} of all heliostats together."
+        ),
     )
-    since: Moment | None = Field(default=None, description="Only photographs from then on (time with zone).")
-    until: Moment | None = Field(default=None, description="Only photographs before then (time with zone).")
-    candidates: list[str] | None = Field(
-        default=None, min_length=1, max_length=100, description="Names of the effects to try; all without it."
+    since: Moment | None = Field(
+        default=None, description="Only photographs from then on (time with zone)."
+    )
+    until: Moment | None = Field(
+        default=None, description="Only photographs before then (time with zone)."
+    )
+    candidates: list[Text] | None = Field(
+        default=None,
+        min_length=1,
+        max_length=100,
+        description="Names of the effects to try; all without it.",
     )
 
     @field_validator("candidates")
@@ -42,19 +63,41 @@ class StudyIn(Model):
             raise ValueError(f"the catalogue of effects has {', '.join(CATALOGUE)}")
         return None if names is None else list(dict.fromkeys(names))
 
+    @field_validator("images")
+    @classmethod
+    def _not_too_many(cls, images: int, info: ValidationInfo) -> int:
+        named = info.data.get("heliostats")
+        count = info.data.get("max_heliostats", 1) if named is None else len(set(named))
+        if count * images > MAX_STUDY_IMAGES:
+            raise ValueError(
+                f"{count * images} in all, {MAX_STUDY_IMAGES} at most; ask for"
+                f" {MAX_STUDY_IMAGES // count} of each heliostat, or for fewer heliostats"
+            )
+        return images
+
 
 def make_study(context: Context, payload: StudyIn) -> Result:
-    """A study, stored once however often the job is begun."""
+    """Make a study and store it, once even if the job restarts."""
     if "study" not in context.steps():
         studied = study_store(context.runtime, StudyRequest(**payload.model_dump()), context.report)
         options = payload.model_dump(mode="json")
-        title, scales = f"Study of job {context.lease.job_id}", context.runtime.settings.figure_scales
+        title, scales = (
+            f"Study of job {context.lease.job_id}",
+            context.runtime.settings.figure_scales,
+        )
         row = study_row(studied, title, options, context.created_by, scales)
         with context.runtime.database.writing() as session:
             store.add_study(session, row)
-            about = {"study": row.id, "verdict": row.verdict, "conclusion": row.conclusion, "skipped": row.skipped}
+            about = {
+                "study": row.id,
+                "verdict": row.verdict,
+                "conclusion": row.conclusion,
+                "skipped": row.skipped,
+            }
             context.keep(session, "study", about)
     return Result(context.steps()["study"])
 
 
-KIND = Kind("studies", StudyIn, make_study, "Find the effect that photographs demand and the model lacks.")
+KIND = Kind(
+    "studies", StudyIn, make_study, "Find the effect that photographs demand and the model lacks."
+)

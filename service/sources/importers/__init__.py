@@ -1,1 +1,1 @@
-"""Whose folders are read, one file a source, with its `IMPORTER`."""
+"""Importers of folders, one file for each source, with its `IMPORTER`."""

@@ -1,4 +1,4 @@
-"""Folders in the layout of the PAINT database of the Solar Tower Juelich, https://paint-database.org."""
+"""Folders of the PAINT database of the Solar Tower Juelich, https://paint-database.org."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -7,18 +7,18 @@ from typing import Any
 
 from model.errors import InvalidInputError
 from model.plant import Heliostat, Plant
+from model.plant_model import PlantModel
 from model.pointing import Weather
 from service.sources.documents import (
     IMAGE_KINDS,
     SUFFIXES,
     Measurement,
     read_heliostat,
+    read_item,
     read_json,
     read_measurement,
-    read_moment,
     read_receivers,
     read_targets,
-    read_weather,
 )
 from service.sources.folder import Importer, MeasurementFolder, read_declared
 
@@ -28,12 +28,12 @@ class PaintFolder(MeasurementFolder):
     """A folder in PAINT's layout."""
 
     def read_measurements(self, heliostat: str) -> Iterator[Measurement]:
-        """Those of ``H/Calibration``, with their moments where there are STAC items."""
+        """Iterate over the measurements of ``H/Calibration``; STAC items give their times."""
         folder = self.root / heliostat / "Calibration"
         for path in sorted(folder.glob("*calibration-properties.json")):
             identifier = path.name.removesuffix("calibration-properties.json").removesuffix("-")
             if not identifier:
-                continue  # a sample that PAINT ships without a number; nothing could refer to it
+                continue  # PAINT has a sample without a number, which has no identifier
             try:
                 measurement = read_measurement(identifier, heliostat, read_json(path), self.plant)
                 item = folder / f"{identifier}-calibration-item-stac.json"
@@ -51,11 +51,9 @@ class PaintFolder(MeasurementFolder):
 
 
 def _with_item(measurement: Measurement, item: Any, where: str) -> Measurement:
-    """With the moment of its STAC item, and its weather where the measurement tells none."""
-    taken_at, weather = read_moment(item, where), measurement.weather
-    if weather == Weather():
-        weather = read_weather(item["properties"], where)
-    return replace(measurement, taken_at=taken_at, weather=weather)
+    """Add the time of a STAC item, and its weather if the measurement has none."""
+    (taken_at, weather), own = read_item(item, where), measurement.weather
+    return replace(measurement, taken_at=taken_at, weather=weather if own == Weather() else own)
 
 
 def _towers(root: Path) -> list[Path]:
@@ -63,11 +61,15 @@ def _towers(root: Path) -> list[Path]:
 
 
 def _read(root: Path, heliostats: list[str] | None) -> PaintFolder:
-    file = _towers(root)[0]
+    file, *others = _towers(root)
+    if others:
+        names = ", ".join(entry.name for entry in (file, *others))
+        raise InvalidInputError(f"{root}: more than one tower file ({names}); leave the right one")
     tower = read_json(file)
     origin, targets = read_targets(tower)
     found: dict[str, Heliostat] = {}
     skipped: dict[str, str] = {}
+    broken: dict[str, str] = {}
     properties: dict[str, Any] = {}
     for own in sorted(filter(Path.is_dir, root.iterdir())):
         name, folder = own.name, own / "Properties"
@@ -77,24 +79,40 @@ def _read(root: Path, heliostats: list[str] | None) -> PaintFolder:
             continue
         try:
             if not files:
-                raise InvalidInputError(f"{folder}: no '{name}-heliostat-properties.json'; add it, or leave {name} out")
+                raise InvalidInputError(
+                    f"{folder}: no '{name}-heliostat-properties.json'; add it, or leave {name} out"
+                )
             if len(files) > 1:
                 names = ", ".join(entry.name for entry in files)
-                raise InvalidInputError(f"{folder}: more than one file of properties ({names}); leave the right one")
+                raise InvalidInputError(
+                    f"{folder}: more than one file of properties ({names}); leave the right one"
+                )
             document = read_json(files[0])
             found[name], properties[name] = read_heliostat(name, document, origin), document
         except InvalidInputError as error:
             skipped[name] = str(error)
+            if files:
+                said = str(error)
+                broken[name] = said if str(folder) in said else f"{files[0]}: {said}"
     if not found:
-        raise InvalidInputError(f"{root}: no heliostat with a readable 'Properties/*heliostat-properties.json'")
+        why = next(iter(broken.values()), "")
+        raise InvalidInputError(
+            f"{root}: no heliostat with a readable"
+            f" 'Properties/*heliostat-properties.json'{why and f': {why}'}"
+        )
     plant = Plant(_plant_name(tower, file), origin, targets, found, read_receivers(tower))
-    return PaintFolder(root, plant, *read_declared(root / "twin.json"), skipped, properties)
+    model = PlantModel(plant.site, *read_declared(root / "twin.json"))
+    return PaintFolder(root, plant, model, skipped, properties, broken)
 
 
 def _plant_name(tower: Any, file: Path) -> str:
-    """PAINT's ID of the plant; older files have none, and bear the name themselves."""
+    """PAINT's ID of the plant; without an ID, the prefix of the file name."""
     name = tower["power_plant_properties"].get("ID")
-    return name if isinstance(name, str) and name else file.name.removesuffix("-tower-measurements.json")
+    return (
+        name
+        if isinstance(name, str) and name
+        else file.name.removesuffix("-tower-measurements.json")
+    )
 
 
 IMPORTER = Importer(

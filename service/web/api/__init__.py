@@ -1,1 +1,1 @@
-"""REST: one file a resource, with its schema, its representations and its routes."""
+"""REST API: one module for each resource, with its schema, representations and routes."""

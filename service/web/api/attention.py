@@ -1,4 +1,4 @@
-"""What needs attention, and who has acknowledged it."""
+"""Alerts, and who has acknowledged them."""
 
 from datetime import datetime
 from operator import attrgetter
@@ -8,10 +8,19 @@ from fastapi import APIRouter, Body, Depends, Query, Request
 from pydantic import BaseModel, Field
 
 from service.base.fields import Model
-from service.twin.attention import AttentionCount, Item, Reason, acknowledge, needs_attention
-from service.web.answers.openapi import problems
-from service.web.answers.paging import Page, page
-from service.web.door.dependencies import OPERATE, READ, FieldBookDep, IdentityDep, Limit, RuntimeDep, require_json
+from service.twin.alerts.alerts import Alert, AlertCount, Reason, acknowledge, list_alerts
+from service.web.auth.dependencies import (
+    OPERATE,
+    OVERVIEW_SLOT,
+    READ,
+    FieldCacheDep,
+    IdentityDep,
+    Limit,
+    RuntimeDep,
+    require_json,
+)
+from service.web.responses.openapi import problems
+from service.web.responses.paging import Page, page
 
 router = APIRouter(prefix="/attention", tags=["attention"])
 
@@ -20,63 +29,73 @@ ItemId = Annotated[
     Field(
         max_length=80,
         pattern=r"^[A-Za-z0-9_-]+:[a-z_]+:[0-9a-f]{8}$",
-        description="The item and its reason as they are now; another where the reason changes or returns.",
+        description=(
+            "The item and its reason as they are now; another where the reason changes or returns."
+        ),
         examples=["AA39:moved:1f0c22ab"],
     ),
 ]
 
 
 class AttentionOut(BaseModel):
-    """Something that needs attention."""
+    """An alert: something that needs attention."""
 
     id: ItemId
     reason: Reason
     heliostat: str | None = Field(description="null: the plant as a whole.")
     since: datetime
-    what: str
-    todo: str = Field(description="What to do.")
-    photographs: list[str] = Field(description="Ids of the heliostat's measurements to look at, where there are some.")
-    acknowledged_by: str | None = Field(description="Name of the key; null where nobody has.")
+    message: str = Field(description="What is wrong.")
+    action: str = Field(description="What to do.")
+    measurements: list[str] = Field(
+        description="Ids of the heliostat's measurements to look at, where there are some."
+    )
+    acknowledged_by: str | None = Field(description="Name of the key; null if not acknowledged.")
     acknowledged_at: datetime | None
 
 
-def attention_out(item: Item) -> AttentionOut:
-    """An item as JSON."""
+def attention_out(item: Alert) -> AttentionOut:
+    """An alert as JSON."""
     return AttentionOut.model_validate(item, from_attributes=True)
 
 
 class AttentionPage(Page[AttentionOut]):
-    """A part of all that needs attention."""
+    """A part of the list of alerts."""
 
-    pending: int = Field(description="Heliostats whose pointing error is still being worked out; ask again for them.")
+    pending: int = Field(
+        description="Heliostats whose pointing error is still being computed; ask again for them."
+    )
 
 
 class AcknowledgementsIn(Model):
-    """What somebody has seen."""
+    """Alerts to acknowledge."""
 
-    ids: list[ItemId] = Field(min_length=1, max_length=500, description="Ids of items of `GET /v1/attention`.")
+    ids: list[ItemId] = Field(
+        min_length=1, max_length=500, description="Ids of items of `GET /v1/attention`."
+    )
 
 
-async def _count(request: Request) -> AttentionCount:
-    count: AttentionCount = request.app.state.attention
+async def _count(request: Request) -> AlertCount:
+    count: AlertCount = request.app.state.attention
     return count
 
 
-AttentionCountDep = Annotated[AttentionCount, Depends(_count)]
+AttentionCountDep = Annotated[AlertCount, Depends(_count)]
 
 
-@router.get("", responses=problems(), dependencies=[READ])
+@router.get("", responses=problems(), dependencies=[READ, OVERVIEW_SLOT])
 def list_attention(
     runtime: RuntimeDep,
-    book: FieldBookDep,
+    cache: FieldCacheDep,
     reason: Annotated[Reason | None, Query(description="Only this reason.")] = None,
-    acknowledged: Annotated[bool | None, Query(description="Only what somebody, or nobody, has acknowledged.")] = None,
+    acknowledged: Annotated[
+        bool | None, Query(description="Only alerts that are, or are not, acknowledged.")
+    ] = None,
     limit: Limit = 100,
     after: Annotated[ItemId | None, Query(description="The last id of the page before.")] = None,
 ) -> AttentionPage:
-    """All that needs attention, in the order of ids: reasons by the settings' thresholds, as they are now."""
+    """All alerts, in the order of ids. The thresholds are those of the current settings."""
     with runtime.database.reading() as session:
-        items, pending = needs_attention(session, book, runtime.settings)
+        items, pending = list_alerts(session, cache, runtime.settings)
     wanted = [
         item
         for item in items
@@ -89,15 +108,23 @@ def list_attention(
     return AttentionPage(items=part.items, next=part.next, pending=pending)
 
 
-@router.post("/acknowledgements", responses=problems(404, 413, 415), dependencies=[OPERATE, Depends(require_json)])
+@router.post(
+    "/acknowledgements",
+    responses=problems(404, 413, 415),
+    dependencies=[OPERATE, Depends(require_json)],
+)
 def post_acknowledgements(
     runtime: RuntimeDep,
-    book: FieldBookDep,
+    cache: FieldCacheDep,
     count: AttentionCountDep,
     identity: IdentityDep,
     seen: Annotated[AcknowledgementsIn, Body()],
-) -> list[AttentionOut]:
-    """Acknowledge items: who did stays with them until their reason changes or returns. The first who did stays."""
-    items = acknowledge(runtime, book, seen.ids, identity.name)
+) -> Page[AttentionOut]:
+    """Acknowledge alerts.
+
+    An acknowledgement lasts until the reason of the alert changes or returns. The first one is
+    kept.
+    """
+    items = acknowledge(runtime, cache, seen.ids, identity.name)
     count.forget()
-    return [attention_out(item) for item in items]
+    return Page(items=[attention_out(item) for item in items], next=None)

@@ -9,17 +9,19 @@ from pydantic import BaseModel, Field
 from service.base.fields import Version
 from service.store import audit
 from service.store.job_tables import AuditRow
-from service.web.answers.openapi import problems
-from service.web.answers.paging import Page, page
-from service.web.door.dependencies import ADMIN, Limit, RuntimeDep
+from service.web.auth.dependencies import ADMIN, Limit, RuntimeDep
+from service.web.responses.openapi import problems
+from service.web.responses.paging import Page, page
 
 
 class AuditOut(BaseModel):
     """An entry of the audit trail."""
 
     id: int
-    at: datetime
-    actor: str = Field(description="Name of the key; `local` where none is demanded, `cli` and the user elsewhere.")
+    created_at: datetime
+    actor: str = Field(
+        description="Name of the key; `local` where none is demanded, `cli` and the user elsewhere."
+    )
     action: str = Field(examples=["key.withdrawn"])
     subject: str = Field(examples=["key calibration"])
     detail: dict[str, Any]

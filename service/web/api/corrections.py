@@ -1,24 +1,26 @@
-"""Corrections of photographs: another sun, target or time, or that nothing shall be made from one."""
+"""Corrections of photographs: another sun, target or time, or exclusion."""
 
 from datetime import datetime
 from typing import Annotated, Any, Self
 
-from fastapi import APIRouter, Body, Depends
+from fastapi import APIRouter, Body, Depends, Query
 from pydantic import BaseModel, Field, model_validator
 
 from model.pointing import Weather
 from service import store
-from service.base.fields import Azimuth, Elevation, Flag, Model, Moment, Name
-from service.jobs.asking import ask_for
+from service.base.fields import Flag, Model, Moment, Name, Reason, Sun
+from service.jobs.enqueuing import enqueue
+from service.jobs.kinds import predictions
 from service.jobs.kinds.predictions import PredictionsIn
-from service.store.corrections import list_corrections, made_from
+from service.sources.schema import Temperature, WindFrom, WindSpeed
+from service.store.photographs.correction_log import list_corrections, made_from
 from service.store.tables import CorrectionRow, MeasurementRow
-from service.twin.correcting import Changes, correct
-from service.twin.runtime import Runtime
-from service.web.answers.openapi import problems
-from service.web.api.measurements import MeasurementOut, Motors, Temperature, WindFrom, WindSpeed, measurement_out
-from service.web.door.dependencies import (
-    COMPUTES,
+from service.twin.photographs.corrections import PhotographChanges, correct_photograph
+from service.twin.photographs.deletion import delete_photograph
+from service.twin.runtime.runtime import Runtime
+from service.web.api.measurements import MeasurementOut, Motors, measurement_out
+from service.web.auth.dependencies import (
+    COMPUTE_SLOT,
     OPERATE,
     READ,
     IdentityDep,
@@ -27,68 +29,94 @@ from service.web.door.dependencies import (
     RuntimeDep,
     require_json,
 )
+from service.web.responses.openapi import problems
+from service.web.responses.paging import Page
 
 
 class CorrectionIn(Model):
-    """What shall be known of a photograph instead; what is not named stays as it is."""
+    """New values of a photograph. Fields that are not named stay as they are."""
 
-    reason: str = Field(min_length=1, max_length=200, description="Why; kept with the correction.")
-    target_name: Name | None = None
-    sun_azimuth: Azimuth | None = Field(default=None, description="From south, positive to the east [deg].")
-    sun_elevation: Elevation | None = Field(default=None, description="[deg]")
+    reason: Reason = Field(description="Why; kept with the correction.")
+    target: Name | None = None
+    sun: Sun | None = None
     taken_at: Moment | None = None
     motor_position: Motors | None = Field(default=None, description="Of both axes [steps].")
     wind_speed_m_s: WindSpeed | None = Field(default=None, description="[m/s]")
     wind_from_deg: WindFrom | None = Field(default=None, description="From north, over east [deg].")
     temperature_c: Temperature | None = Field(default=None, description="[°C]")
-    excluded: Flag | None = Field(default=None, description="Whether nothing shall be made from it any more.")
-    remake: Flag = Field(default=False, description="Begin a job that makes the heliostat's surface anew.")
+    excluded: Flag | None = Field(
+        default=None, description="Whether nothing shall be made from it any more."
+    )
+    predict_again: Flag = Field(
+        default=False, description="Begin a job that predicts the heliostat's surface again."
+    )
 
     @model_validator(mode="after")
     def _some(self) -> Self:
-        if not self.model_fields_set - {"reason", "remake"}:
+        if not self.model_fields_set - {"reason", "predict_again"}:
             raise ValueError("name what shall be changed: a field of the photograph, or excluded")
         return self
 
 
 class CorrectionOut(BaseModel):
-    """What somebody corrected."""
+    """A correction of a photograph."""
 
-    made_at: datetime
-    made_by: str
+    created_at: datetime
+    created_by: str
     reason: str
-    before: dict[str, Any] = Field(description="What stood there, by the fields that changed.")
-    after: dict[str, Any] = Field(description="What stands there instead.")
+    before: dict[str, Any] = Field(description="Previous values, by the fields that changed.")
+    after: dict[str, Any] = Field(description="New values.")
+
+
+class DeletedOut(BaseModel):
+    """A deleted photograph, and what was made from it."""
+
+    deleted: list[str] = Field(description="Ids of the images that were deleted.")
+    surface_versions: list[int] = Field(
+        description="Versions of the heliostat's surface that were made from it; they say so."
+    )
+    forecasts: int = Field(description="How many forecasts were made with those.")
 
 
 class CorrectedOut(BaseModel):
-    """A corrected photograph, and what had been made from it before."""
+    """A corrected photograph, and what was made from it before the correction."""
 
     measurement: MeasurementOut
-    surfaces: list[int] = Field(description="Versions of the heliostat's surface that were made from it as it was.")
+    surface_versions: list[int] = Field(
+        description="Versions of the heliostat's surface that were made from it as it was."
+    )
     forecasts: int = Field(description="How many forecasts were made with those.")
-    job: int | None = Field(description="The job that makes the surface anew, where one was asked for.")
+    job: int | None = Field(
+        description="The job that predicts the surface again, if one was requested."
+    )
 
 
 def correction_out(row: CorrectionRow) -> CorrectionOut:
     """A correction as JSON."""
-    return CorrectionOut.model_validate({name: getattr(row, name) for name in CorrectionOut.model_fields})
+    return CorrectionOut.model_validate(
+        {name: getattr(row, name) for name in CorrectionOut.model_fields}
+    )
 
 
-def remake(runtime: Runtime, heliostat: str, actor: str) -> int:
-    """Ask for the job that makes a heliostat's surface anew, by the method of the one that it has."""
+def predict_again(runtime: Runtime, heliostat: str, actor: str) -> int:
+    """Enqueue a prediction of a heliostat's surface, and return the id of the job.
+
+    The method is that of the active surface.
+    """
     with runtime.database.reading() as session:
         today = store.find_surface_at(session, store.get_heliostat(session, heliostat))
     method = "network" if today is not None and today.source == "network" else "refined"
     payload = PredictionsIn(heliostats=[heliostat], method=method)
-    return ask_for(runtime, "predictions", payload.model_dump(mode="json"), actor).id
+    return enqueue(runtime, predictions.KIND, payload, actor).id
 
 
 router = APIRouter(prefix="/heliostats/{name}/measurements/{measurement}", tags=["measurements"])
 
 
 @router.patch(
-    "", responses=problems(404, 409, 410, 413, 415, 429), dependencies=[OPERATE, Depends(require_json), COMPUTES]
+    "",
+    responses=problems(404, 409, 410, 413, 415, 429),
+    dependencies=[OPERATE, Depends(require_json), COMPUTE_SLOT],
 )
 def patch_measurement(
     name: NamePath,
@@ -96,36 +124,81 @@ def patch_measurement(
     runtime: RuntimeDep,
     identity: IdentityDep,
     correction: Annotated[
-        CorrectionIn, Body(examples=[{"sun_azimuth": -41.2, "reason": "the clock was an hour ahead", "remake": True}])
+        CorrectionIn,
+        Body(
+            examples=[
+                {
+                    "sun": {"azimuth_deg": 221.2, "elevation_deg": 33.5},
+                    "reason": "the clock was an hour ahead",
+                    "predict_again": True,
+                }
+            ]
+        ),
     ],
 ) -> CorrectedOut:
-    """Correct what is known of a photograph, or exclude it, in all its images; its history is kept.
+    """Correct a photograph in all its images, or exclude it. Its history is kept.
 
-    With another target it is measured anew. What was made from it stays, and is named here; with `remake` a job makes
-    the heliostat's surface anew. Another weather outdates no surface: only calibrations ask for it.
+    With another target, the photograph is measured again. Surfaces and forecasts that were made
+    from it stay, and the response names them. With `predict_again`, a job predicts the
+    heliostat's surface again. Another weather outdates no surface, because only calibrations use
+    it.
     """
-    changes = Changes(
+    changes = PhotographChanges(
         reason=correction.reason,
-        target_name=correction.target_name,
-        sun_azimuth_deg=correction.sun_azimuth,
-        sun_elevation_deg=correction.sun_elevation,
+        target_name=correction.target,
+        sun=correction.sun,
         taken_at=correction.taken_at,
         motor_position=correction.motor_position,
-        weather=Weather(correction.wind_speed_m_s, correction.wind_from_deg, correction.temperature_c),
+        weather=Weather(
+            correction.wind_speed_m_s, correction.wind_from_deg, correction.temperature_c
+        ),
         excluded=correction.excluded,
     )
-    row = correct(runtime, name, measurement, changes, identity.name)
+    row = correct_photograph(runtime, name, measurement, changes, identity.name)
     with runtime.database.reading() as session:
-        made = made_from(session, row)
-    job = remake(runtime, name, identity.name) if correction.remake else None
+        made, measured = made_from(session, row), measurement_out(session, name, row)
+    job = predict_again(runtime, name, identity.name) if correction.predict_again else None
     return CorrectedOut(
-        measurement=measurement_out(name, row), surfaces=list(made.surfaces), forecasts=made.forecasts, job=job
+        measurement=measured,
+        surface_versions=list(made.surfaces),
+        forecasts=made.forecasts,
+        job=job,
+    )
+
+
+@router.delete("", responses=problems(404), dependencies=[OPERATE])
+def delete_measurement(
+    name: NamePath,
+    measurement: MeasurementPath,
+    runtime: RuntimeDep,
+    identity: IdentityDep,
+    reason: Annotated[Reason, Query(description="Why; kept in the audit trail.")],
+    only_this: Annotated[
+        bool, Query(description="Delete only this image, not the photograph in all kinds.")
+    ] = False,
+) -> DeletedOut:
+    """Delete a photograph that was sent by mistake, in all its images.
+
+    Its files are deleted when nothing else refers to them. Surfaces that were made from it stay,
+    and name it in `deleted`; predict them again. An import of a folder that holds the photograph
+    brings it back.
+    """
+    deleted = delete_photograph(runtime, name, measurement, reason, identity.name, only_this)
+    return DeletedOut(
+        deleted=list(deleted.images),
+        surface_versions=list(deleted.surfaces),
+        forecasts=deleted.forecasts,
     )
 
 
 @router.get("/corrections", responses=problems(404), dependencies=[READ])
-def get_corrections(name: NamePath, measurement: MeasurementPath, runtime: RuntimeDep) -> list[CorrectionOut]:
-    """What was corrected of a photograph, the first correction first."""
+def get_corrections(
+    name: NamePath, measurement: MeasurementPath, runtime: RuntimeDep
+) -> Page[CorrectionOut]:
+    """The corrections of a photograph, oldest first."""
     with runtime.database.reading() as session:
-        row: MeasurementRow = store.get_measurement(session, store.get_heliostat(session, name), measurement)
-        return [correction_out(correction) for correction in list_corrections(session, row)]
+        row: MeasurementRow = store.get_measurement(
+            session, store.get_heliostat(session, name), measurement
+        )
+        items = [correction_out(correction) for correction in list_corrections(session, row)]
+    return Page(items=items, next=None)

@@ -7,17 +7,25 @@ from fastapi import APIRouter, Depends, Query, Response, status
 from pydantic import BaseModel, Field
 
 from service import store
-from service.base.fields import Model, Name
+from service.base.fields import Model, Name, Search
 from service.sources.schema import HeliostatProperties
 from service.store.tables import HeliostatRow
-from service.twin import geometry
-from service.web.answers.openapi import problems
-from service.web.answers.paging import Page, page
-from service.web.door.dependencies import OPERATE, READ, IdentityDep, Limit, NamePath, RuntimeDep, require_json
+from service.twin.plant import setup
+from service.web.auth.dependencies import (
+    OPERATE,
+    READ,
+    IdentityDep,
+    Limit,
+    NamePath,
+    RuntimeDep,
+    require_json,
+)
+from service.web.responses.openapi import problems
+from service.web.responses.paging import Page, page
 
 
 class HeliostatIn(Model):
-    """A heliostat to be stored."""
+    """A heliostat to store."""
 
     name: Name
     properties: HeliostatProperties
@@ -27,7 +35,9 @@ class HeliostatSummary(BaseModel):
     """A heliostat in a list."""
 
     name: str
-    position_m: tuple[float, float, float] = Field(description="East, north, up of the tower base [m].")
+    position_m: tuple[float, float, float] = Field(
+        description="East, north, up of the tower base [m]."
+    )
 
 
 class HeliostatOut(HeliostatSummary):
@@ -45,7 +55,9 @@ def heliostat_summary(row: HeliostatRow) -> HeliostatSummary:
 def heliostat_out(row: HeliostatRow) -> HeliostatOut:
     """A heliostat as JSON."""
     position = (row.east_m, row.north_m, row.up_m)
-    return HeliostatOut(name=row.name, position_m=position, properties=row.properties, updated_at=row.updated_at)
+    return HeliostatOut(
+        name=row.name, position_m=position, properties=row.properties, updated_at=row.updated_at
+    )
 
 
 router = APIRouter(tags=["heliostats"])
@@ -56,10 +68,14 @@ def list_heliostats(
     runtime: RuntimeDep,
     limit: Limit = 100,
     after: Annotated[Name | None, Query(description="The last name of the page before.")] = None,
-    prefix: Annotated[Name | None, Query(description="Only names that begin so, in capitals or not.")] = None,
-    search: Annotated[str, Query(max_length=32, description="Only names with this in them, in capitals or not.")] = "",
+    prefix: Annotated[
+        Name | None, Query(description="Only names that begin so, in capitals or not.")
+    ] = None,
+    search: Annotated[
+        Search, Query(description="Only names with this in them, in capitals or not.")
+    ] = "",
 ) -> Page[HeliostatSummary]:
-    """Heliostats in the order of their names; `/v1/field` finds them by what their twins are worth."""
+    """Heliostats in the order of their names. `/v1/field` filters them by their metrics."""
     with runtime.database.reading() as session:
         rows = store.list_heliostats(session, limit + 1, after, prefix, search)
     items = [heliostat_summary(row) for row in rows]
@@ -69,15 +85,23 @@ def list_heliostats(
 @router.post(
     "/heliostats",
     status_code=status.HTTP_201_CREATED,
-    responses={**problems(409, 413, 415), 200: {"model": HeliostatOut, "description": "It was there already."}},
+    responses={
+        **problems(409, 413, 415),
+        200: {"model": HeliostatOut, "description": "It was there already."},
+    },
     dependencies=[OPERATE, Depends(require_json)],
 )
 def post_heliostat(
     request: HeliostatIn, runtime: RuntimeDep, identity: IdentityDep, response: Response
 ) -> HeliostatOut:
-    """Add a heliostat; the same one again is no error, the same name with other properties is (use PUT)."""
-    row, change = runtime.database.written(
-        lambda session: geometry.add_heliostat(session, identity.name, request.name, request.properties.raw)
+    """Add a heliostat.
+
+    The same heliostat again is no error. The same name with other properties is refused; use PUT.
+    """
+    row, change = runtime.database.run_in_transaction(
+        lambda session: setup.set_heliostat(
+            session, identity.name, request.name, request.properties.raw, replace=False
+        )
     )
     if change is store.Change.UNCHANGED:
         response.status_code = status.HTTP_200_OK
@@ -95,7 +119,10 @@ def get_heliostat(name: NamePath, runtime: RuntimeDep) -> HeliostatOut:
 
 @router.put(
     "/heliostats/{name}",
-    responses={**problems(409, 413, 415), 201: {"model": HeliostatOut, "description": "It is new."}},
+    responses={
+        **problems(409, 413, 415),
+        201: {"model": HeliostatOut, "description": "It is new."},
+    },
     dependencies=[OPERATE, Depends(require_json)],
 )
 def put_heliostat(
@@ -106,8 +133,8 @@ def put_heliostat(
     response: Response,
 ) -> HeliostatOut:
     """Set a heliostat's PAINT properties."""
-    row, change = runtime.database.written(
-        lambda session: geometry.set_heliostat(session, identity.name, name, properties.raw)
+    row, change = runtime.database.run_in_transaction(
+        lambda session: setup.set_heliostat(session, identity.name, name, properties.raw)
     )
     if change is store.Change.NEW:
         response.status_code = status.HTTP_201_CREATED
@@ -122,5 +149,10 @@ def put_heliostat(
     dependencies=[OPERATE],
 )
 def delete_heliostat(name: NamePath, runtime: RuntimeDep, identity: IdentityDep) -> None:
-    """Delete a heliostat that was made by mistake; not where photographs, surfaces or anything else refers to it."""
-    runtime.database.written(lambda session: geometry.remove(session, identity.name, "heliostat", name))
+    """Delete a heliostat that was created by mistake.
+
+    This is refused if photographs, surfaces or anything else refers to it.
+    """
+    runtime.database.run_in_transaction(
+        lambda session: setup.remove(session, identity.name, "heliostat", name)
+    )

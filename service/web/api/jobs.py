@@ -1,28 +1,34 @@
-"""Jobs: ask for them, follow them, cancel them."""
+"""Jobs: enqueue, follow and cancel them."""
 
 from functools import partial
 from threading import Event
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Depends, Header, HTTPException, Path, Query, Request, Response, status
+from fastapi import (
+    APIRouter,
+    Depends,
+    Header,
+    HTTPException,
+    Path,
+    Query,
+    Request,
+    Response,
+    status,
+)
 from pydantic import Field
 
-from service.base.arrays import unpack
-from service.base.faults import NotFoundError
+from service.base.arrays import pack, unpack
+from service.base.errors import NotFoundError
 from service.base.fields import Rows, State, Version
 from service.drawing.pictures import flux_picture
-from service.jobs.asking import ask_for, cancel_for, forget_for
+from service.jobs.enqueuing import cancel_for, delete_plan_for, enqueue
 from service.jobs.kind import Kind, Kinds, result_of
-from service.store import queue
+from service.jobs.kinds.plans import MAX_TIMES, map_name
 from service.store.job_tables import JobRow
-from service.twin.runtime import Runtime
-from service.web.answers import formats
-from service.web.answers.formats import MediaType, json_answer, maps_answer
-from service.web.answers.openapi import TEXT, arrays, problems
-from service.web.answers.paging import Page, page
-from service.web.answers.representation import Maps
-from service.web.answers.watching import JobStream, JobSummary, Watcher, Watchers, job_summary
-from service.web.door.dependencies import (
+from service.store.jobs import queue
+from service.store.listing import Order, Period
+from service.twin.runtime.runtime import Runtime
+from service.web.auth.dependencies import (
     OPERATE,
     READ,
     IdentityDep,
@@ -33,6 +39,12 @@ from service.web.door.dependencies import (
     StoppingDep,
     require_json,
 )
+from service.web.responses import formats
+from service.web.responses.formats import MediaType, json_answer, maps_answer
+from service.web.responses.job_events import JobStream, JobSummary, Watcher, Watchers, job_summary
+from service.web.responses.openapi import TEXT, arrays, problems
+from service.web.responses.paging import OrderQuery, Page, Since, Until, page
+from service.web.responses.representation import Maps
 
 
 async def _watchers(request: Request) -> Watchers:
@@ -44,16 +56,19 @@ WatchersDep = Annotated[Watchers, Depends(_watchers)]
 
 
 class JobOut(JobSummary):
-    """A job as it stands, with what was asked and what came of it."""
+    """The state of a job, with its payload and its result."""
 
     payload: dict[str, Any] = Field(description="What was asked.")
     result: dict[str, Any] | None = Field(
-        description="What a done job gave, by its kind; of a cancelled or failed one what it had changed until then."
+        description=(
+            "What a done job gave, by its kind; of a cancelled or failed one what it had changed"
+            " until then."
+        )
     )
 
 
 class JobFluxOut(JobOut):
-    """A job with the flux map that it gave."""
+    """A job with its flux map."""
 
     flux: Rows = Field(description="(rows, columns) [W/m2].")
 
@@ -63,32 +78,45 @@ def job_out(row: JobRow) -> JobOut:
     return JobOut(**dict(job_summary(row)), payload=row.payload, result=row.result)
 
 
-def job_flux(row: JobRow, media_type: str) -> Response:
-    """The flux map of a job; NotFoundError where it has none."""
-    if row.arrays is None or row.result is None:
+def job_flux(row: JobRow, packed: bytes | None, media_type: str) -> Response:
+    """The flux map of a job; ``packed`` is an npz with `flux`.
+
+    Raises
+    ------
+    NotFoundError
+        If the job has no flux map.
+    """
+    if packed is None or row.result is None:
         raise NotFoundError(f"job {row.id} ({row.kind}, {row.state}) has no flux map")
-    flux = unpack(row.arrays)["flux"]
+    flux = unpack(packed)["flux"]
     if media_type == formats.JSON:
         return json_answer(job_out(row), flux=flux)
     plane = row.result["plane"]
     picture = partial(flux_picture, flux, (plane["width"], plane["height"]), "W/m²")
     title = f"job {row.id}, {row.result['heliostats']} heliostats"
-    return maps_answer(Maps(f"job-{row.id}-flux", title, {"flux": flux}, picture, row.arrays), media_type)
+    return maps_answer(
+        Maps(f"job-{row.id}-flux", title, {"flux": flux}, picture, packed), media_type
+    )
 
 
-def stream(watchers: Watchers, runtime: Runtime, watcher: Watcher, last: str | None, stopping: Event) -> Response:
-    """The events after ``last``; 204, which tells a browser not to come again, where that was the last of all.
+def stream(
+    watchers: Watchers, runtime: Runtime, watcher: Watcher, last: str | None, stopping: Event
+) -> Response:
+    """Stream of the events after the event id ``last``.
+
+    The status is 204 if the job had no later event. A browser then does not reconnect.
 
     Raises
     ------
     NotFoundError
+        If there is no such job.
     """
     seen = int(last[:10]) if last is not None and last.isascii() and last.isdecimal() else 0
     with runtime.database.reading() as session:
         row = queue.get_summary(session, watcher.number)
     if row.state in queue.ENDED and row.revision <= seen:
         return Response(status_code=204)
-    # FastAPI's own routes for generators could not answer 204.
+    # FastAPI routes that are generators could not answer 204.
     return JobStream(watchers, watcher, seen, stopping)
 
 
@@ -99,15 +127,19 @@ IdempotencyKey = Annotated[
     Header(
         alias="Idempotency-Key",
         pattern=r"^[\x21-\x7e]{1,128}$",
-        description="Any text of the sender's own: the same request with the same key is the same job.",
+        description=(
+            "Any text of the sender's own: the same request with the same key is the same job."
+        ),
     ),
 ]
 
-KindName = Annotated[str | None, Query(pattern=r"^[a-z]{1,32}$", description="Only jobs of this kind.")]
+KindName = Annotated[
+    str | None, Query(pattern=r"^[a-z]{1,32}$", description="Only jobs of this kind.")
+]
 
 
 def creators(kinds: Kinds) -> APIRouter:
-    """Routes that ask for a job, one for each of ``kinds``."""
+    """Routes that enqueue a job, one for each of ``kinds``."""
     asking = APIRouter(prefix="/jobs", tags=["jobs"])
     for kind in kinds.values():
         add_creator(asking, kind, f"/{kind.name}", f"post_{kind.name}_job")
@@ -117,12 +149,12 @@ def creators(kinds: Kinds) -> APIRouter:
 
 
 async def _only_post() -> None:
-    """There is nothing to read, or to delete, where jobs are asked for."""
+    """Refuse to read or delete the path that only enqueues jobs."""
     raise HTTPException(status.HTTP_405_METHOD_NOT_ALLOWED, headers={"Allow": "POST"})
 
 
 def add_creator(router: APIRouter, kind: Kind[Any], path: str, name: str) -> None:
-    """A route that asks for a job of this kind."""
+    """Add a route that enqueues a job of this kind."""
     payload_type = kind.payload
 
     def create(
@@ -134,8 +166,7 @@ def add_creator(router: APIRouter, kind: Kind[Any], path: str, name: str) -> Non
     ) -> JobOut:
         if kind.require is not None:
             kind.require(runtime.settings)
-        document = payload.model_dump(mode="json")  # type: ignore[attr-defined]
-        row = ask_for(runtime, kind.name, document, identity.name, idempotency_key)
+        row = enqueue(runtime, kind, payload, identity.name, idempotency_key)
         response.headers["Location"] = f"/v1/jobs/{row.id}"
         return job_out(row)
 
@@ -145,7 +176,11 @@ def add_creator(router: APIRouter, kind: Kind[Any], path: str, name: str) -> Non
         summary=kind.summary,
         description=f"{kind.summary} Answers at once; follow the job under its Location.",
         status_code=status.HTTP_202_ACCEPTED,
-        responses=problems(409, 413, 415, 429) if kind.require is not None else problems(413, 415, 429),
+        responses=(
+            problems(404, 409, 413, 415, 429)
+            if kind.require is not None
+            else problems(404, 413, 415, 429)
+        ),
         dependencies=[OPERATE, Depends(require_json)],
     )(create)
 
@@ -160,10 +195,16 @@ def list_jobs(
     after: Annotated[Version | None, Query(description="The last id of the page before.")] = None,
     state: Annotated[State | None, Query(description="Only jobs in this state.")] = None,
     kind: KindName = None,
+    since: Since = None,
+    until: Until = None,
+    order: OrderQuery = "down",
 ) -> Page[JobSummary]:
-    """Jobs in short, newest first; each one whole under its `href`."""
+    """Job summaries, newest first. The complete job is at its `href`."""
     with runtime.database.reading() as session:
-        rows = queue.list_jobs(session, limit + 1, after, state, kind)
+        asked, direction = Period(since, until), Order(descending=order == "down")
+        rows = queue.list_jobs(
+            session, limit + 1, after, state, kind, created=asked, order=direction
+        )
     items = [job_summary(row) for row in rows]
     return page(items, limit)
 
@@ -181,11 +222,32 @@ def get_job(number: Number, runtime: RuntimeDep, kinds: KindsDep) -> JobOut:
     responses={**problems(404, 406), **arrays(JobFluxOut, "`flux` (rows, columns) [W/m2].")},
     dependencies=[READ],
 )
-def get_job_flux(number: Number, runtime: RuntimeDep, media_type: MediaType) -> Response:
-    """The flux map of a job that gave one."""
+def get_job_flux(
+    number: Number,
+    runtime: RuntimeDep,
+    media_type: MediaType,
+    step: Annotated[
+        int | None,
+        Query(
+            ge=0, lt=MAX_TIMES, description="Of a plan: which of its `steps`; else the most of all."
+        ),
+    ] = None,
+    mirrors: Annotated[
+        Literal["twin", "ideal"],
+        Query(description="Of a plan's step: by the twin, or by ideal mirrors."),
+    ] = "twin",
+) -> Response:
+    """The flux map of a job, if its kind computes one."""
     with runtime.database.reading() as session:
-        row = queue.get_job(session, number, arrays=True)
-    return job_flux(row, media_type)
+        row = queue.get_job(session, number, arrays=step is None)
+        maps = None if step is None else queue.checkpoint_arrays(session, number, map_name(step))
+    if step is None:
+        return job_flux(row, row.arrays, media_type)
+    if maps is None:
+        raise NotFoundError(
+            f"step: job {number} ({row.kind}, {row.state}) has no map of a step {step}"
+        )
+    return job_flux(row, pack({"flux": unpack(maps)[mirrors]}), media_type)
 
 
 @router.get(
@@ -208,20 +270,25 @@ def get_job_events(
     identity: IdentityDep,
     presented: PresentedDep,
     stopping: StoppingDep,
-    last_event_id: Annotated[str | None, Header(alias="Last-Event-ID", description="Go on after this one.")] = None,
+    last_event_id: Annotated[
+        str | None, Header(alias="Last-Event-ID", description="Go on after this one.")
+    ] = None,
 ) -> Response:
-    """The job in short each time it changes, as server-sent events, until it ends."""
+    """The job summary after each change, as server-sent events, until the job ends."""
     watcher = Watcher(number, identity.name, presented)
     return stream(watchers, runtime, watcher, last_event_id, stopping)
 
 
 @router.delete("/{number}", responses=problems(404, 409), dependencies=[OPERATE])
 def delete_job(number: Number, runtime: RuntimeDep, identity: IdentityDep) -> JobOut:
-    """Delete a plan that is done: its result goes, and the job then ends as any other. Other jobs go by their age."""
-    return job_out(forget_for(runtime, number, identity.name))
+    """Delete the result of a finished plan.
+
+    The job then expires like any other. Other jobs cannot be deleted; they expire by their age.
+    """
+    return job_out(delete_plan_for(runtime, number, identity.name))
 
 
 @router.post("/{number}/cancel", responses=problems(404, 409), dependencies=[OPERATE])
 def cancel_job(number: Number, runtime: RuntimeDep, identity: IdentityDep) -> JobOut:
-    """Cancel a job: at once where it waits; a running one ends at its next report."""
+    """Cancel a job: a waiting one at once, a running one at its next progress report."""
     return job_out(cancel_for(runtime, number, identity.name))

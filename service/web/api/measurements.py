@@ -1,20 +1,23 @@
-"""Photographs and what was measured in them."""
+"""Photographs and their measured flux."""
 
 from datetime import datetime
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal, Self
 
 from fastapi import APIRouter, Depends, File, Form, Header, Query, Response, UploadFile, status
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, Json, JsonValue
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, Json, JsonValue, model_validator
+from pydantic.json_schema import SkipJsonSchema
+from sqlalchemy.orm import Session
 from starlette.datastructures import UploadFile as StarletteUploadFile
 
+from model.errors import InvalidInputError
+from model.frames import enu_to_wgs84
 from model.pointing import Weather
 from service import store
-from service.base.arrays import pair, unpack
-from service.base.faults import GoneError, NotFoundError, StoreDamagedError, TooLargeError
+from service.base.arrays import pair_or_none, unpack
+from service.base.errors import GoneError, NotFoundError, StoreDamagedError, TooLargeError
 from service.base.fields import (
-    Azimuth,
-    Elevation,
+    Flag,
     Identifier,
     Kind,
     MeasurementName,
@@ -22,30 +25,37 @@ from service.base.fields import (
     Moment,
     Name,
     Number,
+    Position,
+    Reason,
     Rows,
+    Sun,
 )
 from service.drawing.pictures import flux_picture
 from service.sources.photograph import Photograph
-from service.sources.schema import FocalSpot, FocalSpots, paint_motors
-from service.store.tables import MeasurementRow
-from service.twin.ingest import ingest
-from service.twin.runtime import Runtime
-from service.web.answers import formats
-from service.web.answers.files import WholeFile, is_held
-from service.web.answers.formats import MediaType, json_answer, maps_answer
-from service.web.answers.openapi import BINARY, arrays, problems
-from service.web.answers.paging import Page, page
-from service.web.answers.representation import Maps
-from service.web.door.dependencies import (
-    COMPUTES,
+from service.sources.schema import Temperature, WindFrom, WindSpeed, paint_motors
+from service.store.listing import Order, Period
+from service.store.photographs.measurements import MeasurementFilter
+from service.store.tables import ImageRow, MeasurementRow
+from service.twin.heliostats.metadata import spot_m
+from service.twin.photographs.repeats import receive
+from service.twin.runtime.runtime import Runtime
+from service.web.auth.dependencies import (
+    COMPUTE_SLOT,
     INGEST,
     READ,
+    IdentityDep,
     Limit,
     MeasurementPath,
     NamePath,
     RuntimeDep,
     require_multipart,
 )
+from service.web.responses import formats
+from service.web.responses.files import WholeFile, etag_matches
+from service.web.responses.formats import MediaType, json_answer, maps_answer
+from service.web.responses.openapi import BINARY, arrays, problems
+from service.web.responses.paging import OrderQuery, Page, page
+from service.web.responses.representation import Maps
 
 Motors = Annotated[
     tuple[Annotated[Number, Field(ge=-1e9, le=1e9)], Annotated[Number, Field(ge=-1e9, le=1e9)]],
@@ -55,50 +65,97 @@ Motors = Annotated[
 Pixel = tuple[Annotated[Number, Field(ge=-1e5, le=1e5)], Annotated[Number, Field(ge=-1e5, le=1e5)]]
 
 
-WindSpeed = Annotated[Number, Field(ge=0, le=100)]
-WindFrom = Annotated[Number, Field(ge=0, le=360)]
-Temperature = Annotated[Number, Field(ge=-90, le=60)]
-
-# What the documentation's form begins with.
+# Initial content of the form on the documentation page.
 _EXAMPLE: dict[str, JsonValue] = {
     "id": "205363",
     "kind": "flux",
-    "target_name": "multi_focus_tower",
-    "sun_azimuth": -41.2,
-    "sun_elevation": 33.5,
+    "target": "multi_focus_tower",
+    "sun": {"azimuth_deg": 221.2, "elevation_deg": 33.5},
 }
 
 
 class MeasurementIn(Model):
-    """What is known of a photograph; PAINT's ``calibration-properties.json`` with ``kind`` (and ``id``) added fits."""
+    """Metadata of a photograph."""
 
     model_config = ConfigDict(json_schema_extra={"examples": [_EXAMPLE]})
 
-    target_name: Name = Field(description="The target that the heliostat was aimed at.")
-    sun_azimuth: Azimuth
-    sun_elevation: Elevation
+    target: Name = Field(description="The target that the heliostat was aimed at.")
+    sun: Sun
     kind: Kind = Field(
-        description="raw: a camera frame; cropped: the rectified target; flux: the separated spot on the whole "
-        "target; flux-centered: the spot about its centre of mass, already separated."
+        description=(
+            "raw: a camera frame; cropped: the rectified target; flux: the separated spot on the"
+            " whole target; flux-centered: the spot about its centre of mass, already separated;"
+            " none: no image, but motor_position and focal_spot_m."
+        )
     )
-    id: Identifier | None = Field(default=None, description="The caller's own number of the measurement.")
+    id: Identifier | None = Field(
+        default=None, description="The caller's own number of the measurement."
+    )
     taken_at: Moment | None = Field(default=None, description="When it was taken, with time zone.")
     motor_position: Motors | None = Field(
-        default=None, description="Motor positions of both axes [steps], as a pair or as PAINT's object."
-    )
-    focal_spot: FocalSpot | None = Field(
         default=None,
-        description="Known centre of mass: latitude [deg], longitude [deg], altitude [m], or PAINT's object (UTIS is "
-        "preferred).",
+        description="Motor positions of both axes [steps], as a pair or as PAINT's object.",
+    )
+    focal_spot_m: Position | None = Field(
+        default=None,
+        description="Known centre of mass: east, north, up of the tower base [m]; PAINT's UTIS.",
+    )
+    helios_spot_m: Position | None = Field(
+        default=None, description="The same by HeliOS, used if there is no other; likewise [m]."
     )
     corners: tuple[Pixel, Pixel, Pixel, Pixel] | None = Field(
         default=None,
-        description="Positions (x, y) [px] of the target's upper left, upper right, lower left and lower right "
-        "corners in a raw frame; without them they are searched.",
+        description=(
+            "Positions (x, y) [px] of the target's upper left, upper right, lower left and lower"
+            " right corners in a raw frame; without them they are searched."
+        ),
     )
     wind_speed_m_s: WindSpeed | None = Field(default=None, description="Of the wind then [m/s].")
-    wind_from_deg: WindFrom | None = Field(default=None, description="Where it came from, from north, over east [deg].")
+    wind_from_deg: WindFrom | None = Field(
+        default=None, description="Where it came from, from north, over east [deg]."
+    )
     temperature_c: Temperature | None = Field(default=None, description="Of the air then [°C].")
+    force: Flag = Field(
+        default=False,
+        description=(
+            "Store the image although another heliostat has the same one; needs a `reason`."
+        ),
+    )
+    reason: Reason | None = Field(
+        default=None, description="Why it is forced; kept with the measurement."
+    )
+
+    @model_validator(mode="after")
+    def _forced_with_reason(self) -> Self:
+        if self.force != (self.reason is not None):
+            raise ValueError("force and reason: send both, or neither")
+        return self
+
+
+class WarningOut(BaseModel):
+    """A warning about a measurement, which its sender should check."""
+
+    type: Literal["sun_contradicts_time", "unlike_heliostat"] = Field(
+        description=(
+            "sun_contradicts_time: the sun did not stand where it was recorded at the time that was"
+            " sent. unlike_heliostat: when the photograph came, the surface of another heliostat"
+            " forecast it much better than its own heliostat's."
+        )
+    )
+    detail: str
+    angle_deg: float | None = Field(
+        default=None,
+        description=(
+            "Between the recorded sun and where it was at the recorded time [deg]; null: of another"
+            " type, or found by an older version."
+        ),
+    )
+    like: str | None = Field(
+        default=None,
+        description=(
+            "The heliostat whose surface forecasts the photograph much better, of that type."
+        ),
+    )
 
 
 class MeasurementOut(BaseModel):
@@ -108,33 +165,62 @@ class MeasurementOut(BaseModel):
     heliostat: str
     external_id: str | None = Field(description="The caller's own number.")
     kind: Kind
-    target_name: str
-    sun_azimuth: float = Field(description="From south, positive to the east [deg].")
-    sun_elevation: float = Field(description="[deg]")
+    target: str
+    sun: Sun
     motor_position: tuple[float, float] | None = Field(description="[steps]")
-    taken_at: datetime | None
-    focal_spot: tuple[float, float, float] | None = Field(
-        description="As given, UTIS's, else HeliOS's: latitude [deg], longitude [deg], altitude [m]."
+    taken_at: datetime | None = Field(description="null: the time is not known.")
+    focal_spot_m: tuple[float, float, float] | None = Field(
+        description="As given, else HeliOS's: east, north, up of the tower base [m]."
     )
-    helios_spot: tuple[float, float, float] | None = Field(
-        description="HeliOS's, where it was given: likewise [deg, deg, m]."
+    helios_spot_m: tuple[float, float, float] | None = Field(
+        description="HeliOS's, if it was given: likewise [m]."
     )
     wind_speed_m_s: float | None = Field(description="[m/s]")
     wind_from_deg: float | None = Field(description="From north, over east [deg].")
     temperature_c: float | None = Field(description="[°C]")
-    accepted: bool = Field(description="Whether the image can be used; a refused one is kept with its reason.")
-    reason: str | None = Field(description="Why it was refused; `excluded`: somebody did.")
-    quality: dict[str, Any] = Field(
-        description="The quality record of the image; `clock` says where time and sun disagree by more than a degree."
+    accepted: bool = Field(
+        description="Whether the image can be used; a refused one is kept with its reason."
     )
-    center_of_mass: tuple[float, float] | None = Field(description="Right and up of the target's centre [m].")
-    image_sha256: str
-    image_media_type: str
+    reason: str | None = Field(description="Why it was refused; `excluded`: a person excluded it.")
+    warnings: list[WarningOut] = Field(
+        description="What contradicts itself in what was sent; none where nothing does."
+    )
+    quality: dict[str, Any] = Field(
+        description=(
+            "The quality record of the image; `clock` says where time and sun disagree by over half"
+            " a degree."
+        )
+    )
+    center_of_mass_m: tuple[float, float] | None = Field(
+        description="Right and up of the target's centre [m]."
+    )
+    image_sha256: str | None = Field(description="null: it came without an image.")
+    image_media_type: str | None
     image_pruned_at: datetime | None = Field(
         description="Since when the image is kept no longer; everything else of the measurement is."
     )
-    corrected_at: datetime | None = Field(description="Since when it stands so, where it was corrected or excluded.")
+    corrected_at: datetime | None = Field(description="When it was last corrected or excluded.")
+    forced: str | None = Field(
+        description="Why it is stored although another heliostat has the same image."
+    )
     created_at: datetime
+    sent_by: str | None = Field(
+        description=(
+            "Name of the key that sent it, `local` without one, or who imported it; null: not"
+            " known."
+        )
+    )
+
+
+class PostedOut(MeasurementOut):
+    """A posted photograph. If it was stored already, this includes what the post changed."""
+
+    filled: list[str] = Field(
+        description="Fields that were missing, and that this post filled; empty if it is new."
+    )
+    ignored: list[str] = Field(
+        description="Fields that this post has otherwise than they are stored; PATCH corrects them."
+    )
 
 
 class MeasurementFluxOut(MeasurementOut):
@@ -146,101 +232,152 @@ class MeasurementFluxOut(MeasurementOut):
     centered: Rows = Field(description="(64, 64) in 4 m about the centre of mass, sum 100 [%].")
 
 
-def measurement_out(heliostat_name: str, row: MeasurementRow) -> MeasurementOut:
+def measurement_out(session: Session, heliostat_name: str, row: MeasurementRow) -> MeasurementOut:
     """A measurement as JSON."""
+    origin = store.get_plant(session).origin
     return MeasurementOut.model_validate(
         {
             "id": row.identifier,
             "heliostat": heliostat_name,
             "external_id": row.external_id,
             "kind": row.kind,
-            "target_name": row.target.name,
-            "sun_azimuth": row.sun_azimuth_deg,
-            "sun_elevation": row.sun_elevation_deg,
-            "motor_position": pair(row.motor_axis_1, row.motor_axis_2),
+            "target": row.target.name,
+            "sun": row.sun,
+            "motor_position": pair_or_none(row.motor_axis_1, row.motor_axis_2),
             "taken_at": row.taken_at,
-            "focal_spot": row.focal_spot_wgs84,
-            "helios_spot": row.helios_spot_wgs84,
+            "focal_spot_m": spot_m(row.focal_spot_wgs84, origin),
+            "helios_spot_m": spot_m(row.helios_spot_wgs84, origin),
             "wind_speed_m_s": row.wind_speed_m_s,
             "wind_from_deg": row.wind_from_deg,
             "temperature_c": row.temperature_c,
             "accepted": row.accepted,
             "reason": row.reason,
+            "warnings": row.warnings or [],
             "quality": row.quality,
-            "center_of_mass": pair(row.center_right_m, row.center_up_m),
+            "center_of_mass_m": pair_or_none(row.center_right_m, row.center_up_m),
             "image_sha256": row.image_sha256,
-            "image_media_type": row.image.media_type,
-            "image_pruned_at": row.image.pruned_at,
+            "image_media_type": row.image and row.image.media_type,
+            "image_pruned_at": row.image and row.image.pruned_at,
             "corrected_at": row.corrected_at,
+            "forced": row.forced,
             "created_at": row.created_at,
+            "sent_by": row.sent_by,
         }
     )
 
 
-_PRUNED = {"age": "it was as old as the store's settings allow", "quota": "the store's images had reached their quota"}
+_PRUNED = {
+    "age": "it was as old as the store's settings allow",
+    "quota": "the store's images had reached their quota",
+    "deleted": "the photograph was deleted",
+}
 
 
-def require_image(row: MeasurementRow) -> None:
-    """GoneError, which says why, where the image of a measurement is kept no longer."""
+def require_image(row: MeasurementRow) -> ImageRow:
+    """The image of a measurement.
+
+    Raises
+    ------
+    NotFoundError
+        If the measurement came without an image.
+    GoneError
+        If the image is no longer stored.
+    """
+    if row.image is None:
+        raise NotFoundError(f"measurement {row.identifier} came without an image")
     if row.image.pruned_at is not None:
         raise GoneError(
-            f"the image of measurement {row.identifier} was given up on {row.image.pruned_at:%Y-%m-%d}: "
-            f"{_PRUNED[row.image.pruned_for or 'age']}; its figures are kept"
+            f"the image of measurement {row.identifier} was deleted on"
+            f" {row.image.pruned_at:%Y-%m-%d}: {_PRUNED[row.image.pruned_for or 'age']}; its"
+            " figures are kept"
         )
+    return row.image
 
 
-def flux_answer(heliostat_name: str, row: MeasurementRow, media_type: str) -> Response:
-    """The flux of a measurement; NotFoundError for a refused image, which has none."""
+def flux_answer(
+    session: Session, heliostat_name: str, row: MeasurementRow, media_type: str
+) -> Response:
+    """The flux of a measurement in the requested media type.
+
+    Raises
+    ------
+    NotFoundError
+        If the measurement has no image, or if its image was refused.
+    """
+    if row.image_sha256 is None:
+        raise NotFoundError(
+            f"measurement {row.identifier} came without an image, so it has no flux"
+        )
     if row.arrays is None:
-        raise NotFoundError(f"measurement {row.identifier} was refused ({row.reason}), so it has no flux")
+        raise NotFoundError(
+            f"measurement {row.identifier} was refused ({row.reason}), so it has no flux"
+        )
     arrays = unpack(row.arrays)
     if media_type == formats.JSON:
-        document = measurement_out(heliostat_name, row)
+        document = measurement_out(session, heliostat_name, row)
         return json_answer(document, flux=arrays.get("flux"), centered=arrays.get("centered"))
     whole = "flux" in arrays
     size = (row.target.width_m, row.target.height_m) if whole else None
-    picture = partial(flux_picture, arrays["flux" if whole else "centered"], size, "flux [% per pixel]")
-    name, title = f"{heliostat_name}-{row.identifier}-flux", f"{heliostat_name} {row.identifier}, measured"
+    picture = partial(
+        flux_picture, arrays["flux" if whole else "centered"], size, "flux [% per pixel]"
+    )
+    name, title = (
+        f"{heliostat_name}-{row.identifier}-flux",
+        f"{heliostat_name} {row.identifier}, measured",
+    )
     return maps_answer(Maps(name, title, arrays, picture, row.arrays), media_type)
 
 
 router = APIRouter(prefix="/heliostats/{name}/measurements", tags=["measurements"])
 
-# Bytes of metadata that are read of a part that came as a file.
-_MOST_METADATA = 2**16
+# Largest metadata that are read from a form part with a file [bytes].
+_MAX_METADATA = 2**16
 
 
-def _photograph(metadata: MeasurementIn) -> Photograph:
-    spot = metadata.focal_spot
-    utis, helios = (spot.UTIS, spot.HeliOS) if isinstance(spot, FocalSpots) else (spot, None)
+def _wgs84(runtime: Runtime, place: Position | None) -> tuple[float, float, float] | None:
+    if place is None:
+        return None
+    with runtime.database.reading() as session:
+        origin = store.get_plant(session).origin
+    latitude, longitude, altitude = enu_to_wgs84(place, origin).tolist()
+    return latitude, longitude, altitude
+
+
+def _photograph(metadata: MeasurementIn, runtime: Runtime) -> Photograph:
+    helios = metadata.helios_spot_m
+    used = helios if metadata.focal_spot_m is None else metadata.focal_spot_m
     return Photograph(
-        target_name=metadata.target_name,
-        kind=metadata.kind,
-        sun_azimuth_deg=metadata.sun_azimuth,
-        sun_elevation_deg=metadata.sun_elevation,
+        target_name=metadata.target,
+        kind=None if metadata.kind == "none" else metadata.kind,
+        sun=metadata.sun,
         external_id=metadata.id,
         taken_at=metadata.taken_at,
         motor_position=metadata.motor_position,
-        focal_spot_wgs84=helios if utis is None else utis,
-        helios_spot_wgs84=helios,
+        focal_spot_wgs84=_wgs84(runtime, used),
+        helios_spot_wgs84=_wgs84(runtime, helios),
         corners=metadata.corners,
         weather=Weather(metadata.wind_speed_m_s, metadata.wind_from_deg, metadata.temperature_c),
+        forced=metadata.reason,
     )
 
 
 def get_row(name: str, measurement: str, runtime: Runtime) -> MeasurementRow:
-    """A heliostat's measurement; NotFoundError where there is none."""
+    """A heliostat's measurement; NotFoundError if it is not stored."""
     with runtime.database.reading() as session:
         return store.get_measurement(session, store.get_heliostat(session, name), measurement)
 
 
 def _text(part: Any) -> Any:
-    """A part of the form; browsers send JSON as if it were a file."""
-    return part.file.read(_MOST_METADATA + 1) if isinstance(part, UploadFile | StarletteUploadFile) else part
+    """Text of a form part. Some clients send JSON as a file."""
+    return (
+        part.file.read(_MAX_METADATA + 1)
+        if isinstance(part, UploadFile | StarletteUploadFile)
+        else part
+    )
 
 
 def _file(part: Any) -> Any:
-    """A part of the form that is a file; the framework's own words for another name its classes."""
+    """Require that a form part is a file. The default message names classes of the framework."""
     if not isinstance(part, StarletteUploadFile):
         raise ValueError("must be a file; send it as a part with a filename")
     return part
@@ -258,29 +395,46 @@ def _bytes(upload: UploadFile, limit: int) -> bytes:
     status_code=status.HTTP_201_CREATED,
     responses={
         **problems(400, 404, 409, 413, 415, 507),
-        200: {"model": MeasurementOut, "description": "This image was there already; nothing changed."},
+        200: {
+            "model": PostedOut,
+            "description": "This image was there already; what was missing is filled.",
+        },
     },
-    dependencies=[INGEST, Depends(require_multipart), COMPUTES],
+    dependencies=[INGEST, Depends(require_multipart), COMPUTE_SLOT],
 )
 def post_measurement(
     name: NamePath,
-    image: Annotated[UploadFile, BeforeValidator(_file), File(description="A PNG, JPEG, TIFF or BMP file.")],
     metadata: Annotated[Json[MeasurementIn], BeforeValidator(_text), Form(description="JSON")],
     runtime: RuntimeDep,
+    identity: IdentityDep,
     response: Response,
-) -> MeasurementOut:
-    """Measure and keep a photograph of a heliostat's spot.
+    image: Annotated[
+        UploadFile | SkipJsonSchema[None],
+        BeforeValidator(_file),
+        File(description="A PNG, JPEG, TIFF or BMP file; none if kind is none."),
+    ] = None,
+) -> PostedOut:
+    """Measure and store a photograph, or motor positions and a spot without an image.
 
-    The same image posted again is the same measurement (200 instead of 201); with another sun, target or time it is
-    refused (409), and `PATCH` corrects what is known of it. An image that cannot be used is kept
-    with `accepted: false` and its `reason`.
+    The same image posted again is the same measurement (200 instead of 201). Missing fields are
+    `filled`. Another focal spot, weather or corners are `ignored`. The measurement is then also
+    found by this `id`. The image is refused (409) with another kind, sun, target, time or motor
+    position, or at another heliostat; `detail` says what to do. An image that cannot be used is
+    stored with `accepted: false` and its `reason`.
     """
-    data = _bytes(image, runtime.settings.max_image_bytes)
-    row, is_new = ingest(runtime, name, _photograph(metadata), data)
-    response.headers["Location"] = f"/v1/heliostats/{name}/measurements/{row.identifier}"
-    if not is_new:
+    photograph = _photograph(metadata, runtime)
+    if image is None and photograph.kind is not None:
+        raise InvalidInputError(
+            f"image: is missing, and kind says {photograph.kind}; send it, or kind none"
+        )
+    data = None if image is None else _bytes(image, runtime.settings.max_image_bytes)
+    received = receive(runtime, name, photograph, data, actor=identity.name)
+    response.headers["Location"] = f"/v1/heliostats/{name}/measurements/{received.row.identifier}"
+    if not received.is_new:
         response.status_code = status.HTTP_200_OK
-    return measurement_out(name, row)
+    with runtime.database.reading() as session:
+        known = measurement_out(session, name, received.row).model_dump()
+    return PostedOut(**known, filled=list(received.filled), ignored=list(received.ignored))
 
 
 @router.get("", responses=problems(404), dependencies=[READ])
@@ -288,20 +442,56 @@ def list_measurements(
     name: NamePath,
     runtime: RuntimeDep,
     limit: Limit = 100,
-    after: Annotated[MeasurementName | None, Query(description="The last id of the page before.")] = None,
-    accepted: Annotated[bool | None, Query(description="Only accepted, or only refused ones.")] = None,
+    after: Annotated[
+        MeasurementName | None, Query(description="The last id of the page before.")
+    ] = None,
+    accepted: Annotated[
+        bool | None, Query(description="Only accepted, or only refused ones.")
+    ] = None,
+    dated: Annotated[
+        bool | None, Query(description="Only those whose time is known, or is unknown.")
+    ] = None,
+    warned: Annotated[
+        bool | None, Query(description="Only those with warnings, or without any.")
+    ] = None,
+    kind: Annotated[Kind | None, Query(description="Only images of this kind.")] = None,
+    target: Annotated[Name | None, Query(description="Only photographs of this target.")] = None,
+    since: Annotated[
+        Moment | None, Query(description="Only those taken from then on (time with zone).")
+    ] = None,
+    until: Annotated[
+        Moment | None, Query(description="Only those taken before then (time with zone).")
+    ] = None,
+    sort: Annotated[
+        Literal["created_at", "taken_at"],
+        Query(
+            description="By when they came, or were taken: then those of unknown time come last."
+        ),
+    ] = "created_at",
+    order: OrderQuery = "up",
 ) -> Page[MeasurementOut]:
-    """A heliostat's measurements in the order they came."""
+    """A heliostat's measurements, in the order of arrival or by the time they were taken."""
     with runtime.database.reading() as session:
-        rows = store.list_measurements(session, store.get_heliostat(session, name), limit + 1, after, accepted)
-    items = [measurement_out(name, row) for row in rows]
+        rows = store.list_measurements(
+            session,
+            store.get_heliostat(session, name),
+            limit + 1,
+            after,
+            MeasurementFilter(accepted, kind, target, dated, warned, Period(since, until)),
+            Order("id" if sort == "created_at" else sort, order == "down"),
+        )
+        items = [measurement_out(session, name, row) for row in rows]
     return page(items, limit)
 
 
 @router.get("/{measurement}", responses=problems(404), dependencies=[READ])
-def get_measurement(name: NamePath, measurement: MeasurementPath, runtime: RuntimeDep) -> MeasurementOut:
+def get_measurement(
+    name: NamePath, measurement: MeasurementPath, runtime: RuntimeDep
+) -> MeasurementOut:
     """A measurement with its quality record."""
-    return measurement_out(name, get_row(name, measurement, runtime))
+    with runtime.database.reading() as session:
+        row = store.get_measurement(session, store.get_heliostat(session, name), measurement)
+        return measurement_out(session, name, row)
 
 
 @router.get(
@@ -309,7 +499,10 @@ def get_measurement(name: NamePath, measurement: MeasurementPath, runtime: Runti
     response_class=Response,
     responses={
         **problems(404, 410),
-        200: {"description": "The file as it was sent.", "content": {"image/*": {"schema": BINARY}}},
+        200: {
+            "description": "The file as it was sent.",
+            "content": {"image/*": {"schema": BINARY}},
+        },
         304: {"description": "If-None-Match names the file, which the client holds already."},
     },
     dependencies=[READ],
@@ -318,22 +511,25 @@ def get_image(
     name: NamePath,
     measurement: MeasurementPath,
     runtime: RuntimeDep,
-    if_none_match: Annotated[str | None, Header(description="The ETag of a file that is held already.")] = None,
+    if_none_match: Annotated[
+        str | None, Header(description="The ETag of a file that is held already.")
+    ] = None,
 ) -> Response:
-    """The image as it was sent; every byte of it is checked before the first one leaves."""
-    row = get_row(name, measurement, runtime)
-    require_image(row)
-    # It may be kept, but every use asks again, and shows its key again.
+    """The image as it was sent. The whole file is verified before the response begins."""
+    image = require_image(row := get_row(name, measurement, runtime))
+    # Browsers may store it, but must ask again and present the key each time.
     headers = {"ETag": f'"{row.image_sha256}"', "Cache-Control": "private, no-cache"}
-    if is_held(headers["ETag"], if_none_match):
+    if etag_matches(headers["ETag"], if_none_match):
         return Response(status_code=status.HTTP_304_NOT_MODIFIED, headers=headers)
     headers["X-Content-Type-Options"] = "nosniff"
     try:
-        path = runtime.images.checked(row.image_sha256)
+        path = runtime.images.checked(image.sha256)
     except StoreDamagedError:
-        require_image(get_row(name, measurement, runtime))  # it may have been given up since its row was read
+        require_image(
+            get_row(name, measurement, runtime)
+        )  # it may have been pruned after its row was read
         raise
-    return WholeFile(path, media_type=row.image.media_type, headers=headers)
+    return WholeFile(path, media_type=image.media_type, headers=headers)
 
 
 @router.get(
@@ -341,8 +537,15 @@ def get_image(
     responses={**problems(404, 406), **arrays(MeasurementFluxOut, "`flux` and `centered`.")},
     dependencies=[READ],
 )
-def get_flux(name: NamePath, measurement: MeasurementPath, runtime: RuntimeDep, media_type: MediaType) -> Response:
-    """The measured flux: over the whole target (256 x 256), and 64 x 64 about the centre of mass with sum 100."""
+def get_flux(
+    name: NamePath, measurement: MeasurementPath, runtime: RuntimeDep, media_type: MediaType
+) -> Response:
+    """The measured flux, with a sum of 100.
+
+    `flux` covers the whole target (256 x 256). `centered` covers 64 x 64 about the centre of mass.
+    """
     with runtime.database.reading() as session:
-        row = store.get_measurement(session, store.get_heliostat(session, name), measurement, arrays=True)
-    return flux_answer(name, row, media_type)
+        row = store.get_measurement(
+            session, store.get_heliostat(session, name), measurement, arrays=True
+        )
+        return flux_answer(session, name, row, media_type)

@@ -1,4 +1,4 @@
-"""Versions of the plant's model."""
+"""Versions of the plant model."""
 
 from datetime import datetime
 from typing import Any
@@ -7,27 +7,33 @@ from fastapi import APIRouter
 from pydantic import BaseModel, Field
 from sqlalchemy.orm import Session
 
-from service.store.models import declared_of
+from service.store.plant.model_versions import declared_of
 from service.store.tables import ModelRow
-from service.twin import versions
-from service.web.answers.openapi import problems
-from service.web.answers.paging import Page
-from service.web.door.dependencies import READ, RuntimeDep
+from service.twin.plant import model_versions
+from service.web.auth.dependencies import READ, RuntimeDep
+from service.web.responses.openapi import problems
+from service.web.responses.paging import Page
 
 router = APIRouter(tags=["studies"])
 
 
 class ModelOut(BaseModel):
-    """A version of the plant's model."""
+    """A version of the plant model."""
 
-    number: int = Field(description="Ask for it as `model_version`.")
-    version: str = Field(description="Number and names of its effects.", examples=["2:camera_response"])
+    version: int = Field(description="Ask for it as `model_version`.")
     is_current: bool = Field(description="Whether forecasts and predictions are made by it.")
-    effects: list[dict[str, Any]] = Field(description="Its effects with parameters and scopes, but for declared ones.")
-    declared: dict[str, Any] | None = Field(
-        description="What was declared when it was made, as in twin.json; null: Buie's sun with a ratio of 0.02."
+    effects: list[dict[str, Any]] = Field(
+        description="Its effects with parameters and scopes, but for declared ones."
     )
-    study: int | None = Field(description="The study that it was adopted from; null: a declared model.")
+    declared: dict[str, Any] | None = Field(
+        description=(
+            "What was declared when it was made, as in twin.json; null: Buie's sun with a ratio of"
+            " 0.02."
+        )
+    )
+    study: int | None = Field(
+        description="The study that it was adopted from; null: a declared model."
+    )
     adopted_at: datetime | None
     adopted_by: str | None
     withdrawn_at: datetime | None
@@ -35,46 +41,49 @@ class ModelOut(BaseModel):
 
 
 def declared_model(declared: dict[str, Any] | None, is_current: bool) -> ModelOut:
-    """The model that the plant began with."""
+    """The declared model, which is the first version."""
     unknown = dict.fromkeys(("study", "adopted_at", "adopted_by", "withdrawn_at", "withdrawn_by"))
-    about: dict[str, Any] = {
-        "number": versions.DECLARED,
-        "version": versions.version_name(versions.DECLARED, ()),
-        "effects": [],
-    }
-    about["declared"] = declared
+    about = {"version": model_versions.DECLARED, "effects": [], "declared": declared}
     return ModelOut.model_validate({**about, "is_current": is_current, **unknown})
 
 
 def model_out(row: ModelRow, is_current: bool) -> ModelOut:
-    """A later version of the plant's model."""
-    names = ModelOut.model_fields.keys() - {"is_current", "study"}
+    """An adopted version of the plant model."""
+    names = ModelOut.model_fields.keys() - {"version", "is_current", "study"}
     fields = {name: getattr(row, name) for name in names}
-    return ModelOut.model_validate({**fields, "is_current": is_current, "study": row.study_id})
+    about = {"version": row.number, "is_current": is_current, "study": row.study_id}
+    return ModelOut.model_validate(fields | about)
 
 
 def all_models(session: Session) -> list[ModelOut]:
-    """All versions of the plant's model, oldest first, withdrawn ones too."""
-    current = versions.current_number(session)
-    adopted = [model_out(row, row.number == current) for row in versions.list_models(session)]
-    return [declared_model(declared_of(session, None), current == versions.DECLARED), *adopted]
+    """All versions of the plant model, oldest first, including withdrawn ones."""
+    current = model_versions.current_number(session)
+    adopted = [model_out(row, row.number == current) for row in model_versions.list_models(session)]
+    return [
+        declared_model(declared_of(session, None), current == model_versions.DECLARED),
+        *adopted,
+    ]
 
 
 def current_out(session: Session) -> ModelOut:
     """The current version, adopted or declared."""
-    row = versions.find_current(session)
-    return declared_model(declared_of(session, None), True) if row is None else model_out(row, is_current=True)
+    row = model_versions.find_current(session)
+    return (
+        declared_model(declared_of(session, None), True)
+        if row is None
+        else model_out(row, is_current=True)
+    )
 
 
 @router.get("/models", responses=problems(), dependencies=[READ])
 def list_models(runtime: RuntimeDep) -> Page[ModelOut]:
-    """All versions of the plant's model, oldest first, withdrawn ones too."""
+    """All versions of the plant model, oldest first, including withdrawn ones."""
     with runtime.database.reading() as session:
         return Page(items=all_models(session), next=None)
 
 
 @router.get("/models/current", responses=problems(), dependencies=[READ])
 def get_current_model(runtime: RuntimeDep) -> ModelOut:
-    """The version that forecasts and predictions are made by."""
+    """The version that forecasts and predictions use."""
     with runtime.database.reading() as session:
         return current_out(session)

@@ -1,4 +1,4 @@
-"""The plant and its target planes."""
+"""The plant, its target planes and its receivers."""
 
 from typing import Any, Self
 
@@ -7,17 +7,25 @@ from pydantic import BaseModel, Field, model_validator
 from sqlalchemy.orm import Session
 
 from model.frames import wgs84_to_enu
-from model.plant import TargetPlane
+from model.plant import Plant, TargetPlane
 from service import store
 from service.base.fields import Model, Plane, ReceiverIn, Wgs84
 from service.sources.documents import parse_declared, read_receivers, read_targets
 from service.sources.schema import TowerMeasurements
-from service.store.models import declared_of, find_current
+from service.store.plant.model_versions import declared_of, find_current
+from service.store.rows import Put
 from service.store.tables import ReceiverRow, TargetRow
-from service.twin import geometry
-from service.web.answers.openapi import problems
-from service.web.answers.paging import Page
-from service.web.door.dependencies import OPERATE, READ, IdentityDep, NamePath, RuntimeDep, require_json
+from service.twin.plant import setup
+from service.web.auth.dependencies import (
+    OPERATE,
+    READ,
+    IdentityDep,
+    NamePath,
+    RuntimeDep,
+    require_json,
+)
+from service.web.responses.openapi import problems
+from service.web.responses.paging import Page
 
 
 class PlantOut(BaseModel):
@@ -28,8 +36,10 @@ class PlantOut(BaseModel):
         description="Tower base: latitude [deg], longitude [deg], altitude [m]."
     )
     declared: dict[str, Any] | None = Field(
-        description="What is declared of its model, as in twin.json; null: Buie's sun with a ratio of 0.02, no "
-        "effects, and optics of reflectivity 1 without attenuation."
+        description=(
+            "What is declared of its model, as in twin.json; null: Buie's sun with a ratio of 0.02,"
+            " no effects, and optics of reflectivity 1 without attenuation."
+        )
     )
 
 
@@ -46,7 +56,10 @@ class ReceiverOut(BaseModel):
 
 
 class Corners(Model):
-    """A target by its corners as seen from the field, in WGS84 (latitude [deg], longitude [deg], altitude [m])."""
+    """The corners of a target as seen from the field.
+
+    In WGS84: latitude [deg], longitude [deg], altitude [m].
+    """
 
     upper_left: Wgs84 = Field(description="[deg, deg, m]")
     upper_right: Wgs84 = Field(description="[deg, deg, m]")
@@ -55,7 +68,7 @@ class Corners(Model):
 
 
 class TargetIn(Model):
-    """A target plane, either by its rectangle in east-north-up metres or by its four corners in WGS84."""
+    """A target plane: a rectangle in east-north-up metres, or four corners in WGS84."""
 
     plane: Plane | None = None
     corners: Corners | None = None
@@ -76,7 +89,9 @@ class TargetOut(BaseModel):
     up: tuple[float, float, float] = Field(description="Unit vector up the image.")
     width: float = Field(description="[m]")
     height: float = Field(description="[m]")
-    corners: dict[str, Any] | None = Field(description="The WGS84 corners that it was made from, if it was.")
+    corners: dict[str, Any] | None = Field(
+        description="The WGS84 corners that it was made from, if it was."
+    )
 
 
 def plant_out(session: Session) -> PlantOut:
@@ -117,14 +132,24 @@ def receiver_out(row: ReceiverRow) -> ReceiverOut:
 
 router = APIRouter(tags=["plant"])
 _CORNERS = ("upper_left", "upper_right", "lower_left", "lower_right")
-_RECEIVER_EXAMPLE = {"center": [0, 0, 55.2], "normal": [0, 1, 0], "radius": 4.1, "height": 5.2, "opening_deg": 60}
-_PLANE_EXAMPLE = {"plane": {"center": [0, -3.2, 35.9], "normal": [0, 1, 0], "width": 8.6, "height": 7.2}}
+_RECEIVER_EXAMPLE = {
+    "center": [0, 0, 55.2],
+    "normal": [0, 1, 0],
+    "radius": 4.1,
+    "height": 5.2,
+    "opening_deg": 60,
+}
+_PLANE_EXAMPLE = {
+    "plane": {"center": [0, -3.2, 35.9], "normal": [0, 1, 0], "width": 8.6, "height": 7.2}
+}
 
 
 def _from_corners(session: Session, name: str, corners: Corners) -> TargetPlane:
-    store.one_at_a_time(session)  # the origin must not move until the target stands upon it
+    store.serialize_writers(session)  # the origin must not change before the target is stored
     origin = store.get_plant(session).origin
-    return TargetPlane.from_corners(name, *(wgs84_to_enu(getattr(corners, corner), origin) for corner in _CORNERS))
+    return TargetPlane.from_corners(
+        name, *(wgs84_to_enu(getattr(corners, corner), origin) for corner in _CORNERS)
+    )
 
 
 def _paint_corners(document: dict[str, Any], name: str) -> dict[str, list[float]]:
@@ -139,26 +164,29 @@ def get_plant(runtime: RuntimeDep) -> PlantOut:
         return plant_out(session)
 
 
-@router.put("/plant", responses=problems(409, 413, 415), dependencies=[OPERATE, Depends(require_json)])
+@router.put(
+    "/plant", responses=problems(409, 413, 415), dependencies=[OPERATE, Depends(require_json)]
+)
 def put_plant(document: TowerMeasurements, runtime: RuntimeDep, identity: IdentityDep) -> PlantOut:
-    """Set the tower base, all planar targets and receivers from PAINT's tower measurements; again changes nothing.
+    """Set the tower base, all planar targets and receivers from PAINT's tower measurements.
 
-    What is `declared` of the plant's model comes with them, where it is given. An effect's `scope` says when it acts
-    and at which `heliostats`: `{"kind": "set", "heliostats": ["AB12"]}` is of one mirror; without it all have it.
+    Repeating the request changes nothing. `declared` sets what is declared of the plant model, if
+    it is given. An effect's `scope` says when it acts and at which `heliostats`. Without a scope,
+    it acts at all of them.
+
+    A scope of one mirror: `{"kind": "set", "heliostats": ["AB12"]}`.
     """
     origin, targets = read_targets(document.raw)
     receivers = read_receivers(document.raw)
-    parse_declared(document.declared or {}, "declared")  # what is stored can be computed with
+    parse_declared(document.declared or {}, "declared")  # refuse models that cannot be computed
     corners = {name: _paint_corners(document.raw, name) for name in targets}
 
-    def deed(session: Session) -> PlantOut:
-        name, declared = document.power_plant_properties.ID, document.declared
-        geometry.set_plant(
-            session, identity.name, name, origin, targets.values(), receivers.values(), declared, corners=corners
-        )
+    def write(session: Session) -> PlantOut:
+        plant = Plant(document.power_plant_properties.ID, origin, targets, receivers=receivers)
+        setup.set_plant(session, identity.name, plant, document.declared, corners)
         return plant_out(session)
 
-    return runtime.database.written(deed)
+    return runtime.database.run_in_transaction(write)
 
 
 @router.get("/targets", responses=problems(), dependencies=[READ])
@@ -190,15 +218,15 @@ def put_target(
 ) -> TargetOut:
     """Set a target plane, by its rectangle [m] or by its four corners in WGS84."""
 
-    def deed(session: Session) -> tuple[TargetRow, store.Change]:
+    def write(session: Session) -> Put[TargetRow]:
         if request.corners is not None:
             plane = _from_corners(session, name, request.corners)
             corners = {corner: list(getattr(request.corners, corner)) for corner in _CORNERS}
-            return geometry.set_target(session, identity.name, plane, corners)
-        assert request.plane is not None  # the schema wants one of both
-        return geometry.set_target(session, identity.name, request.plane.named(name))
+            return setup.set_target(session, identity.name, plane, corners)
+        assert request.plane is not None  # the schema requires one of the two
+        return setup.set_target(session, identity.name, request.plane.named(name))
 
-    row, change = runtime.database.written(deed)
+    row, change = runtime.database.run_in_transaction(write)
     if change is store.Change.NEW:
         response.status_code = status.HTTP_201_CREATED
     return target_out(row)
@@ -212,8 +240,13 @@ def put_target(
     dependencies=[OPERATE],
 )
 def delete_target(name: NamePath, runtime: RuntimeDep, identity: IdentityDep) -> None:
-    """Delete a target plane that was made by mistake; not where photographs, forecasts or waiting jobs name it."""
-    runtime.database.written(lambda session: geometry.remove(session, identity.name, "target", name))
+    """Delete a target plane that was created by mistake.
+
+    This is refused if photographs, forecasts or waiting jobs refer to it.
+    """
+    runtime.database.run_in_transaction(
+        lambda session: setup.remove(session, identity.name, "target", name)
+    )
 
 
 @router.get("/receivers", responses=problems(), dependencies=[READ])
@@ -244,8 +277,8 @@ def put_receiver(
     response: Response,
 ) -> ReceiverOut:
     """Set a cylindrical receiver."""
-    row, change = runtime.database.written(
-        lambda session: geometry.set_receiver(session, identity.name, request.named(name))
+    row, change = runtime.database.run_in_transaction(
+        lambda session: setup.set_receiver(session, identity.name, request.named(name))
     )
     if change is store.Change.NEW:
         response.status_code = status.HTTP_201_CREATED
@@ -260,5 +293,10 @@ def put_receiver(
     dependencies=[OPERATE],
 )
 def delete_receiver(name: NamePath, runtime: RuntimeDep, identity: IdentityDep) -> None:
-    """Delete a receiver that was made by mistake; not where waiting jobs name it."""
-    runtime.database.written(lambda session: geometry.remove(session, identity.name, "receiver", name))
+    """Delete a receiver that was created by mistake.
+
+    This is refused if waiting jobs refer to it.
+    """
+    runtime.database.run_in_transaction(
+        lambda session: setup.remove(session, identity.name, "receiver", name)
+    )

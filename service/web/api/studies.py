@@ -1,4 +1,4 @@
-"""Studies, and the versions of the plant's model that come of them."""
+"""Studies, and the versions of the plant model that are adopted from them."""
 
 from datetime import datetime
 from typing import Annotated, Any
@@ -9,16 +9,17 @@ from pydantic import BaseModel, Field
 from sqlalchemy.orm import Session
 
 from service import store
-from service.base.faults import NotFoundError
-from service.base.fields import Flag, Model, StudyReport, Verdict, Version
+from service.base.errors import NotFoundError
+from service.base.fields import Flag, Model, ModelNumber, StudyReport, Verdict, Version
 from service.jobs.kinds import KINDS
+from service.store.listing import Order, Period
 from service.store.tables import StudyRow
-from service.twin import versions
-from service.web.answers.openapi import TEXT, problems
-from service.web.answers.paging import Page, page
+from service.twin.plant import model_versions
 from service.web.api.jobs import add_creator
 from service.web.api.models import ModelOut, current_out, model_out
-from service.web.door.dependencies import OPERATE, READ, IdentityDep, Limit, RuntimeDep
+from service.web.auth.dependencies import OPERATE, READ, IdentityDep, Limit, RuntimeDep
+from service.web.responses.openapi import TEXT, problems
+from service.web.responses.paging import OrderQuery, Page, Since, Until, page
 
 
 class StudySummary(BaseModel):
@@ -29,11 +30,19 @@ class StudySummary(BaseModel):
     created_by: str = Field(description="Name of the key that asked for it.")
     options: dict[str, Any] = Field(description="What was asked.")
     heliostats: list[str] = Field(description="Those whose photographs were studied.")
-    taken_from: datetime | None = Field(description="When the first photograph was taken, where that is known.")
-    taken_to: datetime | None = Field(description="When the last one was.")
-    model_version: str = Field(description="Version of the plant's model that the photographs were held against.")
-    adopted: str | None = Field(description="Version of the model that stands for what was found, unless withdrawn.")
-    verdict: Verdict = Field(description="effect: it is found; none: nothing is missing; unexplained: something is.")
+    first_taken_at: datetime | None = Field(
+        description="When the first photograph was taken, where that is known."
+    )
+    last_taken_at: datetime | None = Field(description="When the last one was.")
+    model_version: ModelNumber = Field(
+        description="Version of the plant's model that the photographs were compared with."
+    )
+    adopted: int | None = Field(
+        description="Version of the model that was adopted from it, unless withdrawn."
+    )
+    verdict: Verdict = Field(
+        description="effect: it is found; none: nothing is missing; unexplained: something is."
+    )
     conclusion: str
 
 
@@ -42,55 +51,64 @@ class StudyOut(StudySummary, StudyReport):
 
 
 class AdoptedOut(ModelOut):
-    """The version that an adoption made, and the surfaces that were not made by it."""
+    """The version that an adoption made, and the surfaces that it outdates."""
 
     outdated_surfaces: dict[str, int] = Field(
-        description="Versions of today's surfaces that another version of the model made, by heliostat; "
-        "`POST /v1/jobs/predictions` makes them anew."
+        description=(
+            "Versions of active surfaces that another version of the model made, by heliostat; "
+            "`POST /v1/jobs/predictions` makes them again."
+        )
     )
 
 
 class AdoptIn(Model):
-    """How to adopt what a study found."""
+    """How to adopt the result of a study."""
 
     force: Flag = Field(
         default=False,
-        description="Also where its verdict is not `effect`, or another version of the model is current by now, which "
-        "it then takes the place of.",
+        description=(
+            "Also where its verdict is not `effect`, or another version of the model is current by"
+            " now, which it then takes the place of."
+        ),
     )
 
 
-def _study_fields(row: StudyRow, adopted: str | None) -> dict[str, Any]:
+def _study_fields(row: StudyRow, adopted: int | None) -> dict[str, Any]:
     names = StudySummary.model_fields.keys() - {"adopted"}
     return {name: getattr(row, name) for name in names} | {"adopted": adopted}
 
 
-def study_summary(row: StudyRow, adopted: str | None) -> StudySummary:
-    """A study without its figures; ``adopted`` is the version that stands for what it found."""
+def study_summary(row: StudyRow, adopted: int | None) -> StudySummary:
+    """A study without its figures. ``adopted`` is the version that was adopted from it."""
     return StudySummary.model_validate(_study_fields(row, adopted))
 
 
-def study_out(row: StudyRow, adopted: str | None) -> StudyOut:
+def study_out(row: StudyRow, adopted: int | None) -> StudyOut:
     """A study, loaded with its report, as JSON."""
-    return StudyOut.model_validate({**row.report, **_study_fields(row, adopted), "skipped": row.skipped})
+    return StudyOut.model_validate(
+        {**row.report, **_study_fields(row, adopted), "skipped": row.skipped}
+    )
 
 
 router = APIRouter(tags=["studies"])
 Number = Annotated[Version, Path(description="Id of the study.")]
 
 REPORT_POLICY = (
-    "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'; "
-    "frame-ancestors 'none'; sandbox allow-same-origin"
+    "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; form-action"
+    " 'none'; frame-ancestors 'none'; sandbox allow-same-origin"
 )
-"""The page holds its style and its pictures, and nothing else may run or load in it; of this origin, for its links."""
+"""Content security policy of the report, which includes its style and images.
+
+Nothing else may load or run in it. It keeps this origin, so that its links work.
+"""
 
 
 add_creator(router, KINDS["studies"], "/studies", "post_study")
 
 
-def _adopted(session: Session, row: StudyRow) -> str | None:
-    version = versions.find_adopted(session, row.id)
-    return None if version is None else version.version
+def _adopted(session: Session, row: StudyRow) -> int | None:
+    version = model_versions.find_adopted(session, row.id)
+    return None if version is None else version.number
 
 
 @router.get("/studies", responses=problems(), dependencies=[READ])
@@ -98,19 +116,26 @@ def list_studies(
     runtime: RuntimeDep,
     limit: Limit = 100,
     after: Annotated[Version | None, Query(description="The last id of the page before.")] = None,
+    verdict: Annotated[Verdict | None, Query(description="Only those of this verdict.")] = None,
+    since: Since = None,
+    until: Until = None,
+    order: OrderQuery = "down",
 ) -> Page[StudySummary]:
     """Studies, newest first."""
     with runtime.database.reading() as session:
-        rows = store.list_studies(session, limit + 1, after)
-        adopted = versions.adopted_from(session, [row.id for row in rows])
-    versions_of = {study: version.version for study, version in adopted.items()}
+        made, direction = Period(since, until), Order(descending=order == "down")
+        rows = store.list_studies(
+            session, limit + 1, after, verdict=verdict, created=made, order=direction
+        )
+        adopted = model_versions.adopted_from(session, [row.id for row in rows])
+    versions_of = {study: version.number for study, version in adopted.items()}
     items = [study_summary(row, versions_of.get(row.id)) for row in rows]
     return page(items, limit)
 
 
 @router.get("/studies/{number}", responses=problems(404), dependencies=[READ])
 def get_study(number: Number, runtime: RuntimeDep) -> StudyOut:
-    """A study: its verdict, what it found, and what that buys."""
+    """A study: its verdict, its results, and their benefit."""
     with runtime.database.reading() as session:
         row = store.get_study(session, number)
         return study_out(row, _adopted(session, row))
@@ -121,7 +146,7 @@ def get_study(number: Number, runtime: RuntimeDep) -> StudyOut:
     response_class=Response,
     responses={
         **problems(404),
-        200: {"description": "A page that stands alone.", "content": {"text/html": {"schema": TEXT}}},
+        200: {"description": "A self-contained page.", "content": {"text/html": {"schema": TEXT}}},
     },
     dependencies=[READ],
 )
@@ -146,17 +171,22 @@ def adopt_study(
     identity: IdentityDep,
     request: Annotated[AdoptIn | None, Body(examples=[{"force": False}])] = None,
 ) -> AdoptedOut:
-    """Make what the study found the next version of the plant's model, which is used from then on."""
+    """Adopt the result of a study as the current version of the plant model."""
     force = request is not None and request.force
     with runtime.database.writing() as session:
-        row = versions.adopt(session, number, identity.name, force)
-        outdated = {one.heliostat: one.version for one in store.outdated_surfaces(session, row.version)}
+        row = model_versions.adopt(session, number, identity.name, force)
+        outdated = {
+            one.heliostat: one.version for one in store.outdated_surfaces(session, row.version)
+        }
         return AdoptedOut(**dict(model_out(row, is_current=True)), outdated_surfaces=outdated)
 
 
 @router.post("/studies/{number}/withdraw", responses=problems(404, 409), dependencies=[OPERATE])
 def withdraw_study(number: Number, runtime: RuntimeDep, identity: IdentityDep) -> ModelOut:
-    """Take back what was adopted from the study; the version before is current again, and is the answer."""
+    """Withdraw the version that was adopted from the study.
+
+    The version before it is current again, and is the response.
+    """
     with runtime.database.writing() as session:
-        versions.withdraw(session, number, identity.name)
+        model_versions.withdraw(session, number, identity.name)
         return current_out(session)

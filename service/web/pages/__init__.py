@@ -1,1 +1,1 @@
-"""The web pages: rendered here from templates, with every style and script of our own."""
+"""Web pages: rendered on the server from templates, with local styles and scripts only."""

@@ -1,7 +1,7 @@
-"""Needs attention: what, since when, what to do, and who has seen it."""
+"""Page of alerts: what is wrong, since when, what to do, and who acknowledged it."""
 
 from collections import Counter
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Form, Query, Request, Response
 from fastapi.responses import HTMLResponse
@@ -9,35 +9,42 @@ from markupsafe import Markup
 from pydantic import Field
 
 from service.base.fields import Model
-from service.twin.attention import REASONS, Reason, acknowledge, needs_attention
-from service.web.answers.pages import go_to, render
+from service.twin.alerts.alerts import REASONS, Reason, acknowledge, list_alerts
 from service.web.api.attention import AttentionCountDep, ItemId
-from service.web.door.dependencies import OPERATE, READ, FieldBookDep, IdentityDep, RuntimeDep
+from service.web.auth.dependencies import (
+    OPERATE,
+    OVERVIEW_SLOT,
+    READ,
+    FieldCacheDep,
+    IdentityDep,
+    RuntimeDep,
+)
+from service.web.responses.pages import go_to, render
 
 router = APIRouter(include_in_schema=False)
 
-# Items on the page; a reason's own list shows as many of it.
+# Items on the page, in total or for one reason.
 _LISTED = 100
 
 
 class AcknowledgementForm(Model):
-    """The buttons: one item, or all that the page lists; ``reason`` is where to go back to."""
+    """The buttons for one item or all listed ones. ``reason`` is the list to return to."""
 
     ids: Annotated[list[ItemId], Field(min_length=1, max_length=_LISTED)]
     reason: Reason | None = None
 
 
-@router.get("/attention", dependencies=[READ])
+@router.get("/attention", dependencies=[READ, OVERVIEW_SLOT])
 def get_attention_page(
     request: Request,
     runtime: RuntimeDep,
-    book: FieldBookDep,
+    cache: FieldCacheDep,
     reason: Annotated[Reason | None, Query()] = None,
     acknowledged: Annotated[bool, Query()] = False,
 ) -> HTMLResponse:
-    """What nobody has acknowledged, or what somebody has; of one reason or of all."""
+    """Alerts that are not acknowledged, or those that are; of one reason or of all."""
     with runtime.database.reading() as session:
-        items, pending = needs_attention(session, book, runtime.settings)
+        items, pending = list_alerts(session, cache, runtime.settings)
     chosen = [item for item in items if (item.acknowledged_by is not None) == acknowledged]
     listed = [item for item in chosen if reason in (None, item.reason)]
     return render(
@@ -55,28 +62,34 @@ def get_attention_page(
     )
 
 
-def _limits(runtime: RuntimeDep) -> dict[str, Any]:
+def _limits(runtime: RuntimeDep) -> dict[str, object]:
     settings = runtime.settings
-    return {name: getattr(settings, name) for name in type(settings).model_fields if name.startswith("attention_")}
+    return {
+        name: getattr(settings, name)
+        for name in type(settings).model_fields
+        if name.startswith("attention_")
+    }
 
 
 @router.get("/attention/count", dependencies=[READ])
 def get_attention_count(count: AttentionCountDep) -> Response:
-    """How many items nobody has acknowledged, as the menu shows it."""
+    """The number of alerts that are not acknowledged, for the menu."""
     number = count.read()
-    told = Markup('<span class="count">{}<span class="hidden"> not acknowledged</span></span>').format(number)
-    return HTMLResponse(told if number else "")
+    badge = Markup(
+        '<span class="count">{}<span class="hidden"> not acknowledged</span></span>'
+    ).format(number)
+    return HTMLResponse(badge if number else "")
 
 
 @router.post("/attention/acknowledgements", dependencies=[OPERATE])
 def post_acknowledgement_form(
     form: Annotated[AcknowledgementForm, Form()],
     runtime: RuntimeDep,
-    book: FieldBookDep,
+    cache: FieldCacheDep,
     count: AttentionCountDep,
     identity: IdentityDep,
 ) -> Response:
-    """Acknowledge items, and go back to the list."""
-    acknowledge(runtime, book, form.ids, identity.name)
+    """Acknowledge items, and return to the list."""
+    acknowledge(runtime, cache, form.ids, identity.name)
     count.forget()
     return go_to("/attention" if form.reason is None else f"/attention?reason={form.reason}")

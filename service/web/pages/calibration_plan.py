@@ -1,4 +1,4 @@
-"""The calibration plan: which heliostats to photograph next, when, and where their motors stand then."""
+"""Page of the calibration plan: which heliostats to photograph, when, and how to aim them."""
 
 from typing import Annotated
 
@@ -7,14 +7,14 @@ from fastapi.responses import HTMLResponse
 
 from model.errors import InvalidInputError
 from service.base.fields import FormMoment
-from service.twin.pointing import make_plan
-from service.web.answers.pages import render
-from service.web.door.dependencies import COMPUTES, READ, RuntimeDep
+from service.twin.pointing.calibration import make_plan
+from service.web.auth.dependencies import COMPUTE_SLOT, READ, RuntimeDep
+from service.web.responses.pages import render
 
 router = APIRouter(include_in_schema=False, dependencies=[READ])
 
 
-@router.get("/calibration-plan", dependencies=[COMPUTES])
+@router.get("/calibration-plan", dependencies=[COMPUTE_SLOT])
 def get_plan_page(
     request: Request,
     runtime: RuntimeDep,
@@ -22,11 +22,11 @@ def get_plan_page(
     minutes: Annotated[float, Query(gt=0, le=720)] = 60.0,
     photographs: Annotated[int, Query(ge=1, le=60)] = 12,
 ) -> HTMLResponse:
-    """The next photographs, from now or from a moment on; at night the page says so."""
+    """The next photographs, from now or from another time. The page says so at night."""
     try:
         slots, trouble = make_plan(runtime, at, minutes, photographs), None
     except InvalidInputError as error:
-        slots, trouble = [], str(error).removeprefix("at: ")  # the form calls it otherwise
+        slots, trouble = ([], str(error).removeprefix("at: "))  # the form has another label
     return render(
         request,
         "calibration_plan.html",

@@ -1,4 +1,7 @@
-"""Two surfaces side by side, of a heliostat or of two: on one scale, what each forecasts, and how it went over time."""
+"""Page that compares two surfaces of one heliostat or two.
+
+Maps share one scale. The page also shows the forecasts of both surfaces, and their history.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,22 +20,22 @@ from model.errors import ModelError
 from model.metrics import flux_accuracy
 from service import store
 from service.base.arrays import unpack
-from service.base.faults import NotFoundError
-from service.base.fields import AZIMUTH, ELEVATION, Model, Name, Version, filled
+from service.base.errors import NotFoundError
+from service.base.fields import AZIMUTH, ELEVATION, Model, Name, Sun, Version, drop_empty_fields
 from service.drawing import charts
 from service.drawing.charts import HeatMap, Timeline, Value
-from service.store import mounts
+from service.store.pointing import mounts
 from service.store.tables import HeliostatRow, MountRow, PlantRow, SurfaceRow, TargetRow
-from service.twin.accuracy import Compared, Comparison, Span
-from service.twin.accuracy import name_of as photograph_of
-from service.twin.compute import Forecast
-from service.twin.field import Shape, figures_of, shape_of
-from service.twin.forecast import ForecastRequest, trace_request
-from service.twin.runtime import Runtime
-from service.web.answers.pages import render
-from service.web.door.dependencies import COMPUTES, DRAWS, READ, RuntimeDep
+from service.twin.alerts.field_overview import SurfaceErrors, field_totals, surface_errors
+from service.twin.forecasts.heliostat_forecast import ForecastRequest, trace_request
+from service.twin.runtime.operations import Forecast
+from service.twin.runtime.runtime import Runtime
+from service.twin.surfaces.accuracy import Comparison, ComparisonResult, Span
+from service.twin.surfaces.accuracy import photograph_name as photograph_of
+from service.web.auth.dependencies import COMPUTE_SLOT, READ, RENDER_SLOT, RuntimeDep
 from service.web.pages.forecast import sun_now
-from service.web.pages.heliostat import ComparisonBookDep
+from service.web.pages.heliostat import ComparisonCacheDep
+from service.web.responses.pages import render
 
 router = APIRouter(include_in_schema=False, dependencies=[READ])
 
@@ -40,10 +43,11 @@ _RESOLUTION = (128, 128)
 
 
 class CompareQuery(Model):
-    """What is compared: a version each of one heliostat or two, under a sun on a target; ``since`` and ``until`` days.
+    """What to compare: one version each of one heliostat or two, with a sun and a target.
 
-    Without versions they are today's and, of the same heliostat, the one that was made before it; or, where today's is
-    the first, the newest.
+    Without versions, the page compares the active surface with the version before it. If the active
+    surface is the first, the page compares it with the newest. For two heliostats, both surfaces
+    are the active ones. ``since`` and ``until`` are days.
     """
 
     heliostat: Name | None = None
@@ -56,20 +60,24 @@ class CompareQuery(Model):
     since: date | None = None
     until: date | None = None
 
-    _filled = model_validator(mode="before")(filled)
+    _filled = model_validator(mode="before")(drop_empty_fields)
 
     @property
     def span(self) -> Span:
-        """From the beginning of the first day to the end of the last, UTC."""
+        """From the beginning of the first day to the end of the last, in UTC."""
         return Span(
             None if self.since is None else datetime.combine(self.since, time(), UTC),
-            None if self.until is None else datetime.combine(self.until, time(), UTC) + timedelta(days=1),
+            (
+                None
+                if self.until is None
+                else datetime.combine(self.until, time(), UTC) + timedelta(days=1)
+            ),
         )
 
 
 @dataclass(frozen=True)
 class Side:
-    """A surface with all that it is held against the other by; ``versions`` are its heliostat's, oldest first."""
+    """One of the two surfaces. ``versions`` are those of its heliostat, oldest first."""
 
     heliostat: HeliostatRow
     surface: SurfaceRow
@@ -79,7 +87,7 @@ class Side:
 
     @property
     def name(self) -> str:
-        """As the page calls it."""
+        """Label on the page."""
         return f"{self.heliostat.name}, version {self.surface.version}"
 
     @property
@@ -88,55 +96,66 @@ class Side:
         return float(self.heliostat.properties["width"]), float(self.heliostat.properties["height"])
 
     @property
-    def shape(self) -> Shape:
-        """The kind of its deviation."""
-        return shape_of(self.z, self.size)
+    def shape(self) -> SurfaceErrors:
+        """Deviation of the surface from the ideal mirror, by kind."""
+        return surface_errors(self.z, self.size)
 
     @property
     def uncertainty_mm(self) -> float | None:
-        """How well it is known [mm]."""
-        return figures_of(self.surface.arrays).uncertainty_mm
+        """Uncertainty of the surface [mm]."""
+        return field_totals(self.surface.arrays).uncertainty_mm
 
 
 def since_of(surface: SurfaceRow) -> datetime:
-    """Since when a surface describes the mirror, or, where that is not known, when it was made."""
-    return surface.valid_from if surface.valid_from.year > 1970 else surface.created_at
+    """Time from which a surface is valid, else when it was made."""
+    return surface.valid_from or surface.created_at
 
 
-_MOST_VERSIONS = 40
-_MOST_MOUNTS = 40
+_MAX_VERSIONS = 40
+_MAX_MOUNTS = 40
 
 
 def _side(session: Session, name: str, version: int | None) -> Side:
-    """A heliostat's surface of this version, else today's."""
+    """Load a surface of a heliostat: this version, or the active one."""
     heliostat = store.get_heliostat(session, name)
-    query = select(SurfaceRow).where(SurfaceRow.heliostat_id == heliostat.id).options(undefer(SurfaceRow.arrays))
-    versions = list(session.scalars(query.order_by(SurfaceRow.version.desc()).limit(_MOST_VERSIONS)))
+    query = (
+        select(SurfaceRow)
+        .where(SurfaceRow.heliostat_id == heliostat.id)
+        .options(undefer(SurfaceRow.arrays))
+    )
+    versions = list(session.scalars(query.order_by(SurfaceRow.version.desc()).limit(_MAX_VERSIONS)))
     if version is None:
         surface = store.get_surface_at(session, heliostat)
     else:
         surface = store.get_surface(session, heliostat, version)
-    made = mounts.list_mounts(session, heliostat, _MOST_MOUNTS)
-    return Side(heliostat, surface, versions[::-1], made, unpack(surface.arrays)["z"].astype(np.float64))
+    made = mounts.list_mounts(session, heliostat, _MAX_MOUNTS)
+    return Side(
+        heliostat, surface, versions[::-1], made, unpack(surface.arrays)["z"].astype(np.float64)
+    )
 
 
 def _sides(session: Session, query: CompareQuery) -> tuple[Side, Side]:
-    """The two; where versions are not said, the newer one comes second."""
+    """The two surfaces. Without versions, the newer one is second."""
     assert query.heliostat is not None
     second = _side(session, query.other or query.heliostat, query.other_version)
     if query.version is not None or second.heliostat.name != query.heliostat:
         return _side(session, query.heliostat, query.version), second
-    of_heliostat = select(func.max(SurfaceRow.version)).where(SurfaceRow.heliostat_id == second.heliostat.id)
+    of_heliostat = select(func.max(SurfaceRow.version)).where(
+        SurfaceRow.heliostat_id == second.heliostat.id
+    )
     before = session.scalar(of_heliostat.where(SurfaceRow.version < second.surface.version))
     if before is not None:
         return _side(session, query.heliostat, before), second
     after = session.scalar(of_heliostat.where(SurfaceRow.version > second.surface.version))
     if after is None:
-        raise NotFoundError(f"heliostat {query.heliostat} has one surface only; name another heliostat")
+        raise NotFoundError(
+            f"heliostat {query.heliostat} has one surface only; name another heliostat"
+        )
     return second, _side(session, query.heliostat, after)
 
 
-# --- maps -------------------------------------------------------------------------------------------------------------
+# --- maps
+# --------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -150,15 +169,20 @@ class Trio:
 
 def _surfaces(first: Side, second: Side, ends: Mapping[str, float]) -> Trio:
     one, other = (
-        charts.surface_map(f"Deviation of {side.name}", side.z, side.size, ends["heights"]) for side in (first, second)
+        charts.surface_map(f"Deviation of {side.name}", side.z, side.size, ends["heights"])
+        for side in (first, second)
     )
     title = f"{second.name} minus {first.name}"
-    return Trio(one, other, charts.surface_map(title, second.z - first.z, second.size, ends["height_change"]))
+    return Trio(
+        one,
+        other,
+        charts.surface_map(title, second.z - first.z, second.size, ends["height_change"]),
+    )
 
 
 @dataclass(frozen=True)
 class Forecasts:
-    """What two surfaces throw on one target, and how alike that is."""
+    """Flux of two surfaces on one target, and the agreement of both [1]."""
 
     maps: Trio
     first: Forecast
@@ -166,14 +190,16 @@ class Forecasts:
     agreement: float
 
 
-def _forecasts(runtime: Runtime, sides: tuple[Side, Side], target: str, sun: tuple[float, float]) -> Forecasts:
-    """Raises ModelError where the light does not get there."""
+def _forecasts(
+    runtime: Runtime, sides: tuple[Side, Side], target: str, sun: tuple[float, float]
+) -> Forecasts:
+    """Trace both surfaces; ModelError if the light does not reach the target."""
     traced = [
         trace_request(
             runtime,
             ForecastRequest(
                 side.heliostat.name,
-                *sun,
+                Sun(azimuth_deg=sun[0], elevation_deg=sun[1]),
                 target=target,
                 surface=side.surface.version,
                 resolution=_RESOLUTION,
@@ -182,36 +208,45 @@ def _forecasts(runtime: Runtime, sides: tuple[Side, Side], target: str, sun: tup
         for side in sides
     ]
     one, other = (made.forecast for made in traced)
-    size = traced[0].plane.width, traced[0].plane.height
+    size = traced[0].receiver.width, traced[0].receiver.height
     top = max(float(one.flux.max()), float(other.flux.max()))
     first, second = (
         charts.flux_map(f"Flux of {side.name} on {target}", made.flux, size, "W/m²", top)
         for side, made in zip(sides, (one, other), strict=True)
     )
     bound = max(runtime.settings.figure_scales["flux_difference"] * top, 1e-9)
-    difference = charts.difference_map("Second minus first", other.flux - one.flux, size, "W/m²", bound)
-    return Forecasts(Trio(first, second, difference), one, other, flux_accuracy(one.flux, other.flux))
+    difference = charts.difference_map(
+        "Second minus first", other.flux - one.flux, size, "W/m²", bound
+    )
+    return Forecasts(
+        Trio(first, second, difference), one, other, flux_accuracy(one.flux, other.flux)
+    )
 
 
-# --- over time --------------------------------------------------------------------------------------------------------
+# --- over time
+# --------------------------------------------------------------------------------------------------
 
 
 def _within(values: Sequence[Value], span: Span) -> list[Value]:
     return [
         value
         for value in sorted(values, key=lambda value: value.at)
-        if (span.since is None or value.at >= span.since) and (span.until is None or value.at < span.until)
+        if (span.since is None or value.at >= span.since)
+        and (span.until is None or value.at < span.until)
     ]
 
 
-def _judged(comparison: Comparison) -> Value:
-    """The accuracy [%] with which a photograph is forecast."""
-    row = comparison.measurement
-    return Value(row.taken_at or row.created_at, 100 * comparison.accuracy, photograph_of(row), comparison.was_used)
+def _judged(comparisons: Sequence[Comparison]) -> list[Value]:
+    """Accuracies of the forecasts [%] at the times of photographs, if these are known."""
+    return [
+        Value(row.taken_at, 100 * one.accuracy, photograph_of(row), one.was_used)
+        for one in comparisons
+        if (row := one.measurement).taken_at is not None
+    ]
 
 
 def _pointing(side: Side) -> list[Value]:
-    """How far off the light was of what its newest mount says [mrad], photograph by photograph."""
+    """Pointing errors by the newest mount [mrad], one for each photograph."""
     if not side.mounts:
         return []
     history = side.mounts[-1].document["history"]
@@ -220,12 +255,17 @@ def _pointing(side: Side) -> list[Value]:
     return [
         Value(datetime.fromisoformat(at), float(off))
         for index, (at, off) in enumerate(zip(history["at"], off_mrad, strict=True))
-        if index not in foreign
+        if index not in foreign and at is not None
     ]
 
 
-def _timelines(sides: tuple[Side, Side], compared: Sequence[Compared], span: Span) -> list[Timeline]:
-    """Accuracy, shape and pointing on one axis of time, each with the versions of the surfaces marked."""
+def _timelines(
+    sides: tuple[Side, Side], compared: Sequence[ComparisonResult], span: Span
+) -> list[Timeline]:
+    """Timelines of accuracy, shape and pointing on one time axis.
+
+    Each marks the versions of the surfaces.
+    """
     heliostats = {side.heliostat.name: side for side in sides}
     marks = [
         (since_of(row), f"{name} {row.version}" if len(heliostats) > 1 else f"v{row.version}")
@@ -233,79 +273,106 @@ def _timelines(sides: tuple[Side, Side], compared: Sequence[Compared], span: Spa
         for row in side.versions
     ]
     accuracy = {
-        side.name: [_judged(comparison) for comparison in one.comparisons]
-        for side, one in zip(sides, compared, strict=True)
+        side.name: _judged(one.comparisons) for side, one in zip(sides, compared, strict=True)
     }
     shapes = {
-        name: [(row, shape_of(unpack(row.arrays)["z"], side.size)) for row in side.versions]
+        name: [(row, surface_errors(unpack(row.arrays)["z"], side.size)) for row in side.versions]
         for name, side in heliostats.items()
     }
 
     def of_shape(figure: str) -> dict[str, list[Value]]:
         return {
-            name: [Value(since_of(row), getattr(shape, figure), f"version {row.version}") for row, shape in rows]
+            name: [
+                Value(since_of(row), getattr(shape, figure), f"version {row.version}")
+                for row, shape in rows
+            ]
             for name, rows in shapes.items()
         }
 
     drawn: list[tuple[str, str, Mapping[str, Sequence[Value]], int]] = [
-        ("Forecast accuracy of photographs; hollow: the surface was made from it", "%", accuracy, 1),
+        (
+            "Forecast accuracy of photographs; hollow: the surface was made from it",
+            "%",
+            accuracy,
+            1,
+        ),
         ("Deviation from the ideal mirror", "mm", of_shape("deviation_mm"), 3),
         ("Canting of the facets", "mrad", of_shape("canting_mrad"), 3),
         ("Pointing error", "mrad", {name: _pointing(side) for name, side in heliostats.items()}, 2),
     ]
-    shown = [{name: _within(values, span) for name, values in series.items()} for _, _, series, _ in drawn]
+    shown = [
+        {name: _within(values, span) for name, values in series.items()}
+        for _, _, series, _ in drawn
+    ]
     moments = [value.at for series in shown for values in series.values() for value in values]
     made = [
-        charts.timeline(title, unit, series, digits, marks=marks, from_zero=unit != "%", moments=moments)
+        charts.timeline(title, unit, series, digits, marks=marks, moments=moments)
         for (title, unit, _, digits), series in zip(drawn, shown, strict=True)
     ]
     return [chart for chart in made if chart is not None]
 
 
-def _unseen(compared: Sequence[Compared]) -> tuple[list[float], int]:
-    """Mean accuracies [1] on photographs that neither was made from, and how many those are."""
+def _unseen(compared: Sequence[ComparisonResult]) -> tuple[list[float], int]:
+    """Mean accuracies [1] on photographs that neither surface was made from, and their number."""
     found = [{c.measurement.id: c for c in one.comparisons} for one in compared]
     either = found[0].keys() & found[1].keys() or found[0].keys() | found[1].keys()
-    fair = {number for number in either if not any(one[number].was_used for one in found if number in one)}
+    fair = {
+        number
+        for number in either
+        if not any(one[number].was_used for one in found if number in one)
+    }
     means = [[c.accuracy for number, c in one.items() if number in fair] for one in found]
     return [fmean(some) for some in means if some], len(fair)
 
 
-# --- the page ---------------------------------------------------------------------------------------------------------
+# --- the page
+# --------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class _Read:
-    """What the page shows, before it is drawn; nobody waits in his turn for comparisons."""
+    """Data of the page, read before the slot for drawing is taken.
+
+    The slot must not be held while the comparisons are computed.
+    """
 
     sides: tuple[Side, Side] | None
-    compared: Sequence[Compared | None]
+    compared: Sequence[ComparisonResult | None]
     targets: Sequence[str]
     sun: tuple[float, float]
 
 
-def _read(query: Annotated[CompareQuery, Query()], runtime: RuntimeDep, book: ComparisonBookDep) -> _Read:
+def _read(
+    query: Annotated[CompareQuery, Query()], runtime: RuntimeDep, cache: ComparisonCacheDep
+) -> _Read:
     with runtime.database.reading() as session:
         targets = session.scalars(select(TargetRow.name).order_by(TargetRow.name)).all()
         azimuth, elevation = sun_now(session.get(PlantRow, 1))
         sides = None if query.heliostat is None else _sides(session, query)
-        shown = [book.read(session, side.heliostat, side.surface, query.span) for side in sides or ()]
-    compared = [Compared() if one is None else book.wait_for(one) for one in shown]
+        shown = [
+            cache.read(session, side.heliostat, side.surface, query.span) for side in sides or ()
+        ]
+    compared = [ComparisonResult() if one is None else cache.wait_for(one) for one in shown]
     given = query.azimuth_deg, query.elevation_deg
     sun = (azimuth if given[0] is None else given[0], elevation if given[1] is None else given[1])
     return _Read(sides, compared, targets, sun)
 
 
-@router.get("/compare", dependencies=[DRAWS, COMPUTES])
+@router.get("/compare", dependencies=[RENDER_SLOT, COMPUTE_SLOT])
 def get_compare_page(
     query: Annotated[CompareQuery, Query()],
     read: Annotated[_Read, Depends(_read)],
     request: Request,
     runtime: RuntimeDep,
 ) -> HTMLResponse:
-    """Two surfaces, or the form that asks which."""
+    """The comparison of two surfaces, or the form that asks for them."""
     target = query.target or next(iter(read.targets), None)
-    filled: dict[str, Any] = {"query": query, "sun": read.sun, "target": target, "targets": read.targets}
+    filled: dict[str, Any] = {
+        "query": query,
+        "sun": read.sun,
+        "target": target,
+        "targets": read.targets,
+    }
     if read.sides is None:
         return render(request, "compare.html", **filled, sides=None)
     known = [one for one in read.compared if one is not None]
@@ -325,6 +392,8 @@ def get_compare_page(
         forecasts=forecasts,
         trouble=trouble,
         unseen=_unseen(known) if is_whole else None,
-        timelines=_timelines(read.sides, [one or Compared() for one in read.compared], query.span),
+        timelines=_timelines(
+            read.sides, [one or ComparisonResult() for one in read.compared], query.span
+        ),
         again=None if is_whole else str(request.url.query),
     )

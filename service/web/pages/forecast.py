@@ -1,4 +1,4 @@
-"""Forecasts: a form, and the flux map that comes of it."""
+"""Pages of forecasts: a form, and the resulting flux map."""
 
 from dataclasses import dataclass
 from datetime import datetime
@@ -6,39 +6,64 @@ from typing import Annotated, Any, Literal, Self
 
 from fastapi import APIRouter, Form, Path, Query, Request, Response
 from fastapi.responses import HTMLResponse
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationError, model_validator
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from model.ephemeris import sun_angles_at
+from model.errors import InvalidInputError
 from service import store
-from service.base.faults import NotFoundError
-from service.base.fields import AZIMUTH, ELEVATION, FormMoment, Model, Name, Sun, SunAt, Version
+from service.base.errors import NotFoundError
+from service.base.fields import (
+    AZIMUTH,
+    ELEVATION,
+    FormMoment,
+    Model,
+    Name,
+    Search,
+    Sun,
+    SunAt,
+    Version,
+)
+from service.base.validation_messages import format_validation_error
 from service.drawing import charts
 from service.drawing.templates import in_zone
-from service.jobs.asking import ask_for
+from service.jobs.enqueuing import enqueue
+from service.jobs.kinds import field_forecasts
 from service.jobs.kinds.field_forecasts import FleetForecastIn
-from service.store import queue
 from service.store.columns import now
 from service.store.job_tables import JobRow
+from service.store.jobs import queue
 from service.store.tables import PlantRow, ReceiverRow, TargetRow
-from service.twin.forecast import ForecastRequest, flux_of, make_forecast, position_of
-from service.twin.runtime import Runtime
-from service.web.answers.pages import go_to, leave_for, render
-from service.web.door.dependencies import COMPUTES, DRAWS, OPERATE, READ, IdentityDep, RuntimeDep
-from service.web.door.security import Identity
+from service.twin.forecasts.heliostat_forecast import (
+    ForecastRequest,
+    flux_of,
+    make_forecast,
+    position_of,
+)
+from service.twin.runtime.runtime import Runtime
+from service.web.auth.dependencies import (
+    COMPUTE_SLOT,
+    OPERATE,
+    READ,
+    RENDER_SLOT,
+    IdentityDep,
+    RuntimeDep,
+)
+from service.web.auth.security import Identity
+from service.web.responses.pages import go_to, leave_for, render
 
 router = APIRouter(include_in_schema=False)
 
 _RECENT = 10
 
-# Heliostats that the form offers at a time: those whose names begin as what is typed does.
+# Heliostats that the form suggests at a time, by the beginning of their names.
 _OFFERED = 20
 
 
 @dataclass(frozen=True)
 class Made:
-    """A line of the list of forecasts: where it is, and what is in it."""
+    """A line in the list of forecasts: its path and its main values."""
 
     path: str
     name: str
@@ -50,7 +75,7 @@ class Made:
 
 
 class ForecastForm(Model):
-    """The form; without a heliostat it means all of them."""
+    """The form. Without a heliostat, it requests a forecast of all heliostats."""
 
     heliostat: Name | None = None
     target: Name
@@ -66,14 +91,17 @@ class ForecastForm(Model):
         if self.sun_by == "time" and self.moment is None:
             raise ValueError("moment: say when")
         if self.sun_by == "position" and self.moment is not None:
-            raise ValueError("moment: a time and a position are both given; choose by the time, or empty the time")
+            raise ValueError(
+                "moment: a time and a position are both given; choose by the time, or empty the"
+                " time"
+            )
         if self.sun_by == "position" and (self.azimuth_deg is None or self.elevation_deg is None):
-            raise ValueError("azimuth_deg, elevation_deg: say where the sun stands")
+            raise ValueError("azimuth_deg, elevation_deg: give the position of the sun")
         return self
 
     @property
     def sun(self) -> Sun | SunAt:
-        """What was asked for."""
+        """The requested position of the sun, or the time."""
         if self.sun_by == "time":
             assert self.moment is not None
             return SunAt(at=self.moment)
@@ -83,11 +111,11 @@ class ForecastForm(Model):
 
 
 def sun_now(plant: PlantRow | None) -> tuple[float, float]:
-    """Where the sun stands now, [deg]; at night, or without a plant, a high sun in the south."""
+    """Azimuth and elevation of the sun now [deg]. At night or without a plant: 180 and 45."""
     if plant is None:
-        return 0.0, 45.0
-    azimuth, elevation = sun_angles_at(now(), plant.latitude_deg, plant.longitude_deg)
-    return (round(azimuth, 2), round(elevation, 2)) if elevation > 5 else (0.0, 45.0)
+        return 180.0, 45.0
+    azimuth, elevation = sun_angles_at(now(), plant.origin)
+    return (round(azimuth, 2) % 360, round(elevation, 2)) if elevation > 5 else (180.0, 45.0)
 
 
 def _choices(session: Session) -> dict[str, Any]:
@@ -100,7 +128,7 @@ def _choices(session: Session) -> dict[str, Any]:
 
 
 def _recent(session: Session) -> list[Made]:
-    """The newest forecasts, of one heliostat and of many, the newest first."""
+    """The newest forecasts of one heliostat and of many, newest first."""
     of_one = [
         Made(
             f"/forecasts/{row.id}",
@@ -129,7 +157,7 @@ def _recent(session: Session) -> list[Made]:
 
 
 def _filled(**known: Any) -> dict[str, Any]:
-    """What stands in the form: what is ``known``, and else what is likely."""
+    """Values of the form fields: those ``known``, else defaults."""
     likely = {"target": None, "surface": "current", "dni_w_m2": 1000.0}
     return {**likely, "sun_by": "position", "moment": None, **known}
 
@@ -138,10 +166,10 @@ def _filled(**known: Any) -> dict[str, Any]:
 def get_offered_heliostats(
     request: Request,
     runtime: RuntimeDep,
-    heliostat: Annotated[str, Query(max_length=32)] = "",
+    heliostat: Annotated[Search, Query()] = "",
     after: Annotated[Name | None, Query(description="The last name of the list before.")] = None,
 ) -> HTMLResponse:
-    """The first names that begin as ``heliostat`` does, as the form offers them."""
+    """The first names that begin with ``heliostat``, as suggestions for the form."""
     with runtime.database.reading() as session:
         rows = store.list_heliostats(session, _OFFERED, after, heliostat)
     return render(request, "offered.html", heliostats=rows)
@@ -154,7 +182,7 @@ def get_forecast_form(
     heliostat: Annotated[Name | None, Query()] = None,
     job: Annotated[Version | None, Query()] = None,
 ) -> HTMLResponse:
-    """The form, empty but for what is likely, or as a ``job`` was asked for by it."""
+    """The form with defaults, or with the values of a forecast ``job``."""
     with runtime.database.reading() as session:
         choices = _choices(session)
         if job is not None:
@@ -167,15 +195,20 @@ def get_forecast_form(
 
 
 def _filled_as(session: Session, job: JobRow) -> dict[str, Any]:
-    """What the form of a forecast of all heliostats held."""
+    """Values of the form from which a forecast of all heliostats was requested."""
     if job.kind != "forecasts":
         raise NotFoundError(f"job {job.id} is no forecast")
-    asked = FleetForecastIn.model_validate(job.payload)
+    try:
+        asked = FleetForecastIn.model_validate(job.payload)
+    except ValidationError as error:
+        raise InvalidInputError(
+            f"job: what job {job.id} asked for is refused since: {format_validation_error(error)}"
+        ) from error
     sun = position_of(session, asked.sun)
     return _filled(
         heliostat="",
         target=asked.target,
-        azimuth_deg=round(sun.azimuth_deg, 3),
+        azimuth_deg=round(sun.azimuth_deg, 3) % 360,
         elevation_deg=round(sun.elevation_deg, 3),
         surface=asked.surface,
         dni_w_m2=asked.dni_w_m2,
@@ -184,24 +217,44 @@ def _filled_as(session: Session, job: JobRow) -> dict[str, Any]:
 
 
 def _page(
-    request: Request, runtime: Runtime, choices: dict[str, Any], filled: dict[str, Any], **shown: Any
+    request: Request,
+    runtime: Runtime,
+    choices: dict[str, Any],
+    filled: dict[str, Any],
+    **shown: Any,
 ) -> HTMLResponse:
     zone = runtime.settings.time_zone
-    return render(request, "forecast.html", **choices, filled=filled, zone=zone, in_zone=in_zone(zone), **shown)
+    return render(
+        request,
+        "forecast.html",
+        **choices,
+        filled=filled,
+        zone=zone,
+        in_zone=in_zone(zone),
+        **shown,
+    )
 
 
 def _ask_for_all(runtime: Runtime, form: ForecastForm, identity: Identity) -> str:
-    """All heliostats take longer than a request may: the path of the job."""
-    payload = FleetForecastIn(target=form.target, sun=form.sun, surface=form.surface, dni_w_m2=form.dni_w_m2)
-    row = ask_for(runtime, "forecasts", payload.model_dump(mode="json"), identity.name)
+    """Enqueue a forecast of all heliostats, and return the path of its job.
+
+    It takes longer than a request may.
+    """
+    payload = FleetForecastIn(
+        target=form.target, sun=form.sun, surface=form.surface, dni_w_m2=form.dni_w_m2
+    )
+    row = enqueue(runtime, field_forecasts.KIND, payload, identity.name)
     return f"/jobs/{row.id}"
 
 
-@router.post("/forecast", dependencies=[OPERATE, COMPUTES])
+@router.post("/forecast", dependencies=[OPERATE, COMPUTE_SLOT])
 def post_forecast_form(
-    form: Annotated[ForecastForm, Form()], request: Request, runtime: RuntimeDep, identity: IdentityDep
+    form: Annotated[ForecastForm, Form()],
+    request: Request,
+    runtime: RuntimeDep,
+    identity: IdentityDep,
 ) -> Response:
-    """Compute and keep a forecast, and go to its page."""
+    """Compute and store a forecast, and go to its page."""
     with runtime.database.reading() as session:
         sun = position_of(session, form.sun)
     if form.heliostat is None:
@@ -209,8 +262,7 @@ def post_forecast_form(
     asked = ForecastRequest(
         heliostat=form.heliostat,
         target=form.target,
-        sun_azimuth_deg=sun.azimuth_deg,
-        sun_elevation_deg=sun.elevation_deg,
+        sun=sun,
         sun_at=form.moment if form.sun_by == "time" else None,
         surface=form.surface,
         dni=form.dni_w_m2,
@@ -218,22 +270,27 @@ def post_forecast_form(
     return go_to(f"/forecasts/{make_forecast(runtime, asked).id}")
 
 
-@router.get("/forecasts/{number}", dependencies=[READ, DRAWS])
+@router.get("/forecasts/{number}", dependencies=[READ, RENDER_SLOT])
 def get_forecast_page(
-    number: Annotated[Version, Path(description="Id of the forecast.")], request: Request, runtime: RuntimeDep
+    number: Annotated[Version, Path(description="Id of the forecast.")],
+    request: Request,
+    runtime: RuntimeDep,
 ) -> HTMLResponse:
-    """A forecast's flux map and figures, with the form for the next one."""
+    """Flux map and metrics of a forecast, with the form for the next one."""
     with runtime.database.reading() as session:
         row = store.get_forecast(session, number)
         choices = _choices(session)
     size = (row.window_m or row.plane["width"], row.window_m or row.plane["height"])
     unit = "% per pixel" if row.normalised else "W/m²"
-    title = f"Flux of {row.heliostat.name} on {row.target_name or 'a plane'}, peak {row.peak_w_m2:.0f} W/m²"
+    title = (
+        f"Flux of {row.heliostat.name} on {row.target_name or 'a plane'}, peak {row.peak_w_m2:.0f}"
+        " W/m²"
+    )
     filled = _filled(
         heliostat=row.heliostat.name,
         target=row.target_name,
         sun_by="position" if row.sun_at is None else "time",
-        azimuth_deg=round(row.sun_azimuth_deg, 3),
+        azimuth_deg=round(row.sun_azimuth_deg, 3) % 360,
         elevation_deg=round(row.sun_elevation_deg, 3),
         moment=row.sun_at,
         surface="ideal" if row.surface is None else "current",

@@ -1,4 +1,4 @@
-"""A heliostat: its surface as a map and in space, how it changed, what it forecasts, and its photographs."""
+"""Page of a heliostat: surface map, 3D view, history, forecast comparisons and photographs."""
 
 import itertools
 import json
@@ -21,42 +21,53 @@ from service.base.fields import Version
 from service.drawing import charts
 from service.drawing.charts import HeatMap, History, Scale
 from service.drawing.pictures import comparison_picture, mirror_heights
-from service.store import decisions, mounts
-from service.store.shots import PhotographVerdict, Shot, Wanted, list_shots
+from service.store.photographs.groups import (
+    PhotographFilter,
+    PhotographGroup,
+    PhotographVerdict,
+    list_groups,
+)
+from service.store.pointing import mounts
+from service.store.surfaces import decisions
 from service.store.tables import DecisionRow, HeliostatRow, MountRow, SurfaceRow
-from service.twin.accuracy import Compared, Comparison, ComparisonBook, rank_of
-from service.twin.field import Figures, Line, figures_of, read_lines
-from service.twin.pointing import Slot, best_slot
-from service.web.answers.pages import render
-from service.web.door.dependencies import READ, FieldBookDep, NamePath, RuntimeDep, Turn
+from service.twin.alerts.field_overview import (
+    FieldTotals,
+    HeliostatSummary,
+    field_totals,
+    read_summaries,
+)
+from service.twin.pointing.calibration import CalibrationSlot, best_slot
+from service.twin.surfaces.accuracy import Comparison, ComparisonCache, ComparisonResult, rank_of
+from service.web.auth.dependencies import READ, FieldCacheDep, NamePath, RenderSlotDep, RuntimeDep
+from service.web.responses.pages import render
 
 router = APIRouter(include_in_schema=False, dependencies=[READ])
 
 # Newest surfaces and photographs that the page lists.
-_MOST_SURFACES = 40
-MOST_PHOTOGRAPHS = 60
-"""Those beyond are on the page of all photographs."""
-# Last decisions on which surface is today's that the page tells.
-_MOST_DECISIONS = 5
-# Points along each side of a facet in the view in space.
+_MAX_SURFACES = 40
+MAX_PHOTOGRAPHS = 60
+"""Older photographs are on the page of all photographs."""
+# Newest decisions on the active surface that the page lists.
+_MAX_DECISIONS = 5
+# Points along each side of a facet in the 3D view.
 _SPACE_SAMPLES = 14
 _OF_PEAK = "of the measured peak"
-# Side of the window of measured fluxes [m].
+# Size of the window of measured fluxes [m].
 _WINDOW = (4.0, 4.0)
 
 
 @dataclass(frozen=True)
 class Revision:
-    """A line of the history."""
+    """A line of the surface history."""
 
     row: SurfaceRow
-    figures: Figures
+    figures: FieldTotals
     change_mm: float | None
 
 
 @dataclass(frozen=True)
 class ComparisonFigure:
-    """A comparison and its three pictures."""
+    """A comparison and its three maps."""
 
     formats: ClassVar[tuple[str, ...]] = ("npz", "png")
 
@@ -67,24 +78,30 @@ class ComparisonFigure:
 
     @property
     def title(self) -> str:
-        """What it shows."""
+        """Title of the figure."""
         return f"Light and forecast of {self.comparison.measurement.identifier}"
 
     @property
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """The three, in shares of the measured peak."""
+        """The three maps, as shares of the measured peak."""
         return {name: getattr(self, name).values for name in ("measured", "forecast", "difference")}
 
     def drawn(self) -> bytes:
-        """The three side by side, as PNG."""
+        """The three maps side by side, as PNG."""
         title = f"{self.comparison.measurement.identifier}: accuracy {self.comparison.accuracy:.1%}"
         bounds = self.measured.scale.high, self.difference.scale.high
-        return comparison_picture(self.measured.values, self.forecast.values, self.measured.width, title, bounds)
+        return comparison_picture(
+            self.measured.values, self.forecast.values, self.measured.width, title, bounds
+        )
 
 
 def _newest_surfaces(session: Session, heliostat: HeliostatRow) -> list[SurfaceRow]:
-    query = select(SurfaceRow).where(SurfaceRow.heliostat_id == heliostat.id).options(undefer(SurfaceRow.arrays))
-    return list(session.scalars(query.order_by(SurfaceRow.version.desc()).limit(_MOST_SURFACES)))
+    query = (
+        select(SurfaceRow)
+        .where(SurfaceRow.heliostat_id == heliostat.id)
+        .options(undefer(SurfaceRow.arrays))
+    )
+    return list(session.scalars(query.order_by(SurfaceRow.version.desc()).limit(_MAX_SURFACES)))
 
 
 def _rms_mm(heights: NDArray[Any]) -> float:
@@ -92,33 +109,48 @@ def _rms_mm(heights: NDArray[Any]) -> float:
 
 
 def versions(rows: Sequence[SurfaceRow]) -> list[Revision]:
-    """Surfaces, newest first, each with its change from the one before it in the list [mm, root mean square]."""
+    """Surfaces, newest first, each with its change from the next older one [mm RMS]."""
     heights = [unpack(row.arrays)["z"] for row in rows]
     changes = [_rms_mm(new - old) for new, old in itertools.pairwise(heights)]
-    return [Revision(row, figures_of(row.arrays), change) for row, change in zip(rows, [*changes, None], strict=False)]
+    return [
+        Revision(row, field_totals(row.arrays), change)
+        for row, change in zip(rows, [*changes, None], strict=False)
+    ]
 
 
 def _histories(listed: Sequence[Revision]) -> list[History]:
     oldest_first = list(reversed(listed))
     deviation = [(f"version {v.row.version}", v.figures.deviation_mm) for v in oldest_first]
-    changes = [(f"version {v.row.version}", v.change_mm) for v in oldest_first if v.change_mm is not None]
+    changes = [
+        (f"version {v.row.version}", v.change_mm) for v in oldest_first if v.change_mm is not None
+    ]
     drawn = [charts.history("Deviation from ideal by version", "mm", deviation, 3)]
-    return [*drawn, charts.history("Change from the version before", "mm", changes, 3)] if changes else drawn
+    return (
+        [*drawn, charts.history("Change from the version before", "mm", changes, 3)]
+        if changes
+        else drawn
+    )
 
 
 def space_view(z: NDArray[Any], size: tuple[float, float], bound: float) -> str:
-    """What `surface3d.js` draws: heights [mm] of each facet on an even grid, the mirror's size [m], and colours.
+    """JSON for `surface3d.js`.
 
-    Those end at ``bound`` [mm], as on the map.
+    It holds the heights of each facet on a regular grid [mm], and the size of the mirror [m]. Its
+    colours end at ``bound`` [mm], as on the map.
     """
     heights = mirror_heights(z, _SPACE_SAMPLES)
     colours = Scale("RdBu_r", 0, 1, "").names(np.linspace(0, 1, 33).tolist())
-    return json.dumps({"size": size, "bound": bound, "facets": np.round(heights, 4).tolist(), "colours": colours})
+    return json.dumps(
+        {"size": size, "bound": bound, "facets": np.round(heights, 4).tolist(), "colours": colours}
+    )
 
 
 @dataclass(frozen=True)
 class ComparisonFigures:
-    """All comparisons, and the two scales that they share; ``beyond`` is the largest difference, where it lies so."""
+    """All comparisons and their two common scales.
+
+    ``beyond`` is the largest difference if it exceeds the scale, else None.
+    """
 
     figures: list[ComparisonFigure]
     flux: Scale
@@ -127,10 +159,15 @@ class ComparisonFigures:
 
 
 def comparison_figures(comparisons: Sequence[Comparison], bound: float) -> ComparisonFigures:
-    """Pictures in shares of each photograph's measured peak, as in a study's report; ``bound`` ends differences."""
+    """Maps in shares of each photograph's measured peak, as in study reports.
+
+    ``bound`` is the end of the scale of differences [1].
+    """
     pairs = [(c.measured / c.measured.max(), c.forecast / c.measured.max()) for c in comparisons]
     top = max((float(image.max()) for pair in pairs for image in pair), default=1.0)
-    largest = max((float(np.abs(forecast - measured).max()) for measured, forecast in pairs), default=0.0)
+    largest = max(
+        (float(np.abs(forecast - measured).max()) for measured, forecast in pairs), default=0.0
+    )
     flux, difference = charts.flux_scale(top, _OF_PEAK), charts.difference_scale(bound, _OF_PEAK)
     figures = []
     for comparison, (measured, forecast) in zip(comparisons, pairs, strict=True):
@@ -140,24 +177,31 @@ def comparison_figures(comparisons: Sequence[Comparison], bound: float) -> Compa
             ("forecast minus measured", forecast - measured, difference),
         )
         name = comparison.measurement.identifier
-        maps = [charts.heat_map(f"{what} flux of {name}", image, _WINDOW, scale) for what, image, scale in shown]
+        maps = [
+            charts.heat_map(f"{what} flux of {name}", image, _WINDOW, scale)
+            for what, image, scale in shown
+        ]
         figures.append(ComparisonFigure(comparison, *maps))
     return ComparisonFigures(figures, flux, difference, largest if largest > bound else None)
 
 
-async def _book(request: Request) -> ComparisonBook:
-    book: ComparisonBook = request.app.state.comparisons
-    return book
+async def _comparisons(request: Request) -> ComparisonCache:
+    cache: ComparisonCache = request.app.state.comparisons
+    return cache
 
 
-ComparisonBookDep = Annotated[ComparisonBook, Depends(_book)]
+ComparisonCacheDep = Annotated[ComparisonCache, Depends(_comparisons)]
 
-_UNDER_WAY = Compared(trouble="The forecasts of its photographs are being worked out; look again in a moment.")
+_UNDER_WAY = ComparisonResult(
+    trouble="The forecasts of its photographs are being computed; reload the page in a moment."
+)
 
 
-def _surface_context(surface: SurfaceRow, size: tuple[float, float], ends: Mapping[str, float]) -> dict[str, Any]:
+def _surface_context(
+    surface: SurfaceRow, size: tuple[float, float], ends: Mapping[str, float]
+) -> dict[str, Any]:
     arrays = unpack(surface.arrays)
-    shown = figures_of(surface.arrays)
+    shown = field_totals(surface.arrays)
     title = f"Surface {surface.version}: deviation from the ideal mirror, seen from the front"
     deviation = charts.surface_map(title, arrays["z"], size, ends["heights"])
     std = "Standard deviation of the surface"
@@ -171,15 +215,21 @@ def _surface_context(surface: SurfaceRow, size: tuple[float, float], ends: Mappi
 
 
 def _mount_context(mount: MountRow) -> dict[str, Any]:
-    """What the page says of a mount: what its drives did, and what contradicts it."""
+    """What the page shows of a mount: changes of its drives, and contradicting measurements."""
     return {
         "steps": [
             {"detail": ""}
             | step
-            | {"from": datetime.fromisoformat(step["from"]), "to": datetime.fromisoformat(step["to"])}
+            | {
+                "from": datetime.fromisoformat(step["from"]),
+                "to": datetime.fromisoformat(step["to"]),
+            }
             for step in reversed(mount.document["steps"])
         ],
-        **{name: mount.document[name] for name in ("drift", "outliers", "measurements", "residual_mrad")},
+        **{
+            name: mount.document[name]
+            for name in ("drift", "outliers", "measurements", "residual_mrad")
+        },
     }
 
 
@@ -189,7 +239,7 @@ def _size(row: HeliostatRow) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class _Read:
-    """What the page shows, before it is drawn."""
+    """Data of the page, read before the slot for drawing is taken."""
 
     row: HeliostatRow
     today: SurfaceRow | None
@@ -197,45 +247,69 @@ class _Read:
     surfaces: list[SurfaceRow]
     decided: Sequence[DecisionRow]
     undoable: DecisionRow | None
-    shots: list[Shot]
+    groups: list[PhotographGroup]
     verdict: PhotographVerdict | None
     mount: MountRow | None
-    line: Line
-    best: Slot | None
-    compared: Compared
+    line: HeliostatSummary
+    best: CalibrationSlot | None
+    compared: ComparisonResult
 
 
 def _read(
     name: NamePath,
     runtime: RuntimeDep,
-    book: ComparisonBookDep,
-    field: FieldBookDep,
+    cache: ComparisonCacheDep,
+    field: FieldCacheDep,
     version: Annotated[Version | None, Query()] = None,
     photographs: Annotated[PhotographVerdict | None, Query()] = None,
 ) -> _Read:
-    """A heliostat with its current surface, or an earlier ``version``; waits for what is compared elsewhere."""
+    """Read a heliostat with its active surface, or an earlier ``version``.
+
+    It waits for comparisons that are computed in the background.
+    """
     with runtime.database.reading() as session:
         row = store.get_heliostat(session, name)
         today = store.find_surface_at(session, row)
         surface = today if version is None else store.get_surface(session, row, version)
         surfaces = _newest_surfaces(session, row)
-        decided = decisions.list_decisions(session, row, _MOST_DECISIONS)
+        decided = decisions.list_decisions(session, row, _MAX_DECISIONS)
         undoable = decisions.find_undoable(session, row)
-        shots = list_shots(session, Wanted(row, verdict=photographs), MOST_PHOTOGRAPHS + 1)
+        groups = list_groups(
+            session, PhotographFilter(row, verdict=photographs), MAX_PHOTOGRAPHS + 1
+        )
         mount = mounts.find_mount_at(session, row)
-        shown, (line,) = book.read(session, row, surface), read_lines(session, row.id)
-    # The rest of the page does not depend on them.
-    compared = Compared() if shown is None else book.wait_for(shown) or _UNDER_WAY
+        shown, (line,) = cache.read(session, row, surface), read_summaries(session, row.id)
+    # The rest of the page does not depend on the comparisons.
+    compared = ComparisonResult() if shown is None else cache.wait_for(shown) or _UNDER_WAY
     line = field.with_pointing(line)
     best = None if line.pointing is None else best_slot(runtime, name)
-    return _Read(row, today, surface, surfaces, decided, undoable, shots, photographs, mount, line, best, compared)
+    return _Read(
+        row,
+        today,
+        surface,
+        surfaces,
+        decided,
+        undoable,
+        groups,
+        photographs,
+        mount,
+        line,
+        best,
+        compared,
+    )
 
 
 @router.get("/heliostats/{name}")
 def get_heliostat_page(
-    request: Request, runtime: RuntimeDep, read: Annotated[_Read, Depends(_read)], _turn: Turn
+    request: Request,
+    runtime: RuntimeDep,
+    read: Annotated[_Read, Depends(_read)],
+    _slot: RenderSlotDep,
 ) -> HTMLResponse:
-    """A heliostat with its current surface, or an earlier ``version``; nobody waits in his turn for comparisons."""
+    """A heliostat with its active surface, or an earlier ``version``.
+
+    The slot for drawing is not held while the comparisons are computed.
+    """
     ends = runtime.settings.figure_scales
     listed, comparisons = versions(read.surfaces), read.compared.comparisons
     return render(
@@ -251,14 +325,20 @@ def get_heliostat_page(
         histories=_histories(listed) if listed else [],
         comparisons=comparison_figures(comparisons, ends["flux_difference"]),
         trouble=read.compared.trouble,
-        shots=read.shots[:MOST_PHOTOGRAPHS],
+        groups=read.groups[:MAX_PHOTOGRAPHS],
         verdict=read.verdict,
-        older=read.shots[MOST_PHOTOGRAPHS - 1].mark if len(read.shots) > MOST_PHOTOGRAPHS else None,
+        older=read.groups[MAX_PHOTOGRAPHS - 1].mark if len(read.groups) > MAX_PHOTOGRAPHS else None,
         rank=rank_of(comparisons),
-        accuracy_seen=fmean(seen) if (seen := [c.accuracy for c in comparisons if c.was_used]) else None,
+        accuracy_seen=fmean(seen)
+        if (seen := [c.accuracy for c in comparisons if c.was_used])
+        else None,
         mount=read.mount,
         line=read.line,
         best=read.best,
         pointing=None if read.mount is None else _mount_context(read.mount),
-        **(_surface_context(read.surface, _size(read.row), ends) if read.surface is not None else {}),
+        **(
+            _surface_context(read.surface, _size(read.row), ends)
+            if read.surface is not None
+            else {}
+        ),
     )

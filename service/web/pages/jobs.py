@@ -1,5 +1,6 @@
-"""Jobs: what is under way, what became of the rest, and the buttons that start and stop them."""
+"""Pages of jobs: what runs, what has ended, and buttons that start and cancel jobs."""
 
+from collections.abc import Mapping
 from datetime import datetime
 from typing import Annotated, Any
 
@@ -11,14 +12,22 @@ from service.base.fields import Method, Model, Name, Version
 from service.drawing import charts
 from service.drawing.charts import HeatMap
 from service.drawing.templates import in_words
-from service.jobs.asking import ask_for, cancel_for
+from service.jobs.enqueuing import cancel_for, enqueue
 from service.jobs.kind import result_of
+from service.jobs.kinds import predictions
 from service.jobs.kinds.predictions import PredictionsIn
-from service.store import queue
 from service.store.job_tables import JobRow
+from service.store.jobs import queue
 from service.store.sizes import sizes
-from service.web.answers.pages import go_to, render
-from service.web.door.dependencies import DRAWS, OPERATE, READ, IdentityDep, KindsDep, RuntimeDep
+from service.web.auth.dependencies import (
+    OPERATE,
+    READ,
+    RENDER_SLOT,
+    IdentityDep,
+    KindsDep,
+    RuntimeDep,
+)
+from service.web.responses.pages import go_to, render
 
 router = APIRouter(include_in_schema=False)
 
@@ -26,12 +35,12 @@ Number = Annotated[Version, Path(description="Id of the job.")]
 
 _PAGE = 50
 
-# Most names that a job's page shows of a list: heliostats that were asked for, or that it was done for.
+# Most names of a list that the page of a job shows, such as its heliostats.
 _SHOWN = 100
 
 
 class PredictionForm(Model):
-    """The form that asks for surfaces; without a heliostat of all of them."""
+    """The form that requests surfaces, of one heliostat or of all."""
 
     heliostat: Name | None = None
     method: Method = "refined"
@@ -66,7 +75,7 @@ def get_jobs_page(
 
 
 def _flux(row: JobRow) -> HeatMap | None:
-    """The map of a job that gave one."""
+    """The flux map of a job, if it has one."""
     if row.arrays is None or row.result is None or "plane" not in row.result:
         return None
     plane = row.result["plane"]
@@ -79,21 +88,21 @@ def _plain(value: Any) -> bool:
     return isinstance(value, str | int | float | bool)
 
 
-# What fields are called whose names do not say it, and the units that names end in.
+# Labels of fields whose names are not clear, and units by the endings of names.
 _LABELS = {
     "dni_w_m2": "direct normal irradiance",
     "neighbours": "mirrors shade and block each other",
     "model_version": "version of the model",
-    "aim_point": "aim point, east, north, up [m]",
-    "aim_points": "aim points, east, north, up [m]",
-    "aim_offsets": "aims, right and up of the middle [m]",
+    "aim_point_m": "aim point, east, north, up [m]",
+    "aim_points_m": "aim points, east, north, up [m]",
+    "aim_offsets_m": "aims, right and up of the middle [m]",
     "images": "photographs of each heliostat",
 }
 _UNITS = {"_w_m2": "\N{NO-BREAK SPACE}W/m²", "_deg": "°", "_minutes": "\N{NO-BREAK SPACE}min"}
 
 
 def _told(name: str, value: Any) -> tuple[str, str]:
-    """A field of what was asked as a person says it: what it is, and its value with its unit."""
+    """Label and formatted value of a payload field."""
     ending = next((ending for ending in _UNITS if name.endswith(ending)), "")
     label = _LABELS.get(name, name.removesuffix(ending).replace("_", " "))
     if isinstance(value, list | dict) and len(value) > _SHOWN:
@@ -104,30 +113,39 @@ def _told(name: str, value: Any) -> tuple[str, str]:
         return label, ", ".join(" ".join(_told(inner, of)) for inner, of in value.items())
     if isinstance(value, list):
         return label, ", ".join(_told("", one)[1] for one in value)
-    if name in ("at", "begin", "end"):
+    if name in ("at", "first_at", "last_at"):
         return label, f"{datetime.fromisoformat(value):%Y-%m-%d %H:%M UTC}"
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     return label, f"{value:.10g}{_UNITS.get(ending, '')}" if is_number else in_words(value)
 
 
 def _asked(payload: dict[str, Any]) -> dict[str, str]:
-    """What was asked, in words and with units, long lists by their length."""
-    return dict(_told(name, value) for name, value in payload.items() if value not in (None, {}, []))
+    """Fields of a payload in words and with units. Long lists are reduced to their length."""
+    return dict(
+        _told(name, value) for name, value in payload.items() if value not in (None, {}, [])
+    )
 
 
-@router.get("/jobs/{number}", dependencies=[READ, DRAWS])
-def get_job_page(number: Number, request: Request, runtime: RuntimeDep, kinds: KindsDep) -> HTMLResponse:
-    """A job; the page follows it until it ends.
+@router.get("/jobs/{number}", dependencies=[READ, RENDER_SLOT])
+def get_job_page(
+    number: Number, request: Request, runtime: RuntimeDep, kinds: KindsDep
+) -> HTMLResponse:
+    """A job, which the page follows until it ends.
 
-    While it does, each change asks for what changes only: neither what was asked nor a result is read for that.
+    While it runs, each update reads only what changes, but neither the payload nor the result.
     """
     with runtime.database.reading() as session:
         row = queue.get_summary(session, number)
-        is_live, asked, result, flux = row.state not in queue.ENDED, None, {}, None
+        is_live, asked, flux = row.state not in queue.ENDED, None, None
+        result: Mapping[str, Any] = {}
         if not is_live or "hx-request" not in request.headers:
             session.expunge(row)
             row = queue.get_job(session, number, arrays=True)
-            asked, result, flux = _asked(row.payload), result_of(kinds, session, row) or {}, _flux(row)
+            asked, result, flux = (
+                _asked(row.payload),
+                result_of(kinds, session, row) or {},
+                _flux(row),
+            )
     return render(
         request,
         "job.html",
@@ -144,6 +162,7 @@ def get_job_page(number: Number, request: Request, runtime: RuntimeDep, kinds: K
         unchanged=result.get("unchanged", {}),
         judged=result.get("judged", {}),
         skipped=result.get("skipped", {}),
+        warnings=result.get("warnings", []),
         shown=_SHOWN,
     )
 
@@ -152,10 +171,10 @@ def get_job_page(number: Number, request: Request, runtime: RuntimeDep, kinds: K
 def post_predictions_form(
     form: Annotated[PredictionForm, Form()], runtime: RuntimeDep, identity: IdentityDep
 ) -> Response:
-    """Ask for surfaces, and go to the job's page."""
+    """Enqueue predictions, and go to the page of the job."""
     heliostats = None if form.heliostat is None else [form.heliostat]
-    payload = PredictionsIn(heliostats=heliostats, method=form.method).model_dump(mode="json")
-    return go_to(f"/jobs/{ask_for(runtime, 'predictions', payload, identity.name).id}")
+    payload = PredictionsIn(heliostats=heliostats, method=form.method)
+    return go_to(f"/jobs/{enqueue(runtime, predictions.KIND, payload, identity.name).id}")
 
 
 @router.post("/jobs/{number}/cancel", dependencies=[OPERATE])

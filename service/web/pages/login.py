@@ -1,4 +1,4 @@
-"""The door's own page, and what it is made of; nothing here needs a key, and nothing shows the plant."""
+"""The login page. It needs no key and shows nothing of the plant."""
 
 import re
 from http import HTTPStatus
@@ -7,23 +7,28 @@ from typing import Annotated
 from fastapi import APIRouter, Form, Query, Request, Response
 from fastapi.responses import HTMLResponse
 
-from service.web.answers.pages import go_to, render
-from service.web.door.dependencies import PresentedDep, RuntimeDep
-from service.web.root.session import forget_key, is_valid, keep_key
+from service.base.fields import Text
+from service.web.auth import security
+from service.web.auth.dependencies import PresentedDep, RuntimeDep
+from service.web.responses.pages import go_to, render
+from service.web.root.session import begin_session, end_session, keep_session
 
 router = APIRouter(include_in_schema=False)
 
-# A path of this service and nothing that a browser could take for another host.
+# A path of this service, and nothing that a browser could read as another host.
 _OWN_PATH = re.compile(r"/(?:[A-Za-z0-9_-][A-Za-z0-9_/-]*)?(?:\?[A-Za-z0-9_=&.%-]*)?")
 
 
 def own_path(wanted: str) -> str:
-    """The path to go on to, or the field where somebody wrote another into the link."""
+    """The path to continue to, or the field page if the link holds anything else."""
     return wanted if _OWN_PATH.fullmatch(wanted) else "/"
 
 
 _WRONG = "This key is not valid: it may be mistyped or withdrawn. Try again, or ask for another."
-_ENDED = "The key of this browser is not valid any more: it was withdrawn. Log in with another."
+_ENDED = (
+    "The session of this browser has ended: its time is over, or its key was withdrawn. Log in"
+    " again."
+)
 
 
 def _form(request: Request, next_: str, trouble: str = "") -> HTMLResponse:
@@ -36,31 +41,35 @@ def get_login(
     request: Request,
     runtime: RuntimeDep,
     presented: PresentedDep,
-    next_: Annotated[str, Query(alias="next", max_length=500)] = "/",
+    next_: Annotated[Text, Query(alias="next")] = "/",
 ) -> HTMLResponse:
-    """The form for a key; it says so where the one that the browser keeps opens nothing any more."""
-    has_ended = presented is not None and not is_valid(runtime, presented)
+    """The login form. It says so if the session of the browser is no longer valid."""
+    has_ended = (
+        presented is not None
+        and security.identify(runtime.database, runtime.settings, presented) is None
+    )
     return _form(request, next_, _ENDED if has_ended else "")
 
 
 @router.post("/login")
 def post_login(
-    key: Annotated[str, Form(max_length=200)],
+    key: Annotated[Text, Form(max_length=200)],
     request: Request,
     runtime: RuntimeDep,
-    next_: Annotated[str, Form(alias="next", max_length=500)] = "/",
+    next_: Annotated[Text, Form(alias="next")] = "/",
 ) -> Response:
-    """Keep a valid key in a cookie, and go on; the form again for any other."""
-    if not is_valid(runtime, key.strip()):
+    """Begin a session with a valid key and continue; otherwise show the form again."""
+    token = begin_session(runtime, key.strip())
+    if token is None:
         return _form(request, next_, _WRONG)
     answer = go_to(own_path(next_))
-    keep_key(answer, request, key.strip())
+    keep_session(answer, request, token)
     return answer
 
 
 @router.post("/logout")
-def post_logout() -> Response:
-    """Forget the key."""
+def post_logout(request: Request, runtime: RuntimeDep) -> Response:
+    """End the session."""
     answer = go_to("/login")
-    forget_key(answer)
+    end_session(runtime, request, answer)
     return answer

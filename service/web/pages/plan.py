@@ -1,4 +1,7 @@
-"""Plans: a day of the field's light on a receiver, by the twin and by ideal mirrors, against what it stands."""
+"""Pages of plans: flux of the field on a receiver over a day.
+
+A plan compares the twin with ideal mirrors, and with the flux that the receiver allows.
+"""
 
 from dataclasses import dataclass
 from datetime import datetime, timedelta
@@ -14,18 +17,19 @@ from sqlalchemy.orm import Session
 from model.errors import InvalidInputError
 from service import store
 from service.base.arrays import unpack
-from service.base.faults import NotFoundError
-from service.base.fields import FormMoment, Model, Name, Version
+from service.base.errors import NotFoundError
+from service.base.fields import FormMoment, Lines, Model, Name, Version
 from service.drawing import charts
 from service.drawing.charts import HeatMap, Timeline, Value
 from service.drawing.templates import in_zone
-from service.jobs.asking import ask_for, forget_for
-from service.jobs.kinds.plans import PlanIn
-from service.store import queue
+from service.jobs.enqueuing import delete_plan_for, enqueue
+from service.jobs.kinds import plans
+from service.jobs.kinds.plans import PlanIn, PlanName, map_name
 from service.store.columns import now
 from service.store.job_tables import JobRow
-from service.web.answers.pages import go_to, leave_for, render
-from service.web.door.dependencies import DRAWS, OPERATE, READ, IdentityDep, RuntimeDep
+from service.store.jobs import queue
+from service.web.auth.dependencies import OPERATE, READ, RENDER_SLOT, IdentityDep, RuntimeDep
+from service.web.responses.pages import go_to, leave_for, render
 
 router = APIRouter(include_in_schema=False)
 
@@ -34,43 +38,55 @@ LISTED = 20
 
 
 class PlanForm(Model):
-    """The form; ``heliostats`` are names, one a line, each with or without an aim: right and up of the middle [m]."""
+    """The form. ``heliostats`` has one name a line.
 
-    name: str = Field(min_length=1, max_length=80)
+    An optional aim follows the name: right and up of the middle [m].
+    """
+
+    name: PlanName
     target: Name
-    begin: FormMoment
-    end: FormMoment
+    first_at: FormMoment
+    last_at: FormMoment
     step_minutes: float = Field(default=60.0, ge=1, le=1440)
-    heliostats: str = Field(default="", max_length=800_000)
+    heliostats: Lines = ""
     allowed_kw_m2: float | None = Field(default=None, gt=0, le=1e5)
     dni_w_m2: float = Field(default=1000.0, gt=0, le=2000)
 
     def chosen(self) -> dict[str, tuple[float, float] | None]:
-        """Heliostats with their aims; InvalidInputError names the line that says neither."""
+        """Heliostats with their aims, or None without an aim.
+
+        Raises
+        ------
+        InvalidInputError
+            If a line has neither a name nor a name with two numbers.
+        """
         lines = [line.replace(",", " ").split() for line in self.heliostats.splitlines()]
         chosen: dict[str, tuple[float, float] | None] = {}
-        for number, (name, *aim) in ((number, words) for number, words in enumerate(lines, 1) if words):
+        for number, (name, *aim) in (
+            (number, words) for number, words in enumerate(lines, 1) if words
+        ):
             try:
                 right, up = map(float, aim or ("nan", "nan"))
             except ValueError as error:
                 raise InvalidInputError(
-                    f"heliostats: line {number}: give a name, or a name and two numbers, metres right and up"
+                    f"heliostats: line {number}: give a name, or a name and two numbers, metres"
+                    " right and up"
                 ) from error
             chosen[name] = (right, up) if aim else None
         return chosen
 
     def payload(self) -> PlanIn:
-        """What the job takes."""
+        """The payload of the job."""
         chosen = self.chosen()
         try:
             return PlanIn(
                 name=self.name,
                 target=self.target,
-                begin=self.begin,
-                end=self.end,
+                first_at=self.first_at,
+                last_at=self.last_at,
                 step_minutes=self.step_minutes,
                 heliostats=list(chosen) or None,
-                aim_offsets={name: aim for name, aim in chosen.items() if aim is not None},
+                aim_offsets_m={name: aim for name, aim in chosen.items() if aim is not None},
                 allowed_w_m2=None if self.allowed_kw_m2 is None else 1e3 * self.allowed_kw_m2,
                 dni_w_m2=self.dni_w_m2,
             )
@@ -79,13 +95,13 @@ class PlanForm(Model):
 
 
 def _likely(targets: list[str]) -> dict[str, Any]:
-    """What stands in the form at first: a day from morning to evening."""
+    """Defaults of the form: a day from morning to evening."""
     morning = now().replace(hour=6, minute=0, second=0, microsecond=0)
     return {
         "name": "",
         "target": targets[0] if targets else None,
-        "begin": morning,
-        "end": morning + timedelta(hours=12),
+        "first_at": morning,
+        "last_at": morning + timedelta(hours=12),
         "step_minutes": 60.0,
         "heliostats": "",
         "allowed_kw_m2": None,
@@ -94,20 +110,24 @@ def _likely(targets: list[str]) -> dict[str, Any]:
 
 
 def _filled(asked: PlanIn) -> dict[str, Any]:
-    """What the form held."""
-    aims = {name: f"{name} {right:g} {up:g}" for name, (right, up) in asked.aim_offsets.items()}
+    """Values of the form from which a plan was requested."""
+    aims = {name: f"{name} {right:g} {up:g}" for name, (right, up) in asked.aim_offsets_m.items()}
     lines = [aims.get(name, name) for name in asked.heliostats or ()]
-    given = {name: getattr(asked, name) for name in ("name", "target", "begin", "end", "step_minutes", "dni_w_m2")}
+    given = {
+        name: getattr(asked, name)
+        for name in ("name", "target", "first_at", "last_at", "step_minutes", "dni_w_m2")
+    }
     allowed = None if asked.allowed_w_m2 is None else asked.allowed_w_m2 / 1e3
     return {**given, "heliostats": "\n".join(lines), "allowed_kw_m2": allowed}
 
 
-# --- what came of it --------------------------------------------------------------------------------------------------
+# --- results
+# --------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Step:
-    """A time of a plan: the sun, and what the light does to the receiver, by the twin and by ideal mirrors."""
+    """A time of a plan: the sun, and the load on the receiver by the twin and by ideal mirrors."""
 
     at: datetime
     sun: dict[str, float]
@@ -117,7 +137,11 @@ class Step:
 
 @dataclass(frozen=True)
 class Day:
-    """A plan that is done; energies [Wh] are None of a single time, ``exceeded`` is how many times too much came."""
+    """Results of a finished plan.
+
+    ``energy_wh`` [Wh] is None if the plan has a single time. ``exceeded`` is the number of times at
+    which the flux exceeds the limit.
+    """
 
     steps: list[Step]
     chosen: int
@@ -129,33 +153,68 @@ class Day:
 
 def _series(steps: list[Step], figure: str, scale: float) -> dict[str, list[Value]]:
     return {
-        name: [Value(step.at, scale * of[figure]) for step in steps if (of := getattr(step, kind))[figure] is not None]
+        name: [
+            Value(step.at, scale * of[figure])
+            for step in steps
+            if (of := getattr(step, kind))[figure] is not None
+        ]
         for name, kind in (("twin", "twin"), ("ideal mirrors", "ideal"))
     }
 
 
 def _energy(steps: list[Step], kind: str) -> float | None:
-    """By straight lines from time to time [Wh]."""
+    """Energy by the trapezoidal rule [Wh], None for a single time."""
     hours = [(step.at - steps[0].at).total_seconds() / 3600 for step in steps]
-    return float(np.trapezoid([getattr(step, kind)["power_w"] for step in steps], hours)) if len(steps) > 1 else None
+    return (
+        float(np.trapezoid([getattr(step, kind)["power_w"] for step in steps], hours))
+        if len(steps) > 1
+        else None
+    )
 
 
-def _maps(row: JobRow, asked: PlanIn, chosen: int) -> dict[str, HeatMap]:
-    """Twin and ideal mirrors on one scale, with what is exceeded outlined, and the most that comes all day."""
+def _stored_request(row: JobRow) -> PlanIn | None:
+    """The request of a plan, or None if it is no longer valid.
+
+    An older version may have accepted what this one refuses, such as more pixels in total.
+    """
+    try:
+        return PlanIn.model_validate(row.payload)
+    except ValidationError:
+        return None
+
+
+def _allowed_w_m2(row: JobRow) -> float | None:
+    allowed: float | None = row.payload.get("allowed_w_m2")
+    return allowed
+
+
+def _maps(row: JobRow, of_time: bytes) -> dict[str, HeatMap]:
+    """Flux maps of the twin, of ideal mirrors, and of the maximum over all times.
+
+    They share one scale, and areas above the limit are outlined. ``of_time`` holds the packed maps
+    of the chosen time.
+    """
     assert row.result is not None
     assert row.arrays is not None
-    plane, arrays = row.result["plane"], unpack(row.arrays)
+    plane, arrays = row.result["plane"], unpack(of_time)
     size = plane["width"], plane["height"]
-    twin, ideal, most = arrays["twin"][chosen], arrays["ideal"][chosen], arrays["flux"]
-    top, allowed = float(max(twin.max(), ideal.max(), most.max())), asked.allowed_w_m2 or np.inf
-    titles = {"by the twin": twin, "by ideal mirrors": ideal, "the most of all times, by the twin": most}
+    twin, ideal, most = arrays["twin"], arrays["ideal"], unpack(row.arrays)["flux"]
+    top, allowed = float(max(twin.max(), ideal.max(), most.max())), _allowed_w_m2(row) or np.inf
+    titles = {
+        "by the twin": twin,
+        "by ideal mirrors": ideal,
+        "the most of all times, by the twin": most,
+    }
     return {
-        title: charts.outlined(charts.flux_map(f"Flux {title}", flux, size, "W/m²", top), flux > allowed)
+        title: charts.outlined(
+            charts.flux_map(f"Flux {title}", flux, size, "W/m²", top), flux > allowed
+        )
         for title, flux in titles.items()
     }
 
 
-def _day(row: JobRow, asked: PlanIn, at: int | None) -> Day:
+def _day(session: Session, row: JobRow, at: int | None) -> Day:
+    """A finished plan with the maps of one time. Other maps are not loaded."""
     assert row.result is not None
     steps = [
         Step(datetime.fromisoformat(step["at"]), step["sun"], step["twin"], step["ideal"])
@@ -163,27 +222,34 @@ def _day(row: JobRow, asked: PlanIn, at: int | None) -> Day:
     ]
     hottest = max(range(len(steps)), key=lambda index: steps[index].twin["peak_w_m2"])
     chosen = hottest if at is None else min(at, len(steps) - 1)
-    limit = None if asked.allowed_w_m2 is None else asked.allowed_w_m2 / 1e3
+    of_time = queue.checkpoint_arrays(session, row.id, map_name(chosen))
+    assert of_time is not None
+    allowed = _allowed_w_m2(row)
+    limit = None if allowed is None else allowed / 1e3
     drawn = (
         charts.timeline("Power on the receiver", "kW", _series(steps, "power_w", 1e-3), 1),
         charts.timeline("Largest flux", "kW/m²", _series(steps, "peak_w_m2", 1e-3), 1, limit=limit),
-        charts.timeline("Intercept factor", "%", _series(steps, "intercept", 100.0), 1, from_zero=False),
+        charts.timeline("Intercept factor", "%", _series(steps, "intercept", 100.0), 1),
     )
     return Day(
         steps,
         chosen,
         [chart for chart in drawn if chart is not None],
-        _maps(row, asked, chosen),
+        _maps(row, of_time),
         {kind: _energy(steps, kind) for kind in ("twin", "ideal")},
         sum(bool(step.twin["exceeded_m2"]) for step in steps),
     )
 
 
-# --- pages ------------------------------------------------------------------------------------------------------------
+# --- pages
+# --------------------------------------------------------------------------------------------------
 
 
 def _choices(session: Session, after: int | None) -> dict[str, Any]:
-    receivers, plans = [row.name for row in store.list_receivers(session)], store.list_plans(session, LISTED + 1, after)
+    receivers, plans = (
+        [row.name for row in store.list_receivers(session)],
+        store.list_plans(session, LISTED + 1, after),
+    )
     return {
         "targets": [*receivers, *(row.name for row in store.list_targets(session))],
         "plans": plans[:LISTED],
@@ -198,14 +264,24 @@ Number = Annotated[Version, Path(description="Id of the plan's job.")]
 
 @router.get("/plans", dependencies=[READ])
 def get_plans_page(request: Request, runtime: RuntimeDep, after: After = None) -> HTMLResponse:
-    """The form, and the plans that were made."""
+    """The form, and the list of plans."""
     with runtime.database.reading() as session:
         choices = _choices(session, after)
     zone = in_zone(runtime.settings.time_zone)
-    return render(request, "plan.html", **choices, filled=_likely(choices["targets"]), job=None, day=None, in_zone=zone)
+    filled, plan_days = _likely(choices["targets"]), runtime.settings.plan_retention_days
+    return render(
+        request,
+        "plan.html",
+        **choices,
+        filled=filled,
+        job=None,
+        day=None,
+        in_zone=zone,
+        plan_days=plan_days,
+    )
 
 
-@router.get("/plans/{number}", dependencies=[READ, DRAWS])
+@router.get("/plans/{number}", dependencies=[READ, RENDER_SLOT])
 def get_plan_page(
     number: Number,
     request: Request,
@@ -213,29 +289,34 @@ def get_plan_page(
     after: After = None,
     at: Annotated[int | None, Query(ge=0, le=1000, description="Which time's maps.")] = None,
 ) -> HTMLResponse:
-    """A plan, followed until it is done, with the form as it was asked for."""
+    """A plan, followed until it is done, with its request in the form."""
     with runtime.database.reading() as session:
         row, choices = queue.get_job(session, number, arrays=True), _choices(session, after)
-    if row.kind != "plans":
-        raise NotFoundError(f"job {number} is no plan")
-    asked = PlanIn.model_validate(row.payload)
+        if row.kind != "plans":
+            raise NotFoundError(f"job {number} is no plan")
+        day = None if row.result is None else _day(session, row, at)
+    asked = _stored_request(row)
     return render(
         request,
         "plan.html",
         **choices,
-        filled=_filled(asked),
+        filled=(
+            _likely(choices["targets"]) | {"name": row.payload["name"]}
+            if asked is None
+            else _filled(asked)
+        ),
         job=row,
         is_live=row.state not in queue.ENDED,
-        asked=asked,
-        day=None if row.result is None else _day(row, asked, at),
+        day=day,
+        plan_days=runtime.settings.plan_retention_days,
         in_zone=in_zone(runtime.settings.time_zone),
     )
 
 
 @router.post("/plans/{number}/delete", dependencies=[OPERATE])
 def post_deletion_form(number: Number, runtime: RuntimeDep, identity: IdentityDep) -> Response:
-    """Delete a plan, and go back to the others."""
-    forget_for(runtime, number, identity.name)
+    """Delete a plan, and return to the list."""
+    delete_plan_for(runtime, number, identity.name)
     return go_to("/plans")
 
 
@@ -243,12 +324,10 @@ def post_deletion_form(number: Number, runtime: RuntimeDep, identity: IdentityDe
 def post_plan_form(
     request: Request, form: Annotated[PlanForm, Form()], runtime: RuntimeDep, identity: IdentityDep
 ) -> Response:
-    """Ask for a plan, and go to its page; what is wrong is told beside the form, which keeps what was typed."""
+    """Enqueue a plan, and go to its page.
+
+    Errors are shown next to the form, which keeps its values.
+    """
     payload = form.payload()
-    with runtime.database.reading() as session:
-        chosen = payload.heliostats or []
-        known = store.get_heliostats(session, chosen)
-    if unknown := [name for name in chosen if name not in known]:
-        raise InvalidInputError(f"heliostats: there is no {unknown[0]} here; the field's page has the names")
-    row = ask_for(runtime, "plans", payload.model_dump(mode="json"), identity.name)
+    row = enqueue(runtime, plans.KIND, payload, identity.name)
     return leave_for(request, f"/plans/{row.id}")

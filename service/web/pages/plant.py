@@ -1,4 +1,4 @@
-"""The plant: its targets and receivers, and what its administrators look at: settings, keys, the audit trail."""
+"""Pages of the plant: targets, receivers and model, and settings, keys and audit trail."""
 
 from collections.abc import Sequence
 from typing import Annotated
@@ -10,11 +10,12 @@ from sqlalchemy.orm import Session
 
 from service import store
 from service.base.fields import Version
+from service.drawing.templates import figure
 from service.store import audit, keys
 from service.store.tables import MeasurementRow, PlantRow, TargetRow
-from service.twin import versions
-from service.web.answers.pages import render
-from service.web.door.dependencies import ADMIN, READ, RuntimeDep
+from service.twin.plant import model_versions
+from service.web.auth.dependencies import ADMIN, READ, RuntimeDep
+from service.web.responses.pages import render
 
 router = APIRouter(include_in_schema=False, prefix="/plant")
 
@@ -23,18 +24,28 @@ _PAGE = 100
 
 def _targets(session: Session) -> Sequence[tuple[TargetRow, int]]:
     """Target planes with the number of their photographs."""
-    counted = select(TargetRow, func.count(MeasurementRow.id)).outerjoin(MeasurementRow).group_by(TargetRow.id)
+    counted = (
+        select(TargetRow, func.count(MeasurementRow.id))
+        .outerjoin(MeasurementRow)
+        .group_by(TargetRow.id)
+    )
     return [(row, count) for row, count in session.execute(counted.order_by(TargetRow.name))]
+
+
+def _place(metres: Sequence[float]) -> list[str]:
+    """East, north and up as parts of a table's cell."""
+    east, north, up = (figure(value, 2) for value in metres)
+    return [east, ", ", north, ", ", up]
 
 
 @router.get("", dependencies=[READ])
 def get_plant_page(request: Request, runtime: RuntimeDep) -> HTMLResponse:
-    """What stands on the tower, and what is believed of the light."""
+    """Targets and receivers on the tower, and the optical model."""
     with runtime.database.reading() as session:
         plant = session.get(PlantRow, 1)
         targets, receivers = _targets(session), store.list_receivers(session)
-        model = versions.get_model(session)
-    shape = model.optics.sun_shape
+        model = None if plant is None else model_versions.get_model(session)
+    shape = None if model is None else model.optics.sun_shape
     return render(
         request,
         "plant.html",
@@ -42,7 +53,8 @@ def get_plant_page(request: Request, runtime: RuntimeDep) -> HTMLResponse:
         targets=targets,
         receivers=receivers,
         model=model,
-        sun_shape=(type(shape).__name__, vars(shape)),
+        place=_place,
+        sun_shape=None if shape is None else (type(shape).__name__, vars(shape)),
     )
 
 
@@ -54,7 +66,7 @@ def get_settings_page(request: Request, runtime: RuntimeDep) -> HTMLResponse:
 
 @router.get("/keys", dependencies=[ADMIN])
 def get_keys_page(request: Request, runtime: RuntimeDep) -> HTMLResponse:
-    """Who may come in; the keys themselves are not stored."""
+    """Who has a key. The keys themselves are not stored."""
     with runtime.database.reading() as session:
         rows = keys.list_keys(session)
     return render(request, "keys.html", keys=rows)

@@ -1,4 +1,4 @@
-"""The tables of the pages as CSV."""
+"""Tables of the pages as CSV."""
 
 from dataclasses import fields
 from typing import Annotated
@@ -7,38 +7,44 @@ from fastapi import APIRouter, Query, Response
 
 from service import store
 from service.store.tables import MeasurementRow
-from service.twin.accuracy import name_of
-from service.twin.attention import Item, needs_attention
-from service.twin.field import PATIENCE_S, figures_of
-from service.twin.finding import METRICS, Wanted, find
-from service.web.answers.sheets import sheet_answer
-from service.web.api.field import FieldLine, field_line
-from service.web.door.dependencies import DRAWS, READ, FieldBookDep, NamePath, RuntimeDep
+from service.twin.alerts.alerts import Alert, list_alerts
+from service.twin.alerts.field_filter import HeliostatFilter, filter_heliostats
+from service.twin.alerts.field_overview import PATIENCE_S, field_totals
+from service.twin.surfaces.accuracy import photograph_name
+from service.web.api.field_overview import FieldLine, field_line
+from service.web.auth.dependencies import READ, RENDER_SLOT, FieldCacheDep, NamePath, RuntimeDep
+from service.web.responses.csv_tables import sheet_answer
 
-router = APIRouter(include_in_schema=False, dependencies=[READ, DRAWS])
+router = APIRouter(include_in_schema=False, dependencies=[READ, RENDER_SLOT])
 
-_FIELD = [name for name in FieldLine.model_fields if name not in ("position_m", "doubts")]
-_UNITS = {name: f"{name} [{metric.unit}]" for name, metric in METRICS.items()}
+_FIELD = [name for name in FieldLine.model_fields if name not in ("position_m", "warnings")]
 
 
 @router.get("/field.csv")
-def get_field_table(wanted: Annotated[Wanted, Query()], runtime: RuntimeDep, book: FieldBookDep) -> Response:
-    """All heliostats that are looked for, in their order."""
+def get_field_table(
+    filters: Annotated[HeliostatFilter, Query()], runtime: RuntimeDep, cache: FieldCacheDep
+) -> Response:
+    """All heliostats of the filter, in its order."""
     with runtime.database.reading() as session:
-        lines = find(book.read(session, PATIENCE_S).lines, wanted)
-    columns = ["east [m]", "north [m]", *(_UNITS.get(name, name) for name in _FIELD), "doubts"]
-    told = map(field_line, lines)
-    rows = ([*line.position_m, *(getattr(line, name) for name in _FIELD), "; ".join(line.doubts)] for line in told)
+        lines = filter_heliostats(cache.read(session, PATIENCE_S).lines, filters)
+    columns = ["east_m", "north_m", *_FIELD, "warnings"]
+    summaries = map(field_line, lines)
+    rows = (
+        [*line.position_m, *(getattr(line, name) for name in _FIELD), "; ".join(line.warnings)]
+        for line in summaries
+    )
     return sheet_answer("field", columns, rows)
 
 
 @router.get("/attention.csv")
-def get_attention_table(runtime: RuntimeDep, book: FieldBookDep) -> Response:
-    """All that needs attention, acknowledged or not."""
+def get_attention_table(runtime: RuntimeDep, cache: FieldCacheDep) -> Response:
+    """All alerts, acknowledged or not."""
     with runtime.database.reading() as session:
-        items, _ = needs_attention(session, book, runtime.settings)
-    columns = [one.name for one in fields(Item) if one.name != "mark"]
-    return sheet_answer("attention", columns, ([getattr(item, name) for name in columns] for item in items))
+        items, _ = list_alerts(session, cache, runtime.settings)
+    columns = [one.name for one in fields(Alert) if one.name != "mark"]
+    return sheet_answer(
+        "attention", columns, ([getattr(item, name) for name in columns] for item in items)
+    )
 
 
 _QUALITY = (
@@ -58,14 +64,15 @@ _PHOTOGRAPH = (
     "detail",
     "taken_at",
     "target",
-    "sun_azimuth [deg]",
-    "sun_elevation [deg]",
-    "motor_1 [steps]",
-    "motor_2 [steps]",
-    "center_right [m]",
-    "center_up [m]",
+    "sun_azimuth_deg",
+    "sun_elevation_deg",
+    "motor_axis_1",
+    "motor_axis_2",
+    "center_right_m",
+    "center_up_m",
     *_QUALITY,
     "created_at",
+    "sent_by",
     "corrected_at",
     "image_sha256",
 )
@@ -73,7 +80,7 @@ _PHOTOGRAPH = (
 
 def _photograph(row: MeasurementRow) -> list[object]:
     return [
-        name_of(row),
+        photograph_name(row),
         row.identifier,
         row.kind,
         row.accepted,
@@ -89,6 +96,7 @@ def _photograph(row: MeasurementRow) -> list[object]:
         row.center_up_m,
         *(row.quality.get(name) for name in _QUALITY),
         row.created_at,
+        row.sent_by,
         row.corrected_at,
         row.image_sha256,
     ]
@@ -96,7 +104,7 @@ def _photograph(row: MeasurementRow) -> list[object]:
 
 @router.get("/heliostats/{name}/photographs.csv")
 def get_photographs_table(name: NamePath, runtime: RuntimeDep) -> Response:
-    """All images of a heliostat's photographs, in the order they came."""
+    """All images of a heliostat's photographs, in the order of their arrival."""
     with runtime.database.reading() as session:
         rows = store.list_measurements(session, store.get_heliostat(session, name), None)
     return sheet_answer(f"{name}-photographs", _PHOTOGRAPH, map(_photograph, rows))
@@ -105,15 +113,15 @@ def get_photographs_table(name: NamePath, runtime: RuntimeDep) -> Response:
 _SURFACE = (
     "version",
     "source",
-    "is_todays",
-    "set_aside",
+    "is_active",
+    "is_candidate",
     "valid_from",
     "created_at",
-    "deviation [mm]",
-    "uncertainty [mm]",
-    "misfit [%]",
+    "deviation_mm",
+    "uncertainty_mm",
+    "misfit",
     "trusted",
-    "doubts",
+    "warnings",
     "photographs",
     "model",
     "model_version",
@@ -129,23 +137,23 @@ def get_surfaces_table(name: NamePath, runtime: RuntimeDep) -> Response:
         rows = store.list_surfaces(session, heliostat, None, arrays=True)
     lines = []
     for row in rows:
-        figures = figures_of(row.arrays)
+        figures = field_totals(row.arrays)
         lines.append(
             [
                 row.version,
                 row.source,
                 today is not None and row.id == today.id,
-                row.set_aside,
-                None if row.valid_from.year <= 1970 else row.valid_from,
+                row.is_candidate,
+                row.valid_from,
                 row.created_at,
                 figures.deviation_mm,
                 figures.uncertainty_mm,
-                None if row.misfit is None else 100 * row.misfit,
+                row.misfit,
                 row.trusted,
-                "; ".join(row.doubts or []),
+                "; ".join(row.warnings or []),
                 " ".join(one.identifier for one in row.measurements),
                 row.model,
-                row.model_version,
+                row.model_version and int(row.model_version.partition(":")[0]),
             ]
         )
     return sheet_answer(f"{name}-surfaces", _SURFACE, lines)

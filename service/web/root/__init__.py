@@ -1,1 +1,1 @@
-"""What stands at the root beside the pages: probes, metrics, the session, the documentation, styles and scripts."""
+"""Routes at the root next to the pages: probes, metrics, session, documentation and assets."""

@@ -1,9 +1,9 @@
-"""Styles and scripts, which nobody needs a key for."""
+"""Styles and scripts, which need no key."""
 
 from pathlib import Path
 
 from service.drawing.templates import ASSETS
-from service.web.answers.files import MEDIA_TYPES, KnownFiles
+from service.web.responses.files import MEDIA_TYPES, KnownFiles
 
 _FOLDER = Path(str(ASSETS))
 
@@ -12,7 +12,7 @@ MOUNT = (
     KnownFiles(
         _FOLDER,
         [path.name for path in _FOLDER.iterdir() if path.suffix in MEDIA_TYPES],
-        # They are asked for by the digest of their content, so what a browser has stays right.
+        # The URL holds a digest of the content, so browsers may cache it without limit.
         "public, max-age=31536000, immutable",
     ),
 )

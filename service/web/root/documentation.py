@@ -1,11 +1,14 @@
-"""The page at ``/docs``: Swagger UI from an installed package, so that no request leaves the plant."""
+"""The page at ``/docs``: Swagger UI from an installed package.
+
+The browser requests nothing from outside the plant.
+"""
 
 from pathlib import Path
 
 from fastapi import APIRouter
 from fastapi.responses import HTMLResponse
 
-from service.web.answers.files import KnownFiles
+from service.web.responses.files import KnownFiles
 
 router = APIRouter(include_in_schema=False)
 
@@ -35,7 +38,7 @@ MOUNT = (
         packages=[("fastapi_offline", "static")],
     ),
 )
-"""What the page loads."""
+"""Scripts and styles of the page."""
 
 
 @router.get("/docs")

@@ -1,21 +1,23 @@
-"""Whether the process lives, and whether it can work."""
+"""Probes: whether the process lives, and whether it can work."""
 
 import logging
 from collections.abc import Callable
 from typing import Literal
 
-from anyio import CapacityLimiter, to_thread
-from fastapi import APIRouter, Response, status
+from anyio import CapacityLimiter, Lock, to_thread
+from fastapi import APIRouter, Request, Response, status
 from pydantic import BaseModel
 
+from model.errors import WeightsError
 from model.network.predictor import default_predictor
-from service.base.faults import StoreDamagedError
-from service.twin.runtime import Runtime
-from service.web.door.dependencies import RuntimeDep
+from model.prior import default_prior
+from service.base.errors import StoreDamagedError
+from service.twin.runtime.runtime import Runtime
+from service.web.auth.dependencies import RuntimeDep
 
 
 class Health(BaseModel):
-    """The state of the service; each check is "ok" or says what is wrong."""
+    """The state of the service. Each check is "ok" or a description of the failure."""
 
     status: Literal["ok", "unavailable"]
     checks: dict[str, str]
@@ -24,8 +26,31 @@ class Health(BaseModel):
 router = APIRouter(tags=["health"])
 logger = logging.getLogger("heliotwin.service")
 
-# Its own thread, so that a busy service still says that it is ready.
+# A separate thread, so that the probe also answers while the service is busy.
 _checker = CapacityLimiter(1)
+
+
+class SharedCheck:
+    """Check that runs once at a time and shares its result with waiting requests.
+
+    Many requests cost no more than one check after the other. A result is never older than its
+    request.
+    """
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._begun = self._done = 0
+        self._result: dict[str, str] = {}
+
+    async def result(self, check: Callable[[], dict[str, str]]) -> dict[str, str]:
+        """Return the result of a check that began after this call."""
+        wanted = self._begun + 1
+        async with self._lock:
+            if self._done < wanted:
+                self._begun = number = self._begun + 1
+                self._result = await to_thread.run_sync(check, limiter=_checker)
+                self._done = number
+            return self._result
 
 
 def _check(name: str, question: Callable[[], str]) -> str:
@@ -34,7 +59,10 @@ def _check(name: str, question: Callable[[], str]) -> str:
     except StoreDamagedError as error:
         logger.error("readiness check failed: %s: %s", name, error)
         return "damaged: run `heliotwin check`, and restore a back-up"
-    except Exception:  # whatever it is, not being ready is the answer; the log has the rest
+    except WeightsError as error:
+        logger.error("readiness check failed: %s", error)
+        return str(error)
+    except Exception:  # any failure means not ready; the log has the details
         logger.exception("readiness check failed: %s", name)
         return "unavailable"
 
@@ -45,17 +73,22 @@ def _database(runtime: Runtime) -> str:
 
 
 def _migrations(runtime: Runtime) -> str:
-    return "ok" if runtime.database.is_current() else "not at the newest version: run `heliotwin migrate`"
+    return (
+        "ok"
+        if runtime.database.is_current()
+        else "not at the newest version: run `heliotwin migrate`"
+    )
 
 
 def _weights(_runtime: Runtime) -> str:
     default_predictor()
+    default_prior()
     return "ok"
 
 
 def _ask_all(runtime: Runtime) -> dict[str, str]:
     questions = {"database": _database, "migrations": _migrations, "weights": _weights}
-    return {name: _check(name, lambda ask=ask: ask(runtime)) for name, ask in questions.items()}  # type: ignore[misc]
+    return {name: _check(name, lambda run=run: run(runtime)) for name, run in questions.items()}  # type: ignore[misc]
 
 
 @router.get("/livez")
@@ -64,10 +97,17 @@ async def get_livez() -> Health:
     return Health(status="ok", checks={})
 
 
-@router.get("/readyz", responses={503: {"model": Health, "description": "Something that it needs is missing."}})
-async def get_readyz(runtime: RuntimeDep, response: Response) -> Health:
-    """The database answers at the newest schema and the network's weights can be loaded."""
-    checks = await to_thread.run_sync(_ask_all, runtime, limiter=_checker)
+@router.get(
+    "/readyz",
+    responses={503: {"model": Health, "description": "Something that it needs is missing."}},
+)
+async def get_readyz(request: Request, runtime: RuntimeDep, response: Response) -> Health:
+    """The service is ready.
+
+    The database answers with the newest schema. The network and the prior match their model cards.
+    """
+    readiness: SharedCheck = request.app.state.readiness
+    checks = await readiness.result(lambda: _ask_all(runtime))
     is_ready = all(answer == "ok" for answer in checks.values())
     if not is_ready:
         response.status_code = status.HTTP_503_SERVICE_UNAVAILABLE

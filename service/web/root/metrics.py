@@ -1,11 +1,11 @@
-"""The figures that Prometheus reads."""
+"""Metrics for Prometheus."""
 
 from fastapi import APIRouter, Response
 from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
 
-from service.web.answers.openapi import TEXT
-from service.web.door.dependencies import READ, FieldBookDep, RuntimeDep
-from service.web.metrics import registry
+from service.web.auth.dependencies import OVERVIEW_SLOT, READ, FieldCacheDep, RuntimeDep
+from service.web.responses.openapi import TEXT
+from service.web.store_metrics import registry
 
 router = APIRouter(tags=["health"])
 
@@ -13,9 +13,14 @@ router = APIRouter(tags=["health"])
 @router.get(
     "/metrics",
     response_class=Response,
-    responses={200: {"description": "Prometheus' text format.", "content": {"text/plain": {"schema": TEXT}}}},
-    dependencies=[READ],
+    responses={
+        200: {
+            "description": "Prometheus' text format.",
+            "content": {"text/plain": {"schema": TEXT}},
+        }
+    },
+    dependencies=[READ, OVERVIEW_SLOT],
 )
-def get_metrics(runtime: RuntimeDep, book: FieldBookDep) -> Response:
-    """Counts and times of this process, the queue, and the drift of heliostats."""
-    return Response(generate_latest(registry(runtime, book)), media_type=CONTENT_TYPE_LATEST)
+def get_metrics(runtime: RuntimeDep, cache: FieldCacheDep) -> Response:
+    """Counts and times of this process, the job queue, and the drift of heliostats."""
+    return Response(generate_latest(registry(runtime, cache)), media_type=CONTENT_TYPE_LATEST)

@@ -1,50 +1,83 @@
-"""A key in a cookie, for pages: scripts cannot read it, and no other site's page can use it."""
+"""Sessions for pages, in a cookie.
+
+Scripts cannot read the cookie, and pages of other sites cannot use it.
+"""
 
 from http import HTTPStatus
 from typing import Annotated
 
 from fastapi import APIRouter, Form, HTTPException, Request, Response, status
 
-from service.twin.runtime import Runtime
-from service.web.answers.openapi import problems
-from service.web.door import security
-from service.web.door.dependencies import RuntimeDep
+from service.base.fields import Text
+from service.store import keys, sessions
+from service.twin.runtime.runtime import Runtime
+from service.web.auth import security
+from service.web.auth.dependencies import RuntimeDep
+from service.web.responses.openapi import problems
 
 router = APIRouter(tags=["session"])
 
-_LASTS_S = 12 * 3600
+
+def begin_session(runtime: Runtime, key: str) -> str | None:
+    """Begin a session with a key; None if the key is not valid."""
+    with runtime.database.reading() as session:
+        if keys.find(session, key) is None:
+            return None  # a wrong key must not wait for the write lock
+    with runtime.database.writing() as session:
+        row = keys.find(session, key)
+        return None if row is None else sessions.begin(session, row)
 
 
-def is_valid(runtime: Runtime, key: str) -> bool:
-    """Whether a key opens something."""
-    return security.identify(runtime.database, runtime.settings, key) is not None
+def keep_session(response: Response, request: Request, token: str) -> None:
+    """Store a session in the cookie of the browser."""
+    response.set_cookie(
+        security.COOKIE,
+        token,
+        max_age=int(sessions.LASTS.total_seconds()),
+        httponly=True,
+        samesite="strict",
+        secure=request.url.scheme == "https",
+    )
 
 
-def keep_key(response: Response, request: Request, key: str) -> None:
-    """Put a key into the browser's cookie for half a day."""
-    secure = request.url.scheme == "https"
-    response.set_cookie(security.COOKIE, key, max_age=_LASTS_S, httponly=True, samesite="strict", secure=secure)
-
-
-def forget_key(response: Response) -> None:
-    """Take the cookie back."""
+def end_session(runtime: Runtime, request: Request, response: Response) -> None:
+    """End the session of the browser, and delete the cookie."""
+    token = security.presented_session(request.headers)
+    if token and security.identify(runtime.database, runtime.settings, token) is not None:
+        with runtime.database.writing() as session:
+            sessions.end(session, token)
     response.delete_cookie(security.COOKIE, httponly=True, samesite="strict")
 
 
-@router.post("/session", status_code=status.HTTP_204_NO_CONTENT, response_class=Response, responses=problems(401))
+@router.post(
+    "/session",
+    status_code=status.HTTP_204_NO_CONTENT,
+    response_class=Response,
+    responses=problems(401),
+)
 def post_session(
-    key: Annotated[str, Form(max_length=200, description="A key made by `heliotwin keys create`.")],
+    key: Annotated[
+        Text, Form(max_length=200, description="A key made by `heliotwin keys create`.")
+    ],
     request: Request,
     runtime: RuntimeDep,
     response: Response,
 ) -> None:
-    """Keep a valid key in a cookie for half a day; it stops working at once when the key is withdrawn."""
-    if not is_valid(runtime, key):
-        raise HTTPException(HTTPStatus.UNAUTHORIZED, "this key is not valid", {"WWW-Authenticate": "Bearer"})
-    keep_key(response, request, key)
+    """Begin a session in a cookie for half a day. It ends at once if the key is withdrawn."""
+    token = begin_session(runtime, key)
+    if token is None:
+        raise HTTPException(
+            HTTPStatus.UNAUTHORIZED, "this key is not valid", {"WWW-Authenticate": "Bearer"}
+        )
+    keep_session(response, request, token)
 
 
-@router.delete("/session", status_code=status.HTTP_204_NO_CONTENT, response_class=Response, responses=problems())
-def delete_session(response: Response) -> None:
-    """Forget the key."""
-    forget_key(response)
+@router.delete(
+    "/session",
+    status_code=status.HTTP_204_NO_CONTENT,
+    response_class=Response,
+    responses=problems(),
+)
+def delete_session(request: Request, runtime: RuntimeDep, response: Response) -> None:
+    """End the session. Copies of its cookie are no longer valid."""
+    end_session(runtime, request, response)

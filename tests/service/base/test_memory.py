@@ -12,7 +12,7 @@ HEAPS = """
 import ctypes, sys, threading
 from service.base import memory
 libc = ctypes.CDLL(None)
-limited = memory.limit() if "limit" in sys.argv else None
+limited = memory.limit_memory() if "limit" in sys.argv else None
 libc.malloc.restype = ctypes.c_void_p
 ready = threading.Barrier(13)
 def take():
@@ -35,7 +35,11 @@ print(limited, file=sys.stderr)
 def heaps(*arguments: str, **more: str) -> tuple[int, str]:
     kept = {name: value for name, value in os.environ.items() if name != "MALLOC_ARENA_MAX"}
     done = subprocess.run(
-        [sys.executable, "-c", HEAPS, *arguments], env=kept | more, capture_output=True, text=True, check=True
+        [sys.executable, "-c", HEAPS, *arguments],
+        env=kept | more,
+        capture_output=True,
+        text=True,
+        check=True,
     )
     return len(ElementTree.fromstring(done.stdout).findall("heap")), done.stderr.strip()
 

@@ -16,9 +16,17 @@ print(json.dumps({"pools": pools, "torch": torch.get_num_threads(), "cv2": cv2.g
 
 def pools(**environment: str) -> dict[str, object]:
     """Threads that a process which loads the service takes in each library."""
-    kept = {name: value for name, value in os.environ.items() if not name.endswith(("_NUM_THREADS", "_THREADS_NUM"))}
+    kept = {
+        name: value
+        for name, value in os.environ.items()
+        if not name.endswith(("_NUM_THREADS", "_THREADS_NUM"))
+    }
     done = subprocess.run(
-        [sys.executable, "-c", POOLS], env=kept | environment, capture_output=True, text=True, check=True
+        [sys.executable, "-c", POOLS],
+        env=kept | environment,
+        capture_output=True,
+        text=True,
+        check=True,
     )
     return json.loads(done.stdout)
 

@@ -1,4 +1,6 @@
-"""``heliotwin camera``: a law is measured, judged by other days, and declared only where it is better."""
+"""``heliotwin camera``: a law is measured, judged by other days, and declared only where it is
+better.
+"""
 
 import json
 import shutil
@@ -12,7 +14,7 @@ from model.errors import InvalidInputError
 from model.imaging.light import Measured, Power, Srgb, Transfer
 from service.cli.folder_camera import measure_camera
 from service.sources.folder import read_folder
-from tests.service.cli.test_folder_verbs import heliotwin
+from tests.service.command import heliotwin
 
 
 def taken_through(law: Transfer, source: Path, root: Path) -> Path:
@@ -38,16 +40,20 @@ def test_srgb_stays_where_it_is_no_worse(made_plant, tmp_path):
 
 def test_another_camera_s_curve_is_found_and_makes_forecasts_agree(made_plant, tmp_path):
     root = taken_through(Power(1.4), made_plant, tmp_path / "plant")
-    report = measure_camera(read_folder(root), tmp_path / "camera.json", targets=["calibration_target"])
+    report = measure_camera(
+        read_folder(root), tmp_path / "camera.json", targets=["calibration_target"]
+    )
     assert report["verdict"] == "measured"
     assert report["gain"]["ci95"][0] > 0.01
     assert "Declare it" in report["conclusion"]
     (tmp_path / "plant" / "twin.json").write_text((tmp_path / "camera.json").read_text())
-    (camera,) = read_folder(root).cameras
+    (camera,) = read_folder(root).model.cameras
     assert camera.targets == ("calibration_target",)
     assert isinstance(camera.transfer, Measured)
     seen = np.linspace(0.5, 1, 50)
-    found, truth, usual = (law.light(seen) - law.light(0.5) for law in (camera.transfer, Power(1.4), Srgb()))
+    found, truth, usual = (
+        law.light(seen) - law.light(0.5) for law in (camera.transfer, Power(1.4), Srgb())
+    )
     found, truth, usual = (light / light[-1] for light in (found, truth, usual))
     assert np.abs(found - truth).max() < 0.02 < 0.06 < np.abs(usual - truth).max()
 
@@ -65,14 +71,21 @@ def test_photographs_that_tell_nothing_of_a_law_are_left_out_with_the_reason(mad
 
 
 def test_what_cannot_be_measured_is_one_clear_error(made_plant, tmp_path):
-    with pytest.raises(InvalidInputError, match=r"--target must be one of calibration_target.*'roof'"):
+    with pytest.raises(
+        InvalidInputError, match=r"--target must be one of calibration_target.*'roof'"
+    ):
         measure_camera(read_folder(made_plant), tmp_path / "c.json", targets=["roof"])
-    with pytest.raises(InvalidInputError, match=r"takes photographs of 4 days.*0 are left.*no surface"):
+    with pytest.raises(
+        InvalidInputError, match=r"needs photographs of 4 days.*0 are left.*no surface"
+    ):
         measure_camera(read_folder(made_plant), tmp_path / "c.json", surfaces=str(tmp_path))
     root = tmp_path / "plant"
     shutil.copytree(made_plant, root)
     effects = [{"name": "camera_shoulder", "parameters": {"compression": 1.0}}]
     (root / "twin.json").write_text(json.dumps({"declared": {"effects": effects}}))
-    with pytest.raises(InvalidInputError, match="declares camera_shoulder, which stands for the camera's law"):
+    with pytest.raises(
+        InvalidInputError,
+        match="declares camera_shoulder, which replaces the camera response curve",
+    ):
         measure_camera(read_folder(root), tmp_path / "c.json")
     assert heliotwin("camera", made_plant, "--out", tmp_path).returncode == 2

@@ -35,7 +35,9 @@ def test_corners_lie_in_the_frame(plane):
 
 
 def test_brightness_is_daylight_plus_flux(plane, spot):
-    options = CameraOptions(noise=0.0, gradient=(0.0, 0.0), grid_step=0.0, time_stamp="", perspective=0.0)
+    options = CameraOptions(
+        noise=0.0, gradient=(0.0, 0.0), grid_step=0.0, time_stamp="", perspective=0.0
+    )
     frame = photograph(spot, plane, np.random.default_rng(0), options)
     red = frame[..., 0].astype(float)
     assert red.max() == pytest.approx(255 * Srgb().counts(0.85), abs=2)

@@ -1,4 +1,4 @@
-"""What stands in files of JSON that verbs read: whatever is wrong with it is told in plain words."""
+"""JSON files that verbs read: every error in them is reported in plain words."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -12,18 +12,18 @@ from model.errors import InvalidInputError
 from model.plant import Plant
 from model.pointing.kinematics import NAMES
 from model.pointing.report import mount_from_json
-from model.tracing import Optics
+from model.site import JUELICH
 from service.sources.documents import (
     parse_declared,
     read_heliostat,
+    read_item,
     read_json,
     read_measurement,
-    read_moment,
     read_receivers,
     read_targets,
 )
-from service.twin.study import row_of_report
-from service.twin.versions import PlantModel
+from service.twin.plant.model_versions import ModelVersion
+from service.twin.studies.study import row_of_report
 from tests.service.conftest import ORIGIN, properties_document, tower_document
 from tests.service.wrong import RAW, wrong_somewhere
 
@@ -39,7 +39,14 @@ MEASUREMENT = {
 DECLARED = {
     "sun": {"shape": "buie", "circumsolar_ratio": 0.02},
     "optics": {"reflectivity": 0.9, "attenuation": [0.0067, 0.1]},
-    "cameras": [{"transfer": {"gamma": 2.0}, "since": "2024-03-01T00:00:00Z", "targets": ["lower"], "bits": 14}],
+    "cameras": [
+        {
+            "transfer": {"gamma": 2.0},
+            "since": "2024-03-01T00:00:00Z",
+            "targets": ["lower"],
+            "bits": 14,
+        }
+    ],
     "effects": [{"name": "slope_error", "parameters": {"sigma_mrad": {"value": 1.0}}}],
 }
 TIMES = ["2024-06-01T09:00:00+00:00", "2024-06-02T09:00:00+00:00"]
@@ -53,7 +60,13 @@ MOUNT = {
     "parameters": dict.fromkeys(NAMES, NUMBER),
     "covariance": np.eye(len(NAMES)).tolist(),
     "steps": [
-        {"from": TIMES[0], "to": TIMES[1], "zeros_mrad": [1.0, 0.0], "std_mrad": [0.1, 0.1], "motor_steps": [9, 0]}
+        {
+            "from": TIMES[0],
+            "to": TIMES[1],
+            "zeros_mrad": [1.0, 0.0],
+            "std_mrad": [0.1, 0.1],
+            "motor_steps": [9, 0],
+        }
     ],
     "drift": {"std_mrad": [0.1, 0.1]},
 }
@@ -69,16 +82,28 @@ REPORT = {
     "candidates": [],
     "skipped": {"AA40": "no images"},
 }
-MODEL = PlantModel(1, "1", Optics(), ())
+MODEL = ModelVersion(site=JUELICH, number=1, version="1")
 READERS: dict[str, tuple[Any, Callable[[Any], Any]]] = {
-    "properties": (properties_document(), lambda told: read_heliostat("AA39", told, np.array(ORIGIN))),
+    "properties": (
+        properties_document(),
+        lambda json_value: read_heliostat("AA39", json_value, np.array(ORIGIN)),
+    ),
     "targets": (tower_document(), read_targets),
     "receivers": (tower_document(), read_receivers),
-    "measurement": (MEASUREMENT, lambda told: read_measurement("1", "AA39", told, PLANT)),
-    "item": ({"properties": {"datetime": "2024-06-01T09:00:00Z"}}, lambda told: read_moment(told, "item")),
-    "declared": (DECLARED, lambda told: parse_declared(told, "twin.json")),
-    "mount": (MOUNT, lambda told: mount_from_json(told, "MOUNTS.json, AA39")),
-    "report": (REPORT, lambda told: row_of_report(told, "report.json", MODEL, "tester")),
+    "measurement": (
+        MEASUREMENT,
+        lambda json_value: read_measurement("1", "AA39", json_value, PLANT),
+    ),
+    "item": (
+        {"properties": {"datetime": "2024-06-01T09:00:00Z"}},
+        lambda json_value: read_item(json_value, "item"),
+    ),
+    "declared": (DECLARED, lambda json_value: parse_declared(json_value, "twin.json")),
+    "mount": (MOUNT, lambda json_value: mount_from_json(json_value, "MOUNTS.json, AA39")),
+    "report": (
+        REPORT,
+        lambda json_value: row_of_report(json_value, "report.json", MODEL, "tester"),
+    ),
     "effects": ({"effects": DECLARED["effects"]}, effects_from_json),
 }
 
@@ -96,7 +121,7 @@ def refusal(read: Callable[[Any], Any], document: Any) -> str:
 def test_whatever_is_wrong_is_told(name: str):
     document, read = READERS[name]
     read(document)
-    said = [told for wrong in wrong_somewhere(document) if (told := refusal(read, wrong))]
+    said = [message for wrong in wrong_somewhere(document) if (message := refusal(read, wrong))]
     assert len(said) > 15
     assert [text for text in said if RAW.search(text) or "\n" in text] == []
 
@@ -112,6 +137,6 @@ def test_whatever_is_wrong_is_told(name: str):
 def test_what_is_no_json_names_the_place(tmp_path: Path, text: bytes, says: str):
     file = tmp_path / "twin.json"
     file.write_bytes(text)
-    with pytest.raises(InvalidInputError) as told:
+    with pytest.raises(InvalidInputError) as refused:
         read_json(file)
-    assert str(told.value).startswith(f"{file}: {says}")
+    assert str(refused.value).startswith(f"{file}: {says}")

@@ -1,4 +1,6 @@
-"""``heliotwin calibrate`` and ``heliotwin spot`` on a made folder with faults, and on real heliostats."""
+"""``heliotwin calibrate`` and ``heliotwin spot`` on a made folder with faults, and on real
+heliostats.
+"""
 
 import json
 import shutil
@@ -13,23 +15,31 @@ from typer.testing import CliRunner
 
 from model.effects import Since
 from model.effects.encoder_offset import EncoderOffset
-from model.errors import InvalidInputError, ModelError
-from model.forecast import Setup, align
+from model.errors import InvalidInputError
+from model.forecast import align
+from model.frames import enu_to_wgs84
 from model.imaging import center_of_mass
+from model.plant_model import PlantModel
 from model.pointing import Weather, calibrate_field
-from model.pointing.report import mount_to_json
+from model.pointing.report import day_of, mount_to_json
+from model.setup import Setup
 from model.study import FluxImage
 from model.surface import control_points
+from service.base.errors import ConflictError
 from service.base.settings import Settings
-from service.cli.folder_pointing import Mounts, calibrate_folder, read_readings, spot_folder
+from service.cli.folder_pointing import calibrate_folder, spot_folder
+from service.cli.folder_store import open_folder
 from service.cli.main import app
 from service.sources.folder import read_folder
-from service.twin.importing import import_folder
-from service.twin.pointing import calibrate_store, make_plan
-from service.twin.runtime import Runtime
+from service.sources.paint_documents import azimuth_from_south
+from service.twin.heliostats.stored_mount import load_mount
+from service.twin.pointing.calibration import calibrate_store, make_plan
+from service.twin.runtime.runtime import Runtime
+from service.twin.transfer.importing import import_folder
 from tests.benchmarks import data_folder
+from tests.benchmarks.folders import read_readings
 from tests.benchmarks.pointing import Plant, with_clock
-from tests.service.conftest import QUIET, properties_document, tower_document
+from tests.service.conftest import ORIGIN, QUIET, properties_document, tower_document
 from tests.service.spots import photographs
 
 
@@ -38,15 +48,21 @@ def write(path: Path, document: Any) -> None:
     path.write_text(json.dumps(document))
 
 
-def write_measurement(root: Path, name: str, number: int, taken: dict[str, Any], **changes: Any) -> None:
+def write_measurement(
+    root: Path, name: str, number: int, taken: dict[str, Any], **changes: Any
+) -> None:
     document = {
         "motor_position": dict(
-            zip(("axis_1_motor_position", "axis_2_motor_position"), taken["motor_position"], strict=True)
+            zip(
+                ("axis_1_motor_position", "axis_2_motor_position"),
+                taken["motor_position"],
+                strict=True,
+            )
         ),
         "target_name": "lower",
-        "sun_azimuth": taken["sun_azimuth"],
-        "sun_elevation": taken["sun_elevation"],
-        "focal_spot": {"UTIS": taken["focal_spot"]},
+        "sun_azimuth": azimuth_from_south(taken["sun"]["azimuth_deg"]),
+        "sun_elevation": taken["sun"]["elevation_deg"],
+        "focal_spot": {"UTIS": enu_to_wgs84(taken["focal_spot_m"], ORIGIN).tolist()},
         **changes,
     }
     kept = {key: value for key, value in document.items() if value is not None}
@@ -55,7 +71,9 @@ def write_measurement(root: Path, name: str, number: int, taken: dict[str, Any],
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """AA39 with 16 good measurements and others; AB01 has no drives, AB02 no measurement, AB09 no properties."""
+    """AA39 with 16 good measurements and others; AB01 has no drives, AB02 no measurement, AB09 no
+    properties.
+    """
     root = tmp_path / "plant"
     write(root / "P-tower-measurements.json", tower_document())
     for name in ("AA39", "AB01", "AB02"):
@@ -67,8 +85,10 @@ def folder(tmp_path: Path) -> Path:
     for number, one in enumerate(taken):
         write_measurement(root, "AA39", 100 + number, one)
         item = {"properties": {"datetime": one["taken_at"]}}
-        if number % 3 != 1:  # the others are dated by their numbers
-            write(root / "AA39" / "Calibration" / f"{100 + number}-calibration-item-stac.json", item)
+        if number % 3 != 1:  # the time of the others is not known
+            write(
+                root / "AA39" / "Calibration" / f"{100 + number}-calibration-item-stac.json", item
+            )
     far = [50.92, 6.39, 100.0]
     write_measurement(root, "AA39", 200, taken[0], motor_position=None)
     write_measurement(root, "AA39", 201, taken[0], focal_spot=None)
@@ -91,7 +111,9 @@ def test_the_demonstrations_motors_tell_where_its_mirrors_point(made_plant: Path
     runtime.close()
     assert calibrated.skipped == {}
     for name, mount in calibrated.done.mounts.items():
-        document = mount_to_json(mount, calibrated.done.readings[name], calibrated.done.contradictions[name])
+        document = mount_to_json(
+            mount, calibrated.done.readings[name], calibrated.done.contradictions[name]
+        )
         assert document["residual_mrad"]["median"] < 0.3, name
 
 
@@ -101,9 +123,9 @@ def test_what_cannot_be_used_is_listed_and_costs_nothing_else(folder: Path, tmp_
     assert report["heliostats"]["AA39"]["measurements"] == 16
     assert report["heliostats"]["AA39"]["residual_mrad"]["median"] < 1
     said = {
-        "AA39/200": "no 'motor_position'",
-        "AA39/201": "no 'focal_spot'",
-        "AA39/202": "'sun_azimuth' is missing",
+        "AA39/200": "no motor_position",
+        "AA39/201": "no place of its spot",
+        "AA39/202": "sun_azimuth: is missing",
         "AA39/203": "off every target",
         "AA39/204": "beyond the travel",
         "AB01": "no linear actuators",
@@ -113,40 +135,55 @@ def test_what_cannot_be_used_is_listed_and_costs_nothing_else(folder: Path, tmp_
     assert set(report["skipped"]) == set(said)
     assert all(words in report["skipped"][key] for key, words in said.items())
     days = report["heliostats"]["AA39"]["history"]["at"]
-    assert days == sorted(days)
-    assert days[1].startswith("2024-05-02T12:00:00")  # by its number, between two that have times
+    assert days[:5] == [None] * 5
+    assert days[5:] == sorted(days[5:])
+    assert report["heliostats"]["AA39"]["undated"] == 5
+    assert report["undated"] == {"used": 5, "left_out": 0}
     assert set(report["parameters"]) == set(report["heliostats"]["AA39"]["parameters"])
     assert {entry["unit"] for entry in report["parameters"].values()} == {"m", "rad"}
 
 
 def test_photographs_that_a_mount_has_not_seen_say_where_motors_sent_the_light(tmp_path: Path):
-    """The first drive stepped by 4 mrad on the ninth day: mounts that were calibrated before do not know it."""
+    """The first drive stepped by 4 mrad on the ninth day: mounts that were calibrated before do not
+    know it.
+    """
     root = tmp_path / "plant"
     write(root / "P-tower-measurements.json", tower_document())
     write(root / "AA39" / "Properties" / "AA39-heliostat-properties.json", properties_document())
-    for number, one in enumerate(photographs(tower_document(), properties_document(), step_mrad=4.0)):
+    for number, one in enumerate(
+        photographs(tower_document(), properties_document(), step_mrad=4.0)
+    ):
         write_measurement(root, "AA39", 100 + number, one)
         item = {"properties": {"datetime": one["taken_at"]}}
         write(root / "AA39" / "Calibration" / f"{100 + number}-calibration-item-stac.json", item)
     source, file = read_folder(root), tmp_path / "mounts.json"
     report = calibrate_folder(source, file, until=datetime(2024, 5, 9, tzinfo=UTC))
     assert report["heliostats"]["AA39"]["measurements"] == 8
-    mounts, heliostat = Mounts(source, file), source.plant.heliostats["AA39"]
-    standing = mounts.stand(heliostat)
-    assert standing.mount.calibrated_until == date(2024, 5, 8)
-    taken = []
-    for one in source.measurements("AA39", with_images=False):
-        given = (one.sun, source.plant.targets[one.target], one.spot)
-        setup = Setup(standing, control_points(standing), *given, identifier=one.key, taken_at=one.taken_at)
-        taken.append(mounts.photograph(heliostat, one, FluxImage(setup, np.ones((8, 8)))))
+    with open_folder(source, mounts_file=file) as opened:
+        stored = load_mount(opened.session, "AA39")
+        standing = stored.turned()
+        assert standing.mount.calibrated_until == date(2024, 5, 8)
+        taken = []
+        for one in source.measurements("AA39", with_images=False):
+            given = (one.sun, source.plant.targets[one.target], one.spot)
+            setup = Setup(standing, control_points(standing), *given, taken_at=one.taken_at)
+            image, day = FluxImage(setup, np.ones((8, 8))), day_of(one.taken_at)
+            taken.append(image.sent(stored.heliostat, stored.mount, one.motor_position, day))
     assert [one.setup.angles is not None for one in taken] == [False] * 8 + [True] * 8
-    setups, latitude_deg = [one.setup for one in taken[8:]], float(source.plant.origin[0])
-    before = align(setups, latitude_deg=latitude_deg).displaced
+    setups, surveyed = [one.setup for one in taken[8:]], PlantModel(source.plant.site)
+    before = align(setups, surveyed).displacements
     assert np.linalg.norm(before, axis=-1).min() > 6e-3
-    stepped = EncoderOffset(first_deg={"AA39": float(np.degrees(4e-3))}, scope=Since(date(2024, 5, 9)))
-    after = align(setups, [stepped], latitude_deg=latitude_deg).displaced
-    doubts = np.array([np.hypot(one.spot_std_rad, np.linalg.norm(one.spot_doubts_rad, axis=1)) for one in taken[8:]])
-    assert (np.abs(after) < 3 * doubts).all()
+    stepped = EncoderOffset(
+        first_deg={"AA39": float(np.degrees(4e-3))}, scope=Since(date(2024, 5, 9))
+    )
+    after = align(setups, surveyed.with_effects([stepped])).displacements
+    deviations = np.array(
+        [
+            np.hypot(one.spot_std_rad, np.linalg.norm(one.spot_shifts_rad, axis=1))
+            for one in taken[8:]
+        ]
+    )
+    assert (np.abs(after) < 3 * deviations).all()
 
 
 def test_spots_need_no_focal_spot(folder: Path, tmp_path: Path):
@@ -169,7 +206,9 @@ def test_spots_need_no_focal_spot(folder: Path, tmp_path: Path):
 
 
 def test_verbs_stand_on_the_mounts_of_a_file(folder: Path, tmp_path: Path):
-    """Without a spot the light of the motors lands where it was seen, and not 29 mrad away; with one it is rolled."""
+    """Without a spot the light of the motors lands where it was seen, and not 29 mrad away; with
+    one it is rolled.
+    """
     mounts, measured = tmp_path / "mounts.json", {}
     calibrate_folder(read_folder(folder), mounts)
     for measurement in read_folder(folder).measurements("AA39", with_images=False):
@@ -177,7 +216,9 @@ def test_verbs_stand_on_the_mounts_of_a_file(folder: Path, tmp_path: Path):
     options = ["--surfaces", "ideal", "--json"]
 
     def forecasts(out: str, *more: str) -> dict[str, Any]:
-        made = CliRunner().invoke(app, ["forecast", str(folder), "--out", str(tmp_path / out), *options, *more])
+        made = CliRunner().invoke(
+            app, ["forecast", str(folder), "--out", str(tmp_path / out), *options, *more]
+        )
         assert made.exit_code == 0, made.output
         keys = json.loads(made.stdout)["measurements"]
         return {key: np.load(tmp_path / out / f"{key}-forecast.npz")["flux"] for key in keys}
@@ -197,7 +238,9 @@ def test_verbs_stand_on_the_mounts_of_a_file(folder: Path, tmp_path: Path):
     for key, flux in by_motors.items():
         if key[-3:] < "116":  # those that were measured well
             spot = plane.to_enu(center_of_mass(flux, (plane.width, plane.height)))
-            off.append(np.linalg.norm(spot - measured[key]) / np.linalg.norm(heliostat.position - spot))
+            off.append(
+                np.linalg.norm(spot - measured[key]) / np.linalg.norm(heliostat.position - spot)
+            )
     assert len(off) == 16
     assert np.median(off) < 1e-3
 
@@ -215,8 +258,12 @@ def test_mounts_of_another_sun_are_refused(folder: Path, tmp_path: Path):
     write(folder / "twin.json", {"declared": late})
     report = calibrate_folder(read_folder(folder), tmp_path / "mounts.json")
     assert report["heliostats"]["AA39"]["sun"] == late["effects"]
-    off = spot_folder(read_folder(folder), tmp_path / "mounts.json", tmp_path / "spots.json")["spots"]["AA39/105"]
-    (measured,) = [m.spot for m in read_folder(folder).measurements("AA39", False) if m.key == "AA39/105"]
+    off = spot_folder(read_folder(folder), tmp_path / "mounts.json", tmp_path / "spots.json")[
+        "spots"
+    ]["AA39/105"]
+    (measured,) = [
+        m.spot for m in read_folder(folder).measurements("AA39", False) if m.key == "AA39/105"
+    ]
     assert np.linalg.norm(np.array(off["spot"]) - measured) < 0.3
 
 
@@ -227,7 +274,7 @@ def test_files_that_are_no_mounts_are_refused(folder: Path, tmp_path: Path):
         with pytest.raises(InvalidInputError, match=r"wrong\.json"):
             spot_folder(read_folder(folder), wrong, tmp_path / "spots.json")
     shutil.rmtree(folder / "AA39")
-    with pytest.raises(ModelError, match="no heliostat can be calibrated"):
+    with pytest.raises(ConflictError, match="no heliostat can be calibrated"):
         calibrate_folder(read_folder(folder), tmp_path / "mounts.json")
 
 
@@ -236,9 +283,13 @@ def test_the_verbs_print_tables_and_name_bad_files(folder: Path, tmp_path: Path)
     done = CliRunner().invoke(app, ["calibrate", str(folder), "--out", str(mounts)])
     assert done.exit_code == 0, done.output
     assert "AA39" in done.stdout
-    report = CliRunner().invoke(app, ["spot", str(folder), "--mounts", str(mounts), "--out", str(spots), "--json"])
+    report = CliRunner().invoke(
+        app, ["spot", str(folder), "--mounts", str(mounts), "--out", str(spots), "--json"]
+    )
     assert json.loads(report.stdout)["spots"] == json.loads(spots.read_text())["spots"]
-    missing = CliRunner().invoke(app, ["spot", str(folder), "--mounts", str(tmp_path / "none"), "--out", str(spots)])
+    missing = CliRunner().invoke(
+        app, ["spot", str(folder), "--mounts", str(tmp_path / "none"), "--out", str(spots)]
+    )
     assert isinstance(missing.exception, InvalidInputError)
     assert "no such file" in str(missing.exception)
     onto = CliRunner().invoke(app, ["calibrate", str(folder), "--out", str(tmp_path)])
@@ -248,19 +299,31 @@ def test_the_verbs_print_tables_and_name_bad_files(folder: Path, tmp_path: Path)
 def test_what_the_weather_explains_is_asked_where_it_is_stored(folder: Path, tmp_path: Path):
     taken = photographs(tower_document(), properties_document())
     for name in ("AB02", "AB03", "AB04"):
-        write(folder / name / "Properties" / f"{name}-heliostat-properties.json", properties_document())
+        write(
+            folder / name / "Properties" / f"{name}-heliostat-properties.json",
+            properties_document(),
+        )
         for number, one in enumerate(taken):
             write_measurement(folder, name, 100 + number, one, temperature_c=10.0 + number)
-            item = {"properties": {"datetime": one["taken_at"], "wind_speed_m_s": 4.0 + number, "wind_from_deg": 90.0}}
-            if name == "AB03":  # where the measurement itself tells of the weather, its item's is not asked
-                write(folder / name / "Calibration" / f"{100 + number}-calibration-item-stac.json", item)
+            item = {
+                "properties": {
+                    "datetime": one["taken_at"],
+                    "wind_speed_m_s": 4.0 + number,
+                    "wind_from_deg": 90.0,
+                }
+            }
+            if name == "AB03":  # if the measurement has the weather, that of its item is not used
+                write(
+                    folder / name / "Calibration" / f"{100 + number}-calibration-item-stac.json",
+                    item,
+                )
     write_measurement(folder, "AB02", 300, taken[0], temperature_c="cold")
     write_measurement(folder, "AB02", 301, taken[0], wind_from_deg=400.0)
-    told = [one.weather for one in read_readings(read_folder(folder))[0]["AB03"]]
-    assert told[2] == Weather(temperature_c=12.0)
+    weathers = [one.weather for one in read_readings(read_folder(folder))["AB03"]]
+    assert weathers[2] == Weather(temperature_c=12.0)
     report = calibrate_folder(read_folder(folder), tmp_path / "mounts.json")
-    assert "'temperature_c' must be a finite number" in report["skipped"]["AB02/300"]
-    assert "'wind_from_deg' must lie in 0 to 360" in report["skipped"]["AB02/301"]
+    assert "temperature_c: must be a valid number" in report["skipped"]["AB02/300"]
+    assert "wind_from_deg: must be less than or equal to 360" in report["skipped"]["AB02/301"]
     covariates = report["covariates"]
     assert covariates["temperature"]["measurements"] == 48
     assert set(covariates["temperature"]["share"]) == {"sidewards", "upwards"}
@@ -273,16 +336,23 @@ def test_weather_of_items_is_read(folder: Path):
         document = json.loads(path.read_text())
         document["properties"] |= {"wind_speed_m_s": 4, "wind_from_deg": 90, "temperature_c": 7.5}
         write(path, document)
-    told = [one.weather for one in read_readings(read_folder(folder))[0]["AA39"]]
-    assert told[:2] == [Weather(4.0, 90.0, 7.5), Weather()]
+    weathers = [one.weather for one in read_readings(read_folder(folder))["AA39"]]
+    assert weathers[:2] == [Weather(4.0, 90.0, 7.5), Weather()]
 
 
 def test_a_wrong_clock_is_said_first(folder: Path, tmp_path: Path):
     taken = photographs(tower_document(), properties_document(), fast_minutes=2.0)
     for name in ("AB02", "AB03", "AB04"):
-        write(folder / name / "Properties" / f"{name}-heliostat-properties.json", properties_document())
+        write(
+            folder / name / "Properties" / f"{name}-heliostat-properties.json",
+            properties_document(),
+        )
         for number, one in enumerate(taken):
             write_measurement(folder, name, 100 + number, one)
+            item = {"properties": {"datetime": one["taken_at"]}}
+            write(
+                folder / name / "Calibration" / f"{100 + number}-calibration-item-stac.json", item
+            )
     mounts = tmp_path / "mounts.json"
     done = CliRunner().invoke(app, ["calibrate", str(folder), "--out", str(mounts)])
     assert done.exit_code == 0, done.output
@@ -296,9 +366,9 @@ def test_the_clock_of_real_photographs_is_right_until_it_is_put_wrong():
     if not real.is_dir():
         pytest.skip(f"no real pointing at {real}")
     plant = Plant([real])
-    wrong = with_clock(plant.readings, 19481.0, 1.0, plant.latitude_deg)
+    wrong = with_clock(plant.readings, 19481.0, 1.0, plant.site)
     right, found = (
-        calibrate_field(plant.heliostats, readings, plant.targets, latitude_deg=plant.latitude_deg).clock
+        calibrate_field(plant.heliostats, readings, plant.targets, plant.site).clock
         for readings in (plant.readings, wrong)
     )
     assert right is None
@@ -308,7 +378,7 @@ def test_the_clock_of_real_photographs_is_right_until_it_is_put_wrong():
 
 
 def test_real_heliostats_are_forecast_to_a_milliradian(tmp_path: Path):
-    """A third of the measurements of two heliostats tell nothing but their motors."""
+    """For a third of the measurements of two heliostats only the motor positions are used."""
     real = data_folder().parent / "stj-pointing"
     if not real.is_dir():
         pytest.skip(f"no real pointing at {real}")
@@ -321,15 +391,23 @@ def test_real_heliostats_are_forecast_to_a_milliradian(tmp_path: Path):
     for name in source.plant.heliostats:
         for measurement in source.measurements(name, with_images=False)[::3]:
             measured[measurement.key] = measurement.spot
-            path = root / name / "Calibration" / f"{measurement.identifier}-calibration-properties.json"
+            path = (
+                root
+                / name
+                / "Calibration"
+                / f"{measurement.identifier}-calibration-properties.json"
+            )
             document = json.loads(path.read_text())
             del document["focal_spot"]
             write(path, document)
     calibrate_folder(read_folder(root), tmp_path / "mounts.json")
-    spots = spot_folder(read_folder(root), tmp_path / "mounts.json", tmp_path / "spots.json")["spots"]
+    spots = spot_folder(read_folder(root), tmp_path / "mounts.json", tmp_path / "spots.json")[
+        "spots"
+    ]
     for name, heliostat in source.plant.heliostats.items():
         off = [
-            np.linalg.norm(np.array(spots[key]["spot"]) - spot) / np.linalg.norm(spot - heliostat.position)
+            np.linalg.norm(np.array(spots[key]["spot"]) - spot)
+            / np.linalg.norm(spot - heliostat.position)
             for key, spot in measured.items()
             if key.startswith(name)
         ]

@@ -1,4 +1,6 @@
-"""The main job over HTTP with the real model, on real measurements of the Solar Tower Juelich where they are."""
+"""The main job over HTTP with the real model, on real measurements of the Solar Tower Juelich where
+they are.
+"""
 
 import io
 import json
@@ -10,7 +12,10 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
+from model.frames import wgs84_to_enu
 from service.base.settings import Settings
+from service.sources.documents import read_targets
+from service.sources.paint_documents import azimuth_from_north
 from service.web.app import create_app
 from tests.benchmarks import data_folder
 from tests.service.conftest import client_of
@@ -18,7 +23,9 @@ from tests.service.conftest import client_of
 STJ = data_folder()
 CALIBRATION = STJ / "AA39" / "Calibration"
 
-pytestmark = pytest.mark.skipif(not CALIBRATION.is_dir(), reason=f"no measurements of AA39 under {STJ}")
+pytestmark = pytest.mark.skipif(
+    not CALIBRATION.is_dir(), reason=f"no measurements of AA39 under {STJ}"
+)
 
 
 def read(path: Path) -> Any:
@@ -29,20 +36,36 @@ def read(path: Path) -> Any:
 def real(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
     settings = Settings(data_dir=tmp_path_factory.mktemp("real"))
     with client_of(create_app(settings)) as client:
-        assert client.put("/v1/plant", json=read(STJ / "WRI1030197-tower-measurements.json")).status_code == 200
+        assert (
+            client.put(
+                "/v1/plant", json=read(STJ / "WRI1030197-tower-measurements.json")
+            ).status_code
+            == 200
+        )
         properties = read(STJ / "AA39" / "Properties" / "AA39-heliostat-properties.json")
         assert client.put("/v1/heliostats/AA39", json=properties).status_code == 201
         yield client
 
 
 def send(client: TestClient, number: str, kind: str = "flux") -> Any:
-    """Post an image with PAINT's own metadata."""
+    """Post an image with what PAINT says of it."""
     document = read(CALIBRATION / f"{number}-calibration-properties.json")
+    tower = read(STJ / "WRI1030197-tower-measurements.json")
+    origin = tower["power_plant_properties"]["coordinates"]
+    azimuth_deg = azimuth_from_north(document["sun_azimuth"])
+    metadata = {
+        "kind": kind,
+        "id": number,
+        "target": document["target_name"],
+        "sun": {"azimuth_deg": azimuth_deg, "elevation_deg": document["sun_elevation"]},
+        "motor_position": document["motor_position"],
+        "focal_spot_m": wgs84_to_enu(document["focal_spot"]["UTIS"], origin).tolist(),
+    }
     image = (CALIBRATION / f"{number}-{kind}.png").read_bytes()
     return client.post(
         "/v1/heliostats/AA39/measurements",
         files={"image": (f"{number}-{kind}.png", image, "image/png")},
-        data={"metadata": json.dumps(document | {"kind": kind, "id": number})},
+        data={"metadata": json.dumps(metadata)},
     )
 
 
@@ -66,7 +89,7 @@ def test_real_image_to_flux_surface_and_forecast(real: TestClient):
         json={
             "heliostat": "AA39",
             "target": "multi_focus_tower",
-            "sun": {"azimuth_deg": -20.0, "elevation_deg": 45.0},
+            "sun": {"azimuth_deg": 200.0, "elevation_deg": 45.0},
             "surface": "current",
         },
     )
@@ -85,12 +108,11 @@ def test_measured_spot_lies_where_paint_saw_it(real: TestClient):
     answer = send(real, "151375").json()
     document = read(CALIBRATION / "151375-calibration-properties.json")
     tower = read(STJ / "WRI1030197-tower-measurements.json")
-    from model.frames import wgs84_to_enu
-    from service.sources.documents import read_targets
-
     origin, targets = read_targets(tower)
-    expected = targets[document["target_name"]].to_plane(wgs84_to_enu(document["focal_spot"]["UTIS"], origin))
-    np.testing.assert_allclose(answer["center_of_mass"], expected, atol=0.2)
+    expected = targets[document["target_name"]].to_plane(
+        wgs84_to_enu(document["focal_spot"]["UTIS"], origin)
+    )
+    np.testing.assert_allclose(answer["center_of_mass_m"], expected, atol=0.2)
 
 
 def test_sun_behind_the_mirror_is_the_callers_error(real: TestClient):
@@ -100,7 +122,7 @@ def test_sun_behind_the_mirror_is_the_callers_error(real: TestClient):
         json={
             "heliostat": "AA39",
             "plane": plane,
-            "sun": {"azimuth_deg": 0, "elevation_deg": 20},
+            "sun": {"azimuth_deg": 180, "elevation_deg": 20},
             "surface": "ideal",
         },
     )
@@ -108,4 +130,8 @@ def test_sun_behind_the_mirror_is_the_callers_error(real: TestClient):
 
 
 def test_service_with_the_shipped_weights_is_ready(real: TestClient):
-    assert real.get("/readyz").json()["checks"] == {"database": "ok", "migrations": "ok", "weights": "ok"}
+    assert real.get("/readyz").json()["checks"] == {
+        "database": "ok",
+        "migrations": "ok",
+        "weights": "ok",
+    }

@@ -1,4 +1,6 @@
-"""``heliotwin study``: the report of DESIGN.md, section 7, its page, and what it says to bad input."""
+"""``heliotwin study``: the report of DESIGN.md, section 7, its page, and what it says
+to bad input.
+"""
 
 import json
 import re
@@ -17,10 +19,10 @@ from model.effects import CATALOGUE
 from model.effects.facet_canting import FacetCanting
 from model.effects.sun_shape import SunShapeEffect
 from model.errors import InvalidInputError
-from model.study import StudyOptions
+from model.study import StudyOptions, conclude, study_to_json
 from model.study.judging import Gain
-from model.study.report import Found
-from model.study.unknowns import Term, Unknowns
+from model.study.outcome import Found
+from model.study.parameters import ParameterVector, Term
 from service.base.settings import FIGURE_SCALES
 from service.cli.folder_study import FolderStudy, study_folder
 from service.cli.main import main
@@ -46,7 +48,9 @@ def copy(source: Path, root: Path, images: int) -> Path:
         for part in ("Properties", "Deflectometry"):
             shutil.copytree(source / name / part, root / name / part)
         (root / name / "Calibration").mkdir()
-        kept = sorted((source / name / "Calibration").glob("*-calibration-properties.json"))[:images]
+        kept = sorted((source / name / "Calibration").glob("*-calibration-properties.json"))[
+            :images
+        ]
         for about in kept:
             for path in about.parent.glob(about.name.split("-")[0] + "-*"):
                 shutil.copy(path, root / name / "Calibration")
@@ -55,19 +59,24 @@ def copy(source: Path, root: Path, images: int) -> Path:
 
 @pytest.fixture(scope="module")
 def hazy(few) -> FolderStudy:
-    return study_folder(read_folder(few), options=StudyOptions(candidates=("sun_shape", "camera_blur")))
+    return study_folder(
+        read_folder(few), options=StudyOptions(candidates=("sun_shape", "camera_blur"))
+    )
 
 
 @pytest.fixture(scope="module")
 def clean(undeclared, tmp_path_factory) -> FolderStudy:
     """Of a folder that declares the sun that it has."""
     root = copy(undeclared / "set-5", tmp_path_factory.mktemp("clean"), 3)
-    found = study_folder(read_folder(root), options=StudyOptions(candidates=("sun_shape",))).study.effects[0]
+    found = study_folder(
+        read_folder(root), options=StudyOptions(candidates=("sun_shape",))
+    ).study.effects[0]
     options = StudyOptions(candidates=("sun_shape", "axis_tilt"))
     return study_folder(read_folder(root), options=options, effects=[found])
 
 
-# --- the command ------------------------------------------------------------------------------------------------------
+# --- the command
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -100,8 +109,12 @@ def test_the_report_keeps_the_contract_and_serves_forecasts(few, tmp_path, helio
     for part in ("before", "after"):
         accuracies = report[part]["per_image"]
         assert {key.split("/")[0] for key in accuracies} == set(HELIOSTATS)
-        assert report[part]["accuracy_mean"] == pytest.approx(np.mean(list(accuracies.values())), abs=2e-5)
-        assert report[part]["accuracy_median"] == pytest.approx(np.median(list(accuracies.values())), abs=2e-5)
+        assert report[part]["accuracy_mean"] == pytest.approx(
+            np.mean(list(accuracies.values())), abs=2e-5
+        )
+        assert report[part]["accuracy_median"] == pytest.approx(
+            np.median(list(accuracies.values())), abs=2e-5
+        )
     assert 0 < report["noise_floor"] < 0.05
     assert 0 <= report["unexplained_share"] <= 1
     for effect in report["effects"]:
@@ -120,8 +133,13 @@ def test_the_report_keeps_the_contract_and_serves_forecasts(few, tmp_path, helio
     assert "Colours from -0.2 to 0.2 of the measured peak" in page
 
     plain = report_of("forecast", few, "--out", tmp_path / "plain")
-    better = report_of("forecast", few, "--out", tmp_path / "better", "--effects", tmp_path / "new" / "r.json")
-    assert better["accuracy_mean"] > plain["accuracy_mean"] + 0.5 * report["effects"][0]["accuracy_gain"]["mean"]
+    better = report_of(
+        "forecast", few, "--out", tmp_path / "better", "--effects", tmp_path / "new" / "r.json"
+    )
+    assert (
+        better["accuracy_mean"]
+        > plain["accuracy_mean"] + 0.5 * report["effects"][0]["accuracy_gain"]["mean"]
+    )
 
 
 @pytest.mark.parametrize(
@@ -130,7 +148,10 @@ def test_the_report_keeps_the_contract_and_serves_forecasts(few, tmp_path, helio
         (("nowhere", "--out", "x"), "no such folder"),
         (("FOLDER", "--out", "."), "is a folder; name a file"),
         (("FOLDER", "--out", "x", "--surfaces", "nowhere"), "--surfaces must be"),
-        (("FOLDER", "--out", "x", "--surfaces", "."), "got 0 (AD34: no surface in AD34/Deflectometry; AR18"),
+        (
+            ("FOLDER", "--out", "x", "--surfaces", "."),
+            "got 0 (AD34: no surface in AD34/Deflectometry; AR18",
+        ),
         (("FOLDER", "--out", "x", "--effects", "nowhere.json"), "nowhere.json: no such file"),
     ],
 )
@@ -142,7 +163,8 @@ def test_bad_input_is_one_line_and_exit_code_2(few, heliotwin, arguments, says):
     assert not Path("x").exists()
 
 
-# --- what is left out -------------------------------------------------------------------------------------------------
+# --- what is left out
+# -------------------------------------------------------------------------------------------------
 
 
 def changed(few: Path, root: Path, change: Callable[[dict], None]) -> str:
@@ -158,7 +180,9 @@ def changed(few: Path, root: Path, change: Callable[[dict], None]) -> str:
 def test_a_heliostat_without_a_prediction_is_skipped_by_name(few, tmp_path):
     """The other one is not enough for a study, and the error says why there is no more."""
     shutil.copytree(few / "AD34" / "Deflectometry", tmp_path / "AD34" / "Deflectometry")
-    with pytest.raises(InvalidInputError, match=r"at least 4 photographs, got 3 \(AR18: no surface in"):
+    with pytest.raises(
+        InvalidInputError, match=r"at least 4 photographs, got 3 \(AR18: no surface in"
+    ):
         study_folder(read_folder(few), str(tmp_path))
 
 
@@ -175,7 +199,8 @@ def test_a_spot_off_its_target_is_skipped_by_name(few, tmp_path):
     assert key in text(study_page(done.study, "few", FIGURE_SCALES, done.skipped))
 
 
-# --- the page ---------------------------------------------------------------------------------------------------------
+# --- the page
+# --------------------------------------------------------------------------------------------------
 
 
 class _Reader(HTMLParser):
@@ -191,7 +216,9 @@ class _Reader(HTMLParser):
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.tags.append(tag)
         given = dict(attrs)
-        self.addresses += [given[name] or "" for name in ("src", "href", "action", "data") if name in given]
+        self.addresses += [
+            given[name] or "" for name in ("src", "href", "action", "data") if name in given
+        ]
         if tag == "svg" and given.get("role") == "img":
             self.labels.append(given.get("aria-label") or given.get("aria-labelledby") or "")
 
@@ -212,9 +239,12 @@ def text(page: str) -> str:
 
 def test_accuracies_are_in_percent_as_on_all_pages(hazy):
     page = text(study_page(hazy.study, "few", FIGURE_SCALES))
-    before, after = (100 * float(values.mean()) for values in (hazy.study.accuracy_before, hazy.study.accuracy_after))
+    before, after = (
+        100 * float(values.mean())
+        for values in (hazy.study.accuracy_before, hazy.study.accuracy_after)
+    )
     assert f"{before:.1f} % → {after:.1f} %" in page
-    assert f"rises from {before:.1f}% to {after:.1f}%" in hazy.study.conclusion()
+    assert f"rises from {before:.1f}% to {after:.1f}%" in conclude(hazy.study)
     assert "accuracy [%]" in page
     assert f"{100 * hazy.study.found[0].gain.mean:.1f} points" in page
 
@@ -233,10 +263,10 @@ def test_the_page_stands_alone(hazy):
 def test_the_page_says_what_was_found(hazy):
     page = study_page(hazy.study, "few", FIGURE_SCALES)
     words = text(page)
-    assert hazy.study.conclusion() in words
-    assert words.index(hazy.study.conclusion()) < words.index("Mean accuracy")
+    assert conclude(hazy.study) in words
+    assert words.index(conclude(hazy.study)) < words.index("Mean accuracy")
     assert "Effect found" in words
-    ratio = hazy.study.to_json()["effects"][0]["parameters"]["circumsolar_ratio"]
+    ratio = study_to_json(hazy.study)["effects"][0]["parameters"]["circumsolar_ratio"]
     assert f"{ratio['value']:.3f}{ratio['ci95'][0]:.3f} to {ratio['ci95'][1]:.3f}" in words
     assert "camera blur" in words
     for photograph in hazy.study.images:
@@ -253,15 +283,18 @@ def test_the_page_of_a_complete_model_shows_no_after(clean):
 
 def test_look_alikes_come_with_the_photographs_that_decide(hazy):
     (found,) = hazy.study.found
-    doubtful = replace(hazy.study, found=[replace(found, lookalikes=["slope_error"])])
-    words = text(study_page(doubtful, "few", FIGURE_SCALES))
-    assert "Slope error would do as well. To decide, photograph several heliostats within the same hour" in words
+    ambiguous = replace(hazy.study, found=[replace(found, lookalikes=["slope_error"])])
+    words = text(study_page(ambiguous, "few", FIGURE_SCALES))
+    assert (
+        "Slope error would do as well. To decide, photograph several heliostats within the same"
+        " hour" in words
+    )
     assert "Before the effect is adopted" in words
 
 
 def test_parameters_of_facets_stand_in_columns(hazy):
     term = Term(FacetCanting)
-    unknowns = Unknowns((term,), (("AD34", 4), ("AR18", 4)))
+    unknowns = ParameterVector((term,), (("AD34", 4), ("AR18", 4)))
     values = np.linspace(-1, 1, 16)
     found = Found("facet_canting", GAIN, GAIN, []).fitted(term, unknowns, values, np.full(16, 0.1))
     page = study_page(replace(hazy.study, found=[found]), "few", FIGURE_SCALES)
@@ -275,7 +308,7 @@ def test_what_comes_and_goes_is_shown_by_day(hazy):
     days = date(2024, 6, 7), date(2024, 6, 9)
     term = Term(SunShapeEffect, days=days)
     found = Found("sun_shape", GAIN, GAIN, []).fitted(
-        term, Unknowns((term,), (("AD34", 4),)), np.array([0.02, 0.2]), np.full(2, 0.01)
+        term, ParameterVector((term,), (("AD34", 4),)), np.array([0.02, 0.2]), np.full(2, 0.01)
     )
     words = text(study_page(replace(hazy.study, found=[found]), "few", FIGURE_SCALES))
     assert "Sun shape by day (most on 2024-06-09)" in words
@@ -285,7 +318,12 @@ def test_what_comes_and_goes_is_shown_by_day(hazy):
 def test_names_are_text_wherever_they_come_from(hazy):
     evil = '"><script>alert(1)</script>'
     photographs = [
-        replace(p, setup=replace(p.setup, identifier=f"{evil}/{n}", heliostat=replace(p.setup.heliostat, name=evil)))
+        replace(
+            p,
+            setup=replace(
+                p.setup, identifier=f"{evil}/{n}", heliostat=replace(p.setup.heliostat, name=evil)
+            ),
+        )
         for n, p in enumerate(hazy.study.images)
     ]
     page = study_page(replace(hazy.study, images=photographs), evil, FIGURE_SCALES, {evil: evil})

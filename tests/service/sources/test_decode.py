@@ -1,20 +1,30 @@
+import os
+import signal
 import struct
 import subprocess
 import sys
+import time
 import zlib
+from contextlib import closing
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
 from model.errors import InvalidInputError
+from service.base.errors import BusyError
+from service.sources import decode
 from service.sources.decode import decode_image
 
 
 @pytest.fixture(scope="module")
 def picture():
     ramp = np.linspace(0, 255, 60, dtype=np.uint8)
-    return np.stack([np.tile(ramp, (40, 1)), np.full((40, 60), 90, np.uint8), np.tile(ramp[::-1], (40, 1))], axis=-1)
+    return np.stack(
+        [np.tile(ramp, (40, 1)), np.full((40, 60), 90, np.uint8), np.tile(ramp[::-1], (40, 1))],
+        axis=-1,
+    )
 
 
 def encoded(picture, suffix):
@@ -28,7 +38,10 @@ def chunk(kind, body):
 def png_claiming(width, height):
     header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
     return (
-        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"\0" * 99)) + chunk(b"IEND", b"")
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", header)
+        + chunk(b"IDAT", zlib.compress(b"\0" * 99))
+        + chunk(b"IEND", b"")
     )
 
 
@@ -124,22 +137,30 @@ def test_random_bytes_behind_a_signature_never_crash():
 
 
 def jpeg_with_a_trap(picture, marker):
-    """A bare marker before an APP1 that holds a small frame header just where that marker's "length" would lead.
+    """A bare marker before an APP1 that holds a small frame header just where that marker's
+    "length" would lead.
 
     The real frame, which the decoder meets, is huge.
     """
     data = encoded(picture, ".jpg")
     frame = next(i for i in range(len(data)) if data[i : i + 2] == b"\xff\xc0")
-    huge = data[:frame] + data[frame : frame + 5] + struct.pack(">HH", 32000, 32000) + data[frame + 9 :]
+    huge = (
+        data[:frame]
+        + data[frame : frame + 5]
+        + struct.pack(">HH", 32000, 32000)
+        + data[frame + 9 :]
+    )
     hidden = bytearray(b"\xff\xe1" + struct.pack(">H", 65533) + bytes(65531))
     landing = 0xFFE1  # read from the APP1's own marker, counted from there
     hidden[landing : landing + 19] = data[frame : frame + 19]
     return huge[:2] + bytes((0xFF, marker)) + bytes(hidden) + huge[2:]
 
 
-@pytest.mark.parametrize("marker", [0x01, 0xD0, 0xD7])
-def test_a_bare_marker_does_not_hide_the_real_size(picture, marker):
-    with pytest.raises(InvalidInputError, match="32000 x 32000 pixels"):
+@pytest.mark.parametrize(
+    ("marker", "refusal"), [(0x01, "damaged"), (0xD0, "32000 x 32000"), (0xD7, "32000 x 32000")]
+)
+def test_a_bare_marker_does_not_hide_the_real_size(picture, marker, refusal):
+    with pytest.raises(InvalidInputError, match=refusal):
         decode_image(jpeg_with_a_trap(picture, marker))
 
 
@@ -147,24 +168,183 @@ def test_a_second_frame_is_refused(picture):
     data = encoded(picture, ".jpg")
     frame = next(i for i in range(len(data)) if data[i : i + 2] == b"\xff\xc0")
     length = struct.unpack_from(">H", data, frame + 2)[0]
-    with pytest.raises(InvalidInputError, match="more than one frame"):
+    with pytest.raises(InvalidInputError, match="damaged"):
         decode_image(data[:frame] + data[frame : frame + 2 + length] + data[frame:])
 
 
-def test_bare_markers_do_no_harm(picture):
+def jpeg_of_scans(count):
+    """A small file of 500 x 800 pixels with so many scans, the last of which refine nothing."""
+    data = cv2.imencode(
+        ".jpg", np.full((500, 800), 90, np.uint8), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1]
+    )[1].tobytes()
+    last = data.rindex(b"\xff\xda")
+    return data[:last] + data[last:-2] * (count - data.count(b"\xff\xda") + 1) + data[-2:]
+
+
+def test_a_progressive_jpeg_is_decoded_and_one_of_endless_scans_is_not():
+    assert decode_image(jpeg_of_scans(20)).shape == (500, 800)
+    with pytest.raises(InvalidInputError, match="2501 scans over 800 x 500 pixels takes too long"):
+        decode_image(jpeg_of_scans(2501))
+
+
+def tiff(*entries, data=b""):
+    """A little-endian TIFF of entries (tag, type, count, value), with ``data`` behind its
+    directory.
+    """
+    directory = b"".join(struct.pack("<HHII", *entry) for entry in entries)
+    return b"II*\0" + struct.pack("<IH", 8, len(entries)) + directory + bytes(4) + data
+
+
+SHORT, LONG = 3, 4
+GRAY = {
+    256: (SHORT, 1, 8),
+    257: (SHORT, 1, 8),
+    258: (SHORT, 1, 8),
+    259: (SHORT, 1, 1),
+    262: (SHORT, 1, 1),
+}
+"""An image of 8 x 8 pixels."""
+BEHIND = {273: (LONG, 1, 122), 277: (SHORT, 1, 1), 278: (SHORT, 1, 8), 279: (LONG, 1, 64)}
+"""Its pixels lie behind nine entries."""
+PIXELS = bytes(range(64))
+
+
+def gray_tiff(*more, **changed):
+    """With ``more`` entries behind; ``changed`` are entries by ``_TAG``."""
+    changes = {int(name[1:]): entry for name, entry in changed.items()}
+    fields = GRAY | BEHIND | changes
+    return tiff(*[(tag, *fields[tag]) for tag in sorted(fields)], *more, data=PIXELS)
+
+
+def test_a_plain_tiff_is_decoded():
+    assert decode_image(gray_tiff()).tobytes() == PIXELS
+
+
+@pytest.mark.parametrize(
+    ("data", "refusal"),
+    [
+        (gray_tiff((256, 3, 1, 30000)), "not each there once and in order"),
+        (gray_tiff((256, 3, 1, 8)), "not each there once and in order"),
+        (gray_tiff(_277=(8, 1, 4)), "tag 277 has 1 values of type 8"),
+        (gray_tiff(_258=(8, 1, 64)), "tag 258 has 1 values of type 8"),
+        (gray_tiff(_277=(3, 0, 0)), "tag 277 has 0 values"),
+        (gray_tiff(_257=(3, 0, 0)), "tag 257 has 0 values"),
+        (gray_tiff(_258=(3, 1, 32)), "more than 4 samples or 16 bits"),
+        (gray_tiff(_277=(3, 1, 60000)), "more than 4 samples or 16 bits"),
+        (gray_tiff((60000, 99, 1, 0)), "unknown type"),
+        (gray_tiff(_279=(4, 1, 65000)), "ends early"),
+    ],
+)
+def test_a_tiff_that_readers_read_differently_is_refused(data, refusal):
+    with pytest.raises(InvalidInputError, match=refusal):
+        decode_image(data)
+
+
+@pytest.mark.parametrize("count", [500, 1000])
+def test_a_tiff_whose_tags_share_a_million_bytes_is_refused_without_reading_them(count):
+    entries = [(60000 + tag, 1, 1_000_000, 8) for tag in range(count)]
+    with pytest.raises(InvalidInputError, match="TIFF"):
+        decode_image(tiff(*entries, data=bytes(1_000_000)))
+
+
+# --- the decoder's process
+# --------------------------------------------------------------------------------------------
+
+
+def spoiled(monkeypatch, statement):
+    """Decoders whose program does something else than to decode."""
+    program = (
+        "from service.sources import decoder_process as d\ndef decode(*_):\n   "
+        f" {statement}\nd.decode = decode\n"
+    )
+    monkeypatch.setattr(decode, "_PROGRAM", ("-c", f"{program}d.CPU_S = 0\nd.main()"))
+    return decode.DecoderPool()
+
+
+@pytest.mark.parametrize(
+    ("statement", "refusal"),
+    [
+        ("while True: pass", "takes more than 10 s to decode; save it again"),
+        ("bytearray(2**40)", "more memory to decode than its pixels need; save it again"),
+        ("__import__('os').abort()", "breaks the decoder; save it again"),
+    ],
+)
+def test_a_file_that_breaks_the_decoder_is_refused_and_the_next_one_decoded(
+    monkeypatch, statement, refusal
+):
+    with closing(spoiled(monkeypatch, statement)) as pool:
+        with pytest.raises(InvalidInputError, match=refusal):
+            pool.decode(b"", 1)
+        with pytest.raises(InvalidInputError, match=refusal):
+            pool.decode(b"", 1)
+
+
+def test_a_decoder_that_hangs_is_ended(monkeypatch):
+    monkeypatch.setattr(decode, "_WALL_S", 0.1)
+    pool = spoiled(monkeypatch, "__import__('time').sleep(300)")
+    with closing(pool), pytest.raises(InvalidInputError, match="takes more than"):
+        pool.decode(b"", 1)
+
+
+def test_a_decoder_that_was_ended_meanwhile_is_replaced(picture):
+    with closing(decode.DecoderPool()) as pool:
+        pool.decode(encoded(picture, ".png"), 10_000)
+        (idle,) = pool._idle
+        os.kill(idle._process.pid, signal.SIGKILL)
+        assert np.array_equal(pool.decode(encoded(picture, ".png"), 10_000), picture)
+
+
+def test_a_machine_that_ends_every_decoder_is_not_the_photographs_fault(monkeypatch):
+    pool = spoiled(monkeypatch, "__import__('os').kill(__import__('os').getpid(), 9)")
+    with closing(pool), pytest.raises(BusyError, match="send it again"):
+        pool.decode(b"", 1)
+
+
+def test_decoders_end_with_their_service(picture):
+    """Also where it is killed: nobody is left to end them."""
+    code = (
+        "import sys\nfrom service.sources import decode\n"
+        "decode.decode_image(sys.stdin.buffer.read())\n"
+        "print(decode._DECODERS._idle[0]._process.pid, flush=True)\n"
+        "import os, signal; os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], input=encoded(picture, ".png"), capture_output=True
+    )
+    assert done.returncode == -signal.SIGKILL
+    assert not done.stderr
+    pid = int(done.stdout)
+    while (
+        Path(f"/proc/{pid}").exists()
+        and "Z" not in Path(f"/proc/{pid}/stat").read_text().split()[2]
+    ):
+        time.sleep(0.05)
+
+
+def test_what_libraries_say_of_a_broken_file_reaches_no_log(picture):
+    code = (
+        "import sys\nfrom service.sources.decode import"
+        " decode_image\ndecode_image(sys.stdin.buffer.read())"
+    )
     data = encoded(picture, ".jpg")
-    np.testing.assert_array_equal(decode_image(data[:2] + b"\xff\x01" + data[2:]), decode_image(data))
+    done = subprocess.run(
+        [sys.executable, "-c", code], input=data[:700] + data[800:], capture_output=True
+    )
+    assert b"Corrupt" not in done.stderr
+    assert done.stderr.count(b"\n") < 40  # of the traceback at the most
 
 
 def test_the_decoder_has_a_limit_of_its_own():
-    """Behind the checks: OpenCV itself refuses, whoever calls it in a process of the service."""
+    """In addition to the checks, OpenCV itself refuses in every process of the service."""
     code = (
-        "import service, cv2, numpy as np, sys\n"
-        "data = sys.stdin.buffer.read()\n"
-        "try:\n    cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)\n"
-        "except cv2.error as error:\n    print('refused' if 'pixels' in str(error).lower() else error)\n"
+        "import service, cv2, numpy as np, sys\ndata = sys.stdin.buffer.read()\ntry:\n   "
+        " cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)\nexcept cv2.error as"
+        " error:\n    print('refused' if 'pixels' in str(error).lower() else error)\n"
     )
     done = subprocess.run(
-        [sys.executable, "-c", code], input=png_claiming(20000, 20000), capture_output=True, check=True
+        [sys.executable, "-c", code],
+        input=png_claiming(20000, 20000),
+        capture_output=True,
+        check=True,
     )
     assert done.stdout.strip() == b"refused"

@@ -1,4 +1,4 @@
-"""A folder's files are regular ones, or are not opened: whoever opens a pipe waits without end."""
+"""Only regular files of a folder are opened: opening a pipe could block forever."""
 
 import json
 import os
@@ -8,12 +8,19 @@ import pytest
 
 from model.errors import InvalidInputError
 from service.base.settings import Settings
-from service.cli.folder import read_image
+from service.cli.folder_camera import read_image
+from service.sources import documents
 from service.sources.files import require_regular
 from service.sources.folder import read_declared, read_folder
-from service.twin.importing import import_folder
-from service.twin.runtime import Runtime
-from tests.service.conftest import FakeOperations, metadata, png, properties_document, tower_document
+from service.twin.runtime.runtime import Runtime
+from service.twin.transfer.importing import import_folder
+from tests.service.conftest import (
+    FakeOperations,
+    paint_measurement,
+    png,
+    properties_document,
+    tower_document,
+)
 
 pytestmark = pytest.mark.timeout(60)
 
@@ -27,14 +34,20 @@ def plant(tmp_path: Path) -> Path:
     for kind in ("Properties", "Calibration", "Deflectometry"):
         (root / "AA39" / kind).mkdir(parents=True)
     (root / "WRI1030197-tower-measurements.json").write_text(json.dumps(tower_document()))
-    (root / "AA39" / "Properties" / "AA39-heliostat-properties.json").write_text(json.dumps(properties_document()))
-    (root / "AA39" / "Calibration" / "1-calibration-properties.json").write_text(json.dumps(metadata()))
+    (root / "AA39" / "Properties" / "AA39-heliostat-properties.json").write_text(
+        json.dumps(properties_document())
+    )
+    (root / "AA39" / "Calibration" / "1-calibration-properties.json").write_text(
+        json.dumps(paint_measurement())
+    )
     (root / "AA39" / "Calibration" / "1-flux.png").write_bytes(png())
     return root
 
 
 @pytest.mark.parametrize("name", [SURFACE, "AA39/Deflectometry/AA39-nurbs-surface.npz"])
-def test_a_pipe_for_a_surface_costs_the_surface_and_nothing_else(plant: Path, tmp_path: Path, name: str):
+def test_a_pipe_for_a_surface_costs_the_surface_and_nothing_else(
+    plant: Path, tmp_path: Path, name: str
+):
     os.mkfifo(plant / name)
     runtime = Runtime.from_settings(Settings(data_dir=tmp_path / "data"), FakeOperations())
     try:
@@ -66,12 +79,15 @@ def test_no_pipe_of_a_folder_is_waited_for(plant: Path, name: str):
         measurements = folder.measurements("AA39", with_images=False)
         folder.measured_surface("AA39")
     except InvalidInputError as error:
-        told = str(error)
+        message = str(error)
     else:
-        told = " ".join(folder.skipped.values())
+        message = " ".join(folder.skipped.values())
         taken = [(kind, item.taken_at) for item in measurements for kind in item.images]
-        assert told or taken in ([], [("flux", None)])  # PAINT's images and items are taken where they are files
-    assert not told or "no regular file" in told or "no heliostat with a readable" in told
+        assert message or taken in (
+            [],
+            [("flux", None)],
+        )  # PAINT's images and items are taken where they are files
+    assert not message or "no regular file" in message or "no heliostat with a readable" in message
 
 
 def test_only_regular_files_of_a_bearable_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -79,13 +95,30 @@ def test_only_regular_files_of_a_bearable_size(tmp_path: Path, monkeypatch: pyte
     (tmp_path / "link").symlink_to(tmp_path / "file")
     os.mkfifo(tmp_path / "pipe")
     assert require_regular(tmp_path / "link") == tmp_path / "link"
-    for name, told in (("pipe", "no regular file"), (".", "no regular file"), ("nothing", "no such file")):
-        with pytest.raises(InvalidInputError, match=told):
+    for name, message in (
+        ("pipe", "no regular file"),
+        (".", "no regular file"),
+        ("nothing", "no such file"),
+    ):
+        with pytest.raises(InvalidInputError, match=message):
             require_regular(tmp_path / name)
     with pytest.raises(InvalidInputError, match="pipe: no regular file"):
         read_image(tmp_path / "pipe")
     with pytest.raises(InvalidInputError, match="pipe: no regular file"):
         read_declared(tmp_path / "pipe")
-    monkeypatch.setattr("service.sources.files._MOST_BYTES", 10)
+    monkeypatch.setattr("service.sources.files._MAX_BYTES", 10)
     with pytest.raises(InvalidInputError, match="link: 11 bytes, 10 are the most"):
         require_regular(tmp_path / "link")
+
+
+def test_json_of_too_many_values_is_not_parsed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """22 million empty objects, which 64 MiB hold, took 7.7 GB."""
+    monkeypatch.setattr(documents, "MAX_JSON_VALUES", 10)
+    file = tmp_path / "wide.json"
+    file.write_text('{"a": [0, 1, 2, 3, 4, 5, 6]}')
+    assert documents.read_json(file) == {"a": [0, 1, 2, 3, 4, 5, 6]}
+    file.write_text('{"a": [0, 1, 2, 3, 4, 5, 6, {}]}')
+    with pytest.raises(
+        InvalidInputError, match=r"wide\.json: holds up to 11 values; at most 10 are read"
+    ):
+        documents.read_json(file)

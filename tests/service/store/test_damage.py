@@ -1,4 +1,4 @@
-"""A damaged SQLite file is told as that: by `check` in one line, and by readiness."""
+"""A damaged SQLite file is reported as such: by `check` in one line, and by readiness."""
 
 import sqlite3
 import sys
@@ -28,7 +28,9 @@ def spoil(file: Path, table: str | None) -> None:
     with closing(sqlite3.connect(file)) as connection:
         connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         (size,) = connection.execute("PRAGMA page_size").fetchone()
-        found = connection.execute("SELECT rootpage FROM sqlite_master WHERE name = ?", (table,)).fetchone()
+        found = connection.execute(
+            "SELECT rootpage FROM sqlite_master WHERE name = ?", (table,)
+        ).fetchone()
     with file.open("r+b") as opened:
         opened.seek(0 if found is None else (found[0] - 1) * size)
         opened.write(b"\xa5" * size)
@@ -36,7 +38,10 @@ def spoil(file: Path, table: str | None) -> None:
 
 @pytest.mark.parametrize("table", [None, "images", "measurements"])
 def test_check_ends_in_one_line(
-    file: Path, table: str | None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    file: Path,
+    table: str | None,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ):
     spoil(file, table)
     monkeypatch.setattr(sys, "argv", ["heliotwin", "check"])

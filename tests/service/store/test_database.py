@@ -1,7 +1,6 @@
 """Migrations up, down and up again without drift, and transactions that wait their turn."""
 
 import os
-import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta, timezone
@@ -17,6 +16,7 @@ from service import store
 from service.store.columns import Base
 from service.store.database import Database
 from service.store.tables import HeliostatRow
+from tests.waiting import WAIT_LIMIT_S, child_process
 
 ROOT = Path(__file__).parents[3]
 
@@ -45,10 +45,13 @@ def test_migrated_schema_is_the_mapped_one(database: Database):
 
 
 def test_two_processes_migrate_at_once(empty_url: URL):
-    environment = os.environ | {"HELIOTWIN_DATABASE_URL": empty_url.render_as_string(hide_password=False)}
+    environment = os.environ | {
+        "HELIOTWIN_DATABASE_URL": empty_url.render_as_string(hide_password=False)
+    }
     command = [sys.executable, "-m", "alembic", "upgrade", "head"]
-    running = [subprocess.Popen(command, env=environment, cwd=ROOT) for _ in range(2)]
-    assert [process.wait(60) for process in running] == [0, 0]
+    options = {"env": environment, "cwd": ROOT}
+    with child_process(command, **options) as first, child_process(command, **options) as second:
+        assert [process.wait(WAIT_LIMIT_S) for process in (first, second)] == [0, 0]
     database = Database(empty_url)
     assert database.is_current()
     database.close()
@@ -56,7 +59,9 @@ def test_two_processes_migrate_at_once(empty_url: URL):
 
 def test_foreign_keys_hold(database: Database):
     with pytest.raises(IntegrityError), database.writing() as session:
-        session.execute(text("INSERT INTO surface_measurements (surface_id, measurement_id) VALUES (1, 1)"))
+        session.execute(
+            text("INSERT INTO surface_measurements (surface_id, measurement_id) VALUES (1, 1)")
+        )
 
 
 def test_values_are_checked_by_the_database(database: Database):
@@ -65,14 +70,23 @@ def test_values_are_checked_by_the_database(database: Database):
         for table in Base.metadata.tables
         for check in inspect(database.engine).get_check_constraints(table)
     }
-    columns = {"plant_single", "measurements_kind", "surfaces_source", "studies_verdict", "jobs_state", "api_keys_role"}
-    assert found == {f"ck_{column}" for column in columns}
+    columns = {
+        "plant_single",
+        "measurements_kind",
+        "surfaces_source",
+        "studies_verdict",
+        "jobs_state",
+        "api_keys_role",
+    }
+    assert found == {f"ck_{column}" for column in columns} | {"ck_measurements_image"}
 
 
 def test_moments_come_back_in_utc(database: Database):
     moment = datetime(2024, 6, 1, 14, tzinfo=timezone(timedelta(hours=2)))
     with database.writing() as session:
-        session.add(HeliostatRow(name="A", properties={}, east_m=0, north_m=0, up_m=0, created_at=moment))
+        session.add(
+            HeliostatRow(name="A", properties={}, east_m=0, north_m=0, up_m=0, created_at=moment)
+        )
     with database.reading() as session:
         found = store.get_heliostat(session, "A").created_at
     assert found == moment
@@ -80,7 +94,9 @@ def test_moments_come_back_in_utc(database: Database):
 
 
 def test_moment_without_zone_is_refused(database: Database):
-    row = HeliostatRow(name="A", properties={}, east_m=0, north_m=0, up_m=0, created_at=datetime(2024, 6, 1))
+    row = HeliostatRow(
+        name="A", properties={}, east_m=0, north_m=0, up_m=0, created_at=datetime(2024, 6, 1)
+    )
     with pytest.raises(StatementError, match="time zone"), database.writing() as session:
         session.add(row)
 

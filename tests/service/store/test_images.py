@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from service.base.faults import StoreDamagedError, UnsupportedImageError
-from service.store.images import ImageStore, media_type
+from service.base.errors import StoreDamagedError, UnsupportedImageError
+from service.store.photographs.image_files import ImageStore, media_type
 from tests.service.conftest import png
 
 
@@ -58,7 +58,11 @@ def test_failed_write_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 @pytest.mark.parametrize(
     ("start", "expected"),
-    [(b"\x89PNG\r\n\x1a\n", "image/png"), (b"\xff\xd8\xff\xe0", "image/jpeg"), (b"II*\x00", "image/tiff")],
+    [
+        (b"\x89PNG\r\n\x1a\n", "image/png"),
+        (b"\xff\xd8\xff\xe0", "image/jpeg"),
+        (b"II*\x00", "image/tiff"),
+    ],
 )
 def test_format_is_told_by_the_first_bytes(start: bytes, expected: str):
     assert media_type(start + b"rest") == expected

@@ -1,4 +1,7 @@
-"""Images are given up by age and by quota, never those of today's surfaces; files go after rows, never under one."""
+"""Images are deleted by age and by quota, but never those of active surfaces.
+
+A file is deleted after its row, never while a row refers to it.
+"""
 
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -10,26 +13,30 @@ import pytest
 from sqlalchemy import select, update
 
 from service import store
-from service.base.faults import StoreFullError
+from service.base.errors import StoreFullError
+from service.base.fields import Sun
 from service.base.settings import Settings
-from service.jobs.asking import begin_due
+from service.jobs.enqueuing import enqueue_due
 from service.jobs.kind import Context
 from service.jobs.kinds import KINDS
 from service.jobs.kinds.prunings import PruningsIn, prune
 from service.jobs.worker import Worker
-from service.store import audit, photographs, queue, sizes
-from service.store.backup import back_up, restore
-from service.store.check import inspect_store, is_sound
+from service.store import audit, sizes
 from service.store.columns import now
 from service.store.database import Database
-from service.store.images import ImageStore, digest
 from service.store.job_tables import JobRow
+from service.store.jobs import queue
 from service.store.keys import RESERVED
+from service.store.photographs import image_retention
+from service.store.photographs.image_files import ImageStore, digest
+from service.store.recovery.backup import back_up, restore
+from service.store.recovery.check import inspect_store
 from service.store.tables import ImageRow, MeasurementRow
-from service.twin.ingest import Photograph, ingest
-from service.twin.prediction import predict_surface
-from service.twin.runtime import Runtime
-from tests.service.conftest import png
+from service.twin.photographs.ingest import Photograph, ingest
+from service.twin.plant import setup
+from service.twin.runtime.runtime import Runtime
+from service.twin.surfaces.prediction import predict_surface
+from tests.service.conftest import png, properties_document, sun_at
 from tests.service.store.test_recovery import PHOTOGRAPH, elsewhere, runtime
 
 __all__ = ["elsewhere", "runtime"]  # fixtures
@@ -42,13 +49,18 @@ def with_(runtime: Runtime, **changes: Any) -> Runtime:
     """The same store under other settings."""
     quiet = {"refused_image_retention_days": 0, "image_retention_days": 0, "image_quota_gb": 0}
     return Runtime(
-        runtime.settings.model_copy(update={**quiet, **changes}), runtime.database, runtime.images, runtime.operations
+        runtime.settings.model_copy(update={**quiet, **changes}),
+        runtime.database,
+        runtime.images,
+        runtime.operations,
     )
 
 
 def age(runtime: Runtime, days: float, *seeds: int) -> None:
     with runtime.database.writing() as session:
-        chosen = update(ImageRow).where(ImageRow.sha256.in_([digest(picture(seed)) for seed in seeds]))
+        chosen = update(ImageRow).where(
+            ImageRow.sha256.in_([digest(picture(seed)) for seed in seeds])
+        )
         session.execute(chosen.values(created_at=now() - timedelta(days=days)))
 
 
@@ -59,6 +71,18 @@ def picture(seed: int) -> bytes:
 def give(runtime: Runtime, *seeds: int) -> None:
     for seed in seeds:
         ingest(runtime, "AA39", PHOTOGRAPH, picture(seed))
+
+
+def give_to_another(runtime: Runtime, heliostat: str, data: bytes) -> tuple[MeasurementRow, bool]:
+    """The same image, which this heliostat has, too."""
+    with runtime.database.writing() as session:
+        setup.set_heliostat(session, "tester", heliostat, properties_document())
+    return ingest(
+        runtime,
+        heliostat,
+        Photograph("lower", "flux", Sun(**sun_at()), forced="both have it"),
+        data,
+    )
 
 
 def do(runtime: Runtime) -> dict[str, Any]:
@@ -89,9 +113,14 @@ def totals_hold(database: Database) -> None:
     with database.reading() as session:
         held = sizes.sizes(session)
         for accepted, found in ((True, held.accepted), (False, held.refused)):
-            rows = session.scalars(select(ImageRow).where(ImageRow.pruned_at.is_(None), ImageRow.accepted == accepted))
+            rows = session.scalars(
+                select(ImageRow).where(ImageRow.pruned_at.is_(None), ImageRow.accepted == accepted)
+            )
             listed = rows.all()
-            assert (found.images, found.size_bytes) == (len(listed), sum(row.size_bytes for row in listed))
+            assert (found.images, found.size_bytes) == (
+                len(listed),
+                sum(row.size_bytes for row in listed),
+            )
             assert found.oldest == min((row.created_at for row in listed), default=None)
         assert held.database_bytes > 10_000
 
@@ -116,21 +145,26 @@ def test_old_images_go_and_rows_stay(runtime: Runtime):
         assert row.arrays is not None
         assert (row.image.pruned_for, row.accepted) == ("age", True)
     noted = [
-        (entry.actor, entry.subject, entry.detail["which"], entry.detail["size_bytes"]) for entry in actions(runtime)
+        (entry.actor, entry.subject, entry.detail["which"], entry.detail["size_bytes"])
+        for entry in actions(runtime)
     ]
     assert noted == [
         ("tester", "1 images", "accepted", len(picture(9))),
         ("tester", "1 images", "refused", len(picture(50))),
     ]
-    assert actions(runtime)[0].detail["oldest"].startswith(f"{now() - timedelta(days=100):%Y-%m-%d}")
+    assert (
+        actions(runtime)[0].detail["oldest"].startswith(f"{now() - timedelta(days=100):%Y-%m-%d}")
+    )
     report = inspect_store(runtime.database, runtime.images, lambda _: None)
-    assert is_sound(report)
-    assert (report["pruned"], report["unused"]) == (2, 0)
+    assert report.is_sound
+    assert (report.pruned, report.unused) == (2, 0)
 
 
 def test_quota_takes_refused_ones_then_unused_ones_then_those_of_former_surfaces(runtime: Runtime):
     give(runtime, 50)
-    predict_surface(runtime, "AA39", measurements=[digest(picture(9))[:16]])  # today's is made from 9 alone
+    predict_surface(
+        runtime, "AA39", measurements=[digest(picture(9))[:16]]
+    )  # the active surface is made from 9 alone
     give(runtime, 10)
     age(runtime, 30, 1, 2, 3, 9)
     seeds = (1, 2, 3, 9, 10, 50)
@@ -144,7 +178,11 @@ def test_quota_takes_refused_ones_then_unused_ones_then_those_of_former_surfaces
     do(with_(runtime, image_quota_gb=1e-9))
     assert kept(runtime, *seeds) == {9}
     totals_hold(runtime.database)
-    assert {entry.detail["which"] for entry in actions(runtime)} == {"refused", "unused", "of former surfaces"}
+    assert {entry.detail["which"] for entry in actions(runtime)} == {
+        "refused",
+        "unused",
+        "of former surfaces",
+    }
 
 
 def test_post_beyond_the_quota_is_kept_as_long_as_something_can_go(runtime: Runtime):
@@ -165,8 +203,7 @@ def test_pruned_photograph_posted_again_stays_away_unless_it_says_something_new(
     do(with_(runtime, **settings))
     assert not ingest(runtime, "AA39", PHOTOGRAPH, picture(9))[1]
     assert kept(runtime, 9) == set()
-    other = Photograph("lower", "cropped", 20.0, 45.0)
-    row, is_new = ingest(runtime, "AA39", other, picture(9))
+    row, is_new = give_to_another(runtime, "AB38", picture(9))
     assert is_new
     assert row.image.pruned_at is None
     assert kept(runtime, 9) == {9}
@@ -175,7 +212,9 @@ def test_pruned_photograph_posted_again_stays_away_unless_it_says_something_new(
     totals_hold(runtime.database)
 
 
-def test_file_that_is_removed_while_it_is_posted_is_written_again(runtime: Runtime, monkeypatch: pytest.MonkeyPatch):
+def test_file_that_is_removed_while_it_is_posted_is_written_again(
+    runtime: Runtime, monkeypatch: pytest.MonkeyPatch
+):
     """The sender found the file whole, a pruning took it, then the sender's row is written."""
     age(runtime, 100, 9)
     aged, found = with_(runtime, image_retention_days=90.0), ImageStore.put
@@ -187,14 +226,13 @@ def test_file_that_is_removed_while_it_is_posted_is_written_again(runtime: Runti
         return sha256
 
     monkeypatch.setattr(ImageStore, "put", put_then_prune)
-    assert ingest(runtime, "AA39", Photograph("lower", "cropped", 20.0, 45.0), picture(9))[1]
+    assert give_to_another(runtime, "AB38", picture(9))[1]
     assert kept(runtime, 9) == {9}
-    assert is_sound(inspect_store(runtime.database, runtime.images, lambda _: None))
+    assert inspect_store(runtime.database, runtime.images, lambda _: None).is_sound
 
 
 def test_post_and_pruning_at_once_leave_no_row_without_its_file(runtime: Runtime):
     aged, stop = with_(runtime, image_retention_days=90.0), threading.Event()
-    kinds = ("raw", "cropped", "flux-centered")
 
     def keep_pruning() -> None:
         while not stop.is_set():
@@ -204,39 +242,40 @@ def test_post_and_pruning_at_once_leave_no_row_without_its_file(runtime: Runtime
 
     with ThreadPoolExecutor(1) as pool:
         pruning = pool.submit(keep_pruning)
-        for kind in kinds:
+        for heliostat in ("AB01", "AB02", "AB03"):
             for seed in range(100, 110):
-                ingest(runtime, "AA39", Photograph("lower", kind, 20.0, 45.0), png(seed))
+                give_to_another(runtime, heliostat, png(seed))
         stop.set()
         pruning.result()
     report = inspect_store(runtime.database, runtime.images, lambda _: None)
-    assert (report["bad"], report["unused"]) == ({}, 0)
+    assert (report.bad, report.unused) == ({}, 0)
     totals_hold(runtime.database)
 
 
 def test_files_wait_for_a_back_up(
     runtime: Runtime, elsewhere: Settings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """The snapshot names an image that is given up before it is copied."""
+    """The snapshot names an image that is marked for deletion before it is copied."""
     age(runtime, 100, 9)
-    aged, told = with_(runtime, image_retention_days=90.0), []
+    aged, results = with_(runtime, image_retention_days=90.0), []
 
     def step(name: str) -> None:
-        if name != "database" and not told:
-            told.append(do(aged))
+        if name != "database" and not results:
+            results.append(do(aged))
 
     manifest = back_up(runtime.settings, tmp_path / "one", step)
-    assert (manifest["images"], manifest["damaged"]) == (5, [])
-    assert (told[0]["images"], told[0]["files_removed"]) == (1, 0)
-    assert "back-up" in told[0]["note"]
+    assert (manifest.images, manifest.damaged) == (5, [])
+    assert (results[0]["images"], results[0]["files_removed"]) == (1, 0)
+    assert "back-up" in results[0]["note"]
     report = inspect_store(runtime.database, runtime.images, lambda _: None)
-    assert (report["bad"], report["unused"]) == ({}, 0)
+    assert (report.bad, report.unused) == ({}, 0)
     assert do(aged)["files_removed"] == 1
     assert kept(runtime, 9) == set()
-    assert back_up(runtime.settings, tmp_path / "two")["images"] == 4
+    assert back_up(runtime.settings, tmp_path / "two").images == 4
     restore(elsewhere, tmp_path / "two")
     database = Database(elsewhere.database)
-    assert is_sound(inspect_store(database, ImageStore(elsewhere.data_dir / "images"), lambda _: None))
+    images = ImageStore(elsewhere.data_dir / "images")
+    assert inspect_store(database, images, lambda _: None).is_sound
     totals_hold(database)
     database.close()
 
@@ -249,18 +288,20 @@ def test_check_does_not_call_lost_what_was_given_up_meanwhile(runtime: Runtime):
         if not done:
             done.append(do(with_(runtime, image_retention_days=90.0)))
 
-    assert is_sound(inspect_store(runtime.database, runtime.images, step))
+    assert inspect_store(runtime.database, runtime.images, step).is_sound
     assert done[0]["files_removed"] == 1
 
 
 def test_workers_begin_a_pruning_when_it_is_due_and_once(runtime: Runtime):
     def jobs() -> list[str]:
         with runtime.database.reading() as session:
-            rows = session.scalars(select(JobRow).where(JobRow.kind == "prunings").order_by(JobRow.id))
+            rows = session.scalars(
+                select(JobRow).where(JobRow.kind == "prunings").order_by(JobRow.id)
+            )
             return [row.idempotency_key or "" for row in rows]
 
     aged = with_(runtime, image_retention_days=90.0)
-    begin_due(aged, KINDS)
+    enqueue_due(aged, KINDS)
     assert jobs() == []
     with runtime.database.writing() as session:  # somebody else's key of the same text is no matter
         queue.add_job(session, "forecasts", {}, RESERVED, f"prunings-{now():%Y-%m-%d}")
@@ -269,7 +310,10 @@ def test_workers_begin_a_pruning_when_it_is_due_and_once(runtime: Runtime):
         Worker(aged, KINDS, "one", threading.Event())._purge()
     assert jobs() == [f"prunings-{now():%Y-%m-%d}"]
     Worker(with_(runtime, image_quota_gb=1e-9), KINDS, "two", threading.Event())._purge()
-    assert [len(key) for key in jobs()] == [len("prunings-2026-11-22"), len("prunings-2026-11-22T13")]
+    assert [len(key) for key in jobs()] == [
+        len("prunings-2026-11-22"),
+        len("prunings-2026-11-22T13"),
+    ]
     while Worker(aged, {"prunings": KINDS["prunings"]}, "three", threading.Event()).work():
         pass
     assert kept(runtime, *TODAYS, 9) == TODAYS
@@ -279,11 +323,15 @@ def test_image_of_two_photographs_is_accepted_where_one_is(runtime: Runtime):
     give(runtime, 50)
     totals_hold(runtime.database)
     with runtime.database.writing() as session:
-        row = session.scalars(select(MeasurementRow).where(MeasurementRow.image_sha256 == digest(picture(50)))).one()
-        heliostat, target = store.get_heliostat(session, "AA39"), store.get_target(session, "lower")
+        row = session.scalars(
+            select(MeasurementRow).where(MeasurementRow.image_sha256 == digest(picture(50)))
+        ).one()
+        setup.set_heliostat(session, "tester", "AB38", properties_document())
+        heliostat, target = store.get_heliostat(session, "AB38"), store.get_target(session, "lower")
         image = session.get_one(ImageRow, row.image_sha256)
         again = MeasurementRow(
-            kind="cropped",
+            kind="flux",
+            forced="both have it",
             target_id=target.id,
             sun_azimuth_deg=1.0,
             sun_elevation_deg=2.0,
@@ -300,5 +348,5 @@ def test_nothing_is_given_up_where_the_settings_keep_all(runtime: Runtime):
     age(runtime, 30_000, 1, 2, 3, 9)
     forever = with_(runtime)
     with runtime.database.reading() as session:
-        assert photographs.rules(session, forever.settings) == []
+        assert image_retention.retention_rules(session, forever.settings) == []
     assert do(forever)["images"] == 0

@@ -16,35 +16,44 @@ from model.errors import InvalidInputError
 from model.plant import TargetPlane
 from service import store
 from service.base.arrays import pack, unpack
-from service.base.faults import ConflictError, NotFoundError
-from service.store import keys, queue
+from service.base.errors import ConflictError, NotFoundError
+from service.store import keys
 from service.store.columns import now
 from service.store.database import Database
 from service.store.job_tables import KeyRow
+from service.store.jobs import queue
+from service.store.photographs.measurements import MeasurementFilter
 from service.store.rows import Change
-from service.store.surfaces import NewSurface
+from service.store.surfaces.surface_versions import NewSurface
 from service.store.tables import HeliostatRow, ImageRow, MeasurementRow, SurfaceRow, TargetRow
 from tests.service.conftest import ORIGIN
+from tests.waiting import WAIT_LIMIT_S
 
 PLANE = TargetPlane("lower", np.zeros(3), np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), 8.6, 7.2)
 
 
 def setup(session: Session) -> tuple[HeliostatRow, TargetRow]:
     store.put_plant(session, "plant", ORIGIN)
-    return store.put_heliostat(session, "AA39", {"a": 1}, (1, 2, 3))[0], store.put_target(session, PLANE)[0]
+    return store.put_heliostat(session, "AA39", {"a": 1}, (1, 2, 3))[0], store.put_target(
+        session, PLANE
+    )[0]
 
 
-def new(target: TargetRow, image: str = "a", kind: str = "flux", **changes: Any) -> tuple[ImageRow, MeasurementRow]:
+def new(
+    target: TargetRow, image: str = "a", kind: str = "flux", **changes: Any
+) -> tuple[ImageRow, MeasurementRow]:
     values: dict[str, Any] = {
         "kind": kind,
         "target_id": target.id,
-        "sun_azimuth_deg": 10.0,
+        "sun_azimuth_deg": 170.0,
         "sun_elevation_deg": 40.0,
         "accepted": True,
         "quality": {"accepted": True},
         "arrays": pack({"centered": np.ones((64, 64), np.float32)}),
     }
-    stored = ImageRow(sha256=image * 64, media_type="image/png", size_bytes=10, width_px=4, height_px=5)
+    stored = ImageRow(
+        sha256=image * 64, media_type="image/png", size_bytes=10, width_px=4, height_px=5
+    )
     return stored, MeasurementRow(**(values | changes))
 
 
@@ -55,7 +64,9 @@ def test_plant_target_and_heliostat_are_written_once(database: Database):
             assert store.put_target(session, PLANE)[1] is expected
             assert store.put_heliostat(session, "AA39", {"a": [1, None]}, (1, 2, 3))[1] is expected
     with database.writing() as session:
-        assert store.put_heliostat(session, "AA39", {"a": [2, None]}, (1, 2, 3))[1] is Change.CHANGED
+        assert (
+            store.put_heliostat(session, "AA39", {"a": [2, None]}, (1, 2, 3))[1] is Change.CHANGED
+        )
     with database.reading() as session:
         assert store.counts(session)["heliostats"] == 1
         plane = store.target_plane(store.get_target(session, "lower"))
@@ -129,7 +140,9 @@ def test_same_image_is_one_measurement(database: Database):
     with database.writing() as session:
         heliostat, target = setup(session)
         first, is_new = store.add_measurement(session, heliostat, *new(target, external_id="7"))
-        again, is_new_again = store.add_measurement(session, heliostat, *new(target, external_id="8"))
+        again, is_new_again = store.add_measurement(
+            session, heliostat, *new(target, external_id="8")
+        )
         assert (is_new, is_new_again) == (True, False)
         assert first.id == again.id
         assert store.counts(session)["measurements"] == 1
@@ -155,7 +168,9 @@ def test_same_image_of_two_heliostats_is_kept_once(database: Database):
         heliostat, target = setup(session)
         other, _ = store.put_heliostat(session, "AB12", {}, (0, 0, 0))
         store.add_measurement(session, heliostat, *new(target))
-        assert store.add_measurement(session, other, *new(target))[1]
+        image, forced = new(target)
+        forced.forced = "both have it"
+        assert store.add_measurement(session, other, image, forced)[1]
         assert store.counts(session) == {
             "heliostats": 2,
             "targets": 1,
@@ -167,7 +182,12 @@ def test_same_image_of_two_heliostats_is_kept_once(database: Database):
 
 
 def test_refused_image_keeps_its_reason_and_is_not_used(database: Database):
-    refused = {"accepted": False, "reason": "no_spot", "arrays": None, "quality": {"detail": "dark"}}
+    refused = {
+        "accepted": False,
+        "reason": "no_spot",
+        "arrays": None,
+        "quality": {"detail": "dark"},
+    }
     with database.writing() as session:
         heliostat, target = setup(session)
         row, _ = store.add_measurement(session, heliostat, *new(target, **refused))
@@ -193,7 +213,9 @@ def test_measurement_comes_back_as_it_was(database: Database):
             "focal_spot_wgs84": list(ORIGIN),
             "center_right_m": 0.5,
             "center_up_m": -1,
-            "arrays": pack({"flux": np.eye(256, dtype=np.float32), "centered": np.ones((64, 64), np.float32)}),
+            "arrays": pack(
+                {"flux": np.eye(256, dtype=np.float32), "centered": np.ones((64, 64), np.float32)}
+            ),
         }
         row, _ = store.add_measurement(session, heliostat, *new(target, **given))
     with database.reading() as session:
@@ -212,18 +234,30 @@ def test_pages_follow_each_other(database: Database):
         for name in ("C", "A", "B"):
             store.put_heliostat(session, name, {}, (0, 0, 0))
         for image in "abc":
-            store.add_measurement(session, heliostat, *new(target, image, accepted=image != "b", external_id=image))
+            store.add_measurement(
+                session, heliostat, *new(target, image, accepted=image != "b", external_id=image)
+            )
     with database.reading() as session:
         assert [row.name for row in store.list_heliostats(session, 2)] == ["A", "AA39"]
         assert [row.name for row in store.list_heliostats(session, 9, "AA39")] == ["B", "C"]
         listed = store.list_measurements(session, heliostat, 9, after="a")
         assert [row.identifier for row in listed] == ["b", "c"]
-        assert [row.identifier for row in store.list_measurements(session, heliostat, 9, accepted=False)] == ["b"]
+        assert [
+            row.identifier
+            for row in store.list_measurements(
+                session, heliostat, 9, filters=MeasurementFilter(accepted=False)
+            )
+        ] == ["b"]
 
 
 def surface(value: float = 0.0, **changes: Any) -> NewSurface:
     z = np.full((4, 8, 8), value)
-    return NewSurface(**({"source": "network", "z": z, "z_std": z, "control_points": np.stack([z] * 3, -1)} | changes))
+    return NewSurface(
+        **(
+            {"source": "network", "z": z, "z_std": z, "control_points": np.stack([z] * 3, -1)}
+            | changes
+        )
+    )
 
 
 def test_surfaces_are_versions_in_time(database: Database):
@@ -233,12 +267,15 @@ def test_surfaces_are_versions_in_time(database: Database):
         used, _ = store.add_measurement(session, heliostat, *new(target))
         for days in (0, 20, 10):
             moment = start + timedelta(days=days)
-            store.add_surface(session, heliostat, surface(days, valid_from=moment, measurements=[used]))
+            store.add_surface(
+                session, heliostat, surface(days, valid_from=moment, measurements=[used])
+            )
     with database.reading() as session:
         assert [row.version for row in store.list_surfaces(session, heliostat, 9)] == [1, 2, 3]
         assert [row.version for row in store.list_surfaces(session, heliostat, 9, after=2)] == [3]
         at = [
-            store.get_surface_at(session, heliostat, start + timedelta(days=days)).version for days in (1, 10, 19, 99)
+            store.get_surface_at(session, heliostat, start + timedelta(days=days)).version
+            for days in (1, 10, 19, 99)
         ]
         assert at == [1, 3, 3, 2]
         assert store.find_surface_at(session, heliostat, start - timedelta(seconds=1)) is None
@@ -250,11 +287,17 @@ def test_surfaces_are_versions_in_time(database: Database):
 def test_imported_surface_is_stored_once(database: Database):
     with database.writing() as session:
         heliostat, _ = setup(session)
-        results = [store.add_surface(session, heliostat, surface(v, source="measured"), once=True) for v in (1, 1, 2)]
+        results = [
+            store.add_surface(session, heliostat, surface(v, source="measured"), once=True)
+            for v in (1, 1, 2)
+        ]
         assert [is_new for _, is_new in results] == [True, False, True]
         assert [row.version for row, _ in results] == [1, 1, 2]
-        # predictions may repeat: each is a version of its own
-        assert [store.add_surface(session, heliostat, surface(1))[0].version for _ in range(2)] == [3, 4]
+        # predictions may repeat: each is a separate version
+        assert [store.add_surface(session, heliostat, surface(1))[0].version for _ in range(2)] == [
+            3,
+            4,
+        ]
 
 
 def test_many_writers_of_one_heliostat_make_one(database: Database):
@@ -291,7 +334,9 @@ def test_many_writers_of_one_measurement_in_other_kinds(database: Database):
     def write(kind: str) -> str:
         with database.writing() as session:
             heliostat = store.get_heliostat(session, "AA39")
-            measurement = new(store.get_target(session, "lower"), str(len(kind) % 10), kind, external_id="7")
+            measurement = new(
+                store.get_target(session, "lower"), f"{len(kind):x}", kind, external_id="7"
+            )
             return store.add_measurement(session, heliostat, *measurement)[0].identifier
 
     kinds = ["raw", "cropped", "flux", "flux-centered"]
@@ -334,7 +379,9 @@ def test_many_creators_of_a_key_make_one(database: Database):
 
 
 def test_what_another_writer_undoes_is_free_again(database: Database):
-    """The second of two writers waits for the first; where that one fails, the second is the one that wrote."""
+    """The second of two writers waits for the first; where that one fails, the second is the one
+    that wrote.
+    """
     waiting, failing = threading.Event(), RuntimeError("on purpose")
 
     def fail() -> None:
@@ -346,7 +393,7 @@ def test_what_another_writer_undoes_is_free_again(database: Database):
 
     with ThreadPoolExecutor(1) as pool:
         first = pool.submit(fail)
-        waiting.wait(10)
+        assert waiting.wait(WAIT_LIMIT_S)
         with database.writing() as session:
             row, change = store.put_heliostat(session, "AA39", {"a": 2}, (1, 2, 3))
         assert first.exception() is failing
@@ -370,7 +417,10 @@ def test_inserted_row_has_what_the_database_made(database: Database):
 
 
 def test_what_a_check_forbids_is_no_other_writers_fault(database: Database):
-    """It was told as too many writers, or not at all, while every broken constraint counted as a lost race."""
+    """It was reported as too many writers, or not at all.
+
+    The cause was that every violated constraint counted as a lost race.
+    """
     with database.writing() as session:
         heliostat, target = setup(session)
     with pytest.raises(IntegrityError, match="ck_measurements_kind"), database.writing() as session:
@@ -387,7 +437,9 @@ def test_what_a_check_forbids_is_no_other_writers_fault(database: Database):
 def test_outdated_surfaces_are_those_of_today_by_another_version_of_the_model(database: Database):
     with database.writing() as session:
         heliostat, _ = setup(session)
-        measured, bare = (store.put_heliostat(session, name, {}, (0, 0, 0))[0] for name in ("AB01", "AB02"))
+        measured, bare = (
+            store.put_heliostat(session, name, {}, (0, 0, 0))[0] for name in ("AB01", "AB02")
+        )
         store.add_surface(session, heliostat, surface(1, model_version="1:none"))
         store.add_surface(session, measured, surface(2, source="measured"))
         assert bare.id
@@ -397,13 +449,13 @@ def test_outdated_surfaces_are_those_of_today_by_another_version_of_the_model(da
         assert store.outdated_surfaces(session, "2:slope_error") == [expected]
         heliostat = store.get_heliostat(session, "AA39")
         row, _ = store.add_surface(session, heliostat, surface(3, model_version="2:slope_error"))
-        row.set_aside = True
+        row.is_candidate = True
     with database.reading() as session:
         assert store.outdated_surfaces(session, "2:slope_error") == [replace(expected, waits=True)]
 
 
 def test_plans_are_listed_newest_first_under_way_or_done(database: Database):
-    payload = {"name": "June", "target": "lower", "begin": "2026-06-21T04:00:00Z"}
+    payload = {"name": "June", "target": "lower", "first_at": "2026-06-21T04:00:00Z"}
     with database.writing() as session:
         first, _ = queue.add_job(session, "plans", payload, "tester", None)
         first.result, first.state = {"peak_w_m2": 1.5}, "done"

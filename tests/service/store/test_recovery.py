@@ -1,11 +1,13 @@
-"""Back-up, restore and check, on both databases: what comes back is what was there, and nothing is overwritten."""
+"""Back-up, restore and check, on both databases: what comes back is what was there, and nothing is
+overwritten.
+"""
 
 import json
 import shutil
 import threading
 import uuid
 from collections.abc import Iterator
-from datetime import timedelta
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -16,22 +18,33 @@ from typer.testing import CliRunner
 
 from model.errors import InvalidInputError
 from service import store
-from service.base.faults import ConflictError
+from service.base.errors import ConflictError
+from service.base.fields import Sun
 from service.base.settings import Settings
 from service.cli.main import app as cli
-from service.store import queue
-from service.store.backup import back_up, images_of, restore
-from service.store.check import inspect_store, is_sound
 from service.store.columns import Base
 from service.store.database import Database, migrate
 from service.store.job_tables import JobRow, JobStepRow
+from service.store.jobs import queue
+from service.store.recovery.backup import back_up, images_of, restore
+from service.store.recovery.check import inspect_store
 from service.store.tables import MeasurementRow
-from service.twin.ingest import Photograph, ingest
-from service.twin.prediction import predict_surface
-from service.twin.runtime import Runtime
-from tests.service.conftest import ORIGIN, POSTGRES, FakeOperations, png, properties_document, tower_document
+from service.twin.photographs.ingest import Photograph, ingest
+from service.twin.runtime.runtime import Runtime
+from service.twin.surfaces.prediction import predict_surface
+from tests.service.conftest import (
+    ORIGIN,
+    POSTGRES,
+    FakeOperations,
+    png,
+    properties_document,
+    sun_at,
+    tower_document,
+)
 
-PHOTOGRAPH = Photograph("lower", "flux", 20.0, 45.0)
+PHOTOGRAPH = Photograph(
+    "lower", "flux", Sun(**sun_at()), taken_at=datetime(2024, 6, 1, 12, tzinfo=UTC)
+)
 
 
 def plain(url: URL) -> str:
@@ -43,7 +56,9 @@ def runtime(store_url: URL, tmp_path: Path, operations: FakeOperations) -> Itera
     """A store with a plant, a heliostat, four photographs, a surface and a job."""
     from service.sources.documents import read_targets
 
-    opened = Runtime.from_settings(Settings(data_dir=tmp_path / "data", database_url=plain(store_url)), operations)
+    opened = Runtime.from_settings(
+        Settings(data_dir=tmp_path / "data", database_url=plain(store_url)), operations
+    )
     with opened.database.writing() as session:
         store.put_plant(session, "plant", ORIGIN)
         for plane in read_targets(tower_document())[1].values():
@@ -77,20 +92,25 @@ def contents(database: Database) -> dict[str, list[Any]]:
     """Every row of every table."""
     with database.engine.connect() as connection:
         return {
-            name: [tuple(row) for row in connection.execute(select(table).order_by(*table.primary_key))]
+            name: [
+                tuple(row) for row in connection.execute(select(table).order_by(*table.primary_key))
+            ]
             for name, table in Base.metadata.tables.items()
         }
 
 
 def test_what_comes_back_is_what_was_there(runtime: Runtime, elsewhere: Settings, tmp_path: Path):
     manifest = back_up(runtime.settings, tmp_path / "one")
-    assert (manifest["images"], manifest["damaged"]) == (5, [])
+    assert (manifest.images, manifest.damaged) == (5, [])
     before = contents(runtime.database)
-    assert all(before[name] for name in ("measurements", "surfaces", "surface_measurements", "drift", "jobs", "audit"))
+    assert all(
+        before[name]
+        for name in ("measurements", "surfaces", "surface_measurements", "drift", "jobs", "audit")
+    )
     restore(elsewhere, tmp_path / "one")
     database = Database(elsewhere.database)
     assert contents(database) == before
-    assert is_sound(inspect_store(database, images_of(elsewhere), lambda _: None))
+    assert inspect_store(database, images_of(elsewhere), lambda _: None).is_sound
     restored = Runtime.from_settings(elsewhere, runtime.operations)
     row, is_new = ingest(restored, "AA39", PHOTOGRAPH, png(20))  # numbers go on after the last
     assert is_new
@@ -100,7 +120,9 @@ def test_what_comes_back_is_what_was_there(runtime: Runtime, elsewhere: Settings
     database.close()
 
 
-def test_back_up_while_photographs_come_is_of_one_moment(runtime: Runtime, elsewhere: Settings, tmp_path: Path):
+def test_back_up_while_photographs_come_is_of_one_moment(
+    runtime: Runtime, elsewhere: Settings, tmp_path: Path
+):
     stop, sent = threading.Event(), []
 
     def send() -> None:
@@ -119,7 +141,7 @@ def test_back_up_while_photographs_come_is_of_one_moment(runtime: Runtime, elsew
         thread.join()
     restore(elsewhere, tmp_path / "one")
     database = Database(elsewhere.database)
-    assert is_sound(inspect_store(database, images_of(elsewhere), lambda _: None))
+    assert inspect_store(database, images_of(elsewhere), lambda _: None).is_sound
     with database.reading() as session:
         assert set(acknowledged) <= set(session.scalars(select(MeasurementRow.identifier)))
     database.close()
@@ -146,12 +168,22 @@ def _flip(path: Path) -> None:
 
 
 @pytest.mark.parametrize("what", ["database", "image", "lost image", "list", "manifest"])
-def test_damaged_back_up_is_not_restored(runtime: Runtime, elsewhere: Settings, tmp_path: Path, what: str):
+def test_damaged_back_up_is_not_restored(
+    runtime: Runtime, elsewhere: Settings, tmp_path: Path, what: str
+):
     folder = tmp_path / "one"
     back_up(runtime.settings, folder)
     image = next(path for path in (folder / "images").rglob("*") if path.is_file())
-    database = next(path for path in folder.iterdir() if path.name in ("database.sqlite", "measurements.copy.gz"))
-    file = {"database": database, "list": folder / "images.txt", "manifest": folder / "manifest.json"}.get(what, image)
+    database = next(
+        path
+        for path in folder.iterdir()
+        if path.name in ("database.sqlite", "measurements.copy.gz")
+    )
+    file = {
+        "database": database,
+        "list": folder / "images.txt",
+        "manifest": folder / "manifest.json",
+    }.get(what, image)
     if what == "manifest":
         file.write_text(file.read_text()[:-20])
     elif what == "lost image":
@@ -175,7 +207,9 @@ def test_restore_that_is_interrupted_can_be_tried_again(
     back_up(runtime.settings, tmp_path / "one")
     on_sqlite = elsewhere.database.get_backend_name() == "sqlite"
     with monkeypatch.context() as broken:
-        broken.setattr("shutil.copyfile" if on_sqlite else "service.store.backup._copy_in", interrupt)
+        broken.setattr(
+            "shutil.copyfile" if on_sqlite else "service.store.recovery.backup._copy_in", interrupt
+        )
         with pytest.raises(KeyboardInterrupt):
             restore(elsewhere, tmp_path / "one")
     restore(elsewhere, tmp_path / "one")
@@ -184,20 +218,24 @@ def test_restore_that_is_interrupted_can_be_tried_again(
     database.close()
 
 
-def test_damaged_image_in_the_store_ends_no_back_up(runtime: Runtime, elsewhere: Settings, tmp_path: Path):
+def test_damaged_image_in_the_store_ends_no_back_up(
+    runtime: Runtime, elsewhere: Settings, tmp_path: Path
+):
     image = next(path for path in runtime.images.root.rglob("*") if path.is_file())
     _flip(image)
     manifest = back_up(runtime.settings, tmp_path / "one")
-    assert len(manifest["damaged"]) == 1
-    assert manifest["images"] == 4
+    assert len(manifest.damaged) == 1
+    assert manifest.images == 4
     restore(elsewhere, tmp_path / "one")
     database = Database(elsewhere.database)
     report = inspect_store(database, images_of(elsewhere), lambda _: None)
-    assert [found["reason"] for found in report["bad"].values()] == ["missing"]
+    assert [found["reason"] for found in report.bad.values()] == ["missing"]
     database.close()
 
 
-def test_back_up_of_another_engine_or_a_newer_schema_is_refused(runtime: Runtime, elsewhere: Settings, tmp_path: Path):
+def test_back_up_of_another_engine_or_a_newer_schema_is_refused(
+    runtime: Runtime, elsewhere: Settings, tmp_path: Path
+):
     folder = tmp_path / "one"
     back_up(runtime.settings, folder)
     document = json.loads((folder / "manifest.json").read_text())
@@ -206,19 +244,21 @@ def test_back_up_of_another_engine_or_a_newer_schema_is_refused(runtime: Runtime
         with pytest.raises(InvalidInputError):
             restore(elsewhere, folder)
     for text, says in (
-        ("{", "is no JSON, wrong at line 1, column 2"),
+        ("{", "is no JSON, wrong at line 1, column 1"),
         ("[]", "must be a JSON object"),
-        (json.dumps({"format": document["format"]}), "has no engine, revision"),
+        (json.dumps({"format": document["format"]}), "engine: is missing"),
     ):
         (folder / "manifest.json").write_text(text)
         with pytest.raises(InvalidInputError, match=says):
             restore(elsewhere, folder)
 
 
-def test_back_up_of_an_older_schema_comes_back_and_is_upgraded(runtime: Runtime, elsewhere: Settings, tmp_path: Path):
+def test_back_up_of_an_older_schema_comes_back_and_is_upgraded(
+    runtime: Runtime, elsewhere: Settings, tmp_path: Path
+):
     runtime.database.downgrade("0003")
     try:
-        assert back_up(runtime.settings, tmp_path / "one")["revision"] == "0003"
+        assert back_up(runtime.settings, tmp_path / "one").revision == "0003"
     finally:
         runtime.database.upgrade()
     elsewhere.data_dir.mkdir()
@@ -230,11 +270,14 @@ def test_back_up_of_an_older_schema_comes_back_and_is_upgraded(runtime: Runtime,
     database.close()
 
 
-# --- check ------------------------------------------------------------------------------------------------------------
+# --- check
+# --------------------------------------------------------------------------------------------------
 
 
 def test_check_names_what_is_lost(runtime: Runtime, monkeypatch: pytest.MonkeyPatch):
-    first, second, third, *_ = sorted(path for path in runtime.images.root.rglob("*") if path.is_file())
+    first, second, third, *_ = sorted(
+        path for path in runtime.images.root.rglob("*") if path.is_file()
+    )
     _flip(first)
     second.write_bytes(second.read_bytes()[:10])
     third.unlink()
@@ -245,11 +288,9 @@ def test_check_names_what_is_lost(runtime: Runtime, monkeypatch: pytest.MonkeyPa
     done = CliRunner().invoke(cli, ["check", "--json"])
     assert done.exit_code == 1
     report = json.loads(done.stdout)
-    assert [report["bad"][path.parent.name + path.name]["reason"] for path in (first, second, third)] == [
-        "damaged",
-        "damaged",
-        "missing",
-    ]
+    assert [
+        report["bad"][path.parent.name + path.name]["reason"] for path in (first, second, third)
+    ] == ["damaged", "damaged", "missing"]
     assert all(found["measurements"][0].startswith("AA39/") for found in report["bad"].values())
     assert (report["unused"], report["leftovers"]) == (1, 1)
     for seed in (0, 1, 2, 3, 9):  # posted again, they are whole again
@@ -257,7 +298,9 @@ def test_check_names_what_is_lost(runtime: Runtime, monkeypatch: pytest.MonkeyPa
     assert CliRunner().invoke(cli, ["check"]).exit_code == 0
 
 
-def test_verbs_of_the_command_line(runtime: Runtime, elsewhere: Settings, tmp_path: Path, monkeypatch: Any):
+def test_verbs_of_the_command_line(
+    runtime: Runtime, elsewhere: Settings, tmp_path: Path, monkeypatch: Any
+):
     folder = str(tmp_path / "one")
     monkeypatch.setenv("HELIOTWIN_DATA_DIR", str(runtime.settings.data_dir))
     monkeypatch.setenv("HELIOTWIN_DATABASE_URL", str(runtime.settings.database_url))
@@ -274,14 +317,15 @@ def test_verbs_of_the_command_line(runtime: Runtime, elsewhere: Settings, tmp_pa
     shutil.rmtree(folder)
 
 
-# --- jobs that are old ------------------------------------------------------------------------------------------------
+# --- jobs that are old
+# ------------------------------------------------------------------------------------------------
 
 
 def test_old_jobs_are_deleted_and_numbers_are_not_given_twice(runtime: Runtime):
     with runtime.database.writing() as session:
         for _ in range(5):
             queue.add_job(session, "squares", {}, "tester")
-        at = queue.clock(session)
+        at = queue.database_time(session)
         session.execute(update(JobRow).values(state="done", finished_at=at - timedelta(days=10)))
         numbers = sorted(session.scalars(select(JobRow.id)))
         for number, state in ((numbers[1], "running"), (numbers[2], "failed")):
@@ -296,13 +340,17 @@ def test_old_jobs_are_deleted_and_numbers_are_not_given_twice(runtime: Runtime):
 
 
 def test_clock_that_was_set_back_stalls_no_queue(runtime: Runtime):
-    """Moments that lie further ahead than any pause or lease are those of a clock that was wrong."""
+    """Moments that lie further ahead than any pause or lease are those of a clock that
+    was wrong.
+    """
     with runtime.database.writing() as session:
-        session.execute(update(JobRow).values(not_before=queue.clock(session) + timedelta(hours=5)))
+        session.execute(
+            update(JobRow).values(not_before=queue.database_time(session) + timedelta(hours=5))
+        )
         row = queue.claim(session, ["predictions"], "one", 30.0, 3)
         assert row is not None
         assert not queue.has_claimable(session, ["predictions"], 30.0)
-        row.lease_until = queue.clock(session) + timedelta(hours=5)
+        row.lease_until = queue.database_time(session) + timedelta(hours=5)
         session.flush()
         taken = queue.claim(session, ["predictions"], "two", 30.0, 3)
         assert taken is not None

@@ -1,14 +1,16 @@
-"""What is worked out in the background: once for each key, whoever asks meanwhile."""
+"""Background computations: once for each key, however many requests arrive meanwhile."""
 
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
 
-from service.twin import field
-from service.twin.book import Book
-from tests.service.conftest import FakeOperations, Post, png
+from service.twin.alerts import field_overview
+from service.twin.runtime.background_cache import BackgroundCache
+from tests.service.conftest import FakeOperations, Post, png, sun_at
+from tests.waiting import WAIT_LIMIT_S, until
 
 
 def test_what_is_under_way_is_neither_queued_again_nor_done_twice():
@@ -16,19 +18,19 @@ def test_what_is_under_way_is_neither_queued_again_nor_done_twice():
 
     def work(key: str) -> str:
         began.set()
-        go.wait(30)
+        go.wait(WAIT_LIMIT_S)
         done.append(key)
         return key.upper()
 
-    book: Book[str, str] = Book(work, "", "test", 10)
-    assert book.look_up(["a", "b"]) == ({}, 2)
-    assert began.wait(30)
+    cache: BackgroundCache[str, str] = BackgroundCache(work, "", "test", 10)
+    assert cache.get_many(["a", "b"]) == ({}, 2)
+    assert began.wait(WAIT_LIMIT_S)
     # As a page asks that looks again before its first answer is there.
-    assert book.look_up(["a", "b"]) == ({}, 2)
-    assert book.wait_for("a", 0) is None
+    assert cache.get_many(["a", "b"]) == ({}, 2)
+    assert cache.wait_for("a", 0) is None
     go.set()
-    assert (book.wait_for("a", 30), book.wait_for("b", 30)) == ("A", "B")
-    book.close()
+    assert (cache.wait_for("a", WAIT_LIMIT_S), cache.wait_for("b", WAIT_LIMIT_S)) == ("A", "B")
+    cache.close()
     assert done == ["a", "b"]
 
 
@@ -36,22 +38,44 @@ def test_what_fails_has_an_answer_too_and_the_rest_is_done():
     def work(key: int) -> float:
         return 1 / key
 
-    book: Book[int, float] = Book(work, -1.0, "test", 2)
-    assert [book.wait_for(key, 30) for key in (0, 1, 2)] == [-1.0, 1.0, 0.5]
-    assert book.look_up([0, 1, 2])[0] == {1: 1.0, 2: 0.5}
-    book.close()
-    assert book.wait_for(4, 30) is None
+    cache: BackgroundCache[int, float] = BackgroundCache(work, -1.0, "test", 2)
+    assert [cache.wait_for(key, WAIT_LIMIT_S) for key in (0, 1, 2)] == [-1.0, 1.0, 0.5]
+    assert cache.get_many([0, 1, 2])[0] == {1: 1.0, 2: 0.5}
+    cache.close()
+    assert cache.wait_for(4, WAIT_LIMIT_S) is None
+
+
+def test_a_key_that_a_caller_waits_for_is_computed_though_others_ask_for_other_keys():
+    began, go = threading.Event(), threading.Event()
+
+    def work(key: str) -> str:
+        began.set()
+        go.wait(WAIT_LIMIT_S)
+        return key.upper()
+
+    cache: BackgroundCache[str, str] = BackgroundCache(work, "", "test", 10)
+    assert cache.get_many(["a", "a"]) == ({}, 1)
+    assert began.wait(WAIT_LIMIT_S)
+    with ThreadPoolExecutor(1) as threads:
+        answer = threads.submit(cache.wait_for, "b", WAIT_LIMIT_S)
+        until(lambda: "b" in cache.awaited, "a caller waits")
+        assert cache.get_many(["c"]) == ({}, 1)
+        go.set()
+        assert answer.result() == "B"
+    cache.close()
 
 
 def test_who_waits_a_while_has_what_is_quick():
-    book: Book[int, int] = Book(lambda key: 2 * key, 0, "test", 10)
-    assert book.look_up([1, 2, 3], 30) == ({1: 2, 2: 4, 3: 6}, 0)
-    book.close()
+    cache: BackgroundCache[int, int] = BackgroundCache(lambda key: 2 * key, 0, "test", 10)
+    assert cache.get_many([1, 2, 3], WAIT_LIMIT_S) == ({1: 2, 2: 4, 3: 6}, 0)
+    cache.close()
 
 
-def test_the_field_reads_one_version_of_each_heliostat(client: TestClient, post: Post, monkeypatch: pytest.MonkeyPatch):
+def test_the_field_reads_one_version_of_each_heliostat(
+    client: TestClient, post: Post, monkeypatch: pytest.MonkeyPatch
+):
     for number in range(1, 4):
-        assert post(png(number), sun_azimuth=-10.0 * number).status_code == 201
+        assert post(png(number), sun=sun_at(180 + 10.0 * number)).status_code == 201
         assert client.post("/v1/heliostats/AA39/surfaces", json={}).status_code == 201
     read = []
 
@@ -59,10 +83,10 @@ def test_the_field_reads_one_version_of_each_heliostat(client: TestClient, post:
         read.append(values)
         return current(*values)
 
-    current = field.Current
-    monkeypatch.setattr(field, "Current", counted)
+    current = field_overview.ActiveSurface
+    monkeypatch.setattr(field_overview, "ActiveSurface", counted)
     with client.app.state.runtime.database.reading() as session:  # type: ignore[attr-defined]
-        (line,) = field.read_lines(session)
+        (line,) = field_overview.read_summaries(session)
     assert line.surface is not None
     assert line.surface.version == 3
     assert len(read) == 1
@@ -81,7 +105,7 @@ def test_the_heliostats_page_is_traced_once_for_what_it_depends_on(
         return operations.rendered - before
 
     assert [traced(), traced(), traced()] == [1, 0, 0]
-    assert post(png(2), sun_azimuth=-30.0).status_code == 201
+    assert post(png(2), sun=sun_at(210.0)).status_code == 201
     assert [traced(), traced()] == [1, 0]
     assert client.post("/v1/heliostats/AA39/surfaces", json={}).status_code == 201
     assert [traced(), traced(), traced("/heliostats/AA39?version=1")] == [1, 0, 0]

@@ -13,7 +13,7 @@ from service import store
 from service.base.settings import Settings
 from service.store.columns import now
 from service.store.tables import ImageRow, MeasurementRow
-from service.twin.cameras import FIGURES, find_change
+from service.twin.studies.camera_watch import FIGURES, find_camera_change
 from tests.service.web.test_pages import HTML
 
 SETTINGS = Settings()
@@ -21,8 +21,12 @@ SPREAD = (0.16, 0.2, 0.17)
 """How much days differ at Jülich's lower target (`python -m tests.benchmarks.cameras`)."""
 
 
-def days(rng: np.random.Generator, count: int, factor: float = 1.0, last: int = 0) -> dict[date, Any]:
-    """Medians of so many days, on the ``last`` of which the spot stands out ``factor`` times as much."""
+def days(
+    rng: np.random.Generator, count: int, factor: float = 1.0, last: int = 0
+) -> dict[date, Any]:
+    """Medians of ``count`` days; on the ``last`` of them the spot's contrast is ``factor`` times
+    as high.
+    """
     values = rng.normal(0.8, 1.0, (count, 3)) * SPREAD
     if last:
         values[-last:, 0] += np.log(factor)
@@ -33,7 +37,7 @@ def days(rng: np.random.Generator, count: int, factor: float = 1.0, last: int = 
 def test_change_is_found_with_its_day(factor: float):
     rng = np.random.default_rng(3)
     for _ in range(20):
-        found = find_change("lower", days(rng, 40, factor, 7), SETTINGS)
+        found = find_camera_change("lower", days(rng, 40, factor, 7), SETTINGS)
         assert found is not None
         assert (found.target, found.figure) == ("lower", "signal_to_background")
         assert abs((found.day - date(2024, 7, 6)).days) <= 4
@@ -43,44 +47,64 @@ def test_change_is_found_with_its_day(factor: float):
 
 def test_days_as_they_are_raise_no_alarm():
     rng = np.random.default_rng(4)
-    assert sum(find_change("lower", days(rng, 45), SETTINGS) is not None for _ in range(200)) <= 4
+    assert (
+        sum(find_camera_change("lower", days(rng, 45), SETTINGS) is not None for _ in range(200))
+        <= 4
+    )
 
 
 def test_one_odd_day_and_too_few_days_are_no_change():
     rng = np.random.default_rng(5)
     for last in (1, 2):
-        assert find_change("lower", days(rng, 40, 4.0, last), SETTINGS) is None
-    assert find_change("lower", days(rng, 12, 4.0, 6), SETTINGS) is None
+        assert find_camera_change("lower", days(rng, 40, 4.0, last), SETTINGS) is None
+    assert find_camera_change("lower", days(rng, 12, 4.0, 6), SETTINGS) is None
 
 
 def kept(app: FastAPI, changed: int) -> None:
-    """Four photographs on each of thirty days, on the last of which, so many, the camera sees otherwise."""
+    """Four photographs on each of thirty days, on the last of which, so many, the camera sees
+    otherwise.
+    """
     rng, at = np.random.default_rng(6), now().replace(hour=11) - timedelta(days=30)
     with app.state.runtime.database.writing() as session:
         heliostat, target = store.get_heliostat(session, "AA39"), store.get_target(session, "lower")
         for number in range(120):
             quality = dict(zip(FIGURES, np.exp(rng.normal((0.8, 5.5, -3.6), SPREAD)), strict=True))
             quality["sheet_share"] *= 3.0 if number // 4 >= 30 - changed else 1.0
-            known: dict[str, Any] = {"kind": "flux", "target_id": target.id, "accepted": True, "quality": quality}
-            sun = {"sun_azimuth_deg": 0.0, "sun_elevation_deg": 40.0}
+            known: dict[str, Any] = {
+                "kind": "flux",
+                "target_id": target.id,
+                "accepted": True,
+                "quality": quality,
+            }
+            sun = {"sun_azimuth_deg": 180.0, "sun_elevation_deg": 40.0}
             image = {"sha256": f"{number:03x}" + 61 * "0", "media_type": "image/png"}
-            row = MeasurementRow(**known, **sun, taken_at=at + timedelta(days=number // 4, minutes=number % 4))
-            store.add_measurement(session, heliostat, ImageRow(**image, size_bytes=1, width_px=1, height_px=1), row)
+            row = MeasurementRow(
+                **known, **sun, taken_at=at + timedelta(days=number // 4, minutes=number % 4)
+            )
+            store.add_measurement(
+                session, heliostat, ImageRow(**image, size_bytes=1, width_px=1, height_px=1), row
+            )
 
 
 def of_camera(client: TestClient) -> list[dict[str, Any]]:
-    return [item for item in client.get("/v1/attention").json()["items"] if item["reason"] == "camera"]
+    return [
+        item for item in client.get("/v1/attention").json()["items"] if item["reason"] == "camera"
+    ]
 
 
 def test_changed_camera_needs_attention_without_a_study(app: FastAPI, client: TestClient):
     kept(app, 8)
     (item,) = of_camera(client)
     since = (now() - timedelta(days=8)).date()
-    assert abs(datetime.fromisoformat(item["since"]) - datetime(since.year, since.month, since.day, tzinfo=UTC)) <= (
-        timedelta(days=2)
+    assert abs(
+        datetime.fromisoformat(item["since"])
+        - datetime(since.year, since.month, since.day, tzinfo=UTC)
+    ) <= (timedelta(days=2))
+    assert item["message"].startswith("on lower the sheet's own pattern is ")
+    assert (
+        'heliotwin_camera_change_ratio{figure="sheet_share",target="lower"} '
+        in client.get("/metrics").text
     )
-    assert item["what"].startswith("on lower the sheet's own pattern is ")
-    assert 'heliotwin_camera_change_ratio{figure="sheet_share",target="lower"} ' in client.get("/metrics").text
     assert "On lower the sheet&#39;s own pattern is " in client.get("/attention", headers=HTML).text
     client.post("/v1/attention/acknowledgements", json={"ids": [item["id"]]})
     assert of_camera(client)[0]["acknowledged_by"] == "local"
@@ -90,6 +114,8 @@ def test_days_before_today_are_read_once(app: FastAPI, client: TestClient):
     kept(app, 0)
     assert of_camera(client) == []
     asked: list[str] = []
-    event.listen(app.state.runtime.database.engine, "before_cursor_execute", lambda *a: asked.append(a[2]))
+    event.listen(
+        app.state.runtime.database.engine, "before_cursor_execute", lambda *a: asked.append(a[2])
+    )
     assert of_camera(client) == []
     assert sum("measurements.quality" in one for one in asked) == 1

@@ -1,4 +1,6 @@
-"""Tiles of a fleet forecast on a Ray cluster of two worker processes: the same light, whatever happens to a worker."""
+"""Tiles of a fleet forecast on a Ray cluster of two worker processes: the same light, whatever
+happens to a worker.
+"""
 
 import os
 import signal
@@ -12,29 +14,32 @@ import numpy as np
 import pytest
 
 from model.fleet import FleetFlux, Superposition, Tile, aligned_field, superpose, tiles
-from model.forecast import Setup
 from model.frames import sun_direction
-from model.plant import JUELICH_LATITUDE, Heliostat
+from model.plant import Heliostat
+from model.plant_model import JUELICH_MODEL
+from model.setup import Setup
 from model.surface import control_points
-from service.base.faults import ConflictError
+from service.base.errors import ConflictError
 from service.jobs.kinds import KINDS
 from service.jobs.worker import Worker
-from service.twin.engines import Ray, Threads, engine_of
+from service.twin.runtime.engines import Ray, Threads, engine_of
 from tests.conftest import target
 from tests.service.twin.test_field_light import FLEET, field, runtime_of  # noqa: F401  # a fixture
 
-SUN = sun_direction(20.0, 30.0)
+SUN = sun_direction(160.0, 30.0)
 
 
 def some_tiles() -> list[Tile]:
     positions = [np.array([-20.0 + 5 * (i % 8), 60.0 + 5 * (i // 8), 1.8]) for i in range(32)]
-    heliostats = [Heliostat.juelich(f"H{i}", position, 80.0) for i, position in enumerate(positions)]
+    heliostats = [
+        Heliostat.juelich(f"H{i}", position, 80.0) for i, position in enumerate(positions)
+    ]
     plane = target(10.0)
     shots = [Setup(one, control_points(one), SUN, plane) for one in heliostats]
     return list(
         tiles(
             shots,
-            aligned_field([(one, plane.center) for one in heliostats], SUN, latitude_deg=JUELICH_LATITUDE),
+            aligned_field([(one, plane.center) for one in heliostats], SUN, JUELICH_MODEL),
             size=8,
         )
     )
@@ -53,7 +58,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning:ray", "ignore::Re
 
 @pytest.mark.parametrize("count", [1, 3])
 def test_threads_give_the_same_light_whatever_their_number(count: int):
-    task, parts = Superposition(target(10.0), (32, 32), latitude_deg=JUELICH_LATITUDE), some_tiles()
+    task, parts = Superposition(target(10.0), JUELICH_MODEL, (32, 32)), some_tiles()
     expected, made = superpose(task, parts), superpose(task, parts, Threads(count))
     assert (made.heliostats, made.power) == (expected.heliostats, expected.power)
     np.testing.assert_array_equal(made.irradiance, expected.irradiance)
@@ -61,7 +66,7 @@ def test_threads_give_the_same_light_whatever_their_number(count: int):
 
 @pytest.mark.slow
 def test_cluster_gives_the_same_light_also_where_a_worker_is_killed(cluster: Any, tmp_path: Path):
-    task, parts = Superposition(target(10.0), (32, 32), latitude_deg=JUELICH_LATITUDE), some_tiles()
+    task, parts = Superposition(target(10.0), JUELICH_MODEL, (32, 32)), some_tiles()
     expected = superpose(task, parts, Threads(1))
     begun = tmp_path / "begun"
 
@@ -81,12 +86,15 @@ def test_cluster_gives_the_same_light_also_where_a_worker_is_killed(cluster: Any
 
     made = list(Ray("local").map(Killing(), parts))
     killed, successor = (int(line) for line in begun.read_text().splitlines())
-    # How many workers share the other tiles is the cluster's affair: one may be fast enough for all.
+    # How many workers share the other tiles is the cluster's affair: one may be fast enough for
+    # all.
     assert [process for process, _ in made][1] == successor != killed
     assert len(made) == len(parts) > 2
     total = sum((flux for _, flux in made), FleetFlux(np.zeros(task.resolution)))
     assert (total.heliostats, total.skipped) == (32, {})
-    np.testing.assert_allclose(total.irradiance.clip(min=0), expected.irradiance, atol=1e-6 * expected.irradiance.max())
+    np.testing.assert_allclose(
+        total.irradiance.clip(min=0), expected.irradiance, atol=1e-6 * expected.irradiance.max()
+    )
     assert total.power == pytest.approx(expected.power, rel=1e-6)
 
 
@@ -96,9 +104,11 @@ def test_service_forecasts_on_the_cluster(cluster: Any, field: Any):  # noqa: F8
     runtime = runtime_of(field)
     fluxes = []
     for address in (None, "local"):
-        object.__setattr__(runtime, "settings", runtime.settings.model_copy(update={"ray_address": address}))
+        object.__setattr__(
+            runtime, "settings", runtime.settings.model_copy(update={"ray_address": address})
+        )
         assert isinstance(engine_of(runtime), Threads if address is None else Ray)
-        job = field.post("/v1/forecasts", json=FLEET).headers["Location"]
+        job = field.post("/v1/jobs/forecasts", json=FLEET).headers["Location"]
         assert Worker(runtime, KINDS, "tester", threading.Event()).work()
         assert field.get(job).json()["state"] == "done", field.get(job).json()["reason"]
         fluxes.append(np.array(field.get(f"{job}/flux").json()["flux"]))

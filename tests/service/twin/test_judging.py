@@ -1,26 +1,35 @@
-"""Which of two surfaces is today's, by gains of accuracy on photographs and by what speaks for each before."""
+"""Which of two surfaces is active, by accuracy gains on photographs and by precedence."""
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from service.twin.judging import LEAST_UNSEEN, Standing, decide, standing_of
+from service.twin.surfaces.evaluation import (
+    MIN_HELD_OUT,
+    Precedence,
+    precedence_of,
+    promote_or_reject,
+    promote_or_reject_first,
+)
 
-MEASURED, REFINED, NETWORK = (standing_of(source, None) for source in ("measured", "refined", "network"))
-DOUBTED = standing_of("refined", False)
-OUTDATED = standing_of("refined", True, is_outdated=True)
-# Sure gains and losses, and what chance makes of the same mirror: the mean is above zero, its interval holds zero.
+MEASURED, REFINED, NETWORK = (
+    precedence_of(source, None) for source in ("measured", "refined", "network")
+)
+UNTRUSTED = precedence_of("refined", False)
+OUTDATED = precedence_of("refined", True, is_outdated=True)
+# Sure gains and losses, and what chance makes of the same mirror: the mean is above zero, its
+# interval holds zero.
 BETTER, WORSE = np.full(6, 0.05), np.full(6, -0.05)
 CHANCE = np.array([0.06, -0.05, 0.04, -0.03, 0.05, -0.02])
 
 
 @pytest.mark.parametrize(
-    ("gains", "unseen", "stood", "comes", "taken"),
+    ("gains", "unseen", "current", "candidate", "taken"),
     [
         (BETTER, 6, MEASURED, REFINED, True),
-        (BETTER, 6, MEASURED, DOUBTED, False),  # only somebody may
-        (BETTER, 6, REFINED, DOUBTED, True),
-        (BETTER, LEAST_UNSEEN - 1, MEASURED, REFINED, False),
+        (BETTER, 6, MEASURED, UNTRUSTED, False),  # only somebody may
+        (BETTER, 6, REFINED, UNTRUSTED, True),
+        (BETTER, MIN_HELD_OUT - 1, MEASURED, REFINED, False),
         (BETTER, 0, MEASURED, REFINED, False),
         (CHANCE, 6, MEASURED, REFINED, False),
         (CHANCE, 6, REFINED, NETWORK, False),
@@ -30,12 +39,48 @@ CHANCE = np.array([0.06, -0.05, 0.04, -0.03, 0.05, -0.02])
         (WORSE, 6, NETWORK, REFINED, False),
         (WORSE, 0, NETWORK, REFINED, True),  # both were made to fit these photographs, or one was
         (WORSE, 0, OUTDATED, NETWORK, True),
-        (WORSE, 0, DOUBTED, NETWORK, True),
+        (WORSE, 0, UNTRUSTED, NETWORK, True),
         (WORSE, 0, NETWORK, NETWORK, False),
     ],
 )
-def test_what_decides(gains: NDArray[np.float64], unseen: int, stood: Standing, comes: Standing, taken: bool):
-    decided, reason = decide(gains[: unseen or None], unseen, stood, comes, "version 1")
+def test_what_decides(
+    gains: NDArray[np.float64], unseen: int, current: Precedence, candidate: Precedence, taken: bool
+):
+    decided, reason = promote_or_reject(
+        gains[: unseen or None], unseen, current, candidate, "version 1"
+    )
     assert decided is taken
     assert "version 1" in reason
     assert len(reason) <= 200  # what the store keeps
+
+
+@pytest.mark.parametrize(
+    ("gains", "unseen", "is_trusted", "taken"),
+    [
+        (BETTER, 6, False, True),
+        (CHANCE, 6, False, False),  # in the mean better, but not by more than chance
+        (WORSE, 6, False, False),
+        (CHANCE, MIN_HELD_OUT - 1, False, True),
+        (-CHANCE, MIN_HELD_OUT - 1, False, False),
+        (np.array([0.05]), 0, False, True),
+        (np.array([-0.05]), 0, False, False),
+        (np.zeros(6), 0, False, False),
+        (WORSE, 6, True, False),
+        (CHANCE, 6, True, True),
+        (WORSE, 0, True, True),
+        (np.zeros(1), 0, True, True),
+    ],
+)
+def test_a_first_surface_is_compared_with_the_ideal_mirror(
+    gains: NDArray[np.float64], unseen: int, is_trusted: bool, taken: bool
+):
+    decided, reason = promote_or_reject_first(gains, unseen, is_trusted)
+    assert decided is taken
+    assert "the ideal mirror" in reason
+    used = len(gains) - unseen
+    assert (
+        "that it was not made from" in reason
+        if unseen >= MIN_HELD_OUT
+        else f"{used} of which" in reason
+    )
+    assert len(reason) <= 200

@@ -1,4 +1,6 @@
-"""The closed loop on a stored plant: a study finds an effect, it is adopted, forecasts follow, it is withdrawn."""
+"""The closed loop on a stored plant: a study finds an effect, it is adopted, forecasts follow, it
+is withdrawn.
+"""
 
 import threading
 from collections.abc import Iterator
@@ -15,10 +17,13 @@ from fastapi.testclient import TestClient
 from sqlalchemy import URL, select
 
 from model.effects.camera_response import CameraResponse
-from model.forecast import Setup, View, forecast_setups
+from model.forecast import View, align
 from model.frames import sun_angles, sun_direction
 from model.imaging.window import center_of_mass
-from model.plant import JUELICH_LATITUDE, Heliostat, Plant
+from model.plant import Heliostat, Plant
+from model.plant_model import JUELICH_MODEL
+from model.setup import Setup
+from model.site import JUELICH
 from model.surface import control_points
 from service import store
 from service.base.arrays import pack, unpack
@@ -27,14 +32,15 @@ from service.cli.demo_plant import ORIGIN, TARGET, properties
 from service.jobs.kinds import KINDS
 from service.jobs.worker import Worker
 from service.store.database import Database
-from service.store.images import ImageStore
-from service.store.surfaces import NewSurface
+from service.store.photographs.image_files import ImageStore
+from service.store.surfaces.surface_versions import NewSurface
 from service.store.tables import ImageRow, MeasurementRow, SurfaceRow
-from service.twin.gate import Gate
-from service.twin.runtime import Operations, Runtime
-from service.twin.study import StudyRequest, gather, study_store
+from service.twin.runtime.runtime import Operations, Runtime
+from service.twin.runtime.slots import ComputeSlots
+from service.twin.studies.study import StudyRequest, load_study_inputs, study_store
 from service.web.app import create_app
 from tests.service.conftest import QUIET, client_of, until
+from tests.waiting import WAIT_LIMIT_S
 
 GAMMA = 0.6
 FIELD = {"AB12": (-44.0, 62.0, 1.7), "AK08": (-32.0, 138.0, 1.8)}
@@ -43,7 +49,7 @@ BEGIN = datetime(2024, 6, 1, tzinfo=UTC)
 FORECAST = {
     "heliostat": "AB12",
     "target": TARGET.name,
-    "sun": {"azimuth_deg": -20.0, "elevation_deg": 45.0},
+    "sun": {"azimuth_deg": 200.0, "elevation_deg": 45.0},
     "resolution": 32,
     "surface": 1,
 }
@@ -52,20 +58,33 @@ FORECAST = {
 def heights(rng: np.random.Generator) -> np.ndarray:
     """A mirror's surface (4, 8, 8) [m]: a few waves of half a millimetre on each facet."""
     x = np.linspace(0, np.pi, 8)
-    waves = [np.outer(np.cos(i * x), np.cos(j * x)) for i in range(3) for j in range(3) if i + j > 1]
+    waves = [
+        np.outer(np.cos(i * x), np.cos(j * x)) for i in range(3) for j in range(3) if i + j > 1
+    ]
     z = np.tensordot(rng.normal(0, 2e-4, (4, len(waves))), np.array(waves), axes=1)
     return np.asarray(z - z.mean(axis=(1, 2), keepdims=True))
 
 
-def photographs(mirror: Heliostat, z: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Suns (IMAGES, 3) and 8-bit images of the whole target by a camera with a gamma that nobody declared."""
-    suns = sun_direction(np.linspace(-60, 60, IMAGES), np.linspace(25, 60, IMAGES))
+def photographs(
+    mirror: Heliostat, z: np.ndarray, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Suns (IMAGES, 3) and 8-bit images of the whole target by a camera with a gamma that nobody
+    declared.
+    """
+    suns = sun_direction(180 - np.linspace(-60, 60, IMAGES), np.linspace(25, 60, IMAGES))
     points = control_points(mirror, z)
-    shots = [Setup(mirror, points, sun, TARGET, spot=TARGET.to_enu(rng.uniform(-0.4, 0.4, 2))) for sun in suns]
-    images = forecast_setups(
-        shots, effects=[CameraResponse(gamma=GAMMA)], view=View(128, 128), latitude_deg=JUELICH_LATITUDE
-    ).numpy()
-    counts = 240 * images / images.max(axis=(1, 2), keepdims=True) + rng.normal(0, 0.5, images.shape)
+    shots = [
+        Setup(mirror, points, sun, TARGET, spot=TARGET.to_enu(rng.uniform(-0.4, 0.4, 2)))
+        for sun in suns
+    ]
+    images = (
+        align(shots, JUELICH_MODEL.with_effects([CameraResponse(gamma=GAMMA)]))
+        .images(View(128, 128))
+        .numpy()
+    )
+    counts = 240 * images / images.max(axis=(1, 2), keepdims=True) + rng.normal(
+        0, 0.5, images.shape
+    )
     return suns, np.clip(np.round(counts), 0, 255)
 
 
@@ -77,13 +96,19 @@ def fill(database: Database) -> None:
         store.put_plant(session, "demo", ORIGIN)
         target = store.put_target(session, TARGET)[0]
         for name, position in FIELD.items():
-            mirror = Heliostat.juelich(name, position, float(np.linalg.norm(position - TARGET.center)))
+            mirror = Heliostat.juelich(
+                name, position, float(np.linalg.norm(position - TARGET.center))
+            )
             row = store.put_heliostat(session, name, properties(mirror, plant), position)[0]
             z = heights(rng)
-            surface = NewSurface("measured", z, np.zeros_like(z), control_points(mirror, z), valid_from=BEGIN)
+            surface = NewSurface(
+                "measured", z, np.zeros_like(z), control_points(mirror, z), valid_from=BEGIN
+            )
             store.add_surface(session, row, surface)
             for index, (sun, image) in enumerate(zip(*photographs(mirror, z, rng), strict=True)):
-                store.add_measurement(session, row, *measurement(target, f"{name}{index}", sun, image, index))
+                store.add_measurement(
+                    session, row, *measurement(target, f"{name}{index}", sun, image, index)
+                )
 
 
 def measurement(
@@ -93,7 +118,9 @@ def measurement(
     right, up = center_of_mass(image, (TARGET.width, TARGET.height)).tolist()
     arrays = {"flux": image.astype(np.float32), "centered": np.ones((64, 64), np.float32)}
     sha = f"{int.from_bytes(number.encode(), 'big'):064x}"
-    return ImageRow(sha256=sha, media_type="image/png", size_bytes=10, width_px=128, height_px=128), MeasurementRow(
+    return ImageRow(
+        sha256=sha, media_type="image/png", size_bytes=10, width_px=128, height_px=128
+    ), MeasurementRow(
         kind="flux",
         target_id=target.id,
         sun_azimuth_deg=float(azimuth),
@@ -108,7 +135,8 @@ def measurement(
     )
 
 
-# --- the loop, with the real model ------------------------------------------------------------------------------------
+# --- the loop, with the real model
+# ------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -154,33 +182,39 @@ def test_effect_is_found_adopted_used_and_withdrawn(looped: TestClient):
     assert [effect["name"] for effect in study["effects"]] == ["camera_response"]
     assert study["effects"][0]["parameters"]["gamma"]["value"] == pytest.approx(GAMMA, abs=0.03)
     assert study["after"]["accuracy_mean"] > study["before"]["accuracy_mean"] + 0.1
-    assert (study["heliostats"], study["model_version"], study["adopted"]) == (sorted(FIELD), "1:none", None)
-    assert study["taken_from"].startswith("2024-06-01")
-    assert set(study["before"]["per_image"]) <= {f"{name}/{name}{index}" for name in FIELD for index in range(IMAGES)}
+    assert (study["heliostats"], study["model_version"], study["adopted"]) == (
+        sorted(FIELD),
+        1,
+        None,
+    )
+    assert study["first_taken_at"].startswith("2024-06-01")
+    assert set(study["before"]["per_image"]) <= {
+        f"{name}/{name}{index}" for name in FIELD for index in range(IMAGES)
+    }
     page = looped.get(f"{path}/report")
     assert "camera response" in page.text
     assert "script" not in page.headers["Content-Security-Policy"]
 
     version, declared = forecast(looped)
-    assert version == "1:none"
+    assert version == 1
     adopted = looped.post(f"{path}/adopt")
     assert adopted.status_code == 201, adopted.text
-    assert (adopted.json()["version"], adopted.json()["is_current"]) == ("2:camera_response", True)
-    assert looped.get(path).json()["adopted"] == "2:camera_response"
+    assert (adopted.json()["version"], adopted.json()["is_current"]) == (2, True)
+    assert looped.get(path).json()["adopted"] == 2
 
     version, photographed = forecast(looped)
-    assert version == "2:camera_response"
+    assert version == 2
     assert photographed.sum() > 1.2 * declared.sum()  # a gamma below one lifts the faint parts
     version, earlier = forecast(looped, model_version=1)
-    assert version == "1:none"
+    assert version == 1
     np.testing.assert_array_equal(earlier, declared)
 
-    assert looped.post(f"{path}/withdraw").json()["version"] == "1:none"
+    assert looped.post(f"{path}/withdraw").json()["version"] == 1
     version, again = forecast(looped)
-    assert version == "1:none"
+    assert version == 1
     np.testing.assert_array_equal(again, declared)
     version, withdrawn = forecast(looped, model_version=2)
-    assert version == "2:camera_response"
+    assert version == 2
     np.testing.assert_array_equal(withdrawn, photographed)
 
 
@@ -191,18 +225,21 @@ def test_study_that_knows_the_effect_finds_no_more(looped: TestClient):
     second = done(looped, "/v1/jobs/studies", candidates=candidates)
     assert second["verdict"] == "none"
     study = looped.get(f"/v1/studies/{second['study']}").json()
-    assert study["model_version"] == "2:camera_response"
+    assert study["model_version"] == 2
     assert study["before"]["accuracy_mean"] > 0.97
     assert "found no effect" in looped.post(f"/v1/studies/{second['study']}/adopt").json()["detail"]
 
 
-# --- what a study takes out of the store ------------------------------------------------------------------------------
+# --- what a study takes out of the store
+# ------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
 def filled(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Database]:
     """The stored plant, to look at only."""
-    database = Database(URL.create("sqlite", database=str(tmp_path_factory.mktemp("filled") / "store.sqlite")))
+    database = Database(
+        URL.create("sqlite", database=str(tmp_path_factory.mktemp("filled") / "store.sqlite"))
+    )
     database.upgrade()
     fill(database)
     yield database
@@ -211,7 +248,7 @@ def filled(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Database]:
 
 def test_photograph_shows_its_heliostat_with_the_stored_surface(filled: Database):
     with filled.reading() as session:
-        material = gather(session, StudyRequest(heliostats=["AB12"]))
+        material = load_study_inputs(session, StudyRequest(heliostats=["AB12"]))
         row = store.get_surface(session, store.get_heliostat(session, "AB12"), 1)
     assert material.heliostats == ["AB12"]
     assert not material.skipped
@@ -224,38 +261,48 @@ def test_photograph_shows_its_heliostat_with_the_stored_surface(filled: Database
 
 
 def test_study_lets_others_at_the_model_between_its_steps(filled: Database, tmp_path: Path):
-    """A request that comes during the first step is done before the second begins, and the slot is free at the end."""
+    """A request that comes during the first step is done before the second begins, and the slot is
+    free at the end.
+    """
     order: list[str] = []
 
     def ask() -> None:
         with runtime.for_requests().computing("forecast"):
             order.append("a request")
 
-    def study(photographs: Any, optics: Any, effects: Any, options: Any, step: Any, *, latitude_deg: float) -> None:
+    def study(photographs: Any, model: Any, options: Any, step: Any) -> None:
         request = threading.Thread(target=ask)
         step("one")
         request.start()
-        until(lambda: len(runtime.gate._line) == 1)
+        until(lambda: len(runtime.compute_slots._queue) == 1)
         order.append("step one")
         step("two")
         order.append("step two")
-        request.join(30)
+        request.join(WAIT_LIMIT_S)
 
     operations = cast(Operations, SimpleNamespace(study=study))
-    runtime = Runtime(Settings(data_dir=tmp_path), filled, ImageStore(tmp_path), operations, gate=Gate(1))
+    runtime = Runtime(
+        Settings(data_dir=tmp_path),
+        filled,
+        ImageStore(tmp_path),
+        operations,
+        compute_slots=ComputeSlots(1),
+    )
     study_store(runtime, StudyRequest(surfaces="measured"))
     assert order == ["step one", "a request", "step two"]
-    with runtime.gate.turn(0.0):
+    with runtime.compute_slots.slot(0.0):
         pass
 
 
 def test_time_and_number_of_photographs_are_bounded(filled: Database):
     since, until = BEGIN + timedelta(days=1), BEGIN + timedelta(days=4)
     with filled.reading() as session:
-        material = gather(session, StudyRequest(since=since, until=until))
-        few = gather(session, StudyRequest(images=2, most_heliostats=1))
-        none = gather(session, StudyRequest(until=BEGIN))
-    assert sorted(p.key for p in material.photographs) == [f"{h}/{h}{day}" for h in sorted(FIELD) for day in (1, 2, 3)]
+        material = load_study_inputs(session, StudyRequest(since=since, until=until))
+        few = load_study_inputs(session, StudyRequest(images=2, max_heliostats=1))
+        none = load_study_inputs(session, StudyRequest(until=BEGIN))
+    assert sorted(p.key for p in material.photographs) == [
+        f"{h}/{h}{day}" for h in sorted(FIELD) for day in (1, 2, 3)
+    ]
     assert material.span == (since, until - timedelta(days=1))
     assert (len(few.photographs), len(few.heliostats)) == (2, 1)
     assert set(none.skipped) == set(FIELD)
@@ -268,13 +315,16 @@ def test_measured_surface_goes_before_a_newer_prediction(store_url: URL):
         for name in FIELD:
             row = store.get_heliostat(session, name)
             flat = np.zeros((4, 8, 8))
-            store.add_surface(session, row, NewSurface("network", flat, flat, np.zeros((4, 8, 8, 3))))
-        measured = session.scalars(select(SurfaceRow).where(SurfaceRow.heliostat_id == row.id)).first()
+            store.add_surface(
+                session, row, NewSurface("network", flat, flat, np.zeros((4, 8, 8, 3)))
+            )
+        of_heliostat = select(SurfaceRow).where(SurfaceRow.heliostat_id == row.id)
+        measured = session.scalars(of_heliostat.where(SurfaceRow.source == "measured")).first()
         assert measured is not None
         session.delete(measured)
     with database.reading() as session:
-        both = gather(session, StudyRequest())
-        only = gather(session, StudyRequest(surfaces="measured", heliostats=list(FIELD)))
+        both = load_study_inputs(session, StudyRequest())
+        only = load_study_inputs(session, StudyRequest(surfaces="measured", heliostats=list(FIELD)))
     assert (both.heliostats, only.heliostats) == (["AB12", "AK08"], ["AB12"])
     assert "no measured surface" in only.skipped["AK08"]
     depth = {p.heliostat: np.ptp(p.setup.control_points[0, :, :, 2]) for p in both.photographs}
@@ -285,30 +335,40 @@ def test_measured_surface_goes_before_a_newer_prediction(store_url: URL):
 
 def test_photograph_that_cannot_have_been_is_left_out_by_name(filled: Database):
     with filled.reading() as session:
-        material = gather(session, StudyRequest())
+        material = load_study_inputs(session, StudyRequest())
     whole, behind = material.photographs[0], material.photographs[1]
     shot = replace(behind.setup, plane=replace(TARGET, normal=-TARGET.normal))
     odd = replace(material, photographs=[whole, replace(behind, setup=shot)])
-    left = odd.without_untraceable(JUELICH_LATITUDE)
+    left = odd.without_untraceable(JUELICH)
     assert [p.key for p in left.photographs] == [whole.key]
     assert set(left.skipped) == {behind.key}
     assert whole.taken_at is not None
     assert left.span == (whole.taken_at,) * 2
 
 
-@pytest.mark.parametrize(("up", "reason"), [(None, "no place on the target"), (9.0, "off its target"), (0.5, None)])
-def test_centred_flux_needs_a_spot_on_its_target(database: Database, up: float | None, reason: str | None):
+@pytest.mark.parametrize(
+    ("up", "reason"), [(None, "no place on the target"), (9.0, "off its target"), (0.5, None)]
+)
+def test_centred_flux_needs_a_spot_on_its_target(
+    database: Database, up: float | None, reason: str | None
+):
     fill(database)
-    spot = None if up is None else tuple(float(v) for v in Plant("demo", ORIGIN).to_wgs84(TARGET.to_enu((0.25, up))))
+    spot = (
+        None
+        if up is None
+        else tuple(float(v) for v in Plant("demo", ORIGIN).to_wgs84(TARGET.to_enu((0.25, up))))
+    )
     with database.writing() as session:
         row = store.get_heliostat(session, "AB12")
         target = store.get_target(session, TARGET.name)
-        image, about = measurement(target, "centred", sun_direction(0, 40), np.ones((64, 64)), 20)
+        image, about = measurement(target, "centred", sun_direction(180, 40), np.ones((64, 64)), 20)
         about.arrays = pack({"centered": np.ones((64, 64), np.float32)})
         about.center_right_m = about.center_up_m = None
         about.focal_spot_wgs84, about.kind = None if spot is None else list(spot), "flux-centered"
         store.add_measurement(session, row, image, about)
-        material = gather(session, StudyRequest(heliostats=["AB12"], since=BEGIN + timedelta(days=19)))
+        material = load_study_inputs(
+            session, StudyRequest(heliostats=["AB12"], since=BEGIN + timedelta(days=19))
+        )
     if reason is not None:
         assert reason in material.skipped["AB12/centred"]
         return
@@ -327,7 +387,14 @@ def test_too_few_photographs_end_the_job_with_the_reasons(client: TestClient):
 
 
 @pytest.mark.parametrize(
-    "payload", [{"candidates": ["magic"]}, {"surfaces": "ideal"}, {"images": 1}, {"since": "2024-06-01"}, {"x": 1}]
+    "payload",
+    [
+        {"candidates": ["magic"]},
+        {"surfaces": "ideal"},
+        {"images": 1},
+        {"since": "2024-06-01"},
+        {"x": 1},
+    ],
 )
 def test_malformed_request_is_refused(refusing: TestClient, payload: dict[str, Any]):
     for path in ("/v1/studies", "/v1/jobs/studies"):

@@ -14,85 +14,48 @@ from sqlalchemy import URL, select, text
 from model.effects import CATALOGUE, acting, model_version
 from model.sunshape import Gaussian
 from service import store
-from service.base.faults import ConflictError, NotFoundError
+from service.base.errors import ConflictError, NotFoundError
+from service.base.settings import Settings
 from service.jobs.kinds import KINDS
 from service.jobs.worker import Worker
 from service.store import audit, keys
 from service.store.database import Database
 from service.store.job_tables import AuditRow
-from service.store.models import put_declared
-from service.store.tables import MODEL_VERSION, ModelRow, StudyRow
-from service.twin import versions
+from service.store.plant.model_versions import put_declared
+from service.store.tables import MODEL_VERSION, ModelRow
+from service.twin.plant import model_versions
+from tests.service.command import exit_code
 from tests.service.conftest import ORIGIN, FakeOperations, Post, png
-from tests.service.web.test_keys import heliotwin
+from tests.service.studies import GAMMA, SLOPE, add, adopt, report_of
 
-GAMMA = {"name": "camera_response", "parameters": {"gamma": {"value": 0.8, "ci95": [0.78, 0.82], "unit": "1"}}}
-SLOPE = {"name": "slope_error", "parameters": {"sigma_mrad": {"value": 1.5, "ci95": [1.4, 1.6], "unit": "mrad"}}}
 FORECAST = {
     "heliostat": "AA39",
     "target": "lower",
-    "sun": {"azimuth_deg": 0, "elevation_deg": 45},
+    "sun": {"azimuth_deg": 180, "elevation_deg": 45},
     "surface": "ideal",
     "resolution": 16,
 }
 
 
-def report_of(*effects: dict[str, Any], verdict: str = "effect") -> dict[str, Any]:
-    """The report of a study that found these effects."""
-    accuracy = {"accuracy_mean": 0.9, "accuracy_median": 0.9, "per_image": {"AA39/1": 0.9}}
-    return {
-        "verdict": verdict,
-        "conclusion": "It is so.",
-        "images": {"fit": 4, "held_out": 4},
-        "before": accuracy,
-        "after": accuracy,
-        "noise_floor": 0.01,
-        "unexplained_share": 0.1,
-        "effects": list(effects),
-        "candidates": [],
-    }
-
-
-def study_row(*effects: dict[str, Any], model: int = 1, verdict: str | None = None) -> StudyRow:
-    """A study of AA39 that found these effects."""
-    verdict = verdict or ("effect" if effects else "none")
-    return StudyRow(
-        created_by="tester",
-        options={},
-        heliostats=["AA39"],
-        model=model,
-        model_version=f"{model}:",
-        verdict=verdict,
-        conclusion="It is so.",
-        report=report_of(*effects, verdict=verdict),
-        skipped={},
-    )
-
-
-def add(database: Database, *effects: dict[str, Any], **about: Any) -> int:
-    with database.writing() as session:
-        return store.add_study(session, study_row(*effects, **about)).id
-
-
-def adopt(database: Database, study: int, force: bool = False) -> str:
-    with database.writing() as session:
-        return versions.adopt(session, study, "tester", force).version
-
-
 def current(database: Database) -> str:
     with database.reading() as session:
-        return versions.get_model(session).version
+        return model_versions.get_model(session).version
 
 
-# --- versions ---------------------------------------------------------------------------------------------------------
+# --- versions
+# --------------------------------------------------------------------------------------------------
 
 
 def test_declared_model_is_the_first_version(database: Database):
+    with database.reading() as session, pytest.raises(ConflictError, match="the plant is not set"):
+        model_versions.get_model(session)
+    with database.writing() as session:
+        store.put_plant(session, "plant", ORIGIN)
     with database.reading() as session:
-        model = versions.get_model(session)
+        model = model_versions.get_model(session)
         assert (model.number, model.version, model.effects) == (1, "1:none", ())
         with pytest.raises(NotFoundError, match="no version 2"):
-            versions.get_model(session, 2)
+            model_versions.get_model(session, 2)
 
 
 DECLARED = {"sun": {"shape": "gaussian", "sigma_mrad": 2.0}, "effects": [GAMMA]}
@@ -105,18 +68,24 @@ def test_declared_sun_and_effects_are_part_of_every_version(database: Database):
         assert put_declared(session, DECLARED) is store.Change.UNCHANGED
     assert adopt(database, add(database, SLOPE)) == "2:slope_error"
     with database.reading() as session:
-        first, second = versions.get_model(session, 1), versions.get_model(session, 2)
+        first, second = model_versions.get_model(session, 1), model_versions.get_model(session, 2)
     assert (first.optics.sun_shape, second.optics.sun_shape) == (Gaussian(0.002), Gaussian(0.002))
     assert [effect.name for effect in first.effects] == ["camera_response"]
     assert [effect.name for effect in second.effects] == ["camera_response", "slope_error"]
-    with database.writing() as session, pytest.raises(ConflictError, match="studies were made with it"):
+    with (
+        database.writing() as session,
+        pytest.raises(ConflictError, match="studies were made with it"),
+    ):
         put_declared(session, {})
 
 
 def test_what_is_found_of_one_heliostat_is_adopted_for_it_alone(database: Database):
-    assert adopt(database, add(database, SLOPE | {"scope": {"kind": "set", "heliostats": ["AA39"]}})) == "2:slope_error"
+    assert (
+        adopt(database, add(database, SLOPE | {"scope": {"kind": "set", "heliostats": ["AA39"]}}))
+        == "2:slope_error"
+    )
     with database.reading() as session:
-        effects = versions.get_model(session).effects
+        effects = model_versions.get_model(session).effects
     assert [len(acting(effects, None, name)) for name in ("AA39", "AB01")] == [1, 0]
 
 
@@ -125,7 +94,7 @@ def test_what_is_declared_otherwise_is_another_version(database: Database):
     with database.writing() as session:
         store.put_plant(session, "plant", ORIGIN)
     with database.reading() as session:
-        before = versions.get_model(session, 1)
+        before = model_versions.get_model(session, 1)
     for number, sigma in ((2, 2.0), (3, 3.0)):
         declared = {"sun": {"shape": "gaussian", "sigma_mrad": sigma}, "effects": [GAMMA]}
         with database.writing() as session:
@@ -134,10 +103,13 @@ def test_what_is_declared_otherwise_is_another_version(database: Database):
         assert current(database) == f"{number}:none"
     assert adopt(database, add(database, SLOPE, model=2), force=True) == "4:slope_error"
     with database.reading() as session:
-        found = {number: versions.get_model(session, number) for number in (1, 2, 3, 4)}
+        found = {number: model_versions.get_model(session, number) for number in (1, 2, 3, 4)}
     assert (repr(found[1].optics), found[1].effects) == (repr(before.optics), before.effects)
-    assert [found[number].optics.sun_shape for number in (2, 3)] == [Gaussian(0.002), Gaussian(0.003)]
-    # What was adopted stands upon what its study was made with.
+    assert [found[number].optics.sun_shape for number in (2, 3)] == [
+        Gaussian(0.002),
+        Gaussian(0.003),
+    ]
+    # The adopted version is based on the model that its study used.
     assert found[4].optics.sun_shape == Gaussian(0.002)
     assert [effect.name for effect in found[4].effects] == ["camera_response", "slope_error"]
 
@@ -148,23 +120,23 @@ def test_versions_build_upon_each_other_and_are_withdrawn_from_the_top(database:
     second = add(database, SLOPE, model=2)
     assert adopt(database, second) == "3:slope_error+camera_response"
     with database.reading() as session:
-        found = {effect.name: effect for effect in versions.get_model(session).effects}
+        found = {effect.name: effect for effect in model_versions.get_model(session).effects}
         assert (found["camera_response"].gamma, found["slope_error"].sigma_mrad) == (0.8, 1.5)
     with database.writing() as session, pytest.raises(ConflictError, match="withdraw version 3"):
-        versions.withdraw(session, first, "tester")
+        model_versions.withdraw(session, first, "tester")
     for study, before in ((second, "2:camera_response"), (first, "1:none")):
         with database.writing() as session:
-            versions.withdraw(session, study, "other")
+            model_versions.withdraw(session, study, "other")
         assert current(database) == before
     with database.writing() as session, pytest.raises(ConflictError, match="is not adopted"):
-        versions.withdraw(session, first, "tester")
+        model_versions.withdraw(session, first, "tester")
     with database.reading() as session:
-        kept = versions.list_models(session)
+        kept = model_versions.list_models(session)
         assert [(row.number, row.adopted_by, row.withdrawn_by) for row in kept] == [
             (2, "tester", "other"),
             (3, "tester", "other"),
         ]
-        assert versions.get_model(session, 3).version == "3:slope_error+camera_response"
+        assert model_versions.get_model(session, 3).version == "3:slope_error+camera_response"
     # Numbers are not given twice: forecasts name them.
     assert adopt(database, first) == "4:camera_response"
 
@@ -182,22 +154,24 @@ def test_study_that_is_adopted_by_force_again_stays_one_version(database: Databa
     first, second = add(database, GAMMA), add(database, SLOPE)
     assert [adopt(database, first, force=True) for _ in range(8)] == ["2:camera_response"] * 8
     with database.reading() as session:
-        assert len(versions.list_models(session)) == 1
+        assert len(model_versions.list_models(session)) == 1
         assert len(audit.entries(session, 10)) == 1
     # Over another that is current by now it is another version again.
     assert adopt(database, second, force=True) == "3:slope_error"
     with ThreadPoolExecutor(4) as pool:
-        assert set(pool.map(lambda _: adopt(database, first, force=True), range(8))) == {"4:camera_response"}
+        assert set(pool.map(lambda _: adopt(database, first, force=True), range(8))) == {
+            "4:camera_response"
+        }
 
 
 def test_study_that_found_nothing_is_not_adopted(database: Database):
-    nothing, doubtful = add(database), add(database, GAMMA, verdict="unexplained")
+    nothing, unexplained_study = add(database), add(database, GAMMA, verdict="unexplained")
     for force in (False, True):
         with pytest.raises(ConflictError, match="found no effect"):
             adopt(database, nothing, force)
     with pytest.raises(ConflictError, match="verdict is 'unexplained'"):
-        adopt(database, doubtful)
-    assert adopt(database, doubtful, force=True) == "2:camera_response"
+        adopt(database, unexplained_study)
+    assert adopt(database, unexplained_study, force=True) == "2:camera_response"
 
 
 def test_of_those_who_adopt_at_once_one_is_first(database: Database):
@@ -220,29 +194,41 @@ def test_name_of_a_model_with_every_effect_fits_its_column():
     assert len(model_version(kind() for kind in CATALOGUE.values())) + 10 <= MODEL_VERSION
 
 
-# --- the migration ----------------------------------------------------------------------------------------------------
+# --- the migration
+# --------------------------------------------------------------------------------------------------
 
 
 def test_what_was_stored_before_goes_up_and_down(empty_url: URL):
     database = Database(empty_url)
     database.upgrade("0002")
     add_old = (
-        "INSERT INTO heliostats (id, name, properties, east_m, north_m, up_m, created_at, updated_at) "
-        "VALUES (1, 'A', '{}', 0, 0, 0, '2024-06-01', '2024-06-01')",
-        "INSERT INTO surfaces (id, heliostat_id, version, created_at, valid_from, source, arrays) "
-        "VALUES (1, 1, 1, '2024-06-01', '2024-06-01', 'measured', 'a')",
-        "INSERT INTO surfaces (id, heliostat_id, version, created_at, valid_from, source, arrays) "
-        "VALUES (2, 1, 2, '2024-06-01', '2024-06-01', 'network', 'b')",
-        "INSERT INTO forecasts (id, heliostat_id, surface_id, plane, sun_azimuth_deg, sun_elevation_deg, dni_w_m2, "
-        "normalised, rows, columns, peak_w_m2, power_w, model_version, flux, created_at) "
-        "VALUES (1, 1, 2, '{}', 0, 45, 1000, FALSE, 8, 8, 1, 1, '1:none', 'f', '2024-06-01')",
+        (
+            "INSERT INTO heliostats (id, name, properties, east_m, north_m, up_m, created_at,"
+            " updated_at) VALUES (1, 'A', '{}', 0, 0, 0, '2024-06-01', '2024-06-01')"
+        ),
+        (
+            "INSERT INTO surfaces (id, heliostat_id, version, created_at, valid_from, source,"
+            " arrays) VALUES (1, 1, 1, '2024-06-01', '2024-06-01', 'measured', 'a')"
+        ),
+        (
+            "INSERT INTO surfaces (id, heliostat_id, version, created_at, valid_from, source,"
+            " arrays) VALUES (2, 1, 2, '2024-06-01', '2024-06-01', 'network', 'b')"
+        ),
+        (
+            "INSERT INTO forecasts (id, heliostat_id, surface_id, plane, sun_azimuth_deg,"
+            " sun_elevation_deg, dni_w_m2, normalised, rows, columns, peak_w_m2, power_w,"
+            " model_version, flux, created_at) VALUES (1, 1, 2, '{}', 0, 45, 1000, FALSE, 8, 8, 1,"
+            " 1, '1:none', 'f', '2024-06-01')"
+        ),
     )
     with database.writing() as session:
         for statement in add_old:
             session.execute(text(statement))
     database.upgrade()
     with database.writing() as session:
-        surfaces = session.execute(text("SELECT version, model_version FROM surfaces ORDER BY version")).all()
+        surfaces = session.execute(
+            text("SELECT version, model_version FROM surfaces ORDER BY version")
+        ).all()
         assert surfaces == [(1, None), (2, "1:none")]
         session.execute(text(f"UPDATE forecasts SET model_version = '{'2:' + 'x' * 200}'"))
     database.downgrade("0002")
@@ -256,24 +242,30 @@ def test_what_was_stored_before_goes_up_and_down(empty_url: URL):
 
 
 def test_declared_models_go_up_and_down(empty_url: URL):
-    """All versions so far were made with what the plant declares; going back, that of the current one is kept."""
+    """All versions so far were made with what the plant declares; going back, that of the current
+    one is kept.
+    """
     database = Database(empty_url)
     database.upgrade("0005")
     with database.writing() as session:
         session.execute(text("INSERT INTO plant VALUES (1, 'p', 50, 6, 0, '{\"sun\": null}')"))
         session.execute(
             text(
-                "INSERT INTO studies (id, created_at, created_by, options, heliostats, model, model_version, verdict, "
-                "conclusion, report, skipped) VALUES "
-                "(1, '2024-06-01', 'x', '{}', '[]', 1, '1:none', 'effect', '', '{}', '{}')"
+                "INSERT INTO studies (id, created_at, created_by, options, heliostats, model,"
+                " model_version, verdict, conclusion, report, skipped) VALUES (1, '2024-06-01',"
+                " 'x', '{}', '[]', 1, '1:none', 'effect', '', '{}', '{}')"
             )
         )
-        session.execute(text("INSERT INTO models VALUES (2, '2:x', '[]', 1, '2024-06-01', 'x', NULL, NULL)"))
+        session.execute(
+            text("INSERT INTO models VALUES (2, '2:x', '[]', 1, '2024-06-01', 'x', NULL, NULL)")
+        )
     database.upgrade()
     with database.writing() as session:
         row = session.get_one(ModelRow, 2)
         assert row.declared == {"sun": None}
-        session.add(ModelRow(number=3, version="3:none", effects=[], declared=DECLARED, adopted_by="x"))
+        session.add(
+            ModelRow(number=3, version="3:none", effects=[], declared=DECLARED, adopted_by="x")
+        )
     database.downgrade("0005")
     with database.reading() as session:
         assert session.execute(text("SELECT number FROM models")).scalars().all() == [2]
@@ -282,7 +274,8 @@ def test_declared_models_go_up_and_down(empty_url: URL):
     database.close()
 
 
-# --- over HTTP --------------------------------------------------------------------------------------------------------
+# --- over HTTP
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -298,17 +291,26 @@ def work(client: TestClient) -> None:
 
 def test_models_are_listed_with_what_became_of_them(client: TestClient, stored: Database):
     declared = client.get("/v1/models/current").json()
-    assert (declared["number"], declared["version"], declared["study"]) == (1, "1:none", None)
+    assert (declared["version"], declared["study"]) == (1, None)
     path = f"/v1/studies/{add(stored, GAMMA)}"
     assert client.get(path).json()["adopted"] is None
     client.post(f"{path}/adopt")
     adopted = client.get("/v1/models/current").json()
-    assert (adopted["version"], adopted["adopted_by"]) == ("2:camera_response", "local")
-    assert adopted["effects"] == [{"name": "camera_response", "parameters": {"gamma": 0.8, "saturation": 1.0}}]
-    assert [entry["is_current"] for entry in client.get("/v1/models").json()["items"]] == [False, True]
+    assert (adopted["version"], adopted["adopted_by"]) == (2, "local")
+    assert adopted["effects"] == [
+        {"name": "camera_response", "parameters": {"gamma": 0.8, "saturation": 1.0}}
+    ]
+    assert [entry["is_current"] for entry in client.get("/v1/models").json()["items"]] == [
+        False,
+        True,
+    ]
     client.post(f"{path}/withdraw")
     first, second = client.get("/v1/models").json()["items"]
-    assert (first["is_current"], second["is_current"], second["withdrawn_by"]) == (True, False, "local")
+    assert (first["is_current"], second["is_current"], second["withdrawn_by"]) == (
+        True,
+        False,
+        "local",
+    )
 
 
 def test_studies_are_listed_newest_first(client: TestClient, stored: Database):
@@ -317,7 +319,7 @@ def test_studies_are_listed_newest_first(client: TestClient, stored: Database):
     page = client.get("/v1/studies", params={"limit": 1}).json()
     assert [(item["id"], item["verdict"]) for item in page["items"]] == [(second, "none")]
     rest = client.get("/v1/studies", params={"after": page["next"]}).json()
-    assert [(item["id"], item["adopted"]) for item in rest["items"]] == [(first, "2:camera_response")]
+    assert [(item["id"], item["adopted"]) for item in rest["items"]] == [(first, 2)]
 
 
 def test_conflicts_say_what_to_do(client: TestClient, stored: Database):
@@ -338,7 +340,9 @@ def test_audit_trail_names_who_adopted_and_withdrew(client: TestClient, stored: 
     client.post(f"{path}/adopt")
     client.post(f"{path}/withdraw")
     with stored.reading() as session:
-        entries = session.scalars(select(AuditRow).where(AuditRow.action.startswith("effect."))).all()
+        entries = session.scalars(
+            select(AuditRow).where(AuditRow.action.startswith("effect."))
+        ).all()
     about = {"model": "2:camera_response"}
     assert [(e.actor, e.action, e.subject, e.detail) for e in entries] == [
         ("local", "effect.adopted", "study 1", about | {"effects": ["camera_response"]}),
@@ -350,18 +354,23 @@ def test_audit_trail_names_who_adopted_and_withdrew(client: TestClient, stored: 
 def roles(client: TestClient, stored: Database) -> dict[str, dict[str, str]]:
     """Headers by role."""
     with stored.writing() as session:
-        made = {role: keys.create(session, role, role, "tester") for role in ("read", "ingest", "operate", "admin")}
+        made = {
+            role: keys.create(session, role, role, "tester")
+            for role in ("read", "ingest", "operate", "admin")
+        }
     return {role: {"Authorization": f"Bearer {key}"} for role, key in made.items()}
 
 
-def test_only_operators_change_the_model(client: TestClient, stored: Database, roles: dict[str, dict[str, str]]):
+def test_only_operators_change_the_model(
+    client: TestClient, stored: Database, roles: dict[str, dict[str, str]]
+):
     path = f"/v1/studies/{add(stored, GAMMA)}"
     for role in ("read", "ingest"):
         for action in ("adopt", "withdraw"):
             assert client.post(f"{path}/{action}", headers=roles[role]).status_code == 403
         assert client.post("/v1/studies", json={}, headers=roles[role]).status_code == 403
         assert client.get(path, headers=roles[role]).status_code == 200
-        assert client.get("/v1/models/current", headers=roles[role]).json()["version"] == "1:none"
+        assert client.get("/v1/models/current", headers=roles[role]).json()["version"] == 1
     assert client.post(f"{path}/adopt", headers=roles["operate"]).json()["adopted_by"] == "operate"
     assert client.post(f"{path}/withdraw", headers=roles["admin"]).status_code == 200
 
@@ -372,49 +381,50 @@ def test_everything_that_is_made_uses_the_model_that_is_asked_for(
     post(png(1))
     client.post(f"/v1/studies/{add(stored, GAMMA)}/adopt")
     plane = {key: FORECAST[key] for key in ("target", "sun", "surface", "resolution")}
-    for wanted, version, names in (
-        ({}, "2:camera_response", ["camera_response"]),
-        ({"model_version": 1}, "1:none", []),
-    ):
+    for wanted, version, names in (({}, 2, ["camera_response"]), ({"model_version": 1}, 1, [])):
         forecast = client.post("/v1/forecasts", json=FORECAST | wanted).json()
         surface = client.post("/v1/heliostats/AA39/surfaces", json=wanted).json()
         assert (forecast["model_version"], surface["model_version"]) == (version, version)
-        assert [effect.name for effect in operations.forecasts[-1]["effects"]] == names
-        assert [effect.name for effect in operations.believed[-1]] == names
+        assert [effect.name for effect in operations.forecasts[-1]["model"].effects] == names
+        assert [effect.name for effect in operations.models[-1].effects] == names
         fleet = client.post("/v1/jobs/forecasts", json=plane | wanted)
         work(client)
         assert client.get(fleet.headers["Location"]).json()["result"]["model_version"] == version
         client.post("/v1/jobs/predictions", json=wanted)
         work(client)
         assert client.get("/v1/heliostats/AA39/surfaces/current").json()["model_version"] == version
-    assert operations.forecasts[-1]["latitude_deg"] == pytest.approx(ORIGIN[0])
-    assert operations.latitudes
-    assert operations.latitudes == pytest.approx([ORIGIN[0]] * len(operations.latitudes))
+    assert operations.models
+    sites = [model.site.origin for model in (operations.forecasts[-1]["model"], *operations.models)]
+    assert set(sites) == {ORIGIN}
 
 
-def test_forecast_is_made_under_the_declared_sun(client: TestClient, stored: Database, operations: FakeOperations):
+def test_forecast_is_made_under_the_declared_sun(
+    client: TestClient, stored: Database, operations: FakeOperations
+):
     with stored.writing() as session:
         put_declared(session, {"sun": {"shape": "gaussian", "sigma_mrad": 2.0}})
     assert client.get("/v1/plant").json()["declared"]["sun"]["shape"] == "gaussian"
     client.post("/v1/forecasts", json=FORECAST | {"dni_w_m2": 800})
-    optics = operations.forecasts[-1]["optics"]
+    optics = operations.forecasts[-1]["model"].optics
     assert (optics.sun_shape, optics.dni) == (Gaussian(0.002), 800)
 
 
-def test_forecast_by_the_first_version_stays_the_same(client: TestClient, stored: Database, operations: FakeOperations):
+def test_forecast_by_the_first_version_stays_the_same(
+    client: TestClient, stored: Database, operations: FakeOperations
+):
     wanted = FORECAST | {"model_version": 1}
     client.post("/v1/forecasts", json=wanted)
     with stored.writing() as session:
         put_declared(session, DECLARED, "tester")
     again = client.post("/v1/forecasts", json=wanted).json()
-    first, second = operations.forecasts
-    assert (repr(first["optics"]), first["effects"]) == (repr(second["optics"]), second["effects"])
-    assert again["model_version"] == "1:none"
-    assert client.post("/v1/forecasts", json=FORECAST).json()["model_version"] == "2:none"
+    first, second = (made["model"] for made in operations.forecasts)
+    assert (repr(first.optics), first.effects) == (repr(second.optics), second.effects)
+    assert again["model_version"] == 1
+    assert client.post("/v1/forecasts", json=FORECAST).json()["model_version"] == 2
     listed = client.get("/v1/models").json()["items"]
     assert [(m["version"], m["declared"], m["study"]) for m in listed] == [
-        ("1:none", None, None),
-        ("2:none", DECLARED, None),
+        (1, None, None),
+        (2, DECLARED, None),
     ]
     assert "another declaration" in client.get("/studies").text
 
@@ -429,43 +439,63 @@ def test_version_that_is_not_there_is_not_found(client: TestClient, post: Post):
     assert "no version 7" in client.get(job).json()["reason"]
 
 
-# --- the command line -------------------------------------------------------------------------------------------------
+# --- the command line
+# -------------------------------------------------------------------------------------------------
+
+
+def set_plant() -> None:
+    """Make the store that the environment names, with a plant."""
+    assert exit_code("migrate") == 0
+    database = Database(Settings().database)
+    with database.writing() as session:
+        store.put_plant(session, "plant", ORIGIN)
+    database.close()
 
 
 def test_report_of_a_folder_is_adopted_and_withdrawn_by_the_command_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     monkeypatch.setenv("HELIOTWIN_DATA_DIR", str(tmp_path / "data"))
+    set_plant()
+    capsys.readouterr()
     file = tmp_path / "report.json"
     file.write_text(json.dumps(report_of(GAMMA)))
-    assert heliotwin("models", "adopt", str(file), "--json") == 0
+    assert exit_code("migrate") == 0
+    capsys.readouterr()
+    assert exit_code("models", "adopt", str(file), "--json") == 0
     assert json.loads(capsys.readouterr().out) == {
         "study": 1,
-        "version": "2:camera_response",
+        "version": 2,
         "outdated_surfaces": {},
     }
-    assert heliotwin("models", "list", "--json") == 0
+    assert exit_code("models", "list", "--json") == 0
     listed = json.loads(capsys.readouterr().out)
-    assert [(entry["number"], entry["is_current"]) for entry in listed] == [(1, False), (2, True)]
+    assert [(entry["version"], entry["is_current"]) for entry in listed] == [(1, False), (2, True)]
     assert listed[1]["adopted_by"].startswith("cli")
-    assert heliotwin("models", "withdraw", "1") == 0
-    assert capsys.readouterr().out.strip() == "1:none is current"
-    assert heliotwin("models", "withdraw", "1") == 1
-    assert heliotwin("models", "list") == 0
-    assert "2:camera_response" in capsys.readouterr().out
+    assert exit_code("models", "withdraw", "1") == 0
+    assert capsys.readouterr().out.strip() == "version 1 is current"
+    assert exit_code("models", "withdraw", "1") == 1
+    assert exit_code("models", "list") == 0
+    assert "current" in capsys.readouterr().out
 
 
 def test_report_is_adopted_into_the_version_that_it_was_made_with(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     monkeypatch.setenv("HELIOTWIN_DATA_DIR", str(tmp_path / "data"))
+    set_plant()
+    capsys.readouterr()
     file = tmp_path / "report.json"
 
     def adopt(found: dict[str, Any], known: list[dict[str, Any]]) -> int:
         file.write_text(json.dumps(report_of(found) | {"model": {"effects": known}}))
-        return heliotwin("models", "adopt", str(file))
+        return exit_code("models", "adopt", str(file))
 
-    slope = {"name": "slope_error", "parameters": {"sigma_mrad": 0.5}}
+    slope = {
+        "name": "slope_error",
+        "parameters": {"sigma_mrad": {"value": 0.5, "ci95": [0.4, 0.6], "unit": "mrad"}},
+    }
+    assert exit_code("migrate") == 0
     assert adopt(slope, [GAMMA]) == 1
     assert "camera_response" in capsys.readouterr().err
     assert adopt(GAMMA, []) == 0
@@ -482,16 +512,32 @@ def test_report_is_adopted_into_the_version_that_it_was_made_with(
         (report_of(GAMMA) | {"verdict": "perhaps"}, "verdict"),
         (report_of(GAMMA) | {"before": 3}, "before"),
         (report_of({"name": "magic"}), "magic"),
-        (report_of({"name": "slope_error", "parameters": {"sigma_mrad": 99}}), "sigma_mrad"),
+        (
+            report_of(
+                {
+                    "name": "slope_error",
+                    "parameters": {"sigma_mrad": {"value": 99, "ci95": [98, 99], "unit": "mrad"}},
+                }
+            ),
+            "sigma_mrad",
+        ),
     ],
 )
 def test_file_that_is_no_report_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], document: Any, word: str
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    document: Any,
+    word: str,
 ):
     monkeypatch.setenv("HELIOTWIN_DATA_DIR", str(tmp_path / "data"))
+    assert exit_code("migrate") == 0
+    capsys.readouterr()
     file = tmp_path / "report.json"
     file.write_text(json.dumps(document))
-    assert heliotwin("models", "adopt", str(file)) == 2
+    assert exit_code("migrate") == 0
+    assert exit_code("models", "adopt", str(file)) == 2
     assert word in capsys.readouterr().err
-    assert heliotwin("models", "list", "--json") == 0
+    capsys.readouterr()
+    assert exit_code("models", "list", "--json") == 0
     assert len(json.loads(capsys.readouterr().out)) == 1

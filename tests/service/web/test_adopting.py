@@ -1,4 +1,4 @@
-"""What adopting an effect means for surfaces that are there: which were made under the old model, and made anew."""
+"""Adopting an effect: surfaces made with the old model are listed, and made again."""
 
 import json
 from pathlib import Path
@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from service.cli.main import app as command
 from service.store import outdated_surfaces
 from tests.service.conftest import FakeOperations, Post, png
-from tests.service.twin.test_versions import SLOPE, report_of
+from tests.service.studies import SLOPE, report_of
 from tests.service.web.test_pages import HTML, keep_study, make_key, text_of
 from tests.service.web.test_plans import work
 
@@ -36,26 +36,33 @@ def test_adopting_names_the_surfaces_of_the_old_model(app: FastAPI, pages: TestC
     assert answer.json()["outdated_surfaces"] == {"AA39": 1, "AB01": 1}
     for path in ("/studies", f"/studies/{number}"):
         page = text_of(pages, path)
-        assert "Of today's surfaces 2 were made by another version" in page
-        assert '<a href="/heliostats/AB01">AB01</a> (version 1, by model version 1, no effects)' in page
-        assert "Make these 2 anew" in page
+        assert "Of the active surfaces 2 were made by another version" in page
+        assert (
+            '<a href="/heliostats/AB01">AB01</a> (version 1, by model version 1, no effects)'
+            in page
+        )
+        assert "Predict these 2 again" in page
     # Withdrawn, the old model is the current one again, and its surfaces are in order.
     assert pages.post(f"/studies/{number}/withdraw", follow_redirects=False).status_code == 303
     assert "another version of the model" not in text_of(pages, "/studies")
 
 
-def test_they_are_made_anew_by_a_job(app: FastAPI, pages: TestClient, operations: FakeOperations):
+def test_job_predicts_outdated_surfaces_again(
+    app: FastAPI, pages: TestClient, operations: FakeOperations
+):
     pages.post(f"/v1/studies/{keep_study(app, SLOPE)}/adopt")
-    path = pages.post("/studies/remake", data={"method": "network"}, follow_redirects=False).headers["Location"]
+    path = pages.post(
+        "/studies/predictions", data={"method": "network"}, follow_redirects=False
+    ).headers["Location"]
     job = pages.get(f"/v1{path}").json()
     assert (job["payload"]["heliostats"], job["payload"]["method"]) == (["AA39", "AB01"], "network")
     work(app)
-    assert [effect.name for effect in operations.believed[-1]] == ["slope_error"]
+    assert [effect.name for effect in operations.models[-1].effects] == ["slope_error"]
     with app.state.runtime.database.reading() as session:
         left = outdated_surfaces(session, "2:slope_error")
-    assert left == []  # they are no worse, and today's
+    assert left == []  # they are no worse, so they are active
     assert "another version of the model" not in text_of(pages, "/studies")
-    assert pages.post("/studies/remake").status_code == 409
+    assert pages.post("/studies/predictions").status_code == 409
 
 
 def test_what_waits_aside_is_not_offered_again(app: FastAPI, pages: TestClient):
@@ -65,24 +72,28 @@ def test_what_waits_aside_is_not_offered_again(app: FastAPI, pages: TestClient):
     assert pages.put("/v1/heliostats/AB01/surfaces/current", json=back).status_code == 200
     page = text_of(pages, "/studies")
     assert "one made by the current model waits aside" in page
-    assert "Make it anew" in page
-    path = pages.post("/studies/remake", follow_redirects=False).headers["Location"]
+    assert "Predict it again" in page
+    path = pages.post("/studies/predictions", follow_redirects=False).headers["Location"]
     assert pages.get(f"/v1{path}").json()["payload"]["heliostats"] == ["AA39"]
 
 
-def test_readers_are_told_but_not_offered(app: FastAPI, pages: TestClient):
+def test_readers_see_outdated_surfaces_without_a_button(app: FastAPI, pages: TestClient):
     pages.post(f"/v1/studies/{keep_study(app, SLOPE)}/adopt")
     pages.headers["Authorization"] = f"Bearer {make_key(app, 'read')}"
     page = text_of(pages, "/studies")
-    assert "Of today's surfaces 2" in page
-    assert "/studies/remake" not in page
-    assert pages.post("/studies/remake").status_code == 403
+    assert "Of the active surfaces 2" in page
+    assert "/studies/predictions" not in page
+    assert pages.post("/studies/predictions").status_code == 403
 
 
-def test_command_line_names_them_too(app: FastAPI, pages: TestClient, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_command_line_names_them_too(
+    app: FastAPI, pages: TestClient, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     monkeypatch.setenv("HELIOTWIN_DATA_DIR", str(app.state.runtime.settings.data_dir))
     report = tmp_path / "report.json"
-    report.write_text(json.dumps(report_of(SLOPE, verdict="effect") | {"known_effects": []}), encoding="utf-8")
+    report.write_text(
+        json.dumps(report_of(SLOPE, verdict="effect") | {"known_effects": []}), encoding="utf-8"
+    )
     done = CliRunner().invoke(command, ["models", "adopt", str(report)])
     assert done.exit_code == 0, done.output
     assert "AA39, AB01" in done.output.replace("\n", " ")

@@ -1,4 +1,6 @@
-"""Several who change the plant at one moment, on both databases; and what was made by mistake is taken back."""
+"""Several who change the plant at one moment, on both databases; and what was made by mistake is
+taken back.
+"""
 
 import threading
 from collections.abc import Callable, Iterator
@@ -15,37 +17,46 @@ from sqlalchemy import URL
 from sqlalchemy.exc import OperationalError
 
 from service import store
-from service.base.faults import NotFoundError
+from service.base.errors import NotFoundError
 from service.base.settings import Settings
 from service.store import audit
 from service.store.database import Database
 from service.store.tables import HeliostatRow, ImageRow, MeasurementRow
-from service.web.answers.problems import database_away
 from service.web.app import create_app
+from service.web.responses.problems import database_away
 from tests.service.conftest import QUIET, FakeOperations, client_of, png, poster
+from tests.waiting import WAIT_LIMIT_S
 
 PLANE = {"plane": {"center": [0, -3, 36], "normal": [0, 2, 0], "width": 8.6, "height": 7.2}}
-CYLINDER = {"center": [0, 0, 55.2], "normal": [0, 1, 0], "radius": 4.1, "height": 5.2, "opening_deg": 60}
+CYLINDER = {
+    "center": [0, 0, 55.2],
+    "normal": [0, 1, 0],
+    "radius": 4.1,
+    "height": 5.2,
+    "opening_deg": 60,
+}
 
 
 @pytest.fixture
 def both(store_url: URL, tmp_path: Path) -> Iterator[TestClient]:
     """A service with an empty store, on each of the two databases."""
     address = store_url.render_as_string(hide_password=False)
-    with client_of(create_app(Settings(data_dir=tmp_path, database_url=address, **QUIET), FakeOperations())) as client:
+    with client_of(
+        create_app(Settings(data_dir=tmp_path, database_url=address, **QUIET), FakeOperations())
+    ) as client:
         yield client
 
 
-def at_once(*deeds: Callable[[], Any]) -> list[Any]:
+def at_once(*calls: Callable[[], Any]) -> list[Any]:
     """What each of these gives, all begun at one moment."""
-    barrier = threading.Barrier(len(deeds))
+    barrier = threading.Barrier(len(calls))
 
-    def run(deed: Callable[[], Any]) -> Any:
+    def run(call: Callable[[], Any]) -> Any:
         barrier.wait()
-        return deed()
+        return call()
 
-    with ThreadPoolExecutor(len(deeds)) as pool:
-        return list(pool.map(run, deeds))
+    with ThreadPoolExecutor(len(calls)) as pool:
+        return list(pool.map(run, calls))
 
 
 def test_target_and_receiver_never_have_one_name(both: TestClient):
@@ -58,7 +69,9 @@ def test_target_and_receiver_never_have_one_name(both: TestClient):
         assert sorted(answer.status_code for answer in answers) == [201, 409]
 
 
-def test_plants_in_opposite_orders_do_not_wait_for_each_other(both: TestClient, tower: dict[str, Any]):
+def test_plants_in_opposite_orders_do_not_wait_for_each_other(
+    both: TestClient, tower: dict[str, Any]
+):
     head = {"power_plant_properties": tower["power_plant_properties"]}
     names = [f"t{number}" for number in range(40)]
 
@@ -68,8 +81,11 @@ def test_plants_in_opposite_orders_do_not_wait_for_each_other(both: TestClient, 
 
     assert put(names, 0) == 200
     for turn in range(1, 4):
-        deeds = [partial(put, order, turn + place) for place, order in enumerate((names, names[::-1]) * 2)]
-        assert at_once(*deeds) == [200] * 4
+        calls = [
+            partial(put, order, turn + place)
+            for place, order in enumerate((names, names[::-1]) * 2)
+        ]
+        assert at_once(*calls) == [200] * 4
 
 
 def test_heliostat_that_is_posted_twice_at_once_is_never_overwritten(
@@ -77,53 +93,71 @@ def test_heliostat_that_is_posted_twice_at_once_is_never_overwritten(
 ):
     assert both.put("/v1/plant", json=tower).status_code == 200
     for number in range(8):
-        bodies = [{"name": f"AB{number}", "properties": properties | {"note": note}} for note in ("one", "two")]
-        answers = at_once(*(lambda body=body: both.post("/v1/heliostats", json=body) for body in bodies))
+        bodies = [
+            {"name": f"AB{number}", "properties": properties | {"note": note}}
+            for note in ("one", "two")
+        ]
+        answers = at_once(
+            *(lambda body=body: both.post("/v1/heliostats", json=body) for body in bodies)
+        )
         assert sorted(answer.status_code for answer in answers) == [201, 409]
         (first,) = (answer.json() for answer in answers if answer.status_code == 201)
         assert both.get(f"/v1/heliostats/AB{number}").json()["properties"] == first["properties"]
-    again = at_once(*(lambda: both.post("/v1/heliostats", json={"name": "AC1", "properties": properties}),) * 2)
+    again = at_once(
+        *(lambda: both.post("/v1/heliostats", json={"name": "AC1", "properties": properties}),) * 2
+    )
     assert sorted(answer.status_code for answer in again) == [200, 201]
 
 
-def test_deed_that_met_a_deadlock_is_done_again(database: Database):
-    """Two that take two rows in opposite orders: on PostgreSQL one is ended, and does not know it."""
+def test_transaction_is_retried_after_a_deadlock(database: Database):
+    """Two that take two rows in opposite orders: on PostgreSQL one is ended, and does
+    not know it.
+    """
     with database.writing() as session:
         for name in ("A", "B"):
             store.put_heliostat(session, name, {}, (0, 0, 0))
     barrier = threading.Barrier(2)
 
     def add(first: str, second: str) -> None:
-        def deed(session: Any) -> None:
+        def call(session: Any) -> None:
             for place, name in enumerate((first, second)):
                 session.query(HeliostatRow).filter_by(name=name).with_for_update().one().east_m += 1
                 session.flush()
-                if place == 0 and database.url.get_backend_name() == "postgresql" and not barrier.broken:
+                if (
+                    place == 0
+                    and database.url.get_backend_name() == "postgresql"
+                    and not barrier.broken
+                ):
                     try:
-                        barrier.wait(2)  # both hold their first row now
+                        barrier.wait(WAIT_LIMIT_S)  # both hold their first row now
                     except threading.BrokenBarrierError:
                         continue
                     barrier.abort()
 
-        database.written(deed)
+        database.run_in_transaction(call)
 
     at_once(lambda: add("A", "B"), lambda: add("B", "A"))
     with database.reading() as session:
         assert [store.get_heliostat(session, name).east_m for name in ("A", "B")] == [2, 2]
 
 
-def test_deadlock_is_not_told_as_a_database_that_is_away():
+def test_deadlock_is_not_reported_as_unavailable_database():
     scope = {"type": "http", "path": "/v1/plant", "headers": [], "method": "PUT"}
-    answer = database_away(scope, OperationalError("", {}, psycopg.errors.DeadlockDetected("deadlock detected")))
+    answer = database_away(
+        scope, OperationalError("", {}, psycopg.errors.DeadlockDetected("deadlock detected"))
+    )
     assert (answer.status_code, answer.headers["Retry-After"]) == (503, "1")
     assert b"does not answer" not in answer.body
     assert b"send it again" in answer.body
 
 
-# --- taking back ------------------------------------------------------------------------------------------------------
+# --- taking back
+# --------------------------------------------------------------------------------------------------
 
 
-def test_what_nothing_refers_to_is_deleted(both: TestClient, tower: dict[str, Any], properties: dict[str, Any]):
+def test_what_nothing_refers_to_is_deleted(
+    both: TestClient, tower: dict[str, Any], properties: dict[str, Any]
+):
     both.put("/v1/plant", json=tower)
     both.put("/v1/targets/screen", json=PLANE)
     both.put("/v1/receivers/drum", json=CYLINDER)
@@ -135,7 +169,11 @@ def test_what_nothing_refers_to_is_deleted(both: TestClient, tower: dict[str, An
     # The name is free again, for either.
     assert both.put("/v1/receivers/screen", json=CYLINDER).status_code == 201
     with cast(FastAPI, both.app).state.runtime.database.reading() as session:
-        deleted = [entry.subject for entry in audit.entries(session, 100) if entry.action.endswith(".deleted")]
+        deleted = [
+            entry.subject
+            for entry in audit.entries(session, 100)
+            if entry.action.endswith(".deleted")
+        ]
     assert deleted == ["heliostat AA39", "receiver drum", "target screen"]
 
 
@@ -146,8 +184,14 @@ def test_what_is_referred_to_stays_and_says_by_what(
     both.put("/v1/receivers/drum", json=CYLINDER)
     both.put("/v1/heliostats/AA39", json=properties)
     assert poster(both)(png(1)).status_code == 201
-    sun = {"azimuth_deg": 0, "elevation_deg": 45}
-    forecast = {"heliostat": "AA39", "target": "upper", "sun": sun, "surface": "ideal", "resolution": 16}
+    sun = {"azimuth_deg": 180, "elevation_deg": 45}
+    forecast = {
+        "heliostat": "AA39",
+        "target": "upper",
+        "sun": sun,
+        "surface": "ideal",
+        "resolution": 16,
+    }
     assert both.post("/v1/forecasts", json=forecast).status_code == 201
     both.post("/v1/jobs/forecasts", json={"target": "drum", "sun": sun, "surface": "ideal"})
     for path, by in (
@@ -162,10 +206,15 @@ def test_what_is_referred_to_stays_and_says_by_what(
 
 
 def test_what_is_deleted_meanwhile_is_not_referred_to(database: Database):
-    """A photograph that is measured while its heliostat is deleted is refused, and no constraint breaks."""
+    """A photograph that is measured while its heliostat is deleted is refused, and no constraint
+    breaks.
+    """
     with database.writing() as session:
         row, _ = store.put_heliostat(session, "A", {}, (0, 0, 0))
     with database.writing() as session:
         store.remove_heliostat(session, "A")
-    with database.writing() as session, pytest.raises(NotFoundError, match="heliostat A was deleted"):
+    with (
+        database.writing() as session,
+        pytest.raises(NotFoundError, match="heliostat A was deleted"),
+    ):
         store.add_measurement(session, row, ImageRow(), MeasurementRow())

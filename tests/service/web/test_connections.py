@@ -1,4 +1,6 @@
-"""The pool of database connections: enough for workers and requests, and an answer where all are busy."""
+"""The pool of database connections: enough for workers and requests, and an answer where all are
+busy.
+"""
 
 import threading
 from contextlib import ExitStack
@@ -9,10 +11,11 @@ from fastapi.testclient import TestClient
 
 from service.base.settings import Settings
 from service.store import keys
-from service.twin.accuracy import AccuracyBook, Rank, State
-from service.twin.runtime import Runtime
+from service.twin.runtime.runtime import Runtime
+from service.twin.surfaces.accuracy import AccuracyCache, AccuracyState, Rank
 from service.web.app import create_app
 from tests.service.conftest import FakeOperations, client_of, until
+from tests.waiting import WAIT_LIMIT_S
 
 
 def hold(runtime: Runtime, count: int, held: ExitStack) -> None:
@@ -22,7 +25,9 @@ def hold(runtime: Runtime, count: int, held: ExitStack) -> None:
 
 def test_requests_are_answered_beside_64_workers(settings: Settings):
     """Each of them holds two connections, and 40 threads of requests one each."""
-    runtime = Runtime.from_settings(settings.model_copy(update={"job_workers": 64}), FakeOperations())
+    runtime = Runtime.from_settings(
+        settings.model_copy(update={"job_workers": 64}), FakeOperations()
+    )
     runtime.database.engine.pool._timeout = 0.2  # type: ignore[attr-defined]
     try:
         with ExitStack() as held:
@@ -47,23 +52,23 @@ def test_busy_pool_is_answered_with_when_to_come_again(settings: Settings, heade
     assert "busy" in answer.json()["detail"]
 
 
-def test_accuracy_that_is_being_worked_out_is_not_begun_again(client: TestClient, monkeypatch: pytest.MonkeyPatch):
+def test_pending_accuracy_is_computed_once(client: TestClient, monkeypatch: pytest.MonkeyPatch):
     begun, go = [], threading.Event()
 
-    def work(self: AccuracyBook, state: State) -> Rank:
+    def work(self: AccuracyCache, state: AccuracyState) -> Rank:
         begun.append(state)
-        assert go.wait(10)
+        assert go.wait(WAIT_LIMIT_S)
         return Rank(0.9, 3)
 
-    monkeypatch.setattr(AccuracyBook, "_rank", work)
+    monkeypatch.setattr(AccuracyCache, "_rank", work)
     app: Any = client.app
-    book, state = AccuracyBook(app.state.runtime), State("AA39", 1, 1, None, 1)
+    cache, state = AccuracyCache(app.state.runtime), AccuracyState("AA39", 1, 1, None, 1)
     try:
-        book.look_up([state])
+        cache.get_many([state])
         until(lambda: bool(begun))
-        assert [book.look_up([state]) for _ in range(3)] == [({}, 1)] * 3
+        assert [cache.get_many([state]) for _ in range(3)] == [({}, 1)] * 3
         go.set()
-        until(lambda: book.look_up([state]) == ({"AA39": Rank(0.9, 3)}, 0))
+        until(lambda: cache.get_many([state]) == ({"AA39": Rank(0.9, 3)}, 0))
     finally:
-        book.close()
+        cache.close()
     assert begun == [state]

@@ -1,4 +1,7 @@
-"""Which surface is today's: the better one stays it, unless somebody decides otherwise, and takes that back."""
+"""Which surface is active: the better one, unless a person decides otherwise.
+
+Such a decision can be undone.
+"""
 
 import threading
 from collections.abc import Iterator
@@ -19,31 +22,44 @@ from service.base.settings import Settings
 from service.jobs.kinds import KINDS
 from service.jobs.worker import Worker
 from service.web.app import create_app
-from tests.service.conftest import QUIET, FakeOperations, client_of, png, poster, properties_document, tower_document
+from tests.service.conftest import (
+    QUIET,
+    FakeOperations,
+    client_of,
+    png,
+    poster,
+    properties_document,
+    sun_at,
+    tower_document,
+)
 
 BASE = "/v1/heliostats/AA39/surfaces"
 
 
 class Mirrors(FakeOperations):
-    """Predicts a mirror that bends by ``bends`` of the method [mm], and forecasts the worse the more a mirror bends."""
+    """Predicts a mirror that bends by ``bends`` of the method [mm], and forecasts the worse the
+    more a mirror bends.
+    """
 
     bends: dict[str, float]
 
     def __init__(self) -> None:
         super().__init__()
         self.bends = {"network": 2.0, "refined": 1.0}
-        self.doubts: tuple[str, ...] = ()
+        self.warnings: tuple[str, ...] = ()
 
     def predict(self, heliostat: Heliostat, *rest: Any, **more: Any) -> SurfacePrediction:
         made = super().predict(heliostat, *rest, **more)
         z = np.full((4, 8, 8), self.bends[made.method] / 1e3)
-        return replace(made, z=z, doubts=self.doubts)
+        return replace(made, z=z, warnings=self.warnings)
 
-    def render(self, heliostat: Heliostat, observations: list[Observation], z: Any, *rest: Any, **more: Any) -> Any:
+    def render(
+        self, heliostat: Heliostat, observations: list[Observation], z: Any, *rest: Any, **more: Any
+    ) -> Any:
         right = super().render(heliostat, observations, z, *rest, **more)
         wrong = np.zeros_like(right)
         wrong[:, 0, 0] = 100
-        share = np.clip(np.abs(z).max() * 50, 0, 1)
+        share = 1 if z is None else np.clip(np.abs(z).max() * 50, 0, 1)
         return (1 - share) * right + share * wrong
 
 
@@ -64,12 +80,18 @@ def client(tmp_path: Path, mirrors: Mirrors) -> Iterator[TestClient]:
 def photograph(client: TestClient, *numbers: int) -> None:
     """Post photographs of these numbers, each on its day of May."""
     for number in numbers:
-        told = {"id": str(number), "sun_azimuth": 10.0 * number, "taken_at": f"2024-05-0{number + 1}T10:00:00Z"}
-        assert poster(client)(png(number), **told).status_code == 201
+        sent = {
+            "id": str(number),
+            "sun": sun_at(180 - 10.0 * number),
+            "taken_at": f"2024-05-0{number + 1}T10:00:00Z",
+        }
+        assert poster(client)(png(number), **sent).status_code == 201
 
 
 def predict(client: TestClient, method: str, *measurements: str) -> Any:
-    answer = client.post(BASE, json={"method": method, "measurements": measurements or ("0", "1", "2")})
+    answer = client.post(
+        BASE, json={"method": method, "measurements": measurements or ("0", "1", "2")}
+    )
     assert answer.status_code == 201, answer.text
     return answer.json()
 
@@ -79,45 +101,52 @@ def current(client: TestClient) -> int:
 
 
 def test_worse_surface_waits_aside(client: TestClient):
-    assert predict(client, "refined")["set_aside"] is False
-    assert predict(client, "network")["set_aside"] is True
+    assert predict(client, "refined")["is_candidate"] is False
+    assert predict(client, "network")["is_candidate"] is True
     assert current(client) == 1
-    (decision,) = client.get(f"{BASE}/decisions").json()
-    assert (decision["version"], decision["taken"], decision["previous"]) == (2, False, 1)
+    (decision,) = client.get(f"{BASE}/decisions").json()["items"]
+    assert (decision["version"], decision["became_active"], decision["previous"]) == (2, False, 1)
     assert decision["accuracy_before"] == pytest.approx(0.9, abs=0.01)
     assert decision["accuracy_after"] == pytest.approx(0.8, abs=0.01)
     assert "too few to judge" in decision["reason"]
     assert "version 1 is refined, this one is the network's alone" in decision["reason"]
 
 
-def test_better_surface_becomes_todays_and_is_taken_back(client: TestClient):
+def test_better_surface_becomes_active_and_is_undone(client: TestClient):
     predict(client, "network")
-    assert predict(client, "refined")["set_aside"] is False
+    assert predict(client, "refined")["is_candidate"] is False
     assert current(client) == 2
     undone = client.post(f"{BASE}/undo")
     assert (undone.status_code, undone.json()["version"], current(client)) == (200, 1, 1)
-    assert client.get(f"{BASE}/2").json()["set_aside"] is True
+    assert client.get(f"{BASE}/2").json()["is_candidate"] is True
     assert client.post(f"{BASE}/undo").status_code == 200  # undone again it is as it was
     assert current(client) == 2
-    assert client.get(f"{BASE}/2").json()["set_aside"] is False
+    assert client.get(f"{BASE}/2").json()["is_candidate"] is False
 
 
-def test_undo_is_of_the_last_decision_that_changed_todays(client: TestClient, mirrors: Mirrors):
-    """Not of what was set aside since, which changed nothing."""
+def test_undo_is_of_the_last_decision_that_changed_the_active_surface(
+    client: TestClient, mirrors: Mirrors
+):
+    """Later candidates do not count: they changed nothing."""
     predict(client, "network")
     predict(client, "refined")
     mirrors.bends["network"] = 3.0
-    assert predict(client, "network")["set_aside"] is True
-    client.put(f"{BASE}/current", json={"version": 2, "reason": "it stays"})  # nor of what left it in its place
+    assert predict(client, "network")["is_candidate"] is True
+    client.put(
+        f"{BASE}/current", json={"version": 2, "reason": "it stays"}
+    )  # nor of what left it in its place
     assert "Undo: back to version 1" in page_of(client, "/heliostats/AA39")
     undone = client.post(f"{BASE}/undo")
     assert (undone.status_code, undone.json()["previous"], current(client)) == (200, 2, 1)
     assert "Undo: back to version 2" in page_of(client, "/heliostats/AA39")
-    assert client.get(f"{BASE}/3").json()["set_aside"] is True
+    assert client.get(f"{BASE}/3").json()["is_candidate"] is True
 
 
 def test_what_came_since_is_not_undone(client: TestClient):
-    """A surface that was measured is today's without a decision: no earlier decision says what was before it."""
+    """A measured surface becomes active without a decision.
+
+    So no decision names the surface that was active before it.
+    """
     predict(client, "network")
     predict(client, "refined")
     measure(client, 4e-3)
@@ -132,14 +161,21 @@ def test_somebody_decides_otherwise(client: TestClient):
     predict(client, "network")
     chosen = client.put(f"{BASE}/current", json={"version": 2, "reason": "the mirror was cleaned"})
     assert (chosen.status_code, current(client)) == (200, 2)
-    assert client.put(f"{BASE}/current", json={"version": 1, "reason": "no"}).json()["previous"] == 2
-    assert (current(client), client.get(f"{BASE}/2").json()["set_aside"]) == (1, True)
+    assert (
+        client.put(f"{BASE}/current", json={"version": 1, "reason": "no"}).json()["previous"] == 2
+    )
+    assert (current(client), client.get(f"{BASE}/2").json()["is_candidate"]) == (1, True)
     client.post(f"{BASE}/undo")
     assert current(client) == 2
     assert client.put(f"{BASE}/current", json={"version": 9, "reason": "x"}).status_code == 404
     assert client.put(f"{BASE}/current", json={"version": 1}).status_code == 422
     actions = [entry["action"] for entry in client.get("/v1/audit").json()["items"]]
-    assert actions[:4] == ["surface.taken", "surface.taken", "surface.taken", "surface.set_aside"]
+    assert actions[:4] == [
+        "surface.promoted",
+        "surface.promoted",
+        "surface.promoted",
+        "surface.rejected",
+    ]
 
 
 def test_nothing_to_undo(client: TestClient):
@@ -154,39 +190,52 @@ def test_photographs_that_neither_has_seen_judge(client: TestClient, mirrors: Mi
     predict(client, "refined", "0")
     mirrors.bends["network"] = 0.0
     predict(client, "network", "1")
-    (decision,) = client.get(f"{BASE}/decisions").json()
-    assert (decision["photographs"], decision["taken"]) == (5, True)
-    assert "forecasts better than version 1 on 5 photographs that neither has seen, by" in decision["reason"]
+    (decision,) = client.get(f"{BASE}/decisions").json()["items"]
+    assert (decision["photographs"], decision["became_active"]) == (5, True)
+    assert (
+        "forecasts better than version 1 on 5 photographs that neither has seen, by"
+        in decision["reason"]
+    )
 
 
 def test_a_few_unseen_photographs_judge_nothing(client: TestClient, mirrors: Mirrors):
     """One alone would have put the network's surface in the refined one's place."""
     predict(client, "refined", "0")
     mirrors.bends["network"] = 0.0
-    assert predict(client, "network", "1")["set_aside"] is True
-    reason = client.get(f"{BASE}/decisions").json()[0]["reason"]
+    assert predict(client, "network", "1")["is_candidate"] is True
+    reason = client.get(f"{BASE}/decisions").json()["items"][0]["reason"]
     assert "too few to judge (5 do)" in reason
 
 
 def test_surface_of_corrected_photographs_gives_way(client: TestClient):
-    """What was made anew of the same photographs takes its place, however well the wrong one forecasts them."""
+    """A surface made again from the corrected photographs replaces it.
+
+    That the wrong one forecasts them better does not matter.
+    """
     predict(client, "refined")
-    told = {"reason": "the clock was wrong", "sun_azimuth": 59.0}
-    assert client.patch("/v1/heliostats/AA39/measurements/2", json=told).status_code == 200
-    assert predict(client, "network")["set_aside"] is False
-    assert "corrected since" in client.get(f"{BASE}/decisions").json()[0]["reason"]
+    sent = {"reason": "the clock was wrong", "sun": sun_at(121.0)}
+    assert client.patch("/v1/heliostats/AA39/measurements/2", json=sent).status_code == 200
+    assert predict(client, "network")["is_candidate"] is False
+    assert (
+        "corrected or deleted since" in client.get(f"{BASE}/decisions").json()["items"][0]["reason"]
+    )
 
 
-def test_measured_surface_stays_unless_unseen_photographs_speak(client: TestClient, mirrors: Mirrors):
+def test_measured_surface_stays_unless_unseen_photographs_speak(
+    client: TestClient, mirrors: Mirrors
+):
     photograph(client, 3, 4, 5, 6)
     measure(client, 5e-3, datetime(1970, 1, 1, tzinfo=UTC))
-    assert predict(client, "refined")["set_aside"] is True  # four are left that it has not seen
-    assert "version 1 was measured" in client.get(f"{BASE}/decisions").json()[0]["reason"]
-    mirrors.doubts = ("a facet sends no light",)
-    assert predict(client, "refined", "5")["set_aside"] is True
-    assert "only somebody puts it in its place" in client.get(f"{BASE}/decisions").json()[0]["reason"]
-    mirrors.doubts = ()
-    assert predict(client, "refined", "2")["set_aside"] is False
+    assert predict(client, "refined")["is_candidate"] is True  # four are left that it has not seen
+    assert "version 1 was measured" in client.get(f"{BASE}/decisions").json()["items"][0]["reason"]
+    mirrors.warnings = ("a facet sends no light",)
+    assert predict(client, "refined", "5")["is_candidate"] is True
+    assert (
+        "only a person may promote it"
+        in client.get(f"{BASE}/decisions").json()["items"][0]["reason"]
+    )
+    mirrors.warnings = ()
+    assert predict(client, "refined", "2")["is_candidate"] is False
     assert current(client) == 4
 
 
@@ -201,9 +250,9 @@ def test_nothing_new_makes_no_version(client: TestClient):
 def test_surface_of_earlier_photographs_is_history(client: TestClient):
     """It replaces nothing, so nothing is judged."""
     predict(client, "network", "2")
-    assert predict(client, "refined", "0")["set_aside"] is False
+    assert predict(client, "refined", "0")["is_candidate"] is False
     assert current(client) == 1
-    assert client.get(f"{BASE}/decisions").json() == []
+    assert client.get(f"{BASE}/decisions").json()["items"] == []
 
 
 def measure(client: TestClient, bend_m: float, valid_from: datetime | None = None) -> None:
@@ -211,7 +260,9 @@ def measure(client: TestClient, bend_m: float, valid_from: datetime | None = Non
     app: Any = client.app
     with app.state.runtime.database.writing() as session:
         z = np.full((4, 8, 8), bend_m)
-        new = store.NewSurface("measured", z, 0 * z, np.stack([z] * 3, -1), valid_from)
+        new = store.NewSurface(
+            "measured", z, 0 * z, np.stack([z] * 3, -1), valid_from or datetime.now(UTC)
+        )
         store.add_surface(session, store.get_heliostat(session, "AA39"), new)
 
 
@@ -225,7 +276,9 @@ def work(app: FastAPI) -> None:
         pass
 
 
-def test_cancelled_job_says_what_it_changed(client: TestClient, mirrors: Mirrors, monkeypatch: pytest.MonkeyPatch):
+def test_cancelled_job_says_what_it_changed(
+    client: TestClient, mirrors: Mirrors, monkeypatch: pytest.MonkeyPatch
+):
     monkeypatch.setattr("service.jobs.kind._REPORT_EVERY_S", 0.0)
     app: Any = client.app
     client.put("/v1/heliostats/AB01", json=properties_document())
@@ -246,11 +299,11 @@ def test_cancelled_job_says_what_it_changed(client: TestClient, mirrors: Mirrors
     job = client.get(f"/v1/jobs/{asked}").json()
     assert job["state"] == "cancelled"
     assert job["result"]["surfaces"]["AA39"] == 2
-    assert job["result"]["judged"]["AA39"]["taken"] is False
+    assert job["result"]["judged"]["AA39"]["became_active"] is False
     page = page_of(client, f"/jobs/{asked}")
-    assert "What it had changed until then" in page
+    assert "Changes until it ended" in page
     assert "AA39, version 2" in page
-    assert "set aside" in page
+    assert '<span class="state">candidate</span>' in page
 
 
 def test_page_decides_and_takes_back(client: TestClient):

@@ -8,9 +8,9 @@ from fastapi.testclient import TestClient
 from starlette.staticfiles import StaticFiles
 
 from service.base.settings import Settings
-from service.web.answers.files import is_held
 from service.web.app import create_app
-from service.web.door import security
+from service.web.auth import security
+from service.web.responses.files import etag_matches
 
 PATHS = ("/static/app.css", "/static/icon.svg", "/docs/swagger-ui.css", "/docs/start.js")
 
@@ -29,7 +29,7 @@ def test_what_a_browser_holds_is_not_sent_again(bare: TestClient, path: str):
 
 
 @pytest.mark.parametrize("path", PATHS)
-def test_head_tells_the_same_without_the_file(bare: TestClient, path: str):
+def test_head_has_the_same_headers_without_the_file(bare: TestClient, path: str):
     head, answer = bare.head(path), bare.get(path)
     assert (head.status_code, head.content) == (200, b"")
     for name in ("Content-Type", "Content-Length", "ETag", "Cache-Control"):
@@ -45,7 +45,10 @@ def test_range_is_ignored(bare: TestClient, value: str):
 
 
 def test_styles_stay_for_good_and_the_documentation_an_hour(bare: TestClient):
-    assert bare.get("/static/app.css?v=1").headers["Cache-Control"] == "public, max-age=31536000, immutable"
+    assert (
+        bare.get("/static/app.css?v=1").headers["Cache-Control"]
+        == "public, max-age=31536000, immutable"
+    )
     assert bare.get("/docs/start.js").headers["Cache-Control"] == "max-age=3600"
 
 
@@ -103,4 +106,4 @@ def test_mounted_application_needs_to_be_public_on_purpose(tmp_path: Any):
     ],
 )
 def test_if_none_match(given: str | None, expected: bool):
-    assert is_held('"a"', given) is expected
+    assert etag_matches('"a"', given) is expected

@@ -1,8 +1,11 @@
-"""Finding heliostats: what is looked for, in which order, page by page, on the field's page and over REST."""
+"""Finding heliostats: what is looked for, in which order, page by page, on the field's page and
+over REST.
+"""
 
 import re
 from collections.abc import Iterator
 from dataclasses import replace
+from datetime import UTC, datetime
 from typing import Any
 
 import pytest
@@ -12,32 +15,55 @@ from fastapi.testclient import TestClient
 from service import store
 from service.base.settings import Settings
 from service.store.database import Database
-from service.store.surfaces import NewSurface, Trust
-from service.twin import field
-from service.twin.accuracy import Rank
-from service.twin.field import Current, FieldBook, Figures, Line
-from service.twin.finding import Wanted, find
-from service.twin.runtime import Runtime
+from service.store.surfaces.surface_versions import NewSurface, Trust
+from service.twin.alerts import field_overview
+from service.twin.alerts.field_filter import HeliostatFilter, filter_heliostats
+from service.twin.alerts.field_overview import (
+    ActiveSurface,
+    FieldOverviewCache,
+    FieldTotals,
+    HeliostatSummary,
+)
+from service.twin.runtime.runtime import Runtime
+from service.twin.surfaces.accuracy import Rank
 from service.web.app import create_app
-from service.web.pages.field import FieldView
-from tests.service.conftest import QUIET, FakeOperations, client_of, properties_document, tower_document, until
+from service.web.pages.field_page import FieldView
+from tests.service.conftest import (
+    QUIET,
+    FakeOperations,
+    client_of,
+    properties_document,
+    tower_document,
+    until,
+)
 from tests.service.web.test_pages import HTML, settled, text_of
+from tests.waiting import WAIT_LIMIT_S
 
-OF_1970 = field.datetime.fromisoformat("2026-01-01T00:00:00+00:00")
+OF_1970 = field_overview.datetime.fromisoformat("2026-01-01T00:00:00+00:00")
 
 
-def line(name: str, deviation: float | None = None, accuracy: float | None = None, **more: Any) -> Line:
+def line(
+    name: str, deviation: float | None = None, accuracy: float | None = None, **more: Any
+) -> HeliostatSummary:
     """A heliostat; with a deviation it has a surface."""
-    surface = None if deviation is None else Current(1, 1, "refined", OF_1970, 0.1, True, [])
-    figures = None if deviation is None else Figures(deviation, None)
-    return replace(Line(name, 0.0, 1.0, surface=surface, figures=figures, rank=Rank(accuracy, 1)), **more)
+    surface = None if deviation is None else ActiveSurface(1, 1, "refined", OF_1970, 0.1, True, [])
+    figures = None if deviation is None else FieldTotals(deviation, None)
+    return replace(
+        HeliostatSummary(name, 0.0, 1.0, surface=surface, figures=figures, rank=Rank(accuracy, 1)),
+        **more,
+    )
 
 
 LINES = [
     line("AA01", 0.3, 0.9, photographs=3),
     line("AA02", 0.1, 0.8, photographs=5, refused=2),
     line("AB01"),
-    line("AB02", 0.3, surface=Current(2, 4, "network", OF_1970, 0.2, False, ["strange"]), rank=Rank(None, 0)),
+    line(
+        "AB02",
+        0.3,
+        surface=ActiveSurface(2, 4, "network", OF_1970, 0.2, False, ["strange"]),
+        rank=Rank(None, 0),
+    ),
 ]
 
 
@@ -46,16 +72,16 @@ LINES = [
     [
         ({}, "AA02 AA01 AB01 AB02"),  # the worst first, what is not known last
         ({"order": "down"}, "AA01 AA02 AB01 AB02"),
-        ({"metric": "deviation"}, "AA01 AB02 AA02 AB01"),
-        ({"metric": "deviation", "sort": "name"}, "AA01 AA02 AB01 AB02"),
+        ({"metric": "deviation_mm"}, "AA01 AB02 AA02 AB01"),
+        ({"metric": "deviation_mm", "sort": "name"}, "AA01 AA02 AB01 AB02"),
         ({"sort": "name", "order": "down"}, "AB02 AB01 AA02 AA01"),
         ({"sort": "photographs"}, "AA02 AA01 AB01 AB02"),
         ({"sort": "trusted"}, "AB02 AA01 AA02 AB01"),
-        ({"sort": "surface"}, "AB02 AA01 AA02 AB01"),
+        ({"sort": "surface_version"}, "AB02 AA01 AA02 AB01"),
         ({"search": "ab"}, "AB01 AB02"),
         ({"search": "01", "sort": "name"}, "AA01 AB01"),
-        ({"show": "doubted"}, "AB02"),
-        ({"show": "unseen"}, "AB02"),
+        ({"show": "flagged"}, "AB02"),
+        ({"show": "unacknowledged"}, "AB02"),
         ({"show": "trusted"}, "AA02 AA01"),
         ({"show": "no_surface"}, "AB01"),
         ({"show": "surface", "sort": "name"}, "AA01 AA02 AB02"),
@@ -64,18 +90,26 @@ LINES = [
         ({"show": "no_photographs"}, "AB01 AB02"),
         ({"low": 85}, "AA01"),
         ({"low": 80, "high": 85}, "AA02"),
-        ({"metric": "deviation", "high": 0.2}, "AA02"),
-        ({"metric": "deviation", "low": "", "high": "", "search": "", "show": "", "sort": ""}, "AA01 AB02 AA02 AB01"),
+        ({"metric": "deviation_mm", "high": 0.2}, "AA02"),
+        (
+            {"metric": "deviation_mm", "low": "", "high": "", "search": "", "show": "", "sort": ""},
+            "AA01 AB02 AA02 AB01",
+        ),
     ],
 )
 def test_what_is_wanted_is_found_in_its_order(wanted: dict[str, Any], names: str):
-    assert " ".join(one.name for one in find(LINES, Wanted.model_validate(wanted))) == names
+    assert (
+        " ".join(
+            one.name for one in filter_heliostats(LINES, HeliostatFilter.model_validate(wanted))
+        )
+        == names
+    )
 
 
 def test_every_view_has_an_address():
-    view = FieldView.model_validate({"search": "A", "metric": "age", "page": 3})
-    assert view.link() == "/?search=A&metric=age"
-    assert view.link(page=4) == "/?page=4&search=A&metric=age"
+    view = FieldView.model_validate({"search": "A", "metric": "age_days", "page": 3})
+    assert view.link() == "/?search=A&metric=age_days"
+    assert view.link(page=4) == "/?page=4&search=A&metric=age_days"
     assert FieldView().link() == FieldView().link(search=None) == "/"
     assert FieldView().sorted_by("accuracy") == "/?sort=accuracy&order=down"
     assert FieldView(sort="name").sorted_by("name") == "/?sort=name&order=down"
@@ -100,9 +134,10 @@ def large(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
 
 
 def surface(height: float, is_doubted: bool) -> NewSurface:
-    z = field.np.full((4, 8, 8), height)
-    doubts = ("it is strange",) if is_doubted else ()
-    return NewSurface("refined", z, 0 * z, field.np.stack([z, z, z], -1), trust=Trust(doubts, (), 1.0, 40.0))
+    z = field_overview.np.full((4, 8, 8), height)
+    warnings = ("it is strange",) if is_doubted else ()
+    points, trust = field_overview.np.stack([z, z, z], -1), Trust(warnings, (), 1.0, 40.0)
+    return NewSurface("refined", z, 0 * z, points, datetime.now(UTC), trust=trust)
 
 
 def names_in(page: str) -> list[str]:
@@ -122,29 +157,41 @@ def test_table_comes_in_pages_of_a_hundred(large: TestClient):
     assert len(first.encode()) < 100_000
 
 
-def test_map_shows_all_and_what_is_looked_for_stands_out(large: TestClient):
+def test_map_shows_all_and_highlights_matches(large: TestClient):
     def drawn(page: str, path: str) -> int:
-        return sum(found.count("M") for found in re.findall(rf'<path class="{path}[^"]*"[^>]* d="([^"]*)"', page))
+        return sum(
+            found.count("M")
+            for found in re.findall(rf'<path class="{path}[^"]*"[^>]* d="([^"]*)"', page)
+        )
 
     page = settled(large)
-    assert (drawn(page, "mirrors"), drawn(page, "left-out"), drawn(page, "doubted")) == (250, 0, 3)
-    page = settled(large, "/?show=doubted&metric=deviation")
+    assert (drawn(page, "mirrors"), drawn(page, "left-out"), drawn(page, "flagged")) == (250, 0, 3)
+    page = settled(large, "/?show=flagged&metric=deviation_mm")
     assert (drawn(page, "mirrors"), drawn(page, "left-out")) == (3, 247)
     assert names_in(page) == ["H200", "H100", "H000"]
-    assert '<a class="button" href="/?metric=deviation">All</a>' in page
+    assert '<a class="button" href="/?metric=deviation_mm">All</a>' in page
     none = text_of(large, "/?search=nobody")
     assert "0 of 250 heliostats" in none
     assert (drawn(none, "mirrors"), drawn(none, "left-out")) == (0, 250)
 
 
 def test_columns_lead_to_their_order_and_back(large: TestClient):
-    page = settled(large, "/?metric=deviation")
-    assert re.search(r'aria-sort="descending"><a href="/\?metric=deviation&amp;sort=deviation&amp;order=up">', page)
+    page = settled(large, "/?metric=deviation_mm")
+    assert re.search(
+        r'aria-sort="descending">'
+        r'<a href="/\?metric=deviation_mm&amp;sort=deviation_mm&amp;order=up">',
+        page,
+    )
     assert names_in(page)[:2] == ["H240", "H230"]
-    assert names_in(text_of(large, "/?metric=deviation&sort=deviation&order=up"))[:2] == ["H000", "H010"]
+    assert names_in(text_of(large, "/?metric=deviation_mm&sort=deviation_mm&order=up"))[:2] == [
+        "H000",
+        "H010",
+    ]
 
 
-@pytest.mark.parametrize("query", ["show=x", "sort=x", "order=x", "page=0", "low=nan", "high=x", f"search={'x' * 33}"])
+@pytest.mark.parametrize(
+    "query", ["show=x", "sort=x", "order=x", "page=0", "low=nan", "high=x", f"search={'x' * 33}"]
+)
 def test_question_that_makes_no_sense_is_refused(large: TestClient, query: str):
     for path in ("/", "/v1/field"):
         if not (path == "/v1/field" and query == "page=0"):
@@ -155,52 +202,64 @@ def test_question_that_makes_no_sense_is_refused(large: TestClient, query: str):
 
 def test_rest_has_the_same_field(large: TestClient):
     settled(large)
-    found = large.get("/v1/field", params={"show": "surface", "metric": "deviation", "limit": 3}).json()
+    found = large.get(
+        "/v1/field", params={"show": "surface", "metric": "deviation_mm", "limit": 3}
+    ).json()
     assert [item["name"] for item in found["items"]] == ["H240", "H230", "H220"]
     assert found["items"][0] == {
         "name": "H240",
         "position_m": [90.0, 54.0],
         "accuracy": None,
         "judged_by": None,
-        "deviation": pytest.approx(0.24),
-        "uncertainty": None,
+        "deviation_mm": pytest.approx(0.24),
+        "uncertainty_mm": None,
         "misfit": None,
-        "sun_span": 40.0,
-        "age": pytest.approx(0, abs=1),
-        "pointing": None,
-        "surface": 1,
+        "sun_span_deg": 40.0,
+        "age_days": pytest.approx(0, abs=1),
+        "pointing_error_mrad": None,
+        "surface_version": 1,
         "source": "refined",
         "trusted": True,
-        "doubts": [],
-        "doubted_since": None,
-        "seen_by": None,
+        "warnings": [],
+        "warned_since": None,
+        "acknowledged_by": None,
         "photographs": 0,
         "refused": 0,
     }
     names, after = [], None
     while True:
-        page = large.get("/v1/field", params={"sort": "name", "limit": 99} | ({"after": after} if after else {})).json()
+        page = large.get(
+            "/v1/field", params={"sort": "name", "limit": 99} | ({"after": after} if after else {})
+        ).json()
         names += [item["name"] for item in page["items"]]
         after = page["next"]
         if after is None:
             break
     assert names == [f"H{number:03}" for number in range(250)]
-    assert large.get("/v1/field?show=doubted&after=H001").status_code == 404
+    assert large.get("/v1/field?show=flagged&after=H001").status_code == 404
 
 
 def test_rest_finds_names_by_a_part(large: TestClient):
     found = large.get("/v1/heliostats?search=24").json()["items"]
-    assert [item["name"] for item in found] == ["H024", "H124", "H224", *(f"H{number}" for number in range(240, 250))]
+    assert [item["name"] for item in found] == [
+        "H024",
+        "H124",
+        "H224",
+        *(f"H{number}" for number in range(240, 250)),
+    ]
     assert large.get("/v1/heliostats?search=%25").json()["items"] == []
 
 
-# --- what is read once ------------------------------------------------------------------------------------------------
+# --- what is read once
+# ------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
-def book(database: Database, settings: Settings) -> Iterator[FieldBook]:
-    runtime = Runtime.from_settings(settings.model_copy(update={"database_url": str(database.url)}), FakeOperations())
-    made = FieldBook(runtime)
+def cache(database: Database, settings: Settings) -> Iterator[FieldOverviewCache]:
+    runtime = Runtime.from_settings(
+        settings.model_copy(update={"database_url": str(database.url)}), FakeOperations()
+    )
+    made = FieldOverviewCache(runtime)
     made._runtime = replace(runtime, database=database)
     yield made
     made.close()
@@ -212,35 +271,41 @@ def put(database: Database, name: str) -> None:
         store.put_heliostat(session, name, properties_document(), (1.0, 2.0, 3.0))
 
 
-def now(book: FieldBook, database: Database) -> tuple[list[str], bool]:
+def now(cache: FieldOverviewCache, database: Database) -> tuple[list[str], bool]:
     with database.reading() as session:
-        found = book.read(session)
+        found = cache.read(session)
     return [one.name for one in found.lines], found.is_behind
 
 
-def test_field_is_read_anew_where_it_changed(book: FieldBook, database: Database, monkeypatch: pytest.MonkeyPatch):
-    reads, read = [], field.read_lines
-    monkeypatch.setattr(field, "read_lines", lambda session: reads.append(1) or read(session))
+def test_changed_part_of_the_field_is_read_again(
+    cache: FieldOverviewCache, database: Database, monkeypatch: pytest.MonkeyPatch
+):
+    reads, read = [], field_overview.read_summaries
+    monkeypatch.setattr(
+        field_overview, "read_summaries", lambda session: reads.append(1) or read(session)
+    )
     put(database, "AA01")
-    assert [now(book, database) for _ in range(3)] == [(["AA01"], False)] * 3
+    assert [now(cache, database) for _ in range(3)] == [(["AA01"], False)] * 3
     assert len(reads) == 1
     put(database, "AA02")
-    assert [now(book, database) for _ in range(3)] == [(["AA01", "AA02"], False)] * 3
+    assert [now(cache, database) for _ in range(3)] == [(["AA01", "AA02"], False)] * 3
     assert len(reads) == 2
 
 
 def test_large_field_is_shown_as_it_was_until_it_is_read(
-    book: FieldBook, database: Database, monkeypatch: pytest.MonkeyPatch
+    cache: FieldOverviewCache, database: Database, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(field, "_QUICK_S", 0.0)  # every field is large
+    monkeypatch.setattr(field_overview, "_QUICK_S", 0.0)  # every field is large
     put(database, "AA01")
-    assert now(book, database) == (["AA01"], False)
-    go, read = field.threading.Event(), field.read_lines
-    monkeypatch.setattr(field, "read_lines", lambda session: go.wait(30) and read(session))
+    assert now(cache, database) == (["AA01"], False)
+    go, read = field_overview.threading.Event(), field_overview.read_summaries
+    monkeypatch.setattr(
+        field_overview, "read_summaries", lambda session: go.wait(WAIT_LIMIT_S) and read(session)
+    )
     put(database, "AA02")
-    assert now(book, database) == (["AA01"], True)
+    assert now(cache, database) == (["AA01"], True)
     go.set()
-    until(lambda: now(book, database) == (["AA01", "AA02"], False))
+    until(lambda: now(cache, database) == (["AA01", "AA02"], False))
 
 
 def test_transaction_that_ends_late_is_seen(database: Database):
@@ -249,16 +314,18 @@ def test_transaction_that_ends_late_is_seen(database: Database):
 
     def row(number: int) -> HeliostatRow:
         properties = properties_document()
-        return HeliostatRow(id=number, name=f"H{number}", properties=properties, east_m=0.0, north_m=0.0, up_m=0.0)
+        return HeliostatRow(
+            id=number, name=f"H{number}", properties=properties, east_m=0.0, north_m=0.0, up_m=0.0
+        )
 
     with database.writing() as session:
         session.add(row(2))
     with database.reading() as session:
-        before = field._marks(session)
+        before = field_overview._cache_marks(session)
     with database.writing() as session:
         session.add(row(1))
     with database.reading() as session:
-        assert field._marks(session) != before
+        assert field_overview._cache_marks(session) != before
 
 
 def test_app_has_the_field(app: FastAPI) -> None:

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from pydantic import BaseModel
 
-from service.base.faults import NotAcceptableError
-from service.web.answers.formats import ARRAYS, JSON, choose, json_answer
-from service.web.answers.representations.npz import NPZ, NPZ_VENDOR
-from service.web.answers.representations.png import PNG
+from service.base.errors import NotAcceptableError
+from service.web.responses.formats import ARRAYS, JSON, choose, json_answer
+from service.web.responses.representations.npz import NPZ, NPZ_VENDOR
+from service.web.responses.representations.png import PNG
 
 
 @pytest.mark.parametrize(
@@ -48,7 +48,8 @@ def test_nothing_acceptable(accept: str):
     assert caught.value.offered == ARRAYS
 
 
-# --- arrays -----------------------------------------------------------------------------------------------------------
+# --- arrays
+# --------------------------------------------------------------------------------------------------
 
 
 class Named(BaseModel):
@@ -60,7 +61,9 @@ class Named(BaseModel):
 def test_numbers_come_back_bit_by_bit(dtype: type):
     rng = np.random.default_rng(0)
     array = (
-        rng.lognormal(0, 3, (7, 5, 3)) if dtype in (np.float32, np.float64) else rng.integers(0, 99, (7, 5, 3))
+        rng.lognormal(0, 3, (7, 5, 3))
+        if dtype in (np.float32, np.float64)
+        else rng.integers(0, 99, (7, 5, 3))
     ).astype(dtype)
     for shown in (array, array.T, array[::2], array[0], array[0, 0, 0]):
         answer = json_answer(Named(name="ä"), array=shown, none=None)
@@ -69,11 +72,16 @@ def test_numbers_come_back_bit_by_bit(dtype: type):
         back = np.array(document["array"], dtype=dtype)
         assert back.shape == np.shape(shown)
         assert back.tobytes() == np.asarray(shown).tobytes()
-    assert (answer.headers["Content-Type"], answer.headers["Vary"]) == ("application/json", "Accept")
+    assert (answer.headers["Content-Type"], answer.headers["Vary"]) == (
+        "application/json",
+        "Accept",
+    )
 
 
 def test_what_is_not_finite_becomes_null():
     """NaN and Infinity are no JSON; a parser that is strict would refuse the whole answer."""
     array = np.array([1.5, math.nan, math.inf, -math.inf], dtype=np.float32)
-    document = json.loads(json_answer(Named(name="a", value=math.nan), array=array).body, parse_constant=pytest.fail)
+    document = json.loads(
+        json_answer(Named(name="a", value=math.nan), array=array).body, parse_constant=pytest.fail
+    )
     assert document == {"name": "a", "value": None, "array": [1.5, None, None, None]}

@@ -1,8 +1,8 @@
 """The door: who may come in, to which routes, and what the audit trail says of it."""
 
 import json
-import sys
 from collections.abc import Iterator
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -13,36 +13,32 @@ from fastapi.testclient import TestClient
 from sqlalchemy import select
 
 from model.errors import InvalidInputError
-from service.base.faults import ConflictError, NotFoundError, OpenDoorError
+from service.base.errors import ConflictError, NotFoundError, UnauthenticatedExposureError
 from service.base.settings import Settings
-from service.cli.main import main
-from service.store import job_tables, keys
+from service.store import job_tables, keys, sessions
+from service.store.columns import now
 from service.store.database import Database
-from service.store.job_tables import AuditRow, KeyRow
+from service.store.job_tables import AuditRow, KeyRow, SessionRow
 from service.web.app import create_app
-from service.web.door import dependencies, security
-from service.web.door.limits import Buckets
-from service.web.door.security import Role
-from tests.service.conftest import QUIET, FakeOperations, client_of, free_port, properties_document, tower_document
+from service.web.auth import dependencies, security
+from service.web.auth.rate_limiter import RateLimiter
+from service.web.auth.security import COOKIE, Role
+from tests.service.access import all_routes, bearer, make_key, withdraw
+from tests.service.command import exit_code
+from tests.service.conftest import (
+    QUIET,
+    FakeOperations,
+    client_of,
+    free_port,
+    properties_document,
+    tower_document,
+)
 
 ROLES = list(Role)
 
 
-def make_key(app: FastAPI, name: str, role: str = "admin") -> str:
-    with app.state.runtime.database.writing() as session:
-        return keys.create(session, name, role, "tester")
-
-
-def withdraw(app: FastAPI, name: str) -> None:
-    with app.state.runtime.database.writing() as session:
-        keys.withdraw(session, name, "tester")
-
-
-def bearer(key: str) -> dict[str, str]:
-    return {"Authorization": f"Bearer {key}"}
-
-
-# --- the keys themselves ----------------------------------------------------------------------------------------------
+# --- the keys themselves
+# ----------------------------------------------------------------------------------------------
 
 
 def test_key_is_kept_as_a_hash(database: Database):
@@ -70,7 +66,8 @@ def test_keys_differ_and_names_are_not_given_again(database: Database):
 
 
 @pytest.mark.parametrize(
-    ("name", "role"), [("../x", "read"), ("a b", "read"), ("", "read"), ("local", "read"), ("a", "root")]
+    ("name", "role"),
+    [("../x", "read"), ("a b", "read"), ("", "read"), ("local", "read"), ("a", "root")],
 )
 def test_bad_names_and_roles_are_refused(database: Database, name: str, role: str):
     with pytest.raises(InvalidInputError), database.writing() as session:
@@ -96,12 +93,17 @@ def test_only_the_very_key_is_found(database: Database):
             assert keys.find(session, wrong) is None, wrong
 
 
-# --- every route ------------------------------------------------------------------------------------------------------
+# --- every route
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
-def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[FastAPI, TestClient, dict[str, str]]]:
-    """A service with a key of each role and a withdrawn one; those that may not come in change nothing in it."""
+def guarded(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Iterator[tuple[FastAPI, TestClient, dict[str, str]]]:
+    """A service with a key of each role and a withdrawn one; those that may not come in change
+    nothing in it.
+    """
     settings = Settings(data_dir=tmp_path_factory.mktemp("guarded"), **QUIET)
     app = create_app(settings, FakeOperations())
     with client_of(app) as client:
@@ -113,14 +115,12 @@ def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[FastAPI,
         yield app, client, made
 
 
-def all_routes() -> list[tuple[str, str]]:
-    return [route for route in security.declared_roles(create_app(Settings())) if not security.is_public(route[1])]
-
-
 def ask(client: TestClient, method: str, path: str, headers: dict[str, str]) -> Any:
     filled = path.format(name="AA39", measurement="1", number="999", version="999", view="crop")
     body = {"content": b"{}"} if method in ("POST", "PUT") else {}
-    return client.request(method, filled, headers={"Content-Type": "application/json", **headers}, **body)
+    return client.request(
+        method, filled, headers={"Content-Type": "application/json", **headers}, **body
+    )
 
 
 def test_there_are_routes():
@@ -161,7 +161,7 @@ def test_roles_of_routes_are_those_documented(guarded: Any):
             assert role is None
         elif path in ("/v1/audit", "/plant/audit", "/plant/keys", "/plant/settings"):
             assert role == Role.ADMIN
-        elif method == "GET" or path.endswith("/motors"):  # what is only worked out is read
+        elif method == "GET" or path.endswith("/motors"):  # what changes nothing is read
             assert role == Role.READ
         else:
             is_photograph = path.endswith("/measurements") and not path.startswith("/v1/jobs/")
@@ -169,7 +169,9 @@ def test_roles_of_routes_are_those_documented(guarded: Any):
 
 
 def test_roles_are_those_of_the_keys():
-    """By their names, in whatever order they are written down; each may do what those before it may."""
+    """By their names, in whatever order they are written down; each may do what those before it
+    may.
+    """
     assert {role.value for role in Role} == set(job_tables.ROLES)
     steps = [Role.READ, Role.INGEST, Role.OPERATE, Role.ADMIN]
     assert [[one.includes(other) for other in steps] for one in steps] == [
@@ -189,9 +191,16 @@ def test_route_without_a_role_keeps_the_service_from_starting():
         security.require_declared_roles(app)
 
 
-def test_paths_that_are_none_tell_strangers_nothing(guarded: Any):
+def test_unknown_paths_disclose_nothing_without_a_key(guarded: Any):
     _, client, made = guarded
-    for path in ("/v1/nothing", "/", "/metrics", "/docsx", "/livez/../v1/heliostats", "/docs/../v1/heliostats"):
+    for path in (
+        "/v1/nothing",
+        "/",
+        "/metrics",
+        "/docsx",
+        "/livez/../v1/heliostats",
+        "/docs/../v1/heliostats",
+    ):
         assert client.get(path).status_code in (401, 404), path
         assert client.get(path, headers=bearer(made["admin"])).status_code in (200, 404), path
     assert client.get("/docs/%2e%2e/v1/heliostats").status_code in (401, 404)
@@ -203,7 +212,7 @@ def test_public_paths_need_no_key(guarded: Any):
         assert client.get(path).status_code == 200
 
 
-def test_body_of_a_stranger_is_not_read(guarded: Any):
+def test_body_without_a_key_is_not_read(guarded: Any):
     """The answer comes without a chunk being asked for."""
     app, sent = guarded[0], []
     scope = {
@@ -225,7 +234,8 @@ def test_body_of_a_stranger_is_not_read(guarded: Any):
     assert sent[0]["status"] == 401
 
 
-# --- open and closed --------------------------------------------------------------------------------------------------
+# --- open and closed
+# --------------------------------------------------------------------------------------------------
 
 
 def test_open_on_this_machine_until_the_first_key(app: FastAPI, bare: TestClient):
@@ -242,29 +252,70 @@ def test_open_on_this_machine_until_the_first_key(app: FastAPI, bare: TestClient
 def test_does_not_start_open_to_other_machines(settings: Settings, operations: FakeOperations):
     reachable = settings.model_copy(update={"host": "0.0.0.0"})
     app = create_app(reachable, operations)
-    with pytest.raises(OpenDoorError, match="heliotwin keys create"), client_of(app):
+    with pytest.raises(UnauthenticatedExposureError, match="heliotwin keys create"), client_of(app):
         pass
     with client_of(create_app(settings, operations)) as client:
         key = make_key(client.app, "first")  # type: ignore[arg-type]
     with client_of(create_app(reachable, operations)) as client:
         assert client.get("/v1/heliostats").status_code == 401
-        assert client.get("/v1/heliostats", headers=bearer(key) | {"Host": "plant.example"}).status_code == 200
+        assert (
+            client.get(
+                "/v1/heliostats", headers=bearer(key) | {"Host": "plant.example"}
+            ).status_code
+            == 200
+        )
         withdraw(client.app, "first")  # type: ignore[arg-type]
-    with pytest.raises(OpenDoorError), client_of(create_app(reachable, operations)):
+    with pytest.raises(UnauthenticatedExposureError), client_of(create_app(reachable, operations)):
         pass
 
 
 def test_open_network_must_be_acknowledged(settings: Settings, operations: FakeOperations):
     acknowledged = settings.model_copy(update={"host": "0.0.0.0", "allow_open_network": True})
     with client_of(create_app(acknowledged, operations)) as client:
-        assert client.get("/v1/heliostats", headers={"Host": "plant.example"}).status_code == 200
+        for host in ("192.0.2.7:8000", "[2001:db8::7]:8000", "localhost:8000"):
+            assert client.get("/v1/heliostats", headers={"Host": host}).status_code == 200
         make_key(client.app, "first")  # type: ignore[arg-type]
         assert client.get("/v1/heliostats").status_code == 401
 
 
-@pytest.mark.parametrize("host", ["evil.example", "127.0.0.1.evil.example", "[::1", "", "localhost@evil.example:80"])
+FOREIGN = [
+    "evil.example",
+    "127.0.0.1.evil.example",
+    "[::1",
+    "",
+    "localhost@evil.example:80",
+    "evil.example:8000",
+]
+
+
+@pytest.mark.parametrize("host", FOREIGN)
 def test_foreign_names_of_this_machine_are_refused(bare: TestClient, host: str):
-    assert bare.get("/v1/heliostats", headers={"Host": host}).status_code in (400, 403)
+    answer = bare.get("/v1/heliostats", headers={"Host": host})
+    assert (answer.status_code, answer.json()["type"]) == (421, "urn:heliotwin:problem:other-host")
+    assert "HELIOTWIN_ALLOWED_HOSTS" in answer.json()["detail"]
+    assert bare.get("/livez", headers={"Host": host}).status_code == 200
+
+
+@pytest.mark.parametrize("host", FOREIGN)
+def test_foreign_names_are_refused_where_the_network_is_open(
+    settings: Settings, operations: FakeOperations, host: str
+):
+    """A page of another site could make the first key, or read all, by a name of its owner's that
+    points here.
+    """
+    reachable = {
+        "host": "0.0.0.0",
+        "allow_open_network": True,
+        "allowed_hosts": "plant.example, Twin.example",
+    }
+    with client_of(create_app(settings.model_copy(update=reachable), operations)) as client:
+        assert client.get("/v1/heliostats", headers={"Host": host}).status_code == 421
+        assert (
+            client.put("/v1/plant", json=tower_document(), headers={"Host": host}).status_code
+            == 421
+        )
+        for own in ("plant.example", "PLANT.example:8000", "twin.example.", "plant.example."):
+            assert client.get("/v1/heliostats", headers={"Host": own}).status_code == 200, own
 
 
 def test_any_name_will_do_with_a_key(app: FastAPI, bare: TestClient):
@@ -291,13 +342,16 @@ def test_own_names_of_this_machine_are_known(bare: TestClient, host: str):
         ({}, True),
     ],
 )
-def test_pages_of_other_sites_change_nothing(bare: TestClient, headers: dict[str, str], is_allowed: bool):
+def test_pages_of_other_sites_change_nothing(
+    bare: TestClient, headers: dict[str, str], is_allowed: bool
+):
     answer = bare.put("/v1/plant", json=tower_document(), headers=headers)
     assert answer.status_code == (200 if is_allowed else 403)
     assert bare.get("/v1/targets", headers=headers).status_code == 200
 
 
-# --- the cookie -------------------------------------------------------------------------------------------------------
+# --- the cookie
+# --------------------------------------------------------------------------------------------------
 
 
 def test_cookie_for_pages(app: FastAPI, bare: TestClient):
@@ -320,18 +374,95 @@ def test_cookie_for_pages(app: FastAPI, bare: TestClient):
     assert bare.get("/v1/heliostats").status_code == 401
 
 
+def copied(client: TestClient) -> dict[str, str]:
+    """The browser's cookie, as somebody else would send it."""
+    return {"Cookie": f"{COOKIE}={client.cookies[COOKIE]}"}
+
+
+def answer_to(app: FastAPI, headers: dict[str, str]) -> int:
+    """What another browser is answered, on the same service."""
+    return (
+        TestClient(app, base_url="http://127.0.0.1")
+        .get("/v1/heliostats", headers=headers)
+        .status_code
+    )
+
+
+def test_cookie_holds_a_session_and_never_the_key(app: FastAPI, bare: TestClient):
+    key = make_key(app, "operator", "read")
+    for begin in (
+        lambda: bare.post("/session", data={"key": key}),
+        lambda: bare.post("/login", data={"key": key}, follow_redirects=False),
+    ):
+        answer = begin()
+        token = bare.cookies[COOKIE]
+        assert key.rpartition("_")[2] not in answer.headers["Set-Cookie"]
+        with app.state.runtime.database.reading() as session:
+            rows = session.scalars(select(SessionRow)).all()
+            assert token not in str([vars(row) for row in rows])
+            assert all(len(row.sha256) == 64 for row in rows)
+        assert bare.get("/v1/heliostats").status_code == 200
+    # Each is of use in its own place only.
+    assert answer_to(app, bearer(token)) == 401
+    assert answer_to(app, {"Cookie": f"{COOKIE}={key}"}) == 401
+
+
+@pytest.mark.parametrize("end", ["logout", "delete", "withdraw", "time"])
+def test_session_ends_for_all_its_copies(
+    app: FastAPI, bare: TestClient, end: str, monkeypatch: pytest.MonkeyPatch
+):
+    key = make_key(app, "operator", "read")
+    bare.post("/session", data={"key": key})
+    stolen = copied(bare)
+    assert answer_to(app, stolen) == 200
+    if end == "logout":
+        bare.post("/logout")
+    elif end == "delete":
+        bare.delete("/session")
+    elif end == "withdraw":
+        withdraw(app, "operator")
+    else:
+        later = now() + sessions.LASTS + timedelta(seconds=1)
+        monkeypatch.setattr(sessions, "now", lambda: later)
+    assert answer_to(app, stolen) == 401
+    assert "session of this browser has ended" in bare.get("/login", headers=stolen).text
+    assert answer_to(app, bearer(key)) == (401 if end == "withdraw" else 200)
+
+
+def test_sessions_of_a_key_are_bounded_and_old_ones_deleted(
+    database: Database, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(sessions, "_MOST", 2)
+    with database.writing() as session:
+        keys.create(session, "operator", "read", "tester")
+        row = keys.list_keys(session)[0]
+        tokens = [sessions.begin(session, row) for _ in range(3)]
+    with database.reading() as session:
+        assert [sessions.find_key(session, token) is not None for token in tokens] == [
+            False,
+            True,
+            True,
+        ]
+    later = now() + sessions.LASTS + timedelta(seconds=1)
+    monkeypatch.setattr(sessions, "now", lambda: later)
+    with database.writing() as session:
+        sessions.begin(session, session.merge(row))
+        assert len(session.scalars(select(SessionRow)).all()) == 1
+
+
 def test_cookie_is_for_encrypted_connections_where_there_is_one(app: FastAPI, bare: TestClient):
     key = make_key(app, "operator", "read")
     answer = bare.post("https://127.0.0.1/session", data={"key": key})
     assert "secure" in answer.headers["Set-Cookie"].lower()
 
 
-# --- limits and headers -----------------------------------------------------------------------------------------------
+# --- limits and headers
+# -----------------------------------------------------------------------------------------------
 
 
 def test_bucket_empties_and_fills():
     at = [0.0]
-    buckets = Buckets(rate_per_s=2.0, burst=3, clock=lambda: at[0])
+    buckets = RateLimiter(rate_per_s=2.0, burst=3, clock=lambda: at[0])
     assert [buckets.wait_s("a") for _ in range(4)] == [0, 0, 0, 0.5]
     assert buckets.wait_s("b") == 0
     at[0] = 0.5
@@ -340,8 +471,17 @@ def test_bucket_empties_and_fills():
     assert [buckets.wait_s("a") for _ in range(4)] == [0, 0, 0, 0.5]
 
 
+SLOW = {
+    "requests_per_s": 0.01,
+    "requests_burst": 3,
+    "public_requests_per_s": 0.01,
+    "public_requests_burst": 3,
+}
+"""Settings by which a key, and an address without one, may ask three times."""
+
+
 def test_who_asks_too_often_has_to_wait(settings: Settings, operations: FakeOperations):
-    slow = settings.model_copy(update={"requests_per_s": 0.01, "requests_burst": 3})
+    slow = settings.model_copy(update=SLOW)
     app = create_app(slow, operations)
     with client_of(app) as client:
         first, second = make_key(app, "first"), make_key(app, "second")
@@ -349,8 +489,43 @@ def test_who_asks_too_often_has_to_wait(settings: Settings, operations: FakeOper
         assert [answer.status_code for answer in answers] == [200, 200, 200, 429]
         assert int(answers[-1].headers["Retry-After"]) > 60
         assert client.get("/v1/heliostats", headers=bearer(second)).status_code == 200
-        guesses = [client.get("/v1/heliostats", headers=bearer(f"guess{i}")).status_code for i in range(5)]
+        guesses = [
+            client.get("/v1/heliostats", headers=bearer(f"guess{i}")).status_code for i in range(5)
+        ]
         assert guesses == [401, 401, 401, 429, 429]
+
+
+@pytest.mark.parametrize(
+    "path", ["/login", "/session", "/logout", "/docs", "/openapi.json", "/static/app.css"]
+)
+def test_public_paths_are_limited_by_address(
+    settings: Settings, operations: FakeOperations, path: str
+):
+    """They have a separate limit: a valid key at that address, and supervisors, are not limited."""
+    app = create_app(settings.model_copy(update=SLOW), operations)
+    with client_of(app) as client:
+        reader = bearer(make_key(app, "reader"))
+        answers = [client.get(path) for _ in range(8)]
+        refused = [answer.status_code == 429 for answer in answers]
+        assert refused == sorted(refused), "once refused, an address stays so until it has waited"
+        assert not refused[0]
+        assert refused[3:] == [True] * 5
+        assert int(answers[-1].headers["Retry-After"]) > 60
+        assert (
+            client.get("/static/app.css", headers=reader).status_code == 429
+        )  # a key changes nothing where none is
+        assert client.get("/v1/heliostats", headers=reader).status_code == 200
+        assert {
+            client.get(probe).status_code for probe in ("/livez", "/readyz") for _ in range(5)
+        } == {200}
+
+
+def test_public_limit_is_below_the_limit_of_keys():
+    """What the machine serves is measured by ``python -m tests.benchmarks.public``: 28
+    /openapi.json a second.
+    """
+    fields = Settings.model_fields
+    assert fields["public_requests_per_s"].default <= fields["requests_per_s"].default / 10
 
 
 @pytest.mark.parametrize(
@@ -365,7 +540,7 @@ def test_headers_for_browsers(bare: TestClient, path: str):
     assert headers["Referrer-Policy"] == "no-referrer"
 
 
-def test_headers_for_browsers_stand_on_failures_too(bare: TestClient, monkeypatch: pytest.MonkeyPatch):
+def test_failures_have_headers_for_browsers(bare: TestClient, monkeypatch: pytest.MonkeyPatch):
     def fail(*_: Any) -> None:
         raise ZeroDivisionError
 
@@ -391,7 +566,8 @@ def test_documentation_asks_nobody_else(bare: TestClient):
     assert bare.get("/docs/other.js").status_code == 404
 
 
-# --- the audit trail --------------------------------------------------------------------------------------------------
+# --- the audit trail
+# --------------------------------------------------------------------------------------------------
 
 
 def test_audit_trail_says_who_did_what(app: FastAPI, client: TestClient, post: Any):
@@ -404,7 +580,10 @@ def test_audit_trail_says_who_did_what(app: FastAPI, client: TestClient, post: A
     withdraw(app, "operator")
     page = client.get("/v1/audit", params={"limit": 4}, headers=bearer(admin)).json()
     rest = client.get("/v1/audit", params={"after": page["next"]}, headers=bearer(admin)).json()
-    found = [(entry["actor"], entry["action"], entry["subject"]) for entry in page["items"] + rest["items"]]
+    found = [
+        (entry["actor"], entry["action"], entry["subject"])
+        for entry in page["items"] + rest["items"]
+    ]
     assert found == [
         ("tester", "key.withdrawn", "key operator"),
         ("tester", "key.created", "key admin"),
@@ -415,7 +594,7 @@ def test_audit_trail_says_who_did_what(app: FastAPI, client: TestClient, post: A
         ("local", "heliostat.set", "heliostat AA39"),
         ("local", "plant.set", "plant WRI1030197"),
     ]
-    assert page["items"][0]["at"]
+    assert page["items"][0]["created_at"]
 
 
 def test_what_fails_leaves_no_entry(app: FastAPI, client: TestClient):
@@ -427,56 +606,52 @@ def test_what_fails_leaves_no_entry(app: FastAPI, client: TestClient):
         assert len(session.scalars(select(AuditRow)).all()) == before
 
 
-# --- the command line -------------------------------------------------------------------------------------------------
+# --- the command line
+# -------------------------------------------------------------------------------------------------
 
 
-def heliotwin(*arguments: str) -> int:
-    """Run the command in this process, which has loaded everything already; its exit code."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", ["heliotwin", *arguments])
-        with pytest.raises(SystemExit) as ended:
-            main()
-    return int(ended.value.code or 0)
-
-
-def test_keys_by_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+def test_keys_by_the_command_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
     monkeypatch.setenv("HELIOTWIN_DATA_DIR", str(tmp_path / "data"))
-    assert heliotwin("keys", "create", "plant", "--role", "operate") == 0
+    assert exit_code("keys", "create", "plant", "--role", "operate") == 0
     key = capsys.readouterr().out.strip()
-    assert heliotwin("keys", "list", "--json") == 0
+    assert exit_code("keys", "list", "--json") == 0
     listed = json.loads(capsys.readouterr().out)
-    assert [(entry["name"], entry["role"], entry["withdrawn_at"]) for entry in listed] == [("plant", "operate", None)]
+    assert [(entry["name"], entry["role"], entry["withdrawn_at"]) for entry in listed] == [
+        ("plant", "operate", None)
+    ]
     assert key.split("_", 2)[2] not in json.dumps(listed)
     database = Database(Settings().database)
     with database.reading() as session:
         assert keys.find(session, key) is not None
-    assert heliotwin("keys", "withdraw", "plant") == 0
+    assert exit_code("keys", "withdraw", "plant") == 0
     with database.reading() as session:
         assert keys.find(session, key) is None
     database.close()
     capsys.readouterr()
-    assert heliotwin("keys", "withdraw", "plant") == 1
+    assert exit_code("keys", "withdraw", "plant") == 1
     assert capsys.readouterr().err.count("\n") == 1
-    assert heliotwin("keys", "create", "a b", "--role", "read") == 2
+    assert exit_code("keys", "create", "a b", "--role", "read") == 2
     capsys.readouterr()
-    assert heliotwin("keys", "create", "x", "--role", "root") == 2
+    assert exit_code("keys", "create", "x", "--role", "root") == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     assert "--role must be" in said
     assert all(f"'{role}'" in said for role in ROLES)
-    assert heliotwin("keys", "create", "x") == 2
+    assert exit_code("keys", "create", "x") == 2
     assert capsys.readouterr().err.count("\n") == 1
-    assert heliotwin("worker", "--count", "0") == 2
+    assert exit_code("worker", "--count", "0") == 2
 
 
-def test_serve_refuses_to_stand_open(
+def test_serve_refuses_unauthenticated_exposure(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     caplog: pytest.LogCaptureFixture,
 ):
     monkeypatch.setenv("HELIOTWIN_DATA_DIR", str(tmp_path / "data"))
-    assert heliotwin("serve", "--host", "0.0.0.0", "--port", str(free_port())) == 1
+    assert exit_code("serve", "--host", "0.0.0.0", "--port", str(free_port())) == 1
     said = capsys.readouterr().err
     assert "heliotwin: host 0.0.0.0" in said
     assert "heliotwin keys create" in said

@@ -1,4 +1,6 @@
-"""Photographs over HTTP: once each, kept when refused, bounded, read back in every representation."""
+"""Photographs over HTTP: once each, kept when refused, bounded, read back in every
+representation.
+"""
 
 import io
 import json
@@ -11,13 +13,25 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from sqlalchemy import URL
 
 from model.ephemeris import sun_angles_at
 from service.base.settings import Settings
 from service.web.app import create_app
-from tests.service.conftest import ORIGIN, FakeOperations, Post, client_of, metadata, png
+from tests.service.access import bearer, make_key
+from tests.service.conftest import (
+    ORIGIN,
+    FakeOperations,
+    Post,
+    client_of,
+    metadata,
+    png,
+    spot_of,
+    sun_at,
+)
+from tests.waiting import WAIT_LIMIT_S
 
 BASE = "/v1/heliostats/AA39/measurements"
 
@@ -27,28 +41,34 @@ def test_measurement_is_stored_and_read_back(client: TestClient, post: Post):
         "id": "205363",
         "taken_at": "2024-05-01T10:00:00+02:00",
         "motor_position": {"axis_1_motor_position": 30076, "axis_2_motor_position": 37935},
-        "focal_spot": {"HeliOS": [50.9, 6.38, 122.1], "UTIS": [50.9, 6.38, 122.0]},
+        "focal_spot_m": (spot := spot_of(50.9, 6.38, 122.0)),
+        "helios_spot_m": (helios := spot_of(50.9, 6.38, 122.1)),
     }
     created = post(**sent)
     assert created.status_code == 201
     body = created.json()
     assert created.headers["Location"] == f"{BASE}/205363"
     assert body["id"] == body["external_id"] == "205363"
-    assert (body["accepted"], body["reason"], body["center_of_mass"]) == (True, None, [0.5, -0.25])
+    assert (body["accepted"], body["reason"], body["center_of_mass_m"]) == (
+        True,
+        None,
+        [0.5, -0.25],
+    )
     assert body["motor_position"] == [30076, 37935]
-    assert (body["focal_spot"], body["helios_spot"]) == ([50.9, 6.38, 122.0], [50.9, 6.38, 122.1])
+    assert (body["focal_spot_m"], body["helios_spot_m"]) == (spot, helios)
     assert body["taken_at"] == "2024-05-01T08:00:00Z"
     assert body["quality"]["accepted"] is True
+    assert (body.pop("filled"), body.pop("ignored")) == ([], [])
     assert client.get(f"{BASE}/205363").json() == body
 
 
 def test_plain_pairs_are_taken_too(post: Post):
-    body = post(motor_position=[1, 2], focal_spot=[50.9, 6.38, 122.0]).json()
-    assert (body["motor_position"], body["focal_spot"]) == ([1, 2], [50.9, 6.38, 122.0])
+    body = post(motor_position=[1, 2], helios_spot_m=(spot := spot_of(50.9, 6.38, 122.0))).json()
+    assert (body["motor_position"], body["focal_spot_m"]) == ([1, 2], spot)
 
 
 def test_same_image_is_one_measurement(client: TestClient, post: Post, operations: FakeOperations):
-    first, second = post(id="1"), post(id="2")
+    first, second = post(id="1"), post(id="1")
     assert (first.status_code, second.status_code) == (201, 200)
     assert first.json() == second.json()
     assert second.headers["Location"] == first.headers["Location"]
@@ -70,7 +90,7 @@ def test_refused_image_is_kept_with_its_reason(client: TestClient, post: Post):
     assert created.status_code == 201
     body = created.json()
     assert (body["accepted"], body["reason"]) == (False, "no_spot")
-    assert body["quality"]["detail"] == "no spot stands out"
+    assert body["quality"]["detail"] == "no spot was found"
     assert client.get(f"{BASE}/{body['id']}/image").content == image
     flux = client.get(f"{BASE}/{body['id']}/flux")
     assert flux.status_code == 404
@@ -137,7 +157,10 @@ def test_flux_in_every_representation(client: TestClient, post: Post):
         answer = client.get(f"{BASE}/7/flux", headers={"Accept": media_type})
         assert answer.headers["Content-Type"] == media_type
         arrays = np.load(io.BytesIO(answer.content), allow_pickle=False)
-        assert {name: arrays[name].shape for name in arrays} == {"flux": (256, 256), "centered": (64, 64)}
+        assert {name: arrays[name].shape for name in arrays} == {
+            "flux": (256, 256),
+            "centered": (64, 64),
+        }
     picture = client.get(f"{BASE}/7/flux", headers={"Accept": "image/png"})
     assert picture.headers["Content-Type"] == "image/png"
     assert cv2.imdecode(np.frombuffer(picture.content, np.uint8), cv2.IMREAD_COLOR).ndim == 3
@@ -149,30 +172,31 @@ def test_flux_in_every_representation(client: TestClient, post: Post):
 
 def test_centered_image_has_no_place_on_the_target(client: TestClient, post: Post):
     body = post(id="7", kind="flux-centered").json()
-    assert body["center_of_mass"] is None
+    assert body["center_of_mass_m"] is None
     flux = client.get(f"{BASE}/7/flux").json()
     assert flux["flux"] is None
     assert np.shape(flux["centered"]) == (64, 64)
     assert client.get(f"{BASE}/7/flux", headers={"Accept": "image/png"}).status_code == 200
 
 
-# --- what is refused --------------------------------------------------------------------------------------------------
+# --- what is refused
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
-        ({"sun_elevation": 91}, "metadata.sun_elevation"),
-        ({"sun_elevation": 0}, "metadata.sun_elevation"),
-        ({"sun_azimuth": "x"}, "metadata.sun_azimuth"),
+        ({"sun": sun_at(elevation_deg=91)}, "metadata.sun.elevation_deg"),
+        ({"sun": sun_at(elevation_deg=0)}, "metadata.sun.elevation_deg"),
+        ({"sun": sun_at("x")}, "metadata.sun.azimuth_deg"),
         ({"kind": "photo"}, "metadata.kind"),
-        ({"target_name": "../x"}, "metadata.target_name"),
+        ({"target": "../x"}, "metadata.target"),
         ({"id": "a/b"}, "metadata.id"),
         ({"taken_at": "2024-05-01T10:00:00"}, "metadata.taken_at"),
         ({"motor_position": [1]}, "metadata.motor_position"),
         ({"motor_position": {"axis_1_motor_position": 1}}, "metadata.motor_position"),
-        ({"focal_spot": {"UTIS": [1, 2]}}, "metadata.focal_spot"),
-        ({"focal_spot": {}}, "metadata.focal_spot"),
+        ({"focal_spot_m": [1, 2]}, "metadata.focal_spot_m"),
+        ({"focal_spot": [1, 2, 3]}, "metadata.focal_spot"),
         ({"corners": [[0, 0]] * 3}, "metadata.corners"),
         ({"typo": 1}, "metadata.typo"),
     ],
@@ -185,9 +209,19 @@ def test_wrong_metadata_is_named(refused_post: Post, changes: dict[str, Any], na
 
 @pytest.mark.parametrize("number", ["NaN", "Infinity", "-Infinity", "1e999"])
 def test_numbers_that_are_none(refused_post: Post, number: str):
-    for key in ("sun_azimuth", "sun_elevation"):
-        assert refused_post(raw=json.dumps(metadata(**{key: "@"})).replace('"@"', number)).status_code == 422
-    assert refused_post(raw=json.dumps(metadata(motor_position=["@", 1])).replace('"@"', number)).status_code == 422
+    for key in ("azimuth_deg", "elevation_deg"):
+        assert (
+            refused_post(
+                raw=json.dumps(metadata(sun=sun_at(**{key: "@"}))).replace('"@"', number)
+            ).status_code
+            == 422
+        )
+    assert (
+        refused_post(
+            raw=json.dumps(metadata(motor_position=["@", 1])).replace('"@"', number)
+        ).status_code
+        == 422
+    )
 
 
 @pytest.mark.parametrize("text", ["", "{", "null", "[]", "x" * 10_000, '{"kind": "flux"}'])
@@ -197,19 +231,23 @@ def test_metadata_that_is_none(refused_post: Post, text: str):
 
 def test_unknown_heliostat_or_target(refused_post: Post):
     assert "heliostat AB01" in refused_post(heliostat="AB01").json()["detail"]
-    answer = refused_post(target_name="middle")
+    answer = refused_post(target="middle")
     assert answer.status_code == 404
     assert "lower, upper" in answer.json()["detail"]
 
 
-@pytest.mark.parametrize("data", [b"", b"GIF89a", b"<svg xmlns='http://www.w3.org/2000/svg'/>", b"\x00" * 100])
+@pytest.mark.parametrize(
+    "data", [b"", b"GIF89a", b"<svg xmlns='http://www.w3.org/2000/svg'/>", b"\x00" * 100]
+)
 def test_file_of_another_format(refused_post: Post, data: bytes):
     answer = refused_post(data)
     assert answer.status_code == 415
     assert "PNG" in answer.json()["detail"]
 
 
-@pytest.mark.parametrize("data", [png()[:60], png()[:-20], png() + b"PK\x03\x04", b"\xff\xd8\xff\xe0 no more"])
+@pytest.mark.parametrize(
+    "data", [png()[:60], png()[:-20], png() + b"PK\x03\x04", b"\xff\xd8\xff\xe0 no more"]
+)
 def test_broken_file_is_refused(refused_post: Post, data: bytes):
     assert refused_post(data).status_code == 422
 
@@ -238,7 +276,9 @@ def test_body_without_announced_length_is_stopped(client: TestClient, settings: 
             sent += 50_000
             yield bytes(50_000)
 
-    answer = client.post(BASE, content=endless(), headers={"Content-Type": "multipart/form-data; boundary=b"})
+    answer = client.post(
+        BASE, content=endless(), headers={"Content-Type": "multipart/form-data; boundary=b"}
+    )
     assert answer.status_code == 413
 
 
@@ -253,26 +293,33 @@ def test_body_that_is_no_form(refusing: TestClient, content_type: str):
 def test_form_without_its_parts(refusing: TestClient):
     answer = refusing.post(BASE, files={"other": ("x", b"y")})
     assert answer.status_code == 422
-    assert {error["field"] for error in answer.json()["errors"]} == {"image", "metadata"}
-    broken = refusing.post(BASE, content=b"nothing", headers={"Content-Type": "multipart/form-data; boundary=b"})
+    assert {error["field"] for error in answer.json()["errors"]} == {"metadata"}
+    broken = refusing.post(
+        BASE, content=b"nothing", headers={"Content-Type": "multipart/form-data; boundary=b"}
+    )
     assert broken.status_code in (400, 422)
-    no_boundary = refusing.post(BASE, content=b"nothing", headers={"Content-Type": "multipart/form-data"})
+    no_boundary = refusing.post(
+        BASE, content=b"nothing", headers={"Content-Type": "multipart/form-data"}
+    )
     assert no_boundary.status_code in (400, 422)
 
 
-# --- at the same time -------------------------------------------------------------------------------------------------
+# --- at the same time
+# -------------------------------------------------------------------------------------------------
 
 
 def test_same_image_from_many_clients_is_one_measurement(
     store_url: URL, tmp_path: Path, tower: dict[str, Any], properties: dict[str, Any]
 ):
-    """All requests pass the first look-up before any of them writes, and still one measurement comes of them."""
+    """All requests pass the first look-up before any of them writes, and still one measurement
+    comes of them.
+    """
     clients = 6
     together = threading.Barrier(clients)
 
     class Waiting(FakeOperations):
         def measure(self, *arguments: Any, **options: Any) -> Any:
-            together.wait(timeout=20)
+            together.wait(timeout=WAIT_LIMIT_S)
             return super().measure(*arguments, **options)
 
     url = store_url.render_as_string(hide_password=False)
@@ -283,7 +330,9 @@ def test_same_image_from_many_clients_is_one_measurement(
         client.put("/v1/heliostats/AA39", json=properties)
         with ThreadPoolExecutor(clients) as pool:
             sending = [
-                pool.submit(client.post, BASE, files=files, data={"metadata": json.dumps(metadata(id="7"))})
+                pool.submit(
+                    client.post, BASE, files=files, data={"metadata": json.dumps(metadata(id="7"))}
+                )
                 for _ in range(clients)
             ]
             answers = [future.result() for future in sending]
@@ -293,11 +342,28 @@ def test_same_image_from_many_clients_is_one_measurement(
 
 
 @pytest.mark.parametrize(("hours", "says"), [(0, None), (2, "2 h ahead")])
-def test_a_time_that_disagrees_with_the_sun_is_told(post: Post, hours: int, says: str | None):
+def test_time_that_disagrees_with_the_sun_is_reported(post: Post, hours: int, says: str | None):
     moment = datetime(2024, 6, 21, 10, 0, tzinfo=UTC)
-    azimuth, elevation = sun_angles_at(moment, *ORIGIN[:2])
+    azimuth, elevation = sun_angles_at(moment, ORIGIN)
     taken_at = (moment + timedelta(hours=hours)).isoformat()
-    answer = post(png(1), sun_azimuth=azimuth, sun_elevation=elevation, taken_at=taken_at)
+    answer = post(png(1), sun=sun_at(azimuth, elevation), taken_at=taken_at)
     clock = answer.json()["quality"]["clock"]
     assert answer.status_code == 201
     assert clock is None if says is None else says in clock
+
+
+def test_photograph_names_the_key_that_sent_it(client: TestClient, app: FastAPI, post: Post):
+    post(png(1), id="1")
+    key = bearer(make_key(app, "calibration", "ingest"))
+    client.headers.update(key)
+    assert post(png(2), id="2").json()["sent_by"] == "calibration"
+    client.headers.update(bearer(make_key(app, "another", "ingest")))
+    assert (
+        post(png(2), id="2").json()["sent_by"] == "calibration"
+    )  # sending it again by another key changes nothing
+    listed = client.get("/v1/heliostats/AA39/measurements").json()["items"]
+    assert [item["sent_by"] for item in listed] == ["local", "calibration"]
+    assert "sent by calibration" in client.get("/heliostats/AA39/photographs/2").text
+    table = client.get("/heliostats/AA39/photographs.csv").text.splitlines()
+    at = table[0].split(",").index("sent_by")
+    assert [line.split(",")[at] for line in table[1:]] == ["local", "calibration"]

@@ -1,6 +1,8 @@
-"""Schemathesis over the whole OpenAPI document, with the key of each role: what is answered is what is documented.
+"""Schemathesis over the whole OpenAPI document, with the key of each role: what is answered is what
+is documented.
 
-``HELIOTWIN_FUZZ_EXAMPLES`` sets how many requests of each kind are made, 2 unless set; 200 take about an hour.
+``HELIOTWIN_FUZZ_EXAMPLES`` sets how many requests of each kind are made, 2 unless set; 200 take
+about an hour.
 """
 
 import os
@@ -23,7 +25,8 @@ from schemathesis.specs.openapi.checks import content_type_conformance, status_c
 
 from service.base.settings import Settings
 from service.web.app import create_app
-from service.web.door.security import Role
+from service.web.auth.security import Role
+from tests.service.access import bearer, make_key
 from tests.service.conftest import (
     QUIET,
     FakeOperations,
@@ -34,22 +37,28 @@ from tests.service.conftest import (
     serving,
     tower_document,
 )
-from tests.service.web.test_keys import bearer, make_key
+from tests.waiting import WAIT_LIMIT_S
 
 EXAMPLES = int(os.environ.get("HELIOTWIN_FUZZ_EXAMPLES", "2"))
 CHECKS = [not_a_server_error, status_code_conformance, content_type_conformance]
-SUN = {"azimuth_deg": 0, "elevation_deg": 45}
+SUN = {"azimuth_deg": 180, "elevation_deg": 45}
 
 
 @pytest.fixture(scope="module")
-def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, FastAPI, dict[str, dict[str, str]]]]:
-    """The service with some of everything in it behind a socket, and headers of nobody and of a key of each role."""
+def served(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Iterator[tuple[str, FastAPI, dict[str, dict[str, str]]]]:
+    """The service with some of everything in it behind a socket, and headers of nobody and of a key
+    of each role.
+    """
     settings = Settings(data_dir=tmp_path_factory.mktemp("fuzz"), max_image_bytes=200_000, **QUIET)
     app = create_app(settings, FakeOperations())
     with client_of(app) as client, pytest.MonkeyPatch.context() as patch:
         patch.setattr("service.web.root.health.default_predictor", lambda: None)
         _fill(client)
-        headers = {role.value: bearer(make_key(app, f"key-{role}", role)) for role in Role} | {"none": {}}
+        headers = {role.value: bearer(make_key(app, f"key-{role}", role)) for role in Role} | {
+            "none": {}
+        }
         with serving(app, lifespan="off") as address:
             yield address, app, headers
 
@@ -59,7 +68,9 @@ def _fill(client: TestClient) -> None:
     client.put("/v1/heliostats/AA39", json=properties_document())
     poster(client)(png(1), id="1")
     client.post("/v1/heliostats/AA39/surfaces", json={})
-    made = client.post("/v1/forecasts", json={"heliostat": "AA39", "target": "lower", "sun": SUN, "resolution": 16})
+    made = client.post(
+        "/v1/forecasts", json={"heliostat": "AA39", "target": "lower", "sun": SUN, "resolution": 16}
+    )
     assert made.status_code == 201
     client.post(client.post("/v1/jobs/predictions", json={}).headers["Location"] + "/cancel")
 
@@ -67,7 +78,8 @@ def _fill(client: TestClient) -> None:
 def _require_its_schema(document: dict[str, Any], case: Any, response: Any) -> None:
     """The answer's JSON is what the document says of it.
 
-    Schemathesis' own response_schema_conformance (4.32) takes our tuples, `prefixItems`, for invalid schemas.
+    Schemathesis' own response_schema_conformance (4.32) takes our tuples, `prefixItems`, for
+    invalid schemas.
     """
     media_type = response.headers.get("content-type", [""])[0].partition(";")[0]
     if not media_type.endswith("json"):
@@ -90,7 +102,7 @@ def _try(document: dict[str, Any], cases: Any, headers: dict[str, str], met: Cou
     )
     @given(case=cases)
     def check(case: Any) -> None:
-        response = case.call(timeout=20, headers=headers)
+        response = case.call(timeout=WAIT_LIMIT_S, headers=headers)
         met[response.status_code] += 1
         case.validate_response(response, checks=CHECKS)
         _require_its_schema(document, case, response)

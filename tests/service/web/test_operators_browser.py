@@ -1,4 +1,6 @@
-"""What operators decide, in a real browser at a desk and on a phone: trust, correct, compare, find, export, plan."""
+"""What operators decide, in a real browser at a desk and on a phone: trust, correct, compare, find,
+export, plan.
+"""
 
 import threading
 from collections.abc import Iterator
@@ -22,11 +24,21 @@ from tests.service.conftest import (
     poster,
     properties_document,
     serving,
+    sun_at,
     tower_document,
     until,
 )
-from tests.service.twin.test_versions import SLOPE, study_row
-from tests.service.web.test_pages_browser import DESK, PHONE, GatedOperations, Served, browser, expect, follow, page
+from tests.service.studies import SLOPE, study_row
+from tests.service.web.test_pages_browser import (
+    DESK,
+    PHONE,
+    GatedOperations,
+    Served,
+    browser,
+    expect,
+    follow,
+    page,
+)
 
 assert (browser, page) is not None  # fixtures of this module, too
 
@@ -34,7 +46,9 @@ SIZES = pytest.mark.parametrize("size", [DESK, PHONE], ids=["desk", "phone"])
 
 
 class Operations(GatedOperations):
-    """Finds the target of raw photographs; explains none under a sun in the east; forecasts too little on the left."""
+    """Finds the target of raw photographs; explains none under a sun in the east; forecasts too
+    little on the left.
+    """
 
     def measure(self, image: Any, kind: str, plane: Any, **more: Any) -> MeasuredFlux:
         made = super().measure(image, kind, plane, **more)
@@ -42,11 +56,15 @@ class Operations(GatedOperations):
             return made
         corners = np.array([[8.0, 8], [24, 8], [8, 24], [24, 24]])
         crop = np.full((256, 256), 99, np.uint8)
-        return MeasuredFlux(made.quality, made.flux, made.centered, made.center_of_mass, 4.0, crop, corners)
+        return MeasuredFlux(
+            made.quality, made.flux, made.centered, made.center_of_mass, 4.0, crop, corners
+        )
 
     def predict(self, heliostat: Any, observations: Any, *rest: Any, **more: Any) -> Any:
         made = super().predict(heliostat, observations, *rest, **more)
-        return replace(made, misfits=tuple(0.31 if one.sun[0] > 0.5 else 0.05 for one in observations))
+        return replace(
+            made, misfits=tuple(0.31 if one.sun[0] > 0.5 else 0.05 for one in observations)
+        )
 
     def render(self, *arguments: Any, **options: Any) -> Any:
         forecast = super().render(*arguments, **options).copy()
@@ -62,16 +80,26 @@ def fill(settings: Settings) -> None:
             client.put(f"/v1/heliostats/{name}", json=properties_document())
         send = poster(client)
         for number in range(1, 4):
-            sun = {"sun_azimuth": -20.0 * number, "taken_at": f"2026-06-0{number}T11:30:00Z"}
+            sun = {"sun": sun_at(180 + 20.0 * number), "taken_at": f"2026-06-0{number}T11:30:00Z"}
             assert send(png(number), id=str(number), kind="raw", **sun).status_code == 201
         assert send(png(9, refused=True), id="9").status_code == 201
         for used in (["1"], ["1", "2"]):
-            assert client.post("/v1/heliostats/AA39/surfaces", json={"measurements": used}).status_code == 201
-        for number, azimuth in ((1, 0.0), (2, 90.0)):
-            assert send(png(20 + number), "AB01", id=str(number), sun_azimuth=azimuth).status_code == 201
-        assert client.post("/v1/heliostats/AB01/surfaces", json={"method": "refined"}).status_code == 201
-        sun = {"azimuth_deg": -20, "elevation_deg": 45}
-        assert client.post("/v1/forecasts", json={"target": "lower", "sun": sun}).status_code == 202
+            assert (
+                client.post("/v1/heliostats/AA39/surfaces", json={"measurements": used}).status_code
+                == 201
+            )
+        for number, azimuth in ((1, 180.0), (2, 90.0)):
+            assert (
+                send(png(20 + number), "AB01", id=str(number), sun=sun_at(azimuth)).status_code
+                == 201
+            )
+        assert (
+            client.post("/v1/heliostats/AB01/surfaces", json={"method": "refined"}).status_code
+            == 201
+        )
+        sun = {"azimuth_deg": 200, "elevation_deg": 45}
+        made = client.post("/v1/jobs/forecasts", json={"target": "lower", "sun": sun})
+        assert made.status_code == 202
         worker = Worker(app.state.runtime, KINDS, "tester", threading.Event())
         while worker.work():
             pass
@@ -97,28 +125,29 @@ def seen(page: Any, size: dict[str, int]) -> Any:
 
 
 @SIZES
-def test_what_is_todays_is_decided_and_taken_back(seen: Any):
+def test_active_surface_is_chosen_and_the_choice_undone(seen: Any):
     seen.goto("/heliostats/AA39")
-    todays = seen.locator("tr:has(.state.done) th", has_text="today's")
-    expect(todays).to_have_text("2 today's")
-    follow(seen, "text=Make it today's")
-    expect(todays).to_have_text("1 today's")
+    active = seen.locator("tr:has(.state.done) th", has_text="active")
+    expect(active).to_have_text("2 active")
+    follow(seen, "text=Make it active")
+    expect(active).to_have_text("1 active")
     follow(seen, "text=Undo: back to version 2")
-    expect(todays).to_have_text("2 today's")
+    expect(active).to_have_text("2 active")
     expect(seen.locator(".decided")).to_contain_text("in place of")
 
 
 @SIZES
 def test_what_is_not_trusted_nor_judged_says_so(seen: Any):
-    seen.goto("/?show=doubted")
+    seen.goto("/?show=flagged")
     expect(seen.locator("tbody th")).to_have_text(["AB01"])
-    expect(seen.locator("tbody")).to_contain_text("not yet judged")
+    expect(seen.locator("tbody")).to_contain_text("not yet evaluated")
     follow(seen, "tbody th a")
-    expect(seen.locator("#doubts-title")).to_contain_text("not trusted since")
-    expect(seen.locator(".tiles")).to_contain_text("not yet judged")
-    if seen.locator("text=I have seen it").count():
-        follow(seen, "text=I have seen it")
-    expect(seen.locator("section:has(#doubts-title)")).to_contain_text("Seen by local")
+    expect(seen.locator("#warnings-title")).to_contain_text("not trusted since")
+    expect(seen.locator(".tiles")).to_contain_text("not yet evaluated")
+    button = "section:has(#warnings-title) button"
+    if seen.locator(button).count():
+        follow(seen, button)
+    expect(seen.locator("section:has(#warnings-title)")).to_contain_text("Acknowledged by local")
 
 
 @SIZES
@@ -142,10 +171,12 @@ def test_photograph_is_found_looked_at_and_corrected(seen: Any, size: dict[str, 
     expect(seen.locator("h1")).to_have_text("Photograph 3 of AA39")
     for shown in ("outlined", "crop"):
         expect(seen.locator(f"img[src$='{shown}.jpg']")).to_be_visible()
-    expect(seen.locator(".sides figcaption")).to_contain_text(["photograph", "target", "its light", "forecast", "diff"])
+    expect(seen.locator(".sides figcaption")).to_contain_text(
+        ["photograph", "target", "its light", "forecast", "diff"]
+    )
     expect(seen.locator("main")).to_contain_text("red where the forecast is brighter")
-    azimuth = f"{-60 - size['width'] / 1e4:g}"
-    seen.fill("[name=sun_azimuth]", azimuth)
+    azimuth = f"{240 + size['width'] / 1e4:g}"
+    seen.fill("[name=azimuth_deg]", azimuth)
     seen.fill("[name=reason]", "by hand")
     seen.check("[name=excluded]")
     follow(seen, "button >> text=Correct")
@@ -159,11 +190,11 @@ def test_photograph_is_found_looked_at_and_corrected(seen: Any, size: dict[str, 
 
 @SIZES
 def test_maps_of_all_versions_have_one_scale(seen: Any):
-    told = []
+    scales = []
     for version in (1, 2):
         seen.goto(f"/heliostats/AA39?version={version}")
-        told.append(seen.locator("#deviation-title").text_content().rpartition("; ")[2])
-    assert told == ["from -2 to 2 mm"] * 2
+        scales.append(seen.locator("#deviation-title").text_content().rpartition("; ")[2])
+    assert scales == ["from -2 to 2 mm"] * 2
     expect(seen.locator("#compare-title + p")).to_contain_text("3 photographs, the newest")
     expect(seen.locator("svg.scale").last).to_have_attribute(
         "aria-label", "Colours from -0.3 to 0.3 of the measured peak"
@@ -171,24 +202,26 @@ def test_maps_of_all_versions_have_one_scale(seen: Any):
     seen.goto("/compare?heliostat=AA39&version=1&other_version=2")
     expect(seen.locator("#compared .columns figure")).to_have_count(6)
     expect(seen.locator("#compared [role=status]")).to_have_count(0)
-    assert seen.locator("#surface-first-title").text_content().endswith(told[0])
+    assert seen.locator("#surface-first-title").text_content().endswith(scales[0])
 
 
 @SIZES
 def test_study_says_what_matters_and_adopting_what_is_of_before(seen: Any):
     seen.goto("/studies/2")
     expect(seen.locator("#verdict-title")).to_have_text("nothing missing")
-    expect(seen.locator("section p >> nth=1")).to_contain_text("of the light falls elsewhere than forecast")
+    expect(seen.locator("section p >> nth=1")).to_contain_text(
+        "of the light falls elsewhere than forecast"
+    )
     seen.goto("/studies/1")
     follow(seen, "button >> text=Adopt")
     expect(seen.locator("main")).to_contain_text("2 were made by another version of the model")
-    expect(seen.locator("form[action='/studies/remake'] button")).to_be_visible()
+    expect(seen.locator("form[action='/studies/predictions'] button")).to_be_visible()
     follow(seen, "text=Withdraw it")
     expect(seen.locator("button >> text=Adopt")).to_be_visible()
 
 
 @SIZES
-def test_light_of_the_field_is_told_in_units(seen: Any):
+def test_flux_of_the_field_has_units(seen: Any):
     seen.goto("/jobs/1")
     expect(seen.locator(".tiles").nth(1)).to_contain_text("Reflected by the mirrors")
     expect(seen.locator("figure svg image")).to_be_visible()
@@ -212,8 +245,10 @@ def test_tables_and_figures_are_taken_along(seen: Any):
 
 @SIZES
 def test_plan_is_deleted_by_who_asked_twice(seen: Any, served: Served):
-    day = {"begin": "2026-06-21T08:00:00Z", "end": "2026-06-21T10:00:00Z"}
-    job = seen.request.post("/v1/jobs/plans", data=day | {"name": "to go", "target": "lower"}).json()["id"]
+    day = {"first_at": "2026-06-21T08:00:00Z", "last_at": "2026-06-21T10:00:00Z"}
+    job = seen.request.post(
+        "/v1/jobs/plans", data=day | {"name": "to go", "target": "lower"}
+    ).json()["id"]
     worker = Worker(served.app.state.runtime, KINDS, "tester", threading.Event())
     while worker.work():
         pass

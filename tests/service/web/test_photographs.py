@@ -1,23 +1,36 @@
-"""Photographs on the pages: one row each, whatever kinds came of it; small, outlined, and beside its light."""
+"""Photographs on the pages: one row each, whatever kinds came of it; small, outlined, and beside
+its light.
+"""
 
 import csv
 import html
 import io
 import re
+from dataclasses import replace
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
+from model.errors import InvalidInputError
 from model.imaging import MeasuredFlux, Quality
 from service import store
+from service.base.errors import BusyError
+from service.sources.decode import decode_image
 from service.store.columns import now
 from service.store.database import Database
-from service.store.shots import Wanted, list_shots, page_of_shots
+from service.store.photographs.groups import (
+    PhotographFilter,
+    dated_groups,
+    list_groups,
+    undated_groups,
+)
 from service.store.tables import TargetRow
-from service.web.pages import heliostat, photographs
+from service.twin.runtime import runtime
+from service.web.pages import heliostat, photograph_list
 from tests.service.conftest import FakeOperations, Post, png, poster
 from tests.service.web.test_pages import HTML, text_of
 
@@ -26,7 +39,9 @@ HERE = "/heliostats/AA39/photographs"
 
 def rows_of(page: str) -> list[str]:
     table = page.partition('id="photographs-title"')[2]
-    return re.findall(r'<th scope="row"><a href="/heliostats/AA39/photographs/[\w-]+">(\w+)</a>', table)
+    return re.findall(
+        r'<th scope="row"><a href="/heliostats/AA39/photographs/[\w-]+">(\w+)</a>', table
+    )
 
 
 @pytest.fixture
@@ -37,7 +52,9 @@ def filled(client: TestClient, post: Post) -> TestClient:
     for seed, kind in enumerate(("cropped", "flux")):
         assert post(png(seed + 11, refused=True), id="2", kind=kind).status_code == 201
     assert post(png(21), id="3").status_code == 201
-    excluded = client.patch("/v1/heliostats/AA39/measurements/3", json={"excluded": True, "reason": "a bird"})
+    excluded = client.patch(
+        "/v1/heliostats/AA39/measurements/3", json={"excluded": True, "reason": "a bird"}
+    )
     assert excluded.status_code == 200
     client.headers.update(HTML)
     return client
@@ -47,10 +64,16 @@ def test_photograph_has_one_row(filled: TestClient):
     page = text_of(filled, "/heliostats/AA39")
     assert rows_of(page) == ["3", "2", "1"]
     assert page.count("thumbnail.jpg") == 3
-    assert re.findall(r'class="note" href="[^"]*">([\w-]+)</a>', page)[-3:] == ["flux", "cropped", "raw"]
+    assert re.findall(r'class="note" href="[^"]*">([\w-]+)</a>', page)[-3:] == [
+        "flux",
+        "cropped",
+        "raw",
+    ]
 
 
-@pytest.mark.parametrize(("verdict", "names"), [("used", ["1"]), ("refused", ["2"]), ("excluded", ["3"])])
+@pytest.mark.parametrize(
+    ("verdict", "names"), [("used", ["1"]), ("refused", ["2"]), ("excluded", ["3"])]
+)
 def test_photographs_are_chosen_by_verdict(filled: TestClient, verdict: str, names: list[str]):
     page = text_of(filled, f"/heliostats/AA39?photographs={verdict}")
     assert rows_of(page) == names
@@ -59,7 +82,7 @@ def test_photographs_are_chosen_by_verdict(filled: TestClient, verdict: str, nam
 
 
 def test_older_photographs_are_a_page_away(filled: TestClient, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(heliostat, "MOST_PHOTOGRAPHS", 2)
+    monkeypatch.setattr(heliostat, "MAX_PHOTOGRAPHS", 2)
     page = text_of(filled, "/heliostats/AA39")
     assert rows_of(page) == ["3", "2"]
     (older,) = re.findall(r'href="(/photographs[^"]*before=\d+)"', page)
@@ -69,7 +92,9 @@ def test_older_photographs_are_a_page_away(filled: TestClient, monkeypatch: pyte
 
 
 def names_of(page: str) -> list[str]:
-    found = re.findall(r'<th scope="row"><a href="/heliostats/(\w+)/photographs/[\w-]+">(\w+)</a>', page)
+    found = re.findall(
+        r'<th scope="row"><a href="/heliostats/(\w+)/photographs/[\w-]+">(\w+)</a>', page
+    )
     return [f"{heliostat} {name}" for heliostat, name in found]
 
 
@@ -78,27 +103,38 @@ def field(filled: TestClient, properties: dict[str, Any]) -> TestClient:
     """The same with another heliostat's on another target, of a day long ago."""
     assert filled.put("/v1/heliostats/AB01", json=properties).status_code == 201
     send = poster(filled)
-    answer = send(png(31), heliostat="AB01", id="4", target_name="upper", taken_at="2024-06-01T11:30:00Z")
+    answer = send(
+        png(31), heliostat="AB01", id="4", target="upper", taken_at="2024-06-01T11:30:00Z"
+    )
     assert answer.status_code == 201
     return filled
 
 
-OF_FIELD = ["AA39 3", "AA39 2", "AA39 1", "AB01 4"]
+OF_FIELD = [
+    "AB01 4",
+    "AA39 3",
+    "AA39 2",
+    "AA39 1",
+]  # those of an unknown time last, the last that came first
 
 
 @pytest.mark.parametrize(
     ("asked", "shown"),
     [
         ("", [0, 1, 2, 3]),
-        ("heliostat=AB01&verdict=&target=&since=&until=", [3]),
-        ("verdict=used", [2, 3]),
-        ("verdict=refused", [1]),
-        ("verdict=excluded", [0]),
-        ("target=lower", [0, 1, 2]),
-        ("target=upper&verdict=used", [3]),
-        ("since=2024-06-01&until=2024-06-01", [3]),
+        ("heliostat=AB01&verdict=&target=&since=&until=", [0]),
+        ("verdict=used", [0, 3]),
+        ("verdict=refused", [2]),
+        ("verdict=excluded", [1]),
+        ("target=lower", [1, 2, 3]),
+        ("target=upper&verdict=used", [0]),
+        ("since=2024-06-01&until=2024-06-01", [0]),
+        ("time=unknown", [1, 2, 3]),
+        ("time=known", [0]),
+        ("time=unknown&verdict=refused", [2]),
+        ("time=unknown&since=2024-06-01", []),
         ("until=2024-05-31", []),
-        ("since=2024-06-02&heliostat=AA39&verdict=used", [2]),
+        ("since=2024-06-02&heliostat=AA39&verdict=used", []),
     ],
 )
 def test_photographs_of_the_field_are_found(field: TestClient, asked: str, shown: list[int]):
@@ -106,8 +142,8 @@ def test_photographs_of_the_field_are_found(field: TestClient, asked: str, shown
 
 
 def test_pages_of_photographs_meet(field: TestClient, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(photographs, "LISTED", 1)
-    path, seen = "/photographs?since=2024-01-01", []
+    monkeypatch.setattr(photograph_list, "LISTED", 1)
+    path, seen = "/photographs", []
     while path:
         page = text_of(field, path)
         seen += names_of(page)
@@ -118,32 +154,37 @@ def test_pages_of_photographs_meet(field: TestClient, monkeypatch: pytest.Monkey
 
 
 def test_photographs_are_a_table_for_spreadsheets(field: TestClient):
-    rows = list(csv.DictReader(io.StringIO(field.get("/photographs?verdict=used&table=photographs").text)))
+    rows = list(
+        csv.DictReader(io.StringIO(field.get("/photographs?verdict=used&table=photographs").text))
+    )
     assert [(row["Heliostat"], row["Target"], float(row["Sun elevation [°]"])) for row in rows] == [
-        ("AA39", "lower", 45.0),
         ("AB01", "upper", 45.0),
+        ("AA39", "lower", 45.0),
     ]
 
 
 @pytest.mark.parametrize(
     ("wanted", "index"),
     [
-        (Wanted(), "ix_measurements_moment_id"),
-        (Wanted(verdict="used"), "ix_measurements_accepted_moment_id"),
-        (Wanted(verdict="refused"), "ix_measurements_accepted_moment_id"),
-        (Wanted(verdict="excluded"), "ix_measurements_accepted_moment_id"),
-        (Wanted(target=TargetRow(id=1)), "ix_measurements_target_id_moment_id"),
-        (Wanted(since=now(), until=now()), "ix_measurements_moment_id"),
+        (PhotographFilter(), "ix_measurements_taken_at_id"),
+        (PhotographFilter(verdict="used"), "ix_measurements_accepted_taken_at_id"),
+        (PhotographFilter(verdict="refused"), "ix_measurements_accepted_taken_at_id"),
+        (PhotographFilter(verdict="excluded"), "ix_measurements_accepted_taken_at_id"),
+        (PhotographFilter(target=TargetRow(id=1)), "ix_measurements_target_id_taken_at_id"),
+        (PhotographFilter(since=now(), until=now()), "ix_measurements_taken_at_id"),
     ],
 )
-def test_page_is_read_in_the_order_of_an_index(client: TestClient, wanted: Wanted, index: str):
+def test_page_is_read_in_the_order_of_an_index(
+    client: TestClient, wanted: PhotographFilter, index: str
+):
     database: Database = client.app.state.runtime.database  # type: ignore[attr-defined]
     with database.engine.connect() as connection:
-        query = page_of_shots(wanted, 50, (now(), 7)).compile(connection, compile_kwargs={"literal_binds": True})
-        told = connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {query}").all()
-    plan = " ".join(row[-1] for row in told)
-    assert index in plan
-    assert "TEMP B-TREE" not in plan
+        for query in (dated_groups(wanted, 50, (now(), 7)), undated_groups(wanted, 50, 7)):
+            text = query.compile(connection, compile_kwargs={"literal_binds": True})
+            explained = connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {text}").all()
+            plan = " ".join(row[-1] for row in explained)
+            assert index in plan
+            assert "TEMP B-TREE" not in plan
 
 
 def test_other_verdicts_are_refused(filled: TestClient):
@@ -154,19 +195,75 @@ def test_one_image_that_is_used_makes_a_photograph_used(client: TestClient, post
     post(png(1, refused=True), id="1", kind="raw")
     post(png(2), id="1", kind="flux")
     with client.app.state.runtime.database.reading() as session:  # type: ignore[attr-defined]
-        (shot,) = list_shots(session, Wanted(store.get_heliostat(session, "AA39")), 10)
-    assert (shot.name, shot.verdict, [row.kind for row in shot.images]) == ("1", "used", ["flux", "raw"])
+        (shot,) = list_groups(session, PhotographFilter(store.get_heliostat(session, "AA39")), 10)
+    assert (shot.name, shot.verdict, [row.kind for row in shot.images]) == (
+        "1",
+        "used",
+        ["flux", "raw"],
+    )
 
 
 def test_thumbnail_is_small_and_is_sent_once(client: TestClient, post: Post):
     post(png(1, size=(300, 400)), id="1")
     answer = client.get(f"{HERE}/1/thumbnail.jpg")
     assert (answer.status_code, answer.headers["Content-Type"]) == (200, "image/jpeg")
-    assert cv2.imdecode(np.frombuffer(answer.content, np.uint8), cv2.IMREAD_COLOR).shape == (144, 192, 3)
+    assert cv2.imdecode(np.frombuffer(answer.content, np.uint8), cv2.IMREAD_COLOR).shape == (
+        144,
+        192,
+        3,
+    )
     tag = {"If-None-Match": answer.headers["ETag"]}
     assert client.get(f"{HERE}/1/thumbnail.jpg", headers=tag).status_code == 304
     assert client.get(f"{HERE}/9/thumbnail.jpg").status_code == 404
     assert client.get(f"{HERE}/1/nothing.jpg").status_code == 422
+
+
+def test_large_photographs_are_decoded_one_at_a_time(
+    app: FastAPI, client: TestClient, monkeypatch: pytest.MonkeyPatch
+):
+    """Ordinary ones pass meanwhile; a second large one waits, and is refused if the first takes too
+    long.
+    """
+    monkeypatch.setattr(runtime, "LARGE_PIXELS", 100 * 100)
+    patient: runtime.Runtime = replace(app.state.runtime, timeout_s=0.05)
+    large, ordinary = png(1, size=(101, 100)), png(2, size=(100, 100))
+    with patient.decoded(large) as pixels:
+        assert pixels.shape[:2] == (101, 100)
+        for _ in range(5):
+            with patient.decoded(ordinary) as others:
+                assert others.shape[:2] == (100, 100)
+        with pytest.raises(BusyError), patient.decoded(large):
+            pass
+    with patient.decoded(large):
+        pass
+    few = replace(
+        patient, settings=patient.settings.model_copy(update={"max_image_pixels": 100 * 90})
+    )
+    with pytest.raises(InvalidInputError, match="more than 9000 allowed"), few.decoded(ordinary):
+        pass
+
+
+def test_thumbnail_is_made_once(client: TestClient, post: Post, monkeypatch: pytest.MonkeyPatch):
+    """However long a photograph takes to decode, nobody can have it decoded again and again."""
+    post(png(1, size=(300, 400)), id="1")
+    first = client.get(f"{HERE}/1/thumbnail.jpg").content
+    monkeypatch.delattr(runtime, "decode_image")
+    assert client.get(f"{HERE}/1/thumbnail.jpg").content == first
+
+
+def test_a_photograph_is_decoded_before_it_takes_the_model(
+    client: TestClient, post: Post, monkeypatch: pytest.MonkeyPatch
+):
+    computing, free = client.app.state.runtime.compute_slots, []  # type: ignore[attr-defined]
+
+    def decode(data: bytes, **options: Any) -> Any:
+        free.append(computing._free)
+        return decode_image(data, **options)
+
+    monkeypatch.setattr(runtime, "decode_image", decode)
+    slots = computing._free
+    assert post(png(1), id="1").status_code == 201
+    assert free == [slots]
 
 
 class Finder(FakeOperations):
@@ -178,7 +275,15 @@ class Finder(FakeOperations):
             return made
         corners = np.array([[8.0, 8], [24, 8], [8, 24], [24, 24]])
         crop = np.full((256, 256), 99, np.uint8)
-        return MeasuredFlux(Quality(accepted=True), made.flux, made.centered, made.center_of_mass, 4.0, crop, corners)
+        return MeasuredFlux(
+            Quality(accepted=True),
+            made.flux,
+            made.centered,
+            made.center_of_mass,
+            4.0,
+            crop,
+            corners,
+        )
 
 
 class TestFound:
@@ -187,7 +292,9 @@ class TestFound:
         return Finder()
 
     def test_target_is_outlined_and_straightened(self, client: TestClient, post: Post):
-        post(cv2.imencode(".png", np.full((32, 32), 200, np.uint8))[1].tobytes(), id="1", kind="raw")
+        post(
+            cv2.imencode(".png", np.full((32, 32), 200, np.uint8))[1].tobytes(), id="1", kind="raw"
+        )
         outlined = cv2.imdecode(
             np.frombuffer(client.get(f"{HERE}/1/outlined.jpg").content, np.uint8), cv2.IMREAD_COLOR
         ).astype(int)
@@ -195,7 +302,9 @@ class TestFound:
         assert abs(outlined[16, 8] - 200).max() > 40  # its left edge
         assert f'href="{HERE}/1/large.jpg"' in text_of(client, f"{HERE}/1")
         assert client.get(f"{HERE}/1/large.jpg").headers["Content-Type"] == "image/jpeg"
-        crop = cv2.imdecode(np.frombuffer(client.get(f"{HERE}/1/crop.jpg").content, np.uint8), cv2.IMREAD_GRAYSCALE)
+        crop = cv2.imdecode(
+            np.frombuffer(client.get(f"{HERE}/1/crop.jpg").content, np.uint8), cv2.IMREAD_GRAYSCALE
+        )
         assert crop.shape == (256, 256)
         assert abs(crop.astype(int) - 99).max() < 3
 
@@ -205,9 +314,15 @@ def test_image_without_a_target_has_no_crop(client: TestClient, post: Post):
     assert client.get(f"{HERE}/1/crop.jpg").status_code == 404
 
 
-def test_photograph_stands_beside_its_light_and_the_forecast(filled: TestClient):
-    page = text_of(filled, f"{HERE}/1")  # the first that came: raw
-    for shown in ("outlined.jpg", "crop.jpg", 'alt="measured flux of 1"', 'alt="forecast flux of 1"', "100.0"):
+def test_photograph_is_next_to_its_flux_and_the_forecast(filled: TestClient):
+    page = text_of(filled, f"{HERE}/1")  # the first that came: raw, forecast by the ideal mirror
+    for shown in (
+        "outlined.jpg",
+        "crop.jpg",
+        'alt="measured flux of 1"',
+        'alt="forecast flux of 1"',
+        "80.0",
+    ):
         assert shown in page
     assert page.count('class="scale"') == 2
     assert re.search(r'also as <a href="[^"]*/1-flux">flux</a>', page)

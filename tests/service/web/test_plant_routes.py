@@ -77,12 +77,76 @@ def test_target_by_corners(client: TestClient, tower: dict[str, Any]):
         {"plane": PLANE | {"normal": [0, 0, 1]}},
         {"plane": PLANE | {"width": 0}},
         {"plane": PLANE | {"depth": 1}},
-        {"corners": {name: [50, 6, 100] for name in ("upper_left", "upper_right", "lower_left", "lower_right")}},
+        {
+            "corners": {
+                name: [50, 6, 100]
+                for name in ("upper_left", "upper_right", "lower_left", "lower_right")
+            }
+        },
     ],
 )
 def test_target_that_is_no_rectangle(refusing: TestClient, body: dict[str, Any]):
     assert refusing.put("/v1/targets/screen", json=body).status_code == 422
     assert refusing.get("/v1/targets/screen").status_code == 404
+
+
+CYLINDER = {
+    "center": [0, 0, 55.2],
+    "normal": [0, 1, 0],
+    "radius": 4.1,
+    "height": 5.2,
+    "opening_deg": 60,
+}
+SUN = {"azimuth_deg": 180, "elevation_deg": 45}
+
+
+@pytest.mark.parametrize(
+    "plane", [PLANE | {"width": 0.3, "height": 6.1}, PLANE | {"width": 1000, "height": 0.01}]
+)
+def test_plane_is_no_more_than_twenty_times_as_long_as_wide(
+    refusing: TestClient, plane: dict[str, Any]
+):
+    """The tracer's grid has pixels as fine as the shorter side asks, as far as the longer one
+    reaches.
+    """
+    for answer in (
+        refusing.put("/v1/targets/strip", json={"plane": plane}),
+        refusing.post("/v1/forecasts", json={"heliostat": "AA39", "plane": plane, "sun": SUN}),
+        refusing.post("/v1/jobs/forecasts", json={"plane": plane, "sun": SUN}),
+    ):
+        assert answer.status_code == 422
+        assert "no more than 20 times the other; give a larger plane" in answer.json()["detail"]
+
+
+def test_target_of_four_corners_has_the_same_bound(refusing: TestClient, tower: dict[str, Any]):
+    corners = {
+        name: place for name, place in tower["lower"]["coordinates"].items() if name != "center"
+    }
+    low = {name: [*place[:2], 30 + ("upper" in name) / 10] for name, place in corners.items()}
+    answer = refusing.put("/v1/targets/strip", json={"corners": low})
+    assert (answer.status_code, "target strip: width" in answer.json()["detail"]) == (422, True)
+    answer = refusing.put(
+        "/v1/plant", json=tower | {"strip": tower["lower"] | {"coordinates": low}}
+    )
+    assert (answer.status_code, "target strip: width" in answer.json()["detail"]) == (422, True)
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"opening_deg": 1e-9}, "opening_deg"),
+        ({"height": 100}, "20 times"),
+        ({"radius": 0.2, "opening_deg": 360}, "20"),
+    ],
+)
+def test_cylinder_that_is_next_to_a_line_is_refused(
+    refusing: TestClient, change: dict[str, Any], named: str
+):
+    for answer in (
+        refusing.put("/v1/receivers/line", json=CYLINDER | change),
+        refusing.post("/v1/jobs/forecasts", json={"receiver": CYLINDER | change, "sun": SUN}),
+    ):
+        assert (answer.status_code, named in answer.json()["detail"]) == (422, True)
 
 
 def test_heliostat_comes_back_as_it_was_sent(client: TestClient, properties: dict[str, Any]):
@@ -97,7 +161,9 @@ def test_heliostat_posted_twice_is_one(client: TestClient, properties: dict[str,
     assert created.status_code == 201
     assert created.headers["Location"] == "/v1/heliostats/AC43"
     assert client.post("/v1/heliostats", json=body).status_code == 200
-    other = client.post("/v1/heliostats", json={"name": "AC43", "properties": properties | {"width": 3.0}})
+    other = client.post(
+        "/v1/heliostats", json={"name": "AC43", "properties": properties | {"width": 3.0}}
+    )
     assert other.status_code == 409
     assert "PUT" in other.json()["detail"]
     assert client.put("/v1/heliostats/AC43", json=properties | {"width": 3.0}).status_code == 200
@@ -144,29 +210,41 @@ def _without(document: dict[str, Any], *path: str) -> dict[str, Any]:
         (("kinematics_properties", "concentrator_translation_n"), "concentrator_translation_n"),
     ],
 )
-def test_missing_property_is_named(refusing: TestClient, properties: dict[str, Any], path: tuple[str, ...], named: str):
+def test_missing_property_is_named(
+    refusing: TestClient, properties: dict[str, Any], path: tuple[str, ...], named: str
+):
     answer = refusing.put("/v1/heliostats/AA39", json=_without(properties, *path))
     assert answer.status_code == 422
     assert named in answer.json()["detail"]
 
 
-@pytest.mark.parametrize("number", ["NaN", "Infinity", "-Infinity", "1e999", "1" + "0" * 400, "1" + "0" * 5000])
+@pytest.mark.parametrize(
+    "number", ["NaN", "Infinity", "-Infinity", "1e999", "1" + "0" * 400, "1" + "0" * 5000]
+)
 @pytest.mark.parametrize("place", ["width", "renovation", "deep"])
 def test_numbers_that_are_none_are_refused_anywhere(
     refusing: TestClient, properties: dict[str, Any], place: str, number: str
 ):
     properties[place] = "@"
-    text = json.dumps(properties | ({"deep": {"list": [1, "@"]}} if place == "deep" else {})).replace('"@"', number)
-    answer = refusing.put("/v1/heliostats/AA39", content=text, headers={"Content-Type": "application/json"})
+    text = json.dumps(
+        properties | ({"deep": {"list": [1, "@"]}} if place == "deep" else {})
+    ).replace('"@"', number)
+    answer = refusing.put(
+        "/v1/heliostats/AA39", content=text, headers={"Content-Type": "application/json"}
+    )
     assert answer.status_code in (400, 422)
     assert answer.headers["Content-Type"] == "application/problem+json"
 
 
 @pytest.mark.parametrize("text", ["\x00", "\ud800", "a\udfffb"])
-def test_text_that_no_database_keeps_is_refused(refusing: TestClient, properties: dict[str, Any], text: str):
+def test_text_that_no_database_keeps_is_refused(
+    refusing: TestClient, properties: dict[str, Any], text: str
+):
     for document in (properties | {"note": text}, properties | {text: 1}):
         answer = refusing.put(
-            "/v1/heliostats/AA39", content=json.dumps(document), headers={"Content-Type": "application/json"}
+            "/v1/heliostats/AA39",
+            content=json.dumps(document),
+            headers={"Content-Type": "application/json"},
         )
         assert answer.status_code == 422
 
@@ -174,8 +252,10 @@ def test_text_that_no_database_keeps_is_refused(refusing: TestClient, properties
 @pytest.mark.parametrize("depth", [100, 5_000, 200_000])
 def test_deep_nesting_is_refused(refusing: TestClient, depth: int):
     body = '{"note": ' + "[" * depth + "]" * depth + "}"
-    answer = refusing.put("/v1/heliostats/AA39", content=body, headers={"Content-Type": "application/json"})
-    assert answer.status_code in (400, 422)
+    answer = refusing.put(
+        "/v1/heliostats/AA39", content=body, headers={"Content-Type": "application/json"}
+    )
+    assert answer.status_code in (400, 413, 422)
 
 
 @pytest.mark.parametrize(
@@ -186,7 +266,13 @@ def test_deep_nesting_is_refused(refusing: TestClient, depth: int):
         {"facet_properties": {"facets": [{"translation_vector": "abc"}]}},
         {
             "facet_properties": {
-                "facets": [{"translation_vector": [0, 0, 0], "canting_e": [0, 0, 0], "canting_n": [0, 0, 0]}]
+                "facets": [
+                    {
+                        "translation_vector": [0, 0, 0],
+                        "canting_e": [0, 0, 0],
+                        "canting_n": [0, 0, 0],
+                    }
+                ]
             }
         },
         {"kinematics_properties": {"actuators": [1, 2]}},
@@ -197,7 +283,9 @@ def test_deep_nesting_is_refused(refusing: TestClient, depth: int):
         {"width": -1},
     ],
 )
-def test_properties_of_the_wrong_shape(refusing: TestClient, properties: dict[str, Any], wrong: dict[str, Any]):
+def test_properties_of_the_wrong_shape(
+    refusing: TestClient, properties: dict[str, Any], wrong: dict[str, Any]
+):
     assert refusing.put("/v1/heliostats/AA39", json=properties | wrong).status_code == 422
 
 
@@ -205,8 +293,13 @@ def test_properties_of_the_wrong_shape(refusing: TestClient, properties: dict[st
     "name", ["..", "a b", "-a", "_a", "a" * 33, "a.b", "%2e%2e", "a%00", "ä", "a;b", "a'--", "%0a"]
 )
 @pytest.mark.parametrize("resource", ["heliostats", "targets"])
-def test_names_fit_the_pattern(refusing: TestClient, properties: dict[str, Any], resource: str, name: str):
-    for answer in (refusing.get(f"/v1/{resource}/{name}"), refusing.put(f"/v1/{resource}/{name}", json=properties)):
+def test_names_fit_the_pattern(
+    refusing: TestClient, properties: dict[str, Any], resource: str, name: str
+):
+    for answer in (
+        refusing.get(f"/v1/{resource}/{name}"),
+        refusing.put(f"/v1/{resource}/{name}", json=properties),
+    ):
         assert answer.status_code in (404, 405, 422)
         assert answer.headers["Content-Type"] == "application/problem+json"
 
@@ -218,29 +311,38 @@ def test_declared_effects_may_be_of_one_heliostat(client: TestClient, tower: dic
         "scope": {"kind": "set", "heliostats": ["AA39"]},
     }
     declared = {"effects": [rough]}
-    assert client.put("/v1/plant", json=tower | {"declared": declared}).json()["declared"] == declared
+    assert (
+        client.put("/v1/plant", json=tower | {"declared": declared}).json()["declared"] == declared
+    )
     hazy = {"name": "sun_shape", "parameters": {"circumsolar_ratio": 0.1}, "scope": rough["scope"]}
     refused = client.put("/v1/plant", json=tower | {"declared": {"effects": [hazy]}})
     assert refused.status_code == 422
-    assert "sun_shape: the sun and the camera are the same for all heliostats" in refused.json()["detail"]
+    assert (
+        "sun_shape: the sun and the camera are the same for all heliostats"
+        in refused.json()["detail"]
+    )
 
 
-def test_declared_optics_make_the_light_of_forecasts(client: TestClient, tower: dict[str, Any], operations: Any):
+def test_declared_optics_make_the_light_of_forecasts(
+    client: TestClient, tower: dict[str, Any], operations: Any
+):
     request = {
         "heliostat": "AA39",
         "target": "lower",
         "surface": "ideal",
-        "sun": {"azimuth_deg": 20, "elevation_deg": 45},
+        "sun": {"azimuth_deg": 160, "elevation_deg": 45},
         "dni_w_m2": 800,
     }
     assert client.post("/v1/forecasts", json=request).status_code == 201
-    assert operations.forecasts[-1]["optics"].reflectivity == 1.0
+    assert operations.forecasts[-1]["model"].optics.reflectivity == 1.0
     bad = client.put("/v1/plant", json=tower | {"declared": {"optics": {"reflectivity": 1.5}}})
     assert bad.status_code == 422
-    assert "'reflectivity' must lie in 0 to 1" in bad.json()["detail"]
+    assert "optics: reflectivity: must be less than or equal to 1" in bad.json()["detail"]
     declared = {"optics": {"reflectivity": 0.9, "attenuation": [0.01, 0.1]}}
-    assert client.put("/v1/plant", json=tower | {"declared": declared}).json()["declared"] == declared
+    assert (
+        client.put("/v1/plant", json=tower | {"declared": declared}).json()["declared"] == declared
+    )
     assert client.post("/v1/forecasts", json=request).status_code == 201
-    optics = operations.forecasts[-1]["optics"]
+    optics = operations.forecasts[-1]["model"].optics
     assert (optics.dni, optics.reflectivity, optics.attenuation) == (800, 0.9, (0.01, 0.1))
     assert client.put("/v1/plant", json=tower).json()["declared"] == declared

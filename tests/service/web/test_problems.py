@@ -9,11 +9,11 @@ import pytest
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
-from service.base.faults import SchemaError
+from service.base.errors import SchemaError
 from service.base.settings import Settings
-from service.web.answers.problem_schema import Problem
 from service.web.api.measurements import MeasurementIn
 from service.web.app import create_app
+from service.web.responses.problem_schema import Problem
 from tests.service.conftest import client_of, metadata
 
 
@@ -28,7 +28,8 @@ def check(answer: Any, status: int) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(
-    "path", ["/nothing", "/v1", "/v1/nothing", "/v1/heliostats/", "/v1/heliostats/a/b", "/../etc/passwd"]
+    "path",
+    ["/nothing", "/v1", "/v1/nothing", "/v1/heliostats/", "/v1/heliostats/a/b", "/../etc/passwd"],
 )
 def test_unknown_path(refusing: TestClient, path: str):
     assert "docs" in check(refusing.get(path), 404)["detail"]
@@ -47,7 +48,9 @@ def test_unreadable_body(refusing: TestClient):
     check(refusing.post("/v1/heliostats", content=b"", headers=headers), 422)
 
 
-@pytest.mark.parametrize("content_type", ["text/plain", "application/x-www-form-urlencoded", "multipart/form-data", ""])
+@pytest.mark.parametrize(
+    "content_type", ["text/plain", "application/x-www-form-urlencoded", "multipart/form-data", ""]
+)
 def test_body_that_is_not_json(refusing: TestClient, content_type: str):
     headers = {"Content-Type": content_type} if content_type else {}
     for method, path in (
@@ -63,7 +66,10 @@ def test_body_that_is_not_json(refusing: TestClient, content_type: str):
 
 def test_body_that_is_too_large(bare: TestClient, settings: Settings):
     headers = {"Content-Type": "application/json"}
-    check(bare.post("/v1/heliostats", content=bytes(settings.max_json_bytes + 1), headers=headers), 413)
+    check(
+        bare.post("/v1/heliostats", content=bytes(settings.max_json_bytes + 1), headers=headers),
+        413,
+    )
 
     def chunks() -> Any:
         for _ in range(settings.max_json_bytes // 1000 + 100):
@@ -73,17 +79,29 @@ def test_body_that_is_too_large(bare: TestClient, settings: Settings):
 
 
 def test_every_wrong_field_is_listed(refusing: TestClient):
-    document = check(refusing.post("/v1/forecasts", json={"heliostat": "a b", "sun": {"azimuth_deg": "x"}}), 422)
-    assert {error["field"] for error in document["errors"]} == {"heliostat", "sun.azimuth_deg", "sun.elevation_deg"}
+    document = check(
+        refusing.post("/v1/forecasts", json={"heliostat": "a b", "sun": {"azimuth_deg": "x"}}), 422
+    )
+    assert {error["field"] for error in document["errors"]} == {
+        "heliostat",
+        "sun.azimuth_deg",
+        "sun.elevation_deg",
+    }
 
 
 def test_text_in_errors_can_always_be_sent(refusing: TestClient):
     body = json.dumps({"heliostat": "A", "sun": {}, "\ud800": 1})
-    check(refusing.post("/v1/forecasts", content=body, headers={"Content-Type": "application/json"}), 422)
+    check(
+        refusing.post("/v1/forecasts", content=body, headers={"Content-Type": "application/json"}),
+        422,
+    )
 
 
 def test_unexpected_failure_says_nothing_of_the_inside(
-    app: FastAPI, bare: TestClient, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    app: FastAPI,
+    bare: TestClient,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
 ):
     def fail(*_: Any) -> None:
         raise ZeroDivisionError("the secret inside")
@@ -134,16 +152,26 @@ def test_openapi_document_is_tidy(refusing: TestClient):
         assert operation.get("summary"), path
         for status, response in operation["responses"].items():
             if int(status) >= 400 and path.startswith("/v1"):
-                assert list(response["content"]) == ["application/problem+json"], (path, method, status)
-    assert "HTTPValidationError" not in document["components"]["schemas"]
+                assert list(response["content"]) == ["application/problem+json"], (
+                    path,
+                    method,
+                    status,
+                )
+    schemas = document["components"]["schemas"]
+    assert "HTTPValidationError" not in schemas
+    assert not [name for name in schemas if "__" in name], (
+        "two models share a name; generated clients refuse that"
+    )
     jsonschema.Draft202012Validator.check_schema({"$defs": document["components"]["schemas"]})
 
 
 def test_every_number_says_its_unit(refusing: TestClient):
-    """Numbers in requests and answers carry a unit in their description, their name, or are known to have none."""
+    """Numbers in requests and answers carry a unit in their description, their name, or are known
+    to have none.
+    """
     unitless = {
-        "normal", "up", "version", "images", "surface", "resolution", "misfit", "id", "surface_version", "status",
-        "accepted", "power_plant_properties",
+        "normal", "up", "version", "images", "surface", "resolution", "misfit", "id",
+        "surface_version", "status", "accepted", "power_plant_properties",
     }  # fmt: skip
     schemas = refusing.get("/openapi.json").json()["components"]["schemas"]
     missing = [
@@ -151,12 +179,15 @@ def test_every_number_says_its_unit(refusing: TestClient):
         for name, schema in schemas.items()
         for key, field in schema.get("properties", {}).items()
         if '"number"' in json.dumps(field) and key not in unitless
-        if "[" not in field.get("description", "") and not key.endswith(("_deg", "_m", "_w_m2", "_w"))
+        if "[" not in field.get("description", "")
+        and not key.endswith(("_deg", "_m", "_w_m2", "_w"))
     ]
     assert missing == []
 
 
-def test_unready_until_migrated(settings: Settings, operations: Any, app: FastAPI, bare: TestClient):
+def test_unready_until_migrated(
+    settings: Settings, operations: Any, app: FastAPI, bare: TestClient
+):
     app.state.runtime.database.downgrade("base")
     ready = bare.get("/readyz")
     assert ready.status_code == 503
@@ -173,7 +204,10 @@ def test_ready(bare: TestClient, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("service.web.root.health.default_predictor", lambda: None)
     ready = bare.get("/readyz")
     assert ready.status_code == 200
-    assert ready.json() == {"status": "ok", "checks": {"database": "ok", "migrations": "ok", "weights": "ok"}}
+    assert ready.json() == {
+        "status": "ok",
+        "checks": {"database": "ok", "migrations": "ok", "weights": "ok"},
+    }
 
 
 def test_unready_without_weights(bare: TestClient, monkeypatch: pytest.MonkeyPatch):
@@ -188,7 +222,9 @@ def test_unready_without_weights(bare: TestClient, monkeypatch: pytest.MonkeyPat
 
 
 def test_problem_names_its_kind_the_field_and_the_remedy(refusing: TestClient):
-    broken = refusing.post("/v1/forecasts", content='{"heliostat": oops}', headers={"Content-Type": "application/json"})
+    broken = refusing.post(
+        "/v1/forecasts", content='{"heliostat": oops}', headers={"Content-Type": "application/json"}
+    )
     assert broken.json()["type"] == "urn:heliotwin:problem:invalid"
     assert broken.json()["detail"].startswith("body: is no JSON, wrong at character 14; make it")
     unknown = refusing.post("/v1/heliostats/AA39/surfaces", json={"metod": "network"}).json()
@@ -204,7 +240,10 @@ def test_metadata_may_come_as_a_file_of_json(refusing: TestClient):
     """So Swagger's page sends them, and what its form begins with is taken."""
     schemas = refusing.get("/openapi.json").json()["components"]["schemas"]
     MeasurementIn.model_validate(schemas["MeasurementIn"]["examples"][0])
-    sent = {"metadata": ("blob", b"{", "application/json"), "image": ("spot.png", b"x", "image/png")}
+    sent = {
+        "metadata": ("blob", b"{", "application/json"),
+        "image": ("spot.png", b"x", "image/png"),
+    }
     answer = refusing.post("/v1/heliostats/AA39/measurements", files=sent)
     assert answer.status_code == 422
     assert answer.json()["errors"][0]["field"] == "metadata"

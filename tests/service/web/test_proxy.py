@@ -1,4 +1,6 @@
-"""Behind a proxy: nobody is let in without a key, and its word on who asks counts where it is trusted only."""
+"""Behind a proxy: nobody is let in without a key, and its word on who asks counts where it is
+trusted only.
+"""
 
 import http.client
 import threading
@@ -12,11 +14,11 @@ import pytest
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
-from service.store import keys
-from service.store.database import Database
-from tests.faults.harness import Process, Store
-from tests.service.conftest import serving
-from tests.service.web.test_keys import bearer, make_key
+from service.base.settings import Settings
+from service.web.app import create_app
+from service.web.server import config_of
+from tests.service.access import bearer, make_key
+from tests.service.conftest import FakeOperations, free_port, listening, serving
 
 FORWARDED = [
     {"Forwarded": "for=192.0.2.1"},
@@ -32,7 +34,9 @@ FORWARDED = [
 
 
 @pytest.mark.parametrize("headers", FORWARDED, ids=str)
-def test_nobody_behind_a_proxy_comes_in_without_a_key(app: FastAPI, bare: TestClient, headers: dict[str, str]):
+def test_nobody_behind_a_proxy_comes_in_without_a_key(
+    app: FastAPI, bare: TestClient, headers: dict[str, str]
+):
     """It sends 127.0.0.1 as Host, for that is where it found the service."""
     assert bare.get("/v1/audit").status_code == 200
     refused = bare.get("/v1/audit", headers=headers)
@@ -46,7 +50,7 @@ def test_nobody_behind_a_proxy_comes_in_without_a_key(app: FastAPI, bare: TestCl
 
 
 def test_a_proxy_that_says_nothing_is_known_by_its_version(app: FastAPI, bare: TestClient):
-    """nginx as it comes: HTTP/1.0, the service's own name as Host, no header of its own."""
+    """nginx with its default settings: HTTP/1.0, the service's name as Host, no added header."""
     with serving(app, lifespan="off") as address:
         connection = http.client.HTTPConnection(address.removeprefix("http://"))
         for version, status in (("HTTP/1.0", 401), ("HTTP/1.1", 200)):
@@ -56,17 +60,24 @@ def test_a_proxy_that_says_nothing_is_known_by_its_version(app: FastAPI, bare: T
             connection.close()
 
 
-# --- a service and a proxy --------------------------------------------------------------------------------------------
+# --- a service and a proxy
+# --------------------------------------------------------------------------------------------
 
 
 @contextmanager
 def proxy(service: str) -> Iterator[str]:
-    """A proxy with TLS, as far as the service behind can tell; it takes its client's word on where that is."""
+    """A proxy that the service sees as one with TLS.
+
+    It takes its client's address from a header of the request.
+    """
 
     class Handler(BaseHTTPRequestHandler):
         def _pass_on(self) -> None:
             client, given = self.headers["X-Test-Client"], self.headers["X-Forwarded-For"]
-            seen = {"X-Forwarded-For": client if given is None else f"{given}, {client}", "X-Forwarded-Proto": "https"}
+            seen = {
+                "X-Forwarded-For": client if given is None else f"{given}, {client}",
+                "X-Forwarded-Proto": "https",
+            }
             headers = {**dict(self.headers), **seen}
             body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
             answer = httpx.request(self.command, service + self.path, headers=headers, content=body)
@@ -94,16 +105,17 @@ def proxy(service: str) -> Iterator[str]:
 
 @contextmanager
 def plant(folder: Path, **environment: str) -> Iterator[tuple[str, str]]:
-    """A proxy before a service that lets each client try four times; yields its address and a valid key."""
-    store = Store(folder / "data", None)
-    few = {"HELIOTWIN_REQUESTS_PER_S": "0.001", "HELIOTWIN_REQUESTS_BURST": "4"}
-    with Process(store, **few, **environment) as service:
-        database = Database(store.settings.database)
-        with database.writing() as session:
-            key = keys.create(session, "operator", "read", "tester")
-        database.close()
-        with proxy(service.base) as address:
-            yield address, key
+    """A proxy before a service that lets each client try four times; yields its address and a valid
+    key.
+    """
+    few = {"HELIOTWIN_PUBLIC_REQUESTS_PER_S": "0.001", "HELIOTWIN_PUBLIC_REQUESTS_BURST": "4"}
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in (few | environment).items():
+            patch.setenv(name, value)
+        settings = Settings(data_dir=folder / "data", port=free_port(), job_workers=0)
+        app = create_app(settings, FakeOperations())
+        with listening(config_of(settings, app), app) as service, proxy(service) as address:
+            yield address, make_key(app, "operator", "read")
 
 
 def guess(address: str, client: str, **headers: str) -> int:
@@ -112,7 +124,9 @@ def guess(address: str, client: str, **headers: str) -> int:
 
 
 def logged_in(address: str, key: str) -> str:
-    answer = httpx.post(f"{address}/session", data={"key": key}, headers={"X-Test-Client": "192.0.2.9"})
+    answer = httpx.post(
+        f"{address}/session", data={"key": key}, headers={"X-Test-Client": "192.0.2.9"}
+    )
     assert answer.status_code == 204
     return answer.headers["Set-Cookie"].lower()
 

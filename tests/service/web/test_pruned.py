@@ -1,4 +1,6 @@
-"""What is kept of photographs, as clients and operators see it: sizes, 410 for what is gone, 507 at the end."""
+"""What is kept of photographs, as clients and operators see it: sizes, 410 for what is gone, 507 at
+the end.
+"""
 
 import re
 from collections.abc import Iterator
@@ -15,10 +17,18 @@ from service.jobs.kinds import KINDS
 from service.jobs.worker import Worker
 from service.store.columns import now
 from service.store.tables import ImageRow
-from service.twin.runtime import Runtime
+from service.twin.runtime.runtime import Runtime
 from service.web.app import create_app
 from tests.service.base.test_watch import samples, value
-from tests.service.conftest import QUIET, FakeOperations, client_of, png, poster, properties_document, tower_document
+from tests.service.conftest import (
+    QUIET,
+    FakeOperations,
+    client_of,
+    png,
+    poster,
+    properties_document,
+    tower_document,
+)
 
 BASE = "/v1/heliostats/AA39/measurements"
 
@@ -30,18 +40,23 @@ def settings(tmp_path: Path) -> Settings:
 
 @pytest.fixture
 def pruned(settings: Settings, operations: FakeOperations) -> Iterator[TestClient]:
-    """A store with an accepted photograph, 1, and a refused one, 2, whose image was given up."""
+    """A store with an accepted photograph, 1, and a refused one, 2, whose images were deleted."""
     app = create_app(settings, operations)
     with client_of(app) as client:
         client.put("/v1/plant", json=tower_document())
         client.put("/v1/heliostats/AA39", json=properties_document())
         poster(client)(png(1), id="1")
         poster(client)(png(2, refused=True), id="2")
-        give_up(app)
+        for number in (1, 2):
+            assert (
+                client.get(f"/heliostats/AA39/photographs/{number}/thumbnail.jpg").status_code
+                == 200
+            )
+        prune_images(app)
         yield client
 
 
-def give_up(app: FastAPI) -> None:
+def prune_images(app: FastAPI) -> None:
     """Let a hundred days pass, and a worker work."""
     runtime: Runtime = app.state.runtime
     with runtime.database.writing() as session:
@@ -51,7 +66,7 @@ def give_up(app: FastAPI) -> None:
     assert worker.work()
 
 
-def test_image_that_was_given_up_is_gone_and_the_measurement_is_not(pruned: TestClient):
+def test_deleted_image_is_gone_and_its_measurement_is_not(pruned: TestClient):
     answer = pruned.get(f"{BASE}/2/image")
     assert answer.status_code == 410
     assert answer.headers["Content-Type"] == "application/problem+json"
@@ -67,23 +82,33 @@ def test_image_that_was_given_up_is_gone_and_the_measurement_is_not(pruned: Test
     assert "image kept until" in page
 
 
+def test_thumbnail_goes_with_its_image(pruned: TestClient, settings: Settings):
+    assert (
+        len([path for path in (settings.data_dir / "thumbnails").rglob("*") if path.is_file()]) == 1
+    )
+
+
 def test_job_and_audit_trail_say_what_went(pruned: TestClient):
     (listed,) = pruned.get("/v1/jobs").json()["items"]
     job = pruned.get(listed["href"]).json()
     assert (job["kind"], job["state"], job["result"]["images"]) == ("prunings", "done", 1)
     assert job["result"]["counts"] == {"refused, age": 1}
-    (entry,) = [e for e in pruned.get("/v1/audit").json()["items"] if e["action"] == "images.pruned"]
+    (entry,) = [
+        e for e in pruned.get("/v1/audit").json()["items"] if e["action"] == "images.pruned"
+    ]
     assert entry["subject"] == "1 images"
     assert entry["detail"]["size_bytes"] == len(png(2, refused=True))
     assert pruned.get("/jobs/1", headers={"Accept": "text/html"}).status_code == 200
 
 
-def test_sizes_stand_on_the_page_and_in_the_metrics(pruned: TestClient):
+def test_sizes_are_on_the_page_and_in_the_metrics(pruned: TestClient):
     poster(pruned)(png(3, refused=True), id="3")
     page = pruned.get("/jobs", headers={"Accept": "text/html"}).text
     rows = {
         verdict: re.findall(r"<td[^>]*>(?:<time[^>]*>)?([^<]*)", row)
-        for verdict, row in re.findall(r'<tr><th scope="row">(accepted|refused)</th>(.*?)</tr>', page)
+        for verdict, row in re.findall(
+            r'<th scope="row">(accepted|refused)</th>(.*?)</tr>', page, re.DOTALL
+        )
     }
     space = "\N{NO-BREAK SPACE}"
     assert rows["accepted"][:2] == ["1", f"{len(png(1)) / 1e3:.1f}{space}kB"]
@@ -94,19 +119,21 @@ def test_sizes_stand_on_the_page_and_in_the_metrics(pruned: TestClient):
     assert value(found, "heliotwin_image_bytes", verdict="accepted") == len(png(1))
     assert value(found, "heliotwin_image_bytes", verdict="refused") == len(png(3, refused=True))
     assert value(found, "heliotwin_images", verdict="accepted") == 1
-    assert value(found, "heliotwin_image_oldest_seconds", verdict="accepted") == pytest.approx(8.64e6, rel=0.01)
+    assert value(found, "heliotwin_image_oldest_seconds", verdict="accepted") == pytest.approx(
+        8.64e6, rel=0.01
+    )
     assert value(found, "heliotwin_image_quota_bytes") == 10_000
     assert value(found, "heliotwin_database_bytes") > 10_000
 
 
-def test_post_to_a_store_that_may_give_up_nothing_says_so(pruned: TestClient):
+def test_post_to_a_full_store_is_refused(pruned: TestClient):
     """Nine images are a little more than the quota, and the surface was made from eight of them."""
     post = poster(pruned)
     for seed in range(10, 18):
         assert post(png(seed)).status_code == 201
     assert pruned.post("/v1/heliostats/AA39/surfaces", json={"images": 8}).status_code == 201
-    assert post(png(99, size=(90, 90))).status_code == 201  # there is still something to give up
-    give_up(pruned.app)  # type: ignore[arg-type]
+    assert post(png(99, size=(90, 90))).status_code == 201  # an image can still be deleted
+    prune_images(pruned.app)  # type: ignore[arg-type]
     refused = post(png(98, size=(90, 90)))
     assert refused.status_code == 507
     assert refused.headers["Retry-After"] == "3600"

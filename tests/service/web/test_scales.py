@@ -1,4 +1,6 @@
-"""Colours mean the same on all pages: maps end where the settings say, and differences have one sign."""
+"""Colours mean the same on all pages: maps end where the settings say, and differences have one
+sign.
+"""
 
 import io
 import re
@@ -11,7 +13,7 @@ from pydantic import ValidationError
 
 from service.base.settings import FIGURE_SCALES, Settings
 from service.web.app import create_app
-from tests.service.conftest import FakeOperations, Post, client_of, png
+from tests.service.conftest import FakeOperations, Post, client_of, png, sun_at
 from tests.service.web.test_pages import text_of
 
 ENDS = r"Surface \d: deviation[^;]*; from (\S+) to (\S+) mm"
@@ -39,9 +41,14 @@ def operations() -> FakeOperations:
 @pytest.fixture
 def pages(client: TestClient, post: Post) -> TestClient:
     for number in (1, 2):
-        assert post(png(number), id=f"10{number}", sun_azimuth=20.0 * number).status_code == 201
+        assert (
+            post(png(number), id=f"10{number}", sun=sun_at(180 - 20.0 * number)).status_code == 201
+        )
     for used in (["101"], ["101", "102"]):
-        assert client.post("/v1/heliostats/AA39/surfaces", json={"measurements": used}).status_code == 201
+        assert (
+            client.post("/v1/heliostats/AA39/surfaces", json={"measurements": used}).status_code
+            == 201
+        )
     return client
 
 
@@ -50,7 +57,9 @@ def test_all_versions_have_one_scale_and_what_lies_beyond_is_said(pages: TestCli
     for version in (1, 2):
         page = text_of(pages, f"/heliostats/AA39?version={version}")
         assert re.search(ENDS, page).groups() == ("-2", "2")  # type: ignore[union-attr]
-        heights += re.findall(r"From (\S+) to (\S+) mm: what lies beyond the scale has its end colours", page)
+        heights += re.findall(
+            r"From (\S+) to (\S+) mm: what lies beyond the scale has its end colours", page
+        )
     assert heights == [("−3", "3")]  # the first is 2 mm high
     compared = text_of(pages, "/compare?heliostat=AA39&version=1&other_version=2")
     assert compared.count("from -2 to 2 mm") == 2
@@ -63,7 +72,9 @@ def test_scales_are_settings(pages: TestClient, settings: Settings):
         page = text_of(client, "/heliostats/AA39")
         assert re.search(ENDS, page).groups() == ("-5", "5")  # type: ignore[union-attr]
         assert "beyond the scale" not in page
-        drawn = [one.get("/v1/heliostats/AA39/surfaces/2?format=png").content for one in (pages, client)]
+        drawn = [
+            one.get("/v1/heliostats/AA39/surfaces/2?format=png").content for one in (pages, client)
+        ]
     assert drawn[0] != drawn[1]
 
 
@@ -74,8 +85,12 @@ def test_wrong_scales_are_refused(given: dict[str, float]):
 
 
 def test_difference_is_forecast_minus_photograph(pages: TestClient):
-    arrays = np.load(io.BytesIO(pages.get("/heliostats/AA39/photographs/101?figure=compared&format=npz").content))
-    np.testing.assert_allclose(arrays["difference"], arrays["forecast"] - arrays["measured"], atol=1e-7)
+    arrays = np.load(
+        io.BytesIO(pages.get("/heliostats/AA39/photographs/101?figure=compared&format=npz").content)
+    )
+    np.testing.assert_allclose(
+        arrays["difference"], arrays["forecast"] - arrays["measured"], atol=1e-7
+    )
     assert arrays["difference"][:, :30].max() < 0
     page = text_of(pages, "/heliostats/AA39/photographs/101")
     assert "forecast minus photograph; red where the forecast is brighter" in page

@@ -1,4 +1,4 @@
-"""The service as a process: it starts on an empty folder, answers, and stops when told to."""
+"""The service as a process: it starts on an empty folder, answers, and stops on a signal."""
 
 import json
 import os
@@ -6,7 +6,6 @@ import signal
 import sqlite3
 import subprocess
 import sys
-import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
@@ -17,22 +16,30 @@ import pytest
 from service.base.settings import Settings
 from service.store.database import migrate
 from tests.service.conftest import free_port, metadata, png, properties_document, tower_document
+from tests.waiting import WAIT_LIMIT_S, child_process, until
 
-_SERVE = "from service.web.server import serve; from service.base.settings import Settings; serve(Settings())"
+_SERVE = (
+    "from service.web.server import serve; from service.base.settings import Settings;"
+    " serve(Settings())"
+)
 
 
 def _wait(url: str, process: subprocess.Popen[bytes]) -> httpx.Response:
-    for _ in range(300):
+    """What the service answers, once it does."""
+
+    def ask() -> tuple[httpx.Response] | None:  # an error is an answer, too, and false by itself
         assert process.poll() is None, "the service ended"
         try:
-            return httpx.get(url, timeout=10)
+            return (httpx.get(url),)
         except httpx.TransportError:
-            time.sleep(0.1)
-    pytest.fail("the service does not answer")
+            return None
+
+    (answer,) = until(ask, "the service answers")
+    return answer
 
 
 def _environment(tmp_path: Path, port: int) -> dict[str, str]:
-    """Of a process with a store of its own that finds this checkout."""
+    """Environment of a process with a separate store that imports this checkout."""
     root = str(Path(__file__).parents[3])
     return os.environ | {
         "HELIOTWIN_PORT": str(port),
@@ -44,16 +51,15 @@ def _environment(tmp_path: Path, port: int) -> dict[str, str]:
 def test_process_starts_answers_and_stops(tmp_path: Path):
     port = free_port()
     environment = _environment(tmp_path, port)
-    process = subprocess.Popen([sys.executable, "-c", _SERVE], cwd=tmp_path, env=environment, stderr=subprocess.PIPE)
-    try:
+    options = {"cwd": tmp_path, "env": environment, "stderr": subprocess.PIPE}
+    with child_process([sys.executable, "-c", _SERVE], **options) as process:
         base = f"http://127.0.0.1:{port}"
         assert _wait(f"{base}/livez", process).json()["status"] == "ok"
         answer = httpx.get(f"{base}/v1/heliostats", headers={"X-Request-ID": "trace-me-42"})
         assert answer.json() == {"items": [], "next": None}
         assert "server" not in answer.headers
-    finally:
         process.send_signal(signal.SIGTERM)
-        _, log = process.communicate(timeout=30)
+        _, log = process.communicate(timeout=WAIT_LIMIT_S)
     assert b"trace-me-42 GET /v1/heliostats 200" in log
     assert b"Finished server process" in log
 
@@ -66,34 +72,48 @@ def test_migrate_makes_the_embedded_store(tmp_path: Path):
 
 _SLOW = """
 import os
-import time
 from service.base.settings import Settings
-from service.twin import runtime
+from service.twin.runtime import runtime, slots
 from service.web.server import serve
 from tests.service.conftest import FakeOperations
 
 class Slow(FakeOperations):
     def predict(self, *arguments, **options):
-        os.write(1, b"begun\\n")  # at once: print writes the line's end by itself, and two threads print
-        time.sleep(20)
+        # One write: print writes the end of the line separately, and two threads print.
+        os.write(1, b"begun\\n")
+        os.read(0, 1)  # until the test closes it
         return super().predict(*arguments, **options)
 
+class Telling(slots.ComputeSlots):
+    def enter(self, timeout_s=None, check=None):
+        if not self._free:
+            os.write(1, b"waits\\n")
+        super().enter(timeout_s, check)
+
+runtime.ComputeSlots = Telling
 runtime.load_operations = Slow
 serve(Settings())
 """
 
 
-@pytest.mark.parametrize("told", [signal.SIGTERM, signal.SIGINT])
-def test_requests_at_the_model_are_told_to_come_again_when_the_service_stops(tmp_path: Path, told: signal.Signals):
-    """Two at the model and one that waits for it: 503 with Retry-After within seconds, and nothing of them is kept."""
+@pytest.mark.parametrize("signal_number", [signal.SIGTERM, signal.SIGINT])
+def test_requests_for_the_model_get_retry_after_when_the_service_stops(
+    tmp_path: Path, signal_number: signal.Signals
+):
+    """Two that the model keeps and one that waits for it: 503 with Retry-After, and nothing of them
+    is kept.
+
+    By SIGTERM the process ends while the model still computes; by SIGINT it waits for that.
+    """
     port = free_port()
     environment = _environment(tmp_path, port)
     command = [sys.executable, "-c", _SLOW]
     with ExitStack() as held:
-        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
-        process = held.enter_context(subprocess.Popen(command, cwd=tmp_path, env=environment, **pipes))
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
+        process = held.enter_context(child_process(command, cwd=tmp_path, env=environment, **pipes))
         threads = held.enter_context(ThreadPoolExecutor(3))
         held.callback(process.kill)
+        assert process.stdin is not None
         assert process.stdout is not None
         base = f"http://127.0.0.1:{port}"
         _wait(f"{base}/livez", process)
@@ -101,24 +121,32 @@ def test_requests_at_the_model_are_told_to_come_again_when_the_service_stops(tmp
         httpx.put(f"{base}/v1/heliostats/AA39", json=properties_document())
         form = {"metadata": json.dumps(metadata())}
         files = {"image": ("spot.png", png(), "image/png")}
-        assert httpx.post(f"{base}/v1/heliostats/AA39/measurements", files=files, data=form).status_code == 201
+        assert (
+            httpx.post(
+                f"{base}/v1/heliostats/AA39/measurements", files=files, data=form
+            ).status_code
+            == 201
+        )
         asked = [
-            threads.submit(httpx.post, f"{base}/v1/heliostats/AA39/surfaces", json={}, timeout=60) for _ in range(3)
+            threads.submit(httpx.post, f"{base}/v1/heliostats/AA39/surfaces", json={})
+            for _ in range(3)
         ]
-        assert [process.stdout.readline() for _ in range(2)] == [b"begun\n"] * 2
-        time.sleep(0.5)  # for the third, which waits
-        started = time.monotonic()
-        process.send_signal(told)
+        assert sorted(process.stdout.readline() for _ in range(3)) == [
+            b"begun\n",
+            b"begun\n",
+            b"waits\n",
+        ]
+        process.send_signal(signal_number)
         answers = [future.result() for future in asked]
-        assert time.monotonic() - started < 12
         assert [answer.status_code for answer in answers] == [503] * 3
         for answer in answers:
             assert answer.headers["Retry-After"]
             assert answer.headers["Content-Type"] == "application/problem+json"
             assert answer.headers["X-Request-ID"] == answer.json()["request_id"]
         assert any("stopping" in answer.json()["detail"] for answer in answers)
-        process.wait(60)
-        assert time.monotonic() - started < 40
+        if signal_number == signal.SIGINT:
+            process.stdin.close()
+        process.wait(WAIT_LIMIT_S)
     with sqlite3.connect(tmp_path / "data" / "heliotwin.sqlite") as store:
         assert store.execute("SELECT count(*) FROM surfaces").fetchone() == (0,)
     store.close()

@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
-from service.web.answers.sheets import cell
+from service.web.responses.csv_tables import cell
 from tests.service.conftest import Post, png
 from tests.service.web.test_pages import HTML, fill, settled, text_of
 
 
-@pytest.mark.parametrize("text", ["=1+1", "+1", "-1", "@SUM(A1)", "\t=1", "\r=1", '=HYPERLINK("http://x")'])
+@pytest.mark.parametrize(
+    "text", ["=1+1", "+1", "-1", "@SUM(A1)", "\t=1", "\r=1", '=HYPERLINK("http://x")']
+)
 def test_text_is_never_a_formula(text: str):
     assert cell(text) == f"'{text}"
 
@@ -23,7 +25,7 @@ def test_text_is_never_a_formula(text: str):
 def test_numbers_stay_numbers():
     moment = datetime(2026, 6, 21, tzinfo=UTC)
     values: list[Any] = [-1.5, 0, None, True, "a=b", moment]
-    assert [cell(value) for value in values] == [-1.5, 0, "", "yes", "a=b", "2026-06-21T00:00:00+00:00"]
+    assert [cell(value) for value in values] == [-1.5, 0, "", "yes", "a=b", "2026-06-21T00:00:00Z"]
 
 
 def sheet(client: TestClient, path: str) -> list[dict[str, str]]:
@@ -45,11 +47,16 @@ def test_field_as_a_table(pages: TestClient):
     link = re.search(r'href="(/field\.csv[^"]*)"', page)
     assert link is not None
     (row,) = sheet(pages, link[1])
-    assert (row["name"], row["accuracy [%]"], row["photographs"], row["refused"]) == ("AA39", "100.0", "3", "1")
-    assert float(row["deviation [mm]"]) > 0
+    assert (row["name"], row["accuracy"], row["photographs"], row["refused"]) == (
+        "AA39",
+        "1.0",
+        "3",
+        "1",
+    )
+    assert float(row["deviation_mm"]) > 0
     assert sheet(pages, "/field.csv?search=nobody") == []
-    narrow = settled(pages, "/?show=surface&metric=age")
-    assert 'href="/field.csv?show=surface&amp;metric=age"' in narrow
+    narrow = settled(pages, "/?show=surface&metric=age_days")
+    assert 'href="/field.csv?show=surface&amp;metric=age_days"' in narrow
 
 
 def test_photographs_as_a_table(pages: TestClient, post: Post):
@@ -58,14 +65,18 @@ def test_photographs_as_a_table(pages: TestClient, post: Post):
     assert 'href="/heliostats/AA39/photographs.csv"' in page
     rows = sheet(pages, "/heliostats/AA39/photographs.csv")
     assert [row["photograph"] for row in rows] == ["101", "102", "103", "104"]
-    assert (rows[1]["sun_azimuth [deg]"], rows[2]["reason"], rows[3]["motor_2 [steps]"]) == ("-30.0", "no_spot", "2.5")
+    assert (rows[1]["sun_azimuth_deg"], rows[2]["reason"], rows[3]["motor_axis_2"]) == (
+        "210.0",
+        "no_spot",
+        "2.5",
+    )
     assert pages.get("/heliostats/none/photographs.csv").status_code == 404
 
 
 def test_surfaces_as_a_table(pages: TestClient):
     assert 'href="/heliostats/AA39/surfaces.csv"' in text_of(pages, "/heliostats/AA39")
     rows = sheet(pages, "/heliostats/AA39/surfaces.csv")
-    assert [(row["version"], row["source"], row["is_todays"]) for row in rows] == [
+    assert [(row["version"], row["source"], row["is_active"]) for row in rows] == [
         ("1", "network", "no"),
         ("2", "refined", "yes"),
     ]
@@ -76,7 +87,9 @@ def test_sender_who_writes_a_formula_does_no_harm(client: TestClient, post: Post
     post(png(1), id="1")
     client.patch("/v1/heliostats/AA39/measurements/1", json={"excluded": True, "reason": "=1+1"})
     client.headers.update(HTML)
-    assert not re.search(r"(^|,)\"?[=+@]", client.get("/heliostats/AA39/photographs.csv").text, re.MULTILINE)
+    assert not re.search(
+        r"(^|,)\"?[=+@]", client.get("/heliostats/AA39/photographs.csv").text, re.MULTILINE
+    )
 
 
 @pytest.mark.parametrize(

@@ -8,14 +8,16 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
-from tests.service.conftest import FakeOperations, Post, png
+from tests.service.conftest import FakeOperations, Post, png, spot_of, sun_at
 
 BASE = "/v1/heliostats/AA39/surfaces"
 
 
-def test_prediction_is_kept_as_a_version(client: TestClient, post: Post, operations: FakeOperations):
-    post(png(1), id="1", sun_azimuth=10)
-    post(png(2), id="2", sun_azimuth=-30, motor_position=[5, 6])
+def test_prediction_is_kept_as_a_version(
+    client: TestClient, post: Post, operations: FakeOperations
+):
+    post(png(1), id="1", sun=sun_at(170))
+    post(png(2), id="2", sun=sun_at(210), motor_position=[5, 6])
     created = client.post(BASE, json={})
     assert created.status_code == 201
     assert created.headers["Location"] == f"{BASE}/1"
@@ -33,13 +35,17 @@ def test_prediction_is_kept_as_a_version(client: TestClient, post: Post, operati
     assert client.get(f"{BASE}/1").json() == body
 
 
-def test_observation_is_what_was_measured(client: TestClient, post: Post, operations: FakeOperations):
-    post(png(1), id="1", sun_azimuth=90, sun_elevation=30, motor_position=[5, 6])
+def test_observation_is_what_was_measured(
+    client: TestClient, post: Post, operations: FakeOperations
+):
+    post(png(1), id="1", sun=sun_at(90, 30), motor_position=[5, 6])
     client.post(BASE, json={})
     (observation,) = operations.predictions[0]
     assert observation.identifier == "1"
     np.testing.assert_allclose(observation.sun, [np.cos(np.pi / 6), 0, 0.5], atol=1e-12)
-    np.testing.assert_allclose(observation.target.to_plane(observation.center_of_mass), [0.5, -0.25], atol=1e-9)
+    np.testing.assert_allclose(
+        observation.target.to_plane(observation.center_of_mass), [0.5, -0.25], atol=1e-9
+    )
     np.testing.assert_array_equal(observation.motor_position, [5, 6])
     assert observation.flux.sum() == pytest.approx(100)
 
@@ -48,18 +54,27 @@ def test_spot_of_a_centered_image_is_the_given_one(
     client: TestClient, post: Post, operations: FakeOperations, tower: dict[str, Any]
 ):
     given = tower["lower"]["coordinates"]["upper_left"]
-    post(png(1), id="1", kind="flux-centered", focal_spot=given)
+    post(png(1), id="1", kind="flux-centered", focal_spot_m=spot_of(*given))
     post(png(2), id="2", kind="flux-centered")
     client.post(BASE, json={"measurements": ["1", "2"]})
     first, second = operations.predictions[0]
     lower = first.target
-    np.testing.assert_allclose(lower.to_plane(first.center_of_mass), [-lower.width / 2, lower.height / 2], atol=0.02)
+    np.testing.assert_allclose(
+        lower.to_plane(first.center_of_mass), [-lower.width / 2, lower.height / 2], atol=0.02
+    )
     np.testing.assert_allclose(second.center_of_mass, lower.center)
 
 
-def test_newest_images_with_the_sun_far_apart_are_chosen(client: TestClient, post: Post, operations: FakeOperations):
+def test_newest_images_with_the_sun_far_apart_are_chosen(
+    client: TestClient, post: Post, operations: FakeOperations
+):
     for day, azimuth in enumerate((0, 50, 1, 2, 3, -50)):
-        post(png(day), id=str(day), sun_azimuth=azimuth, taken_at=f"2024-05-{day + 1:02}T10:00:00Z")
+        post(
+            png(day),
+            id=str(day),
+            sun=sun_at(180 - azimuth),
+            taken_at=f"2024-05-{day + 1:02}T10:00:00Z",
+        )
     client.post(BASE, json={"images": 2})
     assert [observation.identifier for observation in operations.predictions[0]] == ["5", "1"]
     client.post(BASE, json={"images": 1})
@@ -79,7 +94,13 @@ def test_prediction_is_valid_from_its_newest_image(client: TestClient, post: Pos
     assert before.status_code == 404
     picture = client.get(BASE, params=at, headers={"Accept": "image/png"})
     assert picture.headers["Content-Type"] == "image/png"
-    for wrong in ("2024-06-01T00:00:00", "0001-01-01T00:00:00+14:00", "9999-12-31T23:59:59-12:00", "now", ""):
+    for wrong in (
+        "2024-06-01T00:00:00",
+        "0001-01-01T00:00:00+14:00",
+        "9999-12-31T23:59:59-12:00",
+        "now",
+        "",
+    ):
         assert client.get(BASE, params={"at": wrong}).status_code == 422
 
 
@@ -138,7 +159,9 @@ def test_what_is_not_there(refusing: TestClient):
     assert refusing.post("/v1/heliostats/AB01/surfaces", json={}).status_code == 404
 
 
-def test_refinement_takes_more_images_than_the_network(client: TestClient, post: Post, operations: FakeOperations):
+def test_refinement_takes_more_images_than_the_network(
+    client: TestClient, post: Post, operations: FakeOperations
+):
     for number in range(1, 12):
         post(png(number))
     path = "/v1/heliostats/AA39/surfaces"

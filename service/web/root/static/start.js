@@ -1,3 +1,3 @@
-// A file of its own: the content security policy lets no script run that stands in a page. Without validatorUrl the
-// page would ask a server of Swagger's whether the document is valid.
+// A separate file, because the content security policy forbids inline scripts. validatorUrl is null, because the page
+// would otherwise send the document to a validator of Swagger.
 SwaggerUIBundle({url: "/openapi.json", dom_id: "#swagger-ui", deepLinking: true, validatorUrl: null});

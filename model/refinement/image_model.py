@@ -1,0 +1,176 @@
+"""The forward model: traced images as a function of a surface's coefficients."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from model.forecast import Aligned, flux_changes
+from model.images import COARSE_SIZE, binned
+from model.network.inputs import STEP_HEIGHT
+from model.observation import Observation, Saturation, align_observations, common_side
+from model.plant import Heliostat
+from model.plant_model import PlantModel
+from model.prior import SurfacePrior, ripples
+from model.progress import Steps
+from model.surface import halved
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceState:
+    """A surface with its traced images.
+
+    Attributes
+    ----------
+    coefficients : (K,)
+        Of the prior's directions, then of the ripples.
+    aligned : Aligned
+        The mirror without ripples, aligned under each sun.
+    images : (M, R, R)
+        Sum 100, with ripples.
+    """
+
+    coefficients: Array
+    aligned: Aligned
+    images: Array
+
+
+@dataclass(frozen=True, eq=False)
+class ImageModel:
+    """Traces the images of a heliostat's observations from coefficients of its surface.
+
+    Attributes
+    ----------
+    heliostat : Heliostat
+    observations : sequence of M Observation
+    model : PlantModel
+    prior : SurfacePrior
+    ripple_images : (N, M, R, R) or None
+        Change of the images per coefficient of a ripple (`with_ripples`).
+    resolution : int
+        R, the number of pixels along a side.
+    samples : int
+        Traced rays along each side of a facet.
+    steps : Steps
+        Counts minimizations; the work may be ended before each trace.
+    """
+
+    heliostat: Heliostat
+    observations: Sequence[Observation]
+    model: PlantModel
+    prior: SurfacePrior
+    ripple_images: NDArray[Any] | None = None
+    resolution: int = COARSE_SIZE
+    samples: int = 32
+    steps: Steps = field(default_factory=Steps)
+
+    @cached_property
+    def measured(self) -> Array:
+        """The measured images (M, R, R)."""
+        return binned(
+            np.array([o.flux for o in self.observations], dtype=np.float64), self.resolution
+        )
+
+    @cached_property
+    def side(self) -> float:
+        """Width of the images [m]."""
+        return common_side(self.observations)
+
+    @cached_property
+    def suns(self) -> Array:
+        """Unit vectors (M, 3) towards the suns."""
+        return np.array([o.sun for o in self.observations])
+
+    @cached_property
+    def ripples(self) -> NDArray[Any]:
+        """``ripple_images``; (0, M, R, R) without ripples."""
+        none = np.zeros((0, *self.measured.shape), np.float32)
+        return none if self.ripple_images is None else self.ripple_images
+
+    @cached_property
+    def _saturation(self) -> Saturation:
+        return Saturation(self.observations, self.resolution)
+
+    @cached_property
+    def _difference_steps(self) -> NDArray[np.float32]:
+        """Steps (K,) of the prior's coefficients for finite differences.
+
+        All change heights by about the same: little enough for linear images, and far more than
+        their rounding errors.
+        """
+        heights = np.sqrt((self.prior.basis**2).mean(axis=(1, 2, 3)))
+        return np.asarray(np.clip(STEP_HEIGHT / heights, 0.1, 4.0), dtype=np.float32)
+
+    def subset(self, places: Sequence[int]) -> "ImageModel":
+        """The model of some of the observations."""
+        some = None if self.ripple_images is None else self.ripple_images[:, list(places)]
+        return replace(
+            self, observations=[self.observations[i] for i in places], ripple_images=some
+        )
+
+    def split(self, coefficients: Array) -> tuple[Array, ...]:
+        """Coefficients (K,) of the prior and those of the ripples."""
+        return tuple(np.split(coefficients, [len(self.prior.basis)]))
+
+    def state(self, coefficients: Array) -> SurfaceState:
+        """Align the mirror of coefficients (K,) under each sun, and trace its images."""
+        self.steps.alive()
+        smooth, fine = self.split(coefficients)
+        aligned = self._align(self.prior.surface(smooth))
+        return SurfaceState(
+            coefficients, aligned, self._trace(aligned) + np.tensordot(fine, self.ripples, axes=1)
+        )
+
+    def jacobian(self, state: SurfaceState) -> NDArray[Any]:
+        """Derivatives (K, M, R, R) of the images by the prior's coefficients."""
+        steps = self._difference_steps[:, None, None, None]
+        changes = torch.as_tensor(self.prior.basis, dtype=torch.float32) * torch.as_tensor(steps)
+        return np.asarray(self._trace_changes(state.aligned, changes) / steps)
+
+    def with_ripples(self, state: SurfaceState) -> "ImageModel":
+        """The model with ripples, whose images are those at a state, to first order."""
+        half_sizes = self.heliostat.facet_frames.half_sizes
+        directions = torch.as_tensor(ripples(half_sizes), dtype=torch.float32)
+        smooth, _ = self.split(state.coefficients)
+        changes = self._trace_changes(self._align(halved(self.prior.surface(smooth))), directions)
+        return replace(self, ripple_images=changes)
+
+    def dim_facets(self, state: SurfaceState, share: float) -> Array:
+        """Change of the images (F, M, R, R) as each facet in turn loses a share of its light."""
+        dimmed = 1 - share * np.eye(len(self.prior.mean))
+        images = [
+            self._trace(state.aligned.with_facet_light(torch.as_tensor(facets)))
+            for facets in dimmed
+        ]
+        return np.asarray(state.images - np.stack(images))
+
+    def _align(self, z: Array) -> Aligned:
+        """Align the mirror of heights (F, I, J) [m] under each sun."""
+        return align_observations(self.heliostat, self.observations, z, self.model)
+
+    def _trace(self, aligned: Aligned) -> Array:
+        """Images (M, R, R) as the cameras show them."""
+        with torch.no_grad():
+            images = aligned.flux_images(size=self.resolution, side=self.side, samples=self.samples)
+            images = self._saturation.apply(images)
+        return np.asarray(images.double().numpy())
+
+    def _trace_changes(self, aligned: Aligned, directions: torch.Tensor) -> NDArray[Any]:
+        """Change of the images (K, M, R, R) with directions (K, F, I, J) [m] of the heights."""
+        with torch.no_grad():
+            images = flux_changes(
+                aligned,
+                directions,
+                size=self.resolution,
+                side=self.side,
+                samples=self.samples,
+                between=self.steps.alive,
+            )
+            images = self._saturation.apply(images)
+            return np.asarray((images[1:] - images[:1]).numpy())

@@ -1,0 +1,282 @@
+"""The outcome of a study: the effects found, their gains, and the error that is left."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from datetime import date
+from functools import cached_property
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.effects import Always, Effect
+from model.metrics import flux_accuracies
+from model.site import Site
+from model.study.covariates import covariates_of
+from model.study.flux_images import FluxImage, noise_floor
+from model.study.judging import Gain, rank_correlation
+from model.study.parameters import ParameterVector, Term
+from model.study.pattern import Pattern, pattern_of
+from model.study.position import EXPECTED, NAT, is_known, loss
+
+Array = NDArray[np.float64]
+Verdict = Literal["effect", "none", "unexplained"]
+
+TOLERANCE = 0.006
+"""Largest error beyond the images' noise that needs no explanation. Sets without an undeclared
+effect have less (two tracers, resampling, surfaces of finite resolution).
+"""
+
+SHARE = 1 / 3
+"""Smallest share of that error that the effects found must remove for the verdict "effect"."""
+
+SHARED = 0.02
+"""Standard deviation of the error that all images share, in shares of a parameter's distance from
+neutral.
+
+Examples are faint light that 8 bits round away, and the tracer's grid. Chosen by sets of known
+effects (`tests.benchmarks.study`), where the median error of most parameters is 0.2 to 2 %.
+"""
+
+MAX_LISTED = 4
+"""Largest number of days or heliostats that a conclusion names."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An effect of the catalogue, fitted alone: mean accuracy of held-out images, and gains."""
+
+    name: str
+    accuracy_after: float
+    gain: Gain
+    accuracy_gain: Gain
+
+
+@dataclass(frozen=True)
+class Found:
+    """An effect that was found, its gain when it was added, and effects that look alike.
+
+    Attributes
+    ----------
+    name : str
+    gain : Gain
+        Gain for which it was added: in accuracy and in spot position (`model.study.position`).
+    accuracy_gain : Gain
+    lookalikes : list of str
+    parameters : dict
+        Nested as in the report: by name, then by heliostat if it has one, then a list over facets.
+    scope : dict
+        When it acts, as in the report.
+    days : list of date
+        Days on which an effect with values by day is largest.
+    """
+
+    name: str
+    gain: Gain
+    accuracy_gain: Gain
+    lookalikes: list[str]
+    parameters: dict[str, Any] = field(default_factory=dict)
+    scope: dict[str, Any] = field(default_factory=lambda: Always().to_json())
+    days: list[date] = field(default_factory=list)
+
+    def fitted(
+        self, term: Term, unknowns: ParameterVector, values: Array, spread: Array
+    ) -> "Found":
+        """Add the final parameters and their 95 % intervals, clipped to their bounds."""
+        low, high = unknowns.bounds
+        spread = np.hypot(spread, SHARED * (values - unknowns.neutral))
+        intervals = np.stack([values - 1.96 * spread, values + 1.96 * spread], axis=-1)
+        intervals = np.clip(intervals, low[:, None], high[:, None])
+        value = unknowns.nested(term, [round(float(v), 6) for v in values])
+        ci95 = unknowns.nested(
+            term, [[round(float(v), 6) for v in interval] for interval in intervals]
+        )
+        parameters = {
+            p.name: _fitted(value[p.name], ci95[p.name], p.unit, term)
+            for p in term.kind.parameters()
+        }
+        away = dict.fromkeys(term.days, 0.0)
+        for place, unknown in enumerate(unknowns.all):
+            if unknown.term == term and unknown.day is not None:
+                away[unknown.day] += (
+                    abs(values[place] - unknown.parameter.neutral) / (high - low)[place]
+                )
+        most = sorted(day for day in away if away[day] > max(away.values()) / 2)
+        return replace(self, parameters=parameters, scope=_scope(term, unknowns), days=most)
+
+    @property
+    def plain_name(self) -> str:
+        """The name in words."""
+        return self.name.replace("_", " ")
+
+    @property
+    def described(self) -> str:
+        """Name and scope in a few words."""
+        name, scope = self.plain_name, self.scope
+        if scope["kind"] == "day":
+            return f"{name} by day (most on {_listed([day.isoformat() for day in self.days])})"
+        of = f" of {_listed(scope['heliostats'])}" if scope.get("heliostats") else ""
+        return f"{name}{of}" + (f" since {scope['since']}" if scope["kind"] == "since" else "")
+
+
+def _fitted(value: Any, ci95: Any, unit: str, term: Term) -> dict[str, Any]:
+    """A parameter in the report; one by day has the median of its days for all other days."""
+    if not term.days:
+        return {"value": value, "ci95": ci95, "unit": unit}
+    usual = round(float(np.median(list(value.values()))), 6)
+    spread = [round(float(v), 6) for v in np.median(list(ci95.values()), axis=0)]
+    return {"value": usual, "ci95": spread, "unit": unit, "by_day": value, "ci95_by_day": ci95}
+
+
+def _scope(term: Term, unknowns: ParameterVector) -> dict[str, Any]:
+    """When and where an effect acts, as in DESIGN.md, section 7."""
+    if term.since is not None and term.is_per_heliostat and len(unknowns.facets) == 1:
+        term = replace(term, heliostats=tuple(name for name, _ in unknowns.facets))
+    return term.scope.to_json()
+
+
+def _listed(names: Sequence[str]) -> str:
+    """List up to `MAX_LISTED` names."""
+    n_more = len(names) - MAX_LISTED
+    return ", ".join(names[:MAX_LISTED]) + (f" and {n_more} more" if n_more > 0 else "")
+
+
+class BeforeAfter(NamedTuple):
+    """A figure of the declared model, and of the model with the effects found."""
+
+    before: float
+    after: float
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """The outcome of a study.
+
+    Attributes
+    ----------
+    images : sequence of FluxImage
+        The H held-out images, which judge.
+    n_fitted : int
+        Number of the other images, which were fitted.
+    window : float [m]
+        Side of the squares that were compared.
+    measured, before, after : (H, 64, 64)
+        Cuts of sum one: photographs, forecasts of the declared model, forecasts with the effects
+        found.
+    position_residuals_before, position_residuals_after : (H, 2)
+        Offsets of the spots from where motors sent them, in independent standard deviations; NaN
+        if motors are not known.
+    displaced_before, displaced_after : (H, 2) [rad]
+        The same offsets as angles.
+    found : list of Found
+    candidates : list of Candidate
+        Each effect alone, the best first.
+    effects : list of Effect
+        The effects found, ready to be adopted.
+    site : Site
+    """
+
+    images: Sequence[FluxImage]
+    n_fitted: int
+    window: float
+    measured: Array
+    before: Array
+    after: Array
+    position_residuals_before: Array
+    position_residuals_after: Array
+    displaced_before: Array
+    displaced_after: Array
+    found: list[Found]
+    candidates: list[Candidate]
+    effects: list[Effect]
+    site: Site
+
+    @cached_property
+    def accuracy_before(self) -> Array:
+        """Accuracy (H,) of the declared model."""
+        return flux_accuracies(self.measured, self.before)
+
+    @cached_property
+    def accuracy_after(self) -> Array:
+        """Accuracy (H,) with the effects found."""
+        return flux_accuracies(self.measured, self.after)
+
+    @property
+    def has_position(self) -> NDArray[np.bool_]:
+        """Which images (H,) have a known offset of the spot from where motors sent it."""
+        return is_known(self.position_residuals_before)
+
+    @property
+    def position_error_mrad(self) -> BeforeAfter | None:
+        """Median angle [mrad] of those offsets; None if none is known."""
+        if not self.has_position.any():
+            return None
+        both = (self.displaced_before[self.has_position], self.displaced_after[self.has_position])
+        return BeforeAfter(*(1e3 * float(np.median(np.linalg.norm(d, axis=-1))) for d in both))
+
+    @cached_property
+    def noise_floor(self) -> float:
+        """Mean error that the images' noise and the sheets behind the spots make alone."""
+        return noise_floor(self.images, self.window)
+
+    @property
+    def unexplained_share(self) -> float:
+        """Share of the error beyond noise that the effects found leave; zero if it is small."""
+        first = self._excess_error(self.accuracy_before, self.position_residuals_before)
+        return min(1.0, self._error_left / first) if first > TOLERANCE else 0.0
+
+    @property
+    def _error_left(self) -> float:
+        return self._excess_error(self.accuracy_after, self.position_residuals_after)
+
+    def _excess_error(self, accuracy: Array, position_residuals: Array) -> float:
+        """Mean error beyond noise, of shape and of position."""
+        of_position = loss(position_residuals) - EXPECTED * self.has_position
+        return max(0.0, 1 - float(accuracy.mean()) - self.noise_floor) + max(
+            0.0, NAT * float(of_position.mean())
+        )
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether an effect explains the error, the error needs no explanation, or none does."""
+        if self.found and self.unexplained_share <= 1 - SHARE:
+            return "effect"
+        return "unexplained" if self.has_unexplained_error and not self.is_pattern else "none"
+
+    @cached_property
+    def pattern(self) -> Pattern:
+        """The pattern that the photographs' residuals have in common."""
+        return pattern_of(self.images, self.measured, self.after, self.window)
+
+    @property
+    def is_pattern(self) -> bool:
+        """Whether most of the error that is left is a pattern of the target, not of the light.
+
+        The mean magnitude of deviations is 0.8 of their standard deviation ``depth``.
+        """
+        left = self._error_left
+        return left > 0 and self.pattern.is_targets and 0.8 * self.pattern.depth >= left / 2
+
+    @property
+    def n_in_sample(self) -> int:
+        """Number of the images here that surfaces were predicted from."""
+        return sum(p.seen for p in self.images)
+
+    @property
+    def has_unexplained_error(self) -> bool:
+        """Whether more error is left than noise makes."""
+        return self._error_left > TOLERANCE
+
+    def covariates(self) -> dict[str, float]:
+        """Rank correlations of the error that is left with covariates, the strongest first."""
+        error = 1 - self.accuracy_after
+        known = covariates_of(self.images, self.site)
+        found = {
+            covariate.name: round(rank_correlation(error, v), 3) for covariate, v in known.items()
+        }
+        return dict(sorted(found.items(), key=lambda item: -abs(item[1])))
+
+    def residual_map(self) -> Array:
+        """Mean of forecast minus measured (64, 64) with the effects found, in shares of peaks."""
+        peaks = self.measured.max(axis=(1, 2), keepdims=True)
+        return np.asarray(((self.after - self.measured) / peaks).mean(axis=0))

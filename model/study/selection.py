@@ -1,0 +1,222 @@
+"""Forward selection of effects, judged on held-out images.
+
+Notes
+-----
+The score of a held-out image is its flux accuracy, minus the loss by the position of its spot
+(`model.study.position`). The gain of an effect is the mean difference of scores with and without
+it, with a 95 % interval. An effect is worthwhile if the lower end of the interval is above zero and
+the mean is above a minimum.
+
+Of the worthwhile candidates that no held-out image distinguishes from the best, the simplest is
+added. After each addition an effect that is no longer worthwhile is pruned.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.images import FLUX_SIZE
+from model.metrics import flux_accuracies
+from model.study.flux_images import noise_floor
+from model.study.judging import Gain, few_gain, paired_gain
+from model.study.parameters import ParameterVector, Term
+from model.study.position import EXPECTED, NAT, loss
+from model.study.scope_search import ScopeSearch
+from model.study.scopes import MAX_SCREENED
+from model.study.trials import Trial, TrialFitter
+
+Array = NDArray[np.float64]
+
+MAX_REFITTED = 3
+"""Number of the best candidates that are re-fitted jointly with the effects found before."""
+
+MIN_CHANGE = 0.002
+"""Share of the light that an effect must move in a forecast for its photograph to judge it."""
+
+MIN_SINGLE_GAIN = 0.01
+"""Smallest gain of an effect at one heliostat. Some mirrors of undeclared sets without such an
+effect gain up to 0.008: two tracers, surfaces of finite resolution, and faint light in 8 bits
+differ by that.
+"""
+
+MIN_MOVEMENT = 0.5
+"""Standard deviations that an effect must move a spot by for its photograph to judge it."""
+
+MIN_DISTINCTION = 0.001
+"""Smallest gain of one effect over another that distinguishes them."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The candidate to add, its gain and its look-alikes."""
+
+    term: Term
+    gain: Gain
+    lookalikes: list[Term]
+
+
+class ForwardSelection:
+    """Chooses effects by the gain on held-out images."""
+
+    def __init__(self, fitter: TrialFitter, scopes: ScopeSearch) -> None:
+        self.fitter, self.scopes, self.options = fitter, scopes, fitter.options
+        self.heliostats = fitter.heliostats[fitter.split.held_out]
+        held_out = [fitter.flux_images[row] for row in fitter.split.held_out]
+        has_motors = [p.setup.angles is not None for p in held_out]
+        self.noise = noise_floor(held_out, fitter.window) + NAT * EXPECTED * float(
+            np.mean(has_motors)
+        )
+
+    def refit_best(self, trials: dict[Term, Trial]) -> dict[Term, Trial]:
+        """Re-fit the best trials jointly with the effects found before."""
+        best = sorted(trials, key=lambda term: -trials[term].score.mean())[:MAX_REFITTED]
+        return trials | {
+            term: self.fitter.fit(trials[term].parameters.terms, trials[term]) for term in best
+        }
+
+    def can_improve(self, current: Trial) -> bool:
+        """Whether a model without any error but the images' noise would be worthwhile."""
+        return 1 - float(current.score.mean()) - self.noise >= self.options.min_gain
+
+    def gain(self, after: Trial, before: Trial, with_position: bool = True) -> Gain:
+        """Return the gain on held-out images, of accuracy alone unless ``with_position``."""
+        return paired_gain(
+            after.scores(with_position) - before.scores(with_position), self.heliostats
+        )
+
+    def gain_where_acting(
+        self, term: Term, after: Trial, before: Trial, with_position: bool = True
+    ) -> Gain:
+        """Return the gain of an effect on the images whose forecast it changes.
+
+        An effect of limited scope changes few held-out images. So it is also fitted to those and
+        judged by the images of the first fit: each image judges a fit that did not see it. An
+        effect at one heliostat is judged by held-out images alone, since the others chose that
+        heliostat among many; they judge several choices.
+        """
+        if self.scopes.has_full_scope(term):
+            return self.gain(after, before, with_position)
+        held_out = _score_changes(
+            self.fitter.measured, _forecasts(before), _forecasts(after), with_position
+        )
+        if term.is_permanent:
+            return few_gain(held_out, among=MAX_SCREENED)
+        if with_position and not held_out.sum() > 0:
+            return few_gain(held_out)
+        return few_gain(
+            np.concatenate([held_out, self._cross_fitted(term, after, before, with_position)])
+        )
+
+    def _cross_fitted(self, term: Term, after: Trial, before: Trial, with_position: bool) -> Array:
+        """Changes of score (n,) of the fitted images, by a fit to the held-out ones."""
+        fitter = self.fitter
+        crossed = replace(after, values=before.parameters.transfer(before.values, after.parameters))
+        moving = ParameterVector((term,), fitter.facets)
+        crossed = fitter.fit_rows(
+            crossed, fitter.touched(fitter.split.held_out, [term]), moving, set()
+        )
+        rows = fitter.touched(fitter.split.fitted, [term])
+        if not len(rows):
+            return np.empty(0)
+        judge = fitter.forecasters(rows).fine
+        first, second = (
+            _Forecasts(judge.cuts(trial.effects), judge.position_residuals(trial.effects))
+            for trial in (before, crossed)
+        )
+        return _score_changes(judge.measured(FLUX_SIZE), first, second, with_position)
+
+    def is_worthwhile(self, term: Term, gain: Gain) -> bool:
+        """Whether a gain by an effect is significant and large enough."""
+        is_single = term.is_permanent and term.heliostats is not None
+        return gain.low > 0 and gain.mean >= max(
+            MIN_SINGLE_GAIN if is_single else 0.0, self.options.min_gain
+        )
+
+    def choose(self, trials: dict[Term, Trial], current: Trial) -> Choice | None:
+        """Choose the candidate to add: the simplest of those that are not distinguished from the
+        best.
+
+        Effects of different heliostats are no look-alikes.
+        """
+        gains = {
+            term: self.gain_where_acting(term, trial, current) for term, trial in trials.items()
+        }
+        significant = {
+            term: t for term, t in trials.items() if self.is_worthwhile(term, gains[term])
+        }
+        if not significant:
+            return None
+        best = max(significant, key=lambda term: significant[term].score.mean())
+        alike = [
+            term
+            for term, t in significant.items()
+            if term == best
+            or not (term.is_disjoint_from(best) or is_distinct(self.gain(significant[best], t)))
+        ]
+        alike.sort(
+            key=lambda term: (_complexity(term, significant[term]), -significant[term].score.mean())
+        )
+        chosen, *others = alike
+        is_nested = self.scopes.has_full_scope(chosen)
+        gain = self._nested_gain(significant, current) if is_nested else gains[chosen]
+        return Choice(chosen, gain, others) if self.is_worthwhile(chosen, gain) else None
+
+    def _nested_gain(self, trials: dict[Term, Trial], current: Trial) -> Gain:
+        """Gain of the best trial: each half of the images judges the choice by the other."""
+        second = np.arange(len(self.heliostats)) % 2 == 1
+        differences = np.empty(len(second))
+        for half in (second, ~second):
+            best = max(
+                trials.values(), key=lambda t: t.score[~half].mean() if (~half).any() else 0.0
+            )
+            differences[half] = (best.score - current.score)[half]
+        return paired_gain(differences, self.heliostats)
+
+    def prune_redundant(self, current: Trial) -> Trial:
+        """Remove effects that are no longer worthwhile beside a later one."""
+        for term in current.parameters.terms[:-1]:
+            rest = [other for other in current.parameters.terms if other != term]
+            reduced = self.fitter.fit(rest, current)
+            if not self.is_worthwhile(term, self.gain_where_acting(term, current, reduced)):
+                current = reduced
+        return current
+
+
+def is_distinct(gain: Gain) -> bool:
+    """Whether a gain over another effect is significant, and larger than a fit's error."""
+    return gain.low > 0 and gain.mean >= MIN_DISTINCTION
+
+
+@dataclass(frozen=True, eq=False)
+class _Forecasts:
+    """Forecast cuts (n, 64, 64) and position residuals (n, 2)."""
+
+    cuts: Array
+    position_residuals: Array
+
+
+def _forecasts(trial: Trial) -> _Forecasts:
+    return _Forecasts(trial.cuts, trial.position_residuals)
+
+
+def _score_changes(
+    measured: Array, before: _Forecasts, after: _Forecasts, with_position: bool
+) -> Array:
+    """Changes of score (n,) of the images whose forecasts differ."""
+    moved = np.nan_to_num(
+        np.linalg.norm(after.position_residuals - before.position_residuals, axis=-1)
+    )
+    differ = (1 - flux_accuracies(before.cuts, after.cuts) > MIN_CHANGE) | (moved > MIN_MOVEMENT)
+    first, second = (
+        flux_accuracies(measured, forecasts.cuts)
+        - with_position * NAT * loss(forecasts.position_residuals)
+        for forecasts in (before, after)
+    )
+    return np.asarray((second - first)[differ])
+
+
+def _complexity(term: Term, trial: Trial) -> int:
+    """Number of values of a term; a date and a heliostat's name count as one each."""
+    numbers = sum(u.term == term for u in trial.parameters.all)
+    return numbers + (term.since is not None) + (term.heliostats is not None)

@@ -1,0 +1,87 @@
+"""Messages for validation errors: pydantic's own, but for those that mislead."""
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from pydantic import ValidationError
+
+from service.base.names import FORMS
+
+_OBJECT = "must be a JSON object, {..}"
+_LIST = "must be a list, [..]"
+_TIME = "must be a time such as 2026-06-21T11:36:00Z"
+_DEEP = "is nested too deeply; send it flatter"
+_OTHERWISE = "must be of the form that /docs shows"
+
+ERROR_MESSAGES: Mapping[str, str] = {
+    "missing": "is missing; send it",
+    "extra_forbidden": "is not known here; leave it out, or check its spelling",
+    "invalid_key": "must have names that are text",
+    "none_required": "must be null, or left out",
+    "timezone_aware": "names no time zone; add it, such as Z or +02:00",
+    "int_parsing_size": "must be a smaller whole number",
+    "string_type": 'must be text, ".."',
+    "string_unicode": "must be text of valid Unicode",
+    "bytes_type": 'must be text, ".."',
+    "json_type": "must be JSON as text",
+    "recursion_loop": _DEEP,
+    "recursion_depth_exceeded": _DEEP,
+    "is_instance_of": _OTHERWISE,
+    **dict.fromkeys(("dict_type", "mapping_type", "dataclass_type"), _OBJECT),
+    **dict.fromkeys(("model_type", "model_attributes_type"), _OBJECT),
+    **dict.fromkeys(("list_type", "tuple_type", "set_type"), _LIST),
+    **dict.fromkeys(("frozen_set_type", "iterable_type"), _LIST),
+    **dict.fromkeys(("datetime_type", "datetime_parsing"), _TIME),
+    **dict.fromkeys(("datetime_from_date_parsing", "datetime_object_invalid"), _TIME),
+}
+"""Messages by pydantic's error type, if its own message names a Python type or no remedy."""
+
+# How pydantic's own messages begin: the field's path takes the place of this subject.
+_SUBJECT = re.compile("^[A-Z][a-z]+ should ")
+
+
+def message_of(entry: Mapping[str, Any]) -> str:
+    """The message of an entry of `ValidationError.errors`."""
+    kind, context = entry["type"], entry.get("ctx", {})
+    if kind in ("value_error", "assertion_error"):  # the message of one of our validators
+        return str(context.get("error", entry["msg"]))
+    if kind == "json_invalid":
+        return not_json(_place(entry))
+    if kind == "string_pattern_mismatch":
+        return f"must be {FORMS.get(context['pattern']) or 'text that fits ' + context['pattern']}"
+    own = _SUBJECT.sub("must ", entry["msg"])
+    return ERROR_MESSAGES.get(kind, own if own.startswith("must ") else _OTHERWISE)
+
+
+def field_of(location: Sequence[int | str]) -> str:
+    """A field's path, such as ``sun.elevation_deg``; empty for the whole document.
+
+    Round brackets mark the variant of a union and square ones an entry's name; both are left out.
+    """
+    return ".".join(str(part) for part in location if not str(part).startswith(("(", "[")))
+
+
+def format_validation_error(error: ValidationError, whole: str = "document") -> str:
+    """The first error in one line: the field's path, or ``whole``, and what to do."""
+    first = error.errors(include_url=False)[0]
+    return f"{field_of(first['loc']) or whole}: {message_of(first)}"
+
+
+def not_json(place: str) -> str:
+    """The message that a text is not JSON at ``place``."""
+    return f"is no JSON{place and f', wrong at {place}'}; make it one JSON document"
+
+
+def place_of(error: json.JSONDecodeError) -> str:
+    """The position at which a text stops being JSON."""
+    return f"line {error.lineno}, column {error.colno}"
+
+
+def _place(entry: Mapping[str, Any]) -> str:
+    if entry["loc"] and isinstance(entry["loc"][-1], int):
+        # FastAPI puts the position in place of a field's name.
+        return f"character {entry['loc'][-1]}"
+    found = re.search(r"line (\d+) column (\d+)", str(entry.get("ctx", {}).get("error", "")))
+    return f"line {found[1]}, column {found[2]}" if found else ""

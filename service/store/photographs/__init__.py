@@ -1,0 +1,1 @@
+"""Storage of measurements and their image files."""

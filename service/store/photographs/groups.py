@@ -1,0 +1,198 @@
+"""Lists of photographs, newest first, by pages. Each photograph groups its kinds of images.
+
+Photographs without a time come last, the most recently received first.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Literal
+
+from sqlalchemy import ColumnElement, Select, and_, exists, func, not_, select, tuple_
+from sqlalchemy.orm import InstrumentedAttribute, Session, aliased
+
+from service.base.errors import NotFoundError
+from service.store.photographs.measurements import EXCLUDED, PREFERENCE
+from service.store.tables import HeliostatRow, MeasurementRow, TargetRow
+
+PhotographVerdict = Literal["used", "refused", "excluded"]
+TimeState = Literal["known", "unknown"]
+
+_Row = MeasurementRow
+_Other = aliased(MeasurementRow)
+
+
+@dataclass(frozen=True)
+class PhotographGroup:
+    """A photograph and its images: accepted ones first, then in the order of `PREFERENCE`.
+
+    ``mark`` is the position for the next page.
+    """
+
+    heliostat: str
+    name: str
+    images: tuple[MeasurementRow, ...]
+    mark: int
+
+    @property
+    def best(self) -> MeasurementRow:
+        """The image that decides the photograph's verdict."""
+        return self.images[0]
+
+    @property
+    def verdict(self) -> PhotographVerdict:
+        """Verdict: used if an image is accepted, else excluded if one was, else refused."""
+        if self.best.accepted:
+            return "used"
+        return "excluded" if any(row.reason == EXCLUDED for row in self.images) else "refused"
+
+
+@dataclass(frozen=True)
+class PhotographFilter:
+    """Filter of photographs: heliostat, target, verdict, and time from ``since`` to before
+    ``until``.
+
+    ``time`` selects known or unknown times, ``warned`` photographs with or without warnings.
+    """
+
+    heliostat: HeliostatRow | None = None
+    target: TargetRow | None = None
+    verdict: PhotographVerdict | None = None
+    since: datetime | None = None
+    until: datetime | None = None
+    time: TimeState | None = None
+    warned: bool | None = None
+
+    @property
+    def dated(self) -> bool:
+        """Whether the filter includes photographs with a known time."""
+        return self.time != "unknown"
+
+    @property
+    def undated(self) -> bool:
+        """Whether the filter includes photographs with an unknown time."""
+        return self.time != "known" and self.since is None and self.until is None
+
+
+def _has_other(condition: ColumnElement[bool] | InstrumentedAttribute[bool]) -> ColumnElement[bool]:
+    """Whether the same photograph has another image that fulfils ``condition``."""
+    is_same = and_(_Other.heliostat_id == _Row.heliostat_id, _Other.external_id == _Row.external_id)
+    return exists(select(_Other.id).where(is_same, _Other.id != _Row.id, condition))
+
+
+def _represents(
+    verdict: PhotographVerdict | None,
+) -> list[ColumnElement[bool] | InstrumentedAttribute[bool]]:
+    """Conditions that select one image per photograph, so that an index by time applies."""
+    came_before, is_excluded = _Other.id < _Row.id, _Other.reason == EXCLUDED
+    if verdict is None:
+        return [not_(_has_other(came_before))]
+    if verdict == "used":
+        return [_Row.accepted, not_(_has_other(and_(came_before, _Other.accepted)))]
+    refused = [not_(_Row.accepted), not_(_has_other(_Other.accepted))]
+    if verdict == "excluded":
+        return [*refused, _Row.reason == EXCLUDED, not_(_has_other(and_(came_before, is_excluded)))]
+    return [
+        *refused,
+        func.coalesce(_Row.reason, "") != EXCLUDED,
+        not_(_has_other(is_excluded | came_before)),
+    ]
+
+
+def dated_groups(
+    filters: PhotographFilter, limit: int, before: tuple[datetime, int] | None = None
+) -> Select[MeasurementRow]:
+    """Select up to ``limit`` photographs with a known time, newest first, after the mark
+    ``before``.
+    """
+    query = _groups(filters).where(_Row.taken_at.is_not(None))
+    if filters.since is not None:
+        query = query.where(_Row.taken_at >= filters.since)
+    if filters.until is not None:
+        query = query.where(_Row.taken_at < filters.until)
+    if before is not None:
+        query = query.where(tuple_(_Row.taken_at, _Row.id) < before)
+    return query.order_by(_Row.taken_at.desc(), _Row.id.desc()).limit(limit)
+
+
+def undated_groups(
+    filters: PhotographFilter, limit: int, before: int | None = None
+) -> Select[MeasurementRow]:
+    """Select up to ``limit`` photographs without a time, after ``before``, most recently received
+    first.
+    """
+    query = _groups(filters).where(_Row.taken_at.is_(None))
+    if before is not None:
+        query = query.where(_Row.id < before)
+    # ``taken_at`` is constant here, but an index has this order.
+    return query.order_by(_Row.taken_at.desc(), _Row.id.desc()).limit(limit)
+
+
+def _groups(filters: PhotographFilter) -> Select[MeasurementRow]:
+    """Select photographs with any time, by one image each."""
+    query = select(_Row).where(*_represents(filters.verdict))
+    if filters.heliostat is not None:
+        query = query.where(_Row.heliostat_id == filters.heliostat.id)
+    if filters.target is not None:
+        query = query.where(_Row.target_id == filters.target.id)
+    if filters.warned is not None:
+        query = query.where(
+            _Row.warnings.is_not(None) if filters.warned else _Row.warnings.is_(None)
+        )
+    return query
+
+
+def list_groups(
+    session: Session, filters: PhotographFilter, limit: int, before: int | None = None
+) -> list[PhotographGroup]:
+    """Up to ``limit`` photographs after the mark ``before``, newest first.
+
+    Raises
+    ------
+    NotFoundError
+        If there is no such mark.
+    """
+    last = None if before is None else session.get(_Row, before)
+    if before is not None and last is None:
+        raise NotFoundError(
+            f"before: there is no photograph of the mark {before}; begin at the first page"
+        )
+    found = list[MeasurementRow]()
+    if filters.dated and (last is None or last.taken_at is not None):
+        mark = None if last is None or last.taken_at is None else (last.taken_at, last.id)
+        found += session.scalars(dated_groups(filters, limit, mark))
+    if filters.undated and len(found) < limit:
+        mark_id = None if last is None or last.taken_at is not None else last.id
+        found += session.scalars(undated_groups(filters, limit - len(found), mark_id))
+    known = select(HeliostatRow.id, HeliostatRow.name).where(
+        HeliostatRow.id.in_({row.heliostat_id for row in found})
+    )
+    names = dict(session.execute(known).all())
+    images = _images(session, found)
+    return [
+        PhotographGroup(
+            names[row.heliostat_id],
+            row.external_id or row.identifier,
+            tuple(images[row.id]),
+            row.id,
+        )
+        for row in found
+    ]
+
+
+def _images(session: Session, found: Sequence[MeasurementRow]) -> dict[int, list[MeasurementRow]]:
+    """All images of the photographs, by the id of each photograph's row; preferred images first."""
+    images = {row.id: [row] for row in found}
+    marks = {
+        (row.heliostat_id, row.external_id): row.id for row in found if row.external_id is not None
+    }
+    named = _Row.heliostat_id.in_({of for of, _ in marks}) & _Row.external_id.in_(
+        {name for _, name in marks}
+    )
+    for row in session.scalars(select(_Row).where(named)):
+        mark = marks.get((row.heliostat_id, row.external_id or ""))
+        if mark is not None and row.id != mark:
+            images[mark].append(row)
+    for rows in images.values():
+        rows.sort(key=lambda row: (not row.accepted, PREFERENCE.index(row.kind)))
+    return images

@@ -1,0 +1,1 @@
+"""Storage of the plant: geometry, versions of its model, removal."""

@@ -1,0 +1,288 @@
+"""Storage of the plant, its heliostats, targets and receivers."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+from sqlalchemy import select
+from sqlalchemy.orm import Session, defer
+
+from model.plant import Cylinder, Receiver, TargetPlane
+from service.base import names
+from service.base.errors import ConflictError, NotFoundError
+from service.store.rows import (
+    Change,
+    Put,
+    assign,
+    floats,
+    insert,
+    insert_or_find,
+    serialize_writers,
+)
+from service.store.tables import HeliostatRow, PlantRow, ReceiverRow, TargetRow
+
+_NEW_PLANT = "heliotwin.new_plant"
+
+
+def get_plant(session: Session) -> PlantRow:
+    """The plant; ConflictError if it is not set."""
+    plant = session.get(PlantRow, 1)
+    if plant is None:
+        raise ConflictError(
+            "the plant is not set yet: PUT its PAINT tower measurements to /v1/plant, or import a"
+            " folder"
+        )
+    return plant
+
+
+def put_plant(session: Session, name: str, origin: ArrayLike) -> Change:
+    """Set the plant's name and origin (latitude [deg], longitude [deg], altitude [m]).
+
+    Raises
+    ------
+    ConflictError
+        If heliostats or targets are already stored relative to another origin.
+    """
+    serialize_writers(session)
+    latitude, longitude, altitude = floats(origin)
+    values = {
+        "name": name,
+        "latitude_deg": latitude,
+        "longitude_deg": longitude,
+        "altitude_m": altitude,
+    }
+    plant = session.get(PlantRow, 1)
+    if plant is None:
+        if insert(session, PlantRow(id=1, **values)):
+            session.info[_NEW_PLANT] = True  # A session of `Database.writing` is one transaction.
+            return Change.NEW
+        plant = get_plant(session)
+    if plant.origin != (latitude, longitude, altitude) and _has_positions(session):
+        raise ConflictError(
+            "the plant's origin is fixed: heliostats or targets are stored relative to it"
+        )
+    return assign(plant, values)
+
+
+def is_plant_new(session: Session) -> bool:
+    """Whether the plant was created in this transaction. No result can depend on it then."""
+    return bool(session.info.get(_NEW_PLANT))
+
+
+def _has_positions(session: Session) -> bool:
+    return any(
+        session.scalar(select(table.id).limit(1)) is not None for table in (HeliostatRow, TargetRow)
+    )
+
+
+def find_heliostat(session: Session, name: str) -> HeliostatRow | None:
+    """The heliostat of this name, or None."""
+    return session.scalar(select(HeliostatRow).where(HeliostatRow.name == name))
+
+
+def get_heliostat(session: Session, name: str) -> HeliostatRow:
+    """The heliostat of this name; NotFoundError if there is none."""
+    row = find_heliostat(session, name)
+    if row is None:
+        raise NotFoundError(f"there is no heliostat {name}; POST it to /v1/heliostats first")
+    return row
+
+
+def get_heliostats(session: Session, names: Sequence[str]) -> dict[str, HeliostatRow]:
+    """The stored heliostats among ``names``, by name."""
+    rows = session.scalars(select(HeliostatRow).where(HeliostatRow.name.in_(names)))
+    return {row.name: row for row in rows}
+
+
+def list_heliostats(
+    session: Session,
+    limit: int,
+    after: str | None = None,
+    prefix: str | None = None,
+    search: str = "",
+) -> Sequence[HeliostatRow]:
+    """Up to ``limit`` heliostats after ``after``, sorted by name.
+
+    Their names begin with ``prefix`` and contain ``search``, both case-insensitive.
+    """
+    query = (
+        select(HeliostatRow)
+        .options(defer(HeliostatRow.properties))
+        .order_by(HeliostatRow.name)
+        .limit(limit)
+    )
+    if prefix:
+        query = query.where(HeliostatRow.name.istartswith(prefix, autoescape=True))
+    if search:
+        query = query.where(HeliostatRow.name.icontains(search, autoescape=True))
+    return session.scalars(query.where(HeliostatRow.name > after) if after else query).all()
+
+
+def require_same_properties(row: HeliostatRow, properties: dict[str, object]) -> None:
+    """Raise ConflictError if ``properties`` differ from those of the stored heliostat."""
+    if row.properties != properties:
+        raise ConflictError(
+            f"name: heliostat {row.name} exists with other properties; PUT them to change it"
+        )
+
+
+def put_heliostat(
+    session: Session,
+    name: str,
+    properties: dict[str, object],
+    position: ArrayLike,
+    replace: bool = True,
+) -> Put[HeliostatRow]:
+    """Store a heliostat, or update it with ``replace``.
+
+    It has PAINT ``properties`` and an ENU ``position`` (3,) [m].
+
+    Raises
+    ------
+    InvalidInputError
+        For an invalid name.
+    ConflictError
+        Without ``replace``, if a heliostat of this name has other properties, even from a
+        concurrent writer.
+    """
+    names.require_name(names.NAME, name, "heliostat")
+    serialize_writers(session)
+    east, north, up = floats(position)
+    values = {"properties": properties, "east_m": east, "north_m": north, "up_m": up}
+    row, is_new = insert_or_find(session, HeliostatRow(name=name, **values))
+    if is_new:
+        return Put(row, Change.NEW)
+    if replace:
+        return Put(row, assign(row, values))
+    require_same_properties(row, properties)
+    return Put(row, Change.UNCHANGED)
+
+
+def find_target(session: Session, name: str) -> TargetRow | None:
+    """The target of this name, or None."""
+    return session.scalar(select(TargetRow).where(TargetRow.name == name))
+
+
+def get_target(session: Session, name: str) -> TargetRow:
+    """The target of this name; NotFoundError if there is none. The message lists the known ones."""
+    row = find_target(session, name)
+    if row is None:
+        known = ", ".join(target.name for target in list_targets(session)) or "none yet"
+        raise NotFoundError(f"there is no target {name}; known targets: {known}")
+    return row
+
+
+def list_targets(session: Session) -> Sequence[TargetRow]:
+    """All targets, sorted by name."""
+    return session.scalars(select(TargetRow).order_by(TargetRow.name)).all()
+
+
+def put_target(
+    session: Session, plane: TargetPlane, corners: dict[str, list[float]] | None = None
+) -> Put[TargetRow]:
+    """Store or update a target plane; ``corners`` are its WGS84 corners, if known.
+
+    Raises
+    ------
+    InvalidInputError
+        For an invalid name.
+    ConflictError
+        If a receiver has this name.
+    """
+    names.require_name(names.NAME, plane.name, "target")
+    serialize_writers(session)
+    if find_receiver(session, plane.name) is not None:
+        raise ConflictError(
+            f"name: {plane.name} is a receiver; choose another name for the target plane"
+        )
+    values: dict[str, object] = {
+        "center_m": floats(plane.center),
+        "normal": floats(plane.normal),
+        "up": floats(plane.up),
+        "width_m": float(plane.width),
+        "height_m": float(plane.height),
+    }
+    row, is_new = insert_or_find(session, TargetRow(name=plane.name, corners=corners, **values))
+    if is_new:
+        return Put(row, Change.NEW)
+    moved = any(getattr(row, name) != value for name, value in values.items())
+    # Known corners remain while the plane is unchanged.
+    values["corners"] = corners if moved or corners is not None else row.corners
+    return Put(row, assign(row, values))
+
+
+def target_plane(row: TargetRow) -> TargetPlane:
+    """Convert a stored target to the model's target plane."""
+    return TargetPlane(
+        name=row.name,
+        center=np.array(row.center_m),
+        normal=np.array(row.normal),
+        up=np.array(row.up),
+        width=row.width_m,
+        height=row.height_m,
+    )
+
+
+def list_receivers(session: Session) -> Sequence[ReceiverRow]:
+    """All receivers, sorted by name."""
+    return session.scalars(select(ReceiverRow).order_by(ReceiverRow.name)).all()
+
+
+def find_receiver(session: Session, name: str) -> ReceiverRow | None:
+    """The receiver of this name, or None."""
+    return session.scalar(select(ReceiverRow).where(ReceiverRow.name == name))
+
+
+def get_receiver(session: Session, name: str) -> ReceiverRow:
+    """The receiver of this name; NotFoundError if there is none."""
+    row = find_receiver(session, name)
+    if row is None:
+        raise NotFoundError(f"there is no receiver {name}; PUT it to /v1/receivers/{name} first")
+    return row
+
+
+def put_receiver(session: Session, cylinder: Cylinder) -> Put[ReceiverRow]:
+    """Store or update a receiver.
+
+    Raises
+    ------
+    InvalidInputError
+        For an invalid name.
+    ConflictError
+        If a target has this name.
+    """
+    names.require_name(names.NAME, cylinder.name, "receiver")
+    serialize_writers(session)
+    if find_target(session, cylinder.name) is not None:
+        raise ConflictError(
+            f"name: {cylinder.name} is a target plane; choose another name for the receiver"
+        )
+    values: dict[str, object] = {
+        "center_m": floats(cylinder.center),
+        "normal": floats(cylinder.normal),
+        "up": floats(cylinder.up),
+        "radius_m": float(cylinder.radius),
+        "height_m": float(cylinder.height),
+        "opening_deg": float(cylinder.opening_deg),
+    }
+    row, is_new = insert_or_find(session, ReceiverRow(name=cylinder.name, **values))
+    return Put(row, Change.NEW if is_new else assign(row, values))
+
+
+def receiver_cylinder(row: ReceiverRow) -> Cylinder:
+    """Convert a stored receiver to the model's cylinder."""
+    return Cylinder(
+        name=row.name,
+        center=np.array(row.center_m),
+        normal=np.array(row.normal),
+        up=np.array(row.up),
+        radius=row.radius_m,
+        height=row.height_m,
+        opening_deg=row.opening_deg,
+    )
+
+
+def get_target_or_receiver(session: Session, name: str) -> Receiver:
+    """The target plane or the cylinder of this name; NotFoundError if there is neither."""
+    row = find_receiver(session, name)
+    return target_plane(get_target(session, name)) if row is None else receiver_cylinder(row)

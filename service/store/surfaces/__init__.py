@@ -1,0 +1,1 @@
+"""Storage of surface versions, and decisions which one is active."""

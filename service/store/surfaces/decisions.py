@@ -1,0 +1,190 @@
+"""Decisions which surface version is active: who made them, why, and how to undo them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from service.base.errors import ConflictError
+from service.store import audit
+from service.store.columns import EPOCH, now
+from service.store.listing import NEWEST_FIRST, select_after
+from service.store.rows import lock_row
+from service.store.surfaces.surface_versions import find_surface_at
+from service.store.tables import DecisionRow, HeliostatRow, SurfaceRow
+
+
+@dataclass(frozen=True)
+class Justification:
+    """Why a version became active, or did not.
+
+    ``before`` and ``after`` are mean flux accuracies [1] of the active surface and of the new one,
+    on ``photographs`` photographs. They are None if nothing was compared.
+    """
+
+    reason: str
+    before: float | None = None
+    after: float | None = None
+    photographs: int = 0
+
+
+def _candidate_ids(session: Session, heliostat: HeliostatRow) -> list[int]:
+    query = select(SurfaceRow.version).where(
+        SurfaceRow.heliostat_id == heliostat.id, SurfaceRow.is_candidate
+    )
+    return list(session.scalars(query.order_by(SurfaceRow.version)))
+
+
+def _record(
+    session: Session,
+    heliostat: HeliostatRow,
+    surface: SurfaceRow,
+    became_active: bool,
+    actor: str,
+    grounds: Justification,
+) -> DecisionRow:
+    """Store a decision, with the candidates until then."""
+    before = find_surface_at(session, heliostat)
+    row = DecisionRow(
+        heliostat_id=heliostat.id,
+        surface_id=surface.id,
+        previous=None if before is None else before.version,
+        became_active=became_active,
+        created_by=actor,
+        reason=grounds.reason,
+        accuracy_before=grounds.before,
+        accuracy_after=grounds.after,
+        photographs=grounds.photographs,
+        candidates_before=_candidate_ids(session, heliostat),
+    )
+    session.add(row)
+    action = "surface.promoted" if became_active else "surface.rejected"
+    about = {"version": surface.version, "previous": row.previous, "reason": grounds.reason}
+    audit.record(session, actor, action, f"heliostat {heliostat.name}", **about)
+    return row
+
+
+def _sort_key(row: SurfaceRow) -> tuple[datetime, int]:
+    """Sort key of a version, in the order of
+    `service.store.surfaces.surface_versions.newest_first`.
+    """
+    return row.valid_from or EPOCH, row.version
+
+
+def promote(
+    session: Session,
+    heliostat: HeliostatRow,
+    surface: SurfaceRow,
+    actor: str,
+    grounds: Justification,
+) -> DecisionRow:
+    """Make a version active. Versions that would take precedence over it become candidates."""
+    lock_row(session, HeliostatRow, heliostat.id, f"heliostat {heliostat.name}")
+    row = _record(session, heliostat, surface, True, actor, grounds)
+    place = _sort_key(surface)
+    for other in session.scalars(select(SurfaceRow).where(SurfaceRow.heliostat_id == heliostat.id)):
+        if _sort_key(other) > place:
+            other.is_candidate = True
+    surface.is_candidate = False
+    session.flush()
+    return row
+
+
+def reject(
+    session: Session,
+    heliostat: HeliostatRow,
+    surface: SurfaceRow,
+    actor: str,
+    grounds: Justification,
+) -> DecisionRow:
+    """Keep the active surface. This version remains a candidate until somebody promotes it."""
+    row = _record(session, heliostat, surface, False, actor, grounds)
+    surface.is_candidate = True
+    session.flush()
+    return row
+
+
+def undo_decision(session: Session, heliostat: HeliostatRow, actor: str) -> DecisionRow:
+    """Undo the decision of `find_undoable`, so that the previous surface is active again.
+
+    A second undo reverses the first.
+
+    Raises
+    ------
+    ConflictError
+        If there is no such decision.
+    """
+    lock_row(session, HeliostatRow, heliostat.id, f"heliostat {heliostat.name}")
+    last = find_undoable(session, heliostat)
+    if last is None or last.previous is None:
+        raise ConflictError(
+            f"heliostat {heliostat.name}: no decision took another surface's place; choose a"
+            " version"
+        )
+    of_heliostat = select(SurfaceRow).where(SurfaceRow.heliostat_id == heliostat.id)
+    rows = {row.version: row for row in session.scalars(of_heliostat)}
+    back = _record(
+        session,
+        heliostat,
+        rows[last.previous],
+        True,
+        actor,
+        Justification(f"took back: {last.reason}"[:200]),
+    )
+    for version, row in rows.items():
+        # Versions that are newer than the decision keep their state.
+        if row.created_at <= last.created_at:
+            row.is_candidate = version in last.candidates_before
+    session.flush()
+    return back
+
+
+def acknowledge_warnings(
+    session: Session, heliostat: HeliostatRow, surface: SurfaceRow, actor: str
+) -> None:
+    """Record that ``actor`` has seen a surface's warnings. An earlier record remains.
+
+    Raises
+    ------
+    ConflictError
+        If the surface has no warnings.
+    """
+    if not surface.warnings:
+        raise ConflictError(
+            f"heliostat {heliostat.name}: surface {surface.version} has no warnings to acknowledge"
+        )
+    if surface.acknowledged_by is None:
+        surface.acknowledged_at, surface.acknowledged_by = now(), actor
+        subject = f"heliostat {heliostat.name}"
+        audit.record(session, actor, "surface.acknowledged", subject, version=surface.version)
+
+
+def list_decisions(
+    session: Session, heliostat: HeliostatRow, limit: int, after: int | None = None
+) -> Sequence[DecisionRow]:
+    """Up to ``limit`` decisions on a heliostat's surfaces before ``after``, newest first."""
+    query = select(DecisionRow).where(DecisionRow.heliostat_id == heliostat.id).limit(limit)
+    return session.scalars(select_after(session, query, DecisionRow, NEWEST_FIRST, after)).all()
+
+
+def find_undoable(session: Session, heliostat: HeliostatRow) -> DecisionRow | None:
+    """The last decision that changed the active surface; None if nothing can be undone.
+
+    Later candidates do not matter. Nothing can be undone if the active surface is not the one that
+    the decision promoted, for example because a measured surface arrived since.
+    """
+    query = (
+        select(DecisionRow)
+        .join(SurfaceRow)
+        .where(DecisionRow.heliostat_id == heliostat.id, DecisionRow.became_active)
+    )
+    query = query.where(
+        DecisionRow.previous.is_not(None), DecisionRow.previous != SurfaceRow.version
+    )
+    last, today = (
+        session.scalar(query.order_by(DecisionRow.id.desc()).limit(1)),
+        find_surface_at(session, heliostat),
+    )
+    return last if last is not None and today is not None and last.surface_id == today.id else None

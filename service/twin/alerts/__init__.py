@@ -1,0 +1,1 @@
+"""Field overview, heliostat filters, and alerts for the operator."""

@@ -1,0 +1,571 @@
+"""Alerts: what needs an operator's attention, since when, and what to do.
+
+All alerts are computed from the store and the field overview when they are read. Only
+acknowledgements are stored. Each alert has a ``fingerprint``, and an acknowledgement is valid as
+long as the fingerprint is the same. The fingerprint changes when the reason disappears and returns,
+or when its measured value doubles.
+"""
+
+import hashlib
+import math
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
+from datetime import time as clock
+from itertools import pairwise
+from typing import Literal, NamedTuple
+
+from sqlalchemy import ColumnElement, case, func, or_, select
+from sqlalchemy.orm import Session
+
+from model.effects import CATALOGUE
+from model.pointing.report import clock_in_words
+from service import store
+from service.base.errors import NotFoundError
+from service.base.settings import Settings
+from service.store import acknowledgements
+from service.store.columns import now
+from service.store.job_tables import AcknowledgementRow, JobRow
+from service.store.jobs import queue
+from service.store.photographs.measurements import EXCLUDED, has_warning
+from service.store.surfaces import decisions
+from service.store.tables import (
+    SUN_CONTRADICTS_TIME,
+    UNLIKE_HELIOSTAT,
+    DriftRow,
+    HeliostatRow,
+    MeasurementRow,
+    ModelRow,
+    MountRow,
+    PlantRow,
+    StudyRow,
+)
+from service.twin.alerts.field_overview import (
+    PATIENCE_S,
+    ActiveSurface,
+    FieldOverviewCache,
+    HeliostatSummary,
+)
+from service.twin.plant import model_versions
+from service.twin.pointing.errors import DriveStep, PointingState
+from service.twin.runtime.runtime import Runtime
+from service.twin.studies.camera_watch import FIGURES, CameraChange
+
+Reason = Literal[
+    "queue",
+    "camera",
+    "clock",
+    "moved",
+    "pointing",
+    "drift",
+    "accuracy",
+    "fell",
+    "untrusted",
+    "unlike_heliostat",
+    "sun_contradicts_time",
+    "no_photograph",
+    "times_unknown",
+]
+
+REASONS: dict[Reason, str] = {
+    "queue": "Queue stuck",
+    "camera": "Camera changed",
+    "clock": "Clock wrong",
+    "moved": "Moved",
+    "pointing": "Pointing error",
+    "drift": "Drives drift",
+    "accuracy": "Newest forecast poor",
+    "fell": "Accuracy fell",
+    "untrusted": "Surface not trusted",
+    "unlike_heliostat": "Unlike its heliostat",
+    "sun_contradicts_time": "Sun contradicts time",
+    "no_photograph": "No photograph",
+    "times_unknown": "Times unknown",
+}
+"""All reasons with their labels, the most urgent first."""
+
+# Longest time that the count in the pages' menu is reused [s].
+_COUNT_HOLDS_S = 15.0
+
+
+@dataclass(frozen=True)
+class Alert:
+    """An alert of a heliostat, or of the plant if ``heliostat`` is None.
+
+    ``measurements`` are identifiers of the heliostat's measurements to look at.
+    """
+
+    reason: Reason
+    heliostat: str | None
+    since: datetime
+    message: str
+    action: str
+    fingerprint: str
+    acknowledged_by: str | None = None
+    acknowledged_at: datetime | None = None
+    measurements: tuple[str, ...] = ()
+
+    @property
+    def id(self) -> str:
+        """Identifier from heliostat, reason and fingerprint; it changes with the fingerprint."""
+        digest = hashlib.sha256(self.fingerprint.encode()).hexdigest()[:8]
+        return f"{self.heliostat or 'plant'}:{self.reason}:{digest}"
+
+
+class AlertList(NamedTuple):
+    """Alerts, and the number of heliostats with pending results."""
+
+    alerts: list[Alert]
+    pending: int
+
+
+def list_alerts(session: Session, cache: FieldOverviewCache, settings: Settings) -> AlertList:
+    """List all alerts, sorted by urgency of the reason, then by time with the newest first."""
+
+    def read_alerts() -> AlertList:
+        field, cameras = cache.read(session, PATIENCE_S), cache.cameras.changes(session, settings)
+        return AlertList(
+            alerts_of_heliostats(session, field.lines, settings, cameras), field.pending
+        )
+
+    return cache.recent(session, "attention", read_alerts)
+
+
+def alerts_of_heliostats(
+    session: Session,
+    lines: Sequence[HeliostatSummary],
+    settings: Settings,
+    cameras: Sequence[CameraChange],
+) -> list[Alert]:
+    """List the alerts of the plant, its cameras and its heliostats.
+
+    ``lines`` include the pointing errors.
+    """
+    at = now()
+    found = [
+        *_queue(session, settings),
+        *_camera(session),
+        *_watch_cameras(session, cameras),
+        *_clock(session),
+    ]
+    found += [*_accuracies(session, settings), *_accuracy_drops(session, settings)]
+    found += _without_photograph(session, timedelta(days=settings.attention_photograph_days), at)
+    found += _warned(session)
+    for line in lines:
+        found += _of_heliostat(line, settings, at)
+    known = acknowledgements.acknowledged(session)
+    order = {reason: place for place, reason in enumerate(REASONS)}
+    items = [_with_acknowledgement(item, known) for item in found]
+    return sorted(
+        items, key=lambda item: (order[item.reason], -item.since.timestamp(), item.heliostat or "")
+    )
+
+
+def _with_acknowledgement(
+    item: Alert, acknowledged: dict[acknowledgements.Key, AcknowledgementRow]
+) -> Alert:
+    row = acknowledged.get((item.heliostat, item.reason, item.fingerprint))
+    return (
+        item
+        if row is None
+        else replace(item, acknowledged_by=row.made_by, acknowledged_at=row.made_at)
+    )
+
+
+# --- heliostats
+# --------------------------------------------------------------------------------------------------
+
+
+def _of_heliostat(line: HeliostatSummary, settings: Settings, at: datetime) -> Iterator[Alert]:
+    surface = line.surface or line.candidate
+    if surface is not None and surface.warnings:
+        yield _untrusted_surfaces(line.name, surface, at)
+    if line.pointing is not None:
+        yield from _pointing(line, line.pointing, settings, at)
+
+
+def _untrusted_surfaces(name: str, surface: ActiveSurface, at: datetime) -> Alert:
+    since, photographs = (
+        surface.warned_since or surface.created_at or at,
+        tuple(surface.suspicious or ()),
+    )
+    which = (
+        f"photographs {', '.join(photographs)}"
+        if len(photographs) > 1
+        else f"photograph {''.join(photographs)}"
+    )
+    return Alert(
+        "untrusted",
+        name,
+        since,
+        "; ".join(surface.warnings or ()),
+        f"look at {which if photographs else 'its photographs'}, exclude what is wrong, and predict"
+        " its surface again",
+        since.isoformat(),
+        surface.acknowledged_by,
+        surface.acknowledged_at,
+        photographs,
+    )
+
+
+def _pointing(
+    line: HeliostatSummary, pointing: PointingState, settings: Settings, at: datetime
+) -> Iterator[Alert]:
+    moved, is_new = pointing.moved, False
+    if moved is not None:
+        is_new = not moved.is_calibrated
+        is_late = at - moved.until < timedelta(days=settings.attention_moved_days)
+        if is_new or is_late:
+            yield _moved_drives(line.name, moved)
+    if pointing.beyond_since is not None and pointing.error_mrad is not None and not is_new:
+        metres = "" if line.pointing_m is None else f", {line.pointing_m:.2f} m on the receiver"
+        yield Alert(
+            "pointing",
+            line.name,
+            pointing.beyond_since,
+            f"its spot is {pointing.error_mrad:.1f} mrad off{metres}",
+            "photograph it where the calibration plan says, and calibrate its mount again",
+            _fingerprint(
+                pointing.beyond_since, pointing.error_mrad / settings.attention_pointing_mrad
+            ),
+        )
+    if pointing.drifted is not None:
+        drifted = pointing.drifted
+        yield Alert(
+            "drift",
+            line.name,
+            drifted.since,
+            f"its drives went {drifted.size_mrad:.1f} mrad slowly until {drifted.until:%Y-%m-%d}",
+            "look at its foundation and drives, and calibrate its mount often",
+            _fingerprint(drifted.since, drifted.size_mrad),
+        )
+
+
+def _moved_drives(name: str, moved: DriveStep) -> Alert:
+    if moved.is_calibrated:
+        size, action = (
+            f"its drives stepped by {moved.size_mrad:.1f} mrad",
+            "find out why; its mount is calibrated since",
+        )
+    else:
+        size, action = (
+            f"its spot is {moved.size_mrad:.1f} mrad off since",
+            "look at its drives and encoders, and calibrate its mount again",
+        )
+    fingerprint = f"{moved.since.isoformat()} {moved.until.isoformat()}"
+    return Alert("moved", name, moved.until, f"it moved {moved.when}: {size}", action, fingerprint)
+
+
+def _without_photograph(session: Session, allowed: timedelta, at: datetime) -> Iterator[Alert]:
+    """Find heliostats without a recent photograph, or whose photographs all have unknown times."""
+    row, photograph = HeliostatRow, MeasurementRow
+    newest, is_undated = func.max(photograph.taken_at), photograph.taken_at.is_(None)
+    undated = func.count(func.distinct(case((is_undated, _photograph()))))
+    came = func.min(case((is_undated, photograph.created_at)))
+    query = select(row.name, row.created_at, newest, undated, came).group_by(
+        row.id, row.name, row.created_at
+    )
+    is_photograph = photograph.accepted & photograph.image_sha256.is_not(None)
+    query = query.outerjoin(photograph, (photograph.heliostat_id == row.id) & is_photograph)
+    query = query.having(or_(func.coalesce(newest, row.created_at) < at - allowed, undated > 0))
+    for name, created, last, count, first in session.execute(query):
+        if last is None and count:
+            yield _times_unknown(name, count, first)
+            continue
+        begun = last or created
+        if begun >= at - allowed:
+            continue
+        message = (
+            "none was ever accepted"
+            if last is None
+            else f"the last accepted one is of {last:%Y-%m-%d}"
+        )
+        action = "photograph it where the calibration plan says"
+        if count:
+            message, action = (
+                f"{message}; the time of {count} more is unknown",
+                f"{action}, or {_GIVE_TIMES}",
+            )
+        yield Alert("no_photograph", name, begun + allowed, message, action, begun.isoformat())
+
+
+_GIVE_TIMES = (
+    "give the times of its photographs (PATCH /v1/measurements/times, or `heliotwin times FILE`)"
+)
+
+
+def _times_unknown(name: str, count: int, first: datetime) -> Alert:
+    message = f"the time of all {count} accepted photographs is unknown, and so is how old they are"
+    action = f"{_GIVE_TIMES}, and have taken_at sent with each photograph"
+    return Alert("times_unknown", name, first, message, action, first.isoformat())
+
+
+_WARNED: dict[Reason, tuple[str, str, str]] = {
+    "unlike_heliostat": (
+        UNLIKE_HELIOSTAT,
+        "that another heliostat's surface forecasts much better",
+        "delete what was sent by mistake, and send it for its heliostat; or look at the mirror",
+    ),
+    "sun_contradicts_time": (
+        SUN_CONTRADICTS_TIME,
+        "with a sun that contradicts the time",
+        "correct time or sun, or exclude what is wrong",
+    ),
+}
+"""Reasons that count measurements with a warning: warning type, message and remedy."""
+
+
+def _warned(session: Session) -> Iterator[Alert]:
+    """Find heliostats that have measurements with a warning; excluded measurements do not count."""
+    row, photograph = HeliostatRow, MeasurementRow
+    count, came = func.count(func.distinct(_photograph())), func.min(photograph.created_at)
+    query = select(row.name, count, came).group_by(row.id, row.name)
+    query = query.join(photograph, photograph.heliostat_id == row.id)
+    query = query.where(
+        photograph.warnings.is_not(None), func.coalesce(photograph.reason, "") != EXCLUDED
+    )
+    for reason, (type_, said, remedy) in _WARNED.items():
+        for name, warned, first in session.execute(query.where(has_warning(type_))):
+            message = f"{warned} measurement{'s' if warned > 1 else ''} {said}"
+            action = f"see /photographs?heliostat={name}&warned=true, and {remedy}"
+            yield Alert(reason, name, first, message, action, _fingerprint(first, warned))
+
+
+def _photograph() -> ColumnElement[str]:
+    """The name that all images of one photograph share, as an SQL expression."""
+    return func.coalesce(MeasurementRow.external_id, MeasurementRow.identifier)
+
+
+def _fingerprint(since: datetime, times: float) -> str:
+    """A fingerprint that changes each time ``times`` doubles."""
+    return f"{since.isoformat()} {math.floor(math.log2(max(times, 1.0)))}"
+
+
+def _accuracies(session: Session, settings: Settings) -> Iterator[Alert]:
+    least = settings.attention_accuracy
+    query = select(HeliostatRow.name, DriftRow.accuracy, DriftRow.poor_since, DriftRow.taken_at)
+    poor = query.join(DriftRow, DriftRow.heliostat_id == HeliostatRow.id).where(
+        DriftRow.accuracy < least
+    )
+    for name, accuracy, poor_since, taken_at in session.execute(poor):
+        since = poor_since or taken_at
+        message = (
+            f"its newest photograph was forecast with an accuracy of {accuracy:.0%}, and"
+            f" {least:.0%} is the least"
+        )
+        action = "predict its surface again; if that does not help, study the photographs"
+        yield Alert(
+            "accuracy",
+            name,
+            since,
+            message,
+            action,
+            _fingerprint(since, (1 - accuracy) / max(1 - least, 1e-6)),
+        )
+
+
+def _accuracy_drops(session: Session, settings: Settings) -> Iterator[Alert]:
+    """Find heliostats whose newest photographs were forecast worse than earlier ones.
+
+    The accuracies are those on arrival of each photograph.
+    """
+    allowed = settings.attention_accuracy_drop
+    query = select(HeliostatRow.name, DriftRow).join(
+        DriftRow, DriftRow.heliostat_id == HeliostatRow.id
+    )
+    for name, row in session.execute(query.where(DriftRow.min_drop > allowed)):
+        since, drop = row.fell_since or row.taken_at, row.min_drop or 0.0
+        message = (
+            f"its newest photographs were forecast with an accuracy of {row.recent:.0%} in the"
+            f" median when they came, {row.earlier:.0%} before; by {drop:.0%} at least, and"
+            f" {allowed:.0%} is allowed"
+        )
+        action = "look for what changed on its mirror, and predict its surface again"
+        yield Alert(
+            "fell", name, since, message, action, _fingerprint(since, drop / max(allowed, 1e-6))
+        )
+
+
+# --- the plant
+# --------------------------------------------------------------------------------------------------
+
+
+def _queue(session: Session, settings: Settings) -> Iterator[Alert]:
+    oldest = session.execute(
+        select(JobRow.id, JobRow.created_at)
+        .where(JobRow.state == "queued")
+        .order_by(JobRow.created_at)
+        .limit(1)
+    ).one_or_none()
+    if oldest is None or queue.database_time(session) - oldest.created_at < timedelta(
+        seconds=settings.attention_queue_s
+    ):
+        return
+    message, action = (
+        f"job {oldest.id} has waited since then",
+        "see whether a worker is alive, and what its log says",
+    )
+    yield Alert("queue", None, oldest.created_at, message, action, str(oldest.id))
+
+
+def _camera(session: Session) -> Iterator[Alert]:
+    """Find camera changes in the newest study, and newly declared cameras.
+
+    The study does not count if it is adopted.
+    """
+    study = session.execute(
+        select(StudyRow.id, StudyRow.created_at, StudyRow.report["effects"])
+        .order_by(StudyRow.id.desc())
+        .limit(1)
+    ).one_or_none()
+    if study is not None and model_versions.find_adopted(session, study.id) is None:
+        for effect in study[2] or ():
+            scope = effect.get("scope") or {}
+            if scope.get("kind") == "since" and CATALOGUE[effect["name"]].stage == "image":
+                name, day = effect["name"], scope["since"]
+                yield Alert(
+                    "camera",
+                    None,
+                    datetime.fromisoformat(f"{day}T00:00:00+00:00"),
+                    f"study {study.id} found {name.replace('_', ' ')} in photographs from {day} on",
+                    f"read study {study.id}, and adopt it or declare the camera again",
+                    f"{name} {day}",
+                )
+    declared = _declared_anew(session)
+    if declared is not None:
+        yield Alert(
+            "camera",
+            None,
+            declared.adopted_at,
+            f"version {declared.number} of the model declared another camera; photographs from"
+            " before it stay measured as they were",
+            "measure the stored photographs again (POST /v1/jobs/measurements), and predict"
+            " surfaces again",
+            f"version {declared.number}",
+        )
+
+
+def _watch_cameras(session: Session, cameras: Sequence[CameraChange]) -> Iterator[Alert]:
+    """Report camera changes in photographs, until a camera is declared again."""
+    declared = _declared_anew(session) if cameras else None
+    for change in cameras:
+        since = datetime.combine(change.day, clock(), UTC)
+        if declared is None or since > declared.adopted_at:
+            way, times = (
+                "up" if change.ratio > 1 else "down",
+                f"{change.ratio:.2f} times what it was",
+            )
+            yield Alert(
+                "camera",
+                None,
+                since,
+                f"on {change.target} {FIGURES[change.figure]} is {times}, in the median of"
+                f" {change.days[1]} days against {change.days[0]} before, from photographs of"
+                f" {change.day} on",
+                "look at the camera's exposure, focus and lens; study the photographs, or declare"
+                " the camera again",
+                f"{change.target} {change.figure} {way} {change.day:%Y-%m}",
+            )
+
+
+def _clock(session: Session) -> Iterator[Alert]:
+    """Report a clock error that the newest calibration found."""
+    newest = (
+        select(MountRow.document["clock"])
+        .order_by(MountRow.created_at.desc(), MountRow.id.desc())
+        .limit(1)
+    )
+    clock = session.scalar(newest)
+    if clock is not None:
+        yield Alert(
+            "clock",
+            None,
+            datetime.fromisoformat(f"{clock['since']}T00:00:00+00:00"),
+            clock_in_words(clock),
+            "set the clock that suns are computed by; correct the suns of photographs since then,"
+            " and calibrate again",
+            f"{clock['since']} {'slow' if clock['minutes'] > 0 else 'fast'}",
+        )
+
+
+def _declared_anew(session: Session) -> ModelRow | None:
+    """Find the newest model version with cameras different from the version before.
+
+    Withdrawn versions do not count.
+    """
+    plant, rows = (
+        session.get(PlantRow, 1),
+        [row for row in model_versions.list_models(session) if row.withdrawn_at is None],
+    )
+    declared = [None if plant is None else plant.declared, *(row.declared for row in rows)]
+    cameras = [(document or {}).get("cameras") for document in declared]
+    changed = [row for row, (old, new) in zip(rows, pairwise(cameras), strict=True) if old != new]
+    return changed[-1] if changed else None
+
+
+# --- acknowledging
+# --------------------------------------------------------------------------------------------------
+
+
+def acknowledge(
+    runtime: Runtime, cache: FieldOverviewCache, ids: Sequence[str], actor: str
+) -> list[Alert]:
+    """Acknowledge alerts for ``actor``; return them in the order of their ids.
+
+    Raises
+    ------
+    NotFoundError
+        If an id is not a current alert. Then none is acknowledged.
+    """
+    with runtime.database.reading() as session:
+        items = {item.id: item for item in list_alerts(session, cache, runtime.settings)[0]}
+    missing = [number for number in ids if number not in items]
+    if missing:
+        raise NotFoundError(
+            f"ids: {missing[0]} does not need attention, or its reason changed; see /v1/attention"
+        )
+    with runtime.database.writing() as session:
+        return [_acknowledge(session, items[number], actor) for number in ids]
+
+
+def _acknowledge(session: Session, item: Alert, actor: str) -> Alert:
+    heliostat = None if item.heliostat is None else store.get_heliostat(session, item.heliostat)
+    if heliostat is not None and item.reason == "untrusted":
+        surface = store.find_candidate(session, heliostat) or store.get_surface_at(
+            session, heliostat
+        )
+        decisions.acknowledge_warnings(session, heliostat, surface, actor)
+        return replace(
+            item, acknowledged_by=surface.acknowledged_by, acknowledged_at=surface.acknowledged_at
+        )
+    row = acknowledgements.acknowledge(session, heliostat, item.reason, item.fingerprint, actor)
+    return replace(item, acknowledged_by=row.made_by, acknowledged_at=row.made_at)
+
+
+class AlertCount:
+    """Number of alerts that nobody has acknowledged, for the menu of every page.
+
+    The count is cached for some seconds.
+    """
+
+    def __init__(self, runtime: Runtime, cache: FieldOverviewCache) -> None:
+        self._runtime, self._cache = runtime, cache
+        self._lock = threading.Lock()
+        self._counted, self._counted_s = 0, -math.inf
+
+    def read(self) -> int:
+        """The count, at most some seconds old."""
+        with self._lock:
+            if time.monotonic() - self._counted_s >= _COUNT_HOLDS_S:
+                with self._runtime.database.reading() as session:
+                    items, _ = list_alerts(session, self._cache, self._runtime.settings)
+                self._counted = sum(item.acknowledged_by is None for item in items)
+                self._counted_s = time.monotonic()
+            return self._counted
+
+    def forget(self) -> None:
+        """Count again at the next read, because an alert was acknowledged."""
+        with self._lock:
+            self._counted_s = -math.inf

@@ -1,0 +1,455 @@
+"""Overview of the field: every heliostat with the state of its twin."""
+
+import math
+import threading
+import time
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy import case, func, select, union_all
+from sqlalchemy.orm import Session
+
+from model.surface import canting_rises, split_canting
+from service import store
+from service.base.arrays import unpack
+from service.base.errors import BusyError
+from service.base.recent_results import RecentResults
+from service.store.columns import now
+from service.store.job_tables import AuditRow
+from service.store.surfaces.surface_versions import newest_first
+from service.store.tables import HeliostatRow, MeasurementRow, MountRow, SurfaceRow
+from service.twin.plant import model_versions
+from service.twin.pointing.errors import MountKey, PointingCache, PointingState
+from service.twin.runtime.background_cache import BackgroundCache
+from service.twin.runtime.runtime import Runtime
+from service.twin.studies.camera_watch import CameraWatch
+from service.twin.surfaces.accuracy import AccuracyCache, AccuracyState, Rank
+
+Result = TypeVar("Result")
+
+# Tables whose newest rows show whether the field has changed, and the number of rows to read.
+_TABLES = (HeliostatRow, MeasurementRow, SurfaceRow, MountRow, AuditRow)
+_NEWEST = 1000
+# If reading the field takes less than `_QUICK_S` [s], each request waits for the current state, at
+# most `PATIENCE_S` [s]. Reading also waits `_QUICK_S` for surface figures.
+_QUICK_S = 0.2
+PATIENCE_S = 20.0
+# Results for a field of more than `_LARGE` heliostats are reused for this time [s], if the store is
+# unchanged. For smaller fields they take milliseconds.
+_RECENT_S = 2.0
+_LARGE = 1000
+# Cached figures [1]: several times the surfaces of the largest plant.
+_MOST = 200_000
+
+
+@dataclass(frozen=True)
+class FieldTotals:
+    """Root mean squares over the mirror: deviation, and standard deviation if known [mm]."""
+
+    deviation_mm: float
+    uncertainty_mm: float | None
+
+
+def field_totals(arrays: bytes) -> FieldTotals:
+    """Compute the totals of a stored surface from its packed arrays."""
+    unpacked = unpack(arrays)
+    z, z_std = unpacked["z"], unpacked["z_std"]
+    uncertainty = float(np.sqrt(np.mean(z_std**2)) * 1e3)
+    return FieldTotals(float(np.sqrt(np.mean(z**2)) * 1e3), uncertainty or None)
+
+
+@dataclass(frozen=True)
+class SurfaceErrors:
+    """Kinds of surface deviation, as root mean squares over the mirror.
+
+    ``deviation_mm`` is the total deviation from the ideal surface. ``waviness_mm`` is the deviation
+    within facets. ``canting_mrad`` is the tilt of the facets.
+    """
+
+    deviation_mm: float
+    waviness_mm: float
+    canting_mrad: float
+
+
+def surface_errors(z: NDArray[np.floating], size: tuple[float, float]) -> SurfaceErrors:
+    """Split surface deviation into canting and waviness.
+
+    ``z`` are heights (4, 8, 8) [m]. ``size`` is the mirror's width and height [m], with two facets
+    in each direction.
+    """
+    _, waviness = split_canting(z)
+    tilts = (canting_rises(z) / (np.array(size) / 2)) ** 2
+    deviation, wavy = (float(np.sqrt(np.mean(heights**2)) * 1e3) for heights in (z, waviness))
+    return SurfaceErrors(deviation, wavy, 1e3 * math.sqrt(tilts.mean(axis=0).sum()))
+
+
+@dataclass(frozen=True)
+class ActiveSurface:
+    """A heliostat's active surface or candidate, without its arrays."""
+
+    id: int
+    version: int
+    source: str
+    valid_from: datetime | None
+    misfit: float | None
+    trusted: bool | None = None
+    warnings: Sequence[str] | None = None
+    warned_since: datetime | None = None
+    acknowledged_by: str | None = None
+    acknowledged_at: datetime | None = None
+    suspicious: Sequence[str] | None = None
+    sun_span_deg: float | None = None
+    created_at: datetime | None = None
+
+    @property
+    def age_days(self) -> float | None:
+        """Time since the surface describes the mirror [days]; None if unknown."""
+        return (
+            None if self.valid_from is None else (now() - self.valid_from).total_seconds() / 86400
+        )
+
+
+@dataclass(frozen=True)
+class HeliostatSummary:
+    """Summary of a heliostat; None means unknown or not computed yet.
+
+    A ``rank`` without an accuracy means that no photograph can evaluate the surface, because it was
+    computed from all of them. ``candidate`` is the newest version of a heliostat without an active
+    surface. ``range_m`` is the distance to the nearest receiver's centre [m].
+    """
+
+    name: str
+    east_m: float
+    north_m: float
+    photographs: int = 0
+    refused: int = 0
+    newest: int | None = None
+    corrected: datetime | None = None
+    surface: ActiveSurface | None = None
+    figures: FieldTotals | None = None
+    rank: Rank | None = None
+    range_m: float | None = None
+    mounted: MountKey | None = None
+    pointing: PointingState | None = None
+    candidate: ActiveSurface | None = None
+
+    @property
+    def pointing_m(self) -> float | None:
+        """The pointing error on the receiver, perpendicular to the beam [m]."""
+        if self.pointing is None or self.pointing.error_mrad is None or self.range_m is None:
+            return None
+        return 1e-3 * self.pointing.error_mrad * self.range_m
+
+    def state(self, model: int) -> AccuracyState | None:
+        """State that the accuracy depends on, under a version of the model.
+
+        None if there is no surface or no photograph to compare.
+        """
+        if self.surface is None or self.newest is None:
+            return None
+        calibrated_at = None if self.mounted is None else self.mounted.calibrated_at
+        return AccuracyState(
+            self.name, self.surface.id, self.newest, self.corrected, model, calibrated_at
+        )
+
+
+def _current_surfaces(
+    session: Session, heliostat: int | None
+) -> tuple[dict[int, ActiveSurface], dict[int, ActiveSurface]]:
+    """Active surfaces, and candidates of heliostats without an active one, by heliostat id."""
+    order = (SurfaceRow.is_candidate, *newest_first())
+    place = func.row_number().over(partition_by=SurfaceRow.heliostat_id, order_by=order)
+    standing = select(SurfaceRow.id, place.label("place"))
+    if heliostat is not None:
+        standing = standing.where(SurfaceRow.heliostat_id == heliostat)
+    ranked = standing.subquery()
+    query = select(
+        SurfaceRow.heliostat_id,
+        SurfaceRow.is_candidate,
+        SurfaceRow.id,
+        SurfaceRow.version,
+        SurfaceRow.source,
+        SurfaceRow.valid_from,
+        SurfaceRow.misfit,
+        SurfaceRow.trusted,
+        SurfaceRow.warnings,
+        SurfaceRow.warned_since,
+        SurfaceRow.acknowledged_by,
+        SurfaceRow.acknowledged_at,
+        SurfaceRow.suspicious,
+        SurfaceRow.sun_span_deg,
+        SurfaceRow.created_at,
+    )
+    # The database selects them, because a plant has many versions and each refresh reads them.
+    query = query.join(ranked, ranked.c.id == SurfaceRow.id).where(ranked.c.place == 1)
+    active: dict[int, ActiveSurface] = {}
+    candidates: dict[int, ActiveSurface] = {}
+    for number, is_candidate, *values in session.execute(query):
+        (candidates if is_candidate else active)[number] = ActiveSurface(*values)
+    return active, candidates
+
+
+class _PhotographCounts(NamedTuple):
+    """Counts of a heliostat's photographs, and its newest rows.
+
+    ``refused`` counts photographs without a used image. ``used`` is the row id of the newest used
+    image, ``newest`` that of the newest image. ``corrected`` is when a photograph was last
+    corrected.
+    """
+
+    photographs: int = 0
+    refused: int = 0
+    used: int | None = None
+    newest: int | None = None
+    corrected: datetime | None = None
+
+
+def _photographs(session: Session, heliostat: int | None) -> dict[int, _PhotographCounts]:
+    """Count photographs by heliostat id."""
+    row, has_image = MeasurementRow, MeasurementRow.image_sha256.is_not(None)
+    is_used = case((row.accepted & has_image, 1), else_=0)
+    each = select(
+        row.heliostat_id,
+        func.max(case((has_image, 1), else_=0)).label("shown"),
+        func.max(is_used).label("used"),
+        func.max(case((row.accepted & has_image, row.id))).label("newest_used"),
+        func.max(row.id).label("newest"),
+        func.max(row.corrected_at).label("corrected"),
+    )
+    if heliostat is not None:
+        each = each.where(row.heliostat_id == heliostat)
+    # One photograph may have several images.
+    images = each.group_by(
+        row.heliostat_id, func.coalesce(row.external_id, row.identifier)
+    ).subquery()
+    query = select(
+        images.c.heliostat_id,
+        func.sum(images.c.shown),
+        func.sum(images.c.shown) - func.sum(images.c.used),
+        *(
+            func.max(column)
+            for column in (images.c.newest_used, images.c.newest, images.c.corrected)
+        ),
+    )
+    return {
+        number: _PhotographCounts(*counts)
+        for number, *counts in session.execute(query.group_by(images.c.heliostat_id))
+    }
+
+
+def _mounts(session: Session, heliostat: int | None) -> dict[int, tuple[int, datetime]]:
+    """Ids and times of the newest mounts, by heliostat id.
+
+    Heliostats that changed since their calibration are left out.
+    """
+    newest = select(func.max(MountRow.id)).group_by(MountRow.heliostat_id)
+    if heliostat is not None:
+        newest = newest.where(MountRow.heliostat_id == heliostat)
+    query = select(MountRow.heliostat_id, MountRow.id, MountRow.created_at).where(
+        MountRow.id.in_(newest)
+    )
+    query = query.join(HeliostatRow, HeliostatRow.id == MountRow.heliostat_id)
+    found = session.execute(query.where(HeliostatRow.updated_at <= MountRow.created_at))
+    return {number: (mount, at) for number, mount, at in found}
+
+
+def read_summaries(session: Session, heliostat: int | None = None) -> list[HeliostatSummary]:
+    """Summarize all heliostats in the order of their names, or only one.
+
+    Surface figures, accuracies and pointing errors are not included.
+    """
+    surfaces, candidates = _current_surfaces(session, heliostat)
+    photographs, mounted = _photographs(session, heliostat), _mounts(session, heliostat)
+    model, receivers = (
+        model_versions.current_number(session),
+        [row.center_m for row in store.list_receivers(session)],
+    )
+    row, none = HeliostatRow, _PhotographCounts()
+    query = select(row.id, row.name, row.photographs_changed_at, row.east_m, row.north_m, row.up_m)
+    if heliostat is not None:
+        query = query.where(row.id == heliostat)
+    lines = []
+    for number, name, changed, *place in session.execute(query.order_by(row.name)):
+        taken, mount = photographs.get(number, none), mounted.get(number)
+        corrected = max((at for at in (taken.corrected, changed) if at is not None), default=None)
+        line = HeliostatSummary(
+            name,
+            place[0],
+            place[1],
+            taken.photographs,
+            taken.refused,
+            taken.used,
+            corrected,
+            surfaces.get(number),
+            range_m=min((math.dist(place, center) for center in receivers), default=None),
+            mounted=None
+            if mount is None
+            else MountKey(name, *mount, taken.newest, corrected, model),
+            candidate=candidates.get(number),
+        )
+        lines.append(line)
+    return lines
+
+
+Marks = tuple[tuple[int, int], ...]
+"""Last id, and sum of the newest ids, of each table; see `_cache_marks`."""
+
+
+def _cache_marks(session: Session) -> Marks:
+    """Last id, and sum of the newest ids, of each table behind the overview.
+
+    Other changes of a summary leave an entry in the audit trail. A transaction that began earlier
+    may end later. The last id alone would miss its rows.
+    """
+    ends = [
+        select(table.id).order_by(table.id.desc()).limit(_NEWEST).subquery() for table in _TABLES
+    ]
+    each = [
+        select(func.coalesce(func.max(end.c.id), 0), func.coalesce(func.sum(end.c.id), 0))
+        for end in ends
+    ]
+    return tuple((int(last), int(total)) for last, total in session.execute(union_all(*each)))
+
+
+class Summaries(NamedTuple):
+    """Heliostats, and the number of those with pending results."""
+
+    lines: list[HeliostatSummary]
+    pending: int
+
+
+class _Snapshot:
+    """Summaries as read at one time; slow results are added as they become known."""
+
+    def __init__(self, lines: list[HeliostatSummary], model: int, took_s: float) -> None:
+        self.took_s, self.count = took_s, len(lines)
+        self._lines, self._lock = lines, threading.Lock()
+        self._figures = {
+            i: line.surface.id for i, line in enumerate(lines) if line.surface is not None
+        }
+        self._ranks = {
+            i: state for i, line in enumerate(lines) if (state := line.state(model)) is not None
+        }
+        self._mounts = {i: line.mounted for i, line in enumerate(lines) if line.mounted is not None}
+
+    def complete(
+        self,
+        figures: BackgroundCache[int, FieldTotals | None],
+        ranks: AccuracyCache,
+        pointing: PointingCache,
+        wait_s: float = 0.0,
+    ) -> Summaries:
+        """The summaries with all results that are known now."""
+        with self._lock:
+            shapes, _ = figures.get_many(self._figures.values(), wait_s)
+            worth, _ = ranks.get_many(self._ranks.values())
+            pointed, _ = pointing.get_many(self._mounts.values())
+            lines = self._lines.copy()  # other threads may still read the old list
+            for i in [i for i, number in self._figures.items() if number in shapes]:
+                lines[i] = replace(lines[i], figures=shapes[self._figures.pop(i)])
+            for i in [i for i, state in self._ranks.items() if state.heliostat in worth]:
+                lines[i] = replace(lines[i], rank=worth[self._ranks.pop(i).heliostat])
+            for i in [i for i, state in self._mounts.items() if state.heliostat in pointed]:
+                lines[i] = replace(lines[i], pointing=pointed[self._mounts.pop(i).heliostat])
+            self._lines = lines
+            return Summaries(
+                lines, len(self._figures.keys() | self._ranks.keys() | self._mounts.keys())
+            )
+
+
+@dataclass(frozen=True)
+class FieldOverview:
+    """All heliostats by name.
+
+    ``pending`` counts heliostats with pending results. ``is_behind`` is True while a newer state is
+    being read.
+    """
+
+    lines: list[HeliostatSummary]
+    pending: int
+    is_behind: bool
+
+
+class FieldOverviewCache:
+    """Cache of the field overview and of the slow results per heliostat.
+
+    Reading a large field takes longer than a page may wait. Until it is read, pages show the
+    previous state.
+    """
+
+    def __init__(self, runtime: Runtime) -> None:
+        self._runtime = runtime
+        self._accuracies, self._pointing = AccuracyCache(runtime), PointingCache(runtime)
+        self._figures: BackgroundCache[int, FieldTotals | None] = BackgroundCache(
+            self._figures_of, None, "figures", _MOST
+        )
+        self._readings: BackgroundCache[tuple[Marks, int], _Snapshot | None] = BackgroundCache(
+            self._read, None, "field", 1
+        )
+        self._last: _Snapshot | None = None
+        self.cameras = CameraWatch()
+        self._recent = RecentResults(_RECENT_S)
+
+    def close(self) -> None:
+        """Stop the background work."""
+        for cache in (self._readings, self._figures, self._accuracies, self._pointing):
+            cache.close()
+
+    def recent(self, session: Session, key: Hashable, compute: Callable[[], Result]) -> Result:
+        """The result of ``compute``, or for a large field a recent one.
+
+        A recent result is used only if nothing was stored since.
+        """
+        if self._last is None or self._last.count <= _LARGE:
+            return compute()
+        return self._recent.get((_cache_marks(session), key), compute)
+
+    def read(self, session: Session, timeout_s: float = 0.0) -> FieldOverview:
+        """Read the field overview.
+
+        If a large field has changed and reading takes longer than ``timeout_s``, the previous state
+        is returned.
+
+        Raises
+        ------
+        BusyError
+            If the field was never read yet and reading takes too long.
+        """
+        last = self._last
+        if last is None or last.took_s < _QUICK_S:
+            timeout_s = PATIENCE_S
+        found = self._readings.wait_for(
+            (_cache_marks(session), model_versions.current_number(session)), timeout_s
+        )
+        reading = self._last = found or last
+        if reading is None:
+            raise BusyError("the field is being read; ask again as Retry-After says")
+        return FieldOverview(
+            *reading.complete(self._figures, self._accuracies, self._pointing), found is None
+        )
+
+    def with_pointing(self, line: HeliostatSummary) -> HeliostatSummary:
+        """Add a heliostat's pointing error, and wait for it; no session should be open."""
+        return (
+            line
+            if line.mounted is None
+            else replace(line, pointing=self._pointing.wait_for(line.mounted))
+        )
+
+    def _read(self, depends: tuple[Marks, int]) -> _Snapshot:
+        _, model = depends
+        start = time.perf_counter()
+        with self._runtime.database.reading() as session:
+            reading = _Snapshot(read_summaries(session), model, time.perf_counter() - start)
+        reading.complete(self._figures, self._accuracies, self._pointing, _QUICK_S)
+        return reading
+
+    def _figures_of(self, surface: int) -> FieldTotals:
+        with self._runtime.database.reading() as session:
+            return field_totals(
+                session.scalars(select(SurfaceRow.arrays).where(SurfaceRow.id == surface)).one()
+            )

@@ -1,0 +1,1 @@
+"""Flux forecasts of one heliostat and of a field."""

@@ -1,0 +1,1 @@
+"""One heliostat: its mount, its accepted measurements and their metadata."""

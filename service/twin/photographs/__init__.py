@@ -1,0 +1,1 @@
+"""Photographs: ingest, repeats, corrections, deletion, display."""

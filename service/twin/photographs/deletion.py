@@ -1,0 +1,29 @@
+"""Delete a photograph, and image files that nothing else needs."""
+
+from service.store.photographs import image_retention, photograph_deletion
+from service.store.photographs.photograph_deletion import Deleted
+from service.twin.runtime.runtime import Runtime
+
+
+def delete_photograph(
+    runtime: Runtime,
+    heliostat: str,
+    identifier: str,
+    reason: str,
+    actor: str,
+    only_this: bool = False,
+) -> Deleted:
+    """Delete a photograph and then its files.
+
+    See `service.store.photographs.photograph_deletion.delete_photograph`. During a back-up the
+    files stay until the job `prunings` removes them.
+    """
+    with runtime.database.writing() as session:
+        deleted = photograph_deletion.delete_photograph(
+            session, heliostat, identifier, reason, actor, only_this
+        )
+    with runtime.images.removing() as is_free:
+        if is_free:
+            with runtime.database.writing() as session:
+                image_retention.remove_marked(session, runtime.images)
+    return deleted

@@ -1,0 +1,1 @@
+"""The plant's geometry and the versions of its model."""

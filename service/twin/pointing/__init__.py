@@ -1,0 +1,1 @@
+"""Calibrated mounts and pointing errors."""

@@ -1,0 +1,279 @@
+"""Pointing errors of heliostats: their size, their trend, and moves.
+
+The errors of calibration photographs are those stored with the mount. Later photographs are
+compared with the mount that is valid now. Results are computed in the background and cached, as
+accuracies are.
+"""
+
+import logging
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy.orm import Session, undefer
+
+from model.errors import ModelError
+from model.pointing import Reading, pointing_error
+from model.pointing.report import moment_of
+from model.pointing.spots import spot_covariance
+from service import store
+from service.base.errors import ServiceError
+from service.store.pointing import mounts
+from service.store.tables import MountRow
+from service.twin.heliostats.stored_mount import StoredMount, stored_mount
+from service.twin.pointing.calibration import load_readings
+from service.twin.runtime.background_cache import BackgroundCache, CachedResults
+from service.twin.runtime.runtime import Runtime
+
+Array = NDArray[np.float64]
+
+logger = logging.getLogger("heliotwin.service")
+
+NEWEST = 8
+"""Largest number of photographs in the median that is the pointing error."""
+
+# Photographs since the calibration that a trend needs: three in each third.
+_MIN_OF_TREND = 9
+
+# A photograph that is off by more standard deviations is foreign, or the heliostat has moved. Two
+# in a row mean that it has moved.
+_FAR = 5.0
+_IN_A_ROW = 2
+
+# Photographs since the calibration that are read, the newest.
+_MAX_READ = 256
+
+# Cached results [1]: several times the heliostats of the largest plant.
+_MOST = 200_000
+
+
+@dataclass(frozen=True)
+class DriveStep:
+    """A move of a heliostat between two photographs.
+
+    If ``is_calibrated``, ``size_mrad`` is the step of the drives' zeros that the calibration found.
+    Otherwise it is the pointing error since the move. Only photographs of known time show a move.
+    """
+
+    since: datetime
+    until: datetime
+    size_mrad: float
+    is_calibrated: bool
+
+    @property
+    def when(self) -> str:
+        """The days between which it moved, in words."""
+        first, last = (f"{moment.day} {moment:%B %Y}" for moment in (self.since, self.until))
+        if first == last:
+            return f"on {first} between {self.since:%H:%M} and {self.until:%H:%M} UTC"
+        for same in (f" {self.until:%B %Y}", f" {self.until:%Y}"):
+            first = first.removesuffix(same)
+        return f"between {first} and {last}"
+
+
+@dataclass(frozen=True)
+class PointingDrift:
+    """Slow drift of the drives' zeros over the calibration photographs [mrad]."""
+
+    since: datetime
+    until: datetime
+    size_mrad: float
+
+
+@dataclass(frozen=True)
+class PointingState:
+    """Pointing of a calibrated mount according to photographs.
+
+    Attributes
+    ----------
+    mount_version : int
+        Version of the mount.
+    calibrated_at : datetime
+    error_mrad : float or None [mrad]
+        Median angle at the mirror between forecast and measured spots, over the newest photographs
+        since the last move.
+    photographs, since_calibration : int
+        Number of photographs in this median, and number of all photographs since the calibration.
+    trend_mrad : float or None [mrad]
+        Median of the newest third of the photographs since the calibration, minus that of the third
+        before.
+    beyond_since : datetime or None
+        When the error began to exceed the limit of the settings.
+    moved : DriveStep or None
+        The last move.
+    drifted : PointingDrift or None
+        Only if the drift is certain.
+    """
+
+    mount_version: int
+    calibrated_at: datetime
+    error_mrad: float | None
+    photographs: int
+    since_calibration: int
+    trend_mrad: float | None = None
+    beyond_since: datetime | None = None
+    moved: DriveStep | None = None
+    drifted: PointingDrift | None = None
+
+
+def pointing_state(
+    stored: StoredMount, kept: MountRow, newer: Sequence[Reading], limit_mrad: float
+) -> PointingState:
+    """Pointing from a stored mount and later photographs, in order of time.
+
+    ``kept`` is loaded with its document. Calibration photographs of unknown time do not count,
+    because they may not be among the newest.
+    """
+    mount = stored.mount
+    is_known = ~mount.foreign & np.isfinite(mount.days)
+    days, off = mount.days[is_known], 1e3 * mount.errors_rad[is_known]
+    moved, begin = None, -np.inf
+    if mount.steps:
+        step = mount.steps[-1]
+        begin, size = mount.days[step.after], 1e3 * float(np.linalg.norm(step.zeros))
+        moved = DriveStep(moment_of(mount.days[step.before]), moment_of(begin), size, True)
+    trend = None
+    if newer:
+        apart, far = _forecast_errors(stored, newer)
+        new_days = np.array([one.day for one in newer])
+        first = int(np.nonzero(~far)[0].max(initial=-1)) + 1
+        if len(newer) - first >= _IN_A_ROW:
+            before = new_days[first - 1] if first else mount.days[-1]
+            begin = new_days[first]
+            size = float(np.median(apart[first:]))
+            if np.isfinite(before):  # else it may have been off from the first photograph on
+                moved = DriveStep(moment_of(before), moment_of(begin), size, False)
+        trend = _trend(apart)
+        days, off = np.concatenate([days, new_days]), np.concatenate([off, apart])
+    days, off = days[days >= begin], off[days >= begin]
+    return PointingState(
+        mount_version=kept.version,
+        calibrated_at=kept.created_at,
+        error_mrad=float(np.median(off[-NEWEST:])) if off.size else None,
+        photographs=min(off.size, NEWEST),
+        since_calibration=len(newer),
+        trend_mrad=trend,
+        beyond_since=_beyond_since(days, off, limit_mrad),
+        moved=moved,
+        drifted=_drifted(kept.document),
+    )
+
+
+def _forecast_errors(
+    stored: StoredMount, newer: Sequence[Reading]
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Angles (N,) [mrad] between forecast and measured spots, and which ones are outliers.
+
+    An outlier is not explained by the mount's covariance.
+    """
+    off = pointing_error(stored.heliostat, stored.mount, newer)
+    motors, suns, spots = (
+        np.array([getattr(one, name) for one in newer]) for name in ("motors", "sun", "spot")
+    )
+    days = np.array([one.day for one in newer])
+    covariance = spot_covariance(stored.mount, stored.heliostat, motors, suns, spots, days)
+    std = np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 2)
+    return 1e3 * off, np.asarray(off > _FAR * std)
+
+
+def _trend(off: Array) -> float | None:
+    if len(off) < _MIN_OF_TREND:
+        return None
+    third = len(off) // 3
+    return float(np.median(off[-third:]) - np.median(off[-2 * third : -third]))
+
+
+def _beyond_since(days: Array, off: Array, limit: float) -> datetime | None:
+    """When the median of the newest errors began to exceed ``limit``; None if below."""
+    begun = None
+    for count in range(len(off), 0, -1):
+        if np.median(off[max(0, count - NEWEST) : count]) <= limit:
+            break
+        begun = moment_of(days[count - 1])
+    return begun
+
+
+def _drifted(document: dict[str, Any]) -> PointingDrift | None:
+    drift, at = document["drift"], document["history"]["at"]
+    if not drift["is_sure"]:
+        return None
+    size = float(np.linalg.norm(drift["zeros_mrad"]))
+    first = next(moment for moment in at if moment is not None)
+    return PointingDrift(datetime.fromisoformat(first), datetime.fromisoformat(at[-1]), size)
+
+
+# --- cached
+# --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class MountKey:
+    """What a heliostat's pointing error depends on.
+
+    ``mount`` and ``newest`` are the row ids of its newest mount and photograph. ``corrected`` is
+    when a photograph was last corrected. ``model`` is the version of the plant's model.
+    """
+
+    heliostat: str
+    mount: int
+    calibrated_at: datetime
+    newest: int | None
+    corrected: datetime | None
+    model: int
+
+
+class PointingCache:
+    """Cache of pointing by `MountKey`; None if the mount is not valid any more."""
+
+    def __init__(self, runtime: Runtime) -> None:
+        self._runtime = runtime
+        self._cache: BackgroundCache[MountKey, PointingState | None] = BackgroundCache(
+            self._pointing, None, "pointing", _MOST
+        )
+
+    def get_many(self, states: Iterable[MountKey]) -> CachedResults[str, PointingState | None]:
+        """Known pointing by heliostat, and the number of pending ones."""
+        known, missing = self._cache.get_many(states)
+        by_heliostat = {state.heliostat: pointing for state, pointing in known.items()}
+        return CachedResults(by_heliostat, missing)
+
+    def wait_for(self, state: MountKey, seconds: float = 5.0) -> PointingState | None:
+        """Pointing of one heliostat; None if it is not ready after ``seconds``."""
+        return self._cache.wait_for(state, seconds)
+
+    def close(self) -> None:
+        """Stop the background work and wait for the current computation."""
+        self._cache.close()
+
+    def _pointing(self, state: MountKey) -> PointingState | None:
+        try:
+            with self._runtime.database.reading() as session:
+                mount = session.get_one(MountRow, state.mount, options=[undefer(MountRow.document)])
+                stored, newer = _newer(session, state.heliostat, mount)
+            return pointing_state(
+                stored, mount, newer, self._runtime.settings.attention_pointing_mrad
+            )
+        except (ModelError, ServiceError) as error:
+            logger.info(
+                "the pointing error of heliostat %s is not known: %s", state.heliostat, error
+            )
+        return None
+
+
+def _newer(session: Session, name: str, mount: MountRow) -> tuple[StoredMount, list[Reading]]:
+    """The heliostat's mount, and photographs taken after its newest calibration photograph."""
+    row = store.get_heliostat(session, name)
+    stored, at = stored_mount(session, row, mount), mount.document["history"]["at"]
+    newest = at[-1] if at else None
+    since = (
+        None if newest is None else datetime.fromisoformat(newest) + timedelta(seconds=1)
+    )  # times are stored to the second
+    rows = [
+        one for one in mounts.pointing_measurements(session, row, since) if one.taken_at is not None
+    ]
+    targets = {one.name: store.target_plane(one) for one in store.list_targets(session)}
+    readings, _ = load_readings(stored.heliostat, rows, stored.model, targets)
+    return stored, sorted(readings, key=lambda one: one.day)[-_MAX_READ:]

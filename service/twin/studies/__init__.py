@@ -1,0 +1,1 @@
+"""Studies of effects that the model lacks, and changes of cameras."""

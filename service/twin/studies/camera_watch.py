@@ -1,0 +1,127 @@
+"""Detect changes of a target's camera from the quality figures of photographs.
+
+No study is needed. Another exposure, focus or setting of the camera changes spots and sheet of all
+heliostats. Clouds, distances and spots differ from photograph to photograph. Therefore medians of
+days are compared, relative to how much days differ.
+"""
+
+import threading
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, date, datetime, timedelta
+from datetime import time as clock
+
+import numpy as np
+from cachetools import TTLCache
+from numpy.typing import NDArray
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from service.base.settings import Settings
+from service.store.columns import now
+from service.store.tables import MeasurementRow, TargetRow
+
+FIGURES = {
+    "signal_to_background": "the spot over the sheet",
+    "signal_to_noise": "the spot over the noise",
+    "sheet_share": "the sheet's own pattern",
+}
+"""Quality figures that a camera changes (`model.imaging.quality.Quality`), with labels."""
+
+_WINDOW_DAYS = 90
+_MAX_A_DAY = 200  # photographs of a day that are read, the last ones
+_HOLDS_S = 6 * 3600.0  # time that earlier days are cached, because few photographs are re-measured
+_MIN_SPREAD = 0.05  # least spread between days, even if few days happen to agree
+# 1.4826 converts a median deviation to a standard deviation. 1.2533 is the standard deviation of a
+# median over that of a mean.
+_OF_DEVIATION, _OF_MEDIAN = 1.4826, 1.2533
+
+Daily = Mapping[date, NDArray[np.float64]]
+"""Logarithms of `FIGURES` (3,), as medians of each day."""
+
+
+@dataclass(frozen=True)
+class CameraChange:
+    """A change of a figure in a target's photographs from ``day`` on.
+
+    ``ratio`` is the figure after the change over that before. ``certainty`` is the change over its
+    standard deviation. ``days`` counts the days with photographs before and after.
+    """
+
+    target: str
+    figure: str
+    day: date
+    ratio: float
+    certainty: float
+    days: tuple[int, int]
+
+
+def find_camera_change(target: str, daily: Daily, settings: Settings) -> CameraChange | None:
+    """The most certain change beyond the limits of the settings; None without any."""
+    days, least = sorted(daily), settings.attention_camera_days
+    values = np.array([daily[day] for day in days]).reshape(-1, len(FIGURES))
+    found: list[CameraChange] = []
+    for split in range(2 * least, len(days) - least + 1):
+        before, after = values[:split], values[split:]
+        shift = np.median(after, axis=0) - np.median(before, axis=0)
+        off = np.vstack([np.abs(part - np.median(part, axis=0)) for part in (before, after)])
+        spread = np.maximum(_OF_DEVIATION * np.median(off, axis=0), _MIN_SPREAD)
+        certainty = np.abs(shift) / (
+            _OF_MEDIAN * spread * np.sqrt(1 / len(before) + 1 / len(after))
+        )
+        for figure, by, sure in zip(FIGURES, shift.tolist(), certainty.tolist(), strict=True):
+            if sure >= settings.attention_camera_certainty and abs(by) >= np.log(
+                settings.attention_camera_ratio
+            ):
+                counted = (len(before), len(after))
+                found.append(
+                    CameraChange(target, figure, days[split], float(np.exp(by)), sure, counted)
+                )
+    return max(found, key=lambda change: change.certainty, default=None)
+
+
+def _of_day(session: Session, day: date) -> dict[str, NDArray[np.float64]]:
+    """Medians of a day by target, over its last accepted photographs."""
+    begin = datetime.combine(day, clock(), UTC)
+    row = MeasurementRow
+    query = select(TargetRow.name, row.quality).join(TargetRow, TargetRow.id == row.target_id)
+    query = query.where(
+        row.accepted, row.taken_at >= begin, row.taken_at < begin + timedelta(days=1)
+    )
+    found: dict[str, list[list[float]]] = defaultdict(list)
+    for name, quality in session.execute(
+        query.order_by(row.taken_at.desc(), row.id.desc()).limit(_MAX_A_DAY)
+    ):
+        figures = [quality.get(figure) or 0.0 for figure in FIGURES]
+        if min(figures) > 0:
+            found[name].append(figures)
+    return {name: np.median(np.log(figures), axis=0) for name, figures in found.items()}
+
+
+class CameraWatch:
+    """Daily medians of all targets, cached except for the current day."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._days: TTLCache[date, dict[str, NDArray[np.float64]]] = TTLCache(
+            2 * _WINDOW_DAYS, _HOLDS_S
+        )
+
+    def changes(self, session: Session, settings: Settings) -> list[CameraChange]:
+        """Camera changes, in the order of target names."""
+        days = self._read(session, now().date())
+        daily: dict[str, dict[date, NDArray[np.float64]]] = defaultdict(dict)
+        for day, of in days.items():
+            for name, medians in of.items():
+                daily[name][day] = medians
+        found = (find_camera_change(name, daily[name], settings) for name in sorted(daily))
+        return [change for change in found if change is not None]
+
+    def _read(self, session: Session, today: date) -> dict[date, dict[str, NDArray[np.float64]]]:
+        days = {}
+        with self._lock:
+            for day in (today - timedelta(days=ago) for ago in range(_WINDOW_DAYS)):
+                known = self._days.get(day) if day < today else None
+                days[day] = self._days[day] = _of_day(session, day) if known is None else known
+        return days

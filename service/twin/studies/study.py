@@ -1,0 +1,357 @@
+"""Studies of stored photographs and surfaces, and their stored reports."""
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import datetime
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from model.effects import effects_from_json
+from model.errors import InvalidInputError, UnreachableError
+from model.forecast import align
+from model.frames import wgs84_to_enu
+from model.plant_model import PlantModel
+from model.pointing.report import day_of
+from model.site import Site
+from model.study import FluxImage, Study, StudyOptions, study_to_json
+from model.study.loop import MIN_IMAGES
+from model.surface import DEGREE, control_points
+from service import store
+from service.base.arrays import to_json_value
+from service.base.errors import SKIPPED, ConflictError, NotFoundError
+from service.base.fields import CheckedStudyReport
+from service.base.progress import Report, Steps, no_report
+from service.base.validation_messages import format_validation_error
+from service.drawing.study_report import study_page
+from service.store.tables import HeliostatRow, MeasurementRow, StudyRow, SurfaceRow
+from service.twin.heliostats.measurements import (
+    HeliostatContext,
+    accepted_measurement,
+    choose_measurements,
+    heights_of,
+    load_heliostat_context,
+)
+from service.twin.heliostats.stored_mount import mount_at
+from service.twin.plant import model_versions
+from service.twin.plant.model_versions import ModelVersion
+from service.twin.runtime.runtime import Runtime
+
+Surfaces = Literal["measured", "current"]
+
+
+@dataclass(frozen=True)
+class StudyRequest:
+    """Photographs and effects to study.
+
+    ``heliostats`` are names; by default ``max_heliostats`` are spread over the field. ``surfaces``
+    is "measured" or "current". "current" is the measured surface if there is one, else the active
+    one. At most ``images`` are taken of each heliostat, from ``since`` until before ``until``.
+    ``candidates`` are effects of the catalogue, by default all.
+    """
+
+    heliostats: Sequence[str] | None = None
+    surfaces: Surfaces = "current"
+    images: int = 12
+    max_heliostats: int = 12
+    since: datetime | None = None
+    until: datetime | None = None
+    candidates: Sequence[str] | None = None
+
+
+@dataclass(eq=False)
+class StudyInputs:
+    """Inputs of a study from the store.
+
+    ``skipped`` are the heliostats and photographs that were left out, with the reasons.
+    """
+
+    photographs: list["FluxImage"] = field(default_factory=list)
+    skipped: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def heliostats(self) -> list[str]:
+        """Names of the heliostats that the photographs show."""
+        return sorted({photograph.heliostat for photograph in self.photographs})
+
+    @property
+    def span(self) -> tuple[datetime | None, datetime | None]:
+        """Times of the first and the last photograph; None if unknown."""
+        known = [p.taken_at for p in self.photographs if p.taken_at is not None]
+        return min(known, default=None), max(known, default=None)
+
+    def without_untraceable(self, site: Site) -> "StudyInputs":
+        """The same without photographs that no attitude of their heliostat explains.
+
+        One of them would stop the study.
+        """
+        traceable, skipped = [], dict(self.skipped)
+        for photograph in self.photographs:
+            try:
+                align([photograph.setup], PlantModel(site))
+            except UnreachableError as error:
+                skipped[photograph.key] = str(error)
+            else:
+                traceable.append(photograph)
+        return replace(self, photographs=traceable, skipped=skipped)
+
+
+def load_study_inputs(session: Session, request: StudyRequest) -> StudyInputs:
+    """Load the photographs of a request, and the surfaces of their mirrors.
+
+    Raises
+    ------
+    NotFoundError
+        If a named heliostat is not stored.
+    """
+    material = StudyInputs()
+    for row in _chosen_heliostats(session, request):
+        try:
+            _load_heliostat_inputs(session, row, request, material)
+        except SKIPPED as error:
+            material.skipped[row.name] = str(error)
+    return material
+
+
+def _chosen_heliostats(session: Session, request: StudyRequest) -> Sequence[HeliostatRow]:
+    """The named heliostats, else a selection with photographs and a surface.
+
+    The selection is spread evenly over the distance from the tower.
+    """
+    if request.heliostats is not None:
+        return [store.get_heliostat(session, name) for name in dict.fromkeys(request.heliostats)]
+    is_photograph = MeasurementRow.accepted & MeasurementRow.image_sha256.is_not(None)
+    photographed = select(MeasurementRow.heliostat_id).where(is_photograph)
+    shaped = select(SurfaceRow.heliostat_id)
+    if request.surfaces == "measured":
+        shaped = shaped.where(SurfaceRow.source == "measured")
+    query = select(HeliostatRow).where(
+        HeliostatRow.id.in_(photographed), HeliostatRow.id.in_(shaped)
+    )
+    rows = list(session.scalars(query))
+    rows.sort(key=lambda row: (np.hypot(row.east_m, row.north_m), row.name))
+    places = (
+        np.linspace(0, len(rows) - 1, min(len(rows), request.max_heliostats)).round().astype(int)
+    )
+    return [rows[place] for place in places]
+
+
+def _surface(session: Session, heliostat: HeliostatRow, surfaces: Surfaces) -> SurfaceRow:
+    measured = store.find_measured_surface(session, heliostat)
+    if measured is not None:
+        return measured
+    if surfaces == "measured":
+        raise NotFoundError(f"heliostat {heliostat.name} has no measured surface")
+    return store.get_surface_at(session, heliostat)
+
+
+def _load_heliostat_inputs(
+    session: Session, row: HeliostatRow, request: StudyRequest, material: StudyInputs
+) -> None:
+    twin, surface = (
+        load_heliostat_context(session, row.name),
+        _surface(session, row, request.surfaces),
+    )
+    points, seen = (
+        control_points(twin.heliostat, heights_of(surface)),
+        {m.identifier for m in surface.measurements},
+    )
+    chosen = choose_measurements(session, row, request.images, request.since, request.until)
+    names = [found.identifier for found in chosen]
+    rows = store.get_measurements(session, row, names, arrays=True)
+    add_photographs(session, material, twin, rows, points, seen=seen)
+
+
+def add_photographs(
+    session: Session,
+    material: StudyInputs,
+    twin: HeliostatContext,
+    rows: Sequence[MeasurementRow],
+    points: NDArray[np.float64],
+    degree: int = DEGREE,
+    seen: Collection[str] = (),
+) -> None:
+    """Add photographs of a heliostat whose mirror has the control ``points`` (F, I, J, 3) [m].
+
+    ``rows`` are accepted photographs, loaded with their arrays. ``seen`` are identifiers of those
+    that the mirror was computed from. A photograph that is newer than the calibration of its mount
+    also has the pointing from its motors.
+    """
+    stored = mount_at(session, twin.row)
+    for row in rows:
+        try:
+            _require_on_target(twin, row)
+            evidence = accepted_measurement(row, twin.origin)
+            photograph = evidence.photograph(
+                twin.heliostat, points, degree, seen=row.identifier in seen
+            )
+            if stored is not None:
+                motors, day = evidence.motor_position, day_of(evidence.taken_at)
+                photograph = photograph.sent(stored.heliostat, stored.mount, motors, day)
+        except SKIPPED as error:
+            material.skipped[f"{twin.row.name}/{row.identifier}"] = str(error)
+            continue
+        material.photographs.append(photograph)
+
+
+def _require_on_target(twin: HeliostatContext, row: MeasurementRow) -> None:
+    """Reject a photograph whose given spot lies off its target.
+
+    It probably shows another target or another heliostat.
+    """
+    if row.focal_spot_wgs84 is None:
+        return
+    if not store.target_plane(row.target).contains(wgs84_to_enu(row.focal_spot_wgs84, twin.origin)):
+        raise InvalidInputError(
+            f"{twin.row.name}/{row.identifier}: 'focal_spot' lies off its target {row.target.name}"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class StoredStudy:
+    """A study with its inputs."""
+
+    request: StudyRequest
+    model: ModelVersion
+    material: StudyInputs
+    study: "Study"
+
+
+def study_store(runtime: Runtime, request: StudyRequest, report: Report = no_report) -> StoredStudy:
+    """Find effects that stored photographs require beyond the plant's current model.
+
+    ``report`` receives the progress and the current fit. An exception that it raises stops the
+    study.
+
+    Raises
+    ------
+    NotFoundError
+        If a named heliostat is not stored.
+    ConflictError
+        If too few photographs with a surface are stored. The message says what was left out.
+    """
+    with runtime.database.reading() as session:
+        model = model_versions.get_model(session)
+        material = load_study_inputs(session, request)
+    options = StudyOptions()
+    if request.candidates is not None:
+        options = replace(options, candidates=tuple(request.candidates))
+    most = (len(options.candidates) + 1) * options.most  # scopes are searched after the effects
+    steps = Steps(most, report, "fits, at most")
+    options = replace(options, between=steps.alive)
+
+    def step(name: str) -> None:
+        """Report a step, and let others use the model in between."""
+        runtime.compute_slots.pause(runtime.check)
+        steps(name)
+
+    with runtime.computing("study") as operations:
+        material = material.without_untraceable(model.site)
+        _require_enough(material)
+        study = operations.study(material.photographs, model, options, step)
+    return StoredStudy(request, model, material, study)
+
+
+def _require_enough(material: StudyInputs) -> None:
+    count = len(material.photographs)
+    if count < MIN_IMAGES:
+        reasons = "; ".join(
+            f"{name}: {reason}" for name, reason in list(material.skipped.items())[:5]
+        )
+        raise ConflictError(
+            f"a study takes at least {MIN_IMAGES} photographs with surfaces, the store has {count}"
+            + (f" ({reasons})" if reasons else "")
+        )
+
+
+def study_row(
+    studied: StoredStudy,
+    title: str,
+    options: dict[str, object],
+    actor: str,
+    scales: Mapping[str, float],
+) -> StudyRow:
+    """The row of a study, with its report page.
+
+    ``options`` are the requested options as JSON. ``scales`` are the upper ends of the maps' colour
+    scales (`Settings.figure_scales`).
+    """
+    material, report = studied.material, to_json_value(study_to_json(studied.study))
+    first_taken_at, last_taken_at = material.span
+    return StudyRow(
+        created_by=actor,
+        options=options,
+        heliostats=material.heliostats,
+        first_taken_at=first_taken_at,
+        last_taken_at=last_taken_at,
+        model=studied.model.number,
+        model_version=studied.model.version,
+        verdict=report["verdict"],
+        conclusion=report["conclusion"],
+        report=report,
+        skipped=material.skipped,
+        html=study_page(studied.study, title, scales, material.skipped),
+    )
+
+
+def model_of_report(session: Session, document: Any, name: str) -> ModelVersion:
+    """Find the model version that a folder's report was made with.
+
+    The default is the current version.
+
+    Raises
+    ------
+    ConflictError
+        If no version has the effects that the report assumes.
+    """
+    known = document.get("model") if isinstance(document, dict) else None
+    if known is None:
+        return model_versions.get_model(session)
+    effects = effects_from_json(known)
+    found = model_versions.find_model(session, effects)
+    if found is None:
+        names = ", ".join(effect.name for effect in effects) or "none"
+        raise ConflictError(
+            f"{name} was made with other effects ({names}) than any version of the store's model"
+            " has: declare those in 'twin.json' and import the folder, or study what is stored"
+        )
+    return found
+
+
+def parse_report(document: Any, name: str) -> CheckedStudyReport:
+    """Parse a report of `heliotwin study`, read from the file ``name``.
+
+    Raises
+    ------
+    InvalidInputError
+        If it is not such a report.
+    """
+    try:
+        report = CheckedStudyReport.model_validate(document)
+    except ValidationError as error:
+        raise InvalidInputError(f"{name}: {format_validation_error(error, 'report')}") from None
+    effects_from_json(document["effects"])
+    return report
+
+
+def row_of_report(document: Any, name: str, model: ModelVersion, actor: str) -> StudyRow:
+    """The study row of a report that was read from the file ``name``.
+
+    ``model`` is the version it was made with. Raises what `parse_report` raises.
+    """
+    report = parse_report(document, name)
+    return StudyRow(
+        created_by=actor,
+        options={"report": name},
+        heliostats=sorted({key.partition("/")[0] for key in report.before.per_image}),
+        model=model.number,
+        model_version=model.version,
+        verdict=report.verdict,
+        conclusion=report.conclusion,
+        report=to_json_value(document),
+        skipped=report.skipped,
+    )

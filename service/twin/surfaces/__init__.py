@@ -1,0 +1,1 @@
+"""Surfaces: prediction, evaluation on photographs, and accuracy over time."""

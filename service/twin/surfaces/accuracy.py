@@ -1,0 +1,484 @@
+"""Accuracy of the active surfaces on photographs, computed once per heliostat and cached.
+
+Forecast and photograph are compared in a 4 m window about the photograph's centre of mass
+(DESIGN.md, section 7). A result is valid until the heliostat gets another surface or photograph, or
+the plant's model another version.
+"""
+
+import logging
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from statistics import fmean
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import bootstrap
+from sqlalchemy import func, select
+from sqlalchemy.orm import Session
+
+from model.errors import ModelError
+from model.metrics import flux_accuracy
+from service import store
+from service.base.errors import ServiceError
+from service.base.settings import Settings
+from service.store.photographs.measurements import PREFERENCE
+from service.store.tables import DriftRow, HeliostatRow, MeasurementRow, MountRow, SurfaceRow
+from service.twin.heliostats.measurements import (
+    AcceptedMeasurement,
+    Array,
+    HeliostatContext,
+    accepted_measurement,
+    heights_of,
+    load_heliostat_context,
+)
+from service.twin.plant import model_versions
+from service.twin.runtime.background_cache import BackgroundCache, CachedResults
+from service.twin.runtime.runtime import Runtime
+
+logger = logging.getLogger("heliotwin.service")
+RECENT = 8
+"""Number of a heliostat's newest photographs that are compared with a forecast."""
+
+
+# Cached results [1]: several times the heliostats of the largest plant.
+_MOST = 200_000
+
+# Heliostats with cached comparisons: half a megabyte each, three times that for a span.
+_MAX_COMPARED = 64
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """A photograph and its forecast.
+
+    Attributes
+    ----------
+    measurement : MeasurementRow
+    measured, forecast : (64, 64)
+        4 m x 4 m, each with sum 100.
+    accuracy : float [1]
+    was_used : bool
+        Whether the surface was computed from this photograph. Then the accuracy proves less.
+    """
+
+    measurement: MeasurementRow
+    measured: NDArray[Any]
+    forecast: NDArray[Any]
+    accuracy: float
+    was_used: bool
+
+
+@dataclass(frozen=True)
+class Span:
+    """Time span in which photographs were taken; None is open."""
+
+    since: datetime | None = None
+    until: datetime | None = None
+
+
+# Newest photographs of a span that are compared with forecasts.
+_MAX_OF_SPAN = 24
+
+# Held-out photographs are searched among the newest `_LOOKED_THROUGH * RECENT` photographs.
+_LOOKED_THROUGH = 4
+
+
+def photograph_name(row: MeasurementRow) -> str:
+    """Name of the photograph that an image shows.
+
+    One photograph may be stored as several kinds of image.
+    """
+    return row.external_id or row.identifier
+
+
+def photographs_of_surface(surface: SurfaceRow | None) -> set[str]:
+    """Names of the photographs that a surface was computed from, deleted ones included."""
+    return (
+        set()
+        if surface is None
+        else {*(photograph_name(row) for row in surface.measurements), *(surface.deleted or ())}
+    )
+
+
+class HeldOutFirst(NamedTuple):
+    """Photographs with arrays, the held-out ones first, and the number of those."""
+
+    rows: list[MeasurementRow]
+    n_held_out: int
+
+
+def held_out_first(
+    session: Session, heliostat: HeliostatRow, seen: Collection[str]
+) -> HeldOutFirst:
+    """A heliostat's newest photographs; those whose names are in ``seen`` are not held out."""
+    recent = store.recent_measurements(session, heliostat, _LOOKED_THROUGH * RECENT)
+    unseen = [row for row in recent if photograph_name(row) not in seen]
+    chosen = (unseen + [row for row in recent if photograph_name(row) in seen])[:RECENT]
+    rows = store.get_measurements(
+        session, heliostat, [row.identifier for row in chosen], arrays=True
+    )
+    return HeldOutFirst(rows, min(len(unseen), RECENT))
+
+
+def _in_span(session: Session, heliostat: HeliostatRow, span: Span) -> list[MeasurementRow]:
+    """A heliostat's newest photographs of a span, with arrays, held out or not."""
+    recent = store.recent_measurements(session, heliostat, _MAX_OF_SPAN, span.since, span.until)
+    return store.get_measurements(
+        session, heliostat, [row.identifier for row in recent], arrays=True
+    )
+
+
+def compare(
+    runtime: Runtime, name: str, surface: SurfaceRow | None, span: Span | None = None
+) -> list[Comparison]:
+    """Compare a heliostat's newest photographs with forecasts.
+
+    The forecasts use a stored surface, or the ideal one if ``surface`` is None. Held-out
+    photographs come first. In a ``span`` all photographs are treated alike.
+
+    Raises
+    ------
+    NotFoundError
+        If there is no such heliostat.
+    ModelError
+        If a photograph or the surface cannot be traced.
+    """
+    with runtime.database.reading() as session:
+        twin = load_heliostat_context(session, name)
+        rows = (
+            held_out_first(session, twin.row, photographs_of_surface(surface))[0]
+            if span is None
+            else _in_span(session, twin.row, span)
+        )
+    return compare_with(runtime, twin, surface, rows) if rows else []
+
+
+def compare_with(
+    runtime: Runtime,
+    twin: HeliostatContext,
+    surface: SurfaceRow | None,
+    rows: Sequence[MeasurementRow],
+) -> list[Comparison]:
+    """Compare photographs, loaded with their arrays, with forecasts.
+
+    The forecasts use a stored surface, or the ideal one if ``surface`` is None.
+    """
+    shown = [accepted_measurement(row, twin.origin) for row in rows]
+    used, forecasts = (
+        photographs_of_surface(surface),
+        forecasts_of(runtime, twin, shown, heights_of(surface)),
+    )
+    return [
+        Comparison(
+            row,
+            evidence.centered,
+            forecast,
+            flux_accuracy(evidence.centered, forecast),
+            photograph_name(row) in used,
+        )
+        for row, evidence, forecast in zip(rows, shown, forecasts, strict=True)
+    ]
+
+
+def forecasts_of(
+    runtime: Runtime, twin: HeliostatContext, photos: Sequence[AcceptedMeasurement], z: Array | None
+) -> NDArray[Any]:
+    """Forecast the flux of photographs: (n, 64, 64), each with sum 100.
+
+    ``z`` are heights (4, 8, 8) [m]; None is the ideal surface.
+    """
+    observations = [evidence.observation() for evidence in photos]
+    with runtime.computing("compare") as operations:
+        return operations.render(twin.heliostat, observations, z, twin.model)
+
+
+@dataclass(frozen=True)
+class Rank:
+    """Mean accuracy [1] on held-out photographs, and their number.
+
+    The accuracy is None if there are none.
+    """
+
+    accuracy: float | None
+    photographs: int
+
+
+def rank_of(comparisons: Sequence[Comparison]) -> Rank:
+    """Average the accuracies on held-out photographs; others prove nothing."""
+    unseen = [comparison.accuracy for comparison in comparisons if not comparison.was_used]
+    return Rank(fmean(unseen) if unseen else None, len(unseen))
+
+
+@dataclass(frozen=True)
+class AccuracyState:
+    """What a heliostat's accuracy depends on.
+
+    ``surface`` and ``newest`` are row ids of the surface and the newest photograph. ``corrected``
+    is when a photograph was last corrected, filled or deleted. ``model`` is the version of the
+    plant's model. ``calibrated_at`` is when the mount was calibrated.
+    """
+
+    heliostat: str
+    surface: int
+    newest: int
+    corrected: datetime | None
+    model: int
+    calibrated_at: datetime | None = None
+
+
+class AccuracyCache:
+    """Cache of accuracies by `AccuracyState`; missing ones are computed in the background."""
+
+    def __init__(self, runtime: Runtime) -> None:
+        self._runtime = runtime
+        self._cache: BackgroundCache[AccuracyState, Rank] = BackgroundCache(
+            self._rank, Rank(None, 0), "accuracy", _MOST
+        )
+
+    def get_many(self, states: Iterable[AccuracyState]) -> CachedResults[str, Rank]:
+        """Known accuracies by heliostat, and the number of pending ones."""
+        known, missing = self._cache.get_many(states)
+        return CachedResults({state.heliostat: rank for state, rank in known.items()}, missing)
+
+    def close(self) -> None:
+        """Stop the background work and wait for the current computation."""
+        self._cache.close()
+
+    def _rank(self, state: AccuracyState) -> Rank:
+        """Accuracy of the surface that is active now; failures are logged."""
+        try:
+            with self._runtime.database.reading() as session:
+                surface = store.get_surface_at(
+                    session, store.get_heliostat(session, state.heliostat)
+                )
+            return rank_of(compare(self._runtime, state.heliostat, surface))
+        except (ModelError, ServiceError) as error:
+            logger.warning("the accuracy of heliostat %s is not known: %s", state.heliostat, error)
+        return Rank(None, 0)
+
+
+@dataclass(frozen=True)
+class ComparisonKey:
+    """What a heliostat's comparisons depend on.
+
+    ``surface`` is a version, None for the ideal mirror. ``span`` is when the photographs were
+    taken; None means the newest ones.
+    """
+
+    heliostat: str
+    surface: int | None
+    newest: int
+    corrected: datetime | None
+    model: int
+    calibrated_at: datetime | None = None
+    span: Span | None = None
+
+
+@dataclass(frozen=True)
+class ComparisonResult:
+    """Comparisons with photographs, or in ``trouble`` why there are none."""
+
+    comparisons: tuple[Comparison, ...] = ()
+    trouble: str | None = None
+
+
+class ComparisonCache:
+    """Cache of comparisons: each is traced once, for all users."""
+
+    def __init__(self, runtime: Runtime) -> None:
+        self._runtime = runtime
+        failed = ComparisonResult(trouble="the comparison failed; the log says why")
+        self._cache: BackgroundCache[ComparisonKey, ComparisonResult] = BackgroundCache(
+            self._compared, failed, "comparisons", _MAX_COMPARED
+        )
+
+    def read(
+        self,
+        session: Session,
+        heliostat: HeliostatRow,
+        surface: SurfaceRow | None,
+        span: Span | None = None,
+    ) -> ComparisonKey | None:
+        """What the comparisons with a surface depend on now; None without a photograph."""
+        photographs = select(func.max(MeasurementRow.id)).where(
+            MeasurementRow.heliostat_id == heliostat.id
+        )
+        newest = session.scalar(photographs.where(MeasurementRow.accepted))
+        if newest is None:
+            return None
+        corrections = select(func.max(MeasurementRow.corrected_at)).where(
+            MeasurementRow.heliostat_id == heliostat.id
+        )
+        changed = session.scalar(
+            select(HeliostatRow.photographs_changed_at).where(HeliostatRow.id == heliostat.id)
+        )
+        calibrations = select(func.max(MountRow.created_at)).where(
+            MountRow.heliostat_id == heliostat.id
+        )
+        return ComparisonKey(
+            heliostat.name,
+            None if surface is None else surface.version,
+            newest,
+            max(
+                (at for at in (session.scalar(corrections), changed) if at is not None),
+                default=None,
+            ),
+            model_versions.current_number(session),
+            session.scalar(calibrations),
+            span,
+        )
+
+    def wait_for(self, key: ComparisonKey, seconds: float = 5.0) -> ComparisonResult | None:
+        """The comparisons; None if they are not ready after ``seconds``."""
+        return self._cache.wait_for(key, seconds)
+
+    def close(self) -> None:
+        """Stop the background work and wait for the current computation."""
+        self._cache.close()
+
+    def _compared(self, key: ComparisonKey) -> ComparisonResult:
+        try:
+            with self._runtime.database.reading() as session:
+                heliostat = store.get_heliostat(session, key.heliostat)
+                surface = (
+                    None
+                    if key.surface is None
+                    else store.get_surface(session, heliostat, key.surface)
+                )
+            return ComparisonResult(tuple(compare(self._runtime, key.heliostat, surface, key.span)))
+        except (ModelError, ServiceError) as error:
+            logger.warning(
+                "heliostat %s cannot be compared with its photographs: %s", key.heliostat, error
+            )
+            return ComparisonResult(trouble=str(error))
+
+
+# --- drift
+# --------------------------------------------------------------------------------------------------
+
+
+def accuracy_on_arrival(
+    runtime: Runtime, twin: HeliostatContext, surface: SurfaceRow | None, photo: AcceptedMeasurement
+) -> float | None:
+    """Accuracy [1] of the active surface's forecast for a photograph that just came.
+
+    ``surface`` is loaded with its arrays. The result is None without a surface, or if the forecast
+    fails. The failure is logged, because the photograph must be stored anyway.
+    """
+    if surface is None:
+        return None
+    try:
+        (forecast,) = forecasts_of(runtime, twin, [photo], heights_of(surface))
+        return float(flux_accuracy(photo.centered, forecast))
+    except ModelError as error:
+        logger.warning("the drift of heliostat %s is not known: %s", twin.row.name, error)
+    except Exception:  # the photograph must be stored, whatever fails here
+        logger.exception("the drift of heliostat %s is not known", twin.row.name)
+    return None
+
+
+@dataclass(frozen=True)
+class AccuracyDrop:
+    """Medians of recent and earlier accuracies [1], and the drop's 95 % interval."""
+
+    recent: float
+    earlier: float
+    low: float
+    high: float
+
+
+# The median of the `_NEWEST` newest photographs is compared with the median of those before: at
+# least `_NEWEST`, at most `_BEFORE`.
+_NEWEST = 5
+_BEFORE = 60
+_DRAWS = 1000
+
+
+def accuracy_drop(accuracies: Sequence[float]) -> AccuracyDrop | None:
+    """Estimate the drop of accuracies (n,) [1], newest first; None for too few.
+
+    The interval is a bootstrap interval: Efron and Tibshirani 1993, *An Introduction to the
+    Bootstrap*, chapter 13.
+    """
+    recent, earlier = (
+        np.array(accuracies[:_NEWEST]),
+        np.array(accuracies[_NEWEST : _NEWEST + _BEFORE]),
+    )
+    if len(earlier) < _NEWEST:
+        return None
+    drop = bootstrap(
+        (earlier, recent), _drop, n_resamples=_DRAWS, method="percentile", rng=0
+    ).confidence_interval
+    return AccuracyDrop(
+        float(np.median(recent)), float(np.median(earlier)), float(drop.low), float(drop.high)
+    )
+
+
+def _drop(earlier: Array, recent: Array, axis: int) -> Array:
+    return np.asarray(np.median(earlier, axis=axis) - np.median(recent, axis=axis))
+
+
+def _accuracies_on_arrival(session: Session, heliostat: int) -> list[float]:
+    """Accuracies on arrival of a heliostat's photographs, newest first.
+
+    Photographs of unknown time are left out. Each photograph counts once, by its preferred kind of
+    image.
+    """
+    row = MeasurementRow
+    query = select(func.coalesce(row.external_id, row.identifier), row.kind, row.forecast_accuracy)
+    query = query.where(
+        row.heliostat_id == heliostat, row.accepted, row.forecast_accuracy.is_not(None)
+    )
+    query = query.where(row.taken_at.is_not(None)).order_by(row.taken_at.desc(), row.id.desc())
+    query = query.limit(len(PREFERENCE) * (_NEWEST + _BEFORE))
+    shots: dict[str, tuple[int, float]] = {}
+    for name, kind, accuracy in session.execute(query):
+        shots[name] = min(
+            shots.get(name, (len(PREFERENCE), 0.0)), (PREFERENCE.index(kind), accuracy or 0.0)
+        )
+    return [accuracy for _, accuracy in shots.values()]
+
+
+def usual_accuracy(session: Session, heliostat: int) -> float | None:
+    """Median accuracy [1] on arrival of a heliostat's photographs; None for fewer than five."""
+    accuracies = _accuracies_on_arrival(session, heliostat)
+    return float(np.median(accuracies)) if len(accuracies) >= _NEWEST else None
+
+
+def record_drift(
+    session: Session,
+    measurement: MeasurementRow,
+    surface: SurfaceRow,
+    accuracy: float,
+    settings: Settings,
+) -> None:
+    """Store an accuracy as the heliostat's newest, unless a later photograph has one.
+
+    A photograph of unknown time is ignored. An accuracy below ``attention_accuracy`` is poor, and
+    ``poor_since`` is when the current series of poor ones began. ``fell_since`` is the same for
+    drops whose lower limit exceeds ``attention_accuracy_drop``.
+    """
+    if measurement.taken_at is None:
+        return
+    new = DriftRow(
+        heliostat_id=measurement.heliostat_id,
+        measurement_id=measurement.id,
+        surface_id=surface.id,
+        taken_at=measurement.taken_at,
+        accuracy=accuracy,
+    )
+    new.poor_since = new.taken_at if accuracy < settings.attention_accuracy else None
+    fall = accuracy_drop(_accuracies_on_arrival(session, measurement.heliostat_id))
+    if fall is not None:
+        new.recent, new.earlier, new.min_drop = fall.recent, fall.earlier, fall.low
+        new.fell_since = new.taken_at if fall.low > settings.attention_accuracy_drop else None
+    held = session.get(DriftRow, measurement.heliostat_id, with_for_update=True)
+    if held is None and store.insert(session, new):
+        return
+    held = held or session.get_one(DriftRow, measurement.heliostat_id, with_for_update=True)
+    if held.taken_at <= new.taken_at:
+        new.poor_since = new.poor_since and (held.poor_since or new.poor_since)
+        new.fell_since = new.fell_since and (held.fell_since or new.fell_since)
+        session.merge(new)

@@ -1,0 +1,259 @@
+"""Predict surfaces from stored measurements.
+
+The computation runs outside any transaction. The result is stored in the caller's transaction.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from sqlalchemy.orm import Session
+
+from model.frames import sun_direction
+from model.observation import TRUSTED_MAHALANOBIS, Observation, SurfacePrediction
+from model.progress import Progress, silent
+from service import store
+from service.base.choices import Method, require_images
+from service.store import audit
+from service.store.keys import RESERVED
+from service.store.rows import lock_row
+from service.store.surfaces import decisions
+from service.store.surfaces.decisions import Justification
+from service.store.tables import DecisionRow, HeliostatRow, MeasurementRow, SurfaceRow
+from service.twin.heliostats.measurements import (
+    HeliostatContext,
+    accepted_measurement,
+    choose_diverse,
+    choose_measurements,
+    load_heliostat_context,
+    named_measurements,
+    to_observations,
+)
+from service.twin.heliostats.outliers import reject_outliers
+from service.twin.runtime.runtime import Operations, Runtime
+from service.twin.surfaces.evaluation import Evaluation, evaluate_first_surface, evaluate_surface
+
+# Candidates per requested image, because some may contradict the others.
+_SPARE = 2
+
+
+@dataclass(frozen=True, eq=False)
+class Predicted:
+    """A predicted surface that is not stored yet.
+
+    ``known`` is the stored version with the same content, if there is one. ``judgement`` compares
+    it with the active surface or the ideal mirror; None without a comparison.
+    """
+
+    twin: HeliostatContext
+    new: store.NewSurface
+    known: SurfaceRow | None = None
+    judgement: Evaluation | None = None
+
+
+def compute_surface(
+    runtime: Runtime,
+    heliostat: str,
+    method: Method = "network",
+    measurements: Sequence[str] | None = None,
+    images: int = 8,
+    model_version: int | None = None,
+    progress: Progress = silent,
+) -> Predicted:
+    """Predict a heliostat's surface from named measurements, or from up to ``images`` chosen ones.
+
+    ``model_version`` is a version of the plant's model, by default the current one. ``progress``
+    receives the progress. An exception that it raises stops the prediction.
+
+    Raises
+    ------
+    NotFoundError, ConflictError
+        If the heliostat, a measurement or the model is not stored, or no measurement is accepted.
+    InvalidInputError
+        If there are more images than the method accepts.
+    """
+    require_images(method, images if measurements is None else len(measurements))
+    with runtime.database.reading() as session:
+        twin = load_heliostat_context(session, heliostat, model_version)
+        names = measurements
+        if names is None:
+            names = [
+                row.identifier
+                for row in choose_measurements(session, twin.row, images, spare=_SPARE)
+            ]
+        rows = named_measurements(session, twin.row, names)
+        today = store.find_surface_at(session, twin.row)
+    with runtime.computing(f"predict_{method}") as operations:
+        if measurements is None:
+            progress("choosing photographs that are consistent", 0, 1)
+            observations, _ = choose_observations(operations, twin, rows, images)
+        else:
+            observations = to_observations([accepted_measurement(row, twin.origin) for row in rows])
+        surface = operations.predict(twin.heliostat, observations, twin.model, method, progress)
+    progress("comparing it with the active surface", 1, 1)
+    new = _new_surface(twin, method, surface, rows)
+    with runtime.database.reading() as session:
+        known = store.find_same_content(session, twin.row, new)
+    if known is not None:
+        return Predicted(twin, new, known)
+    if today is None:
+        return _evaluated_first(twin, new, evaluate_first_surface(runtime, twin, new))
+    if _is_older(new, today):
+        return Predicted(twin, new)
+    return Predicted(twin, new, None, evaluate_surface(runtime, twin, today, new))
+
+
+def _evaluated_first(
+    twin: HeliostatContext, new: store.NewSurface, judgement: Evaluation
+) -> Predicted:
+    """Add a warning to a first surface that forecasts worse than the ideal mirror."""
+    if judgement.became_active or new.trust is None:
+        return Predicted(twin, new, None, judgement)
+    before, after = judgement.grounds.before or 0.0, judgement.grounds.after or 0.0
+    said = (
+        f"the ideal mirror forecasts no worse: accuracy {before:.0%} on photographs, this surface"
+        f" {after:.0%}"
+    )
+    trust = replace(new.trust, warnings=(*new.trust.warnings, said))
+    return Predicted(twin, replace(new, trust=trust), None, judgement)
+
+
+def _is_older(new: store.NewSurface, today: SurfaceRow) -> bool:
+    """Whether a surface describes the mirror from an earlier time than the active one."""
+    return (
+        new.valid_from is not None
+        and today.valid_from is not None
+        and new.valid_from < today.valid_from
+    )
+
+
+def choose_observations(
+    operations: Operations, twin: HeliostatContext, rows: Sequence[MeasurementRow], images: int
+) -> tuple[list[Observation], dict[str, str]]:
+    """Choose up to ``images`` observations of different suns, the newest first.
+
+    Also return the reasons of outliers, by identifier.
+    """
+    arrived = sorted(rows, key=lambda row: row.id)  # the order of those of unknown time
+    observations = to_observations([accepted_measurement(row, twin.origin) for row in arrived])
+    kept, rejected = reject_outliers(operations, twin.heliostat, observations, twin.model)
+    return choose_diverse(kept[::-1], images), rejected
+
+
+def _new_surface(
+    twin: HeliostatContext,
+    method: Method,
+    surface: SurfacePrediction,
+    chosen: Sequence[MeasurementRow],
+) -> store.NewSurface:
+    """The surface as it will be stored.
+
+    It is valid from the time of its newest image; None if no time is known.
+    """
+    used = [row for row in chosen if row.identifier in surface.used]
+    return store.NewSurface(
+        source=method,
+        z=surface.z,
+        z_std=surface.z_std,
+        control_points=surface.control_points,
+        valid_from=max((row.taken_at for row in used if row.taken_at is not None), default=None),
+        model=surface.weights,
+        model_version=twin.model.version,
+        measurements=used,
+        misfit=surface.misfit,
+        trust=_trust(surface, used),
+    )
+
+
+def _trust(surface: SurfacePrediction, used: Sequence[MeasurementRow]) -> store.Trust:
+    """Trust in a prediction: warnings in words, and its figures."""
+    misfits = dict(zip(surface.used, surface.misfits, strict=True))
+    warnings = [
+        f"photograph {name} is not explained: {misfits[name]:.0%} of it is missed"
+        for name in surface.suspicious
+    ]
+    if surface.mahalanobis_distance > TRUSTED_MAHALANOBIS:
+        warnings.append(
+            f"the mirror is unlike those known: {surface.mahalanobis_distance:.1f} standard"
+            f" deviations from them, {TRUSTED_MAHALANOBIS} are usual at most"
+        )
+    warnings += surface.warnings
+    if not surface.trusted and not warnings:
+        warnings.append("the prediction does not trust itself")
+    suns = np.array([sun_direction(row.sun_azimuth_deg, row.sun_elevation_deg) for row in used])
+    span = float(np.degrees(np.arccos(np.clip(suns @ suns.T, -1, 1)).max()))
+    return store.Trust(
+        tuple(warnings), surface.suspicious, float(surface.mahalanobis_distance), span
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class StoredSurface:
+    """A predicted surface in the store: its row, whether it is new, and its decision."""
+
+    row: SurfaceRow
+    is_new: bool = True
+    decision: DecisionRow | None = None
+
+
+def keep_surface(session: Session, predicted: Predicted, actor: str) -> StoredSurface:
+    """Store a predicted surface as the heliostat's next version, unless it exists.
+
+    ``actor`` is who requested it. The surface stays a candidate if the evaluation rejects it, or if
+    another surface became active meanwhile.
+    """
+    heliostat, new = predicted.twin.row, predicted.new
+    lock_row(
+        session, HeliostatRow, heliostat.id, f"heliostat {heliostat.name}"
+    )  # no photograph can be deleted now
+    if predicted.known is not None:
+        return StoredSurface(
+            store.get_surface(session, heliostat, predicted.known.version), is_new=False
+        )
+    today = store.find_surface_at(session, heliostat)
+    last = store.newest_prediction(session, heliostat)
+    used = store.get_measurements(session, heliostat, [row.identifier for row in new.measurements])
+    row, _ = store.add_surface(session, heliostat, replace(new, measurements=used))
+    about = {"version": row.version, "model": new.model_version}
+    audit.record(session, actor, "surface.predicted", f"heliostat {heliostat.name}", **about)
+    _carry_acknowledgement(row, last)
+    judgement = predicted.judgement
+    if judgement is None:
+        return StoredSurface(row)
+    active = None if today is None else today.version
+    if active is None and judgement.became_active:
+        return StoredSurface(row)  # it replaced nothing, so there is no decision to record or undo
+    row.is_candidate = True
+    session.flush()
+    if active != judgement.against:
+        other = "the ideal mirror" if judgement.against is None else f"version {judgement.against}"
+        reason = f"version {active} became active while this one was compared with {other}"
+        return StoredSurface(
+            row, decision=decisions.reject(session, heliostat, row, actor, Justification(reason))
+        )
+    decide = decisions.promote if judgement.became_active else decisions.reject
+    return StoredSurface(row, decision=decide(session, heliostat, row, actor, judgement.grounds))
+
+
+def _carry_acknowledgement(row: SurfaceRow, last: SurfaceRow | None) -> None:
+    """Keep the start time of warnings, and acknowledgements of the same suspicious photographs."""
+    if row.warned_since is None or last is None or last.warned_since is None:
+        return
+    row.warned_since = last.warned_since
+    if row.suspicious == last.suspicious:
+        row.acknowledged_at, row.acknowledged_by = last.acknowledged_at, last.acknowledged_by
+
+
+def predict_surface(
+    runtime: Runtime,
+    heliostat: str,
+    method: Method = "network",
+    measurements: Sequence[str] | None = None,
+    images: int = 8,
+    actor: str = RESERVED,
+    model_version: int | None = None,
+) -> StoredSurface:
+    """Run `compute_surface`, then `keep_surface` in a separate transaction."""
+    predicted = compute_surface(runtime, heliostat, method, measurements, images, model_version)
+    with runtime.database.writing() as session:
+        return keep_surface(session, predicted, actor)

@@ -1,1 +1,0 @@
-"""The form of answers: representations, pages of lists, problems, the OpenAPI document."""

@@ -1,1 +1,0 @@
-"""The representations of maps beside JSON, one file each, with its `REPRESENTATION`."""

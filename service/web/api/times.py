@@ -1,0 +1,68 @@
+"""Times of many measurements, given afterwards."""
+
+from typing import Annotated
+
+from fastapi import APIRouter, Body, Depends
+from pydantic import BaseModel, Field
+
+from service.base.fields import MeasurementName, Model, Moment, Name, Reason
+from service.twin.photographs.corrections import GivenTime, correct_times
+from service.web.auth.dependencies import (
+    COMPUTE_SLOT,
+    OPERATE,
+    IdentityDep,
+    RuntimeDep,
+    require_json,
+)
+from service.web.responses.openapi import problems
+
+router = APIRouter(prefix="/measurements", tags=["measurements"])
+
+_MOST = 2000
+
+
+class TimeIn(Model):
+    """The time of a measurement."""
+
+    heliostat: Name
+    id: MeasurementName
+    taken_at: Moment = Field(description="With time zone.")
+
+
+class TimesIn(Model):
+    """Times of measurements whose time was unknown or wrong."""
+
+    reason: Reason = Field(description="Where they come from; kept with each correction.")
+    times: list[TimeIn] = Field(min_length=1, max_length=_MOST)
+
+
+class TimesOut(BaseModel):
+    """Number of given times, and number of those that changed anything."""
+
+    given: int
+    changed: int
+
+
+_EXAMPLE = {
+    "reason": "from the log of the cameras",
+    "times": [{"heliostat": "AA39", "id": "205363", "taken_at": "2022-06-01T11:30:00Z"}],
+}
+
+
+@router.patch(
+    "/times",
+    responses=problems(404, 409, 410, 413, 415, 429),
+    dependencies=[OPERATE, Depends(require_json), COMPUTE_SLOT],
+)
+def patch_times(
+    runtime: RuntimeDep, identity: IdentityDep, body: Annotated[TimesIn, Body(examples=[_EXAMPLE])]
+) -> TimesOut:
+    """Set the times of many measurements: either all of them, or none.
+
+    Each is a correction with its history. `errors` names every wrong entry by its index, such as
+    `times.3`. Entries that match the stored time are skipped.
+    """
+    given = [GivenTime(entry.heliostat, entry.id, entry.taken_at) for entry in body.times]
+    return TimesOut(
+        given=len(given), changed=correct_times(runtime, given, body.reason, identity.name)
+    )

@@ -1,0 +1,148 @@
+"""Dependencies that routes declare in their signatures.
+
+No dependency holds a database connection. A route opens its session itself and closes it before it
+returns. A session from a dependency would keep its connection while the request waits for a thread,
+and other threads would wait for that connection.
+"""
+
+import threading
+from collections.abc import AsyncIterator
+from contextlib import AbstractAsyncContextManager
+from typing import Annotated, Any
+
+from fastapi import Depends, Path, Query, Request
+
+from service.base.errors import UnsupportedContentError
+from service.base.fields import MeasurementName, Name
+from service.jobs.kind import Kinds
+from service.twin.alerts.field_overview import FieldOverviewCache
+from service.twin.runtime.runtime import Runtime
+from service.web.auth.fair_limiter import FairLimiter
+from service.web.auth.security import Identity, Requires, Role, dependencies_of, presented_key
+
+
+async def get_runtime(request: Request) -> Runtime:
+    """The parts of the running service."""
+    runtime: Runtime = request.app.state.runtime
+    return runtime
+
+
+RuntimeDep = Annotated[Runtime, Depends(get_runtime)]
+
+
+async def _field(request: Request) -> FieldOverviewCache:
+    cache: FieldOverviewCache = request.app.state.field
+    return cache
+
+
+FieldCacheDep = Annotated[FieldOverviewCache, Depends(_field)]
+"""The cache of what is computed once for each heliostat of the field."""
+
+# For the ``dependencies`` of a route: each requires at least this role.
+READ = Depends(Requires(Role.READ))
+INGEST = Depends(Requires(Role.INGEST))
+OPERATE = Depends(Requires(Role.OPERATE))
+ADMIN = Depends(Requires(Role.ADMIN))
+
+
+async def _identity(request: Request) -> Identity:
+    identity: Identity = request.state.identity
+    return identity
+
+
+IdentityDep = Annotated[Identity, Depends(_identity)]
+"""The identity that sent the request, for routes that declare `Requires`."""
+
+
+async def _presented(request: Request) -> str | None:
+    return presented_key(request.headers)
+
+
+PresentedDep = Annotated[str | None, Depends(_presented)]
+"""The presented key, for responses that last only while this key is valid."""
+
+
+async def _stopping(request: Request) -> threading.Event:
+    event: threading.Event = request.app.state.stopping
+    return event
+
+
+StoppingDep = Annotated[threading.Event, Depends(_stopping)]
+"""Event that is set when the service stops, so that endless responses end."""
+
+
+async def _kinds(request: Request) -> Kinds:
+    kinds: Kinds = request.app.state.kinds
+    return kinds
+
+
+KindsDep = Annotated[Kinds, Depends(_kinds)]
+"""The job kinds that this service accepts."""
+
+
+def render_slot(request: Request) -> AbstractAsyncContextManager[None]:
+    """Slot for rendering or serializing large output, for the key that sent the request."""
+    return _slot(request, request.app.state.render_limiter)
+
+
+def _slot(request: Request, limiter: FairLimiter) -> AbstractAsyncContextManager[None]:
+    identity: Identity = request.state.identity
+    return limiter.acquire(identity.name)
+
+
+async def _render(request: Request) -> AsyncIterator[None]:
+    async with render_slot(request):
+        yield
+
+
+async def _overview(request: Request) -> AsyncIterator[None]:
+    async with _slot(request, request.app.state.overview_limiter):
+        yield
+
+
+async def _compute(request: Request) -> AsyncIterator[None]:
+    async with _slot(request, request.app.state.compute_limiter):
+        yield
+
+
+# For the ``dependencies`` of a route. The slot is free again before the response is sent, so that a
+# slow reader does not block others.
+RENDER_SLOT = Depends(_render, scope="function")
+"""Slot for drawing maps."""
+RenderSlotDep = Annotated[None, RENDER_SLOT]
+"""The same slot in a signature, for parameters that follow other dependencies."""
+OVERVIEW_SLOT = Depends(_overview, scope="function")
+"""Slot for responses about all heliostats."""
+COMPUTE_SLOT = Depends(_compute, scope="function")
+"""Slot for waiting on the model, so that one key does not fill its queue."""
+
+
+NamePath = Annotated[Name, Path(description="Name of the heliostat or target.")]
+MeasurementPath = Annotated[MeasurementName, Path()]
+Limit = Annotated[int, Query(ge=1, le=500, description="Most items on a page.")]
+
+
+def _content_type(request: Request) -> str:
+    return request.headers.get("content-type", "").partition(";")[0].strip().lower()
+
+
+async def require_json(request: Request) -> None:
+    """Refuse a body that is not JSON."""
+    media_type = _content_type(request)
+    if media_type != "application/json" and not (
+        media_type.startswith("application/") and media_type.endswith("+json")
+    ):
+        raise UnsupportedContentError("Content-Type: send the body as application/json")
+
+
+async def require_multipart(request: Request) -> None:
+    """Refuse a body that is not a form with files."""
+    if _content_type(request) != "multipart/form-data":
+        raise UnsupportedContentError(
+            "Content-Type: send the image and its metadata as multipart/form-data"
+        )
+
+
+def takes_upload(route: Any) -> bool:
+    """Whether a route accepts a form with files."""
+    return require_multipart in dependencies_of(route)

@@ -1,0 +1,302 @@
+"""Page of the field: a map of all heliostats, coloured by a metric, and the same as a table."""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar
+from urllib.parse import urlencode
+
+import numpy as np
+from fastapi import APIRouter, Query, Request
+from fastapi.responses import HTMLResponse
+from numpy.typing import NDArray
+from pydantic import Field
+from sqlalchemy import func, select
+from sqlalchemy.orm import Session
+
+from service.base.settings import Settings
+from service.drawing.charts import Scale
+from service.drawing.pictures import places_picture
+from service.store.job_tables import JobRow
+from service.store.tables import PlantRow, TargetRow
+from service.twin.alerts.field_filter import (
+    CONDITIONS,
+    METRICS,
+    HeliostatFilter,
+    Metric,
+    default_order,
+    filter_heliostats,
+)
+from service.twin.alerts.field_overview import HeliostatSummary
+from service.web.auth.dependencies import READ, RENDER_SLOT, FieldCacheDep, RuntimeDep
+from service.web.responses.pages import render
+
+router = APIRouter(include_in_schema=False, dependencies=[READ])
+
+# Heliostats on a page of the table.
+_LISTED = 100
+
+
+class FieldView(HeliostatFilter):
+    """The view of the page, which is encoded in its URL."""
+
+    page: int = Field(default=1, ge=1, le=10**6)
+
+    def link(self, **changes: Any) -> str:
+        """The URL of this view with changed parameters, on the first page."""
+        asked = {"page": 1, **self.model_dump(exclude_defaults=True, exclude={"page"}), **changes}
+        query = {
+            name: value
+            for name, value in asked.items()
+            if value is not None and (name, value) != ("page", 1)
+        }
+        return f"/?{urlencode(query)}" if query else "/"
+
+    def sorted_by(self, column: str) -> str:
+        """The URL of this view sorted by ``column``, or in reverse on repetition."""
+        if column != self.column:
+            return self.link(sort=column, order=None)
+        opposite = "down" if self.rises else "up"
+        return self.link(sort=column, order=None if opposite == default_order(column) else opposite)
+
+
+@dataclass(frozen=True)
+class Marks:
+    """Heliostats of one colour on the map, as a path of squares.
+
+    ``colour`` is None if the values are not known. ``names`` and ``texts``, the formatted values,
+    are in the order of the path.
+    """
+
+    colour: str | None
+    path: str
+    names: str
+    texts: str
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """Map of the field from above, north up, in drawing units.
+
+    ``side`` is the size of a square, and ``bar_m`` the length of the scale bar [m]. ``flagged`` is
+    a path around untrusted heliostats. ``left_out`` is a path of those that the filter excludes.
+    """
+
+    width: float
+    height: float
+    side: float
+    marks: list[Marks]
+    flagged: str
+    left_out: str
+    tower: tuple[float, float]
+    per_metre: float
+    bar_m: float
+
+
+@dataclass(frozen=True)
+class FieldMap:
+    """The map as a file."""
+
+    formats: ClassVar[tuple[str, ...]] = ("npz", "png")
+
+    lines: Sequence[HeliostatSummary]
+    metric: Metric
+    scale: Scale
+
+    @property
+    def title(self) -> str:
+        """The metric with its unit."""
+        return self.scale.label
+
+    @property
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Names, positions east and north (n, 2) [m], and values, NaN if not known."""
+        values = [self.metric.shown(line) for line in self.lines]
+        return {
+            "names": np.array([line.name for line in self.lines]),
+            "places_m": (
+                np.array([(line.east_m, line.north_m) for line in self.lines]).reshape(-1, 2)
+            ),
+            "values": np.array([np.nan if value is None else value for value in values]),
+            "unit": np.array(self.metric.unit),
+        }
+
+    def drawn(self) -> bytes:
+        """The map as PNG, with axes and a colour bar."""
+        arrays, scale = self.arrays, self.scale
+        return places_picture(
+            arrays["places_m"],
+            arrays["values"],
+            scale.label,
+            scale.colours,
+            (scale.low, scale.high),
+        )
+
+
+def _text(line: HeliostatSummary, metric: Metric) -> str:
+    """Text in place of a missing value."""
+    is_unjudged = metric.name == "accuracy" and line.rank is not None and not line.rank.photographs
+    return "not yet evaluated" if is_unjudged else "not known"
+
+
+def scale_for(metric: Metric, settings: Settings) -> Scale:
+    """Colours of a metric, from bright (good) to dark (poor), the same for every field."""
+    fine, poor = settings.map_scales[metric.name]
+    label = f"{metric.label} [{metric.unit}]"
+    return Scale("viridis" if poor < fine else "viridis_r", min(fine, poor), max(fine, poor), label)
+
+
+_WIDTH = 720.0
+_MARGIN = 34.0
+
+
+def _round_length(metres: float) -> float:
+    """The largest 1, 2 or 5 times a power of ten up to ``metres``."""
+    power: float = 10.0 ** math.floor(math.log10(metres))
+    return max(factor * power for factor in (1, 2, 5) if factor * power <= metres)
+
+
+def _squares(places: Iterable[tuple[float, float]], side: float) -> str:
+    """A path of squares centred on ``places``."""
+    half, square = side / 2, f"M%.1f %.1fh{side:.1f}v{side:.1f}h-{side:.1f}z"
+    return "".join([square % (x - half, y - half) for x, y in places])
+
+
+def _marks(
+    lines: Sequence[HeliostatSummary],
+    places: dict[str, tuple[float, float]],
+    metric: Metric,
+    scale: Scale,
+    side: float,
+) -> list[Marks]:
+    values = [metric.shown(line) for line in lines]
+    known = [(line, value) for line, value in zip(lines, values, strict=True) if value is not None]
+    groups: dict[str, list[tuple[HeliostatSummary, float]]] = {}
+    for entry, colour in zip(known, scale.names([value for _, value in known]), strict=True):
+        groups.setdefault(colour, []).append(entry)
+    template = (  # `%` formatting, because it is faster for 20,000 heliostats
+        f"%.{metric.digits}f\N{NO-BREAK SPACE}{metric.unit.replace('%', '%%')}"
+    )
+    marks = [
+        Marks(
+            colour,
+            _squares([places[line.name] for line, _ in group], side),
+            "|".join([line.name for line, _ in group]),
+            "|".join([template % value for _, value in group]),
+        )
+        for colour, group in groups.items()
+    ]
+    others = [line for line, value in zip(lines, values, strict=True) if value is None]
+    if others:
+        path = _squares([places[line.name] for line in others], side)
+        names, texts = (
+            "|".join(line.name for line in others),
+            "|".join(_text(line, metric) for line in others),
+        )
+        marks.append(Marks(None, path, names, texts))
+    return marks
+
+
+def draw(
+    lines: Sequence[HeliostatSummary],
+    chosen: Sequence[HeliostatSummary],
+    metric: Metric,
+    scale: Scale,
+) -> Drawing:
+    """Draw the map of ``lines``, with the ``chosen`` ones emphasized.
+
+    The tower, at the origin, is always on the map.
+    """
+    east = np.array([line.east_m for line in lines] + [0.0])
+    north = np.array([line.north_m for line in lines] + [0.0])
+    spans = max(float(np.ptp(east)), 1.0), max(float(np.ptp(north)), 1.0)
+    per_metre = min((_WIDTH - 2 * _MARGIN) / spans[0], (_WIDTH - 2 * _MARGIN) / spans[1])
+    width, height = (max(span * per_metre, 200.0) + 2 * _MARGIN for span in spans)
+    x = width / 2 + (east - (east.max() + east.min()) / 2) * per_metre
+    y = height / 2 - (north - (north.max() + north.min()) / 2) * per_metre
+    side = min(max(0.6 * math.sqrt(width * height / max(len(lines), 1)), 2.5), 22.0)
+    places = dict(
+        zip([line.name for line in lines], zip(x.tolist(), y.tolist(), strict=True), strict=False)
+    )
+    flagged = [
+        places[line.name] for line in chosen if line.surface is not None and line.surface.warnings
+    ]
+    names = {line.name for line in chosen} if len(chosen) < len(lines) else places.keys()
+    left_out = [place for name, place in places.items() if name not in names]
+    return Drawing(
+        width,
+        height,
+        side,
+        _marks(chosen, places, metric, scale, side),
+        _squares(flagged, side + min(side, 6.0)),
+        _squares(left_out, side),
+        (float(x[-1]), float(y[-1])),
+        per_metre,
+        _round_length(width / 4 / per_metre),
+    )
+
+
+def _totals(session: Session) -> dict[str, Any]:
+    plant = session.get(PlantRow, 1)
+    running = (
+        select(func.count()).select_from(JobRow).where(JobRow.state.in_(("queued", "running")))
+    )
+    return {
+        "plant": None if plant is None else plant.name,
+        "targets": session.scalars(select(func.count()).select_from(TargetRow)).one(),
+        "live_jobs": session.scalars(running).one(),
+    }
+
+
+def _counts(lines: Sequence[HeliostatSummary]) -> dict[str, int]:
+    """Totals of all heliostats, for the tiles."""
+    surfaces = [line.surface for line in lines if line.surface is not None]
+    flagged = [surface for surface in surfaces if surface.warnings]
+    return {
+        "surfaces": len(surfaces),
+        "photographs": sum(line.photographs for line in lines),
+        "refused": sum(line.refused for line in lines),
+        "flagged": len(flagged),
+        "unacknowledged": sum(not surface.acknowledged_by for surface in flagged),
+        "judged": sum(line.rank is not None and line.rank.photographs > 0 for line in lines),
+    }
+
+
+@router.get("/", dependencies=[RENDER_SLOT])
+def get_field(
+    request: Request, runtime: RuntimeDep, cache: FieldCacheDep, view: Annotated[FieldView, Query()]
+) -> HTMLResponse:
+    """The field map, with the filtered heliostats emphasized, and one page of their table."""
+    with runtime.database.reading() as session:
+        now, totals = cache.read(session), _totals(session)
+    lines, chosen = now.lines, METRICS[view.metric]
+    found = filter_heliostats(lines, view)
+    last = max(math.ceil(len(found) / _LISTED), 1)
+    begin = (min(view.page, last) - 1) * _LISTED
+    scale = scale_for(chosen, runtime.settings)
+    return render(
+        request,
+        "field.html",
+        **totals,
+        lines=lines,
+        counts=_counts(lines),
+        found=len(found),
+        listed=found[begin : begin + _LISTED],
+        begin=begin,
+        page=min(view.page, last),
+        last=last,
+        view=view,
+        conditions=CONDITIONS,
+        metrics=METRICS,
+        metric=chosen,
+        scale=scale,
+        fine=runtime.settings.map_scales[view.metric][0],
+        poor=runtime.settings.map_scales[view.metric][1],
+        field_map=FieldMap(found, chosen, scale),
+        drawing=draw(lines, found, chosen, scale) if lines else None,
+        pending=now.pending,
+        is_behind=now.is_behind,
+        # The computation for a large field takes time, and its page is long. Reload less often the
+        # more heliostats are pending.
+        again_ms=min(max(1500, 30 * now.pending), 15_000) if now.pending or now.is_behind else None,
+    )

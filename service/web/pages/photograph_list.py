@@ -1,0 +1,93 @@
+"""Page of all photographs, newest first, filtered by heliostat, verdict, target and time."""
+
+from datetime import UTC, date, datetime, time, timedelta
+from typing import Annotated
+from urllib.parse import urlencode
+
+from fastapi import APIRouter, Query, Request
+from fastapi.responses import HTMLResponse
+from pydantic import Field, model_validator
+from sqlalchemy import select
+
+from service import store
+from service.base.fields import Model, Name, Version, drop_empty_fields
+from service.store.photographs.groups import (
+    PhotographFilter,
+    PhotographVerdict,
+    TimeState,
+    list_groups,
+)
+from service.store.tables import TargetRow
+from service.web.auth.dependencies import READ, RENDER_SLOT, RuntimeDep
+from service.web.responses.pages import render
+
+router = APIRouter(include_in_schema=False, dependencies=[READ, RENDER_SLOT])
+
+LISTED = 50
+"""Photographs on a page."""
+
+
+class PhotographsQuery(Model):
+    """Filters of the list.
+
+    ``since`` and ``until`` are days in UTC, both inclusive. ``before`` is where the page begins.
+    ``time`` is whether the time of a photograph is known, and ``warned`` whether it has warnings.
+    """
+
+    heliostat: Name | None = None
+    verdict: PhotographVerdict | None = None
+    target: Name | None = None
+    since: date | None = None
+    until: date | None = Field(default=None, lt=date.max)
+    time: TimeState | None = None
+    warned: bool | None = None
+    before: Version | None = None
+
+    _filled = model_validator(mode="before")(drop_empty_fields)
+
+    def link(self, before: int | None) -> str:
+        """The URL of another page with the same filters."""
+        asked = {
+            **self.model_dump(mode="json", exclude_none=True, exclude={"before"}),
+            "before": before,
+        }
+        query_string = urlencode(
+            {name: value for name, value in asked.items() if value is not None}
+        )
+        return f"/photographs?{query_string}" if query_string else "/photographs"
+
+
+def _midnight(day: date | None, later: int = 0) -> datetime | None:
+    return None if day is None else datetime.combine(day + timedelta(days=later), time(), UTC)
+
+
+@router.get("/photographs")
+def get_photographs_page(
+    request: Request, query: Annotated[PhotographsQuery, Query()], runtime: RuntimeDep
+) -> HTMLResponse:
+    """One page of photographs, with the filter form."""
+    with runtime.database.reading() as session:
+        wanted = PhotographFilter(
+            None if query.heliostat is None else store.get_heliostat(session, query.heliostat),
+            None if query.target is None else store.get_target(session, query.target),
+            query.verdict,
+            _midnight(query.since),
+            _midnight(query.until, 1),
+            query.time,
+            query.warned,
+        )
+        groups = list_groups(session, wanted, LISTED + 1, query.before)
+        targets = session.scalars(select(TargetRow.name).order_by(TargetRow.name)).all()
+    older = query.link(groups[LISTED - 1].mark) if len(groups) > LISTED else None
+    return render(
+        request,
+        "photographs.html",
+        query=query,
+        groups=groups[:LISTED],
+        targets=targets,
+        older=older,
+        verdicts=VERDICTS,
+    )
+
+
+VERDICTS: tuple[PhotographVerdict, ...] = ("used", "refused", "excluded")

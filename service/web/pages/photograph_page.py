@@ -1,0 +1,220 @@
+"""Page of a photograph: comparison with the forecast, correction form, and derived results."""
+
+from collections.abc import Callable
+from functools import partial
+from http import HTTPStatus
+from typing import Annotated, Literal
+
+from fastapi import APIRouter, Form, Header, Request, Response
+from fastapi.responses import HTMLResponse
+from sqlalchemy import select
+
+from model.errors import ModelError
+from service import store
+from service.base.errors import NotFoundError, ServiceError
+from service.base.fields import AZIMUTH, ELEVATION, FormMoment, Model, Name, Reason, Sun
+from service.drawing.pictures import photograph_picture
+from service.drawing.templates import in_words
+from service.store.photographs.correction_log import list_corrections, made_from
+from service.store.photographs.measurements import EXCLUDED, images_of_photograph
+from service.store.tables import CorrectionRow, MeasurementRow, TargetRow
+from service.twin.photographs.corrections import PhotographChanges, correct_photograph
+from service.twin.photographs.deletion import delete_photograph
+from service.twin.photographs.display import compare_one, load_for_display, pixels_of
+from service.twin.runtime.runtime import Runtime
+from service.web.api.corrections import predict_again
+from service.web.api.measurements import get_row, require_image
+from service.web.auth.dependencies import (
+    COMPUTE_SLOT,
+    OPERATE,
+    READ,
+    RENDER_SLOT,
+    IdentityDep,
+    MeasurementPath,
+    NamePath,
+    RuntimeDep,
+)
+from service.web.pages.heliostat import comparison_figures
+from service.web.responses.files import etag_matches
+from service.web.responses.pages import go_to, render
+
+router = APIRouter(include_in_schema=False)
+
+PATH = "/heliostats/{name}/photographs/{measurement}"
+
+
+class CorrectionForm(Model):
+    """The correction form, which is filled with the stored values."""
+
+    reason: Reason
+    target: Name | None = None
+    azimuth_deg: Annotated[float, AZIMUTH] | None = None
+    elevation_deg: Annotated[float, ELEVATION] | None = None
+    taken_at: FormMoment | None = None
+    excluded: bool = False
+    predict_again: bool = False
+
+    @property
+    def sun(self) -> Sun | None:
+        """The sun, if both angles are given."""
+        if self.azimuth_deg is None or self.elevation_deg is None:
+            return None
+        return Sun(azimuth_deg=self.azimuth_deg, elevation_deg=self.elevation_deg)
+
+
+def change_texts(correction: CorrectionRow) -> list[str]:
+    """Changes of a correction in words."""
+    said = []
+    for field, value in correction.after.items():
+        if field == "excluded":
+            said.append("excluded" if value else "no longer excluded")
+        elif field == "flux":
+            said.append("its flux was measured again")
+        else:
+            before, after = (
+                "not change_texts" if known is None else in_words(known)
+                for known in (correction.before[field], value)
+            )
+            name = field.removesuffix("_deg").replace(".", " ").replace("_", " ")
+            said.append(f"{name}: {before} → {after}")
+    return said
+
+
+class DeletionForm(Model):
+    """The form that deletes a photograph."""
+
+    reason: Reason
+    confirmed: Literal["true"]
+
+
+# Longest sides of a thumbnail and of a larger view [px]. The file has the full size.
+_THUMBNAIL = 192
+_SHOWN = 1000
+_LARGE = 6000  # side for close inspection [px]: larger than the frame of any camera
+
+
+def _thumbnail(runtime: Runtime, _: str, row: MeasurementRow) -> bytes:
+    image = require_image(row)
+
+    def draw() -> bytes:
+        with pixels_of(runtime, row) as pixels:
+            return photograph_picture(pixels, _THUMBNAIL)
+
+    return runtime.images.thumbnail(image.sha256, draw)
+
+
+def _outlined(runtime: Runtime, heliostat: str, row: MeasurementRow, most: int = _SHOWN) -> bytes:
+    pixels, measured = load_for_display(runtime, heliostat, row)
+    return photograph_picture(pixels, most, measured.corners)
+
+
+def _crop(runtime: Runtime, heliostat: str, row: MeasurementRow) -> bytes:
+    measured = load_for_display(runtime, heliostat, row)[1]
+    if measured.crop is None:
+        raise NotFoundError(
+            f"measurement {row.identifier}: the target was not found in it, so it has no crop"
+        )
+    return photograph_picture(measured.crop, _SHOWN)
+
+
+_VIEWS: dict[str, Callable[[Runtime, str, MeasurementRow], bytes]] = {
+    "thumbnail": _thumbnail,
+    "outlined": _outlined,
+    "large": partial(_outlined, most=_LARGE),
+    "crop": _crop,
+}
+
+
+@router.get(PATH + "/{view}.jpg", dependencies=[READ, RENDER_SLOT])
+def get_view(
+    name: NamePath,
+    measurement: MeasurementPath,
+    view: Literal["thumbnail", "outlined", "large", "crop"],
+    runtime: RuntimeDep,
+    if_none_match: Annotated[str | None, Header()] = None,
+) -> Response:
+    """A reduced photograph, with the outline of the detected target, or rectified.
+
+    It is made on request.
+    """
+    row = get_row(name, measurement, runtime)
+    image = require_image(row)
+    changed_at = row.corrected_at or row.created_at
+    # Browsers may store it, but must ask again and present the key each time.
+    headers = {
+        "ETag": f'"{image.sha256[:32]}-{changed_at.timestamp():.0f}"',
+        "Cache-Control": "private, no-cache",
+    }
+    if etag_matches(headers["ETag"], if_none_match):
+        return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
+    return Response(_VIEWS[view](runtime, name, row), media_type="image/jpeg", headers=headers)
+
+
+@router.get(PATH, dependencies=[READ, COMPUTE_SLOT])
+def get_photograph_page(
+    name: NamePath, measurement: MeasurementPath, request: Request, runtime: RuntimeDep
+) -> HTMLResponse:
+    """A photograph with its flux, the forecast of the current twin, and its history."""
+    with runtime.database.reading() as session:
+        row = store.get_measurement(session, store.get_heliostat(session, name), measurement)
+        images = images_of_photograph(session, row)
+        corrections, made = list_corrections(session, row), made_from(session, row)
+        targets = session.scalars(select(TargetRow.name).order_by(TargetRow.name)).all()
+    compared, trouble = [], None
+    if row.accepted and row.image_sha256 is not None:
+        try:
+            compared = [compare_one(runtime, name, measurement)]
+        except (ModelError, ServiceError) as error:
+            trouble = str(error)
+    return render(
+        request,
+        "photograph.html",
+        name=name,
+        row=row,
+        images=images,
+        kept={kind: image for kind, image in images.items() if image.has_file},
+        comparisons=comparison_figures(compared, runtime.settings.figure_scales["flux_difference"]),
+        trouble=trouble,
+        is_excluded=row.reason == EXCLUDED,
+        corrections=[(row, change_texts(row)) for row in corrections],
+        made=made,
+        targets=targets,
+    )
+
+
+@router.post(PATH, dependencies=[OPERATE, COMPUTE_SLOT])
+def post_correction_form(
+    name: NamePath,
+    measurement: MeasurementPath,
+    form: Annotated[CorrectionForm, Form()],
+    runtime: RuntimeDep,
+    identity: IdentityDep,
+) -> Response:
+    """Correct or exclude a photograph.
+
+    Return to its page, or to the job that predicts the surface again.
+    """
+    changes = PhotographChanges(
+        reason=form.reason,
+        target_name=form.target,
+        sun=form.sun,
+        taken_at=form.taken_at,
+        excluded=form.excluded,
+    )
+    correct_photograph(runtime, name, measurement, changes, identity.name)
+    if form.predict_again:
+        return go_to(f"/jobs/{predict_again(runtime, name, identity.name)}")
+    return go_to(f"/heliostats/{name}/photographs/{measurement}")
+
+
+@router.post(PATH + "/delete", dependencies=[OPERATE])
+def post_deletion_form(
+    name: NamePath,
+    measurement: MeasurementPath,
+    form: Annotated[DeletionForm, Form()],
+    runtime: RuntimeDep,
+    identity: IdentityDep,
+) -> Response:
+    """Delete all images of a photograph, and return to its heliostat."""
+    delete_photograph(runtime, name, measurement, form.reason, identity.name)
+    return go_to(f"/heliostats/{name}")

@@ -1,0 +1,1 @@
+"""Responses: representations, pages of lists, problem documents, and the OpenAPI document."""

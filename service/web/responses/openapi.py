@@ -1,0 +1,173 @@
+"""The OpenAPI document: the schema of errors, and the error statuses of each route."""
+
+from typing import Any
+
+from fastapi import FastAPI
+from fastapi.openapi.utils import get_openapi
+
+from service.web.auth import security
+from service.web.responses import formats
+from service.web.responses.problem_schema import Problem
+from service.web.responses.problems import PROBLEM_MEDIA_TYPE
+
+_MEANINGS = {
+    400: "The body could not be read.",
+    401: "A key is needed, and none that is valid was presented.",
+    403: "The key's role is not enough, or the request comes from another site's page.",
+    404: "Something that the path or the body names is not stored.",
+    405: "This path takes other methods only; see Allow.",
+    406: "None of the media types in Accept is offered.",
+    408: "The body did not come in time.",
+    409: "The store is in no state to do this; the detail says what to do first.",
+    410: "It was kept, and no longer is; the detail says why.",
+    413: "The body or the image is too large.",
+    415: "The body or the image is of a format that is not taken.",
+    421: "Host is no name of this service, and no key was presented.",
+    422: "A field is wrong; the detail names it.",
+    429: "Too many requests, or too many jobs that wait; see Retry-After.",
+    500: "The service failed.",
+    507: "The store has no space left, and nothing was stored.",
+    503: (
+        "The database does not answer, the weights are damaged, or the service is busy; see"
+        " Retry-After."
+    ),
+}
+
+
+_TAGS = [
+    {
+        "name": "plant",
+        "description": (
+            "The tower base, which everything is measured from, its targets and receivers."
+        ),
+    },
+    {
+        "name": "heliostats",
+        "description": "Where heliostats stand and how they are built (PAINT properties).",
+    },
+    {
+        "name": "measurements",
+        "description": "Target photographs: post them, read flux and quality back.",
+    },
+    {
+        "name": "surfaces",
+        "description": "Mirror surfaces by version: predict them, read the history.",
+    },
+    {
+        "name": "forecasts",
+        "description": "Flux maps of one heliostat on any plane, or of a field on any receiver.",
+    },
+    {
+        "name": "studies",
+        "description": (
+            "What photographs demand and the model lacks: find it, adopt it into the model,"
+            " withdraw it. Differences, as `residual.mean_map_8x8` [of the measured peak], are"
+            " forecast minus photograph."
+        ),
+    },
+    {
+        "name": "jobs",
+        "description": "Work that outlives a request: ask for it, follow it, cancel it.",
+    },
+    {"name": "audit", "description": "Who did what when."},
+    {"name": "session", "description": "For pages: a session in a cookie."},
+    {"name": "health", "description": "For supervisors."},
+]
+
+TEXT = {"type": "string"}
+BINARY = {"type": "string", "format": "binary"}
+
+
+def problems(*statuses: int) -> dict[int | str, dict[str, object]]:
+    """Documented error responses of a route.
+
+    Statuses that do not depend on the work of the route are added automatically.
+    """
+    return {
+        status: {"model": Problem, "description": _MEANINGS[status]}
+        for status in sorted({500, *statuses})
+    }
+
+
+def arrays(model: Any, description: str) -> dict[int | str, dict[str, object]]:
+    """Documented response with a JSON ``model`` and its other representations."""
+    binary = {media_type: {"schema": BINARY} for media_type in formats.ARRAYS[1:]}
+    return {200: {"model": model, "description": description, "content": binary}}
+
+
+def _as_problem(response: dict[str, Any]) -> None:
+    content = response.get("content", {})
+    if "application/json" in content:
+        content[PROBLEM_MEDIA_TYPE] = content.pop("application/json")
+
+
+def _as_form(body: dict[str, Any]) -> None:
+    """Describe the form of a photograph as client generators and Swagger UI expect it.
+
+    The form has a file and a JSON document. FastAPI documents the missing file as null, but a form
+    cannot hold null. A form without a file has no such part.
+    """
+    image, metadata = body["properties"]["image"], body["properties"]["metadata"]
+    image.pop("anyOf", None)
+    image |= {"type": "string", "format": "binary"}
+    schema = metadata.pop("contentSchema")
+    body["properties"]["metadata"] = schema
+
+
+def _by_themselves(path: str, method: str, operation: dict[str, Any]) -> set[int]:
+    """Statuses of authentication and of invalid requests, which do not depend on the route."""
+    statuses, needs_key = {405, 500}, "security" in operation
+    if path not in security.HEALTH:
+        statuses |= {429, 503}
+    if needs_key:
+        statuses |= {401, 403, 421}
+    if method != "get":
+        statuses |= {403, 413, 507} if needs_key else {403, 413}
+    if "parameters" in operation:
+        statuses |= {422}
+    if "requestBody" in operation:
+        statuses |= {400, 408, 413, 415, 422}
+    return statuses
+
+
+def _document(app: FastAPI) -> dict[str, Any]:
+    document = get_openapi(
+        title=app.title,
+        version=app.version,
+        description=app.description,
+        routes=app.routes,
+        tags=_TAGS,
+    )
+    problem = {"application/json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
+    for path, operations in document["paths"].items():
+        for method, operation in operations.items():
+            responses = operation["responses"]
+            if "HTTPValidationError" in str(responses.get("422")):
+                del responses["422"]  # the default schema of FastAPI
+            for status in _by_themselves(path, method, operation):
+                responses.setdefault(
+                    str(status), {"description": _MEANINGS[status], "content": dict(problem)}
+                )
+            operation["responses"] = dict(sorted(responses.items()))
+            for status, response in responses.items():
+                if int(status) >= 400 and "Problem" in str(response):
+                    _as_problem(response)
+    _as_form(document["components"]["schemas"]["Body_post_measurement"])
+    post = document["paths"]["/v1/heliostats/{name}/measurements"]["post"]
+    post["requestBody"]["content"]["multipart/form-data"]["encoding"] = {
+        "metadata": {"contentType": "application/json"}
+    }
+    for unused in ("HTTPValidationError", "ValidationError"):
+        document["components"]["schemas"].pop(unused, None)
+    return document
+
+
+def install(app: FastAPI) -> None:
+    """Make ``app`` serve this document instead of the default of FastAPI."""
+
+    def openapi() -> dict[str, object]:
+        if app.openapi_schema is None:
+            app.openapi_schema = _document(app)
+        return app.openapi_schema
+
+    app.openapi = openapi  # type: ignore[method-assign]  # as the FastAPI documentation does

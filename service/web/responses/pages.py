@@ -1,0 +1,220 @@
+"""Rendering of templates, and responses for browsers instead of JSON."""
+
+import hashlib
+import json
+from collections.abc import Callable
+from contextvars import ContextVar
+from dataclasses import dataclass, field
+from datetime import datetime
+from functools import cache
+from http import HTTPStatus
+from typing import Any
+from urllib.parse import quote, urlencode
+
+from fastapi import Request, Response
+from fastapi.responses import HTMLResponse, RedirectResponse
+from jinja2 import Environment
+from markupsafe import Markup
+from starlette.datastructures import Headers
+from starlette.types import Scope
+
+from service.base.arrays import pack
+from service.base.errors import NotFoundError
+from service.drawing.charts import Figure
+from service.drawing.templates import ASSETS, environment, moment
+from service.web.auth.security import Identity, Role
+from service.web.responses.csv_tables import CSV, Column, PageTable, sheet
+from service.web.responses.fragments import Part
+
+# Settings of htmx: no code from text and no inline styles, which the content security policy
+# forbids. Error responses are shown, too.
+_HTMX = {
+    "allowEval": False,
+    "includeIndicatorStyles": False,
+    "selfRequestsOnly": True,
+    "historyCacheSize": 0,
+    "responseHandling": [
+        {"code": "204", "swap": False},
+        {"code": "[23]..", "swap": True},
+        {"code": "[45]..", "swap": True, "error": True},
+    ],
+}
+
+# htmx puts an error into the notice of `base.html`, whatever part of the page it requested.
+_NOTICE = {
+    "HX-Retarget": "#notice",
+    "HX-Reswap": "innerHTML",
+    "HX-Reselect": ".alert",
+    "HX-Push-Url": "false",
+}
+
+
+@cache
+def asset(name: str) -> str:
+    """The path of a style or script. It holds a digest of the content, so browsers may cache it."""
+    digest = hashlib.sha256(ASSETS.joinpath(name).read_bytes()).hexdigest()[:12]
+    return f"/static/{name}?v={digest}"
+
+
+@dataclass
+class _Rendering:
+    """State of a page while it is rendered: its path, and its figures and tables by name."""
+
+    page: str
+    figures: dict[str, Figure] = field(default_factory=dict)
+    tables: dict[str, PageTable] = field(default_factory=dict)
+
+    def link(self, **part: str) -> str:
+        """The URL of a part of the page."""
+        return f"{self.page}{'&' if '?' in self.page else '?'}{urlencode(part)}"
+
+
+# Macros link to parts of the page, but do not know the page that calls them.
+_RENDERING: ContextVar[_Rendering] = ContextVar("rendering")
+
+
+def _new_table(name: str) -> PageTable:
+    """Begin a table of the page. The URL ``link_to_table`` is its CSV."""
+    made = _RENDERING.get().tables[name] = PageTable()
+    return made
+
+
+def _add_cell(*cell: Any) -> Column:
+    """Add a cell to the newest table of the page."""
+    return next(reversed(_RENDERING.get().tables.values())).add(*cell)
+
+
+def _shown(value: Any) -> str:
+    """The value of a table's cell as text of the page."""
+    match value:
+        case list():
+            return Markup("").join(map(_shown, value))
+        case datetime() | None:
+            return moment(value)
+    return str(value)
+
+
+def _link_to_table(name: str) -> str:
+    return _RENDERING.get().link(table=name)
+
+
+def _link_to_figure(name: str, figure: Figure) -> str:
+    """Register a figure of the page, and return its URL without the ``format``.
+
+    The URL is valid while the page shows the figure.
+    """
+    _RENDERING.get().figures[name] = figure
+    return _RENDERING.get().link(figure=name)
+
+
+def _environment() -> Environment:
+    made = environment("service.web.pages", "service.drawing")
+    made.globals.update(asset=asset, htmx_settings=json.dumps(_HTMX))
+    made.globals.update(link_to_table=_link_to_table, link_to_figure=_link_to_figure)
+    made.globals.update(new_table=_new_table, add_cell=_add_cell)
+    made.filters.update(shown=_shown)
+    return made
+
+
+TEMPLATES = _environment()
+"""The templates of the pages."""
+
+
+def _text(scope: Scope, template: str, context: dict[str, object]) -> tuple[str, _Rendering]:
+    identity: Identity | None = scope.get("state", {}).get("identity")
+    may = {
+        f"may_{role}": identity is not None and identity.role.includes(role)
+        for role in (Role.OPERATE, Role.ADMIN)
+    }
+    path, query = scope.get("path", ""), scope.get("query_string", b"").decode("ascii", "replace")
+    rendering = _Rendering(quote(path) + (f"?{query}" if query else ""))
+    token = _RENDERING.set(rendering)
+    try:
+        text = TEMPLATES.get_template(template).render(context, identity=identity, here=path, **may)
+        return text, rendering
+    finally:
+        _RENDERING.reset(token)
+
+
+def _page(scope: Scope, template: str, status: int, context: dict[str, object]) -> HTMLResponse:
+    return HTMLResponse(_text(scope, template, context)[0], status)
+
+
+def render(
+    request: Request, template: str, status: int = HTTPStatus.OK, **context: Any
+) -> HTMLResponse:
+    """Render a page, or the requested part of it.
+
+    Raises
+    ------
+    NotFoundError
+        If the page has no such part.
+    """
+    part: Part | None = request.scope.get("state", {}).get("part")
+    if part is None:
+        return _page(request.scope, template, status, context)
+    name = "-".join(filter(None, [*request.scope["path"].split("/"), part.table or part.figure]))
+    rendering = _text(request.scope, template, context)[1]
+    if part.table is not None:
+        if part.table not in rendering.tables:
+            raise NotFoundError(f"table: this page has no table {part.table!r} now")
+        return _file(rendering.tables[part.table].csv(), name, "csv")
+    figure = rendering.figures.get(str(part.figure))
+    if figure is None:
+        raise NotFoundError(f"figure: this page has no figure {part.figure!r} now")
+    if part.format not in figure.formats:
+        raise NotFoundError(f"format: {part.figure} is offered as {' and '.join(figure.formats)}")
+    return _file(_WRITERS[part.format](figure), name, part.format)
+
+
+_WRITERS: dict[str, Callable[[Any], str | bytes]] = {
+    "csv": lambda series: sheet(*series.sheet),
+    "npz": lambda drawn: pack(drawn.arrays),
+    "png": lambda drawn: drawn.drawn(),
+}
+_MEDIA_TYPES = {"csv": f"{CSV}; charset=utf-8", "npz": "application/x-npz", "png": "image/png"}
+
+
+def _file(content: str | bytes, name: str, suffix: str) -> HTMLResponse:
+    """A part of a page as a file. It is an HTMLResponse, because it replaces the page."""
+    headers = {
+        "Content-Disposition": f'attachment; filename="{name}.{suffix}"',
+        "Cache-Control": "private, no-cache",
+    }
+    return HTMLResponse(content, media_type=_MEDIA_TYPES[suffix], headers=headers)
+
+
+def go_to(path: str) -> Response:
+    """Redirect after a form. htmx takes the part that it requested from the new page."""
+    return RedirectResponse(path, HTTPStatus.SEE_OTHER)
+
+
+def leave_for(request: Request, path: str) -> Response:
+    """Redirect to another page as a whole. htmx needs a header for this."""
+    return (
+        Response(headers={"HX-Redirect": path}) if "hx-request" in request.headers else go_to(path)
+    )
+
+
+def wants_page(scope: Scope) -> bool:
+    """Whether a browser requests a page, and not a resource of the REST interface."""
+    headers = Headers(scope=scope)
+    is_browser = "text/html" in headers.get("accept", "") or "hx-request" in headers
+    return is_browser and not scope.get("path", "").startswith("/v1/")
+
+
+def error_page(scope: Scope, document: dict[str, Any]) -> HTMLResponse:
+    """Render a problem document: a page, or for htmx only the message."""
+    is_part = "hx-request" in Headers(scope=scope)
+    page = _page(
+        scope, "alert.html" if is_part else "error.html", document["status"], {"problem": document}
+    )
+    page.headers.update(_NOTICE if is_part else {})
+    return page
+
+
+def login_path(scope: Scope) -> str:
+    """The path of the login page, with the wanted page in its query."""
+    wanted = scope.get("path", "/")
+    query = scope.get("query_string", b"").decode("ascii", "replace")
+    return f"/login?next={quote(f'{wanted}?{query}' if query else wanted, '')}"

@@ -1,0 +1,37 @@
+"""Pages of lists, and their filter and sort parameters."""
+
+from collections.abc import Sequence
+from typing import Annotated, Generic, Literal, TypeVar
+
+from fastapi import Query
+from pydantic import BaseModel, Field
+
+from service.base.fields import Moment
+
+Item = TypeVar("Item")
+
+Since = Annotated[
+    Moment | None, Query(description="Only those from this time on (time with zone).")
+]
+Until = Annotated[Moment | None, Query(description="Only those before this time (time with zone).")]
+Direction = Literal["up", "down"]
+"""Sort direction: "up" begins with the smallest or oldest item, "down" with the largest."""
+OrderQuery = Annotated[
+    Direction, Query(description="up: the oldest, or smallest, first; down: the other way round.")
+]
+
+
+class Page(BaseModel, Generic[Item]):
+    """A part of a list."""
+
+    items: list[Item]
+    next: str | None = Field(description="Pass as `after` for the next page; null on the last.")
+
+
+def page(items: Sequence[Item], limit: int, mark: str = "id") -> Page[Item]:
+    """Build a page of ``limit`` items from up to ``limit`` + 1.
+
+    The next page begins after the ``mark`` of the last item.
+    """
+    shown = list(items[:limit])
+    return Page(items=shown, next=str(getattr(shown[-1], mark)) if len(items) > limit else None)

@@ -1,0 +1,1 @@
+"""Representations of maps other than JSON, one module each with its `REPRESENTATION`."""

@@ -1,0 +1,236 @@
+"""Counts of what makes the code hard to read: ``python -m tests.codebase``.
+
+``--check`` fails if a count exceeds its limit (`LIMITS`); ``--all`` lists the places.
+"""
+
+import ast
+import re
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("model", "service", "training")
+MAX_PARAMETERS = 7
+MAX_CLASS_LINES = 150
+
+TEXTS = (
+    "*.py",
+    "*.html",
+    "*.js",
+    "*.css",
+    "*.md",
+    "*.yml",
+    "*.yaml",
+    "*.toml",
+    "Makefile",
+    "Dockerfile",
+)
+WORDS = {
+    "told, tells": r"\b(?:told|tells?)\b",
+    "stands, stood": r"\b(?:stands|stood)\b",
+    "set aside": r"\bset[ _]aside\b",
+    "anew": r"\banew\b",
+    "doubt": r"\bdoubt(?:s|ed|ful)?\b",
+    "today's": r"\btoday's\b",
+    "given up": r"\bg(?:iven|ive|ives|iving|ave)[ _](?:up|way)\b",
+    "worked out": r"\bwork(?:ed|s)? (?:it |them )?out\b",
+    "whoever, whither": r"\b(?:whoever|whither|whence|thereof)\b",
+    "of its own": r"\bof (?:its|their|our|his) own\b",
+    "held against": r"\bh[eo]ld(?:s)? against\b",
+    "Book, Gate, Shot, Deed": (
+        r"(?-i:\b(?<!NURBS )(?:\w*Book|Gate|Turns|Shots?|Wanted|Shown)\b)|\bdeeds?\b"
+    ),
+    "room, house": r"\b(?:rooms?|houses?)\b",
+    "strangeness": r"\bstrangeness\b",
+    "believe": r"\bbelie(?:ve|ves|ved|f)\b",
+}
+"""Words of WORDS.md's left column, each with the pattern that finds it."""
+
+
+@dataclass(frozen=True)
+class Definition:
+    """A class or function: where it is, its name and its syntax tree."""
+
+    path: str
+    node: ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
+
+    @property
+    def place(self) -> str:
+        """``path:line name``."""
+        return f"{self.path}:{self.node.lineno} {self.node.name}"
+
+
+def python_files(packages: tuple[str, ...] = PACKAGES) -> list[Path]:
+    """The Python files of the packages, in order."""
+    return sorted(path for package in packages for path in (ROOT / package).rglob("*.py"))
+
+
+@cache
+def definitions() -> tuple[Definition, ...]:
+    """All classes and functions of the product."""
+    found = []
+    for path in python_files():
+        tree = ast.parse(path.read_text())
+        kinds = (ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+        where = path.relative_to(ROOT).as_posix()
+        found += [Definition(where, node) for node in ast.walk(tree) if isinstance(node, kinds)]
+    return tuple(found)
+
+
+def product_lines() -> int:
+    """Lines of Python in the product."""
+    return sum(len(path.read_text().splitlines()) for path in python_files())
+
+
+def old_words() -> Counter[str]:
+    """How often each word that WORDS.md replaces occurs in code, pages and documents."""
+    counts: Counter[str] = Counter()
+    for text in texts():
+        for word, pattern in WORDS.items():
+            counts[word] += len(re.findall(pattern, text, re.IGNORECASE))
+    return counts
+
+
+def texts() -> Iterator[str]:
+    """Code, pages and documents that people read, without the lists of words in this file."""
+    folders = [ROOT / name for name in (*PACKAGES, "tests", "docker", "migrations")]
+    paths = {path for folder in folders for pattern in TEXTS for path in folder.rglob(pattern)}
+    for path in sorted(paths | {ROOT / "README.md", ROOT / "Makefile"}):
+        if path != Path(__file__) and ".min." not in path.name:
+            yield path.read_text()
+
+
+def repeated_classes() -> dict[str, list[str]]:
+    """Names of classes that occur more than once in a package."""
+    places: dict[tuple[str, str], list[str]] = {}
+    for definition in definitions():
+        if isinstance(definition.node, ast.ClassDef):
+            package = definition.path.partition("/")[0]
+            places.setdefault((package, definition.node.name), []).append(definition.place)
+    return {name: found for (_, name), found in places.items() if len(found) > 1}
+
+
+def long_classes() -> list[str]:
+    """Classes with more lines than `MAX_CLASS_LINES`."""
+    return [
+        f"{d.place} {_lines(d.node)}"
+        for d in definitions()
+        if isinstance(d.node, ast.ClassDef) and _lines(d.node) > MAX_CLASS_LINES
+    ]
+
+
+def wide_functions() -> list[str]:
+    """Functions with more parameters than `MAX_PARAMETERS`, but for verbs and routes, which declare
+    options.
+    """
+    return [
+        f"{d.place} {_parameters(d.node)}"
+        for d in _functions()
+        if _parameters(d.node) > MAX_PARAMETERS
+    ]
+
+
+def bare_tuples() -> list[str]:
+    """Functions that return a tuple of different things without names."""
+    return [
+        d.place for d in _functions() if d.node.returns is not None and _is_record(d.node.returns)
+    ]
+
+
+def lines_with(word: str) -> int:
+    """Lines of the product that name ``word``."""
+    return sum(word in line for path in python_files() for line in path.read_text().splitlines())
+
+
+def _functions() -> Iterator[Definition]:
+    for definition in definitions():
+        is_endpoint = definition.path.startswith(
+            ("service/cli/verbs/", "service/web/api/", "service/web/pages/")
+        )
+        if not isinstance(definition.node, ast.ClassDef) and not (
+            is_endpoint and definition.node.decorator_list
+        ):
+            yield definition
+
+
+def _lines(node: ast.stmt) -> int:
+    return (node.end_lineno or node.lineno) - node.lineno + 1
+
+
+def _parameters(node: ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) -> int:
+    assert not isinstance(node, ast.ClassDef)
+    names = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
+    return sum(argument.arg not in ("self", "cls") for argument in names)
+
+
+def _is_record(annotation: ast.expr) -> bool:
+    """Whether it is a tuple of fixed length; ``tuple[X, ...]`` of like things is a sequence."""
+    text = ast.unparse(annotation).removesuffix(" | None")
+    return text.startswith("tuple[") and not text.endswith(", ...]")
+
+
+LIMITS = {
+    "product lines": 53_075,
+    "words that WORDS.md replaces": 10,
+    "names of two or more classes": 5,
+    f"functions above {MAX_PARAMETERS} parameters": 0,
+    "functions that return a bare tuple": 40,
+    f"classes above {MAX_CLASS_LINES} lines": 0,
+    "lines with latitude_deg": 15,
+    "dict[str, Any] in service": 120,
+}
+"""The most of each count. A limit is lowered when its count falls; it never rises."""
+
+
+def count_all() -> dict[str, int]:
+    """Return each count of `LIMITS`."""
+    found = (
+        product_lines(),
+        old_words().total(),
+        len(repeated_classes()),
+        len(wide_functions()),
+        len(bare_tuples()),
+        len(long_classes()),
+        lines_with("latitude_deg"),
+        sum(path.read_text().count("dict[str, Any]") for path in python_files(("service",))),
+    )
+    return dict(zip(LIMITS, found, strict=True))
+
+
+def check() -> None:
+    """Exit with an error that names each count above its limit."""
+    counts = count_all()
+    exceeded = [
+        f"{name}: {counts[name]}, at most {limit}"
+        for name, limit in LIMITS.items()
+        if counts[name] > limit
+    ]
+    if exceeded:
+        sys.exit("\n".join([*exceeded, "python -m tests.codebase --all lists the places"]))
+
+
+def details() -> str:
+    """What is behind the counts, one place a line."""
+    blocks = {
+        "words": [f"{word}: {count}" for word, count in old_words().most_common()],
+        "repeated classes": [
+            f"{name}: {', '.join(places)}" for name, places in repeated_classes().items()
+        ],
+        "wide functions": wide_functions(),
+        "long classes": long_classes(),
+        "bare tuples": bare_tuples(),
+    }
+    return "\n\n".join("\n".join([f"# {name}", *lines]) for name, lines in blocks.items())
+
+
+if __name__ == "__main__":
+    for count_name, count in count_all().items():
+        sys.stdout.write(f"{count:>7,}  {count_name}\n")
+    if "--check" in sys.argv:
+        check()
+    if "--all" in sys.argv:
+        sys.stdout.write("\n" + details() + "\n")

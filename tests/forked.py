@@ -1,0 +1,63 @@
+"""Processes that begin as copies of one that has loaded the service's libraries.
+
+A separate process takes seconds to load them. The copies are made by a server of the standard
+library, which does nothing else: no thread runs in it when it is copied.
+"""
+
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+_CONTEXT = multiprocessing.get_context("forkserver")
+_CONTEXT.set_forkserver_preload(["tests.faults.process", "tests.service.job_kinds"])
+
+
+def _run(target: Callable[..., None], environment: dict[str, str], *arguments: str) -> None:
+    os.environ.clear()
+    os.environ.update(environment)
+    with Path(os.devnull).open("wb") as nothing:
+        os.dup2(nothing.fileno(), 2)
+    target(*arguments)
+
+
+class ForkedProcess:
+    """The part of `subprocess.Popen` that tests need."""
+
+    def __init__(
+        self, target: Callable[..., None], environment: Mapping[str, str], *arguments: str
+    ) -> None:
+        given = (target, dict(environment), *arguments)
+        self._process = _CONTEXT.Process(target=_run, args=given)
+        self._process.start()
+        assert self._process.pid is not None
+        self.pid: int = self._process.pid
+        self.returncode: int | None = None
+
+    def poll(self) -> int | None:
+        self.returncode = self._process.exitcode
+        return self.returncode
+
+    def send_signal(self, number: int) -> None:
+        if self.poll() is None:
+            os.kill(self.pid, number)
+
+    def wait(self, timeout: float | None = None) -> int:
+        self._process.join(timeout)
+        code = self.poll()
+        assert code is not None, "the process does not end"
+        return code
+
+
+@contextmanager
+def forked_process(
+    target: Callable[..., None], environment: Mapping[str, str], *arguments: str
+) -> Iterator[ForkedProcess]:
+    """A process that calls ``target``; killed at the end, where it still runs, and waited for."""
+    process = ForkedProcess(target, environment, *arguments)
+    try:
+        yield process
+    finally:
+        process._process.kill()
+        process.wait()
