@@ -174,9 +174,9 @@ def _is_record(annotation: ast.expr) -> bool:
 
 
 LIMITS = {
-    "product lines": 53_075,
+    "product lines": 53_078,
     "words that WORDS.md replaces": 10,
-    "names of two or more classes": 5,
+    "names of two or more classes": 0,
     f"functions above {MAX_PARAMETERS} parameters": 0,
     "functions that return a bare tuple": 40,
     f"classes above {MAX_CLASS_LINES} lines": 0,

@@ -49,7 +49,7 @@ HELD_OUT = 4
 
 
 @dataclass(frozen=True)
-class Result:
+class HeliostatResult:
     """Results for one heliostat: mean accuracies over the test images, surface errors in mm.
 
     ``held_out`` is False if the test images were also used for the prediction, because there are
@@ -135,7 +135,7 @@ def _open_store(folder: Path) -> Runtime:
 class _Made:
     """A result with its surfaces (4, 8, 8) [m], test images and refined forecasts."""
 
-    result: Result
+    result: HeliostatResult
     surfaces: dict[str, Array | None]
     judged: list[Observation]
     forecasts: list[Array]
@@ -200,7 +200,7 @@ def _predict(
         key: float(np.mean([flux_accuracy(o.flux, f) for o, f in zip(judged, images, strict=True)]))
         for key, images in fluxes.items()
     }
-    result = Result(
+    result = HeliostatResult(
         heliostat=name,
         used=len(used),
         judged=len(judged),
@@ -248,7 +248,7 @@ def _forecast(
     return flux_window(traced.camera_view, (wide, wide), center, FLUX_WINDOW, FLUX_SIZE)
 
 
-def _drawn(out: Path, made: Sequence[_Made], ends: Mapping[str, float]) -> list[Result]:
+def _drawn(out: Path, made: Sequence[_Made], ends: Mapping[str, float]) -> list[HeliostatResult]:
     """Results with their pictures, all on the same scales.
 
     ``ends`` are the scales of the settings.
@@ -298,7 +298,7 @@ CAPTION = (
 )
 
 
-def _row(result: Result) -> tuple[str, ...]:
+def _row(result: HeliostatResult) -> tuple[str, ...]:
     images = f"{result.used} + {result.judged}" if result.held_out else str(result.used)
     figures = (
         result.accuracy_ideal,
@@ -311,7 +311,7 @@ def _row(result: Result) -> tuple[str, ...]:
     return (result.heliostat, images, *map(_cell, figures))
 
 
-def _print(console: Console, results: list[Result], out: Path, store: Path) -> None:
+def _print(console: Console, results: list[HeliostatResult], out: Path, store: Path) -> None:
     table = make_table("What the surfaces are worth", *COLUMNS)
     table.caption, table.caption_justify = CAPTION, "left"
     for result in results:
@@ -326,7 +326,7 @@ def _print(console: Console, results: list[Result], out: Path, store: Path) -> N
     console.print(said, highlight=False, markup=False, soft_wrap=True)
 
 
-def _page(report: dict[str, Any], results: list[Result]) -> str:
+def _page(report: dict[str, Any], results: list[HeliostatResult]) -> str:
     """HTML page with a conclusion, the table and links to the pictures."""
     judging = [result for result in results if result.held_out] or results
     photographs = sum(result.judged for result in judging)

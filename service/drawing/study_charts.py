@@ -138,7 +138,7 @@ DRAWN = ("sun elevation", "slant range", "solar time", "recorded time")
 
 
 @dataclass(frozen=True)
-class Dot:
+class ErrorPair:
     """An image's error before and after: positions from 0 to 1, rightwards and upwards."""
 
     key: str
@@ -152,7 +152,7 @@ class Scatter:
     """Error of all held-out images against one quantity, with the rank correlations."""
 
     label: str
-    dots: list[Dot]
+    dots: list[ErrorPair]
     x_ticks: tuple[Tick, ...]
     y_ticks: tuple[Tick, ...]
     correlation_before: float
@@ -175,7 +175,7 @@ def _scatter(study: Study, label: str, x: Array) -> Scatter:
     low, high = float(x.min()) - margin, float(x.max()) + margin
     top = 1.08 * float(max(before.max(), after.max()))
     dots = [
-        Dot(p.key, (float(at) - low) / (high - low), float(one) / top, float(other) / top)
+        ErrorPair(p.key, (float(at) - low) / (high - low), float(one) / top, float(other) / top)
         for p, at, one, other in zip(study.images, x, before, after, strict=True)
     ]
     correlations = rank_correlation(before, x), rank_correlation(after, x)

@@ -21,7 +21,7 @@ FEW = 8
 
 
 @dataclass(frozen=True)
-class Value:
+class FittedValue:
     """A fitted number with its 95 % interval; ``telling`` if that excludes the neutral value."""
 
     value: float
@@ -37,7 +37,7 @@ class Fitted:
     name: str
     unit: str
     owner: str
-    values: list[Value]
+    values: list[FittedValue]
 
 
 @dataclass(frozen=True)
@@ -93,9 +93,9 @@ def _rows(parameter: Parameter, fitted: Mapping[str, Any], of: str) -> list[Fitt
     return [Fitted(parameter.name, parameter.unit, owner, ones) for owner, ones in values.items()]
 
 
-def _value(parameter: Parameter, value: float, ci95: tuple[float, float]) -> Value:
+def _value(parameter: Parameter, value: float, ci95: tuple[float, float]) -> FittedValue:
     low, high = ci95
-    return Value(value, low, high, not low <= parameter.neutral <= high)
+    return FittedValue(value, low, high, not low <= parameter.neutral <= high)
 
 
 def study_page(

@@ -24,7 +24,7 @@ from service.store.job_tables import JobRow
 from service.store.jobs import queue
 from service.store.tables import DriftRow, HeliostatRow
 from service.twin.alerts.alerts import REASONS, Alert, list_alerts
-from service.twin.alerts.field_overview import PATIENCE_S, FieldOverviewCache, HeliostatSummary
+from service.twin.alerts.field_overview import PATIENCE_S, FieldOverviewCache, HeliostatOverview
 from service.twin.runtime.runtime import Runtime
 from service.twin.studies.camera_watch import CameraChange
 
@@ -141,7 +141,7 @@ def _attention(items: Sequence[Alert]) -> Metric:
     return family
 
 
-def _trust(lines: Sequence[HeliostatSummary], most: int) -> Iterator[Metric]:
+def _trust(lines: Sequence[HeliostatOverview], most: int) -> Iterator[Metric]:
     """Counts of active surfaces by trust, and the surfaces that are untrusted longest."""
     surfaces = [(line.name, line.surface) for line in lines if line.surface is not None]
     trusted = Counter(_VERDICTS[surface.trusted] for _, surface in surfaces)
@@ -173,7 +173,7 @@ def _trust(lines: Sequence[HeliostatSummary], most: int) -> Iterator[Metric]:
     yield _worst("heliotwin_heliostat_sun_span_degrees", about, spans, most, is_better_high=True)
 
 
-def _pointing(lines: Sequence[HeliostatSummary], most: int) -> Iterator[Metric]:
+def _pointing(lines: Sequence[HeliostatOverview], most: int) -> Iterator[Metric]:
     """Pointing errors of the worst heliostats, and the latest moves."""
     known = [(line, line.pointing) for line in lines if line.pointing is not None]
     prefix, worst = "heliotwin_heliostat_pointing", "; the worst heliostats only."

@@ -46,7 +46,7 @@ from service.twin.alerts.field_overview import (
     PATIENCE_S,
     ActiveSurface,
     FieldOverviewCache,
-    HeliostatSummary,
+    HeliostatOverview,
 )
 from service.twin.plant import model_versions
 from service.twin.pointing.errors import DriveStep, PointingState
@@ -135,7 +135,7 @@ def list_alerts(session: Session, cache: FieldOverviewCache, settings: Settings)
 
 def alerts_of_heliostats(
     session: Session,
-    lines: Sequence[HeliostatSummary],
+    lines: Sequence[HeliostatOverview],
     settings: Settings,
     cameras: Sequence[CameraChange],
 ) -> list[Alert]:
@@ -178,7 +178,7 @@ def _with_acknowledgement(
 # --------------------------------------------------------------------------------------------------
 
 
-def _of_heliostat(line: HeliostatSummary, settings: Settings, at: datetime) -> Iterator[Alert]:
+def _of_heliostat(line: HeliostatOverview, settings: Settings, at: datetime) -> Iterator[Alert]:
     surface = line.surface or line.candidate
     if surface is not None and surface.warnings:
         yield _untrusted_surfaces(line.name, surface, at)
@@ -211,7 +211,7 @@ def _untrusted_surfaces(name: str, surface: ActiveSurface, at: datetime) -> Aler
 
 
 def _pointing(
-    line: HeliostatSummary, pointing: PointingState, settings: Settings, at: datetime
+    line: HeliostatOverview, pointing: PointingState, settings: Settings, at: datetime
 ) -> Iterator[Alert]:
     moved, is_new = pointing.moved, False
     if moved is not None:

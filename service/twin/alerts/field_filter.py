@@ -7,7 +7,7 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
 from service.base.fields import Search, drop_empty_fields
-from service.twin.alerts.field_overview import HeliostatSummary
+from service.twin.alerts.field_overview import HeliostatOverview
 from service.twin.pointing.errors import NEWEST
 from service.twin.surfaces.accuracy import RECENT
 
@@ -25,7 +25,7 @@ class Metric:
     unit: str
     digits: int
     about: str
-    value: Callable[[HeliostatSummary], float | None]
+    value: Callable[[HeliostatOverview], float | None]
     is_better_high: bool = False
 
     @property
@@ -33,7 +33,7 @@ class Metric:
         """Factor from the value to the unit that is shown."""
         return 100.0 if self.unit == "%" else 1.0
 
-    def shown(self, line: HeliostatSummary) -> float | None:
+    def shown(self, line: HeliostatOverview) -> float | None:
         """The value of a heliostat in the unit that is shown."""
         value = self.value(line)
         return None if value is None else value * self.per_unit
@@ -118,11 +118,11 @@ METRICS: dict[str, Metric] = {
 }
 
 
-def _is_flagged(line: HeliostatSummary) -> bool:
+def _is_flagged(line: HeliostatOverview) -> bool:
     return line.surface is not None and bool(line.surface.warnings)
 
 
-def _has_no_accuracy(line: HeliostatSummary) -> bool:
+def _has_no_accuracy(line: HeliostatOverview) -> bool:
     return line.surface is not None and (line.rank is None or line.rank.accuracy is None)
 
 
@@ -137,7 +137,7 @@ Condition = Literal[
     "no_photographs",
 ]
 
-CONDITIONS: dict[str, tuple[str, Callable[[HeliostatSummary], bool]]] = {
+CONDITIONS: dict[str, tuple[str, Callable[[HeliostatOverview], bool]]] = {
     "flagged": ("surface not trusted", _is_flagged),
     "unacknowledged": (
         "not trusted, not acknowledged",
@@ -163,7 +163,7 @@ Column = Literal[MetricName, "name", "surface_version", "trusted", "photographs"
 Order = Literal["up", "down"]
 
 
-def _trust(line: HeliostatSummary) -> float | None:
+def _trust(line: HeliostatOverview) -> float | None:
     return (
         None
         if line.surface is None or line.surface.trusted is None
@@ -171,7 +171,7 @@ def _trust(line: HeliostatSummary) -> float | None:
     )
 
 
-_OTHERS: dict[str, Callable[[HeliostatSummary], float | None]] = {
+_OTHERS: dict[str, Callable[[HeliostatOverview], float | None]] = {
     "surface_version": lambda line: None if line.surface is None else line.surface.version,
     "trusted": _trust,
     "photographs": lambda line: line.photographs,
@@ -231,7 +231,7 @@ class HeliostatFilter(BaseModel):
         """Whether any condition is set."""
         return bool(self.search or self.show) or self.low is not None or self.high is not None
 
-    def fits(self, line: HeliostatSummary) -> bool:
+    def fits(self, line: HeliostatOverview) -> bool:
         """Whether a heliostat meets all conditions."""
         if self.search.lower() not in line.name.lower():
             return False
@@ -246,8 +246,8 @@ class HeliostatFilter(BaseModel):
 
 
 def filter_heliostats(
-    lines: Sequence[HeliostatSummary], wanted: HeliostatFilter
-) -> list[HeliostatSummary]:
+    lines: Sequence[HeliostatOverview], wanted: HeliostatFilter
+) -> list[HeliostatOverview]:
     """Filter and sort heliostats.
 
     ``lines`` are sorted by name. Heliostats with an unknown value come last. Equal values are

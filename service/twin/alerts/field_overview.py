@@ -114,7 +114,7 @@ class ActiveSurface:
 
 
 @dataclass(frozen=True)
-class HeliostatSummary:
+class HeliostatOverview:
     """Summary of a heliostat; None means unknown or not computed yet.
 
     A ``rank`` without an accuracy means that no photograph can evaluate the surface, because it was
@@ -257,7 +257,7 @@ def _mounts(session: Session, heliostat: int | None) -> dict[int, tuple[int, dat
     return {number: (mount, at) for number, mount, at in found}
 
 
-def read_summaries(session: Session, heliostat: int | None = None) -> list[HeliostatSummary]:
+def read_summaries(session: Session, heliostat: int | None = None) -> list[HeliostatOverview]:
     """Summarize all heliostats in the order of their names, or only one.
 
     Surface figures, accuracies and pointing errors are not included.
@@ -276,7 +276,7 @@ def read_summaries(session: Session, heliostat: int | None = None) -> list[Helio
     for number, name, changed, *place in session.execute(query.order_by(row.name)):
         taken, mount = photographs.get(number, none), mounted.get(number)
         corrected = max((at for at in (taken.corrected, changed) if at is not None), default=None)
-        line = HeliostatSummary(
+        line = HeliostatOverview(
             name,
             place[0],
             place[1],
@@ -318,14 +318,14 @@ def _cache_marks(session: Session) -> Marks:
 class Summaries(NamedTuple):
     """Heliostats, and the number of those with pending results."""
 
-    lines: list[HeliostatSummary]
+    lines: list[HeliostatOverview]
     pending: int
 
 
 class _Snapshot:
     """Summaries as read at one time; slow results are added as they become known."""
 
-    def __init__(self, lines: list[HeliostatSummary], model: int, took_s: float) -> None:
+    def __init__(self, lines: list[HeliostatOverview], model: int, took_s: float) -> None:
         self.took_s, self.count = took_s, len(lines)
         self._lines, self._lock = lines, threading.Lock()
         self._figures = {
@@ -369,7 +369,7 @@ class FieldOverview:
     being read.
     """
 
-    lines: list[HeliostatSummary]
+    lines: list[HeliostatOverview]
     pending: int
     is_behind: bool
 
@@ -432,7 +432,7 @@ class FieldOverviewCache:
             *reading.complete(self._figures, self._accuracies, self._pointing), found is None
         )
 
-    def with_pointing(self, line: HeliostatSummary) -> HeliostatSummary:
+    def with_pointing(self, line: HeliostatOverview) -> HeliostatOverview:
         """Add a heliostat's pointing error, and wait for it; no session should be open."""
         return (
             line

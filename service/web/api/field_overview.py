@@ -9,7 +9,7 @@ from pydantic import BaseModel, Field
 from service.base.errors import NotFoundError
 from service.base.fields import Name, Source
 from service.twin.alerts.field_filter import METRICS, HeliostatFilter, filter_heliostats
-from service.twin.alerts.field_overview import PATIENCE_S, HeliostatSummary
+from service.twin.alerts.field_overview import PATIENCE_S, HeliostatOverview
 from service.web.auth.dependencies import OVERVIEW_SLOT, READ, FieldCacheDep, RuntimeDep
 from service.web.responses.openapi import problems
 from service.web.responses.paging import Page, page
@@ -66,7 +66,7 @@ class FieldLine(BaseModel):
     refused: int
 
 
-def field_line(line: HeliostatSummary) -> FieldLine:
+def field_line(line: HeliostatOverview) -> FieldLine:
     """A heliostat as JSON."""
     surface = line.surface
     return FieldLine.model_validate(

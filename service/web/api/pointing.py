@@ -10,7 +10,7 @@ from pydantic import BaseModel, Field
 from service import store
 from service.base.errors import NotFoundError
 from service.base.fields import Name
-from service.twin.alerts.field_overview import PATIENCE_S, HeliostatSummary, read_summaries
+from service.twin.alerts.field_overview import PATIENCE_S, HeliostatOverview, read_summaries
 from service.twin.pointing.calibration import best_slot
 from service.web.api.mounts import PlannedOut, planned_out
 from service.web.auth.dependencies import READ, FieldCacheDep, Limit, NamePath, RuntimeDep
@@ -89,12 +89,12 @@ class HeliostatPointingOut(PointingOut):
     )
 
 
-def _about(line: HeliostatSummary) -> dict[str, object]:
+def _about(line: HeliostatOverview) -> dict[str, object]:
     own = {} if line.pointing is None else vars(line.pointing)
     return own | {"heliostat": line.name, "error_m": line.pointing_m}
 
 
-def _out(line: HeliostatSummary) -> PointingOut:
+def _out(line: HeliostatOverview) -> PointingOut:
     return PointingOut.model_validate(_about(line), from_attributes=True)
 
 

@@ -330,7 +330,7 @@ def _unseen(compared: Sequence[ComparisonResult]) -> tuple[list[float], int]:
 
 
 @dataclass(frozen=True)
-class _Read:
+class _ComparisonData:
     """Data of the page, read before the slot for drawing is taken.
 
     The slot must not be held while the comparisons are computed.
@@ -344,7 +344,7 @@ class _Read:
 
 def _read(
     query: Annotated[CompareQuery, Query()], runtime: RuntimeDep, cache: ComparisonCacheDep
-) -> _Read:
+) -> _ComparisonData:
     with runtime.database.reading() as session:
         targets = session.scalars(select(TargetRow.name).order_by(TargetRow.name)).all()
         azimuth, elevation = sun_now(session.get(PlantRow, 1))
@@ -355,13 +355,13 @@ def _read(
     compared = [ComparisonResult() if one is None else cache.wait_for(one) for one in shown]
     given = query.azimuth_deg, query.elevation_deg
     sun = (azimuth if given[0] is None else given[0], elevation if given[1] is None else given[1])
-    return _Read(sides, compared, targets, sun)
+    return _ComparisonData(sides, compared, targets, sun)
 
 
 @router.get("/compare", dependencies=[RENDER_SLOT, COMPUTE_SLOT])
 def get_compare_page(
     query: Annotated[CompareQuery, Query()],
-    read: Annotated[_Read, Depends(_read)],
+    read: Annotated[_ComparisonData, Depends(_read)],
     request: Request,
     runtime: RuntimeDep,
 ) -> HTMLResponse:

@@ -27,7 +27,7 @@ from service.twin.alerts.field_filter import (
     default_order,
     filter_heliostats,
 )
-from service.twin.alerts.field_overview import HeliostatSummary
+from service.twin.alerts.field_overview import HeliostatOverview
 from service.web.auth.dependencies import READ, RENDER_SLOT, FieldCacheDep, RuntimeDep
 from service.web.responses.pages import render
 
@@ -99,7 +99,7 @@ class FieldMap:
 
     formats: ClassVar[tuple[str, ...]] = ("npz", "png")
 
-    lines: Sequence[HeliostatSummary]
+    lines: Sequence[HeliostatOverview]
     metric: Metric
     scale: Scale
 
@@ -133,7 +133,7 @@ class FieldMap:
         )
 
 
-def _text(line: HeliostatSummary, metric: Metric) -> str:
+def _text(line: HeliostatOverview, metric: Metric) -> str:
     """Text in place of a missing value."""
     is_unjudged = metric.name == "accuracy" and line.rank is not None and not line.rank.photographs
     return "not yet evaluated" if is_unjudged else "not known"
@@ -163,7 +163,7 @@ def _squares(places: Iterable[tuple[float, float]], side: float) -> str:
 
 
 def _marks(
-    lines: Sequence[HeliostatSummary],
+    lines: Sequence[HeliostatOverview],
     places: dict[str, tuple[float, float]],
     metric: Metric,
     scale: Scale,
@@ -171,7 +171,7 @@ def _marks(
 ) -> list[Marks]:
     values = [metric.shown(line) for line in lines]
     known = [(line, value) for line, value in zip(lines, values, strict=True) if value is not None]
-    groups: dict[str, list[tuple[HeliostatSummary, float]]] = {}
+    groups: dict[str, list[tuple[HeliostatOverview, float]]] = {}
     for entry, colour in zip(known, scale.names([value for _, value in known]), strict=True):
         groups.setdefault(colour, []).append(entry)
     template = (  # `%` formatting, because it is faster for 20,000 heliostats
@@ -198,8 +198,8 @@ def _marks(
 
 
 def draw(
-    lines: Sequence[HeliostatSummary],
-    chosen: Sequence[HeliostatSummary],
+    lines: Sequence[HeliostatOverview],
+    chosen: Sequence[HeliostatOverview],
     metric: Metric,
     scale: Scale,
 ) -> Drawing:
@@ -248,7 +248,7 @@ def _totals(session: Session) -> dict[str, Any]:
     }
 
 
-def _counts(lines: Sequence[HeliostatSummary]) -> dict[str, int]:
+def _counts(lines: Sequence[HeliostatOverview]) -> dict[str, int]:
     """Totals of all heliostats, for the tiles."""
     surfaces = [line.surface for line in lines if line.surface is not None]
     flagged = [surface for surface in surfaces if surface.warnings]

@@ -32,7 +32,7 @@ from service.store.surfaces import decisions
 from service.store.tables import DecisionRow, HeliostatRow, MountRow, SurfaceRow
 from service.twin.alerts.field_overview import (
     FieldTotals,
-    HeliostatSummary,
+    HeliostatOverview,
     field_totals,
     read_summaries,
 )
@@ -238,7 +238,7 @@ def _size(row: HeliostatRow) -> tuple[float, float]:
 
 
 @dataclass(frozen=True)
-class _Read:
+class _HeliostatData:
     """Data of the page, read before the slot for drawing is taken."""
 
     row: HeliostatRow
@@ -250,7 +250,7 @@ class _Read:
     groups: list[PhotographGroup]
     verdict: PhotographVerdict | None
     mount: MountRow | None
-    line: HeliostatSummary
+    line: HeliostatOverview
     best: CalibrationSlot | None
     compared: ComparisonResult
 
@@ -262,7 +262,7 @@ def _read(
     field: FieldCacheDep,
     version: Annotated[Version | None, Query()] = None,
     photographs: Annotated[PhotographVerdict | None, Query()] = None,
-) -> _Read:
+) -> _HeliostatData:
     """Read a heliostat with its active surface, or an earlier ``version``.
 
     It waits for comparisons that are computed in the background.
@@ -283,7 +283,7 @@ def _read(
     compared = ComparisonResult() if shown is None else cache.wait_for(shown) or _UNDER_WAY
     line = field.with_pointing(line)
     best = None if line.pointing is None else best_slot(runtime, name)
-    return _Read(
+    return _HeliostatData(
         row,
         today,
         surface,
@@ -303,7 +303,7 @@ def _read(
 def get_heliostat_page(
     request: Request,
     runtime: RuntimeDep,
-    read: Annotated[_Read, Depends(_read)],
+    read: Annotated[_HeliostatData, Depends(_read)],
     _slot: RenderSlotDep,
 ) -> HTMLResponse:
     """A heliostat with its active surface, or an earlier ``version``.

@@ -101,7 +101,7 @@ _LABELS = {
 _UNITS = {"_w_m2": "\N{NO-BREAK SPACE}W/m²", "_deg": "°", "_minutes": "\N{NO-BREAK SPACE}min"}
 
 
-def _told(name: str, value: Any) -> tuple[str, str]:
+def _entry(name: str, value: Any) -> tuple[str, str]:
     """Label and formatted value of a payload field."""
     ending = next((ending for ending in _UNITS if name.endswith(ending)), "")
     label = _LABELS.get(name, name.removesuffix(ending).replace("_", " "))
@@ -110,9 +110,9 @@ def _told(name: str, value: Any) -> tuple[str, str]:
     if name == "resolution":
         return label, f"{' × '.join(map(str, value))} pixels"
     if isinstance(value, dict):
-        return label, ", ".join(" ".join(_told(inner, of)) for inner, of in value.items())
+        return label, ", ".join(" ".join(_entry(inner, of)) for inner, of in value.items())
     if isinstance(value, list):
-        return label, ", ".join(_told("", one)[1] for one in value)
+        return label, ", ".join(_entry("", one)[1] for one in value)
     if name in ("at", "first_at", "last_at"):
         return label, f"{datetime.fromisoformat(value):%Y-%m-%d %H:%M UTC}"
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
@@ -122,7 +122,7 @@ def _told(name: str, value: Any) -> tuple[str, str]:
 def _asked(payload: dict[str, Any]) -> dict[str, str]:
     """Fields of a payload in words and with units. Long lists are reduced to their length."""
     return dict(
-        _told(name, value) for name, value in payload.items() if value not in (None, {}, [])
+        _entry(name, value) for name, value in payload.items() if value not in (None, {}, [])
     )
 
 

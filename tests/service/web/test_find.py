@@ -22,7 +22,7 @@ from service.twin.alerts.field_overview import (
     ActiveSurface,
     FieldOverviewCache,
     FieldTotals,
-    HeliostatSummary,
+    HeliostatOverview,
 )
 from service.twin.runtime.runtime import Runtime
 from service.twin.surfaces.accuracy import Rank
@@ -44,12 +44,12 @@ OF_1970 = field_overview.datetime.fromisoformat("2026-01-01T00:00:00+00:00")
 
 def line(
     name: str, deviation: float | None = None, accuracy: float | None = None, **more: Any
-) -> HeliostatSummary:
+) -> HeliostatOverview:
     """A heliostat; with a deviation it has a surface."""
     surface = None if deviation is None else ActiveSurface(1, 1, "refined", OF_1970, 0.1, True, [])
     figures = None if deviation is None else FieldTotals(deviation, None)
     return replace(
-        HeliostatSummary(name, 0.0, 1.0, surface=surface, figures=figures, rank=Rank(accuracy, 1)),
+        HeliostatOverview(name, 0.0, 1.0, surface=surface, figures=figures, rank=Rank(accuracy, 1)),
         **more,
     )
 
