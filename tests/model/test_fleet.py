@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from model import neighbours
 from model.effects import Always, Effect
 from model.effects.axis_tilt import AxisTilt
 from model.effects.blocking import Blocking
@@ -170,21 +171,38 @@ def test_half_a_mirror_behind_another():
     )
 
 
+def test_many_obstacles_hide_as_much_in_the_memory_of_few(monkeypatch):
+    """20,000 obstacles of one mirror took 2 GB when all were intersected at once."""
+    generator = torch.Generator().manual_seed(1)
+    obstacles = 5 * torch.randn(2, 300, 3, 3, generator=generator)
+    points, rays = torch.randn(2, 2, 3, 64, generator=generator)
+    monkeypatch.setattr(neighbours, "_INTERSECTED", 2**40)
+    at_once = clear(obstacles, points, rays, torch.full((2,), 0.1))
+    sizes, once = [], neighbours._clear
+    monkeypatch.setattr(neighbours, "_INTERSECTED", 2**10)
+    monkeypatch.setattr(
+        neighbours, "_clear", lambda some, *rest: sizes.append(some.shape[1]) or once(some, *rest)
+    )
+    assert torch.equal(clear(obstacles, points, rays, torch.full((2,), 0.1)), at_once)
+    assert max(sizes) * 2 * 64 <= 2**10
+    assert 0 < float(at_once.mean()) < 1
+
+
 def test_neighbours_that_are_left_out_hide_nothing():
     """The few obstacles that are looked at hide as much as all mirrors of the field do."""
     heliostats = field(5, 5, (3.8, 4.6), 55.0)
-    neighbours = standing_of(heliostats, sun_direction(130.0, 14.0))
+    standing = standing_of(heliostats, sun_direction(130.0, 14.0))
     names = [one.name for one in heliostats]
-    few = neighbours.obstacles(names)
+    few = standing.obstacles(names)
     assert few.shape[1] < 16
     for name, some in zip(names, few, strict=True):
-        rectangle = neighbours.rectangles[neighbours.rows[name]]
-        others = np.delete(neighbours.rectangles, neighbours.rows[name], axis=0)
+        rectangle = standing.rectangles[standing.rows[name]]
+        others = np.delete(standing.rectangles, standing.rows[name], axis=0)
         grid = np.linspace(-0.95, 0.95, 12)
         points = torch.tensor(
             rectangle[0] + [x * rectangle[1] + y * rectangle[2] for x in grid for y in grid]
         ).T[None]
-        for way in (neighbours.sun, np.array([0.0, 0.0, 40.0]) - rectangle[0]):
+        for way in (standing.sun, np.array([0.0, 0.0, 40.0]) - rectangle[0]):
             ray, cell = torch.tensor(way)[None, :, None], torch.tensor([0.2], dtype=torch.float64)
             expected = clear(torch.tensor(others)[None], points, ray, cell)
             torch.testing.assert_close(clear(torch.tensor(some)[None], points, ray, cell), expected)
@@ -205,13 +223,13 @@ def test_blocking_and_shading_of_a_dense_field_against_monte_carlo():
         seed=1,
     )
     some = setups(heliostats, sun, plane.center)
-    neighbours = standing_of(heliostats, sun, plane.center)
+    standing = standing_of(heliostats, sun, plane.center)
     task = Superposition(plane, PlantModel(JUELICH, OPTICS), (18, 18))
-    shaded, free = superpose(task, tiles(some, neighbours)), superpose(task, tiles(some))
+    shaded, free = superpose(task, tiles(some, standing)), superpose(task, tiles(some))
     assert powers.sum() < 0.8 * free.power  # the field is dense
     assert shaded.power == pytest.approx(powers.sum(), rel=3e-3)
     for setup, power in zip(some, powers, strict=True):
-        assert task(tile_of([setup], neighbours)).power == pytest.approx(
+        assert task(tile_of([setup], standing)).power == pytest.approx(
             power, abs=0.01 * free.power / 25
         )
     assert np.abs(shaded.irradiance - expected).sum() < 0.02 * expected.sum()
