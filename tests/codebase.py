@@ -49,6 +49,8 @@ WORDS = {
     "believe": r"\bbelie(?:ve|ves|ved|f)\b",
 }
 """Words of WORDS.md's left column, each with the pattern that finds it."""
+QUOTING = {Path(__file__), ROOT / "service/store/records.py"}
+"""Files that name old words: this list, and the columns of exports of older versions."""
 
 
 @dataclass(frozen=True)
@@ -96,11 +98,12 @@ def old_words() -> Counter[str]:
 
 
 def texts() -> Iterator[str]:
-    """Code, pages and documents that people read, without the lists of words in this file."""
-    folders = [ROOT / name for name in (*PACKAGES, "tests", "docker", "migrations")]
+    """Code, pages and documents that people read; migrations and CHANGELOG name what was."""
+    folders = [ROOT / name for name in (*PACKAGES, "tests", "docker", "docs")]
     paths = {path for folder in folders for pattern in TEXTS for path in folder.rglob(pattern)}
-    for path in sorted(paths | {ROOT / "README.md", ROOT / "Makefile"}):
-        if path != Path(__file__) and ".min." not in path.name:
+    paths |= {ROOT / name for name in ("README.md", "RESULTS.md", "Makefile")}
+    for path in sorted(paths - QUOTING):
+        if ".min." not in path.name:
             yield path.read_text()
 
 
@@ -175,7 +178,7 @@ def _is_record(annotation: ast.expr) -> bool:
 
 LIMITS = {
     "product lines": 53_078,
-    "words that WORDS.md replaces": 10,
+    "words that WORDS.md replaces": 0,
     "names of two or more classes": 0,
     f"functions above {MAX_PARAMETERS} parameters": 0,
     "functions that return a bare tuple": 40,
