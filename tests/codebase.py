@@ -177,7 +177,7 @@ def _is_record(annotation: ast.expr) -> bool:
 
 
 LIMITS = {
-    "product lines": 53_078,
+    "product lines": 53_065,
     "words that WORDS.md replaces": 0,
     "names of two or more classes": 0,
     f"functions above {MAX_PARAMETERS} parameters": 0,

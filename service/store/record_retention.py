@@ -14,56 +14,32 @@ from service.store.tables import ForecastRow
 
 def prune_jobs(session: Session, age: timedelta, most: int = 500) -> int:
     """Delete and audit up to ``most`` jobs that ended before ``age``; return their number."""
-    count = queue.purge(session, age, most)
-    if count:
-        audit.record(
-            session,
-            RESERVED,
-            "jobs.pruned",
-            f"{count} jobs",
-            older_than_days=age / timedelta(days=1),
-        )
-    return count
+    return _audited(session, "jobs", queue.purge(session, age, most), age)
 
 
 def prune_plans(session: Session, age: timedelta, most: int = 50) -> int:
-    """Delete and audit up to ``most`` plans that ended longer than ``age`` ago; return their
-    number.
-
-    Their flux maps are deleted with them.
+    """Delete and audit up to ``most`` plans, with their flux maps, that ended longer than ``age``
+    ago; return their number.
     """
-    count = queue.purge(session, age, most, plans=True)
-    if count:
-        audit.record(
-            session,
-            RESERVED,
-            "plans.pruned",
-            f"{count} plans",
-            older_than_days=age / timedelta(days=1),
-        )
-    return count
+    return _audited(session, "plans", queue.purge(session, age, most, plans=True), age)
 
 
 def prune_forecasts(session: Session, age: timedelta, most: int = 500) -> int:
     """Delete and audit up to ``most`` forecasts older than ``age``; return their number."""
-    count = _prune(session, ForecastRow, age, most)
-    if count:
-        audit.record(
-            session,
-            RESERVED,
-            "forecasts.pruned",
-            f"{count} forecasts",
-            older_than_days=age / timedelta(days=1),
-        )
-    return count
+    return _audited(session, "forecasts", _prune(session, ForecastRow, age, most), age)
 
 
 def prune_audit(session: Session, age: timedelta, most: int = 500) -> int:
     """Delete and audit up to ``most`` audit entries older than ``age``; return their number."""
-    count = _prune(session, AuditRow, age, most)
+    return _audited(session, "audit", _prune(session, AuditRow, age, most), age, "entries")
+
+
+def _audited(session: Session, what: str, count: int, age: timedelta, unit: str = "") -> int:
+    """Audit that ``count`` records of a kind were deleted, if any were; return ``count``."""
     if count:
+        days = age / timedelta(days=1)
         audit.record(
-            session, RESERVED, "audit.pruned", f"{count} entries", days=age / timedelta(days=1)
+            session, RESERVED, f"{what}.pruned", f"{count} {unit or what}", older_than_days=days
         )
     return count
 
