@@ -117,6 +117,21 @@ def repeated_classes() -> dict[str, list[str]]:
     return {name: found for (_, name), found in places.items() if len(found) > 1}
 
 
+REQUEST_CLASSES = ("ForecastIn", "ForecastRequest", "Setup")
+"""What a forecast request is on its way from the REST schema to the tracer."""
+
+
+def request_names() -> set[str]:
+    """Names of the fields of a forecast request, from the REST schema to the tracer."""
+    return {
+        ast.unparse(line.target)
+        for definition in definitions()
+        if isinstance(definition.node, ast.ClassDef) and definition.node.name in REQUEST_CLASSES
+        for line in definition.node.body
+        if isinstance(line, ast.AnnAssign)
+    }
+
+
 def long_classes() -> list[str]:
     """Classes with more lines than `MAX_CLASS_LINES`."""
     return [
@@ -177,13 +192,14 @@ def _is_record(annotation: ast.expr) -> bool:
 
 
 LIMITS = {
-    "product lines": 53_065,
+    "product lines": 53_059,
     "words that WORDS.md replaces": 0,
     "names of two or more classes": 0,
     f"functions above {MAX_PARAMETERS} parameters": 0,
     "functions that return a bare tuple": 40,
     f"classes above {MAX_CLASS_LINES} lines": 0,
     "lines with latitude_deg": 15,
+    "names of a forecast request's fields": 21,
     "dict[str, Any] in service": 120,
 }
 """The most of each count. A limit is lowered when its count falls; it never rises."""
@@ -199,6 +215,7 @@ def count_all() -> dict[str, int]:
         len(bare_tuples()),
         len(long_classes()),
         lines_with("latitude_deg"),
+        len(request_names()),
         sum(path.read_text().count("dict[str, Any]") for path in python_files(("service",))),
     )
     return dict(zip(LIMITS, found, strict=True))

@@ -38,17 +38,17 @@ from service.twin.runtime.runtime import Runtime
 class ForecastRequest:
     """A flux forecast to compute.
 
-    ``receiver`` is the geometry to light. Without it ``target`` names a stored target or receiver.
-    ``sun_at`` is the time that was requested, if any. ``aim`` (3,) [m] is by default the plane's
-    centre.
+    Names are those of `POST /v1/forecasts`. ``receiver`` is the geometry to light. Without it
+    ``target`` names a stored target or receiver. ``sun_at`` is the time that was requested, if any.
+    ``aim_point_m`` (3,) is by default the plane's centre.
 
-    ``motors`` [steps] may replace ``aim``. They turn the mirror by its calibrated mount at
-    ``sun_at``, by default as newly measured.
+    ``motor_position`` [steps] may replace ``aim_point_m``. It turns the mirror by its calibrated
+    mount at ``sun_at``, by default as newly measured.
 
     ``surface`` is "current", "ideal" or a version. A heliostat without a current surface is
-    forecast as an ideal mirror. ``window`` [m] is the side of a square map about the centre of
-    mass. By default the map is of the whole plane. ``model_version`` is a version of the plant's
-    model, by default the current one.
+    forecast as an ideal mirror. ``window_m`` is the side of a square map about the centre of mass.
+    By default the map is of the whole plane. ``model_version`` is a version of the plant's model,
+    by default the current one.
     """
 
     heliostat: str
@@ -56,12 +56,12 @@ class ForecastRequest:
     sun_at: datetime | None = None
     target: str | None = None
     receiver: Receiver | None = None
-    aim: tuple[float, float, float] | None = None
-    motors: tuple[float, float] | None = None
+    aim_point_m: tuple[float, float, float] | None = None
+    motor_position: tuple[float, float] | None = None
     surface: str | int = "current"
-    dni: float = 1000.0
+    dni_w_m2: float = 1000.0
     resolution: tuple[int, int] = (256, 256)
-    window: float | None = None
+    window_m: float | None = None
     normalised: bool = False
     model_version: int | None = None
 
@@ -101,7 +101,7 @@ def _receiver(session: Session, request: ForecastRequest) -> Receiver:
     if request.target is None:
         raise InvalidInputError("target: give a stored target or receiver, or a plane")
     receiver = store.get_target_or_receiver(session, request.target)
-    if request.window is not None and not isinstance(receiver, TargetPlane):
+    if request.window_m is not None and not isinstance(receiver, TargetPlane):
         raise InvalidInputError(
             f"window_m: the map of {request.target}, a cylinder, is all of it; leave it out"
         )
@@ -139,7 +139,7 @@ def trace_request(runtime: Runtime, request: ForecastRequest) -> Traced:
             _receiver(session, request),
             _chosen_surface(session, twin.row, request.surface),
         )
-        if request.motors is not None:
+        if request.motor_position is not None:
             mount = load_mount(session, request.heliostat, request.sun_at, request.model_version)
             twin = replace(twin, heliostat=mount.turned(request.sun_at))
     points = control_points(twin.heliostat, heights_of(surface))
@@ -173,10 +173,10 @@ def _forecast_row(request: ForecastRequest, traced: Traced) -> ForecastRow:
         sun_azimuth_deg=request.sun.azimuth_deg,
         sun_elevation_deg=request.sun.elevation_deg,
         sun_at=request.sun_at,
-        aim_point_m=None if request.aim is None else list(request.aim),
-        motor_position=None if request.motors is None else list(request.motors),
-        dni_w_m2=request.dni,
-        window_m=request.window,
+        aim_point_m=None if request.aim_point_m is None else list(request.aim_point_m),
+        motor_position=None if request.motor_position is None else list(request.motor_position),
+        dni_w_m2=request.dni_w_m2,
+        window_m=request.window_m,
         normalised=request.normalised,
         rows=forecast.flux.shape[0],
         columns=forecast.flux.shape[1],
@@ -217,25 +217,25 @@ def trace_flux(
     """
     receiver, angles = request.receiver, None
     assert receiver is not None
-    if request.motors is not None:
-        twin.heliostat.mount.require_within(np.asarray(request.motors))
-        angles = twin.heliostat.mount.angles_from_motors(request.motors)
+    if request.motor_position is not None:
+        twin.heliostat.mount.require_within(np.asarray(request.motor_position))
+        angles = twin.heliostat.mount.angles_from_motors(request.motor_position)
     setup = Setup(
         twin.heliostat,
         points,
         sun_direction(request.sun.azimuth_deg, request.sun.elevation_deg),
         receiver.middle,
         angles=angles,
-        aim=None if request.aim is None else np.asarray(request.aim),
+        aim=None if request.aim_point_m is None else np.asarray(request.aim_point_m),
         degree=degree,
         identifier=twin.heliostat.name,
         taken_at=request.sun_at,
     )
-    twin = replace(twin, model=twin.model.with_dni(request.dni))
+    twin = replace(twin, model=twin.model.with_dni(request.dni_w_m2))
     if not isinstance(receiver, TargetPlane):
         return _trace_unrolled(runtime, twin, setup, request, receiver)
     with runtime.computing("forecast") as operations:
-        return operations.forecast(setup, twin.model, request.resolution, request.window)
+        return operations.forecast(setup, twin.model, request.resolution, request.window_m)
 
 
 def _trace_unrolled(

@@ -262,24 +262,18 @@ def _given(body: ForecastIn) -> Receiver | None:
     return None if body.receiver is None else body.receiver.named("receiver")
 
 
+_PASSED_ON = (
+    *("heliostat", "target", "aim_point_m", "motor_position", "surface", "dni_w_m2", "resolution"),
+    *("window_m", "normalised", "model_version"),
+)
+
+
 def _request(runtime: Runtime, body: ForecastIn) -> ForecastRequest:
     with runtime.database.reading() as session:
         sun = position_of(session, body.sun)
-    return ForecastRequest(
-        heliostat=body.heliostat,
-        target=body.target,
-        receiver=_given(body),
-        sun=sun,
-        sun_at=body.sun.at if isinstance(body.sun, SunAt) else None,
-        aim=body.aim_point_m,
-        motors=body.motor_position,
-        surface=body.surface,
-        dni=body.dni_w_m2,
-        resolution=body.resolution,
-        window=body.window_m,
-        normalised=body.normalised,
-        model_version=body.model_version,
-    )
+    same = {name: getattr(body, name) for name in _PASSED_ON}
+    sun_at = body.sun.at if isinstance(body.sun, SunAt) else None
+    return ForecastRequest(sun=sun, sun_at=sun_at, receiver=_given(body), **same)
 
 
 @router.post(

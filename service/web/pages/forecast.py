@@ -265,7 +265,7 @@ def post_forecast_form(
         sun=sun,
         sun_at=form.moment if form.sun_by == "time" else None,
         surface=form.surface,
-        dni=form.dni_w_m2,
+        dni_w_m2=form.dni_w_m2,
     )
     return go_to(f"/forecasts/{make_forecast(runtime, asked).id}")
 
