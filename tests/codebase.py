@@ -83,9 +83,25 @@ def definitions() -> tuple[Definition, ...]:
     return tuple(found)
 
 
-def product_lines() -> int:
-    """Lines of Python in the product."""
-    return sum(len(path.read_text().splitlines()) for path in python_files())
+def lines_of_code() -> int:
+    """Lines of Python in the product with code: no docstrings, comments and blank lines."""
+    return sum(map(_code_lines, python_files()))
+
+
+def _code_lines(path: Path) -> int:
+    text = path.read_text()
+    documented = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+    docstrings = {
+        line
+        for node in ast.walk(ast.parse(text))
+        if isinstance(node, documented) and ast.get_docstring(node) is not None
+        for line in range(node.body[0].lineno, node.body[0].end_lineno + 1)
+    }
+    lines = enumerate(text.splitlines(), start=1)
+    return sum(
+        number not in docstrings and bool(line.strip()) and not line.lstrip().startswith("#")
+        for number, line in lines
+    )
 
 
 def old_words() -> Counter[str]:
@@ -192,7 +208,7 @@ def _is_record(annotation: ast.expr) -> bool:
 
 
 LIMITS = {
-    "product lines": 53_059,
+    "lines of code": 35_082,
     "words that WORDS.md replaces": 0,
     "names of two or more classes": 0,
     f"functions above {MAX_PARAMETERS} parameters": 0,
@@ -208,7 +224,7 @@ LIMITS = {
 def count_all() -> dict[str, int]:
     """Return each count of `LIMITS`."""
     found = (
-        product_lines(),
+        lines_of_code(),
         old_words().total(),
         len(repeated_classes()),
         len(wide_functions()),

@@ -4,6 +4,12 @@ The positions of a target's marks are a `Layout`. The default is a bracket at ea
 where marks serve several targets with a common edge have other layouts. Four marks give a
 homography as a hypothesis. It must be plausible (convex, the right aspect ratio, arms along the
 edges), and its score is from all marks of the layout that agree with it.
+
+Notes
+-----
+::
+
+    (u, v, 1) ~ H (x, y, 1)     pixel and plane; H (3, 3) by least squares over agreeing marks
 """
 
 from collections.abc import Sequence

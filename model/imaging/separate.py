@@ -3,6 +3,14 @@
 The image is the sheet in daylight plus the flux. Dark lines, rivets and marks are filled first. A
 smooth surface is fitted to the pixels off the spot, and subtracted. The remaining signal of the
 main spot is kept. Its faint wings fade out softly, because a hard mask would truncate them.
+
+Notes
+-----
+::
+
+    image = sheet(x, y) + flux(x, y) + noise   sheet: a polynomial off the spot, and its residual
+                                               there, bridged under the spot
+    flux = max(0, image - sheet) * mask        mask: 1 on the main spot, falls smoothly to 0
 """
 
 from dataclasses import dataclass

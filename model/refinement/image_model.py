@@ -1,4 +1,14 @@
-"""The forward model: traced images as a function of a surface's coefficients."""
+"""The forward model: traced images as a function of a surface's coefficients.
+
+Notes
+-----
+::
+
+    z(c) = mean + directions c              heights; c are coefficients of the prior
+    images(c, r) = trace(z(c)) + T r        r are coefficients of the ripples, T `ripple_images`
+
+The ripples are so fine that images are linear in them, and T is traced once.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace

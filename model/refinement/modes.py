@@ -1,4 +1,15 @@
-"""Modes of the posterior: minima of its cost, by annealing and for given hyperparameters."""
+"""Modes of the posterior: minima of its cost, by annealing and for given hyperparameters.
+
+Notes
+-----
+::
+
+    for sigma in annealing:   state = argmin cost(state; noise sigma)          (`anneal`)
+    for each round:           hyper = most probable noise and scales at state  (`posterior`)
+                              state = argmin cost(state; hyper)                (`find_optimum`)
+
+The cost is that of `model.refinement.posterior`, in nats.
+"""
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor

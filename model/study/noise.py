@@ -2,6 +2,16 @@
 
 Grain is what no smooth light explains. What is cut at black leaves no grain but a lift: where there
 is no light, noise below zero is lost and noise above it stays.
+
+Notes
+-----
+::
+
+    g = (L * image)**2 / 36,  L = [1 -2 1]' [1 -2 1]   grain; planes and slopes give zero
+    variance(level) = line through the means of g      read noise, rounding and counting
+    lift = sigma (phi(a) - a Phi(-a)),  Phi(-a) = share of black pixels   (`black_lift`)
+
+Sources: Immerkaer (1996), doi:10.1006/cviu.1996.0060, and Tobin (1958), doi:10.2307/1907382.
 """
 
 import numpy as np
@@ -22,12 +32,7 @@ BLOCK = 9
 
 
 def grain_variance(image: Array, spacing: int = SPACING, bins: int = 12) -> Array:
-    """Variance of each pixel's noise (rows, columns), a line in its intensity: read noise, rounding
-    and counting.
-
-    A mask that no plane and no slope answers leaves the grain (Immerkaer 1996,
-    doi:10.1006/cviu.1996.0060).
-    """
+    """Variance of each pixel's noise (rows, columns), which is linear in its intensity."""
     grain, inner = _grain(image, spacing), image[spacing:-spacing, spacing:-spacing]
     parts = np.array_split(np.argsort(inner, axis=None), bins)
     levels = np.array([inner.ravel()[part].mean() for part in parts])
@@ -48,10 +53,9 @@ def _grain(image: Array, spacing: int) -> Array:
 def black_lift(image: NDArray[np.floating]) -> Array:
     """What noise that is cut at black lifts each pixel by on the average (rows, columns).
 
-    A normal variable of mean mu >= 0 and deviation sigma that is cut at zero is lifted by sigma
-    (phi(a) - a Phi(-a)), a = mu / sigma, and the share Phi(-a) of its values is cut (Tobin 1958,
-    doi:10.2307/1907382). No more can be lifted than is there. That such a lift also moves the
-    centre of mass is not counted.
+    A normal variable of mean a sigma that is cut at zero is lifted, and the share Phi(-a) of its
+    values is cut. No more can be lifted than is there. That such a lift also moves the centre of
+    mass is not counted.
     """
     above = np.asarray(image - image.min(), dtype=np.float64)
     black = above == 0

@@ -16,6 +16,14 @@ can explain are no evidence for an effect.
 Fits add the residual, in standard deviations, to the residuals of the pixels. Held-out images are
 judged by the likelihood of Student's t, because some real spots belong to another heliostat. `NAT`
 weighs this likelihood against accuracy.
+
+Notes
+-----
+::
+
+    off ~ N(0, 1 + S S')              residuals in USUAL_RAD; S shifts by the mount's parameters
+    whitened = (1 + S S')**(-1/2) off                                           (`whiten`)
+    loss = (TAILS / 2 + 1) ln(1 + |off|**2 / TAILS)   [nat], Student's t in 2D  (`loss`)
 """
 
 import numpy as np

@@ -4,6 +4,17 @@ acts.
 The cost of each photograph is compared with and without an effect at a few strengths. With the
 right scope the photographs inside gain and those outside lose. The most promising scopes are then
 fitted and judged by other photographs.
+
+Notes
+-----
+With the savings s[k, n] of photograph n at strength k::
+
+    always       max_k sum_n s[k, n]
+    since a day  max_day max_k sum_{n: day_n >= day} s[k, n]         (`best_start_day`)
+    by day       sum_day max(0, max_k sum_{n: day_n = day} s[k, n])  (`time_scopes`)
+    one mirror   max_k sum_{n: mirror_n = mirror} s[k, n]            (`single_heliostat_scopes`)
+
+A scope is a candidate if it saves MIN_RATIO times as much as no scope.
 """
 
 from collections.abc import Iterator, Sequence
