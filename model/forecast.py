@@ -50,6 +50,10 @@ Tracer = Callable[[Scene, Window, Optics], Tensor]
 """Irradiance (B, rows, columns) [W/m2] of a scene's B mirrors."""
 
 
+_TRACED_PIXELS = 2**21
+"""Pixels of the images that are traced at once: about 200 bytes each with padding."""
+
+
 @dataclass(frozen=True)
 class View:
     """The imaged part of the targets, and the accuracy of tracing.
@@ -275,8 +279,11 @@ class Aligned:
         parts, places = [], []
         for group in self.groups:
             for window, there, alike in group.parts(windows_on(group), effects):
-                parts.append(trace_part(group, window, there, alike))
-                places += [group.rows[place] for place in alike]
+                most = max(1, _TRACED_PIXELS // (window.rows * window.columns))
+                for start in range(0, len(alike), most):
+                    some = alike[start : start + most]
+                    parts.append(trace_part(group, window, there, some))
+                    places += [group.rows[place] for place in some]
         return torch.cat(parts)[torch.as_tensor(places).argsort()]
 
 

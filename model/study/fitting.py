@@ -22,7 +22,7 @@ doi:10.2307/1912934 (sandwich estimator).
 The stages are `find_starts`, `Fitter.descend` from the most promising starts, and `sandwich_std`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -50,8 +50,10 @@ STARTS = (-0.4, -0.15, -0.05, 0.05, 0.15, 0.4)
 WORST_START = 3
 """Cost of a start, in costs of the best one, above which no fit begins there."""
 
-AT_ONCE = 16
-"""Forecasts of all images that are traced at once, where they differ in mirrors alone."""
+AT_ONCE, MAX_IMAGES_AT_ONCE = 16, 2048
+"""Forecasts of all images that are traced at once, where they differ in mirrors alone; and the most
+images of them.
+"""
 
 STEP = 5e-3
 """Step of the differences, in shares of an unknown's range."""
@@ -104,14 +106,27 @@ class Fitter:
 
     def residuals_of(self, unknowns: ParameterVector, trials: Array) -> Array:
         """Residuals (M, N, R) of trials (M, P); equal shared unknowns are traced at once."""
+        residuals = np.empty((len(trials), len(self.measured), RESIDUALS))
+        for part in self._alike(unknowns, trials):
+            residuals[part] = self._residuals_alike(unknowns, trials[part])
+        return residuals
+
+    def energies_of(self, unknowns: ParameterVector, trials: Array) -> Array:
+        """Sums (M, N) of squares of `residuals_of`, in the memory of a few trials."""
+        energies = np.empty((len(trials), len(self.measured)))
+        for part in self._alike(unknowns, trials):
+            residuals = self._residuals_alike(unknowns, trials[part])
+            energies[part] = (residuals**2).sum(axis=-1)
+        return energies
+
+    def _alike(self, unknowns: ParameterVector, trials: Array) -> Iterator[NDArray[np.intp]]:
+        """Places of trials (M, P) with the same shared unknowns, which are traced at once."""
         shared = np.array([unknown.shared for unknown in unknowns.all], dtype=bool)
         _, group = np.unique(trials[:, shared], axis=0, return_inverse=True)
-        residuals = np.empty((len(trials), len(self.measured), RESIDUALS))
+        most = max(1, min(AT_ONCE, MAX_IMAGES_AT_ONCE // len(self.measured)))
         for number in np.unique(group):
             rows = np.flatnonzero(group == number)
-            for part in np.array_split(rows, -(-len(rows) // AT_ONCE)):
-                residuals[part] = self._residuals_alike(unknowns, trials[part])
-        return residuals
+            yield from np.array_split(rows, -(-len(rows) // most))
 
     def _residuals_alike(self, unknowns: ParameterVector, trials: Array) -> Array:
         """Residuals (M, N, R) of trials (M, P) with the same shared unknowns."""
@@ -226,8 +241,8 @@ def find_starts(
     for moved, places in zip(trials, groups, strict=True):
         moved[:, places] += np.array([0.0, *STARTS])[:, None] * (high - low)[places]
     trials = np.clip(trials, low, high)
-    residuals = fitter.residuals_of(unknowns, trials.reshape(-1, len(begin)))
-    energies = (residuals**2).sum(axis=-1).reshape(*trials.shape[:2], -1)
+    energies = fitter.energies_of(unknowns, trials.reshape(-1, len(begin)))
+    energies = energies.reshape(*trials.shape[:2], -1)
     chosen, found = begin.copy(), []
     for moved, energy, places in zip(trials, energies, groups, strict=True):
         for place in places:

@@ -250,10 +250,13 @@ def shared_shifts(flux_images: Sequence[FluxImage]) -> list[SharedShifts]:
 
 def saturated_pixels(flux_images: Sequence[FluxImage], rows: int, columns: int) -> Saturated:
     """Intensity and saturated shares of saturated photographs of one size, in (rows, columns)."""
-    light = np.stack([np.asarray(p.image, dtype=np.float64) for p in flux_images])
-    clipped = np.stack([np.asarray(p.clipped, dtype=np.float64) for p in flux_images])
-    pixel = light[0].size / (rows * columns)
-    return Saturated(in_pixels(light, rows, columns), in_pixels(clipped, rows, columns) / pixel)
+    light, clipped = (
+        np.concatenate(
+            [in_pixels(np.asarray(image, np.float64)[None], rows, columns) for image in of]
+        )
+        for of in ([p.image for p in flux_images], [p.clipped for p in flux_images])
+    )
+    return Saturated(light, clipped / (flux_images[0].image.size / (rows * columns)))
 
 
 class Forecaster:
@@ -308,6 +311,10 @@ class Forecaster:
             self._copies[count]._saturated = self._saturated
             self._copies[count]._different = self._different
         return self._copies[count]
+
+    def forget(self) -> None:
+        """Drop what only saves time if the next forecast resembles the last one."""
+        self._aligned, self._flux, self._start, self._copies = {}, {}, None, {}
 
     def measured(self, resolution: int = FLUX_SIZE) -> Array:
         """The photographs' cuts (N, resolution, resolution)."""

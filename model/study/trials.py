@@ -24,6 +24,10 @@ from model.study.scopes import days_of
 Array = NDArray[np.float64]
 
 
+# Parts of the photographs whose last forecasts stay in memory: fits alternate between a few.
+_RECENT = 3
+
+
 @dataclass(frozen=True)
 class StudyOptions:
     """Options of a study.
@@ -118,12 +122,16 @@ class TrialFitter:
         return Forecaster(chosen, self.model, self.window, view, self.options.between)
 
     def forecasters(self, rows: Rows) -> Forecasters:
-        """Return the forecasters of some images."""
-        key = rows.tobytes()
-        if key not in self._forecasters:
-            views = self.options.fit_view, self.options.view
-            self._forecasters[key] = Forecasters(*(self._forecaster(rows, view) for view in views))
-        return self._forecasters[key]
+        """Return the forecasters of some images; those that were used longest ago free memory."""
+        key, views = rows.tobytes(), (self.options.fit_view, self.options.view)
+        made = self._forecasters.pop(key, None)
+        if made is None:
+            made = Forecasters(*(self._forecaster(rows, view) for view in views))
+        self._forecasters[key] = made
+        for coarse, fine in list(self._forecasters.values())[:-_RECENT]:
+            coarse.forget()
+            fine.forget()
+        return made
 
     def touched(self, rows: Rows, terms: Iterable[Term]) -> Rows:
         """Select the images that at least one term may change."""
@@ -191,5 +199,4 @@ class TrialFitter:
 
     def costs(self, rows: Rows, parameters: ParameterVector, values: Array) -> Array:
         """Return the cost of each image (M, n) for several vectors of values (M, P)."""
-        residuals = Fitter(*self.forecasters(rows)).residuals_of(parameters, values)
-        return np.asarray((residuals**2).sum(axis=-1) / 2)
+        return Fitter(*self.forecasters(rows)).energies_of(parameters, values) / 2

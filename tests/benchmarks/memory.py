@@ -425,14 +425,19 @@ def inputs(root: Path) -> dict[str, Send]:
             "predictions", heliostats=["AA39"], images=64, method="refined"
         ),
         "study of 2 x 64 images": job("studies", heliostats=["AA39", "AC43"], images=64),
+        "study of 8 x 64 images": job("studies", heliostats=list(PHOTOGRAPHED), images=64),
     }
 
 
+PHOTOGRAPHED = {"AA39": "AA39", "AC43": "AC43"} | {f"H{n:05d}": "AA39" for n in range(6)}
+"""Heliostats with 64 photographs, and the real mirror that these are of."""
+
+
 def prepare(http: httpx.Client) -> None:
-    """Make 64 photographs of each of the two mirrors from the few real ones, by a little noise."""
+    """Make 64 photographs of each mirror from the few real ones, by a little noise."""
     rng = np.random.default_rng(2)
-    for name in ("AA39", "AC43"):
-        folder = data_folder() / name / "Calibration"
+    for name, source in PHOTOGRAPHED.items():
+        folder = data_folder() / source / "Calibration"
         files = sorted(folder.glob("*-flux.png"))
         for number in range(64):
             file = files[number % len(files)]
