@@ -13,7 +13,7 @@ sys.path.insert(0, str(HERE.parent))
 from docs import generate  # noqa: E402  # it needs the path above
 
 project = "heliotwin"
-copyright = "heliotwin's authors"
+html_show_copyright = False
 html_title = "heliotwin"
 html_theme = "furo"
 html_static_path = ["_static"]

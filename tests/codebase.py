@@ -97,10 +97,11 @@ def old_words() -> Counter[str]:
 
 def texts() -> Iterator[str]:
     """Code, pages and documents that people read, without the lists of words in this file."""
-    folders = [ROOT / name for name in (*PACKAGES, "tests", "docker", "migrations")]
+    folders = [ROOT / name for name in (*PACKAGES, "docs", "tests", "docker", "migrations")]
     paths = {path for folder in folders for pattern in TEXTS for path in folder.rglob(pattern)}
     for path in sorted(paths | {ROOT / "README.md", ROOT / "Makefile"}):
-        if path != Path(__file__) and ".min." not in path.name:
+        is_built = not {"generated", "guide"}.isdisjoint(path.parts)
+        if path != Path(__file__) and ".min." not in path.name and not is_built:
             yield path.read_text()
 
 

@@ -1,5 +1,5 @@
-"""The guide's table of additions, each tried: into a copy of the packages goes the one file, and the
-one line.
+"""The guide's table of additions, each tried: into a copy of the packages goes the one file, and
+the one line.
 """
 
 import json

@@ -137,8 +137,8 @@ echo "${image%%:*}@sha256:$(printf %s "$image" | sha256sum | cut -c1-64)"
 
 
 def test_images_are_named_by_digest_once_they_are_pinned(tmp_path: Path):
-    """The script that the administrator's guide names, with an engine that knows a digest of every image;
-    compose reads its file.
+    """The script that the administrator's guide names, with an engine that knows a digest of every
+    image; compose reads its file.
     """
     for name in ("pin_images.sh", "compose.yaml"):
         shutil.copy(DOCKER / name, tmp_path)

@@ -335,8 +335,8 @@ def test_two_heliostats_have_one_image_by_force(other: TestClient, post: Post):
 
 @promise(
     "A photograph that was sent by mistake is deleted by `DELETE"
-    " .../measurements/205363?reason=...`. This needs the role `operate`. It deletes all its images,"
-    " with `only_this=true` one of them.",
+    " .../measurements/205363?reason=...`. This needs the role `operate`. It deletes all its"
+    " images, with `only_this=true` one of them.",
     "surfaces made from it name it in `deleted`",
 )
 def test_what_was_sent_by_mistake_is_deleted(app: FastAPI, client: TestClient, post: Post):
@@ -428,8 +428,8 @@ def test_only_numbers_are_numbers(refused_post: Post, value: str):
 
 
 @promise(
-    "`sun_contradicts_time`: the sun was not where it was recorded at `taken_at` (`angle_deg` is the"
-    " angle between both). It refuses nothing"
+    "`sun_contradicts_time`: the sun was not where it was recorded at `taken_at` (`angle_deg` is"
+    " the angle between both). It refuses nothing"
 )
 def test_a_sun_that_contradicts_its_time_is_warned_of(client: TestClient, post: Post):
     document = post(id="1", taken_at=MOMENT).json()

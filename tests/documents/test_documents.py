@@ -1,0 +1,61 @@
+"""README and the guide: length, sentences, links, and sections that the service links to."""
+
+import re
+
+import pytest
+
+from service.twin.alerts.alerts import REASONS
+
+from .prose import DOCS, ROOT, pages, sentences, statistics_of
+
+README = ROOT / "README.md"
+
+
+def test_readme_is_short_and_has_a_picture():
+    text = README.read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 150
+    assert len(text.split()) <= 900
+    assert re.search(r"^!\[", text, re.MULTILINE)
+
+
+@pytest.mark.parametrize("name", ["README", "guide"])
+def test_sentences_are_short(name: str):
+    chosen = [page for page in pages() if (page == README) == (name == "README")]
+    found = statistics_of([page.read_text(encoding="utf-8") for page in chosen])
+    assert len(found.lengths) > 30
+    assert not found.faults()
+
+
+def test_sentences_are_counted_as_a_reader_counts_them():
+    text = "# Title\n\nOne [link](x.md) is here. Two;\nthree `a; b`.\n\n"
+    text += "```bash\nno text\n```\n- item one\n"
+    assert sentences(text) == ["One link is here.", "Two; three code.", "item one"]
+
+
+def test_links_of_the_readme_lead_to_files():
+    targets = re.findall(r"\]\(([^)#\s]+)[^)]*\)", README.read_text(encoding="utf-8"))
+    files = [target for target in targets if "://" not in target]
+    assert len(files) > 10
+    missing = [target for target in files if not (ROOT / target).exists()]
+    assert not missing
+
+
+def test_every_alarm_has_its_section_with_meaning_cause_and_action():
+    """The anchors are those that the page of alerts links to."""
+    text = (DOCS / "how-to" / "operator" / "alarms.md").read_text(encoding="utf-8")
+    sections = re.findall(r"^\((\w+)\)=\n## (\w+):(.*?)(?=^\(|\Z)", text, re.MULTILINE | re.DOTALL)
+    assert [anchor for anchor, _, _ in sections] == list(REASONS)
+    for anchor, title, section in sections:
+        assert anchor == title
+        for part in ("Meaning", "Cause", "Action"):
+            assert f"**{part}.**" in section
+
+
+def test_anchors_of_alarms_are_those_of_the_built_page():
+    """Sphinx writes hyphens in them; the template of the alerts replaces them likewise."""
+    built = ROOT / "build" / "docs" / "how-to" / "operator" / "alarms.html"
+    if not built.exists():
+        pytest.skip("the guide is not built: make docs")
+    page = built.read_text(encoding="utf-8")
+    for reason in REASONS:
+        assert f'id="{reason.replace("_", "-")}"' in page
