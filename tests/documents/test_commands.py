@@ -8,7 +8,6 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -87,7 +86,7 @@ def demonstration(made_plant: Path, tmp_path_factory: pytest.TempPathFactory) ->
 
 
 @pytest.fixture
-def folder(demonstration: Path, tmp_path: Path) -> Iterator[Path]:
+def folder(demonstration: Path, tmp_path: Path) -> Path:
     """A checkout after the demonstration, with ``heliotwin`` and ``python`` in ``bin``."""
     shutil.copytree(demonstration / "out", tmp_path / "out")
     (tmp_path / "docs").symlink_to(DOCS)
@@ -96,11 +95,11 @@ def folder(demonstration: Path, tmp_path: Path) -> Iterator[Path]:
     for name, command in {"heliotwin": "-m service", "python": ""}.items():
         (programs / name).write_text(f'#!/bin/sh\nexec {sys.executable} {command} "$@"\n')
         (programs / name).chmod(0o755)
-    yield tmp_path
+    return tmp_path
 
 
 @pytest.mark.skipif(shutil.which("curl") is None, reason="no curl")
-@pytest.mark.parametrize("page", filter(runs, PAGES), ids=lambda p: str(p.relative_to(ROOT)))
+@pytest.mark.parametrize("page", [*filter(runs, PAGES)], ids=lambda p: str(p.relative_to(ROOT)))
 def test_commands_of_a_page_run_in_its_order(page: Path, folder: Path):
     """Each page begins with the demonstration's store. An HTTP error is a failure."""
     data = folder / "out" / ("empty" if page.name == EMPTY else "demo/store-demo")
