@@ -62,10 +62,13 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
 def _prose(text: str | None) -> str:
     """A docstring or help text as Markdown: inline code stays, other marks are text."""
     parts = re.split(r"(`+[^`]+`+)", inspect.cleandoc(text or ""))
-    return "".join(
-        part if part.startswith("`") else re.sub(r"([<>{}*_\[\]$])", r"\\\1", part)
-        for part in parts
-    )
+    return "".join(part if part.startswith("`") else _escaped(part) for part in parts)
+
+
+def _escaped(text: str) -> str:
+    """Text without marks of Markdown, but for emphasis."""
+    escaped = re.sub(r"([<>{}*_\[\]$])", r"\\\1", text)
+    return re.sub(r"\\\*(\w[^*\\]*\w)\\\*", r"*\1*", escaped)
 
 
 # --- command line

@@ -53,8 +53,7 @@ def get_guide(path: str = "") -> Response:
         raise NotFoundError("this installation has no guide; `make docs` builds it")
     if not path:
         return go_to("/docs/guide/index.html")
-    file = (GUIDE / path).resolve()
-    if not (file.is_relative_to(GUIDE) and file.is_file()):
+    if GUIDE / path not in (file for file in GUIDE.rglob("*") if file.is_file()):
         raise NotFoundError(f"the guide has no page {path}")
-    media_type = mimetypes.guess_type(file.name)[0] or "application/octet-stream"
-    return WholeFile(file, headers=_GUIDE_HEADERS, media_type=media_type)
+    media_type = mimetypes.guess_type(path)[0] or "application/octet-stream"
+    return WholeFile(GUIDE / path, headers=_GUIDE_HEADERS, media_type=media_type)

@@ -17,7 +17,7 @@ PAGE = "<html><body><h1>heliotwin</h1></body></html>"
 @pytest.fixture
 def guide(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The folder of a guide with one page."""
-    folder = tmp_path.resolve() / "guide"
+    folder = tmp_path / "guide"
     (folder / "how-to").mkdir(parents=True)
     (folder / "index.html").write_text(PAGE, encoding="utf-8")
     (folder / "how-to" / "page.html").write_text(PAGE, encoding="utf-8")
@@ -37,7 +37,9 @@ def test_pages_and_styles_are_served(client: TestClient, guide: Path):
     assert client.head("/docs/guide/index.html").status_code == 200
 
 
-@pytest.mark.parametrize("path", ["nothing.html", "how-to", "..%2fsecret.txt", "%2fetc%2fpasswd"])
+@pytest.mark.parametrize(
+    "path", ["nothing.html", "how-to", "..%2fsecret.txt", "%2fetc%2fpasswd", "%00", "x" * 999]
+)
 def test_nothing_else_is_served(client: TestClient, guide: Path, path: str):
     answer = client.get(f"/docs/guide/{path}")
     assert answer.status_code == 404
