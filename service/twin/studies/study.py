@@ -152,10 +152,8 @@ def _surface(session: Session, heliostat: HeliostatRow, surfaces: Surfaces) -> S
 def _load_heliostat_inputs(
     session: Session, row: HeliostatRow, request: StudyRequest, material: StudyInputs
 ) -> None:
-    twin, surface = (
-        load_heliostat_context(session, row.name),
-        _surface(session, row, request.surfaces),
-    )
+    twin = load_heliostat_context(session, row.name)
+    surface = _surface(session, row, request.surfaces)
     points, seen = (
         control_points(twin.heliostat, heights_of(surface)),
         {m.identifier for m in surface.measurements},
