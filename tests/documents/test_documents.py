@@ -4,7 +4,10 @@ import hashlib
 import re
 
 import pytest
+from typer.main import get_command
 
+from service.base.settings import Settings
+from service.cli.main import app
 from service.twin.alerts.alerts import REASONS
 
 from .prose import DOCS, ROOT, pages, sentences, statistics_of
@@ -65,6 +68,26 @@ def test_every_alarm_has_its_section_with_meaning_cause_and_action():
         assert anchor == title
         for part in ("Meaning", "Cause", "Action"):
             assert f"**{part}.**" in section
+
+
+def test_rules_of_prometheus_name_the_sections():
+    rules = (ROOT / "docker" / "prometheus-rules.yml").read_text(encoding="utf-8")
+    anchors = re.findall(r"runbook: /docs/guide/how-to/operator/alarms.html#(\S+)", rules)
+    assert anchors == [reason.replace("_", "-") for reason in REASONS]
+
+
+def test_settings_verbs_and_files_that_pages_name_exist():
+    text = "\n".join(page.read_text(encoding="utf-8") for page in pages())
+    settings = {f"HELIOTWIN_{name.upper()}" for name in Settings.model_fields}
+    composition = (ROOT / "docker" / "compose.yaml").read_text(encoding="utf-8")
+    named = set(re.findall(r"HELIOTWIN_[A-Z_]*[A-Z]", text))
+    assert not [n for n in named - settings if f"{{{n}" not in composition]
+    verbs = set(re.findall(r"(?:^|`|bin/)heliotwin ([a-z]+)", text, re.MULTILINE))
+    assert len(verbs) > 10
+    assert not verbs - set(get_command(app).commands)
+    files = re.findall(r"`((?:[a-z_]+/)+[a-z_]+\.(?:py|yml|yaml|json|sh))`", text)
+    assert len(files) > 10
+    assert not [f for f in files if not ((ROOT / f).exists() or (ROOT / "service" / f).exists())]
 
 
 def test_anchors_of_alarms_are_those_of_the_built_page():
