@@ -50,4 +50,4 @@ train: install ## the shipped weights from scratch: network, prior, export, eval
 	$(BIN)/python -m training.evaluate
 
 clean: ## remove the virtual environment and everything that was made
-	rm -rf $(VENV) out build *.egg-info
+	rm -rf $(VENV) out build service/web/root/guide docs/reference/generated *.egg-info

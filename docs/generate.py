@@ -74,10 +74,17 @@ def _escaped(text: str) -> str:
 # --- command line
 
 
+_COMMANDS = """# Command line
+
+Every verb has `--help`. Exit code 0 is done, 1 failed, 2 bad input with one line that names it, and
+130 is an interruption by Ctrl-C. Verbs that look at a store (`export`, `check`, `backup`, `times`,
+`models adopt`) make none.
+"""
+
+
 def command_page() -> str:
     """Every verb of ``heliotwin`` with its arguments and options."""
-    lines = ["# Command line", "", "Every verb has `--help`. Exit code 0 is done, 1 failed, 2 bad"]
-    lines += ["input with one line that names it, and 130 is an interruption by Ctrl-C.", ""]
+    lines = [_COMMANDS]
     root = get_command(command_line)
     for words, command in _verbs(root, ["heliotwin"]):
         lines += [f"## {' '.join(words[1:])}", "", _prose(command.help), "", "```text"]
