@@ -154,10 +154,8 @@ def _load_heliostat_inputs(
 ) -> None:
     twin = load_heliostat_context(session, row.name)
     surface = _surface(session, row, request.surfaces)
-    points, seen = (
-        control_points(twin.heliostat, heights_of(surface)),
-        {m.identifier for m in surface.measurements},
-    )
+    points = control_points(twin.heliostat, heights_of(surface))
+    seen = {m.identifier for m in surface.measurements}
     chosen = choose_measurements(session, row, request.images, request.since, request.until)
     names = [found.identifier for found in chosen]
     rows = store.get_measurements(session, row, names, arrays=True)

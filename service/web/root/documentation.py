@@ -5,8 +5,10 @@ The browser requests nothing from outside the plant.
 
 import mimetypes
 from pathlib import Path
+from typing import Annotated
 
 from fastapi import APIRouter, Response
+from fastapi import Path as Parameter
 from fastapi.responses import HTMLResponse
 
 from service.base.errors import NotFoundError
@@ -46,13 +48,16 @@ _GUIDE_HEADERS = {
 
 
 @router.get("/docs/guide", dependencies=[READ])
+def get_guide_start() -> Response:
+    """Go to the first page of the guide, whose links are relative."""
+    return go_to("/docs/guide/index.html")
+
+
 @router.get("/docs/guide/{path:path}", dependencies=[READ])
-def get_guide(path: str = "") -> Response:
+def get_guide(path: Annotated[str, Parameter(pattern=r"^[\w./-]{0,200}$")]) -> Response:
     """A page of the guide, if this installation has it."""
     if not has_guide():
         raise NotFoundError("this installation has no guide; `make docs` builds it")
-    if not path:
-        return go_to("/docs/guide/index.html")
     if GUIDE / path not in (file for file in GUIDE.rglob("*") if file.is_file()):
         raise NotFoundError(f"the guide has no page {path}")
     media_type = mimetypes.guess_type(path)[0] or "application/octet-stream"
