@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test serve lint lock bench train clean
+.PHONY: help install demo test serve lint lock docs bench train clean
 
 help: ## list the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -24,6 +24,11 @@ test: install ## every test
 
 lock: install ## the image's packages with their hashes, in the versions of constraints.txt
 	PATH=$(BIN):$$PATH $(BIN)/python docker/lock.py $(ARGS)
+
+docs: install ## the guide, into build/docs and into the service, which shows it on /docs/guide
+	$(BIN)/sphinx-build -W --keep-going -q -d build/doctrees -b html docs build/docs
+	rm -rf service/web/root/guide
+	cp -r build/docs service/web/root/guide
 
 lint: install ## ruff, mypy, imports between packages, and limits of what makes code hard to read
 	$(BIN)/ruff check .
@@ -45,4 +50,4 @@ train: install ## the shipped weights from scratch: network, prior, export, eval
 	$(BIN)/python -m training.evaluate
 
 clean: ## remove the virtual environment and everything that was made
-	rm -rf $(VENV) out build *.egg-info
+	rm -rf $(VENV) out build service/web/root/guide docs/reference/generated *.egg-info

@@ -119,7 +119,8 @@ def texts() -> Iterator[str]:
     paths = {path for folder in folders for pattern in TEXTS for path in folder.rglob(pattern)}
     paths |= {ROOT / name for name in ("README.md", "RESULTS.md", "Makefile")}
     for path in sorted(paths - QUOTING):
-        if ".min." not in path.name:
+        is_built = not {"generated", "guide"}.isdisjoint(path.parts)
+        if ".min." not in path.name and not is_built:
             yield path.read_text()
 
 

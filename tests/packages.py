@@ -1,6 +1,6 @@
 """The packages and their imports, read from the code: ``python -m tests.packages``.
 
-It prints the table of the README. A test checks that the README has it.
+It prints the table of docs/explanation/architecture.md. A test checks that the page has it.
 """
 
 import importlib

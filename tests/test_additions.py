@@ -1,5 +1,5 @@
-"""README's table of additions, each tried: into a copy of the packages goes the one file, and the
-one line.
+"""The guide's table of additions, each tried: into a copy of the packages goes the one file, and
+the one line.
 """
 
 import json
@@ -17,6 +17,8 @@ from tests import packages
 
 ROOT = Path(__file__).parents[1]
 ADDED = Path(__file__).parent / "additions"
+DOCS = ROOT / "docs"
+EXTENDING = DOCS / "how-to" / "developer" / "extend.md"
 
 FILES = {
     "REST resource": "service/web/api/greetings.py",
@@ -37,11 +39,6 @@ LINES = {
     "sun shape": ("model/sunshape/__init__.py", "DECLARABLE = (", '"cosine", '),
 }
 """The addition in another file, and the text that it follows."""
-
-
-def _section(title: str) -> str:
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    return text.partition(f"\n{title}\n")[2].partition("\n#")[0]
 
 
 @pytest.fixture(scope="module")
@@ -83,9 +80,9 @@ def test_each_addition_is_one_file_and_at_most_one_line(tried, addition):
 
 
 @pytest.mark.parametrize("addition", FILES)
-def test_readme_says_where_each_goes(addition):
+def test_guide_says_where_each_goes(addition):
     """The row names the folder of the file, and the file of the line."""
-    rows = _section("### Where things go").splitlines()
+    rows = EXTENDING.read_text(encoding="utf-8").splitlines()
     (row,) = (line for line in rows if line.startswith((f"| a {addition} |", f"| an {addition} |")))
     _, _, write, also, _ = row.split("|", 4)
     assert f"`{Path(FILES[addition]).parent}/NAME.py`" in write
@@ -95,7 +92,8 @@ def test_readme_says_where_each_goes(addition):
 
 def test_the_words_of_the_glossary_are_those_of_the_code():
     """Each dotted name in the last column is a module, or something in one."""
-    rows = [line for line in _section("### Words").splitlines() if line.startswith("| ")][2:]
+    text = (DOCS / "glossary.md").read_text(encoding="utf-8")
+    rows = [line for line in text.splitlines() if line.startswith("| ")][2:]
     assert len(rows) > 30
     for name in (
         found for row in rows for found in re.findall(r"`(model\.[\w.]+|service\.[\w.]+)`", row)
@@ -112,7 +110,7 @@ def test_the_words_of_the_glossary_are_those_of_the_code():
             break
 
 
-def test_readme_has_the_table_of_packages():
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
+def test_architecture_has_the_table_of_packages():
+    text = (DOCS / "explanation" / "architecture.md").read_text(encoding="utf-8")
     shown = text.partition("<!-- python -m tests.packages -->\n")[2].partition("\n<!-- end -->")[0]
-    assert shown == packages.table(), "README shows what `python -m tests.packages` printed once"
+    assert shown == packages.table(), "the page shows what `python -m tests.packages` printed once"

@@ -68,10 +68,8 @@ class StoreCollector(Collector):
         yield from found
 
     def _of_heliostats(self, session: Session) -> list[Metric]:
-        lines, most = (
-            self._cache.read(session, PATIENCE_S).lines,
-            self._runtime.settings.metrics_heliostats,
-        )
+        lines = self._cache.read(session, PATIENCE_S).lines
+        most = self._runtime.settings.metrics_heliostats
         return [*_trust(lines, most), *_pointing(lines, most)]
 
 

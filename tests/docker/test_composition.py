@@ -1,7 +1,7 @@
 """The image and the composition as a plant runs them: from a clean clone, on real photographs,
 through a week of faults.
 
-The tests run the commands of docker/OPERATING.md.
+The tests run the commands of docs/how-to/administrator.
 """
 
 import json

@@ -137,8 +137,8 @@ echo "${image%%:*}@sha256:$(printf %s "$image" | sha256sum | cut -c1-64)"
 
 
 def test_images_are_named_by_digest_once_they_are_pinned(tmp_path: Path):
-    """The script that OPERATING.md names, with an engine that knows a digest of every image;
-    compose reads its file.
+    """The script that the administrator's guide names, with an engine that knows a digest of every
+    image; compose reads its file.
     """
     for name in ("pin_images.sh", "compose.yaml"):
         shutil.copy(DOCKER / name, tmp_path)
@@ -316,9 +316,8 @@ def test_alerts_ask_for_metrics_that_exist(tmp_path: Path):
         for name in re.findall(r"heliotwin_\w+", expression)
     }
     assert {name.removesuffix("_bucket") for name in drawn} <= names
-    documented = set(
-        re.findall(r"heliotwin_\w+", (DOCKER / "OPERATING.md").read_text(encoding="utf-8"))
-    )
+    guide = ROOT / "docs" / "how-to" / "administrator" / "monitor.md"
+    documented = set(re.findall(r"heliotwin_\w+", guide.read_text(encoding="utf-8")))
     assert documented <= names
 
 

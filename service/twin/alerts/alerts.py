@@ -187,15 +187,9 @@ def _of_heliostat(line: HeliostatOverview, settings: Settings, at: datetime) -> 
 
 
 def _untrusted_surfaces(name: str, surface: ActiveSurface, at: datetime) -> Alert:
-    since, photographs = (
-        surface.warned_since or surface.created_at or at,
-        tuple(surface.suspicious or ()),
-    )
-    which = (
-        f"photographs {', '.join(photographs)}"
-        if len(photographs) > 1
-        else f"photograph {''.join(photographs)}"
-    )
+    since = surface.warned_since or surface.created_at or at
+    photographs = tuple(surface.suspicious or ())
+    which = f"photograph{'s' if len(photographs) > 1 else ''} {', '.join(photographs)}"
     return Alert(
         "untrusted",
         name,
@@ -245,15 +239,11 @@ def _pointing(
 
 def _moved_drives(name: str, moved: DriveStep) -> Alert:
     if moved.is_calibrated:
-        size, action = (
-            f"its drives stepped by {moved.size_mrad:.1f} mrad",
-            "find out why; its mount is calibrated since",
-        )
+        size = f"its drives stepped by {moved.size_mrad:.1f} mrad"
+        action = "find out why; its mount is calibrated since"
     else:
-        size, action = (
-            f"its spot is {moved.size_mrad:.1f} mrad off since",
-            "look at its drives and encoders, and calibrate its mount again",
-        )
+        size = f"its spot is {moved.size_mrad:.1f} mrad off since"
+        action = "look at its drives and encoders, and calibrate its mount again"
     fingerprint = f"{moved.since.isoformat()} {moved.until.isoformat()}"
     return Alert("moved", name, moved.until, f"it moved {moved.when}: {size}", action, fingerprint)
 
@@ -284,10 +274,8 @@ def _without_photograph(session: Session, allowed: timedelta, at: datetime) -> I
         )
         action = "photograph it where the calibration plan says"
         if count:
-            message, action = (
-                f"{message}; the time of {count} more is unknown",
-                f"{action}, or {_GIVE_TIMES}",
-            )
+            message = f"{message}; the time of {count} more is unknown"
+            action = f"{action}, or {_GIVE_TIMES}"
         yield Alert("no_photograph", name, begun + allowed, message, action, begun.isoformat())
 
 
@@ -403,10 +391,8 @@ def _queue(session: Session, settings: Settings) -> Iterator[Alert]:
         seconds=settings.attention_queue_s
     ):
         return
-    message, action = (
-        f"job {oldest.id} has waited since then",
-        "see whether a worker is alive, and what its log says",
-    )
+    message = f"job {oldest.id} has waited since then"
+    action = "see whether a worker is alive, and what its log says"
     yield Alert("queue", None, oldest.created_at, message, action, str(oldest.id))
 
 
@@ -453,10 +439,8 @@ def _watch_cameras(session: Session, cameras: Sequence[CameraChange]) -> Iterato
     for change in cameras:
         since = datetime.combine(change.day, clock(), UTC)
         if declared is None or since > declared.adopted_at:
-            way, times = (
-                "up" if change.ratio > 1 else "down",
-                f"{change.ratio:.2f} times what it was",
-            )
+            way = "up" if change.ratio > 1 else "down"
+            times = f"{change.ratio:.2f} times what it was"
             yield Alert(
                 "camera",
                 None,
@@ -495,10 +479,8 @@ def _declared_anew(session: Session) -> ModelRow | None:
 
     Withdrawn versions do not count.
     """
-    plant, rows = (
-        session.get(PlantRow, 1),
-        [row for row in model_versions.list_models(session) if row.withdrawn_at is None],
-    )
+    plant = session.get(PlantRow, 1)
+    rows = [row for row in model_versions.list_models(session) if row.withdrawn_at is None]
     declared = [None if plant is None else plant.declared, *(row.declared for row in rows)]
     cameras = [(document or {}).get("cameras") for document in declared]
     changed = [row for row, (old, new) in zip(rows, pairwise(cameras), strict=True) if old != new]

@@ -264,10 +264,8 @@ def read_summaries(session: Session, heliostat: int | None = None) -> list[Helio
     """
     surfaces, candidates = _current_surfaces(session, heliostat)
     photographs, mounted = _photographs(session, heliostat), _mounts(session, heliostat)
-    model, receivers = (
-        model_versions.current_number(session),
-        [row.center_m for row in store.list_receivers(session)],
-    )
+    model = model_versions.current_number(session)
+    receivers = [row.center_m for row in store.list_receivers(session)]
     row, none = HeliostatRow, _PhotographCounts()
     query = select(row.id, row.name, row.photographs_changed_at, row.east_m, row.north_m, row.up_m)
     if heliostat is not None:

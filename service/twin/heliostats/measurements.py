@@ -133,10 +133,8 @@ class AcceptedMeasurement:
             raise InvalidInputError(f"{key}: 'focal_spot' lies off its target {self.target.name}")
         image, plane, clipped = self.flux, self.target, self.clipped
         if image is None:  # only the part about the spot is known
-            image, plane = (
-                self.centered,
-                replace(plane, center=self.spot, width=FLUX_WINDOW, height=FLUX_WINDOW),
-            )
+            image = self.centered
+            plane = replace(plane, center=self.spot, width=FLUX_WINDOW, height=FLUX_WINDOW)
         shot = Setup(
             heliostat,
             points,
@@ -220,10 +218,8 @@ def load_heliostat_context(
     ConflictError
         If the plant is not set.
     """
-    row, model = (
-        store.get_heliostat(session, name),
-        model_versions.get_model(session, model_version),
-    )
+    row = store.get_heliostat(session, name)
+    model = model_versions.get_model(session, model_version)
     return HeliostatContext(
         row, as_calibrated(row, mounts.find_mount_at(session, row), model), model
     )

@@ -152,14 +152,10 @@ def _surface(session: Session, heliostat: HeliostatRow, surfaces: Surfaces) -> S
 def _load_heliostat_inputs(
     session: Session, row: HeliostatRow, request: StudyRequest, material: StudyInputs
 ) -> None:
-    twin, surface = (
-        load_heliostat_context(session, row.name),
-        _surface(session, row, request.surfaces),
-    )
-    points, seen = (
-        control_points(twin.heliostat, heights_of(surface)),
-        {m.identifier for m in surface.measurements},
-    )
+    twin = load_heliostat_context(session, row.name)
+    surface = _surface(session, row, request.surfaces)
+    points = control_points(twin.heliostat, heights_of(surface))
+    seen = {m.identifier for m in surface.measurements}
     chosen = choose_measurements(session, row, request.images, request.since, request.until)
     names = [found.identifier for found in chosen]
     rows = store.get_measurements(session, row, names, arrays=True)

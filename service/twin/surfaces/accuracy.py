@@ -166,10 +166,8 @@ def compare_with(
     The forecasts use a stored surface, or the ideal one if ``surface`` is None.
     """
     shown = [accepted_measurement(row, twin.origin) for row in rows]
-    used, forecasts = (
-        photographs_of_surface(surface),
-        forecasts_of(runtime, twin, shown, heights_of(surface)),
-    )
+    used = photographs_of_surface(surface)
+    forecasts = forecasts_of(runtime, twin, shown, heights_of(surface))
     return [
         Comparison(
             row,
@@ -402,10 +400,8 @@ def accuracy_drop(accuracies: Sequence[float]) -> AccuracyDrop | None:
     The interval is a bootstrap interval: Efron and Tibshirani 1993, *An Introduction to the
     Bootstrap*, chapter 13.
     """
-    recent, earlier = (
-        np.array(accuracies[:_NEWEST]),
-        np.array(accuracies[_NEWEST : _NEWEST + _BEFORE]),
-    )
+    recent = np.array(accuracies[:_NEWEST])
+    earlier = np.array(accuracies[_NEWEST : _NEWEST + _BEFORE])
     if len(earlier) < _NEWEST:
         return None
     drop = bootstrap(

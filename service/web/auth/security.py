@@ -31,6 +31,9 @@ PUBLIC = ("/livez", "/readyz", "/openapi.json", "/docs", "/session", "/login", "
 None of them shows or changes data of the plant.
 """
 
+GUIDE = "/docs/guide/"
+"""The guide, which needs a key like all pages, although it is below a public path."""
+
 
 HEALTH = ("/livez", "/readyz")
 """Probes of process supervisors, without a rate limit.
@@ -73,7 +76,8 @@ LOCAL = Identity(keys.RESERVED, Role.ADMIN)
 
 def is_public(path: str) -> bool:
     """Whether a path needs no key."""
-    return any(path == public or path.startswith(f"{public}/") for public in PUBLIC)
+    below = f"{path}/"
+    return any(below.startswith(f"{public}/") for public in PUBLIC) and not below.startswith(GUIDE)
 
 
 def presented_key(headers: Mapping[str, str]) -> str | None:

@@ -58,17 +58,8 @@ def get_attention_page(
         reason=reason,
         acknowledged=acknowledged,
         pending=pending,
-        limits=_limits(runtime),
+        limits=runtime.settings,
     )
-
-
-def _limits(runtime: RuntimeDep) -> dict[str, object]:
-    settings = runtime.settings
-    return {
-        name: getattr(settings, name)
-        for name in type(settings).model_fields
-        if name.startswith("attention_")
-    }
 
 
 @router.get("/attention/count", dependencies=[READ])

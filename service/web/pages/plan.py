@@ -246,10 +246,8 @@ def _day(session: Session, row: JobRow, at: int | None) -> Day:
 
 
 def _choices(session: Session, after: int | None) -> dict[str, Any]:
-    receivers, plans = (
-        [row.name for row in store.list_receivers(session)],
-        store.list_plans(session, LISTED + 1, after),
-    )
+    receivers = [row.name for row in store.list_receivers(session)]
+    plans = store.list_plans(session, LISTED + 1, after)
     return {
         "targets": [*receivers, *(row.name for row in store.list_targets(session))],
         "plans": plans[:LISTED],

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from functools import cache
 from http import HTTPStatus
+from pathlib import Path
 from typing import Any
 from urllib.parse import quote, urlencode
 
@@ -47,6 +48,15 @@ _NOTICE = {
     "HX-Reselect": ".alert",
     "HX-Push-Url": "false",
 }
+
+
+GUIDE = Path(__file__).resolve().parents[1] / "root" / "guide"
+"""The built guide; ``make docs`` puts it here."""
+
+
+def has_guide() -> bool:
+    """Whether this installation has the guide."""
+    return (GUIDE / "index.html").is_file()
 
 
 @cache
@@ -111,7 +121,7 @@ def _environment() -> Environment:
     made = environment("service.web.pages", "service.drawing")
     made.globals.update(asset=asset, htmx_settings=json.dumps(_HTMX))
     made.globals.update(link_to_table=_link_to_table, link_to_figure=_link_to_figure)
-    made.globals.update(new_table=_new_table, add_cell=_add_cell)
+    made.globals.update(new_table=_new_table, add_cell=_add_cell, has_guide=has_guide)
     made.filters.update(shown=_shown)
     return made
 

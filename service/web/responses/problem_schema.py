@@ -14,7 +14,7 @@ class Problem(BaseModel):
     """An error (RFC 9457)."""
 
     type: str = Field(
-        description="Stable name of what is wrong; INTEGRATION.md lists all of them.",
+        description="Stable name of what is wrong; the guide lists all of them.",
         examples=["urn:heliotwin:problem:invalid"],
     )
     title: str = Field(examples=["Unprocessable Content"])

@@ -1,38 +1,30 @@
-"""The page at ``/docs``: Swagger UI from an installed package.
+"""The page at ``/docs``: Swagger UI from an installed package; the guide at ``/docs/guide``.
 
 The browser requests nothing from outside the plant.
 """
 
+import mimetypes
 from pathlib import Path
+from typing import Annotated
 
-from fastapi import APIRouter
+from fastapi import APIRouter, Response
+from fastapi import Path as Parameter
 from fastapi.responses import HTMLResponse
 
-from service.web.responses.files import KnownFiles
+from service.base.errors import NotFoundError
+from service.web.auth.dependencies import READ
+from service.web.responses.files import KnownFiles, WholeFile
+from service.web.responses.pages import GUIDE, go_to, has_guide
+from service.web.responses.problems import SECURITY_HEADERS
 
 router = APIRouter(include_in_schema=False)
 
-_PAGE = """<!doctype html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>heliotwin: documentation</title>
-<link rel="icon" href="data:,">
-<link rel="stylesheet" href="/docs/swagger-ui.css">
-</head>
-<body>
-<div id="swagger-ui"></div>
-<script src="/docs/swagger-ui-bundle.js"></script>
-<script src="/docs/start.js"></script>
-</body>
-</html>
-"""
+_STATIC = Path(__file__).parent / "static"
 
 MOUNT = (
     "/docs",
     KnownFiles(
-        Path(__file__).parent / "static",
+        _STATIC,
         ["swagger-ui.css", "swagger-ui-bundle.js", "start.js"],
         "max-age=3600",
         packages=[("fastapi_offline", "static")],
@@ -44,4 +36,29 @@ MOUNT = (
 @router.get("/docs")
 def get_docs() -> HTMLResponse:
     """The page."""
-    return HTMLResponse(_PAGE)
+    return HTMLResponse((_STATIC / "docs.html").read_text(encoding="utf-8"))
+
+
+_POLICY = SECURITY_HEADERS["Content-Security-Policy"]
+# The theme of the guide sets some styles in its pages; scripts stay in files.
+_GUIDE_HEADERS = {
+    "Content-Security-Policy": f"{_POLICY}; style-src 'self' 'unsafe-inline'",
+    "Cache-Control": "max-age=3600",
+}
+
+
+@router.get("/docs/guide", dependencies=[READ])
+def get_guide_start() -> Response:
+    """Go to the first page of the guide, whose links are relative."""
+    return go_to("/docs/guide/index.html")
+
+
+@router.get("/docs/guide/{path:path}", dependencies=[READ])
+def get_guide(path: Annotated[str, Parameter(pattern=r"^[\w./-]{0,200}$")]) -> Response:
+    """A page of the guide, if this installation has it."""
+    if not has_guide():
+        raise NotFoundError("this installation has no guide; `make docs` builds it")
+    if GUIDE / path not in (file for file in GUIDE.rglob("*") if file.is_file()):
+        raise NotFoundError(f"the guide has no page {path}")
+    media_type = mimetypes.guess_type(path)[0] or "application/octet-stream"
+    return WholeFile(GUIDE / path, headers=_GUIDE_HEADERS, media_type=media_type)

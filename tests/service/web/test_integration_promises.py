@@ -37,9 +37,8 @@ from tests.service.conftest import (
 from tests.service.real import run_job
 from tests.service.spots import photographs
 
-GUIDE = " ".join(
-    (Path(__file__).parents[3] / "docker" / "INTEGRATION.md").read_text(encoding="utf-8").split()
-)
+PAGE = "docs/how-to/integrator/photographs.md"
+GUIDE = " ".join((Path(__file__).parents[3] / PAGE).read_text(encoding="utf-8").split())
 BASE = "/v1/heliostats/AA39/measurements"
 MOMENT = "2024-06-01T09:14:03Z"
 SPOT = spot_of(50.9133, 6.3878, 122.9)
@@ -53,7 +52,7 @@ def promise(*sentences: str) -> Callable[[Test], Test]:
     def marked(test: Test) -> Test:
         missing = [sentence for sentence in sentences if sentence not in GUIDE]
         assert not missing, (
-            f"docker/INTEGRATION.md no longer says {missing}; change {test.__name__} with the guide"
+            f"{PAGE} no longer says {missing}; change {test.__name__} with the guide"
         )
         return test
 
@@ -79,7 +78,7 @@ def reasons(client: TestClient) -> set[str]:
 # --------------------------------------------------------------------------------------------------
 
 
-@promise("your own name for the photograph, unique for the heliostat; its kinds share it")
+@promise("your own name for the photograph, unique for the heliostat. Its kinds share it")
 def test_an_id_is_unique_for_a_heliostat_and_shared_by_kinds(other: TestClient, post: Post):
     assert post(png(1), id="1", kind="flux").json()["id"] == "1"
     assert post(png(2), id="1", kind="raw").json()["id"] == "1-raw"
@@ -112,7 +111,7 @@ def test_kind_none_has_no_image_part(client: TestClient, tower: Any, properties:
     assert run_job(client, "/v1/jobs/calibrations")["mounts"] == {"AA39": 1}
 
 
-@promise("when it was taken, with zone; it orders photographs and surfaces, however late they come")
+@promise("when it was taken, with zone. It orders photographs and surfaces, however late they come")
 def test_times_order_photographs_and_surfaces_however_late_they_come(
     client: TestClient, post: Post
 ):
@@ -133,7 +132,8 @@ def test_times_order_photographs_and_surfaces_however_late_they_come(
 
 
 @promise(
-    "lists by time have the photograph last, no filter by time finds it", "attention asks for times"
+    "lists by time have the photograph last, and no filter by time finds it",
+    "attention asks for times",
 )
 def test_without_a_time_lists_by_time_have_it_last(client: TestClient, post: Post):
     post(png(1), id="undated")
@@ -152,7 +152,7 @@ def test_without_a_time_lists_by_time_have_it_last(client: TestClient, post: Pos
     )
 
 
-@promise("it says nothing of drift, steps or the newest state")
+@promise("It says nothing of drift, steps or the newest state")
 def test_without_a_time_it_is_never_the_newest(app: FastAPI, client: TestClient, post: Post):
     def drift() -> int | None:
         with app.state.runtime.database.reading() as session:
@@ -173,7 +173,7 @@ def test_without_a_time_it_is_never_the_newest(app: FastAPI, client: TestClient,
 
 
 @promise(
-    "`filled` names what was missing and this post brought, `ignored` what differs; it answers to"
+    "`filled` names what was missing and this post brought, `ignored` what differs. It answers to"
     " this `id`, too"
 )
 def test_200_names_what_was_filled_and_ignored(client: TestClient, post: Post):
@@ -226,7 +226,7 @@ def test_409_has_what_is_stored_and_the_remedy(
     assert listed(other) == ["1", "2"]
 
 
-@promise("an operator corrects it by `PATCH .../measurements/205363`")
+@promise("An operator corrects it by `PATCH .../measurements/205363`")
 def test_what_409_asks_for_helps(client: TestClient, post: Post):
     post(id="205363")
     assert post(id="205363", sun=sun_at(159.0)).status_code == 409
@@ -249,7 +249,7 @@ def test_what_409_asks_for_helps(client: TestClient, post: Post):
         ),
     ],
 )
-@promise("| 404, 413, 415, 422 | it cannot be taken; `detail` says why and what to change |")
+@promise("| 404, 413, 415, 422 | it cannot be taken. `detail` says why and what to change |")
 def test_what_cannot_be_taken_says_why(
     refused_post: Post, changes: dict[str, Any], status: int, says: str
 ):
@@ -303,9 +303,9 @@ def test_measurement_is_independent_of_sender_repetition_and_order(
 
 
 @promise(
-    "Without an image the `id` decides; without an `id` it is the same measurement if target, sun"
+    "Without an image the `id` decides. Without an `id` it is the same measurement if target, sun"
     " and motor position are the same and the times do not differ.",
-    "without an image also another focal spot",
+    "Without an image also another focal spot",
 )
 def test_without_an_image_the_id_decides_or_the_values(client: TestClient):
     document = metadata(kind="none", motor_position=[1, 2], focal_spot_m=SPOT)
@@ -335,8 +335,8 @@ def test_two_heliostats_have_one_image_by_force(other: TestClient, post: Post):
 
 @promise(
     "A photograph that was sent by mistake is deleted by `DELETE"
-    " .../measurements/205363?reason=...` (role `operate`; all its images, with `only_this=true`"
-    " one of them)",
+    " .../measurements/205363?reason=...`. This needs the role `operate`. It deletes all its"
+    " images, with `only_this=true` one of them.",
     "surfaces made from it name it in `deleted`",
 )
 def test_what_was_sent_by_mistake_is_deleted(app: FastAPI, client: TestClient, post: Post):
@@ -383,7 +383,7 @@ def test_images_are_kept_for_two_years_by_default(tmp_path: Path):
 
 
 @promise(
-    "| 201 | stored for good, also if the power fails now; read `accepted`, `reason` and `warnings`"
+    "| 201 | stored for good, also if the power fails now. Read `accepted`, `reason` and `warnings`"
     " | next |"
 )
 def test_201_is_stored_for_good(settings: Settings, client: TestClient, post: Post):
@@ -428,8 +428,8 @@ def test_only_numbers_are_numbers(refused_post: Post, value: str):
 
 
 @promise(
-    "`sun_contradicts_time`, where the sun did not stand where it was recorded at `taken_at`"
-    " (`angle_deg` is the angle between both). It refuses nothing"
+    "`sun_contradicts_time`: the sun was not where it was recorded at `taken_at` (`angle_deg` is"
+    " the angle between both). It refuses nothing"
 )
 def test_a_sun_that_contradicts_its_time_is_warned_of(client: TestClient, post: Post):
     document = post(id="1", taken_at=MOMENT).json()
@@ -464,7 +464,7 @@ def test_times_are_given_together_all_or_none(app: FastAPI, client: TestClient, 
 
 
 @promise(
-    "`taken_at` may be ahead of the service's clock by a day at most; a photograph from further in"
+    "`taken_at` may be ahead of the service's clock by a day at most. A photograph from further in"
     " the future is refused (422)"
 )
 def test_a_photograph_of_the_future_is_refused(client: TestClient, post: Post):

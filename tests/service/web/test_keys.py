@@ -116,6 +116,7 @@ def guarded(
 
 
 def ask(client: TestClient, method: str, path: str, headers: dict[str, str]) -> Any:
+    path = path.replace("{path:path}", "index.html")
     filled = path.format(name="AA39", measurement="1", number="999", version="999", view="crop")
     body = {"content": b"{}"} if method in ("POST", "PUT") else {}
     return client.request(

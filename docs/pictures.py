@@ -1,0 +1,103 @@
+"""Draw the pictures of README and the site from a demonstration: ``python -m docs.pictures OUT``.
+
+``OUT`` is the folder of ``heliotwin demo``, ``out/demo`` by default.
+"""
+
+import json
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from sqlalchemy import select
+
+from model.images import FLUX_WINDOW
+from service.base.arrays import unpack
+from service.base.settings import Settings
+from service.cli import demo
+from service.cli.folder import observations_of
+from service.cli.folder_store import FolderStore
+from service.drawing.pictures import mirror_heights, of_peak
+from service.sources.folder import read_folder
+from service.store.tables import HeliostatRow, SurfaceRow
+from service.twin.runtime.runtime import Runtime
+
+PICTURE = Path(__file__).parent / "images" / "overview.png"
+PHOTOGRAPH = PICTURE.with_name("photograph.jpg")
+"""The photograph that README posts."""
+NAME, IMAGE = "AB12", "104"
+"""The heliostat and its photograph, which no surface was made from."""
+
+
+def draw(out: Path) -> None:
+    """Draw photograph, surface, measured and forecast flux, and field, into `PICTURE`."""
+    PICTURE.parent.mkdir(exist_ok=True)
+    folder = read_folder(out / "plant")
+    settings = Settings(data_dir=out / f"store-{folder.plant.name}", database_url=None)
+    runtime = Runtime.from_settings(settings)
+    try:
+        with runtime.database.reading() as session:
+            found, _ = observations_of(FolderStore(folder, runtime, session), NAME)
+            query = select(SurfaceRow.arrays).join(
+                HeliostatRow, HeliostatRow.id == SurfaceRow.heliostat_id
+            )
+            query = query.where(HeliostatRow.name == NAME, SurfaceRow.source == "refined")
+            z = unpack(session.scalars(query).one())["z"].astype(np.float64)
+    finally:
+        runtime.close()
+    (seen,) = (o for o in found if o.identifier.startswith(IMAGE))
+    flux = demo._forecast(folder.plant.heliostats[NAME], seen, folder, (z, None))
+    report = json.loads((out / "report.json").read_text(encoding="utf-8"))
+    accuracies = {h["heliostat"]: h["accuracy_refined"] for h in report["heliostats"]}
+    positions = {name: h.position for name, h in folder.plant.heliostats.items()}
+
+    figure = Figure(figsize=(15, 3.6), layout="constrained", dpi=90)
+    axes = figure.subplots(1, 5)
+    photograph = cv2.imread(str(next((out / "plant" / NAME).rglob(f"{IMAGE}-raw.png"))))
+    cv2.imwrite(str(PHOTOGRAPH), photograph, [cv2.IMWRITE_JPEG_QUALITY, 92])
+    axes[0].imshow(photograph[..., ::-1])
+    _name(axes[0], "1. Photograph of a target")
+    heights = axes[1].imshow(_mirror(z), cmap="RdBu_r", vmin=-1, vmax=1, origin="lower", aspect=0.8)
+    figure.colorbar(heights, ax=axes[1], label="mm", shrink=0.7)
+    _name(axes[1], "2. Mirror surface")
+    measured, forecast = of_peak(seen.flux, flux)
+    half = FLUX_WINDOW / 2
+    for place, values, title in ((2, measured, "Measured flux"), (3, forecast, "3. Forecast flux")):
+        axes[place].imshow(values, cmap="inferno", vmin=0, vmax=1, extent=(-half, half) * 2)
+        _name(axes[place], title)
+    _draw_field(axes[4], positions, accuracies)
+    figure.savefig(PICTURE)
+
+
+def _mirror(z: np.ndarray) -> np.ndarray:
+    """The mirror's four facets as one map [mm], seen from the front, with rows from below."""
+    left_up, right_up, left_down, right_down = (
+        np.pad(facet.T, 1, constant_values=np.nan) for facet in mirror_heights(z)
+    )
+    return np.block([[left_down, right_down], [left_up, right_up]])
+
+
+def _name(axes: Axes, title: str) -> None:
+    axes.set_title(title)
+    axes.set_xticks([])
+    axes.set_yticks([])
+
+
+def _draw_field(axes: Axes, positions: dict[str, np.ndarray], accuracies: dict[str, float]) -> None:
+    """The heliostats around the tower, with the flux accuracy of each."""
+    axes.plot(0, 0, "ks", markersize=10)
+    axes.annotate("tower", (0, 0), (6, 8), textcoords="offset points")
+    for name, (east, north, _) in positions.items():
+        axes.plot(east, north, "o", color="#2a7f62", markersize=9)
+        axes.annotate(
+            f"{name}\n{accuracies[name]:.0%}", (east, north), (7, -8), textcoords="offset points"
+        )
+    axes.margins(0.3)
+    axes.set_aspect("equal")
+    _name(axes, "4. Field: flux accuracy")
+
+
+if __name__ == "__main__":
+    draw(Path(sys.argv[1] if len(sys.argv) > 1 else "out/demo"))

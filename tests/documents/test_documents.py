@@ -1,0 +1,100 @@
+"""README and the guide: length, sentences, links, and sections that the service links to."""
+
+import hashlib
+import re
+
+import pytest
+from typer.main import get_command
+
+from service.base.settings import Settings
+from service.cli.main import app
+from service.twin.alerts.alerts import REASONS
+
+from .prose import DOCS, ROOT, pages, sentences, statistics_of
+
+README = ROOT / "README.md"
+
+
+def test_readme_is_short_and_has_a_picture():
+    text = README.read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 150
+    assert len(text.split()) <= 900
+    assert re.search(r"^!\[", text, re.MULTILINE)
+
+
+def test_figures_of_the_readme_are_those_of_the_results():
+    text = README.read_text(encoding="utf-8")
+    table = text.partition("## Results")[2].partition("\n\n| what")[2].partition("\n\n")[0]
+    numbers = re.findall(r"\d+\.\d+|\d+ of \d+", table)
+    assert len(numbers) > 10
+    results = (ROOT / "RESULTS.md").read_text(encoding="utf-8")
+    assert not [number for number in numbers if number not in results]
+
+
+def test_answer_in_the_readme_is_that_of_its_photograph():
+    """A photograph without an id is named by the hash of its file."""
+    digest = hashlib.sha256((DOCS / "images" / "photograph.jpg").read_bytes()).hexdigest()
+    assert f'"id": "{digest[:16]}"' in README.read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("name", ["README", "guide"])
+def test_sentences_are_short(name: str):
+    chosen = [page for page in pages() if (page == README) == (name == "README")]
+    found = statistics_of([page.read_text(encoding="utf-8") for page in chosen])
+    assert len(found.lengths) > 30
+    assert not found.faults()
+
+
+def test_sentences_are_counted_as_a_reader_counts_them():
+    text = "# Title\n\nOne [link](x.md) is here. Two;\nthree `a; b`.\n\n"
+    text += "```bash\nno text\n```\n- item one\n"
+    assert sentences(text) == ["One link is here.", "Two; three code.", "item one"]
+
+
+def test_links_of_the_readme_lead_to_files():
+    targets = re.findall(r"\]\(([^)#\s]+)[^)]*\)", README.read_text(encoding="utf-8"))
+    files = [target for target in targets if "://" not in target]
+    assert len(files) > 10
+    missing = [target for target in files if not (ROOT / target).exists()]
+    assert not missing
+
+
+def test_every_alarm_has_its_section_with_meaning_cause_and_action():
+    """The anchors are those that the page of alerts links to."""
+    text = (DOCS / "how-to" / "operator" / "alarms.md").read_text(encoding="utf-8")
+    sections = re.findall(r"^\((\w+)\)=\n## (\w+):(.*?)(?=^\(|\Z)", text, re.MULTILINE | re.DOTALL)
+    assert [anchor for anchor, _, _ in sections] == list(REASONS)
+    for anchor, title, section in sections:
+        assert anchor == title
+        for part in ("Meaning", "Cause", "Action"):
+            assert f"**{part}.**" in section
+
+
+def test_rules_of_prometheus_name_the_sections():
+    rules = (ROOT / "docker" / "prometheus-rules.yml").read_text(encoding="utf-8")
+    anchors = re.findall(r"runbook: /docs/guide/how-to/operator/alarms.html#(\S+)", rules)
+    assert anchors == [reason.replace("_", "-") for reason in REASONS]
+
+
+def test_settings_verbs_and_files_that_pages_name_exist():
+    text = "\n".join(page.read_text(encoding="utf-8") for page in pages())
+    settings = {f"HELIOTWIN_{name.upper()}" for name in Settings.model_fields}
+    composition = (ROOT / "docker" / "compose.yaml").read_text(encoding="utf-8")
+    named = set(re.findall(r"HELIOTWIN_[A-Z_]*[A-Z]", text))
+    assert not [n for n in named - settings if f"{{{n}" not in composition]
+    verbs = set(re.findall(r"(?:^|`|bin/)heliotwin ([a-z]+)", text, re.MULTILINE))
+    assert len(verbs) > 10
+    assert not verbs - set(get_command(app).commands)
+    files = re.findall(r"`((?!out/)(?:[a-z_]+/)+[a-z_]+\.(?:py|yml|yaml|json|sh))`", text)
+    assert len(files) > 10
+    assert not [f for f in files if not ((ROOT / f).exists() or (ROOT / "service" / f).exists())]
+
+
+def test_anchors_of_alarms_are_those_of_the_built_page():
+    """Sphinx writes hyphens in them; the template of the alerts replaces them likewise."""
+    built = ROOT / "build" / "docs" / "how-to" / "operator" / "alarms.html"
+    if not built.exists():
+        pytest.skip("the guide is not built: make docs")
+    page = built.read_text(encoding="utf-8")
+    for reason in REASONS:
+        assert f'id="{reason.replace("_", "-")}"' in page
