@@ -1,6 +1,5 @@
 """Corrections of photographs: another sun, target or time, or exclusion."""
 
-from datetime import datetime
 from typing import Annotated, Any, Self
 
 from fastapi import APIRouter, Body, Depends, Query
@@ -8,7 +7,7 @@ from pydantic import BaseModel, Field, model_validator
 
 from model.pointing import Weather
 from service import store
-from service.base.fields import Flag, Model, Moment, Name, Reason, Sun
+from service.base.fields import Author, CreatedAt, Flag, Model, Moment, Name, Reason, Sun, Why
 from service.jobs.enqueuing import enqueue
 from service.jobs.kinds import predictions
 from service.jobs.kinds.predictions import PredictionsIn
@@ -37,9 +36,9 @@ class CorrectionIn(Model):
     """New values of a photograph. Fields that are not named stay as they are."""
 
     reason: Reason = Field(description="Why; kept with the correction.")
-    target: Name | None = None
-    sun: Sun | None = None
-    taken_at: Moment | None = None
+    target: Name | None = Field(default=None, description="The target it shows.")
+    sun: Sun | None = Field(default=None, description="Where the sun was [deg].")
+    taken_at: Moment | None = Field(default=None, description="When it was taken, with zone.")
     motor_position: Motors | None = Field(default=None, description="Of both axes [steps].")
     wind_speed_m_s: WindSpeed | None = Field(default=None, description="[m/s]")
     wind_from_deg: WindFrom | None = Field(default=None, description="From north, over east [deg].")
@@ -61,9 +60,9 @@ class CorrectionIn(Model):
 class CorrectionOut(BaseModel):
     """A correction of a photograph."""
 
-    created_at: datetime
-    created_by: str
-    reason: str
+    created_at: CreatedAt
+    created_by: Author
+    reason: Why
     before: dict[str, Any] = Field(description="Previous values, by the fields that changed.")
     after: dict[str, Any] = Field(description="New values.")
 
@@ -81,7 +80,7 @@ class DeletedOut(BaseModel):
 class CorrectedOut(BaseModel):
     """A corrected photograph, and what was made from it before the correction."""
 
-    measurement: MeasurementOut
+    measurement: MeasurementOut = Field(description="The photograph as it is now.")
     surface_versions: list[int] = Field(
         description="Versions of the heliostat's surface that were made from it as it was."
     )

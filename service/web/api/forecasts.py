@@ -13,7 +13,10 @@ from service import store
 from service.base.arrays import pair_or_none
 from service.base.fields import (
     AnySun,
+    CreatedAt,
     Flag,
+    HeliostatOf,
+    Id,
     Model,
     ModelNumber,
     ModelVersion,
@@ -25,8 +28,8 @@ from service.base.fields import (
     ReceiverIn,
     Resolution,
     Rows,
-    Sun,
     SunAt,
+    SunPosition,
     Version,
     VersionIn,
 )
@@ -139,7 +142,7 @@ class ForecastReceiverOut(BaseModel):
         description="Its middle: east, north, up of the tower base [m]."
     )
     normal: tuple[float, float, float] = Field(description="Of the lit side, there.")
-    up: tuple[float, float, float]
+    up: tuple[float, float, float] = Field(description="Unit vector up the map.")
     width: float = Field(description="[m]; of a cylinder the length of its arc.")
     height: float = Field(description="[m]")
     radius: float | None = Field(default=None, description="Of a cylinder [m]; null: a plane.")
@@ -151,20 +154,20 @@ class ForecastReceiverOut(BaseModel):
 class ForecastSummary(BaseModel):
     """A computed flux map without its pixels."""
 
-    id: int
+    id: Id
     warnings: list[str] = Field(
         description="What to know first: that the ideal mirror replaces a missing surface."
     )
-    heliostat: str
+    heliostat: HeliostatOf
     surface: Literal["ideal", "stored"] = Field(
         description="Which mirror was traced: the ideal one, or a surface."
     )
     surface_version: int | None = Field(description="null: the ideal surface.")
-    target: str | None
+    target: str | None = Field(description="Name of the target; null: another plane.")
     plane: ForecastReceiverOut = Field(
         description="The plane, or the cylinder, that the light falls on [m]."
     )
-    sun: Sun
+    sun: SunPosition
     at: datetime | None = Field(
         description="The time that was asked for; null: the sun's position was."
     )
@@ -175,7 +178,7 @@ class ForecastSummary(BaseModel):
         description="Side of the mapped square about the centre of mass [m]; null: the plane."
     )
     resolution: tuple[int, int] = Field(description="Rows, columns.")
-    normalised: bool
+    normalised: bool = Field(description="Whether the map is scaled to a sum of 100.")
     unit: str = Field(
         description=(
             "Unit of the map: W/m2, or 1 where it is normalised to a sum of 100. W/m2 are those of"
@@ -189,7 +192,7 @@ class ForecastSummary(BaseModel):
         description="Right and up of the plane's centre [m]."
     )
     model_version: ModelNumber = Field(description="Version of the plant's model, see /v1/models.")
-    created_at: datetime
+    created_at: CreatedAt
 
 
 class ForecastOut(ForecastSummary):

@@ -7,7 +7,7 @@ from fastapi import APIRouter, Depends, Query, Response, status
 from pydantic import BaseModel, Field
 
 from service import store
-from service.base.fields import Model, Name, Search
+from service.base.fields import HeliostatOf, Model, Name, Search
 from service.sources.schema import HeliostatProperties
 from service.store.tables import HeliostatRow
 from service.twin.plant import setup
@@ -28,13 +28,13 @@ class HeliostatIn(Model):
     """A heliostat to store."""
 
     name: Name
-    properties: HeliostatProperties
+    properties: HeliostatProperties = Field(description="PAINT properties.")
 
 
 class HeliostatSummary(BaseModel):
     """A heliostat in a list."""
 
-    name: str
+    name: HeliostatOf
     position_m: tuple[float, float, float] = Field(
         description="East, north, up of the tower base [m]."
     )
@@ -44,7 +44,7 @@ class HeliostatOut(HeliostatSummary):
     """A heliostat with its properties."""
 
     properties: dict[str, Any] = Field(description="PAINT properties as they were sent.")
-    updated_at: datetime
+    updated_at: datetime = Field(description="When it was last changed.")
 
 
 def heliostat_summary(row: HeliostatRow) -> HeliostatSummary:

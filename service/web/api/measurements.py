@@ -17,7 +17,9 @@ from service import store
 from service.base.arrays import pair_or_none, unpack
 from service.base.errors import GoneError, NotFoundError, StoreDamagedError, TooLargeError
 from service.base.fields import (
+    CreatedAt,
     Flag,
+    HeliostatOf,
     Identifier,
     Kind,
     MeasurementName,
@@ -28,7 +30,8 @@ from service.base.fields import (
     Position,
     Reason,
     Rows,
-    Sun,
+    SunPosition,
+    TargetOf,
 )
 from service.drawing.pictures import flux_picture
 from service.sources.photograph import Photograph
@@ -80,7 +83,7 @@ class MeasurementIn(Model):
     model_config = ConfigDict(json_schema_extra={"examples": [_EXAMPLE]})
 
     target: Name = Field(description="The target that the heliostat was aimed at.")
-    sun: Sun
+    sun: SunPosition
     kind: Kind = Field(
         description=(
             "raw: a camera frame; cropped: the rectified target; flux: the separated spot on the"
@@ -142,7 +145,7 @@ class WarningOut(BaseModel):
             " forecast it much better than its own heliostat's."
         )
     )
-    detail: str
+    detail: str = Field(description="What contradicts what, in words.")
     angle_deg: float | None = Field(
         default=None,
         description=(
@@ -162,11 +165,11 @@ class MeasurementOut(BaseModel):
     """A stored measurement."""
 
     id: str = Field(description="Names it in this service's paths.")
-    heliostat: str
+    heliostat: HeliostatOf
     external_id: str | None = Field(description="The caller's own number.")
-    kind: Kind
-    target: str
-    sun: Sun
+    kind: Kind = Field(description="What the image shows, as it was sent.")
+    target: TargetOf
+    sun: SunPosition
     motor_position: tuple[float, float] | None = Field(description="[steps]")
     taken_at: datetime | None = Field(description="null: the time is not known.")
     focal_spot_m: tuple[float, float, float] | None = Field(
@@ -195,7 +198,7 @@ class MeasurementOut(BaseModel):
         description="Right and up of the target's centre [m]."
     )
     image_sha256: str | None = Field(description="null: it came without an image.")
-    image_media_type: str | None
+    image_media_type: str | None = Field(description="Media type of the file; null: no image.")
     image_pruned_at: datetime | None = Field(
         description="Since when the image is kept no longer; everything else of the measurement is."
     )
@@ -203,7 +206,7 @@ class MeasurementOut(BaseModel):
     forced: str | None = Field(
         description="Why it is stored although another heliostat has the same image."
     )
-    created_at: datetime
+    created_at: CreatedAt
     sent_by: str | None = Field(
         description=(
             "Name of the key that sent it, `local` without one, or who imported it; null: not"

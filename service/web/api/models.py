@@ -34,10 +34,10 @@ class ModelOut(BaseModel):
     study: int | None = Field(
         description="The study that it was adopted from; null: a declared model."
     )
-    adopted_at: datetime | None
-    adopted_by: str | None
-    withdrawn_at: datetime | None
-    withdrawn_by: str | None
+    adopted_at: datetime | None = Field(description="When it was adopted; null: declared.")
+    adopted_by: str | None = Field(description="Name of the key that adopted it.")
+    withdrawn_at: datetime | None = Field(description="When it was withdrawn; null: it was not.")
+    withdrawn_by: str | None = Field(description="Name of the key that withdrew it.")
 
 
 def declared_model(declared: dict[str, Any] | None, is_current: bool) -> ModelOut:

@@ -13,6 +13,7 @@ from model.pointing.spots import spot_covariance
 from service import store
 from service.base.fields import (
     AnySun,
+    HeliostatOf,
     Model,
     Moment,
     MountReport,
@@ -20,6 +21,8 @@ from service.base.fields import (
     Position,
     Sun,
     SunAt,
+    SunPosition,
+    TargetOf,
     Version,
 )
 from service.store.pointing import mounts
@@ -46,8 +49,8 @@ Motors = tuple[float, float]
 class MountOut(MountReport):
     """A version of a calibrated mount."""
 
-    heliostat: str
-    version: int
+    heliostat: HeliostatOf
+    version: int = Field(description="Version of the mount, from 1.")
     created_at: datetime = Field(description="When it was last calibrated in the same state.")
     valid_from: datetime | None = Field(
         description=(
@@ -111,12 +114,12 @@ class AimIn(Model):
 class MotorsOut(BaseModel):
     """Motor positions for an aim."""
 
-    heliostat: str
+    heliostat: HeliostatOf
     motor_position: Motors = Field(description="Of both axes [steps], within their travel.")
     aim_point_m: tuple[float, float, float] = Field(
         description="East, north, up of the tower base [m]."
     )
-    sun: Sun
+    sun: SunPosition
     std_mrad: float = Field(
         description="Of the light about the aim, as seen from the mirror, one direction [mrad]."
     )
@@ -178,13 +181,13 @@ def post_motors(
 class PlannedOut(BaseModel):
     """A photograph to take."""
 
-    at: datetime
-    heliostat: str
-    target: str
+    at: datetime = Field(description="When to take it.")
+    heliostat: HeliostatOf
+    target: TargetOf
     motor_position: Motors = Field(
         description="What sends the light to the target's centre then [steps]."
     )
-    sun: Sun
+    sun: SunPosition
     information_bits: float = Field(
         description="Expected information of the photograph about the mount [bit]."
     )

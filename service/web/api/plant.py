@@ -9,7 +9,7 @@ from sqlalchemy.orm import Session
 from model.frames import wgs84_to_enu
 from model.plant import Plant, TargetPlane
 from service import store
-from service.base.fields import Model, Plane, ReceiverIn, Wgs84
+from service.base.fields import Model, Plane, ReceiverIn, TargetOf, Wgs84
 from service.sources.documents import parse_declared, read_receivers, read_targets
 from service.sources.schema import TowerMeasurements
 from service.store.plant.model_versions import declared_of, find_current
@@ -31,7 +31,7 @@ from service.web.responses.paging import Page
 class PlantOut(BaseModel):
     """The plant."""
 
-    name: str
+    name: str = Field(description="Name of the plant.")
     origin_wgs84: tuple[float, float, float] = Field(
         description="Tower base: latitude [deg], longitude [deg], altitude [m]."
     )
@@ -46,7 +46,7 @@ class PlantOut(BaseModel):
 class ReceiverOut(BaseModel):
     """A cylindrical receiver."""
 
-    name: str
+    name: TargetOf
     center: tuple[float, float, float] = Field(description="The middle of the lit surface [m].")
     normal: tuple[float, float, float] = Field(description="Unit normal there, away from the axis.")
     up: tuple[float, float, float] = Field(description="Unit vector along the axis.")
@@ -70,8 +70,8 @@ class Corners(Model):
 class TargetIn(Model):
     """A target plane: a rectangle in east-north-up metres, or four corners in WGS84."""
 
-    plane: Plane | None = None
-    corners: Corners | None = None
+    plane: Plane | None = Field(default=None, description="A rectangle [m]; or `corners`.")
+    corners: Corners | None = Field(default=None, description="Four corners in WGS84.")
 
     @model_validator(mode="after")
     def _one(self) -> Self:
@@ -83,7 +83,7 @@ class TargetIn(Model):
 class TargetOut(BaseModel):
     """A target plane."""
 
-    name: str
+    name: TargetOf
     center: tuple[float, float, float] = Field(description="East, north, up of the tower base [m].")
     normal: tuple[float, float, float] = Field(description="Unit normal of the lit side.")
     up: tuple[float, float, float] = Field(description="Unit vector up the image.")

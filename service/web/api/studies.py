@@ -10,7 +10,16 @@ from sqlalchemy.orm import Session
 
 from service import store
 from service.base.errors import NotFoundError
-from service.base.fields import Flag, Model, ModelNumber, StudyReport, Verdict, Version
+from service.base.fields import (
+    CreatedAt,
+    Flag,
+    Id,
+    Model,
+    ModelNumber,
+    StudyReport,
+    Verdict,
+    Version,
+)
 from service.jobs.kinds import KINDS
 from service.store.listing import Order, Period
 from service.store.tables import StudyRow
@@ -25,8 +34,8 @@ from service.web.responses.paging import OrderQuery, Page, Since, Until, page
 class StudySummary(BaseModel):
     """A study without its figures."""
 
-    id: int
-    created_at: datetime
+    id: Id
+    created_at: CreatedAt
     created_by: str = Field(description="Name of the key that asked for it.")
     options: dict[str, Any] = Field(description="What was asked.")
     heliostats: list[str] = Field(description="Those whose photographs were studied.")
@@ -43,7 +52,7 @@ class StudySummary(BaseModel):
     verdict: Verdict = Field(
         description="effect: it is found; none: nothing is missing; unexplained: something is."
     )
-    conclusion: str
+    conclusion: str = Field(description="The verdict in one sentence.")
 
 
 class StudyOut(StudySummary, StudyReport):

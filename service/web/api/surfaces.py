@@ -10,6 +10,10 @@ from pydantic import BaseModel, Field
 from service import store
 from service.base.arrays import unpack
 from service.base.fields import (
+    Author,
+    CreatedAt,
+    HeliostatOf,
+    Id,
     MeasurementName,
     Method,
     Model,
@@ -18,9 +22,12 @@ from service.base.fields import (
     Moment,
     Reason,
     Source,
+    SurfaceSource,
+    SurfaceVersion,
     Version,
     VersionIn,
     Whole,
+    Why,
 )
 from service.base.settings import Settings
 from service.drawing.pictures import surface_picture
@@ -75,14 +82,14 @@ class SurfaceIn(Model):
 class SurfaceSummary(BaseModel):
     """A version of a surface."""
 
-    heliostat: str
-    version: int
-    source: Source
+    heliostat: HeliostatOf
+    version: SurfaceVersion
+    source: SurfaceSource
     model: str | None = Field(description="Name and hash of the network's weights.")
     model_version: ModelNumber | None = Field(
         description="Version of the plant's model that it was predicted by; null: it was measured."
     )
-    created_at: datetime
+    created_at: CreatedAt
     valid_from: datetime | None = Field(
         description=(
             "The mirror is taken to have this surface from then on; null: since when is not known."
@@ -131,22 +138,22 @@ class SurfaceSummary(BaseModel):
 class ChoiceIn(Model):
     """The version to make the active surface."""
 
-    version: VersionIn
+    version: VersionIn = Field(description="Version of the surface.")
     reason: Reason = Field(description="Why; kept with the decision.")
 
 
 class DecisionOut(BaseModel):
     """A decision that made a version the active surface or a candidate, with its reasons."""
 
-    id: int
-    version: int
+    id: Id
+    version: SurfaceVersion
     became_active: bool = Field(
         description="Whether it became the active surface; else it is a candidate."
     )
     previous: int | None = Field(description="The version that was active until then.")
-    created_at: datetime
-    created_by: str
-    reason: str
+    created_at: CreatedAt
+    created_by: Author
+    reason: Why
     accuracy_before: float | None = Field(
         description="Mean flux accuracy of the former one [1]; null: not compared."
     )

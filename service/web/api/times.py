@@ -33,14 +33,16 @@ class TimesIn(Model):
     """Times of measurements whose time was unknown or wrong."""
 
     reason: Reason = Field(description="Where they come from; kept with each correction.")
-    times: list[TimeIn] = Field(min_length=1, max_length=_MOST)
+    times: list[TimeIn] = Field(
+        min_length=1, max_length=_MOST, description="The times, by heliostat and measurement."
+    )
 
 
 class TimesOut(BaseModel):
     """Number of given times, and number of those that changed anything."""
 
-    given: int
-    changed: int
+    given: int = Field(description="How many times were given.")
+    changed: int = Field(description="How many of them changed a measurement.")
 
 
 _EXAMPLE = {
