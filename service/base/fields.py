@@ -268,7 +268,7 @@ class ReceiverIn(Model):
         default=360.0,
         ge=MIN_OPENING_DEG,
         le=360,
-        description="Angle of the lit surface, half of it to each side of its middle.",
+        description="Angle of the lit surface about its middle [deg].",
     )
 
     @model_validator(mode="after")
@@ -327,7 +327,7 @@ Side = Annotated[Whole, Field(ge=8, le=1024)]
 Resolution = Annotated[
     tuple[Side, Side],
     BeforeValidator(_square),
-    Field(description="Rows and columns of the map, or one number for both."),
+    Field(description="Rows and columns of the map [px], or one number for both."),
 ]
 
 

@@ -256,6 +256,6 @@ KIND = Kind(
     "plans",
     PlanIn,
     plan_day,
-    "Forecast a day of the field's light on a receiver, against ideal mirrors.",
+    "Forecast a day of the field's flux on a receiver.",
     expected_s=expected_plan_s,
 )

@@ -93,7 +93,7 @@ def list_attention(
     limit: Limit = 100,
     after: Annotated[ItemId | None, Query(description="The last id of the page before.")] = None,
 ) -> AttentionPage:
-    """All alerts, in the order of ids. The thresholds are those of the current settings."""
+    """List alerts, in the order of ids. The thresholds are those of the current settings."""
     with runtime.database.reading() as session:
         items, pending = list_alerts(session, cache, runtime.settings)
     wanted = [

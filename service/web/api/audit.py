@@ -40,7 +40,7 @@ def list_audit(
     limit: Limit = 100,
     after: Annotated[Version | None, Query(description="The last id of the page before.")] = None,
 ) -> Page[AuditOut]:
-    """Who did what, newest first."""
+    """List the audit trail: who did what, newest first."""
     with runtime.database.reading() as session:
         rows = audit.entries(session, limit + 1, after)
     items = [audit_out(row) for row in rows]

@@ -2,7 +2,7 @@
 
 from typing import Annotated, Any, Self
 
-from fastapi import APIRouter, Body, Depends, Query
+from fastapi import APIRouter, Depends, Query
 from pydantic import BaseModel, Field, model_validator
 
 from model.pointing import Weather
@@ -122,20 +122,9 @@ def patch_measurement(
     measurement: MeasurementPath,
     runtime: RuntimeDep,
     identity: IdentityDep,
-    correction: Annotated[
-        CorrectionIn,
-        Body(
-            examples=[
-                {
-                    "sun": {"azimuth_deg": 221.2, "elevation_deg": 33.5},
-                    "reason": "the clock was an hour ahead",
-                    "predict_again": True,
-                }
-            ]
-        ),
-    ],
+    correction: CorrectionIn,
 ) -> CorrectedOut:
-    """Correct a photograph in all its images, or exclude it. Its history is kept.
+    """Correct a photograph, or exclude it. This holds for all its images; its history is kept.
 
     With another target, the photograph is measured again. Surfaces and forecasts that were made
     from it stay, and the response names them. With `predict_again`, a job predicts the
@@ -176,9 +165,9 @@ def delete_measurement(
         bool, Query(description="Delete only this image, not the photograph in all kinds.")
     ] = False,
 ) -> DeletedOut:
-    """Delete a photograph that was sent by mistake, in all its images.
+    """Delete a photograph that was sent by mistake.
 
-    Its files are deleted when nothing else refers to them. Surfaces that were made from it stay,
+    All its images are deleted. Its files are deleted when nothing else refers to them. Surfaces that were made from it stay,
     and name it in `deleted`; predict them again. An import of a folder that holds the photograph
     brings it back.
     """
@@ -194,7 +183,7 @@ def delete_measurement(
 def get_corrections(
     name: NamePath, measurement: MeasurementPath, runtime: RuntimeDep
 ) -> Page[CorrectionOut]:
-    """The corrections of a photograph, oldest first."""
+    """List the corrections of a photograph, oldest first."""
     with runtime.database.reading() as session:
         row: MeasurementRow = store.get_measurement(
             session, store.get_heliostat(session, name), measurement

@@ -97,7 +97,7 @@ router = APIRouter(tags=["heliostats"])
 def list_field(
     query: Annotated[FieldQuery, Query()], runtime: RuntimeDep, cache: FieldCacheDep
 ) -> Page[FieldLine]:
-    """Heliostats that match the filter, with their metrics, in the order of one metric."""
+    """List heliostats with their metrics. They match the filter, in the order of one metric."""
     with runtime.database.reading() as session:
         per_unit, given = (
             METRICS[query.metric].per_unit,

@@ -4,7 +4,7 @@ from datetime import datetime
 from functools import partial
 from typing import Annotated, Any, Literal, Self
 
-from fastapi import APIRouter, Body, Depends, Path, Query, Response, status
+from fastapi import APIRouter, Depends, Path, Query, Response, status
 from numpy.typing import NDArray
 from pydantic import BaseModel, Discriminator, Field, Tag, model_validator
 
@@ -250,13 +250,6 @@ def forecast_answer(
 
 router = APIRouter(prefix="/forecasts", tags=["forecasts"])
 
-_EXAMPLE: dict[str, Any] = {
-    "heliostat": "AA39",
-    "target": "multi_focus_tower",
-    "sun": {"azimuth_deg": 200.0, "elevation_deg": 45.0},
-    "surface": "ideal",
-}
-
 
 def _given(body: ForecastIn) -> Receiver | None:
     """The plane or cylinder of the request, or None if it names a stored one."""
@@ -291,12 +284,8 @@ def _request(runtime: Runtime, body: ForecastIn) -> ForecastRequest:
     responses=problems(404, 409, 413, 415),
     dependencies=[OPERATE, Depends(require_json), COMPUTE_SLOT],
 )
-def post_forecast(
-    request: Annotated[ForecastIn, Body(examples=[_EXAMPLE])],
-    runtime: RuntimeDep,
-    response: Response,
-) -> ForecastSummary:
-    """Compute and store a flux map of one heliostat. Read the map from the path of the forecast.
+def post_forecast(request: ForecastIn, runtime: RuntimeDep, response: Response) -> ForecastSummary:
+    """Forecast the flux of one heliostat on a plane, and store it. Read the map from the path of the forecast.
 
     `POST /v1/jobs/forecasts` superposes the whole field, or some heliostats.
     """
@@ -316,7 +305,7 @@ def list_forecasts(
     until: Until = None,
     order: OrderQuery = "up",
 ) -> Page[ForecastSummary]:
-    """Forecasts in the order of their creation."""
+    """List forecasts, in the order of their creation."""
     with runtime.database.reading() as session:
         of = None if heliostat is None else store.get_heliostat(session, heliostat)
         made, direction = Period(since, until), Order(descending=order == "down")
@@ -341,7 +330,7 @@ def get_forecast(
         Query(description="The light, or what the model's camera would show of it."),
     ] = "light",
 ) -> Response:
-    """A forecast with its map: the flux, or the camera image that photographs are compared with."""
+    """Get a forecast with its map. The map is the flux, or the image that a camera would take."""
     with runtime.database.reading() as session:
         row = store.get_forecast(session, number)
         shown = camera_view(session, row) if view == "camera" else None

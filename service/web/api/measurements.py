@@ -5,7 +5,7 @@ from functools import partial
 from typing import Annotated, Any, Literal, Self
 
 from fastapi import APIRouter, Depends, File, Form, Header, Query, Response, UploadFile, status
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, Json, JsonValue, model_validator
+from pydantic import BaseModel, BeforeValidator, Field, Json, model_validator
 from pydantic.json_schema import SkipJsonSchema
 from sqlalchemy.orm import Session
 from starlette.datastructures import UploadFile as StarletteUploadFile
@@ -68,19 +68,8 @@ Motors = Annotated[
 Pixel = tuple[Annotated[Number, Field(ge=-1e5, le=1e5)], Annotated[Number, Field(ge=-1e5, le=1e5)]]
 
 
-# Initial content of the form on the documentation page.
-_EXAMPLE: dict[str, JsonValue] = {
-    "id": "205363",
-    "kind": "flux",
-    "target": "multi_focus_tower",
-    "sun": {"azimuth_deg": 221.2, "elevation_deg": 33.5},
-}
-
-
 class MeasurementIn(Model):
     """Metadata of a photograph."""
-
-    model_config = ConfigDict(json_schema_extra={"examples": [_EXAMPLE]})
 
     target: Name = Field(description="The target that the heliostat was aimed at.")
     sun: SunPosition
@@ -417,9 +406,9 @@ def post_measurement(
         File(description="A PNG, JPEG, TIFF or BMP file; none if kind is none."),
     ] = None,
 ) -> PostedOut:
-    """Measure and store a photograph, or motor positions and a spot without an image.
+    """Post a photograph to measure and store.
 
-    The same image posted again is the same measurement (200 instead of 201). Missing fields are
+    Motor positions and a spot may come without an image. The same image posted again is the same measurement (200 instead of 201). Missing fields are
     `filled`. Another focal spot, weather or corners are `ignored`. The measurement is then also
     found by this `id`. The image is refused (409) with another kind, sun, target, time or motor
     position, or at another heliostat; `detail` says what to do. An image that cannot be used is
@@ -473,7 +462,7 @@ def list_measurements(
     ] = "created_at",
     order: OrderQuery = "up",
 ) -> Page[MeasurementOut]:
-    """A heliostat's measurements, in the order of arrival or by the time they were taken."""
+    """List the photographs of a heliostat, in the order of arrival or by time."""
     with runtime.database.reading() as session:
         rows = store.list_measurements(
             session,
@@ -491,7 +480,7 @@ def list_measurements(
 def get_measurement(
     name: NamePath, measurement: MeasurementPath, runtime: RuntimeDep
 ) -> MeasurementOut:
-    """A measurement with its quality record."""
+    """Get a photograph's measurement with its quality record."""
     with runtime.database.reading() as session:
         row = store.get_measurement(session, store.get_heliostat(session, name), measurement)
         return measurement_out(session, name, row)
@@ -518,7 +507,7 @@ def get_image(
         str | None, Header(description="The ETag of a file that is held already.")
     ] = None,
 ) -> Response:
-    """The image as it was sent. The whole file is verified before the response begins."""
+    """Get the image of a photograph as it was sent. The whole file is verified before the response begins."""
     image = require_image(row := get_row(name, measurement, runtime))
     # Browsers may store it, but must ask again and present the key each time.
     headers = {"ETag": f'"{row.image_sha256}"', "Cache-Control": "private, no-cache"}
@@ -543,7 +532,7 @@ def get_image(
 def get_flux(
     name: NamePath, measurement: MeasurementPath, runtime: RuntimeDep, media_type: MediaType
 ) -> Response:
-    """The measured flux, with a sum of 100.
+    """Get the measured flux of a photograph, with a sum of 100.
 
     `flux` covers the whole target (256 x 256). `centered` covers 64 x 64 about the centre of mass.
     """

@@ -77,13 +77,13 @@ def current_out(session: Session) -> ModelOut:
 
 @router.get("/models", responses=problems(), dependencies=[READ])
 def list_models(runtime: RuntimeDep) -> Page[ModelOut]:
-    """All versions of the plant model, oldest first, including withdrawn ones."""
+    """List the versions of the plant model, oldest first, including withdrawn ones."""
     with runtime.database.reading() as session:
         return Page(items=all_models(session), next=None)
 
 
 @router.get("/models/current", responses=problems(), dependencies=[READ])
 def get_current_model(runtime: RuntimeDep) -> ModelOut:
-    """The version that forecasts and predictions use."""
+    """Get the current version of the plant model. Forecasts and predictions use it."""
     with runtime.database.reading() as session:
         return current_out(session)

@@ -4,7 +4,7 @@ from datetime import datetime
 from typing import Annotated, Self
 
 import numpy as np
-from fastapi import APIRouter, Body, Depends, Query
+from fastapi import APIRouter, Depends, Query
 from pydantic import BaseModel, Field, model_validator
 
 from model.frames import sun_direction
@@ -74,7 +74,7 @@ def list_mounts(
         Version | None, Query(description="The last version of the page before.")
     ] = None,
 ) -> Page[MountOut]:
-    """The calibrations of a mount, oldest version first."""
+    """List the calibrations of a mount, oldest version first."""
     with runtime.database.reading() as session:
         rows = mounts.list_mounts(session, store.get_heliostat(session, name), limit + 1, after)
     return page([_out(name, row) for row in rows], limit, "version")
@@ -88,7 +88,7 @@ def get_current_mount(
         Moment | None, Query(description="The mount that was valid then (time with zone).")
     ] = None,
 ) -> MountOut:
-    """The mount that is valid now, or at a time."""
+    """Get the mount that is valid now, or at a time."""
     with runtime.database.reading() as session:
         return _out(name, mounts.get_mount_at(session, store.get_heliostat(session, name), at))
 
@@ -134,22 +134,8 @@ class MotorsOut(BaseModel):
     responses=problems(404, 409, 413, 415),
     dependencies=[READ, Depends(require_json)],
 )
-def post_motors(
-    name: NamePath,
-    runtime: RuntimeDep,
-    request: Annotated[
-        AimIn,
-        Body(
-            examples=[
-                {
-                    "target": "multi_focus_tower",
-                    "sun": {"azimuth_deg": 200.0, "elevation_deg": 45.0},
-                }
-            ]
-        ),
-    ],
-) -> MotorsOut:
-    """The motor positions that send the sunlight to a point.
+def post_motors(name: NamePath, runtime: RuntimeDep, request: AimIn) -> MotorsOut:
+    """Compute the motor positions that aim at a point.
 
     They follow the calibrated mount that is valid at the time in `sun`, or the newest one.
     """
@@ -219,10 +205,10 @@ def get_plan(
     minutes: Annotated[float, Query(gt=0, le=720, description="How long it lasts [min].")] = 60.0,
     photographs: Annotated[int, Query(ge=1, le=60, description="How many there is time for.")] = 12,
 ) -> Page[PlannedOut]:
-    """The photographs to take next, each of the heliostat for which it is most informative.
+    """Plan the photographs to take next.
 
-    This is usually a mount that was never measured, that was measured long ago, or under few sun
-    positions. Heliostats without linear actuators in their properties are left out, because their
+    Each is of the heliostat for which it is most informative. This is usually a mount that was
+    never measured, that was measured long ago, or under few sun positions. Heliostats without linear actuators in their properties are left out, because their
     motor positions cannot be computed.
     """
     slots = make_plan(runtime, at, minutes, photographs)

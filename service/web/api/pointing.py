@@ -115,7 +115,7 @@ def list_pointing(
         Name | None, Query(description="The last heliostat of the page before.")
     ] = None,
 ) -> PointingPage:
-    """The pointing errors of all calibrated heliostats, in the order of their names."""
+    """List the pointing errors of calibrated heliostats, in the order of their names."""
     with runtime.database.reading() as session:
         field = cache.read(session, PATIENCE_S)
     known = [
@@ -132,7 +132,7 @@ def list_pointing(
 
 @router.get("/heliostats/{name}/pointing", responses=problems(404), dependencies=[READ])
 def get_pointing(name: NamePath, runtime: RuntimeDep, cache: FieldCacheDep) -> HeliostatPointingOut:
-    """The pointing error of a heliostat, from its newest photographs.
+    """Get the pointing error of a heliostat, from its newest photographs.
 
     The response includes the trend, the last move, and the most informative next photograph.
     """

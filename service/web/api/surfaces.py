@@ -102,7 +102,9 @@ class SurfaceSummary(BaseModel):
     deleted: list[str] = Field(
         description="Photographs that it was made from, too, and that were deleted since."
     )
-    misfit: float | None = Field(description="What the refinement left unexplained of the flux.")
+    misfit: float | None = Field(
+        description="What the refinement left unexplained of the flux [1]."
+    )
     trusted: bool | None = Field(
         description=(
             "Whether it explains all its photographs by a mirror like those known; null: it was not"
@@ -256,13 +258,13 @@ def post_surface(
     runtime: RuntimeDep,
     identity: IdentityDep,
     response: Response,
-    request: Annotated[SurfaceIn, Body(examples=[{"method": "network", "images": 4}])],
+    request: SurfaceIn,
 ) -> SurfaceOut:
-    """Predict the surface from stored measurements, and store it as the next version.
+    """Predict the surface of a heliostat from its photographs.
 
-    If there is an active surface already, the new one replaces it if it forecasts photographs no
-    worse. Otherwise it becomes a candidate (`is_candidate`). `decisions` has the figures, and `PUT
-    .../current` changes the decision.
+    It is stored as the next version. If there is an active surface already, the new one replaces it
+    if it forecasts photographs no worse. Otherwise it becomes a candidate (`is_candidate`).
+    `decisions` has the figures, and `PUT .../current` changes the decision.
     """
     kept = predict_surface(
         runtime,
@@ -318,7 +320,7 @@ def list_surfaces(
     ] = "version",
     order: OrderQuery = "up",
 ) -> Page[SurfaceSummary] | Response:
-    """The history of the surface, oldest version first.
+    """List the surfaces of a heliostat, oldest version first.
 
     With `at`, the response is the version that was valid at that time.
     """
@@ -356,7 +358,7 @@ def get_current_surface(
         Moment | None, Query(description="The one that was valid then instead (time with zone).")
     ] = None,
 ) -> Response:
-    """The surface that is valid now, or was at a time."""
+    """Get the surface that is valid now, or was at a time."""
     return _at(runtime, name, at, media_type)
 
 
@@ -366,9 +368,9 @@ def get_current_surface(
 def put_current_surface(
     name: NamePath, runtime: RuntimeDep, identity: IdentityDep, choice: Annotated[ChoiceIn, Body()]
 ) -> DecisionOut:
-    """Make a version the active surface, regardless of the comparison of accuracies.
+    """Make a version the active surface.
 
-    Versions with precedence over it become candidates (`is_candidate`).
+    Accuracies are not compared. Versions with precedence over it become candidates (`is_candidate`).
     """
     with runtime.database.writing() as session:
         heliostat = store.get_heliostat(session, name)
@@ -382,7 +384,7 @@ def put_current_surface(
 
 @router.post("/undo", responses=problems(404, 409), dependencies=[OPERATE])
 def undo_decision(name: NamePath, runtime: RuntimeDep, identity: IdentityDep) -> DecisionOut:
-    """Undo the last decision that changed the active surface. The previous one is active again."""
+    """Undo the last decision about the active surface. The previous one is active again."""
     with runtime.database.writing() as session:
         return decision_out(
             decisions.undo_decision(session, store.get_heliostat(session, name), identity.name)
@@ -396,7 +398,7 @@ def list_decisions(
     limit: Limit = 100,
     after: Annotated[Version | None, Query(description="The last id of the page before.")] = None,
 ) -> Page[DecisionOut]:
-    """The decisions about the active surface, newest first."""
+    """List the decisions about the active surface, newest first."""
     with runtime.database.reading() as session:
         rows = decisions.list_decisions(
             session, store.get_heliostat(session, name), limit + 1, after
@@ -415,7 +417,7 @@ def get_surface(
     runtime: RuntimeDep,
     media_type: MediaType,
 ) -> Response:
-    """A version of the surface."""
+    """Get a version of the surface."""
     with runtime.database.reading() as session:
         row = store.get_surface(session, store.get_heliostat(session, name), version)
     return surface_answer(name, row, media_type, runtime.settings)
@@ -428,7 +430,7 @@ def acknowledge_surface(
     runtime: RuntimeDep,
     identity: IdentityDep,
 ) -> SurfaceSummary:
-    """Acknowledge that a surface is not trusted, and why; 409 if it is trusted."""
+    """Acknowledge that a surface is not trusted. The answer is 409 if it is trusted."""
     with runtime.database.writing() as session:
         heliostat = store.get_heliostat(session, name)
         row = store.get_surface(session, heliostat, version)

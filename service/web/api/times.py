@@ -1,8 +1,6 @@
 """Times of many measurements, given afterwards."""
 
-from typing import Annotated
-
-from fastapi import APIRouter, Body, Depends
+from fastapi import APIRouter, Depends
 from pydantic import BaseModel, Field
 
 from service.base.fields import MeasurementName, Model, Moment, Name, Reason
@@ -45,23 +43,15 @@ class TimesOut(BaseModel):
     changed: int = Field(description="How many of them changed a measurement.")
 
 
-_EXAMPLE = {
-    "reason": "from the log of the cameras",
-    "times": [{"heliostat": "AA39", "id": "205363", "taken_at": "2022-06-01T11:30:00Z"}],
-}
-
-
 @router.patch(
     "/times",
     responses=problems(404, 409, 410, 413, 415, 429),
     dependencies=[OPERATE, Depends(require_json), COMPUTE_SLOT],
 )
-def patch_times(
-    runtime: RuntimeDep, identity: IdentityDep, body: Annotated[TimesIn, Body(examples=[_EXAMPLE])]
-) -> TimesOut:
-    """Set the times of many measurements: either all of them, or none.
+def patch_times(runtime: RuntimeDep, identity: IdentityDep, body: TimesIn) -> TimesOut:
+    """Set the times of many photographs.
 
-    Each is a correction with its history. `errors` names every wrong entry by its index, such as
+    Either all are set, or none. Each is a correction with its history. `errors` names every wrong entry by its index, such as
     `times.3`. Entries that match the stored time are skipped.
     """
     given = [GivenTime(entry.heliostat, entry.id, entry.taken_at) for entry in body.times]

@@ -1,5 +1,8 @@
 """The OpenAPI document: the schema of errors, and the error statuses of each route."""
 
+import json
+import re
+from pathlib import Path
 from typing import Any
 
 from fastapi import FastAPI
@@ -58,6 +61,10 @@ _TAGS = [
         "description": "Flux maps of one heliostat on any plane, or of a field on any receiver.",
     },
     {
+        "name": "mounts",
+        "description": "Where motors send the light: mounts, pointing errors, what to photograph.",
+    },
+    {
         "name": "studies",
         "description": (
             "What photographs demand and the model lacks: find it, adopt it into the model,"
@@ -69,10 +76,14 @@ _TAGS = [
         "name": "jobs",
         "description": "Work that outlives a request: ask for it, follow it, cancel it.",
     },
+    {"name": "attention", "description": "Alerts: what needs attention, and who has seen it."},
     {"name": "audit", "description": "Who did what when."},
     {"name": "session", "description": "For pages: a session in a cookie."},
     {"name": "health", "description": "For supervisors."},
 ]
+
+_EXAMPLES = Path(__file__).parents[1] / "examples.json"
+"""Bodies and answers of a real run, by operation; ``python -m tests.openapi_examples`` writes it."""
 
 TEXT = {"type": "string"}
 BINARY = {"type": "string", "format": "binary"}
@@ -111,7 +122,7 @@ def _as_form(body: dict[str, Any]) -> None:
     image.pop("anyOf", None)
     image |= {"type": "string", "format": "binary"}
     schema = metadata.pop("contentSchema")
-    body["properties"]["metadata"] = schema
+    body["properties"]["metadata"] = schema | {"description": "JSON that describes the image."}
 
 
 def _by_themselves(path: str, method: str, operation: dict[str, Any]) -> set[int]:
@@ -130,6 +141,16 @@ def _by_themselves(path: str, method: str, operation: dict[str, Any]) -> set[int
     return statuses
 
 
+def _add_examples(operation: dict[str, Any], recorded: dict[str, Any]) -> None:
+    """Add the recorded body and answers of an operation."""
+    if "body" in recorded:
+        (content,) = operation["requestBody"]["content"].values()
+        content["example"] = recorded["body"]
+    for status, answers in recorded["answers"].items():
+        for media_type, answer in answers.items():
+            operation["responses"][status]["content"][media_type]["example"] = answer
+
+
 def _document(app: FastAPI) -> dict[str, Any]:
     document = get_openapi(
         title=app.title,
@@ -138,10 +159,13 @@ def _document(app: FastAPI) -> dict[str, Any]:
         routes=app.routes,
         tags=_TAGS,
     )
+    examples = json.loads(_EXAMPLES.read_text(encoding="utf-8"))
     problem = {"application/json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
     for path, operations in document["paths"].items():
         for method, operation in operations.items():
             responses = operation["responses"]
+            operation["summary"] = re.split(r"\.(?:\s|$)", operation["description"], maxsplit=1)[0]
+            _add_examples(operation, examples.get(operation["operationId"], {"answers": {}}))
             if "HTTPValidationError" in str(responses.get("422")):
                 del responses["422"]  # the default schema of FastAPI
             for status in _by_themselves(path, method, operation):
@@ -152,13 +176,16 @@ def _document(app: FastAPI) -> dict[str, Any]:
             for status, response in responses.items():
                 if int(status) >= 400 and "Problem" in str(response):
                     _as_problem(response)
-    _as_form(document["components"]["schemas"]["Body_post_measurement"])
+    schemas = document["components"]["schemas"]
+    _as_form(schemas["Body_post_measurement"])
+    # The form of the documentation page begins with this example.
+    schemas["MeasurementIn"]["examples"] = [examples["post_measurement"]["body"]["metadata"]]
     post = document["paths"]["/v1/heliostats/{name}/measurements"]["post"]
     post["requestBody"]["content"]["multipart/form-data"]["encoding"] = {
         "metadata": {"contentType": "application/json"}
     }
     for unused in ("HTTPValidationError", "ValidationError"):
-        document["components"]["schemas"].pop(unused, None)
+        schemas.pop(unused, None)
     return document
 
 

@@ -93,7 +93,7 @@ def _ask_all(runtime: Runtime) -> dict[str, str]:
 
 @router.get("/livez")
 async def get_livez() -> Health:
-    """The process answers."""
+    """Check that the process answers."""
     return Health(status="ok", checks={})
 
 
@@ -102,7 +102,7 @@ async def get_livez() -> Health:
     responses={503: {"model": Health, "description": "Something that it needs is missing."}},
 )
 async def get_readyz(request: Request, runtime: RuntimeDep, response: Response) -> Health:
-    """The service is ready.
+    """Check that the service is ready.
 
     The database answers with the newest schema. The network and the prior match their model cards.
     """
