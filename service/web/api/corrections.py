@@ -167,9 +167,9 @@ def delete_measurement(
 ) -> DeletedOut:
     """Delete a photograph that was sent by mistake.
 
-    All its images are deleted. Its files are deleted when nothing else refers to them. Surfaces that were made from it stay,
-    and name it in `deleted`; predict them again. An import of a folder that holds the photograph
-    brings it back.
+    All its images are deleted. Its files are deleted when nothing else refers to them. Surfaces
+    that were made from it stay, and name it in `deleted`; predict them again. An import of a folder
+    that holds the photograph brings it back.
     """
     deleted = delete_photograph(runtime, name, measurement, reason, identity.name, only_this)
     return DeletedOut(

@@ -408,11 +408,11 @@ def post_measurement(
 ) -> PostedOut:
     """Post a photograph to measure and store.
 
-    Motor positions and a spot may come without an image. The same image posted again is the same measurement (200 instead of 201). Missing fields are
-    `filled`. Another focal spot, weather or corners are `ignored`. The measurement is then also
-    found by this `id`. The image is refused (409) with another kind, sun, target, time or motor
-    position, or at another heliostat; `detail` says what to do. An image that cannot be used is
-    stored with `accepted: false` and its `reason`.
+    Motor positions and a spot may come without an image. The same image posted again is the same
+    measurement (200 instead of 201). Missing fields are `filled`. Another focal spot, weather or
+    corners are `ignored`. The measurement is then also found by this `id`. The image is refused
+    (409) with another kind, sun, target, time or motor position, or at another heliostat; `detail`
+    says what to do. An image that cannot be used is stored with `accepted: false` and its `reason`.
     """
     photograph = _photograph(metadata, runtime)
     if image is None and photograph.kind is not None:
@@ -507,7 +507,7 @@ def get_image(
         str | None, Header(description="The ETag of a file that is held already.")
     ] = None,
 ) -> Response:
-    """Get the image of a photograph as it was sent. The whole file is verified before the response begins."""
+    """Get the image of a photograph as it was sent. The whole file is verified first."""
     image = require_image(row := get_row(name, measurement, runtime))
     # Browsers may store it, but must ask again and present the key each time.
     headers = {"ETag": f'"{row.image_sha256}"', "Cache-Control": "private, no-cache"}

@@ -208,8 +208,9 @@ def get_plan(
     """Plan the photographs to take next.
 
     Each is of the heliostat for which it is most informative. This is usually a mount that was
-    never measured, that was measured long ago, or under few sun positions. Heliostats without linear actuators in their properties are left out, because their
-    motor positions cannot be computed.
+    never measured, that was measured long ago, or under few sun positions. Heliostats without
+    linear actuators in their properties are left out, because their motor positions cannot be
+    computed.
     """
     slots = make_plan(runtime, at, minutes, photographs)
     return Page(items=[planned_out(slot) for slot in slots], next=None)

@@ -160,9 +160,9 @@ def get_plant(runtime: RuntimeDep) -> PlantOut:
 def put_plant(document: TowerMeasurements, runtime: RuntimeDep, identity: IdentityDep) -> PlantOut:
     """Set the plant: tower base, targets and receivers.
 
-    The body is PAINT's tower measurements. Repeating the request changes nothing. `declared` sets what is declared of the plant model, if
-    it is given. An effect's `scope` says when it acts and at which `heliostats`. Without a scope,
-    it acts at all of them.
+    The body is PAINT's tower measurements. Repeating the request changes nothing. `declared` sets
+    what is declared of the plant model, if it is given. An effect's `scope` says when it acts and
+    at which `heliostats`. Without a scope, it acts at all of them.
 
     A scope of one mirror: `{"kind": "set", "heliostats": ["AB12"]}`.
     """

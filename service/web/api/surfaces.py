@@ -102,9 +102,7 @@ class SurfaceSummary(BaseModel):
     deleted: list[str] = Field(
         description="Photographs that it was made from, too, and that were deleted since."
     )
-    misfit: float | None = Field(
-        description="What the refinement left unexplained of the flux [1]."
-    )
+    misfit: float | None = Field(description="Share of the flux that it leaves unexplained [1].")
     trusted: bool | None = Field(
         description=(
             "Whether it explains all its photographs by a mirror like those known; null: it was not"
@@ -370,7 +368,7 @@ def put_current_surface(
 ) -> DecisionOut:
     """Make a version the active surface.
 
-    Accuracies are not compared. Versions with precedence over it become candidates (`is_candidate`).
+    Accuracies are not compared. Versions with precedence over it become candidates.
     """
     with runtime.database.writing() as session:
         heliostat = store.get_heliostat(session, name)

@@ -51,8 +51,8 @@ class TimesOut(BaseModel):
 def patch_times(runtime: RuntimeDep, identity: IdentityDep, body: TimesIn) -> TimesOut:
     """Set the times of many photographs.
 
-    Either all are set, or none. Each is a correction with its history. `errors` names every wrong entry by its index, such as
-    `times.3`. Entries that match the stored time are skipped.
+    Either all are set, or none. Each is a correction with its history. `errors` names every wrong
+    entry by its index, such as `times.3`. Entries that match the stored time are skipped.
     """
     given = [GivenTime(entry.heliostat, entry.id, entry.taken_at) for entry in body.times]
     return TimesOut(

@@ -83,7 +83,7 @@ _TAGS = [
 ]
 
 _EXAMPLES = Path(__file__).parents[1] / "examples.json"
-"""Bodies and answers of a real run, by operation; ``python -m tests.openapi_examples`` writes it."""
+"""Bodies and answers of a real run; ``python -m tests.openapi_examples`` records them."""
 
 TEXT = {"type": "string"}
 BINARY = {"type": "string", "format": "binary"}
