@@ -287,7 +287,8 @@ def _request(runtime: Runtime, body: ForecastIn) -> ForecastRequest:
 def post_forecast(request: ForecastIn, runtime: RuntimeDep, response: Response) -> ForecastSummary:
     """Forecast the flux of one heliostat on a plane, and store it.
 
-    Read the map from the path of the forecast. `POST /v1/jobs/forecasts` superposes the whole field, or some heliostats.
+    Read the map from the path of the forecast. `POST /v1/jobs/forecasts` superposes the whole
+    field, or some heliostats.
     """
     row = make_forecast(runtime, _request(runtime, request))
     response.headers["Location"] = f"/v1/forecasts/{row.id}"

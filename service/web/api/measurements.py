@@ -462,7 +462,7 @@ def list_measurements(
     ] = "created_at",
     order: OrderQuery = "up",
 ) -> Page[MeasurementOut]:
-    """List the photographs of a heliostat, in the order of arrival or by time."""
+    """List the photographs of a heliostat. They are in the order of arrival, or by time."""
     with runtime.database.reading() as session:
         rows = store.list_measurements(
             session,

@@ -77,7 +77,7 @@ def current_out(session: Session) -> ModelOut:
 
 @router.get("/models", responses=problems(), dependencies=[READ])
 def list_models(runtime: RuntimeDep) -> Page[ModelOut]:
-    """List the versions of the plant model, oldest first, including withdrawn ones."""
+    """List the versions of the plant model, oldest first. Withdrawn ones are included."""
     with runtime.database.reading() as session:
         return Page(items=all_models(session), next=None)
 

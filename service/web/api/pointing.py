@@ -115,7 +115,7 @@ def list_pointing(
         Name | None, Query(description="The last heliostat of the page before.")
     ] = None,
 ) -> PointingPage:
-    """List the pointing errors of calibrated heliostats, in the order of their names."""
+    """List the pointing errors of calibrated heliostats, by name."""
     with runtime.database.reading() as session:
         field = cache.read(session, PATIENCE_S)
     known = [
