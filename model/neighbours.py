@@ -145,7 +145,7 @@ def clear(obstacles: Tensor, points: Tensor, direction: Tensor, cell: Tensor) ->
         Width of the patch of the mirror around each point.
     """
     step = max(1, _INTERSECTED // (points.shape[0] * points.shape[-1]))
-    parts = (_clear(some, points, direction, cell) for some in obstacles.split(step, dim=1))
+    parts = (_clear(some, points, direction, cell) for some in torch.split(obstacles, step, dim=1))
     return reduce(torch.minimum, parts)
 
 

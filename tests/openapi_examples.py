@@ -31,7 +31,7 @@ from service.web.app import create_app
 FILE = Path(__file__).parents[1] / "service" / "web" / "examples.json"
 KEY = "the-key-of-the-calibration-system"
 AT = "2026-07-21T10:00:00Z"
-"""Stands for every moment of the run."""
+"""Written in place of every moment of the run."""
 IMAGES, RAYS = 6, 60_000
 CAMERA = {"transfer": {"gamma": 1.5}}
 """What the plant declares of its camera. The photographs have sRGB, so a study finds the rest."""

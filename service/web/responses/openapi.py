@@ -37,50 +37,25 @@ _MEANINGS = {
 }
 
 
-_TAGS = [
-    {
-        "name": "plant",
-        "description": (
-            "The tower base, which everything is measured from, its targets and receivers."
-        ),
-    },
-    {
-        "name": "heliostats",
-        "description": "Where heliostats stand and how they are built (PAINT properties).",
-    },
-    {
-        "name": "measurements",
-        "description": "Target photographs: post them, read flux and quality back.",
-    },
-    {
-        "name": "surfaces",
-        "description": "Mirror surfaces by version: predict them, read the history.",
-    },
-    {
-        "name": "forecasts",
-        "description": "Flux maps of one heliostat on any plane, or of a field on any receiver.",
-    },
-    {
-        "name": "mounts",
-        "description": "Where motors send the light: mounts, pointing errors, what to photograph.",
-    },
-    {
-        "name": "studies",
-        "description": (
-            "What photographs demand and the model lacks: find it, adopt it into the model,"
-            " withdraw it. Differences, as `residual.mean_map_8x8` [of the measured peak], are"
-            " forecast minus photograph."
-        ),
-    },
-    {
-        "name": "jobs",
-        "description": "Work that outlives a request: ask for it, follow it, cancel it.",
-    },
-    {"name": "attention", "description": "Alerts: what needs attention, and who has seen it."},
-    {"name": "audit", "description": "Who did what when."},
-    {"name": "session", "description": "For pages: a session in a cookie."},
-    {"name": "health", "description": "For supervisors."},
-]
+_TAGS = {
+    "plant": "The tower base, which everything is measured from, its targets and receivers.",
+    "heliostats": "Where heliostats are and how they are built (PAINT properties).",
+    "measurements": "Target photographs: post them, read flux and quality back.",
+    "surfaces": "Mirror surfaces by version: predict them, read the history.",
+    "forecasts": "Flux maps of one heliostat on any plane, or of a field on any receiver.",
+    "mounts": "Where motors send the light: mounts, pointing errors, what to photograph next.",
+    "studies": (
+        "What photographs demand and the model lacks: find it, adopt it into the model, withdraw"
+        " it. Differences, as `residual.mean_map_8x8` [of the measured peak], are forecast minus"
+        " photograph."
+    ),
+    "jobs": "Work that outlives a request: ask for it, follow it, cancel it.",
+    "attention": "Alerts: what needs attention, and who has seen it.",
+    "audit": "Who did what when.",
+    "session": "For pages: a session in a cookie.",
+    "health": "For supervisors.",
+}
+"""Groups of operations, in the order of the work."""
 
 _EXAMPLES = Path(__file__).parents[1] / "examples.json"
 """Bodies and answers of a real run; ``python -m tests.openapi_examples`` records them."""
@@ -141,7 +116,7 @@ def _by_themselves(path: str, method: str, operation: dict[str, Any]) -> set[int
     return statuses
 
 
-def _add_examples(operation: dict[str, Any], recorded: dict[str, Any]) -> None:
+def _add_examples(operation: dict[str, Any], recorded: Any) -> None:
     """Add the recorded body and answers of an operation."""
     if "body" in recorded:
         (content,) = operation["requestBody"]["content"].values()
@@ -157,7 +132,7 @@ def _document(app: FastAPI) -> dict[str, Any]:
         version=app.version,
         description=app.description,
         routes=app.routes,
-        tags=_TAGS,
+        tags=[{"name": name, "description": about} for name, about in _TAGS.items()],
     )
     examples = json.loads(_EXAMPLES.read_text(encoding="utf-8"))
     problem = {"application/json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
