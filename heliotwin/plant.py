@@ -30,6 +30,7 @@ from service.base.choices import Method, require_images
 from service.cli.demo_plant import IMAGES, RAYS, write_plant
 from service.cli.folder_forecast import agreement, forecast_measurement
 from service.cli.folder_store import FolderStore, open_folder
+from service.sources.documents import IMAGE_KINDS
 from service.sources.folder import MeasurementFolder, measured_heights, read_folder
 from service.store.tables import MeasurementRow
 from service.twin.forecasts.heliostat_forecast import ForecastRequest, trace_flux
@@ -127,10 +128,11 @@ def plane(
         for name, value in (("width_m", width_m), ("height_m", height_m))
     )
     require_plane_shape(width, height)
-    axes = (
-        np.array(require_point(name, value)) for name, value in (("normal", normal), ("up", up))
+    center, axis, top = (
+        np.array(require_point(name, value))
+        for name, value in (("center_m", center_m), ("normal", normal), ("up", up))
     )
-    return TargetPlane("plane", np.array(require_point("center_m", center_m)), *axes, width, height)
+    return TargetPlane("plane", center, axis, top, width, height)
 
 
 class PlantFolder:
@@ -399,8 +401,8 @@ class PlantFolder:
 
         Examples
         --------
-        >>> plant.study(candidates=["camera_response", "slope_error"]).verdict
-        'none'
+        >>> found = plant.study(candidates=["camera_response", "slope_error"])
+        >>> better = plant.with_effects(found)
         """
         for name in candidates or ():
             require_known("candidates", name, CATALOGUE)
@@ -438,10 +440,8 @@ class PlantFolder:
         if not self.close.alive:
             raise InvalidInputError("the plant is closed; open it again by open_plant")
         if with_photographs not in self._stores:
-            kinds = {} if with_photographs else {"kinds": None}
-            opened = open_folder(
-                self._folder, effects=self._effects, mounts_file=self._mounts, **kinds
-            )
+            kinds = IMAGE_KINDS if with_photographs else None
+            opened = open_folder(self._folder, kinds, self._effects, self._mounts)
             self._stores[with_photographs] = self._stack.enter_context(opened)
         return self._stores[with_photographs]
 
