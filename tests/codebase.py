@@ -97,7 +97,8 @@ def old_words() -> Counter[str]:
 
 def texts() -> Iterator[str]:
     """Code, pages and documents that people read, without the lists of words in this file."""
-    folders = [ROOT / name for name in (*PACKAGES, "tests", "docker", "migrations")]
+    names = (*PACKAGES, "heliotwin", "tests", "docker", "migrations")
+    folders = [ROOT / name for name in names]
     paths = {path for folder in folders for pattern in TEXTS for path in folder.rglob(pattern)}
     for path in sorted(paths | {ROOT / "README.md", ROOT / "Makefile"}):
         if path != Path(__file__) and ".min." not in path.name:

@@ -13,8 +13,8 @@
 # %% [markdown]
 # # A forecast anywhere
 #
-# A surface is worth its forecasts. This notebook computes the flux of the heliostats on a target, on
-# a plane that was never photographed, and over a day.
+# A surface is worth its forecasts. This notebook computes the flux of heliostats on a target, on a
+# plane that was never photographed, and over a day.
 
 # %%
 from datetime import UTC, datetime, timedelta
@@ -30,8 +30,8 @@ surfaces = [plant.predict(name) for name in plant.heliostats]
 # %% [markdown]
 # ## At a sun
 #
-# The sun is azimuth from north over east and elevation, in degrees. The map is in W/m2, for a direct
-# normal irradiance of 1000 W/m2.
+# The sun is azimuth from north over east and elevation, in degrees. The map is in W/m2, for
+# a direct normal irradiance of 1000 W/m2.
 
 # %%
 flux = plant.forecast(surfaces[0], on="calibration_target", sun=(200.0, 45.0))

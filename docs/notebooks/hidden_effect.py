@@ -13,7 +13,7 @@
 # %% [markdown]
 # # A hidden effect found
 #
-# Where photographs and forecasts differ by more than noise, the plant's model lacks something: haze,
+# If photographs and forecasts differ by more than noise, the plant's model lacks something: haze,
 # facets that sag, a camera with another response. A study finds out what, and how much it gains.
 #
 # Here the plant declares a wrong camera: light is counts to the power of 1.5. Its photographs have

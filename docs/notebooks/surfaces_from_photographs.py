@@ -27,7 +27,7 @@ import numpy as np
 import heliotwin
 
 plant = heliotwin.make_demo("out/demo/plant")
-plant.heliostats, plant.targets
+print(plant.heliostats, plant.targets)
 
 # %% [markdown]
 # ## Photographs
@@ -86,8 +86,8 @@ fig.colorbar(picture, ax=axes, label="height [mm]")
 # ## Are they right?
 #
 # The first figure is the mean absolute error of the control heights. It is known here only because
-# the mirrors are known. The second is the accuracy of forecasts of the held-out photographs. You can
-# compute it at every plant.
+# the mirrors are known. The second is the accuracy of forecasts of the held-out photographs. It can
+# be computed at every plant.
 
 # %%
 errors_mm, accuracies = {}, {}

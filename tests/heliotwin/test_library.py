@@ -178,10 +178,7 @@ SUNS = {
     (200.0, -5.0): "sun: the elevation -5 must be above the horizon",
     (200.0, 0.0): "sun: the elevation 0 must be above the horizon",
     (45.0, 200.0): "give azimuth first, then elevation",
-    (
-        -20.0,
-        45.0,
-    ): "sun: the azimuth -20 must lie in 0 to 360 degrees, from north over east; give 340",
+    (-20.0, 45.0): "sun: the azimuth -20 must lie in 0 to 360 degrees, from north",
     (float("nan"), 45.0): "sun: give azimuth",
     "noon": "sun: give azimuth",
     45.0: "sun: give azimuth",
