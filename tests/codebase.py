@@ -115,7 +115,7 @@ def old_words() -> Counter[str]:
 
 def texts() -> Iterator[str]:
     """Code, pages and documents that people read; migrations and CHANGELOG name what was."""
-    folders = [ROOT / name for name in (*PACKAGES, "tests", "docker", "docs")]
+    folders = [ROOT / name for name in (*PACKAGES, "heliotwin", "tests", "docker", "docs")]
     paths = {path for folder in folders for pattern in TEXTS for path in folder.rglob(pattern)}
     paths |= {ROOT / name for name in ("README.md", "RESULTS.md", "Makefile")}
     for path in sorted(paths - QUOTING):
@@ -209,7 +209,7 @@ def _is_record(annotation: ast.expr) -> bool:
 
 
 LIMITS = {
-    "lines of code": 35_082,
+    "lines of code": 35_057,
     "words that WORDS.md replaces": 0,
     "names of two or more classes": 0,
     f"functions above {MAX_PARAMETERS} parameters": 0,

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PACKAGES = ("model", "service", "training", "migrations")
+PACKAGES = ("heliotwin", "model", "service", "training", "migrations")
 
 # An extra is imported where it may be missing: in a function, or under a `try`, by the packages
 # that know of it.

@@ -106,6 +106,15 @@ def test_verbs_on_a_folder(python: Path, made_plant: Path, tmp_path: Path):
     assert "<html" in (tmp_path / "study.html").read_text(encoding="utf-8")
 
 
+def test_library(python: Path, made_plant: Path, tmp_path: Path):
+    code = (
+        "import heliotwin; plant = heliotwin.open_plant(%r); surface = plant.surface('AB12');"
+        " print(plant.forecast(surface, on='calibration_target', sun=(200, 45)).flux.shape)"
+    )
+    said = _run(python, "-c", code % str(made_plant), folder=tmp_path)
+    assert said.strip() == "(256, 256)"
+
+
 def test_service(python: Path, tmp_path: Path):
     port = free_port()
     settings = {"HELIOTWIN_DATA_DIR": str(tmp_path / "data"), "HELIOTWIN_PORT": str(port)}
@@ -127,7 +136,8 @@ def test_service(python: Path, tmp_path: Path):
 
         until(answers, "the service answers")
         assert httpx.get(f"http://127.0.0.1:{port}/readyz").json()["status"] == "ok"
-        assert httpx.get(f"http://127.0.0.1:{port}/").status_code == 200
+        for path in ("/", "/openapi.json"):
+            assert httpx.get(f"http://127.0.0.1:{port}{path}").status_code == 200
         process.terminate()
         assert process.wait(WAIT_LIMIT_S) in (0, -15)
     assert "Traceback" not in (tmp_path / "log").read_text(encoding="utf-8")

@@ -134,6 +134,21 @@ Moment = Annotated[AwareDatetime, AfterValidator(parse_moment)]
 FormMoment = Annotated[datetime, AfterValidator(parse_moment)]
 """Times in forms. A browser's date field has no time zone; the pages state that it is UTC."""
 
+# Fields of responses.
+Id = Annotated[int, Field(description="Number of the entry, from 1; paths name it by this.")]
+HeliostatOf = Annotated[str, Field(description="Name of the heliostat.")]
+TargetOf = Annotated[str, Field(description="Name of the target or receiver.")]
+CreatedAt = Annotated[datetime, Field(description="When it was stored.")]
+Author = Annotated[str, Field(description="Name of the key that did it; `local` without keys.")]
+Why = Annotated[str, Field(description="The reason, as it was given or determined.")]
+SurfaceVersion = Annotated[int, Field(description="Version of the heliostat's surface, from 1.")]
+SurfaceSource = Annotated[
+    Source,
+    Field(description="How the surface was obtained: measured, predicted, refined or imported."),
+]
+UpTo = Annotated[datetime, Field(description="When it ended.")]
+From = Annotated[datetime, Field(description="When it began.")]
+
 Version = Annotated[int, Field(ge=1, le=2**31 - 1)]
 """For paths and queries."""
 VersionIn = Annotated[Whole, Field(ge=1, le=2**31 - 1)]
@@ -253,7 +268,7 @@ class ReceiverIn(Model):
         default=360.0,
         ge=MIN_OPENING_DEG,
         le=360,
-        description="Angle of the lit surface, half of it to each side of its middle.",
+        description="Angle of the lit surface about its middle [deg].",
     )
 
     @model_validator(mode="after")
@@ -293,6 +308,7 @@ def _way_to_say(sun: Any) -> str:
     return "(time)" if by_time else "(position)"
 
 
+SunPosition = Annotated[Sun, Field(description="Sun: azimuth from north and elevation [deg].")]
 AnySun = Annotated[
     Annotated[Sun, Tag("(position)")] | Annotated[SunAt, Tag("(time)")],
     Discriminator(_way_to_say),
@@ -311,7 +327,7 @@ Side = Annotated[Whole, Field(ge=8, le=1024)]
 Resolution = Annotated[
     tuple[Side, Side],
     BeforeValidator(_square),
-    Field(description="Rows and columns of the map, or one number for both."),
+    Field(description="Rows and columns of the map [px], or one number for both."),
 ]
 
 
@@ -342,7 +358,7 @@ class ReportFigures(BaseModel):
     verdict: Verdict = Field(
         description="effect: it is found; none: nothing is missing; unexplained: something is."
     )
-    conclusion: str = ""
+    conclusion: str = Field(default="", description="The verdict in one sentence.")
     images: dict[str, int] = Field(description="How many were fitted and how many judged the fit.")
     before: AccuracyOut = Field(description="By the model that the study was made with.")
     after: AccuracyOut = Field(description="With the effects that were found.")
@@ -440,7 +456,7 @@ class MountReport(BaseModel):
         default=[],
         description="Effects of the plant's model that moved the sun when it was calibrated.",
     )
-    measurements: int
+    measurements: int = Field(description="How many measurements the calibration used.")
     residual_mrad: dict[str, float | None] = Field(
         description="Between forecast and measured spots [mrad]."
     )

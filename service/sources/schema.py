@@ -164,7 +164,7 @@ class DeclaredOptics(BaseModel):
 class TowerMeasurements(Document):
     """PAINT's ``tower-measurements.json``: the tower base, and planar targets by WGS84 corners."""
 
-    power_plant_properties: PowerPlantProperties
+    power_plant_properties: PowerPlantProperties = Field(description="Name and tower base.")
     declared: dict[str, Any] | None = Field(
         default=None,
         description=(
@@ -200,7 +200,7 @@ class LinearAxis(DocumentPart):
 class KinematicsProperties(DocumentPart):
     """PAINT's ``kinematics_properties`` [m]: the mount and its actuators."""
 
-    actuators: list[dict[str, Any]] = Field(max_length=2)
+    actuators: list[dict[str, Any]] = Field(max_length=2, description="Drives of both axes.")
     joint_translation_e_1: Meters
     joint_translation_n_1: Meters
     joint_translation_u_1: Meters
@@ -221,7 +221,9 @@ class FacetDocument(DocumentPart):
 class FacetProperties(DocumentPart):
     """PAINT's ``facet_properties``."""
 
-    facets: list[FacetDocument] = Field(min_length=1, max_length=64)
+    facets: list[FacetDocument] = Field(
+        min_length=1, max_length=64, description="Position and canting of each facet [m]."
+    )
 
 
 class HeliostatProperties(Document):

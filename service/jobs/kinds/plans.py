@@ -37,7 +37,7 @@ class PlanIn(FleetIn):
     The plan has a name. Times at night are left out.
     """
 
-    name: PlanName
+    name: PlanName = Field(description="Name of the plan.")
     first_at: Moment = Field(description="The first time, with zone.")
     last_at: Moment = Field(description="The last one, with zone.")
     step_minutes: Number = Field(
@@ -256,6 +256,6 @@ KIND = Kind(
     "plans",
     PlanIn,
     plan_day,
-    "Forecast a day of the field's light on a receiver, against ideal mirrors.",
+    "Forecast a day of the field's flux on a receiver.",
     expected_s=expected_plan_s,
 )

@@ -7,7 +7,7 @@ from typing import Annotated
 from fastapi import APIRouter, Body, Depends, Query, Request
 from pydantic import BaseModel, Field
 
-from service.base.fields import Model
+from service.base.fields import From, Model
 from service.twin.alerts.alerts import Alert, AlertCount, Reason, acknowledge, list_alerts
 from service.web.auth.dependencies import (
     OPERATE,
@@ -41,16 +41,16 @@ class AttentionOut(BaseModel):
     """An alert: something that needs attention."""
 
     id: ItemId
-    reason: Reason
+    reason: Reason = Field(description="What kind of alert it is.")
     heliostat: str | None = Field(description="null: the plant as a whole.")
-    since: datetime
+    since: From
     message: str = Field(description="What is wrong.")
     action: str = Field(description="What to do.")
     measurements: list[str] = Field(
         description="Ids of the heliostat's measurements to look at, where there are some."
     )
     acknowledged_by: str | None = Field(description="Name of the key; null if not acknowledged.")
-    acknowledged_at: datetime | None
+    acknowledged_at: datetime | None = Field(description="When; null: it is not.")
 
 
 def attention_out(item: Alert) -> AttentionOut:
@@ -93,7 +93,7 @@ def list_attention(
     limit: Limit = 100,
     after: Annotated[ItemId | None, Query(description="The last id of the page before.")] = None,
 ) -> AttentionPage:
-    """All alerts, in the order of ids. The thresholds are those of the current settings."""
+    """List alerts, in the order of ids. The thresholds are those of the current settings."""
     with runtime.database.reading() as session:
         items, pending = list_alerts(session, cache, runtime.settings)
     wanted = [

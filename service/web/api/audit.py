@@ -1,12 +1,11 @@
 """The audit trail."""
 
-from datetime import datetime
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query
 from pydantic import BaseModel, Field
 
-from service.base.fields import Version
+from service.base.fields import CreatedAt, Id, Version
 from service.store import audit
 from service.store.job_tables import AuditRow
 from service.web.auth.dependencies import ADMIN, Limit, RuntimeDep
@@ -17,14 +16,14 @@ from service.web.responses.paging import Page, page
 class AuditOut(BaseModel):
     """An entry of the audit trail."""
 
-    id: int
-    created_at: datetime
+    id: Id
+    created_at: CreatedAt
     actor: str = Field(
         description="Name of the key; `local` where none is demanded, `cli` and the user elsewhere."
     )
-    action: str = Field(examples=["key.withdrawn"])
-    subject: str = Field(examples=["key calibration"])
-    detail: dict[str, Any]
+    action: str = Field(description="What was done.")
+    subject: str = Field(description="What it was done to.")
+    detail: dict[str, Any] = Field(description="More about it, by the kind of action.")
 
 
 def audit_out(row: AuditRow) -> AuditOut:
@@ -41,7 +40,7 @@ def list_audit(
     limit: Limit = 100,
     after: Annotated[Version | None, Query(description="The last id of the page before.")] = None,
 ) -> Page[AuditOut]:
-    """Who did what, newest first."""
+    """List the audit trail: who did what, newest first."""
     with runtime.database.reading() as session:
         rows = audit.entries(session, limit + 1, after)
     items = [audit_out(row) for row in rows]

@@ -1,14 +1,13 @@
 """Corrections of photographs: another sun, target or time, or exclusion."""
 
-from datetime import datetime
 from typing import Annotated, Any, Self
 
-from fastapi import APIRouter, Body, Depends, Query
+from fastapi import APIRouter, Depends, Query
 from pydantic import BaseModel, Field, model_validator
 
 from model.pointing import Weather
 from service import store
-from service.base.fields import Flag, Model, Moment, Name, Reason, Sun
+from service.base.fields import Author, CreatedAt, Flag, Model, Moment, Name, Reason, Sun, Why
 from service.jobs.enqueuing import enqueue
 from service.jobs.kinds import predictions
 from service.jobs.kinds.predictions import PredictionsIn
@@ -37,9 +36,9 @@ class CorrectionIn(Model):
     """New values of a photograph. Fields that are not named stay as they are."""
 
     reason: Reason = Field(description="Why; kept with the correction.")
-    target: Name | None = None
-    sun: Sun | None = None
-    taken_at: Moment | None = None
+    target: Name | None = Field(default=None, description="The target it shows.")
+    sun: Sun | None = Field(default=None, description="Where the sun was [deg].")
+    taken_at: Moment | None = Field(default=None, description="When it was taken, with zone.")
     motor_position: Motors | None = Field(default=None, description="Of both axes [steps].")
     wind_speed_m_s: WindSpeed | None = Field(default=None, description="[m/s]")
     wind_from_deg: WindFrom | None = Field(default=None, description="From north, over east [deg].")
@@ -61,9 +60,9 @@ class CorrectionIn(Model):
 class CorrectionOut(BaseModel):
     """A correction of a photograph."""
 
-    created_at: datetime
-    created_by: str
-    reason: str
+    created_at: CreatedAt
+    created_by: Author
+    reason: Why
     before: dict[str, Any] = Field(description="Previous values, by the fields that changed.")
     after: dict[str, Any] = Field(description="New values.")
 
@@ -81,7 +80,7 @@ class DeletedOut(BaseModel):
 class CorrectedOut(BaseModel):
     """A corrected photograph, and what was made from it before the correction."""
 
-    measurement: MeasurementOut
+    measurement: MeasurementOut = Field(description="The photograph as it is now.")
     surface_versions: list[int] = Field(
         description="Versions of the heliostat's surface that were made from it as it was."
     )
@@ -123,20 +122,9 @@ def patch_measurement(
     measurement: MeasurementPath,
     runtime: RuntimeDep,
     identity: IdentityDep,
-    correction: Annotated[
-        CorrectionIn,
-        Body(
-            examples=[
-                {
-                    "sun": {"azimuth_deg": 221.2, "elevation_deg": 33.5},
-                    "reason": "the clock was an hour ahead",
-                    "predict_again": True,
-                }
-            ]
-        ),
-    ],
+    correction: CorrectionIn,
 ) -> CorrectedOut:
-    """Correct a photograph in all its images, or exclude it. Its history is kept.
+    """Correct a photograph, or exclude it. This holds for all its images; its history is kept.
 
     With another target, the photograph is measured again. Surfaces and forecasts that were made
     from it stay, and the response names them. With `predict_again`, a job predicts the
@@ -177,11 +165,11 @@ def delete_measurement(
         bool, Query(description="Delete only this image, not the photograph in all kinds.")
     ] = False,
 ) -> DeletedOut:
-    """Delete a photograph that was sent by mistake, in all its images.
+    """Delete a photograph that was sent by mistake.
 
-    Its files are deleted when nothing else refers to them. Surfaces that were made from it stay,
-    and name it in `deleted`; predict them again. An import of a folder that holds the photograph
-    brings it back.
+    All its images are deleted. Its files are deleted when nothing else refers to them. Surfaces
+    that were made from it stay, and name it in `deleted`; predict them again. An import of a folder
+    that holds the photograph brings it back.
     """
     deleted = delete_photograph(runtime, name, measurement, reason, identity.name, only_this)
     return DeletedOut(
@@ -195,7 +183,7 @@ def delete_measurement(
 def get_corrections(
     name: NamePath, measurement: MeasurementPath, runtime: RuntimeDep
 ) -> Page[CorrectionOut]:
-    """The corrections of a photograph, oldest first."""
+    """List the corrections of a photograph, oldest first."""
     with runtime.database.reading() as session:
         row: MeasurementRow = store.get_measurement(
             session, store.get_heliostat(session, name), measurement

@@ -7,7 +7,7 @@ from fastapi import APIRouter, Query
 from pydantic import BaseModel, Field
 
 from service.base.errors import NotFoundError
-from service.base.fields import Name, Source
+from service.base.fields import HeliostatOf, Name, Source
 from service.twin.alerts.field_filter import METRICS, HeliostatFilter, filter_heliostats
 from service.twin.alerts.field_overview import PATIENCE_S, HeliostatOverview
 from service.web.auth.dependencies import OVERVIEW_SLOT, READ, FieldCacheDep, RuntimeDep
@@ -27,7 +27,7 @@ class FieldQuery(HeliostatFilter):
 class FieldLine(BaseModel):
     """A heliostat with its metrics. A value is null if it is unknown or not yet computed."""
 
-    name: str
+    name: HeliostatOf
     position_m: tuple[float, float] = Field(description="East, north of the tower base [m].")
     accuracy: float | None = Field(
         description=(
@@ -55,15 +55,15 @@ class FieldLine(BaseModel):
         )
     )
     surface_version: int | None = Field(description="Version of the active surface.")
-    source: Source | None
+    source: Source | None = Field(description="How that was obtained.")
     trusted: bool | None = Field(
         description="Null for what is measured, or before surfaces were judged."
     )
     warnings: list[str] = Field(description="Why it is not trusted.")
-    warned_since: datetime | None
+    warned_since: datetime | None = Field(description="When its warnings began.")
     acknowledged_by: str | None = Field(description="Who has seen the warnings.")
-    photographs: int
-    refused: int
+    photographs: int = Field(description="How many photographs are stored.")
+    refused: int = Field(description="How many of them were refused.")
 
 
 def field_line(line: HeliostatOverview) -> FieldLine:
@@ -97,7 +97,7 @@ router = APIRouter(tags=["heliostats"])
 def list_field(
     query: Annotated[FieldQuery, Query()], runtime: RuntimeDep, cache: FieldCacheDep
 ) -> Page[FieldLine]:
-    """Heliostats that match the filter, with their metrics, in the order of one metric."""
+    """List heliostats with their metrics. They match the filter, in the order of one metric."""
     with runtime.database.reading() as session:
         per_unit, given = (
             METRICS[query.metric].per_unit,

@@ -4,7 +4,7 @@ from datetime import datetime
 from functools import partial
 from typing import Annotated, Any, Literal, Self
 
-from fastapi import APIRouter, Body, Depends, Path, Query, Response, status
+from fastapi import APIRouter, Depends, Path, Query, Response, status
 from numpy.typing import NDArray
 from pydantic import BaseModel, Discriminator, Field, Tag, model_validator
 
@@ -13,7 +13,10 @@ from service import store
 from service.base.arrays import pair_or_none
 from service.base.fields import (
     AnySun,
+    CreatedAt,
     Flag,
+    HeliostatOf,
+    Id,
     Model,
     ModelNumber,
     ModelVersion,
@@ -25,8 +28,8 @@ from service.base.fields import (
     ReceiverIn,
     Resolution,
     Rows,
-    Sun,
     SunAt,
+    SunPosition,
     Version,
     VersionIn,
 )
@@ -139,7 +142,7 @@ class ForecastReceiverOut(BaseModel):
         description="Its middle: east, north, up of the tower base [m]."
     )
     normal: tuple[float, float, float] = Field(description="Of the lit side, there.")
-    up: tuple[float, float, float]
+    up: tuple[float, float, float] = Field(description="Unit vector up the map.")
     width: float = Field(description="[m]; of a cylinder the length of its arc.")
     height: float = Field(description="[m]")
     radius: float | None = Field(default=None, description="Of a cylinder [m]; null: a plane.")
@@ -151,20 +154,20 @@ class ForecastReceiverOut(BaseModel):
 class ForecastSummary(BaseModel):
     """A computed flux map without its pixels."""
 
-    id: int
+    id: Id
     warnings: list[str] = Field(
         description="What to know first: that the ideal mirror replaces a missing surface."
     )
-    heliostat: str
+    heliostat: HeliostatOf
     surface: Literal["ideal", "stored"] = Field(
         description="Which mirror was traced: the ideal one, or a surface."
     )
     surface_version: int | None = Field(description="null: the ideal surface.")
-    target: str | None
+    target: str | None = Field(description="Name of the target; null: another plane.")
     plane: ForecastReceiverOut = Field(
         description="The plane, or the cylinder, that the light falls on [m]."
     )
-    sun: Sun
+    sun: SunPosition
     at: datetime | None = Field(
         description="The time that was asked for; null: the sun's position was."
     )
@@ -175,7 +178,7 @@ class ForecastSummary(BaseModel):
         description="Side of the mapped square about the centre of mass [m]; null: the plane."
     )
     resolution: tuple[int, int] = Field(description="Rows, columns.")
-    normalised: bool
+    normalised: bool = Field(description="Whether the map is scaled to a sum of 100.")
     unit: str = Field(
         description=(
             "Unit of the map: W/m2, or 1 where it is normalised to a sum of 100. W/m2 are those of"
@@ -189,7 +192,7 @@ class ForecastSummary(BaseModel):
         description="Right and up of the plane's centre [m]."
     )
     model_version: ModelNumber = Field(description="Version of the plant's model, see /v1/models.")
-    created_at: datetime
+    created_at: CreatedAt
 
 
 class ForecastOut(ForecastSummary):
@@ -247,13 +250,6 @@ def forecast_answer(
 
 router = APIRouter(prefix="/forecasts", tags=["forecasts"])
 
-_EXAMPLE: dict[str, Any] = {
-    "heliostat": "AA39",
-    "target": "multi_focus_tower",
-    "sun": {"azimuth_deg": 200.0, "elevation_deg": 45.0},
-    "surface": "ideal",
-}
-
 
 def _given(body: ForecastIn) -> Receiver | None:
     """The plane or cylinder of the request, or None if it names a stored one."""
@@ -282,14 +278,11 @@ def _request(runtime: Runtime, body: ForecastIn) -> ForecastRequest:
     responses=problems(404, 409, 413, 415),
     dependencies=[OPERATE, Depends(require_json), COMPUTE_SLOT],
 )
-def post_forecast(
-    request: Annotated[ForecastIn, Body(examples=[_EXAMPLE])],
-    runtime: RuntimeDep,
-    response: Response,
-) -> ForecastSummary:
-    """Compute and store a flux map of one heliostat. Read the map from the path of the forecast.
+def post_forecast(request: ForecastIn, runtime: RuntimeDep, response: Response) -> ForecastSummary:
+    """Forecast the flux of one heliostat on a plane, and store it.
 
-    `POST /v1/jobs/forecasts` superposes the whole field, or some heliostats.
+    Read the map from the path of the forecast. `POST /v1/jobs/forecasts` superposes the whole
+    field, or some heliostats.
     """
     row = make_forecast(runtime, _request(runtime, request))
     response.headers["Location"] = f"/v1/forecasts/{row.id}"
@@ -307,7 +300,7 @@ def list_forecasts(
     until: Until = None,
     order: OrderQuery = "up",
 ) -> Page[ForecastSummary]:
-    """Forecasts in the order of their creation."""
+    """List forecasts, in the order of their creation."""
     with runtime.database.reading() as session:
         of = None if heliostat is None else store.get_heliostat(session, heliostat)
         made, direction = Period(since, until), Order(descending=order == "down")
@@ -332,7 +325,7 @@ def get_forecast(
         Query(description="The light, or what the model's camera would show of it."),
     ] = "light",
 ) -> Response:
-    """A forecast with its map: the flux, or the camera image that photographs are compared with."""
+    """Get a forecast with its map. The map is the flux, or the image that a camera would take."""
     with runtime.database.reading() as session:
         row = store.get_forecast(session, number)
         shown = camera_view(session, row) if view == "camera" else None

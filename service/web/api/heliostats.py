@@ -7,7 +7,7 @@ from fastapi import APIRouter, Depends, Query, Response, status
 from pydantic import BaseModel, Field
 
 from service import store
-from service.base.fields import Model, Name, Search
+from service.base.fields import HeliostatOf, Model, Name, Search
 from service.sources.schema import HeliostatProperties
 from service.store.tables import HeliostatRow
 from service.twin.plant import setup
@@ -28,13 +28,13 @@ class HeliostatIn(Model):
     """A heliostat to store."""
 
     name: Name
-    properties: HeliostatProperties
+    properties: HeliostatProperties = Field(description="PAINT properties.")
 
 
 class HeliostatSummary(BaseModel):
     """A heliostat in a list."""
 
-    name: str
+    name: HeliostatOf
     position_m: tuple[float, float, float] = Field(
         description="East, north, up of the tower base [m]."
     )
@@ -44,7 +44,7 @@ class HeliostatOut(HeliostatSummary):
     """A heliostat with its properties."""
 
     properties: dict[str, Any] = Field(description="PAINT properties as they were sent.")
-    updated_at: datetime
+    updated_at: datetime = Field(description="When it was last changed.")
 
 
 def heliostat_summary(row: HeliostatRow) -> HeliostatSummary:
@@ -75,7 +75,7 @@ def list_heliostats(
         Search, Query(description="Only names with this in them, in capitals or not.")
     ] = "",
 ) -> Page[HeliostatSummary]:
-    """Heliostats in the order of their names. `/v1/field` filters them by their metrics."""
+    """List heliostats, in the order of their names. `/v1/field` filters them by their metrics."""
     with runtime.database.reading() as session:
         rows = store.list_heliostats(session, limit + 1, after, prefix, search)
     items = [heliostat_summary(row) for row in rows]
@@ -112,7 +112,7 @@ def post_heliostat(
 
 @router.get("/heliostats/{name}", responses=problems(404), dependencies=[READ])
 def get_heliostat(name: NamePath, runtime: RuntimeDep) -> HeliostatOut:
-    """A heliostat with its properties."""
+    """Get a heliostat with its properties."""
     with runtime.database.reading() as session:
         return heliostat_out(store.get_heliostat(session, name))
 
@@ -132,7 +132,7 @@ def put_heliostat(
     identity: IdentityDep,
     response: Response,
 ) -> HeliostatOut:
-    """Set a heliostat's PAINT properties."""
+    """Set the properties of a heliostat (PAINT)."""
     row, change = runtime.database.run_in_transaction(
         lambda session: setup.set_heliostat(session, identity.name, name, properties.raw)
     )

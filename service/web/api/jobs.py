@@ -199,7 +199,7 @@ def list_jobs(
     until: Until = None,
     order: OrderQuery = "down",
 ) -> Page[JobSummary]:
-    """Job summaries, newest first. The complete job is at its `href`."""
+    """List jobs, newest first. The complete job is at its `href`."""
     with runtime.database.reading() as session:
         asked, direction = Period(since, until), Order(descending=order == "down")
         rows = queue.list_jobs(
@@ -211,7 +211,7 @@ def list_jobs(
 
 @router.get("/{number}", responses=problems(404), dependencies=[READ])
 def get_job(number: Number, runtime: RuntimeDep, kinds: KindsDep) -> JobOut:
-    """A job with its progress, and its result when it has ended."""
+    """Get a job with its progress and result."""
     with runtime.database.reading() as session:
         row = queue.get_job(session, number)
         return job_out(row).model_copy(update={"result": result_of(kinds, session, row)})
@@ -237,7 +237,7 @@ def get_job_flux(
         Query(description="Of a plan's step: by the twin, or by ideal mirrors."),
     ] = "twin",
 ) -> Response:
-    """The flux map of a job, if its kind computes one."""
+    """Get the flux map of a job, if its kind computes one."""
     with runtime.database.reading() as session:
         row = queue.get_job(session, number, arrays=step is None)
         maps = None if step is None else queue.checkpoint_arrays(session, number, map_name(step))
@@ -274,7 +274,7 @@ def get_job_events(
         str | None, Header(alias="Last-Event-ID", description="Go on after this one.")
     ] = None,
 ) -> Response:
-    """The job summary after each change, as server-sent events, until the job ends."""
+    """Follow a job as server-sent events. Each has the job summary after a change."""
     watcher = Watcher(number, identity.name, presented)
     return stream(watchers, runtime, watcher, last_event_id, stopping)
 
@@ -290,5 +290,5 @@ def delete_job(number: Number, runtime: RuntimeDep, identity: IdentityDep) -> Jo
 
 @router.post("/{number}/cancel", responses=problems(404, 409), dependencies=[OPERATE])
 def cancel_job(number: Number, runtime: RuntimeDep, identity: IdentityDep) -> JobOut:
-    """Cancel a job: a waiting one at once, a running one at its next progress report."""
+    """Cancel a job. A waiting one ends at once, a running one at its next progress report."""
     return job_out(cancel_for(runtime, number, identity.name))

@@ -5,7 +5,7 @@ from functools import partial
 from typing import Annotated, Any, Literal, Self
 
 from fastapi import APIRouter, Depends, File, Form, Header, Query, Response, UploadFile, status
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, Json, JsonValue, model_validator
+from pydantic import BaseModel, BeforeValidator, Field, Json, model_validator
 from pydantic.json_schema import SkipJsonSchema
 from sqlalchemy.orm import Session
 from starlette.datastructures import UploadFile as StarletteUploadFile
@@ -17,7 +17,9 @@ from service import store
 from service.base.arrays import pair_or_none, unpack
 from service.base.errors import GoneError, NotFoundError, StoreDamagedError, TooLargeError
 from service.base.fields import (
+    CreatedAt,
     Flag,
+    HeliostatOf,
     Identifier,
     Kind,
     MeasurementName,
@@ -28,7 +30,8 @@ from service.base.fields import (
     Position,
     Reason,
     Rows,
-    Sun,
+    SunPosition,
+    TargetOf,
 )
 from service.drawing.pictures import flux_picture
 from service.sources.photograph import Photograph
@@ -65,22 +68,11 @@ Motors = Annotated[
 Pixel = tuple[Annotated[Number, Field(ge=-1e5, le=1e5)], Annotated[Number, Field(ge=-1e5, le=1e5)]]
 
 
-# Initial content of the form on the documentation page.
-_EXAMPLE: dict[str, JsonValue] = {
-    "id": "205363",
-    "kind": "flux",
-    "target": "multi_focus_tower",
-    "sun": {"azimuth_deg": 221.2, "elevation_deg": 33.5},
-}
-
-
 class MeasurementIn(Model):
     """Metadata of a photograph."""
 
-    model_config = ConfigDict(json_schema_extra={"examples": [_EXAMPLE]})
-
     target: Name = Field(description="The target that the heliostat was aimed at.")
-    sun: Sun
+    sun: SunPosition
     kind: Kind = Field(
         description=(
             "raw: a camera frame; cropped: the rectified target; flux: the separated spot on the"
@@ -142,7 +134,7 @@ class WarningOut(BaseModel):
             " forecast it much better than its own heliostat's."
         )
     )
-    detail: str
+    detail: str = Field(description="What contradicts what, in words.")
     angle_deg: float | None = Field(
         default=None,
         description=(
@@ -162,11 +154,11 @@ class MeasurementOut(BaseModel):
     """A stored measurement."""
 
     id: str = Field(description="Names it in this service's paths.")
-    heliostat: str
+    heliostat: HeliostatOf
     external_id: str | None = Field(description="The caller's own number.")
-    kind: Kind
-    target: str
-    sun: Sun
+    kind: Kind = Field(description="What the image shows, as it was sent.")
+    target: TargetOf
+    sun: SunPosition
     motor_position: tuple[float, float] | None = Field(description="[steps]")
     taken_at: datetime | None = Field(description="null: the time is not known.")
     focal_spot_m: tuple[float, float, float] | None = Field(
@@ -195,7 +187,7 @@ class MeasurementOut(BaseModel):
         description="Right and up of the target's centre [m]."
     )
     image_sha256: str | None = Field(description="null: it came without an image.")
-    image_media_type: str | None
+    image_media_type: str | None = Field(description="Media type of the file; null: no image.")
     image_pruned_at: datetime | None = Field(
         description="Since when the image is kept no longer; everything else of the measurement is."
     )
@@ -203,7 +195,7 @@ class MeasurementOut(BaseModel):
     forced: str | None = Field(
         description="Why it is stored although another heliostat has the same image."
     )
-    created_at: datetime
+    created_at: CreatedAt
     sent_by: str | None = Field(
         description=(
             "Name of the key that sent it, `local` without one, or who imported it; null: not"
@@ -414,13 +406,13 @@ def post_measurement(
         File(description="A PNG, JPEG, TIFF or BMP file; none if kind is none."),
     ] = None,
 ) -> PostedOut:
-    """Measure and store a photograph, or motor positions and a spot without an image.
+    """Post a photograph to measure and store.
 
-    The same image posted again is the same measurement (200 instead of 201). Missing fields are
-    `filled`. Another focal spot, weather or corners are `ignored`. The measurement is then also
-    found by this `id`. The image is refused (409) with another kind, sun, target, time or motor
-    position, or at another heliostat; `detail` says what to do. An image that cannot be used is
-    stored with `accepted: false` and its `reason`.
+    Motor positions and a spot may come without an image. The same image posted again is the same
+    measurement (200 instead of 201). Missing fields are `filled`. Another focal spot, weather or
+    corners are `ignored`. The measurement is then also found by this `id`. The image is refused
+    (409) with another kind, sun, target, time or motor position, or at another heliostat; `detail`
+    says what to do. An image that cannot be used is stored with `accepted: false` and its `reason`.
     """
     photograph = _photograph(metadata, runtime)
     if image is None and photograph.kind is not None:
@@ -470,7 +462,7 @@ def list_measurements(
     ] = "created_at",
     order: OrderQuery = "up",
 ) -> Page[MeasurementOut]:
-    """A heliostat's measurements, in the order of arrival or by the time they were taken."""
+    """List the photographs of a heliostat. They are in the order of arrival, or by time."""
     with runtime.database.reading() as session:
         rows = store.list_measurements(
             session,
@@ -488,7 +480,7 @@ def list_measurements(
 def get_measurement(
     name: NamePath, measurement: MeasurementPath, runtime: RuntimeDep
 ) -> MeasurementOut:
-    """A measurement with its quality record."""
+    """Get a photograph's measurement with its quality record."""
     with runtime.database.reading() as session:
         row = store.get_measurement(session, store.get_heliostat(session, name), measurement)
         return measurement_out(session, name, row)
@@ -515,7 +507,7 @@ def get_image(
         str | None, Header(description="The ETag of a file that is held already.")
     ] = None,
 ) -> Response:
-    """The image as it was sent. The whole file is verified before the response begins."""
+    """Get the image of a photograph as it was sent. The whole file is verified first."""
     image = require_image(row := get_row(name, measurement, runtime))
     # Browsers may store it, but must ask again and present the key each time.
     headers = {"ETag": f'"{row.image_sha256}"', "Cache-Control": "private, no-cache"}
@@ -540,7 +532,7 @@ def get_image(
 def get_flux(
     name: NamePath, measurement: MeasurementPath, runtime: RuntimeDep, media_type: MediaType
 ) -> Response:
-    """The measured flux, with a sum of 100.
+    """Get the measured flux of a photograph, with a sum of 100.
 
     `flux` covers the whole target (256 x 256). `centered` covers 64 x 64 about the centre of mass.
     """

@@ -34,10 +34,10 @@ class ModelOut(BaseModel):
     study: int | None = Field(
         description="The study that it was adopted from; null: a declared model."
     )
-    adopted_at: datetime | None
-    adopted_by: str | None
-    withdrawn_at: datetime | None
-    withdrawn_by: str | None
+    adopted_at: datetime | None = Field(description="When it was adopted; null: declared.")
+    adopted_by: str | None = Field(description="Name of the key that adopted it.")
+    withdrawn_at: datetime | None = Field(description="When it was withdrawn; null: it was not.")
+    withdrawn_by: str | None = Field(description="Name of the key that withdrew it.")
 
 
 def declared_model(declared: dict[str, Any] | None, is_current: bool) -> ModelOut:
@@ -77,13 +77,13 @@ def current_out(session: Session) -> ModelOut:
 
 @router.get("/models", responses=problems(), dependencies=[READ])
 def list_models(runtime: RuntimeDep) -> Page[ModelOut]:
-    """All versions of the plant model, oldest first, including withdrawn ones."""
+    """List the versions of the plant model, oldest first. Withdrawn ones are included."""
     with runtime.database.reading() as session:
         return Page(items=all_models(session), next=None)
 
 
 @router.get("/models/current", responses=problems(), dependencies=[READ])
 def get_current_model(runtime: RuntimeDep) -> ModelOut:
-    """The version that forecasts and predictions use."""
+    """Get the current version of the plant model. Forecasts and predictions use it."""
     with runtime.database.reading() as session:
         return current_out(session)

@@ -4,7 +4,7 @@ from datetime import datetime
 from typing import Annotated, Self
 
 import numpy as np
-from fastapi import APIRouter, Body, Depends, Query
+from fastapi import APIRouter, Depends, Query
 from pydantic import BaseModel, Field, model_validator
 
 from model.frames import sun_direction
@@ -13,6 +13,7 @@ from model.pointing.spots import spot_covariance
 from service import store
 from service.base.fields import (
     AnySun,
+    HeliostatOf,
     Model,
     Moment,
     MountReport,
@@ -20,6 +21,8 @@ from service.base.fields import (
     Position,
     Sun,
     SunAt,
+    SunPosition,
+    TargetOf,
     Version,
 )
 from service.store.pointing import mounts
@@ -46,8 +49,8 @@ Motors = tuple[float, float]
 class MountOut(MountReport):
     """A version of a calibrated mount."""
 
-    heliostat: str
-    version: int
+    heliostat: HeliostatOf
+    version: int = Field(description="Version of the mount, from 1.")
     created_at: datetime = Field(description="When it was last calibrated in the same state.")
     valid_from: datetime | None = Field(
         description=(
@@ -71,7 +74,7 @@ def list_mounts(
         Version | None, Query(description="The last version of the page before.")
     ] = None,
 ) -> Page[MountOut]:
-    """The calibrations of a mount, oldest version first."""
+    """List the calibrations of a mount, oldest version first."""
     with runtime.database.reading() as session:
         rows = mounts.list_mounts(session, store.get_heliostat(session, name), limit + 1, after)
     return page([_out(name, row) for row in rows], limit, "version")
@@ -85,7 +88,7 @@ def get_current_mount(
         Moment | None, Query(description="The mount that was valid then (time with zone).")
     ] = None,
 ) -> MountOut:
-    """The mount that is valid now, or at a time."""
+    """Get the mount that is valid now, or at a time."""
     with runtime.database.reading() as session:
         return _out(name, mounts.get_mount_at(session, store.get_heliostat(session, name), at))
 
@@ -111,12 +114,12 @@ class AimIn(Model):
 class MotorsOut(BaseModel):
     """Motor positions for an aim."""
 
-    heliostat: str
+    heliostat: HeliostatOf
     motor_position: Motors = Field(description="Of both axes [steps], within their travel.")
     aim_point_m: tuple[float, float, float] = Field(
         description="East, north, up of the tower base [m]."
     )
-    sun: Sun
+    sun: SunPosition
     std_mrad: float = Field(
         description="Of the light about the aim, as seen from the mirror, one direction [mrad]."
     )
@@ -131,22 +134,8 @@ class MotorsOut(BaseModel):
     responses=problems(404, 409, 413, 415),
     dependencies=[READ, Depends(require_json)],
 )
-def post_motors(
-    name: NamePath,
-    runtime: RuntimeDep,
-    request: Annotated[
-        AimIn,
-        Body(
-            examples=[
-                {
-                    "target": "multi_focus_tower",
-                    "sun": {"azimuth_deg": 200.0, "elevation_deg": 45.0},
-                }
-            ]
-        ),
-    ],
-) -> MotorsOut:
-    """The motor positions that send the sunlight to a point.
+def post_motors(name: NamePath, runtime: RuntimeDep, request: AimIn) -> MotorsOut:
+    """Compute the motor positions that aim at a point.
 
     They follow the calibrated mount that is valid at the time in `sun`, or the newest one.
     """
@@ -178,13 +167,13 @@ def post_motors(
 class PlannedOut(BaseModel):
     """A photograph to take."""
 
-    at: datetime
-    heliostat: str
-    target: str
+    at: datetime = Field(description="When to take it.")
+    heliostat: HeliostatOf
+    target: TargetOf
     motor_position: Motors = Field(
         description="What sends the light to the target's centre then [steps]."
     )
-    sun: Sun
+    sun: SunPosition
     information_bits: float = Field(
         description="Expected information of the photograph about the mount [bit]."
     )
@@ -216,11 +205,12 @@ def get_plan(
     minutes: Annotated[float, Query(gt=0, le=720, description="How long it lasts [min].")] = 60.0,
     photographs: Annotated[int, Query(ge=1, le=60, description="How many there is time for.")] = 12,
 ) -> Page[PlannedOut]:
-    """The photographs to take next, each of the heliostat for which it is most informative.
+    """Plan the photographs to take next.
 
-    This is usually a mount that was never measured, that was measured long ago, or under few sun
-    positions. Heliostats without linear actuators in their properties are left out, because their
-    motor positions cannot be computed.
+    Each is of the heliostat for which it is most informative. This is usually a mount that was
+    never measured, that was measured long ago, or under few sun positions. Heliostats without
+    linear actuators in their properties are left out, because their motor positions cannot be
+    computed.
     """
     slots = make_plan(runtime, at, minutes, photographs)
     return Page(items=[planned_out(slot) for slot in slots], next=None)

@@ -2,14 +2,14 @@
 
 from typing import Any, Self
 
-from fastapi import APIRouter, Body, Depends, Response, status
+from fastapi import APIRouter, Depends, Response, status
 from pydantic import BaseModel, Field, model_validator
 from sqlalchemy.orm import Session
 
 from model.frames import wgs84_to_enu
 from model.plant import Plant, TargetPlane
 from service import store
-from service.base.fields import Model, Plane, ReceiverIn, Wgs84
+from service.base.fields import Model, Plane, ReceiverIn, TargetOf, Wgs84
 from service.sources.documents import parse_declared, read_receivers, read_targets
 from service.sources.schema import TowerMeasurements
 from service.store.plant.model_versions import declared_of, find_current
@@ -31,7 +31,7 @@ from service.web.responses.paging import Page
 class PlantOut(BaseModel):
     """The plant."""
 
-    name: str
+    name: str = Field(description="Name of the plant.")
     origin_wgs84: tuple[float, float, float] = Field(
         description="Tower base: latitude [deg], longitude [deg], altitude [m]."
     )
@@ -46,7 +46,7 @@ class PlantOut(BaseModel):
 class ReceiverOut(BaseModel):
     """A cylindrical receiver."""
 
-    name: str
+    name: TargetOf
     center: tuple[float, float, float] = Field(description="The middle of the lit surface [m].")
     normal: tuple[float, float, float] = Field(description="Unit normal there, away from the axis.")
     up: tuple[float, float, float] = Field(description="Unit vector along the axis.")
@@ -70,8 +70,8 @@ class Corners(Model):
 class TargetIn(Model):
     """A target plane: a rectangle in east-north-up metres, or four corners in WGS84."""
 
-    plane: Plane | None = None
-    corners: Corners | None = None
+    plane: Plane | None = Field(default=None, description="A rectangle [m]; or `corners`.")
+    corners: Corners | None = Field(default=None, description="Four corners in WGS84.")
 
     @model_validator(mode="after")
     def _one(self) -> Self:
@@ -83,7 +83,7 @@ class TargetIn(Model):
 class TargetOut(BaseModel):
     """A target plane."""
 
-    name: str
+    name: TargetOf
     center: tuple[float, float, float] = Field(description="East, north, up of the tower base [m].")
     normal: tuple[float, float, float] = Field(description="Unit normal of the lit side.")
     up: tuple[float, float, float] = Field(description="Unit vector up the image.")
@@ -132,16 +132,6 @@ def receiver_out(row: ReceiverRow) -> ReceiverOut:
 
 router = APIRouter(tags=["plant"])
 _CORNERS = ("upper_left", "upper_right", "lower_left", "lower_right")
-_RECEIVER_EXAMPLE = {
-    "center": [0, 0, 55.2],
-    "normal": [0, 1, 0],
-    "radius": 4.1,
-    "height": 5.2,
-    "opening_deg": 60,
-}
-_PLANE_EXAMPLE = {
-    "plane": {"center": [0, -3.2, 35.9], "normal": [0, 1, 0], "width": 8.6, "height": 7.2}
-}
 
 
 def _from_corners(session: Session, name: str, corners: Corners) -> TargetPlane:
@@ -159,7 +149,7 @@ def _paint_corners(document: dict[str, Any], name: str) -> dict[str, list[float]
 
 @router.get("/plant", responses=problems(409), dependencies=[READ])
 def get_plant(runtime: RuntimeDep) -> PlantOut:
-    """The plant's name and the tower base."""
+    """Get the plant: its name, tower base and declared model."""
     with runtime.database.reading() as session:
         return plant_out(session)
 
@@ -168,11 +158,11 @@ def get_plant(runtime: RuntimeDep) -> PlantOut:
     "/plant", responses=problems(409, 413, 415), dependencies=[OPERATE, Depends(require_json)]
 )
 def put_plant(document: TowerMeasurements, runtime: RuntimeDep, identity: IdentityDep) -> PlantOut:
-    """Set the tower base, all planar targets and receivers from PAINT's tower measurements.
+    """Set the plant: tower base, targets and receivers.
 
-    Repeating the request changes nothing. `declared` sets what is declared of the plant model, if
-    it is given. An effect's `scope` says when it acts and at which `heliostats`. Without a scope,
-    it acts at all of them.
+    The body is PAINT's tower measurements. Repeating the request changes nothing. `declared` sets
+    what is declared of the plant model, if it is given. An effect's `scope` says when it acts and
+    at which `heliostats`. Without a scope, it acts at all of them.
 
     A scope of one mirror: `{"kind": "set", "heliostats": ["AB12"]}`.
     """
@@ -191,14 +181,14 @@ def put_plant(document: TowerMeasurements, runtime: RuntimeDep, identity: Identi
 
 @router.get("/targets", responses=problems(), dependencies=[READ])
 def list_targets(runtime: RuntimeDep) -> Page[TargetOut]:
-    """All target planes."""
+    """List target planes."""
     with runtime.database.reading() as session:
         return Page(items=[target_out(row) for row in store.list_targets(session)], next=None)
 
 
 @router.get("/targets/{name}", responses=problems(404), dependencies=[READ])
 def get_target(name: NamePath, runtime: RuntimeDep) -> TargetOut:
-    """A target plane."""
+    """Get a target plane."""
     with runtime.database.reading() as session:
         return target_out(store.get_target(session, name))
 
@@ -210,13 +200,12 @@ def get_target(name: NamePath, runtime: RuntimeDep) -> TargetOut:
 )
 def put_target(
     name: NamePath,
-    request: TargetIn = Body(examples=[_PLANE_EXAMPLE]),
-    *,
+    request: TargetIn,
     runtime: RuntimeDep,
     identity: IdentityDep,
     response: Response,
 ) -> TargetOut:
-    """Set a target plane, by its rectangle [m] or by its four corners in WGS84."""
+    """Set a target plane, by its rectangle [m] or its corners in WGS84."""
 
     def write(session: Session) -> Put[TargetRow]:
         if request.corners is not None:
@@ -251,14 +240,14 @@ def delete_target(name: NamePath, runtime: RuntimeDep, identity: IdentityDep) ->
 
 @router.get("/receivers", responses=problems(), dependencies=[READ])
 def list_receivers(runtime: RuntimeDep) -> Page[ReceiverOut]:
-    """All cylindrical receivers."""
+    """List cylindrical receivers."""
     with runtime.database.reading() as session:
         return Page(items=[receiver_out(row) for row in store.list_receivers(session)], next=None)
 
 
 @router.get("/receivers/{name}", responses=problems(404), dependencies=[READ])
 def get_receiver(name: NamePath, runtime: RuntimeDep) -> ReceiverOut:
-    """A cylindrical receiver."""
+    """Get a cylindrical receiver."""
     with runtime.database.reading() as session:
         return receiver_out(store.get_receiver(session, name))
 
@@ -270,8 +259,7 @@ def get_receiver(name: NamePath, runtime: RuntimeDep) -> ReceiverOut:
 )
 def put_receiver(
     name: NamePath,
-    request: ReceiverIn = Body(examples=[_RECEIVER_EXAMPLE]),
-    *,
+    request: ReceiverIn,
     runtime: RuntimeDep,
     identity: IdentityDep,
     response: Response,

@@ -9,7 +9,7 @@ from pydantic import BaseModel, Field
 
 from service import store
 from service.base.errors import NotFoundError
-from service.base.fields import Name
+from service.base.fields import From, HeliostatOf, Name, UpTo
 from service.twin.alerts.field_overview import PATIENCE_S, HeliostatOverview, read_summaries
 from service.twin.pointing.calibration import best_slot
 from service.web.api.mounts import PlannedOut, planned_out
@@ -23,8 +23,8 @@ router = APIRouter(tags=["mounts"])
 class MovedOut(BaseModel):
     """A move of a heliostat between two photographs."""
 
-    since: datetime
-    until: datetime
+    since: From
+    until: UpTo
     when: str = Field(
         description=(
             "The same in words. If the photographs have no times, it names them, and `since` and"
@@ -43,17 +43,17 @@ class MovedOut(BaseModel):
 class DriftedOut(BaseModel):
     """Slow drift of the drives."""
 
-    since: datetime
-    until: datetime
+    since: From
+    until: UpTo
     size_mrad: float = Field(description="How far the zeros of its drives went together [mrad].")
 
 
 class PointingOut(BaseModel):
     """What the newest photographs say about a calibrated mount."""
 
-    heliostat: str
+    heliostat: HeliostatOf
     mount_version: int = Field(description="Version of the mount.")
-    calibrated_at: datetime
+    calibrated_at: datetime = Field(description="When the mount was calibrated.")
     error_mrad: float | None = Field(
         description=(
             "Median angle at the mirror between forecast and measured spots, of the newest"
@@ -115,7 +115,7 @@ def list_pointing(
         Name | None, Query(description="The last heliostat of the page before.")
     ] = None,
 ) -> PointingPage:
-    """The pointing errors of all calibrated heliostats, in the order of their names."""
+    """List the pointing errors of calibrated heliostats, by name."""
     with runtime.database.reading() as session:
         field = cache.read(session, PATIENCE_S)
     known = [
@@ -132,7 +132,7 @@ def list_pointing(
 
 @router.get("/heliostats/{name}/pointing", responses=problems(404), dependencies=[READ])
 def get_pointing(name: NamePath, runtime: RuntimeDep, cache: FieldCacheDep) -> HeliostatPointingOut:
-    """The pointing error of a heliostat, from its newest photographs.
+    """Get the pointing error of a heliostat, from its newest photographs.
 
     The response includes the trend, the last move, and the most informative next photograph.
     """

@@ -3,14 +3,23 @@
 from datetime import datetime
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Body, Path, Query, Response, status
+from fastapi import APIRouter, Path, Query, Response, status
 from fastapi.responses import HTMLResponse
 from pydantic import BaseModel, Field
 from sqlalchemy.orm import Session
 
 from service import store
 from service.base.errors import NotFoundError
-from service.base.fields import Flag, Model, ModelNumber, StudyReport, Verdict, Version
+from service.base.fields import (
+    CreatedAt,
+    Flag,
+    Id,
+    Model,
+    ModelNumber,
+    StudyReport,
+    Verdict,
+    Version,
+)
 from service.jobs.kinds import KINDS
 from service.store.listing import Order, Period
 from service.store.tables import StudyRow
@@ -25,8 +34,8 @@ from service.web.responses.paging import OrderQuery, Page, Since, Until, page
 class StudySummary(BaseModel):
     """A study without its figures."""
 
-    id: int
-    created_at: datetime
+    id: Id
+    created_at: CreatedAt
     created_by: str = Field(description="Name of the key that asked for it.")
     options: dict[str, Any] = Field(description="What was asked.")
     heliostats: list[str] = Field(description="Those whose photographs were studied.")
@@ -43,7 +52,7 @@ class StudySummary(BaseModel):
     verdict: Verdict = Field(
         description="effect: it is found; none: nothing is missing; unexplained: something is."
     )
-    conclusion: str
+    conclusion: str = Field(description="The verdict in one sentence.")
 
 
 class StudyOut(StudySummary, StudyReport):
@@ -121,7 +130,7 @@ def list_studies(
     until: Until = None,
     order: OrderQuery = "down",
 ) -> Page[StudySummary]:
-    """Studies, newest first."""
+    """List studies, newest first."""
     with runtime.database.reading() as session:
         made, direction = Period(since, until), Order(descending=order == "down")
         rows = store.list_studies(
@@ -135,7 +144,7 @@ def list_studies(
 
 @router.get("/studies/{number}", responses=problems(404), dependencies=[READ])
 def get_study(number: Number, runtime: RuntimeDep) -> StudyOut:
-    """A study: its verdict, its results, and their benefit."""
+    """Get a study: its verdict, its results, and their benefit."""
     with runtime.database.reading() as session:
         row = store.get_study(session, number)
         return study_out(row, _adopted(session, row))
@@ -151,7 +160,7 @@ def get_study(number: Number, runtime: RuntimeDep) -> StudyOut:
     dependencies=[READ],
 )
 def get_study_report(number: Number, runtime: RuntimeDep) -> HTMLResponse:
-    """The study as a page for people."""
+    """Get the report of a study as a page for people."""
     with runtime.database.reading() as session:
         row = store.get_study(session, number, page=True)
     if row.html is None:
@@ -166,12 +175,9 @@ def get_study_report(number: Number, runtime: RuntimeDep) -> HTMLResponse:
     dependencies=[OPERATE],
 )
 def adopt_study(
-    number: Number,
-    runtime: RuntimeDep,
-    identity: IdentityDep,
-    request: Annotated[AdoptIn | None, Body(examples=[{"force": False}])] = None,
+    number: Number, runtime: RuntimeDep, identity: IdentityDep, request: AdoptIn | None = None
 ) -> AdoptedOut:
-    """Adopt the result of a study as the current version of the plant model."""
+    """Adopt the result of a study. It becomes the current version of the plant model."""
     force = request is not None and request.force
     with runtime.database.writing() as session:
         row = model_versions.adopt(session, number, identity.name, force)
@@ -183,7 +189,7 @@ def adopt_study(
 
 @router.post("/studies/{number}/withdraw", responses=problems(404, 409), dependencies=[OPERATE])
 def withdraw_study(number: Number, runtime: RuntimeDep, identity: IdentityDep) -> ModelOut:
-    """Withdraw the version that was adopted from the study.
+    """Withdraw what was adopted from a study.
 
     The version before it is current again, and is the response.
     """

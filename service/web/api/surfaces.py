@@ -10,6 +10,10 @@ from pydantic import BaseModel, Field
 from service import store
 from service.base.arrays import unpack
 from service.base.fields import (
+    Author,
+    CreatedAt,
+    HeliostatOf,
+    Id,
     MeasurementName,
     Method,
     Model,
@@ -18,9 +22,12 @@ from service.base.fields import (
     Moment,
     Reason,
     Source,
+    SurfaceSource,
+    SurfaceVersion,
     Version,
     VersionIn,
     Whole,
+    Why,
 )
 from service.base.settings import Settings
 from service.drawing.pictures import surface_picture
@@ -75,14 +82,14 @@ class SurfaceIn(Model):
 class SurfaceSummary(BaseModel):
     """A version of a surface."""
 
-    heliostat: str
-    version: int
-    source: Source
+    heliostat: HeliostatOf
+    version: SurfaceVersion
+    source: SurfaceSource
     model: str | None = Field(description="Name and hash of the network's weights.")
     model_version: ModelNumber | None = Field(
         description="Version of the plant's model that it was predicted by; null: it was measured."
     )
-    created_at: datetime
+    created_at: CreatedAt
     valid_from: datetime | None = Field(
         description=(
             "The mirror is taken to have this surface from then on; null: since when is not known."
@@ -95,7 +102,7 @@ class SurfaceSummary(BaseModel):
     deleted: list[str] = Field(
         description="Photographs that it was made from, too, and that were deleted since."
     )
-    misfit: float | None = Field(description="What the refinement left unexplained of the flux.")
+    misfit: float | None = Field(description="Share of the flux that it leaves unexplained [1].")
     trusted: bool | None = Field(
         description=(
             "Whether it explains all its photographs by a mirror like those known; null: it was not"
@@ -131,22 +138,22 @@ class SurfaceSummary(BaseModel):
 class ChoiceIn(Model):
     """The version to make the active surface."""
 
-    version: VersionIn
+    version: VersionIn = Field(description="Version of the surface.")
     reason: Reason = Field(description="Why; kept with the decision.")
 
 
 class DecisionOut(BaseModel):
     """A decision that made a version the active surface or a candidate, with its reasons."""
 
-    id: int
-    version: int
+    id: Id
+    version: SurfaceVersion
     became_active: bool = Field(
         description="Whether it became the active surface; else it is a candidate."
     )
     previous: int | None = Field(description="The version that was active until then.")
-    created_at: datetime
-    created_by: str
-    reason: str
+    created_at: CreatedAt
+    created_by: Author
+    reason: Why
     accuracy_before: float | None = Field(
         description="Mean flux accuracy of the former one [1]; null: not compared."
     )
@@ -249,13 +256,13 @@ def post_surface(
     runtime: RuntimeDep,
     identity: IdentityDep,
     response: Response,
-    request: Annotated[SurfaceIn, Body(examples=[{"method": "network", "images": 4}])],
+    request: SurfaceIn,
 ) -> SurfaceOut:
-    """Predict the surface from stored measurements, and store it as the next version.
+    """Predict the surface of a heliostat from its photographs.
 
-    If there is an active surface already, the new one replaces it if it forecasts photographs no
-    worse. Otherwise it becomes a candidate (`is_candidate`). `decisions` has the figures, and `PUT
-    .../current` changes the decision.
+    It is stored as the next version. If there is an active surface already, the new one replaces it
+    if it forecasts photographs no worse. Otherwise it becomes a candidate (`is_candidate`).
+    `decisions` has the figures, and `PUT .../current` changes the decision.
     """
     kept = predict_surface(
         runtime,
@@ -311,7 +318,7 @@ def list_surfaces(
     ] = "version",
     order: OrderQuery = "up",
 ) -> Page[SurfaceSummary] | Response:
-    """The history of the surface, oldest version first.
+    """List the surfaces of a heliostat, oldest version first.
 
     With `at`, the response is the version that was valid at that time.
     """
@@ -349,7 +356,7 @@ def get_current_surface(
         Moment | None, Query(description="The one that was valid then instead (time with zone).")
     ] = None,
 ) -> Response:
-    """The surface that is valid now, or was at a time."""
+    """Get the surface that is valid now, or was at a time."""
     return _at(runtime, name, at, media_type)
 
 
@@ -359,9 +366,9 @@ def get_current_surface(
 def put_current_surface(
     name: NamePath, runtime: RuntimeDep, identity: IdentityDep, choice: Annotated[ChoiceIn, Body()]
 ) -> DecisionOut:
-    """Make a version the active surface, regardless of the comparison of accuracies.
+    """Make a version the active surface.
 
-    Versions with precedence over it become candidates (`is_candidate`).
+    Accuracies are not compared. Versions with precedence over it become candidates.
     """
     with runtime.database.writing() as session:
         heliostat = store.get_heliostat(session, name)
@@ -375,7 +382,7 @@ def put_current_surface(
 
 @router.post("/undo", responses=problems(404, 409), dependencies=[OPERATE])
 def undo_decision(name: NamePath, runtime: RuntimeDep, identity: IdentityDep) -> DecisionOut:
-    """Undo the last decision that changed the active surface. The previous one is active again."""
+    """Undo the last decision about the active surface. The previous one is active again."""
     with runtime.database.writing() as session:
         return decision_out(
             decisions.undo_decision(session, store.get_heliostat(session, name), identity.name)
@@ -389,7 +396,7 @@ def list_decisions(
     limit: Limit = 100,
     after: Annotated[Version | None, Query(description="The last id of the page before.")] = None,
 ) -> Page[DecisionOut]:
-    """The decisions about the active surface, newest first."""
+    """List the decisions about the active surface, newest first."""
     with runtime.database.reading() as session:
         rows = decisions.list_decisions(
             session, store.get_heliostat(session, name), limit + 1, after
@@ -408,7 +415,7 @@ def get_surface(
     runtime: RuntimeDep,
     media_type: MediaType,
 ) -> Response:
-    """A version of the surface."""
+    """Get a version of the surface."""
     with runtime.database.reading() as session:
         row = store.get_surface(session, store.get_heliostat(session, name), version)
     return surface_answer(name, row, media_type, runtime.settings)
@@ -421,7 +428,7 @@ def acknowledge_surface(
     runtime: RuntimeDep,
     identity: IdentityDep,
 ) -> SurfaceSummary:
-    """Acknowledge that a surface is not trusted, and why; 409 if it is trusted."""
+    """Acknowledge that a surface is not trusted. The answer is 409 if it is trusted."""
     with runtime.database.writing() as session:
         heliostat = store.get_heliostat(session, name)
         row = store.get_surface(session, heliostat, version)

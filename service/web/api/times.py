@@ -1,8 +1,6 @@
 """Times of many measurements, given afterwards."""
 
-from typing import Annotated
-
-from fastapi import APIRouter, Body, Depends
+from fastapi import APIRouter, Depends
 from pydantic import BaseModel, Field
 
 from service.base.fields import MeasurementName, Model, Moment, Name, Reason
@@ -33,20 +31,16 @@ class TimesIn(Model):
     """Times of measurements whose time was unknown or wrong."""
 
     reason: Reason = Field(description="Where they come from; kept with each correction.")
-    times: list[TimeIn] = Field(min_length=1, max_length=_MOST)
+    times: list[TimeIn] = Field(
+        min_length=1, max_length=_MOST, description="The times, by heliostat and measurement."
+    )
 
 
 class TimesOut(BaseModel):
     """Number of given times, and number of those that changed anything."""
 
-    given: int
-    changed: int
-
-
-_EXAMPLE = {
-    "reason": "from the log of the cameras",
-    "times": [{"heliostat": "AA39", "id": "205363", "taken_at": "2022-06-01T11:30:00Z"}],
-}
+    given: int = Field(description="How many times were given.")
+    changed: int = Field(description="How many of them changed a measurement.")
 
 
 @router.patch(
@@ -54,13 +48,11 @@ _EXAMPLE = {
     responses=problems(404, 409, 410, 413, 415, 429),
     dependencies=[OPERATE, Depends(require_json), COMPUTE_SLOT],
 )
-def patch_times(
-    runtime: RuntimeDep, identity: IdentityDep, body: Annotated[TimesIn, Body(examples=[_EXAMPLE])]
-) -> TimesOut:
-    """Set the times of many measurements: either all of them, or none.
+def patch_times(runtime: RuntimeDep, identity: IdentityDep, body: TimesIn) -> TimesOut:
+    """Set the times of many photographs.
 
-    Each is a correction with its history. `errors` names every wrong entry by its index, such as
-    `times.3`. Entries that match the stored time are skipped.
+    Either all are set, or none. Each is a correction with its history. `errors` names every wrong
+    entry by its index, such as `times.3`. Entries that match the stored time are skipped.
     """
     given = [GivenTime(entry.heliostat, entry.id, entry.taken_at) for entry in body.times]
     return TimesOut(

@@ -15,7 +15,7 @@ from pydantic import BaseModel, Field
 from starlette.types import Receive, Scope, Send
 
 from service.base.errors import BusyError, TooManyError
-from service.base.fields import State
+from service.base.fields import CreatedAt, Id, State
 from service.store.job_tables import JobRow
 from service.store.jobs import queue
 from service.twin.runtime.runtime import Runtime
@@ -30,16 +30,16 @@ _COMMENT_EVERY_S = 15.0
 class JobSummary(BaseModel):
     """The state of a job, without its payload and result, which may be megabytes."""
 
-    id: int
-    kind: str
+    id: Id
+    kind: str = Field(description="Kind of job; `POST /v1/jobs/KIND` begins one.")
     state: State = Field(description="queued, running, then for good done, failed or cancelled.")
     progress: float = Field(description="Share that is done, 0 to 1 [1].")
     message: str = Field(description="What is being done.")
     phase: str = Field(
         description="What the job does at present; what `n_done` of `n_total` counts."
     )
-    n_done: int | None
-    n_total: int | None
+    n_done: int | None = Field(description="How many are done; null: not counted.")
+    n_total: int | None = Field(description="How many there are; null: not counted.")
     remaining_s: float | None = Field(
         description="Expected time to its end [s]; null where that is not known."
     )
@@ -47,10 +47,10 @@ class JobSummary(BaseModel):
     cancel_requested: bool = Field(description="It ends as soon as its worker sees this.")
     reason: str | None = Field(description="Why it failed, or why it is tried again.")
     created_by: str = Field(description="Name of the key that asked for it.")
-    created_at: datetime
+    created_at: CreatedAt
     not_before: datetime = Field(description="When it is tried next at the earliest.")
-    started_at: datetime | None
-    finished_at: datetime | None
+    started_at: datetime | None = Field(description="When it was last begun; null: it waits.")
+    finished_at: datetime | None = Field(description="When it ended; null: it has not.")
     href: str = Field(description="Path of the whole job, with its payload and its result.")
 
 

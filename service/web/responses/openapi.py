@@ -1,5 +1,8 @@
 """The OpenAPI document: the schema of errors, and the error statuses of each route."""
 
+import json
+import re
+from pathlib import Path
 from typing import Any
 
 from fastapi import FastAPI
@@ -34,45 +37,28 @@ _MEANINGS = {
 }
 
 
-_TAGS = [
-    {
-        "name": "plant",
-        "description": (
-            "The tower base, which everything is measured from, its targets and receivers."
-        ),
-    },
-    {
-        "name": "heliostats",
-        "description": "Where heliostats stand and how they are built (PAINT properties).",
-    },
-    {
-        "name": "measurements",
-        "description": "Target photographs: post them, read flux and quality back.",
-    },
-    {
-        "name": "surfaces",
-        "description": "Mirror surfaces by version: predict them, read the history.",
-    },
-    {
-        "name": "forecasts",
-        "description": "Flux maps of one heliostat on any plane, or of a field on any receiver.",
-    },
-    {
-        "name": "studies",
-        "description": (
-            "What photographs demand and the model lacks: find it, adopt it into the model,"
-            " withdraw it. Differences, as `residual.mean_map_8x8` [of the measured peak], are"
-            " forecast minus photograph."
-        ),
-    },
-    {
-        "name": "jobs",
-        "description": "Work that outlives a request: ask for it, follow it, cancel it.",
-    },
-    {"name": "audit", "description": "Who did what when."},
-    {"name": "session", "description": "For pages: a session in a cookie."},
-    {"name": "health", "description": "For supervisors."},
-]
+_TAGS = {
+    "plant": "The tower base, which everything is measured from, its targets and receivers.",
+    "heliostats": "Where heliostats are and how they are built (PAINT properties).",
+    "measurements": "Target photographs: post them, read flux and quality back.",
+    "surfaces": "Mirror surfaces by version: predict them, read the history.",
+    "forecasts": "Flux maps of one heliostat on any plane, or of a field on any receiver.",
+    "mounts": "Where motors send the light: mounts, pointing errors, what to photograph next.",
+    "studies": (
+        "What photographs demand and the model lacks: find it, adopt it into the model, withdraw"
+        " it. Differences, as `residual.mean_map_8x8` [of the measured peak], are forecast minus"
+        " photograph."
+    ),
+    "jobs": "Work that outlives a request: ask for it, follow it, cancel it.",
+    "attention": "Alerts: what needs attention, and who has seen it.",
+    "audit": "Who did what when.",
+    "session": "For pages: a session in a cookie.",
+    "health": "For supervisors.",
+}
+"""Groups of operations, in the order of the work."""
+
+_EXAMPLES = Path(__file__).parents[1] / "examples.json"
+"""Bodies and answers of a real run; ``python -m tests.openapi_examples`` records them."""
 
 TEXT = {"type": "string"}
 BINARY = {"type": "string", "format": "binary"}
@@ -111,7 +97,7 @@ def _as_form(body: dict[str, Any]) -> None:
     image.pop("anyOf", None)
     image |= {"type": "string", "format": "binary"}
     schema = metadata.pop("contentSchema")
-    body["properties"]["metadata"] = schema
+    body["properties"]["metadata"] = schema | {"description": "JSON that describes the image."}
 
 
 def _by_themselves(path: str, method: str, operation: dict[str, Any]) -> set[int]:
@@ -130,18 +116,31 @@ def _by_themselves(path: str, method: str, operation: dict[str, Any]) -> set[int
     return statuses
 
 
+def _add_examples(operation: dict[str, Any], recorded: Any) -> None:
+    """Add the recorded body and answers of an operation."""
+    if "body" in recorded:
+        (content,) = operation["requestBody"]["content"].values()
+        content["example"] = recorded["body"]
+    for status, answers in recorded["answers"].items():
+        for media_type, answer in answers.items():
+            operation["responses"][status]["content"][media_type]["example"] = answer
+
+
 def _document(app: FastAPI) -> dict[str, Any]:
     document = get_openapi(
         title=app.title,
         version=app.version,
         description=app.description,
         routes=app.routes,
-        tags=_TAGS,
+        tags=[{"name": name, "description": about} for name, about in _TAGS.items()],
     )
+    examples = json.loads(_EXAMPLES.read_text(encoding="utf-8"))
     problem = {"application/json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
     for path, operations in document["paths"].items():
         for method, operation in operations.items():
             responses = operation["responses"]
+            operation["summary"] = re.split(r"\.(?:\s|$)", operation["description"], maxsplit=1)[0]
+            _add_examples(operation, examples.get(operation["operationId"], {"answers": {}}))
             if "HTTPValidationError" in str(responses.get("422")):
                 del responses["422"]  # the default schema of FastAPI
             for status in _by_themselves(path, method, operation):
@@ -152,13 +151,16 @@ def _document(app: FastAPI) -> dict[str, Any]:
             for status, response in responses.items():
                 if int(status) >= 400 and "Problem" in str(response):
                     _as_problem(response)
-    _as_form(document["components"]["schemas"]["Body_post_measurement"])
+    schemas = document["components"]["schemas"]
+    _as_form(schemas["Body_post_measurement"])
+    # The form of the documentation page begins with this example.
+    schemas["MeasurementIn"]["examples"] = [examples["post_measurement"]["body"]["metadata"]]
     post = document["paths"]["/v1/heliostats/{name}/measurements"]["post"]
     post["requestBody"]["content"]["multipart/form-data"]["encoding"] = {
         "metadata": {"contentType": "application/json"}
     }
     for unused in ("HTTPValidationError", "ValidationError"):
-        document["components"]["schemas"].pop(unused, None)
+        schemas.pop(unused, None)
     return document
 
 

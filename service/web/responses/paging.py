@@ -24,7 +24,7 @@ OrderQuery = Annotated[
 class Page(BaseModel, Generic[Item]):
     """A part of a list."""
 
-    items: list[Item]
+    items: list[Item] = Field(description="The entries of this page, in the list's order.")
     next: str | None = Field(description="Pass as `after` for the next page; null on the last.")
 
 

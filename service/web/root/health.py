@@ -6,7 +6,7 @@ from typing import Literal
 
 from anyio import CapacityLimiter, Lock, to_thread
 from fastapi import APIRouter, Request, Response, status
-from pydantic import BaseModel
+from pydantic import BaseModel, Field
 
 from model.errors import WeightsError
 from model.network.predictor import default_predictor
@@ -19,8 +19,8 @@ from service.web.auth.dependencies import RuntimeDep
 class Health(BaseModel):
     """The state of the service. Each check is "ok" or a description of the failure."""
 
-    status: Literal["ok", "unavailable"]
-    checks: dict[str, str]
+    status: Literal["ok", "unavailable"] = Field(description="Whether all checks passed.")
+    checks: dict[str, str] = Field(description="By name: ok, or what is wrong.")
 
 
 router = APIRouter(tags=["health"])
@@ -93,7 +93,7 @@ def _ask_all(runtime: Runtime) -> dict[str, str]:
 
 @router.get("/livez")
 async def get_livez() -> Health:
-    """The process answers."""
+    """Check that the process answers."""
     return Health(status="ok", checks={})
 
 
@@ -102,7 +102,7 @@ async def get_livez() -> Health:
     responses={503: {"model": Health, "description": "Something that it needs is missing."}},
 )
 async def get_readyz(request: Request, runtime: RuntimeDep, response: Response) -> Health:
-    """The service is ready.
+    """Check that the service is ready.
 
     The database answers with the newest schema. The network and the prior match their model cards.
     """

@@ -22,5 +22,5 @@ router = APIRouter(tags=["health"])
     dependencies=[READ, OVERVIEW_SLOT],
 )
 def get_metrics(runtime: RuntimeDep, cache: FieldCacheDep) -> Response:
-    """Counts and times of this process, the job queue, and the drift of heliostats."""
+    """Get metrics for Prometheus. They are of this process, the job queue, and drifts."""
     return Response(generate_latest(registry(runtime, cache)), media_type=CONTENT_TYPE_LATEST)

@@ -63,7 +63,7 @@ def post_session(
     runtime: RuntimeDep,
     response: Response,
 ) -> None:
-    """Begin a session in a cookie for half a day. It ends at once if the key is withdrawn."""
+    """Begin a session in a cookie. It lasts half a day, or until the key is withdrawn."""
     token = begin_session(runtime, key)
     if token is None:
         raise HTTPException(
