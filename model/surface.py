@@ -72,23 +72,23 @@ def basis(count: int, degree: int, parameters: ArrayLike) -> Basis[Array]:
     """
     u, t = np.asarray(parameters, dtype=np.float64), knots(count, degree)
     span = np.clip(np.searchsorted(t, u, side="right") - 1, degree, count - 1)
-    values = np.zeros((len(u), len(t) - 1))
-    values[np.arange(len(u)), span] = 1.0
+    values = np.zeros((len(t) - 1, len(u)))  # transposed: each function is contiguous
+    values[span, np.arange(len(u))] = 1.0
     lower = values
     for p in range(1, degree + 1):
         lower, values = values, np.zeros_like(values)
         for i in range(len(t) - 1 - p):
             if t[i + p] > t[i]:
-                values[:, i] += (u - t[i]) / (t[i + p] - t[i]) * lower[:, i]
+                values[i] += (u - t[i]) / (t[i + p] - t[i]) * lower[i]
             if t[i + p + 1] > t[i + 1]:
-                values[:, i] += (t[i + p + 1] - u) / (t[i + p + 1] - t[i + 1]) * lower[:, i + 1]
-    slopes = np.zeros((len(u), count))
+                values[i] += (t[i + p + 1] - u) / (t[i + p + 1] - t[i + 1]) * lower[i + 1]
+    slopes = np.zeros((count, len(u)))
     for i in range(count):
         if t[i + degree] > t[i]:
-            slopes[:, i] += degree / (t[i + degree] - t[i]) * lower[:, i]
+            slopes[i] += degree / (t[i + degree] - t[i]) * lower[i]
         if t[i + degree + 1] > t[i + 1]:
-            slopes[:, i] -= degree / (t[i + degree + 1] - t[i + 1]) * lower[:, i + 1]
-    return Basis(values[:, :count], slopes)
+            slopes[i] -= degree / (t[i + degree + 1] - t[i + 1]) * lower[i + 1]
+    return Basis(np.ascontiguousarray(values[:count].T), np.ascontiguousarray(slopes.T))
 
 
 @lru_cache(maxsize=64)

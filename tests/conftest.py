@@ -3,6 +3,7 @@
 import fcntl
 import gc
 import os
+import shutil
 import tempfile
 
 # Two cores, several test processes: threads of linear algebra would only spin against each other.
@@ -86,6 +87,20 @@ def made_plant(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made_once(
         tmp_path_factory, "plant", lambda root: write_plant(root, images=4, rays=60_000)
     )
+
+
+@pytest.fixture(scope="session")
+def pair_plant(made_plant: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same plant with two of its heliostats, for what holds for each alone; read it only."""
+
+    def copy(root: Path) -> None:
+        for path in made_plant.iterdir():
+            if path.is_file():
+                shutil.copy(path, root)
+            elif path.name in ("AB12", "AC31"):
+                shutil.copytree(path, root / path.name)
+
+    return made_once(tmp_path_factory, "pair-plant", copy)
 
 
 def flat_heliostat(

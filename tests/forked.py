@@ -8,17 +8,36 @@ import multiprocessing
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 _CONTEXT = multiprocessing.get_context("forkserver")
-_CONTEXT.set_forkserver_preload(["tests.faults.process", "tests.service.job_kinds"])
+_CONTEXT.set_forkserver_preload(
+    ["tests.faults.process", "tests.service.job_kinds", "service.cli.main"]
+)
 
 
-def _run(target: Callable[..., None], environment: dict[str, str], *arguments: str) -> None:
+@dataclass(frozen=True)
+class Output:
+    """The files that a process writes its output and its errors to; by default it writes none."""
+
+    stdout: Path | None = None
+    stderr: Path = Path(os.devnull)
+
+    def redirect(self) -> None:
+        """Let this process write there from now on."""
+        for number, path in ((1, self.stdout), (2, self.stderr)):
+            if path is not None:
+                with path.open("ab") as file:
+                    os.dup2(file.fileno(), number)
+
+
+def _run(
+    target: Callable[..., None], environment: dict[str, str], output: Output, *arguments: str
+) -> None:
     os.environ.clear()
     os.environ.update(environment)
-    with Path(os.devnull).open("wb") as nothing:
-        os.dup2(nothing.fileno(), 2)
+    output.redirect()
     target(*arguments)
 
 
@@ -26,9 +45,13 @@ class ForkedProcess:
     """The part of `subprocess.Popen` that tests need."""
 
     def __init__(
-        self, target: Callable[..., None], environment: Mapping[str, str], *arguments: str
+        self,
+        target: Callable[..., None],
+        environment: Mapping[str, str],
+        *arguments: str,
+        output: Output,
     ) -> None:
-        given = (target, dict(environment), *arguments)
+        given = (target, dict(environment), output, *arguments)
         self._process = _CONTEXT.Process(target=_run, args=given)
         self._process.start()
         assert self._process.pid is not None
@@ -52,10 +75,13 @@ class ForkedProcess:
 
 @contextmanager
 def forked_process(
-    target: Callable[..., None], environment: Mapping[str, str], *arguments: str
+    target: Callable[..., None],
+    environment: Mapping[str, str],
+    *arguments: str,
+    output: Output = Output(),  # immutable
 ) -> Iterator[ForkedProcess]:
     """A process that calls ``target``; killed at the end, where it still runs, and waited for."""
-    process = ForkedProcess(target, environment, *arguments)
+    process = ForkedProcess(target, environment, *arguments, output=output)
     try:
         yield process
     finally:

@@ -106,8 +106,8 @@ def stand_in_index() -> str:
     return "file:///wheels" if "+cpu" in done.stdout else ""
 
 
-def build(context: Path, dockerfile: Path, image: str) -> str:
-    """Build an image with the builder that every engine has."""
+def build(context: Path, dockerfile: Path, image: str, stage: str = "") -> str:
+    """Build an image, or one of its stages, with the builder that every engine has."""
     index = os.environ.get("TORCH_INDEX_URL", "") or stand_in_index()
     arguments = ["--build-arg", f"TORCH_INDEX_URL={index}"] if index else []
     command = [
@@ -117,6 +117,7 @@ def build(context: Path, dockerfile: Path, image: str) -> str:
         "--network",
         "host",
         *arguments,
+        *(["--target", stage] if stage else []),
         "-f",
         str(dockerfile),
         "-t",
@@ -124,6 +125,17 @@ def build(context: Path, dockerfile: Path, image: str) -> str:
     ]
     run(*command, str(context), environment={"DOCKER_BUILDKIT": "0"})
     return image
+
+
+def build_heliotwin(checkout: Path, image: str) -> str:
+    """Build this project's image.
+
+    The layers with the packages of others stay in the engine, under a separate tag. As long as
+    the locked versions stay, the next build finds them there.
+    """
+    dockerfile = checkout / "docker" / "Dockerfile"
+    build(checkout, dockerfile, "heliotwin-test:packages", stage="packages")
+    return build(checkout, dockerfile, image)
 
 
 def build_monitor(program: str, name: str, kind: str, folder: Path, image: str) -> str:
@@ -196,6 +208,8 @@ class Composition:
             "HELIOTWIN_ALERTMANAGER_PORT": str(free_port()),
         }
         self._command = self._of_this_engine()
+        frequent = {"healthcheck": {"interval": "1s"}}
+        self._override("health", dict.fromkeys(("database", "service", "worker"), frequent))
 
     def _of_this_engine(self) -> list[str]:
         if _compose_is_new():
@@ -224,8 +238,11 @@ class Composition:
 
     def instead(self, images: Mapping[str, str]) -> None:
         """Start services from other images than the file names."""
-        file = self.folder / f".{self.project}-images.yaml"
-        services = {name: {"image": image} for name, image in images.items()}
+        self._override("images", {name: {"image": image} for name, image in images.items()})
+
+    def _override(self, what: str, services: Mapping[str, Mapping[str, Any]]) -> None:
+        """Change some fields of services."""
+        file = self.folder / f".{self.project}-{what}.yaml"
         file.write_text(json.dumps({"version": "3.9", "services": services}), encoding="utf-8")
         self._command += ["-f", str(file)]
 

@@ -45,7 +45,7 @@ def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def version(checkout: Path) -> Iterator[str]:
     """The tag of an image that was built from a clean clone."""
     tag = f"test-{uuid.uuid4().hex[:8]}"
-    engine.build(checkout, checkout / "docker" / "Dockerfile", f"heliotwin:{tag}")
+    engine.build_heliotwin(checkout, f"heliotwin:{tag}")
     yield tag
     engine.run("docker", "rmi", "--force", f"heliotwin:{tag}")
 
@@ -400,12 +400,16 @@ def test_monitoring_reports_that_service_or_worker_is_away(
         "alerts have a way",
     )
 
-    rules_file = plant.folder / "prometheus-rules.yml"
-    patient = rules_file.read_text(encoding="utf-8")
+    # Written in place: both files are mounted.
+    rules_file, configuration = (
+        plant.folder / name for name in ("prometheus-rules.yml", "prometheus.yml")
+    )
+    patient, seldom = (path.read_text(encoding="utf-8") for path in (rules_file, configuration))
+    often = "scrape_interval: 5s\n  scrape_timeout: 5s\n  evaluation_interval: 1s"
+    assert "scrape_interval: 15s" in seldom
     try:
-        rules_file.write_text(
-            re.sub(r"for: \d+[mh]", "for: 0s", patient), encoding="utf-8"
-        )  # in place: it is mounted
+        rules_file.write_text(re.sub(r"for: \d+[mh]", "for: 0s", patient), encoding="utf-8")
+        configuration.write_text(seldom.replace("scrape_interval: 15s", often), encoding="utf-8")
         plant("kill", "-s", "HUP", "prometheus")
         plant("stop", "service")
         until(
@@ -420,3 +424,4 @@ def test_monitoring_reports_that_service_or_worker_is_away(
         )
     finally:
         rules_file.write_text(patient, encoding="utf-8")
+        configuration.write_text(seldom, encoding="utf-8")

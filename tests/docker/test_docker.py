@@ -179,7 +179,7 @@ def test_every_image_of_others_can_be_pinned(dockerfile: list[tuple[str, str]]):
     assert len(images) == 5
     assert all(re.fullmatch(r"\$\{HELIOTWIN_\w+_IMAGE:-[\w/.:-]+\}", image) for image in images)
     bases = [arguments.split()[0] for name, arguments in dockerfile if name == "FROM"]
-    assert set(bases) == {"${PYTHON_IMAGE}", "dependencies"}
+    assert set(bases) == {"${PYTHON_IMAGE}", "dependencies", "packages"}
 
 
 def test_environment_makes_valid_settings(

@@ -1,11 +1,12 @@
 """The command ``heliotwin`` in this process, which has loaded its libraries already.
 
-A separate process takes seconds to load them. Tests of starting, listening and signals start one.
+A separate process takes seconds to load them. Tests of starting, listening and signals use
+`heliotwin_process`, a copy of a process that has loaded them.
 """
 
 import os
 import sys
-from contextlib import redirect_stderr, redirect_stdout
+from contextlib import AbstractContextManager, redirect_stderr, redirect_stdout
 from io import StringIO
 from pathlib import Path
 from subprocess import CompletedProcess
@@ -13,6 +14,7 @@ from subprocess import CompletedProcess
 import pytest
 
 from service.cli.main import main
+from tests.forked import ForkedProcess, Output, forked_process
 
 
 def heliotwin(*arguments: object, cwd: Path | None = None) -> CompletedProcess[str]:
@@ -54,6 +56,31 @@ def heliotwin_on(data: Path, *arguments: object, **settings: str) -> CompletedPr
         for name, value in ({"HELIOTWIN_DATA_DIR": str(data)} | settings).items():
             patch.setenv(name, value)
         return heliotwin(*arguments, cwd=data.parent)
+
+
+def _call_main(folder: str, *arguments: str) -> None:
+    os.chdir(folder)
+    sys.argv = ["heliotwin", *arguments]
+    main()
+
+
+def heliotwin_process(
+    folder: Path, *arguments: object, **settings: str
+) -> AbstractContextManager[ForkedProcess]:
+    """The command in a separate process in ``folder``, with no settings but these.
+
+    It writes to the files ``stdout`` and ``stderr`` there.
+    """
+    environment = {
+        name: value for name, value in os.environ.items() if not name.startswith("HELIOTWIN_")
+    }
+    return forked_process(
+        _call_main,
+        environment | settings,
+        str(folder),
+        *map(str, arguments),
+        output=Output(folder / "stdout", folder / "stderr"),
+    )
 
 
 def ends(done: CompletedProcess[str], code: int, says: str) -> None:

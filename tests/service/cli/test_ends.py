@@ -7,6 +7,7 @@ import socket
 import sqlite3
 import subprocess
 import sys
+import time
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -18,26 +19,26 @@ from rich.console import Console
 from service.base.settings import Settings
 from service.cli import demo
 from service.cli import folder as verbs
-from service.cli.demo_plant import write_plant
+from service.cli.main import main
 from service.sources.folder import read_folder
 from service.store.database import migrate
-from tests.service.command import ends, heliotwin_on
+from tests.forked import Output, forked_process
+from tests.service.command import ends, heliotwin_on, heliotwin_process
 from tests.service.conftest import free_port
-from tests.waiting import WAIT_LIMIT_S, child_process
+from tests.waiting import WAIT_LIMIT_S, child_process, until
 
 ROOT = Path(__file__).parents[3]
 
 
 def process_on(data: Path, *arguments: object, **settings: str) -> subprocess.CompletedProcess[str]:
     """Run the command in a separate process: a service or a worker."""
-    environment = {
-        name: value for name, value in os.environ.items() if not name.startswith("HELIOTWIN_")
-    }
-    environment |= {"HELIOTWIN_DATA_DIR": str(data), "PYTHONPATH": str(ROOT)} | settings
-    command = [sys.executable, "-m", "service", *map(str, arguments)]
-    return subprocess.run(
-        command, capture_output=True, text=True, env=environment, cwd=data.parent, check=False
-    )
+    folder = data.parent
+    for name in ("stdout", "stderr"):
+        (folder / name).unlink(missing_ok=True)
+    with heliotwin_process(folder, *arguments, HELIOTWIN_DATA_DIR=str(data), **settings) as process:
+        code = process.wait(WAIT_LIMIT_S)
+    said = ((folder / name).read_text(encoding="utf-8") for name in ("stdout", "stderr"))
+    return subprocess.CompletedProcess(arguments, code, *said)
 
 
 def test_a_database_that_cannot_be_read_is_one_line(tmp_path: Path):
@@ -50,7 +51,7 @@ def test_a_database_that_cannot_be_read_is_one_line(tmp_path: Path):
         ends(heliotwin_on(data, *verb), 1, "heliotwin: the database: file is not a database")
 
 
-def test_lists_take_no_lock_and_migrate_nothing(tmp_path: Path):
+def test_lists_take_no_lock_and_migrate_nothing(made_plant: Path, tmp_path: Path):
     data = tmp_path / "data"
     for verb in ("keys", "models"):
         assert heliotwin_on(data, verb, "list").returncode == 0
@@ -59,7 +60,7 @@ def test_lists_take_no_lock_and_migrate_nothing(tmp_path: Path):
     assert migrate(settings, "0001")
     ends(heliotwin_on(data, "keys", "list"), 1, "heliotwin migrate")
     ends(
-        heliotwin_on(data, "import", _plant(tmp_path), HELIOTWIN_MIGRATE_ON_START="false"),
+        heliotwin_on(data, "import", made_plant, HELIOTWIN_MIGRATE_ON_START="false"),
         1,
         "heliotwin migrate",
     )
@@ -73,11 +74,6 @@ def test_lists_take_no_lock_and_migrate_nothing(tmp_path: Path):
         held.close()
 
 
-def _plant(folder: Path) -> Path:
-    write_plant(folder / "plant", images=1, rays=30_000)
-    return folder / "plant"
-
-
 def test_an_open_door_is_refused_in_one_line(tmp_path: Path):
     done = process_on(tmp_path / "data", "serve", "--host", "0.0.0.0")
     assert done.returncode == 1
@@ -88,15 +84,9 @@ def test_an_open_door_is_refused_in_one_line(tmp_path: Path):
 
 
 @pytest.mark.parametrize("window", ["-4", "0", "nan", "1e9"])
-def test_a_window_that_is_none_is_bad_input(tmp_path: Path, window: str):
+def test_a_window_that_is_none_is_bad_input(made_plant: Path, tmp_path: Path, window: str):
     done = heliotwin_on(
-        tmp_path / "data",
-        "forecast",
-        _plant(tmp_path),
-        "--out",
-        tmp_path / "out",
-        "--window",
-        window,
+        tmp_path / "data", "forecast", made_plant, "--out", tmp_path / "out", "--window", window
     )
     ends(done, 2, "--window must lie in 0 to 1000 m")
 
@@ -108,9 +98,9 @@ def test_version(tmp_path: Path):
 
 
 def test_an_interrupted_prediction_leaves_what_was_done(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    made_plant: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    folder, calls = read_folder(_plant(tmp_path)), []
+    folder, calls = read_folder(made_plant), []
     predict = verbs.predict_heliostat
 
     def interrupted(*arguments: Any) -> Any:
@@ -158,17 +148,22 @@ def test_what_does_not_listen_says_nothing_of_it(tmp_path: Path, form: tuple[str
 
 
 def test_what_listens_says_where_and_answers(tmp_path: Path):
-    port = free_port()
-    environment = os.environ | {
-        "HELIOTWIN_DATA_DIR": str(tmp_path / "data"),
-        "PYTHONPATH": str(ROOT),
-    }
-    command = [sys.executable, "-m", "service", "serve", "--port", str(port), "--json"]
-    with child_process(
-        command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment
+    settings = {"HELIOTWIN_DATA_DIR": str(tmp_path / "data")}
+    output = tmp_path / "stdout"
+    with heliotwin_process(
+        tmp_path, "serve", "--port", free_port(), "--json", **settings
     ) as process:
-        assert process.stdout is not None
-        url = json.loads(process.stdout.readline())["url"]
+
+        def first_line() -> str | None:
+            assert process.poll() is None, (tmp_path / "stderr").read_text(encoding="utf-8")
+            line, end, _ = (
+                output.read_text(encoding="utf-8").partition("\n")
+                if output.is_file()
+                else ("", "", "")
+            )
+            return line if end else None
+
+        url = json.loads(until(first_line, "it says where it listens"))["url"]
         assert httpx.get(f"{url}/livez").status_code == 200
 
 
@@ -188,43 +183,34 @@ def test_the_last_line_of_the_demonstration_starts_the_service(tmp_path: Path):
         assert (tmp_path / "a store's folder" / "heliotwin.sqlite").is_file()
 
 
-_INTERRUPTED = """
-import signal, sys, time
-from service.cli import folder
-from service.cli.main import main
+def _predict_for_hours(begun: str, *arguments: str) -> None:
+    def long(*_: Any) -> None:
+        Path(begun).touch()
+        time.sleep(3600)
 
-def long(*_):
-    print("begun", file=sys.stderr, flush=True)
-    time.sleep(3600)
-
-folder.predict_heliostat = long
-sys.argv = ["heliotwin", *sys.argv[1:]]
-# A shell that runs the tests in the background has it ignored.
-signal.signal(signal.SIGINT, signal.default_int_handler)
-main()
-"""
+    verbs.predict_heliostat = long  # type: ignore[assignment]
+    sys.argv = ["heliotwin", "predict", *arguments]
+    # A shell that runs the tests in the background has it ignored.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    main()
 
 
-def test_an_interrupted_verb_ends_by_130(tmp_path: Path):
+def test_an_interrupted_verb_ends_by_130(made_plant: Path, tmp_path: Path):
     """Ctrl-C: the exit code that a shell expects of an interrupted program, and no traceback."""
-    command = [
-        sys.executable,
-        "-c",
-        _INTERRUPTED,
-        "predict",
-        _plant(tmp_path),
-        "--out",
-        tmp_path / "out",
-    ]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    with child_process(
-        command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, env=environment
+    begun, errors, out = (tmp_path / name for name in ("begun", "stderr", "out"))
+    with forked_process(
+        _predict_for_hours,
+        os.environ,
+        *map(str, (begun, made_plant, "--out", out)),
+        output=Output(tmp_path / "stdout", errors),
     ) as process:
-        assert process.stderr is not None
-        while b"begun" not in (line := process.stderr.readline()):
-            assert line, "it ended before it was interrupted"
+
+        def has_begun() -> bool:
+            assert process.poll() is None, errors.read_text(encoding="utf-8")
+            return begun.is_file()
+
+        until(has_begun, "the prediction begins")
         process.send_signal(signal.SIGINT)
-        errors = process.stderr.read()
-        assert process.wait(WAIT_LIMIT_S) == 130, errors
-    assert b"Traceback" not in errors
-    assert (tmp_path / "out" / "predictions.json").is_file()
+        assert process.wait(WAIT_LIMIT_S) == 130, errors.read_text(encoding="utf-8")
+    assert "Traceback" not in errors.read_text(encoding="utf-8")
+    assert (out / "predictions.json").is_file()
