@@ -8,7 +8,7 @@ from service.base.fields import Model, Moment, Name, Text, Whole
 from service.jobs.kind import Context, Kind, Result
 from service.twin.studies.study import StudyRequest, Surfaces, study_row, study_store
 
-MAX_STUDY_IMAGES = 512  # bounds the memory of a study
+MAX_STUDY_IMAGES = 400  # bounds the memory of a study
 
 
 class StudyIn(Model):

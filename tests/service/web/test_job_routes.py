@@ -402,7 +402,7 @@ def test_import_needs_the_operators_leave(settings: Settings, operations: FakeOp
         ("forecasts", {"sun": {"azimuth_deg": 180, "elevation_deg": 45}}),
         ("forecasts", {"target": "lower", "sun": {"azimuth_deg": 180, "elevation_deg": -1}}),
         ("studies", {"max_heliostats": 200, "images": 9}),
-        ("studies", {"heliostats": [f"AA{number}" for number in range(1, 10)], "images": 64}),
+        ("studies", {"heliostats": [f"AA{number}" for number in range(1, 8)], "images": 64}),
         ("imports", {"folder": ""}),
         ("imports", {"folder": "a\x00b"}),
         ("imports", {"folder": "a\nb"}),
@@ -417,7 +417,7 @@ def test_too_many_photographs_of_a_study_name_the_field(refusing: TestClient):
     """By default 12 of each heliostat."""
     (error,) = refusing.post("/v1/jobs/studies", json={"max_heliostats": 200}).json()["errors"]
     assert error["field"] == "images"
-    assert "2400 in all, 512 at most; ask for 2 of each heliostat" in error["message"]
+    assert "2400 in all, 400 at most; ask for 2 of each heliostat" in error["message"]
 
 
 # --- asking, listing, cancelling
