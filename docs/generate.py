@@ -9,6 +9,7 @@ import re
 import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -315,6 +316,25 @@ def roles_page() -> str:
     return "\n".join(lines) + "\n"
 
 
+NOTEBOOKS = ("surfaces_from_photographs", "forecast_anywhere", "hidden_effect")
+
+
+def notebook_page(name: str) -> str:
+    """A notebook in Jupytext's percent format as a page; tests execute the notebook."""
+    source = Path(__file__).with_name("notebooks") / f"{name}.py"
+    _, *cells = source.read_text(encoding="utf-8").split("# %%")
+    parts = []
+    for cell in cells:
+        head, _, body = cell.partition("\n")
+        if "[markdown]" in head:
+            parts.append(re.sub(r"^# ?", "", body.strip(), flags=re.MULTILINE))
+        else:
+            parts.append(f"```python\n{body.strip()}\n```")
+    address = f"docs/notebooks/{name}.py"
+    parts.append(f"The notebook is `{address}`. `jupytext --to ipynb {address}` converts it.")
+    return "\n\n".join(parts) + "\n"
+
+
 PAGES: Pages = {
     "cli": command_page,
     "rest": rest_page,
@@ -322,6 +342,7 @@ PAGES: Pages = {
     "metrics": metrics_page,
     "effects": effects_page,
     "roles": roles_page,
+    **{name: partial(notebook_page, name) for name in NOTEBOOKS},
 }
 """Name of each page, and the function that writes it."""
 
