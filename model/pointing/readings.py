@@ -1,7 +1,7 @@
 """Convert the measurements of a field to the arrays of a calibration."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,11 @@ class Weather:
     wind_speed_m_s: float | None = None
     wind_from_deg: float | None = None
     temperature_c: float | None = None
+
+    @classmethod
+    def of(cls, known: object) -> "Weather":
+        """The weather of an object with attributes of these names."""
+        return cls(**{name.name: getattr(known, name.name) for name in fields(cls)})
 
 
 @dataclass(frozen=True, eq=False)

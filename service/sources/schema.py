@@ -261,17 +261,23 @@ class MotorDocument(DocumentPart):
     axis_2_motor_position: Number
 
 
-class WeatherDocument(DocumentPart):
+class WeatherFields(BaseModel):
     """Wind and temperature of a measurement; each may be missing."""
 
-    wind_speed_m_s: WindSpeed | None = None
-    wind_from_deg: WindFrom | None = None
-    temperature_c: Temperature | None = None
+    wind_speed_m_s: WindSpeed | None = Field(default=None, description="Of the wind then [m/s].")
+    wind_from_deg: WindFrom | None = Field(
+        default=None, description="Where it came from, from north, over east [deg]."
+    )
+    temperature_c: Temperature | None = Field(default=None, description="Of the air then [°C].")
 
     @property
     def weather(self) -> Weather:
         """As the model has it."""
-        return Weather(self.wind_speed_m_s, self.wind_from_deg, self.temperature_c)
+        return Weather.of(self)
+
+
+class WeatherDocument(WeatherFields, DocumentPart):
+    """The weather of a measurement in PAINT's folder."""
 
 
 class Spots(DocumentPart):

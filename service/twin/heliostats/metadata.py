@@ -59,6 +59,6 @@ def photograph_with_target(known: Any, target_name: str) -> Photograph:
         focal_spot_wgs84=None if spot is None else tuple(spot),
         helios_spot_wgs84=None if helios is None else tuple(helios),
         corners=None if known.corners_px is None else known.corners_px["corners"],
-        weather=Weather(known.wind_speed_m_s, known.wind_from_deg, known.temperature_c),
+        weather=Weather.of(known),
         forced=known.forced,
     )

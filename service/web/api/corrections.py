@@ -5,13 +5,12 @@ from typing import Annotated, Any, Self
 from fastapi import APIRouter, Depends, Query
 from pydantic import BaseModel, Field, model_validator
 
-from model.pointing import Weather
 from service import store
 from service.base.fields import Author, CreatedAt, Flag, Model, Moment, Name, Reason, Sun, Why
 from service.jobs.enqueuing import enqueue
 from service.jobs.kinds import predictions
 from service.jobs.kinds.predictions import PredictionsIn
-from service.sources.schema import Temperature, WindFrom, WindSpeed
+from service.sources.schema import WeatherFields
 from service.store.photographs.correction_log import list_corrections, made_from
 from service.store.tables import CorrectionRow, MeasurementRow
 from service.twin.photographs.corrections import PhotographChanges, correct_photograph
@@ -32,7 +31,7 @@ from service.web.responses.openapi import problems
 from service.web.responses.paging import Page
 
 
-class CorrectionIn(Model):
+class CorrectionIn(WeatherFields, Model):
     """New values of a photograph. Fields that are not named stay as they are."""
 
     reason: Reason = Field(description="Why; kept with the correction.")
@@ -40,9 +39,6 @@ class CorrectionIn(Model):
     sun: Sun | None = Field(default=None, description="Where the sun was [deg].")
     taken_at: Moment | None = Field(default=None, description="When it was taken, with zone.")
     motor_position: Motors | None = Field(default=None, description="Of both axes [steps].")
-    wind_speed_m_s: WindSpeed | None = Field(default=None, description="[m/s]")
-    wind_from_deg: WindFrom | None = Field(default=None, description="From north, over east [deg].")
-    temperature_c: Temperature | None = Field(default=None, description="[°C]")
     excluded: Flag | None = Field(
         default=None, description="Whether nothing shall be made from it any more."
     )
@@ -137,9 +133,7 @@ def patch_measurement(
         sun=correction.sun,
         taken_at=correction.taken_at,
         motor_position=correction.motor_position,
-        weather=Weather(
-            correction.wind_speed_m_s, correction.wind_from_deg, correction.temperature_c
-        ),
+        weather=correction.weather,
         excluded=correction.excluded,
     )
     row = correct_photograph(runtime, name, measurement, changes, identity.name)

@@ -35,7 +35,7 @@ from service.base.fields import (
 )
 from service.drawing.pictures import flux_picture
 from service.sources.photograph import Photograph
-from service.sources.schema import Temperature, WindFrom, WindSpeed, paint_motors
+from service.sources.schema import WeatherFields, paint_motors
 from service.store.listing import Order, Period
 from service.store.photographs.measurements import MeasurementFilter
 from service.store.tables import ImageRow, MeasurementRow
@@ -68,7 +68,7 @@ Motors = Annotated[
 Pixel = tuple[Annotated[Number, Field(ge=-1e5, le=1e5)], Annotated[Number, Field(ge=-1e5, le=1e5)]]
 
 
-class MeasurementIn(Model):
+class MeasurementIn(WeatherFields, Model):
     """Metadata of a photograph."""
 
     target: Name = Field(description="The target that the heliostat was aimed at.")
@@ -102,11 +102,6 @@ class MeasurementIn(Model):
             " right corners in a raw frame; without them they are searched."
         ),
     )
-    wind_speed_m_s: WindSpeed | None = Field(default=None, description="Of the wind then [m/s].")
-    wind_from_deg: WindFrom | None = Field(
-        default=None, description="Where it came from, from north, over east [deg]."
-    )
-    temperature_c: Temperature | None = Field(default=None, description="Of the air then [°C].")
     force: Flag = Field(
         default=False,
         description=(
@@ -239,9 +234,7 @@ def measurement_out(session: Session, heliostat_name: str, row: MeasurementRow) 
             "taken_at": row.taken_at,
             "focal_spot_m": spot_m(row.focal_spot_wgs84, origin),
             "helios_spot_m": spot_m(row.helios_spot_wgs84, origin),
-            "wind_speed_m_s": row.wind_speed_m_s,
-            "wind_from_deg": row.wind_from_deg,
-            "temperature_c": row.temperature_c,
+            **vars(Weather.of(row)),
             "accepted": row.accepted,
             "reason": row.reason,
             "warnings": row.warnings or [],
@@ -348,7 +341,7 @@ def _photograph(metadata: MeasurementIn, runtime: Runtime) -> Photograph:
         focal_spot_wgs84=_wgs84(runtime, used),
         helios_spot_wgs84=_wgs84(runtime, helios),
         corners=metadata.corners,
-        weather=Weather(metadata.wind_speed_m_s, metadata.wind_from_deg, metadata.temperature_c),
+        weather=metadata.weather,
         forced=metadata.reason,
     )
 

@@ -139,7 +139,8 @@ def _document(app: FastAPI) -> dict[str, Any]:
     for path, operations in document["paths"].items():
         for method, operation in operations.items():
             responses = operation["responses"]
-            operation["summary"] = re.split(r"\.(?:\s|$)", operation["description"], maxsplit=1)[0]
+            about = operation.get("description", operation["summary"])
+            operation["summary"] = re.split(r"\.(?:\s|$)", about, maxsplit=1)[0]
             _add_examples(operation, examples.get(operation["operationId"], {"answers": {}}))
             if "HTTPValidationError" in str(responses.get("422")):
                 del responses["422"]  # the default schema of FastAPI
