@@ -17,7 +17,8 @@ from tests.docker.engine import ROOT, clone
 from tests.service.conftest import free_port
 from tests.waiting import WAIT_LIMIT_S, child_process, until
 
-pytestmark = [pytest.mark.slow]
+# One worker of pytest-xdist does all of this file: its tests share an environment.
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("wheel")]
 
 
 def _bare() -> dict[str, str]:
