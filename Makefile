@@ -20,7 +20,7 @@ demo: install ## photographs in, mirror surfaces and flux forecasts out, under o
 	$(BIN)/heliotwin demo $(ARGS)
 
 test: install ## every test
-	$(BIN)/pytest -n 2 --dist loadgroup $(ARGS)
+	$(BIN)/pytest -n 3 --dist loadgroup $(ARGS)
 
 lock: install ## the image's packages with their hashes, in the versions of constraints.txt
 	PATH=$(BIN):$$PATH $(BIN)/python docker/lock.py $(ARGS)

@@ -110,14 +110,14 @@ def test_verbs_of_the_store(tmp_path: Path, word: str):
     [["predict", "--out", "out", "--images", "2"], ["study", "--out", "out.json"]],
     ids=lambda words: words[0],
 )
-def test_verbs_on_a_folder(tmp_path: Path, made_plant: Path, words: list[str]):
+def test_verbs_on_a_folder(tmp_path: Path, pair_plant: Path, words: list[str]):
     verb, *options = words
-    _, calls = watched(tmp_path, *HELIOTWIN, verb, made_plant, *options)
+    _, calls = watched(tmp_path, *HELIOTWIN, verb, pair_plant, *options)
     assert calls == []
 
 
-def test_demonstration(tmp_path: Path, made_plant: Path):
-    _, calls = watched(tmp_path, *HELIOTWIN, "demo", "--data", made_plant)
+def test_demonstration(tmp_path: Path, pair_plant: Path):
+    _, calls = watched(tmp_path, *HELIOTWIN, "demo", "--data", pair_plant)
     assert calls == []
 
 

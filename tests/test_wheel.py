@@ -17,7 +17,8 @@ from tests.docker.engine import ROOT, clone
 from tests.service.conftest import free_port
 from tests.waiting import WAIT_LIMIT_S, child_process, until
 
-pytestmark = [pytest.mark.slow]
+# One worker of pytest-xdist does all of this file: its tests share an environment.
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("wheel")]
 
 
 def _bare() -> dict[str, str]:
@@ -88,11 +89,11 @@ def test_nothing_of_development_is_there(python: Path):
     assert done.stdout.strip() == "[]", done.stderr
 
 
-def test_verbs_on_a_folder(python: Path, made_plant: Path, tmp_path: Path):
+def test_verbs_on_a_folder(python: Path, pair_plant: Path, tmp_path: Path):
     assert "predict" in heliotwin(python, tmp_path, "--help")
-    assert len(report(python, tmp_path, "flux", made_plant, "--out", "flux")["images"]) == 16
+    assert len(report(python, tmp_path, "flux", pair_plant, "--out", "flux")["images"]) == 8
     predicted = report(
-        python, tmp_path, "predict", made_plant, "--out", "predicted", "--images", 2
+        python, tmp_path, "predict", pair_plant, "--out", "predicted", "--images", 2
     )["heliostats"]
     for name in predicted:
         with np.load(
@@ -100,7 +101,7 @@ def test_verbs_on_a_folder(python: Path, made_plant: Path, tmp_path: Path):
         ) as surface:
             assert surface["z"].shape == (4, 8, 8)
     study = report(
-        python, tmp_path, "study", made_plant, "--out", "study.json", "--html", "study.html"
+        python, tmp_path, "study", pair_plant, "--out", "study.json", "--html", "study.html"
     )
     assert study["verdict"] in ("effect", "none", "unexplained")
     assert "<html" in (tmp_path / "study.html").read_text(encoding="utf-8")

@@ -2,13 +2,11 @@
 empty PostgreSQL.
 """
 
-import os
 import re
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -16,42 +14,25 @@ import httpx
 import psycopg
 import pytest
 
-from tests.faults.harness import ROOT, postgres_database
+from tests.faults.harness import postgres_database
+from tests.forked import ForkedProcess
+from tests.service.command import heliotwin_process
 from tests.service.conftest import free_port
-from tests.waiting import WAIT_LIMIT_S, child_process, until
+from tests.waiting import WAIT_LIMIT_S, until
 
 from .test_docker import SECRET, compose  # noqa: F401  # a fixture
 
 
-def environment(service: dict[str, Any], changes: dict[str, str]) -> dict[str, str]:
-    """The container's environment with the places of this machine in it."""
-    given = {
-        **service.get("environment", {}),
-        "HELIOTWIN_HOST": "127.0.0.1",
-        "HELIOTWIN_METRICS_HOST": "127.0.0.1",
-    }
-    inherited = {
-        name: value for name, value in os.environ.items() if not name.startswith("HELIOTWIN_")
-    }
-    return inherited | given | changes
-
-
-@contextmanager
 def running(
     service: dict[str, Any], changes: dict[str, str], folder: Path
-) -> Iterator[subprocess.Popen[bytes]]:
-    command = [sys.executable, "-m", "service", *service["command"]]
-    settings = environment(service, changes) | {"PYTHONPATH": str(ROOT)}
-    with (
-        (folder / "log").open("ab") as log,
-        child_process(command, cwd=folder, env=settings, stderr=log) as process,
-    ):
-        yield process
+) -> AbstractContextManager[ForkedProcess]:
+    """A container's command with its environment, with the places of this machine in it."""
+    local = {"HELIOTWIN_HOST": "127.0.0.1", "HELIOTWIN_METRICS_HOST": "127.0.0.1"}
+    settings = {**service.get("environment", {}), **local, **changes}
+    return heliotwin_process(folder, *service["command"], **settings)
 
 
-def healthy(
-    service: dict[str, Any], changes: dict[str, str], process: subprocess.Popen[bytes]
-) -> None:
+def healthy(service: dict[str, Any], changes: dict[str, str], process: ForkedProcess) -> None:
     """Wait for the container's own health check."""
     ports = {"8000": changes["HELIOTWIN_PORT"], "9100": changes["HELIOTWIN_METRICS_PORT"]}
     command = [
@@ -113,7 +94,7 @@ def test_composition_starts_from_empty(compose: dict[str, Any], tmp_path: Path):
                     assert "the plant is not set yet" in http.get(job).json()["reason"]
                     assert "heliotwin_database_up 1.0" in http.get("/metrics").text
                 for process in (worker, service):
-                    process.terminate()
+                    process.send_signal(signal.SIGTERM)
                     assert process.wait(WAIT_LIMIT_S) in (0, -signal.SIGTERM)
     except psycopg.OperationalError as error:
         pytest.skip(f"no PostgreSQL server: {error}")

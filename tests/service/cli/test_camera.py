@@ -26,20 +26,20 @@ def taken_through(law: Transfer, source: Path, root: Path) -> Path:
     return root
 
 
-def test_srgb_stays_where_it_is_no_worse(made_plant, tmp_path):
+def test_srgb_stays_where_it_is_no_worse(pair_plant, tmp_path):
     out = tmp_path / "new" / "camera.json"
-    done = heliotwin("camera", made_plant, "--out", out)
+    done = heliotwin("camera", pair_plant, "--out", out)
     assert done.returncode == 0, done.stderr
     assert "sRGB is no worse than the measured curve" in done.stdout
     report = json.loads(out.read_text())
     assert (report["verdict"], report["declared"]) == ("srgb", {"cameras": [{"transfer": "srgb"}]})
     assert abs(report["gain"]["mean"]) < 0.001
     assert report["from_srgb"]["light"] < 0.02
-    assert len(report["per_image"]) == report["photographs"] == report["days"] == 16
+    assert len(report["per_image"]) == report["photographs"] == report["days"] == 8
 
 
-def test_another_camera_s_curve_is_found_and_makes_forecasts_agree(made_plant, tmp_path):
-    root = taken_through(Power(1.4), made_plant, tmp_path / "plant")
+def test_another_camera_s_curve_is_found_and_makes_forecasts_agree(pair_plant, tmp_path):
+    root = taken_through(Power(1.4), pair_plant, tmp_path / "plant")
     report = measure_camera(
         read_folder(root), tmp_path / "camera.json", targets=["calibration_target"]
     )
@@ -70,17 +70,17 @@ def test_photographs_that_tell_nothing_of_a_law_are_left_out_with_the_reason(mad
     assert len(report["per_image"]) == 7
 
 
-def test_what_cannot_be_measured_is_one_clear_error(made_plant, tmp_path):
+def test_what_cannot_be_measured_is_one_clear_error(pair_plant, tmp_path):
     with pytest.raises(
         InvalidInputError, match=r"--target must be one of calibration_target.*'roof'"
     ):
-        measure_camera(read_folder(made_plant), tmp_path / "c.json", targets=["roof"])
+        measure_camera(read_folder(pair_plant), tmp_path / "c.json", targets=["roof"])
     with pytest.raises(
         InvalidInputError, match=r"needs photographs of 4 days.*0 are left.*no surface"
     ):
-        measure_camera(read_folder(made_plant), tmp_path / "c.json", surfaces=str(tmp_path))
+        measure_camera(read_folder(pair_plant), tmp_path / "c.json", surfaces=str(tmp_path))
     root = tmp_path / "plant"
-    shutil.copytree(made_plant, root)
+    shutil.copytree(pair_plant, root)
     effects = [{"name": "camera_shoulder", "parameters": {"compression": 1.0}}]
     (root / "twin.json").write_text(json.dumps({"declared": {"effects": effects}}))
     with pytest.raises(
@@ -88,4 +88,4 @@ def test_what_cannot_be_measured_is_one_clear_error(made_plant, tmp_path):
         match="declares camera_shoulder, which replaces the camera response curve",
     ):
         measure_camera(read_folder(root), tmp_path / "c.json")
-    assert heliotwin("camera", made_plant, "--out", tmp_path).returncode == 2
+    assert heliotwin("camera", pair_plant, "--out", tmp_path).returncode == 2

@@ -25,17 +25,17 @@ from tests.service.conftest import QUIET
 
 
 @pytest.fixture
-def stored(made_plant: Path, tmp_path: Path) -> Iterator[Runtime]:
+def stored(pair_plant: Path, tmp_path: Path) -> Iterator[Runtime]:
     """A store into which the made plant was imported."""
     runtime = Runtime.from_settings(Settings(data_dir=tmp_path / "store", **QUIET))
     runtime.database.upgrade()
-    import_folder(runtime, read_folder(made_plant))
+    import_folder(runtime, read_folder(pair_plant))
     yield runtime
     runtime.close()
 
 
-def test_folder_and_store_are_one_plant(made_plant: Path, stored: Runtime, tmp_path: Path):
-    folder = read_folder(made_plant)
+def test_folder_and_store_are_one_plant(pair_plant: Path, stored: Runtime, tmp_path: Path):
+    folder = read_folder(pair_plant)
     names = list(folder.plant.heliostats)
 
     with open_folder(folder) as opened:
@@ -67,9 +67,9 @@ def test_folder_and_store_are_one_plant(made_plant: Path, stored: Runtime, tmp_p
         assert {one.identifier for one in row.measurements} == set(predicted[name]["images"])
 
 
-def test_an_image_that_two_measurements_have_counts_once(made_plant: Path, tmp_path: Path):
+def test_an_image_that_two_measurements_have_counts_once(pair_plant: Path, tmp_path: Path):
     root = tmp_path / "plant"
-    shutil.copytree(made_plant, root)
+    shutil.copytree(pair_plant, root)
     images = sorted((root / "AB12" / "Calibration").glob("*.png"))
     images[1].write_bytes(images[0].read_bytes())
     with open_folder(read_folder(root)) as opened:

@@ -100,10 +100,10 @@ def folder(tmp_path: Path) -> Path:
     return root
 
 
-def test_the_demonstrations_motors_tell_where_its_mirrors_point(made_plant: Path, tmp_path: Path):
+def test_the_demonstrations_motors_tell_where_its_mirrors_point(pair_plant: Path, tmp_path: Path):
     runtime = Runtime.from_settings(Settings(data_dir=tmp_path, **QUIET))
     runtime.database.upgrade()
-    source = read_folder(made_plant)
+    source = read_folder(pair_plant)
     import_folder(runtime, source)
     plan = make_plan(runtime, datetime(2026, 6, 21, 10, tzinfo=UTC), minutes=60, photographs=12)
     assert {slot.proposal.heliostat for slot in plan} == set(source.plant.heliostats)

@@ -42,10 +42,10 @@ def test_without_a_store_a_verb_ends_and_makes_none(tmp_path: Path, verb: tuple[
 
 
 @pytest.fixture(scope="module")
-def broken(made_plant: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def broken(pair_plant: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The demonstration's plant with one more heliostat, whose file was cut off."""
-    root = Path(shutil.copytree(made_plant, tmp_path_factory.mktemp("broken") / "plant"))
-    name = next(iter(read_folder(made_plant).plant.heliostats))
+    root = Path(shutil.copytree(pair_plant, tmp_path_factory.mktemp("broken") / "plant"))
+    name = next(iter(read_folder(pair_plant).plant.heliostats))
     shutil.copytree(root / name, root / "ZZ99")
     for file in (root / "ZZ99" / "Properties").glob(f"{name}-*"):
         file.unlink()

@@ -62,13 +62,13 @@ def service_of(checkout: Path, plant: Path) -> Iterator[httpx.Client]:
 @pytest.mark.slow
 @pytest.mark.parametrize("damaged", [WEIGHTS.name, PRIOR.name])
 def test_damaged_weights_predict_nothing_and_everything_else_goes_on(
-    damaged: str, made_plant: Path, tmp_path: Path
+    damaged: str, pair_plant: Path, tmp_path: Path
 ):
     shutil.copytree(ROOT / "model", tmp_path / "model")
     for package in ("service", "migrations"):
         (tmp_path / package).symlink_to(ROOT / package)
     flip(tmp_path / "model" / "weights" / damaged)
-    with service_of(tmp_path, made_plant) as client:
+    with service_of(tmp_path, pair_plant) as client:
         ready = client.get("/readyz")
         assert ready.status_code == 503
         assert damaged in ready.json()["checks"]["weights"]
