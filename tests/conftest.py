@@ -12,11 +12,13 @@ for _library in ("OMP", "OPENBLAS", "MKL"):
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import httpx
 import numpy as np
 import pytest
 import torch
+from xdist.scheduler import LoadScopeScheduling
 
 from model.mount import Mount
 from model.plant import Heliostat, TargetPlane
@@ -27,10 +29,37 @@ from tests.waiting import WAIT_LIMIT_S
 
 torch.set_num_threads(1)
 
+FILES_OF_ONE_WORKER = {
+    "tests/docker/test_client.py",
+    "tests/docker/test_composition.py",
+    "tests/model/test_refinement.py",
+    "tests/test_additions.py",
+    "tests/test_wheel.py",
+}
+"""Files whose tests share what is expensive to make: an image, an environment, a surface."""
+
 # Time limit of requests that set none: the default of 5 s would fail on a busy machine.
 _patient = httpx.Timeout(WAIT_LIMIT_S)
 for _phase in ("connect", "read", "write", "pool"):
     setattr(httpx._config.DEFAULT_TIMEOUT_CONFIG, _phase, getattr(_patient, _phase))
+
+
+class FileScheduling(LoadScopeScheduling):  # type: ignore[misc]
+    """Distributes single tests, but `FILES_OF_ONE_WORKER` whole.
+
+    It replaces pytest-xdist's ``loadgroup``, which has no effect from pytest 9.2 on: xdist 3.8
+    writes the group to ``Item._nodeid``, which pytest does not read any more.
+    """
+
+    def _split_scope(self, nodeid: str) -> str:
+        file = nodeid.partition("::")[0]
+        return file if file in FILES_OF_ONE_WORKER else nodeid
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> FileScheduling | None:
+    """The scheduler for ``--dist loadgroup``."""
+    return FileScheduling(config, log) if config.getvalue("dist") == "loadgroup" else None
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

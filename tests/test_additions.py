@@ -15,9 +15,6 @@ import pytest
 
 from tests import packages
 
-# One worker of pytest-xdist does all of this file: its tests share one trial.
-pytestmark = pytest.mark.xdist_group("additions")
-
 ROOT = Path(__file__).parents[1]
 ADDED = Path(__file__).parent / "additions"
 DOCS = ROOT / "docs"

@@ -17,8 +17,7 @@ from tests.docker.engine import ROOT, clone
 from tests.service.conftest import free_port
 from tests.waiting import WAIT_LIMIT_S, child_process, until
 
-# One worker of pytest-xdist does all of this file: its tests share an environment.
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("wheel")]
+pytestmark = [pytest.mark.slow]
 
 
 def _bare() -> dict[str, str]:

@@ -24,9 +24,6 @@ from tests.faults.harness import Process, Store
 from tests.service.conftest import free_port, metadata, png
 from tests.waiting import WAIT_LIMIT_S, child_process
 
-# One worker of pytest-xdist does all of this file: its tests share a service.
-pytestmark = pytest.mark.xdist_group("client")
-
 CLIENT = Path(__file__).parents[2] / "docker" / "example_client.py"
 
 

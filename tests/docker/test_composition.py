@@ -26,9 +26,7 @@ from . import engine
 from .engine import Client, Composition
 from .test_alerts import binary
 
-# One worker of pytest-xdist does all of this file: its tests share an image, and two compositions
-# would be no faster.
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600), pytest.mark.xdist_group("containers")]
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]
 
 Start = Callable[[str], Composition]
 

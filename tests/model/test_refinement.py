@@ -20,9 +20,6 @@ from model.surface import halved
 from tests.conftest import flat_heliostat, target
 from tests.rendered import observe
 
-# One worker of pytest-xdist does all of this file: its tests share a refined surface.
-pytestmark = pytest.mark.xdist_group("refinement")
-
 SUNS = sun_direction_at(
     np.array([-20.0, -5, 5, 20, 15, 0]), np.array([-40.0, 30, -15, 50, 0, 10]), 50.9
 )
