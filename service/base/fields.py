@@ -326,7 +326,7 @@ Side = Annotated[Whole, Field(ge=8, le=1024)]
 
 Resolution = Annotated[
     tuple[Side, Side],
-    BeforeValidator(_square),
+    BeforeValidator(_square, json_schema_input_type=tuple[Side, Side] | Side),
     Field(description="Rows and columns of the map [px], or one number for both."),
 ]
 
