@@ -174,7 +174,8 @@ def test_half_a_mirror_behind_another():
 def test_many_obstacles_hide_as_much_in_the_memory_of_few(monkeypatch):
     """20,000 obstacles of one mirror took 2 GB when all were intersected at once."""
     generator = torch.Generator().manual_seed(1)
-    obstacles = 5 * torch.randn(2, 300, 3, 3, generator=generator)
+    scale = torch.tensor([5.0, 0.2, 0.2])[:, None]  # centres, and half sides
+    obstacles = scale * torch.randn(2, 300, 3, 3, generator=generator)
     points, rays = torch.randn(2, 2, 3, 64, generator=generator)
     monkeypatch.setattr(neighbours, "_INTERSECTED", 2**40)
     at_once = clear(obstacles, points, rays, torch.full((2,), 0.1))
