@@ -334,6 +334,14 @@ class PositionKey:
     taken_at: datetime | None
 
 
+def _check_and_lock(session: Session, heliostat: HeliostatRow, row: MeasurementRow) -> None:
+    """Check the id of a new measurement, and lock its heliostat and its target."""
+    if row.external_id is not None:
+        names.require_name(names.IDENTIFIER, row.external_id, "id")
+    lock_row(session, HeliostatRow, heliostat.id, f"heliostat {heliostat.name}")
+    lock_row(session, TargetRow, row.target_id, "its target")
+
+
 def add_position(
     session: Session, heliostat: HeliostatRow, row: MeasurementRow
 ) -> Added[MeasurementRow]:
@@ -348,10 +356,7 @@ def add_position(
     NotFoundError
         If the heliostat or target was deleted since it was read.
     """
-    if row.external_id is not None:
-        names.require_name(names.IDENTIFIER, row.external_id, "id")
-    lock_row(session, HeliostatRow, heliostat.id, f"heliostat {heliostat.name}")
-    lock_row(session, TargetRow, row.target_id, "its target")
+    _check_and_lock(session, heliostat, row)
     row.heliostat_id, row.kind = heliostat.id, NO_IMAGE
     key = PositionKey(**{name.name: getattr(row, name.name) for name in fields(PositionKey)})
     for _ in range(ROUNDS):
@@ -404,10 +409,7 @@ def add_measurement(
     NotFoundError
         If the heliostat or target was deleted since it was read.
     """
-    if row.external_id is not None:
-        names.require_name(names.IDENTIFIER, row.external_id, "id")
-    lock_row(session, HeliostatRow, heliostat.id, f"heliostat {heliostat.name}")
-    lock_row(session, TargetRow, row.target_id, "its target")
+    _check_and_lock(session, heliostat, row)
     if _is_excluded(session, heliostat, row):
         row.accepted, row.reason = False, EXCLUDED
     image, is_new = _keep_image(session, image, row.accepted)

@@ -251,8 +251,8 @@ def _log_correction(
 def _state(row: MeasurementRow) -> dict[str, object]:
     """Metadata of a photograph, and the hash of its flux images."""
     flux = None if row.arrays is None else digest(row.arrays)[:12]
-    weather = {name: getattr(row, name) for name in _WEATHER}
-    return stored_metadata(row) | weather | {"excluded": row.reason == EXCLUDED, "flux": flux}
+    excluded = {"excluded": row.reason == EXCLUDED, "flux": flux}
+    return stored_metadata(row) | vars(Weather.of(row)) | excluded
 
 
 def _new_values(

@@ -1,5 +1,6 @@
 """Flux forecasts."""
 
+from dataclasses import fields
 from datetime import datetime
 from functools import partial
 from typing import Annotated, Any, Literal, Self
@@ -258,16 +259,11 @@ def _given(body: ForecastIn) -> Receiver | None:
     return None if body.receiver is None else body.receiver.named("receiver")
 
 
-_PASSED_ON = (
-    *("heliostat", "target", "aim_point_m", "motor_position", "surface", "dni_w_m2", "resolution"),
-    *("window_m", "normalised", "model_version"),
-)
-
-
 def _request(runtime: Runtime, body: ForecastIn) -> ForecastRequest:
     with runtime.database.reading() as session:
         sun = position_of(session, body.sun)
-    same = {name: getattr(body, name) for name in _PASSED_ON}
+    names = {field.name for field in fields(ForecastRequest)} & set(ForecastIn.model_fields)
+    same = {name: getattr(body, name) for name in names - {"sun", "receiver"}}
     sun_at = body.sun.at if isinstance(body.sun, SunAt) else None
     return ForecastRequest(sun=sun, sun_at=sun_at, receiver=_given(body), **same)
 
