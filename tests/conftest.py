@@ -93,6 +93,15 @@ def stj() -> Path:
 
 
 @pytest.fixture(scope="session")
+def stj_pointing(stj: Path) -> Path:
+    """Motors and spots of 16 real heliostats, which lie beside the real measurements."""
+    root = stj.parent / "stj-pointing"
+    if not root.is_dir():
+        pytest.skip(f"no real motors and spots at {root}")
+    return root
+
+
+@pytest.fixture(scope="session")
 def undeclared(stj: Path) -> Path:
     """The six sets of images with unknown effects, which lie beside the real measurements."""
     root = stj.parent / "undeclared"

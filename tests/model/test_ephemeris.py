@@ -29,11 +29,8 @@ def test_position_of_the_published_example():
     assert elevation == pytest.approx(90 - 50.11162, abs=3e-4)
 
 
-def test_recorded_suns_are_where_the_sun_was_seen(stj: Path):
-    root = stj.parent / "stj-pointing"
-    if not root.is_dir():
-        pytest.skip(f"no real pointing at {root}")
-    folder = read_folder(root)
+def test_recorded_suns_are_where_the_sun_was_seen(stj_pointing: Path):
+    folder = read_folder(stj_pointing)
     measurements = dated(folder)
     apart, low = (
         apart_mrad(folder, measurements),

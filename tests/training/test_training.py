@@ -120,22 +120,17 @@ def test_rendered_images_are_normalised_and_reproducible(surfaces, stj):
     assert not torch.equal(first.flux, other.flux)
 
 
+PERFECT = Camera(
+    0.02, 0.0, gamma=1.0, compression=0.0, warp=0.0, background=0.0, noise=0.0, exposure=(0.9, 1.0)
+)
+
+
 def test_a_perfect_camera_sees_what_was_traced(surfaces, stj):
-    perfect = Camera(
-        0.02,
-        0.0,
-        gamma=1.0,
-        compression=0.0,
-        warp=0.0,
-        background=0.0,
-        noise=0.0,
-        exposure=(0.9, 1.0),
-    )
     seen, traced = (
         render(
             surfaces[:2], 4, load_field(stj), SceneSampler(), camera, torch.device("cpu"), 3
         ).flux
-        for camera in (perfect, None)
+        for camera in (PERFECT, None)
     )
     assert (
         float((seen - traced).abs().sum(dim=(2, 3)).max()) < 2.5
@@ -147,16 +142,7 @@ def test_what_a_camera_cuts_off_is_cut_off_of_guesses_too(surfaces, stj):
     """Light above the range is no error of a surface: the true one still explains the
     photograph.
     """
-    bright = Camera(
-        0.02,
-        0.0,
-        gamma=1.0,
-        compression=0.0,
-        warp=0.0,
-        background=0.0,
-        noise=0.0,
-        exposure=(1.4, 1.5),
-    )
+    bright = replace(PERFECT, exposure=(1.4, 1.5))
     seen = render(surfaces[:2], 4, load_field(stj), SceneSampler(), bright, torch.device("cpu"), 3)
     assert 0.005 < float(seen.clipped.mean()) < 0.3
     truth = torch.as_tensor(surfaces[:2], dtype=torch.float32)

@@ -36,7 +36,6 @@ from service.twin.heliostats.stored_mount import load_mount
 from service.twin.pointing.calibration import calibrate_store, make_plan
 from service.twin.runtime.runtime import Runtime
 from service.twin.transfer.importing import import_folder
-from tests.benchmarks import data_folder
 from tests.benchmarks.folders import read_readings
 from tests.benchmarks.pointing import Plant, with_clock
 from tests.service.conftest import ORIGIN, QUIET, properties_document, tower_document
@@ -361,11 +360,8 @@ def test_a_wrong_clock_is_said_first(folder: Path, tmp_path: Path):
     assert f"clock: from {clock['since']} on the clock was" in " ".join(done.stderr.split())
 
 
-def test_the_clock_of_real_photographs_is_right_until_it_is_put_wrong():
-    real = data_folder().parent / "stj-pointing"
-    if not real.is_dir():
-        pytest.skip(f"no real pointing at {real}")
-    plant = Plant([real])
+def test_the_clock_of_real_photographs_is_right_until_it_is_put_wrong(stj_pointing: Path):
+    plant = Plant([stj_pointing])
     wrong = with_clock(plant.readings, 19481.0, 1.0, plant.site)
     right, found = (
         calibrate_field(plant.heliostats, readings, plant.targets, plant.site).clock
@@ -377,15 +373,12 @@ def test_the_clock_of_real_photographs_is_right_until_it_is_put_wrong():
     assert found.minutes == pytest.approx(-1.0, abs=0.15)
 
 
-def test_real_heliostats_are_forecast_to_a_milliradian(tmp_path: Path):
+def test_real_heliostats_are_forecast_to_a_milliradian(stj_pointing: Path, tmp_path: Path):
     """For a third of the measurements of two heliostats only the motor positions are used."""
-    real = data_folder().parent / "stj-pointing"
-    if not real.is_dir():
-        pytest.skip(f"no real pointing at {real}")
     root, measured = tmp_path / "plant", {}
     for name in ("BG23", "BH20"):
-        shutil.copytree(real / name, root / name)
-    for path in real.glob("*tower-measurements.json"):
+        shutil.copytree(stj_pointing / name, root / name)
+    for path in stj_pointing.glob("*tower-measurements.json"):
         shutil.copy(path, root)
     source = read_folder(root)
     for name in source.plant.heliostats:

@@ -37,15 +37,12 @@ BASE = "/v1/heliostats/AA39/measurements"
 
 
 @pytest.fixture(scope="module")
-def positions(stj: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def positions(stj_pointing: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Four real heliostats with 45 measurements, none of which has an image."""
-    real = stj.parent / "stj-pointing"
-    if not real.is_dir():
-        pytest.skip(f"no real motors and spots at {real}")
     root = tmp_path_factory.mktemp("positions")
     for name in NAMES:
-        shutil.copytree(real / name, root / name)
-    shutil.copy(next(real.glob("*tower-measurements.json")), root)
+        shutil.copytree(stj_pointing / name, root / name)
+    shutil.copy(next(stj_pointing.glob("*tower-measurements.json")), root)
     return root
 
 

@@ -34,15 +34,14 @@ NAMES = ("BF17", "BG14")
 
 
 @pytest.fixture(scope="module")
-def undated(stj: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def undated(stj_pointing: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two real heliostats' motors and spots over three years, without their times."""
-    real = stj.parent / "stj-pointing"
-    if not real.is_dir():
-        pytest.skip(f"no real motors and spots at {real}")
     root = tmp_path_factory.mktemp("undated")
     for name in NAMES:
-        shutil.copytree(real / name, root / name, ignore=shutil.ignore_patterns("*-item-stac.json"))
-    shutil.copy(next(real.glob("*tower-measurements.json")), root)
+        shutil.copytree(
+            stj_pointing / name, root / name, ignore=shutil.ignore_patterns("*-item-stac.json")
+        )
+    shutil.copy(next(stj_pointing.glob("*tower-measurements.json")), root)
     return root
 
 
