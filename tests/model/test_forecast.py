@@ -84,6 +84,21 @@ def test_different_setups_keep_their_order():
         np.testing.assert_allclose(image, expected, atol=2e-3 * float(expected.max()))
 
 
+def test_many_images_are_traced_in_parts(monkeypatch):
+    """All at once, 1,600 photographs of a study would take gigabytes."""
+    view, sizes = View(32, 32, samples=8), []
+    aligned = align(setups(5), JUELICH_MODEL, dtype=torch.float64)
+    at_once = aligned.flux(view)
+    monkeypatch.setattr("model.forecast._TRACED_PIXELS", 2 * 32 * 32)
+
+    def trace_and_count(scene, window, optics):
+        sizes.append(scene.batch)
+        return view.trace(scene, window, optics)
+
+    np.testing.assert_allclose(aligned.flux(view, trace_and_count), at_once, rtol=1e-6, atol=1e-3)
+    assert sizes == [2, 2, 1]
+
+
 def test_an_alignment_serves_other_optics_and_cameras():
     given, view = setups(), View(32, 32, samples=8)
     model = JUELICH_MODEL.with_effects([*GEOMETRY, SlopeError(1.0)])

@@ -32,6 +32,7 @@ from model.study.judging import few_gain, paired_gain, rank_correlation, split
 from model.study.noise import grain_variance
 from model.study.parameters import ParameterVector, Term
 from model.study.position import whiten
+from model.study.trials import TrialFitter
 from model.surface import control_points
 from tests.conftest import target
 
@@ -297,7 +298,18 @@ def test_a_forecaster_repeats_itself_whatever_it_has_kept(clean):
         np.testing.assert_allclose(
             changed, Forecaster(clean, JUELICH_MODEL, 4.0, SMALL).cuts(effects), atol=1e-6
         )
+    forecaster.forget()
     np.testing.assert_allclose(forecaster.cuts([]), plain, atol=1e-6)
+
+
+def test_parts_of_the_photographs_that_were_used_long_ago_free_their_memory(clean):
+    fitter = TrialFitter(clean, JUELICH_MODEL, StudyOptions(fit_view=SMALL, view=SMALL))
+    made = [fitter.forecasters(np.arange(count)) for count in (1, 2, 3, 4)]
+    for forecasters in made:
+        forecasters.coarse.cuts([])
+    fitter.forecasters(np.arange(4))
+    assert [bool(one.coarse._flux) for one in made] == [False, True, True, True]
+    assert fitter.forecasters(np.arange(1)) is made[0]
 
 
 # --- fitting
@@ -341,6 +353,9 @@ def test_where_the_model_fails_the_residual_is_infinite(clean):
     unknowns = unknowns_of((CATALOGUE["soiling"],), (("far", 4), ("near", 4)))
     dark = np.zeros(len(unknowns.all))
     assert np.isinf(fitter.residuals(unknowns, dark)).all()
+    trials = np.array([dark, unknowns.neutral])
+    energies = (fitter.residuals_of(unknowns, trials) ** 2).sum(axis=-1)
+    np.testing.assert_array_equal(fitter.energies_of(unknowns, trials), energies)
     assert np.isnan(fitter.descend(unknowns, dark).spread).all()
 
 
