@@ -58,7 +58,9 @@ def get_guide(path: Annotated[str, Parameter(pattern=r"^[\w./-]{0,200}$")]) -> R
     """A page of the guide, if this installation has it."""
     if not has_guide():
         raise NotFoundError("this installation has no guide; `make docs` builds it")
-    if GUIDE / path not in (file for file in GUIDE.rglob("*") if file.is_file()):
+    file = GUIDE / path
+    is_inside = file == file.resolve() and file.is_relative_to(GUIDE)  # no "..", no link
+    if not (is_inside and file.is_file()):
         raise NotFoundError(f"the guide has no page {path}")
     media_type = mimetypes.guess_type(path)[0] or "application/octet-stream"
-    return WholeFile(GUIDE / path, headers=_GUIDE_HEADERS, media_type=media_type)
+    return WholeFile(file, headers=_GUIDE_HEADERS, media_type=media_type)
