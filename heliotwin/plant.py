@@ -201,14 +201,13 @@ class PlantFolder:
         if isinstance(z, str):
             require_known("z", z, ("measured", "ideal"))
         if isinstance(z, str) and z == "measured":
-            known = self._folder.measured_surface(heliostat)
-            if known is None:
+            measured = self._measured(heliostat)
+            if measured is None:
                 raise InvalidInputError(
                     f"z: the folder has no measured surface of {heliostat}; give 'ideal' or"
                     " heights, or predict one"
                 )
-            points, degree = known
-            return Surface(heliostat, "measured", measured_heights(mirror, known), points, degree)
+            return measured
         facets = len(mirror.facets)
         heights = np.zeros((facets, 8, 8)) if isinstance(z, str) else require_heights(z, facets)
         source: Literal["ideal", "given"] = "ideal" if isinstance(z, str) else "given"
@@ -243,21 +242,22 @@ class PlantFolder:
         ('101', '102', '103')
         """
         rows, store = self._rows(heliostat), self._store()
-        named = None if isinstance(images, int) else list(images)
-        require_images(method, len(named) if named is not None else int(images))  # type: ignore[arg-type]
+        named = [] if isinstance(images, int) else list(images)
+        count = images if isinstance(images, int) else len(named)
+        require_images(method, count)
         if not rows:
             raise InvalidInputError(
                 f"heliostat: {heliostat} has no photograph that was accepted; see skipped"
             )
         twin = store.context(heliostat)
-        for name in named or ():
+        for name in named:
             require_known("images", name, [row.identifier for row in rows])
         with store.runtime.computing(f"predict_{method}") as operations:
-            if named is None:
-                chosen, _ = choose_observations(operations, twin, rows, int(images))  # type: ignore[arg-type]
-            else:
+            if named:
                 taken = [row for row in rows if row.identifier in named]
                 chosen = to_observations([accepted_measurement(row, twin.origin) for row in taken])
+            else:
+                chosen, _ = choose_observations(operations, twin, rows, count)
             found = operations.predict(twin.heliostat, chosen, twin.model, method)
         return Surface(
             heliostat,
@@ -409,7 +409,9 @@ class PlantFolder:
         names = tuple(CATALOGUE) if candidates is None else tuple(candidates)
         store = self._store()
         inputs = StudyInputs(skipped=self.skipped | store.refused)
-        for one in self._measured() if surfaces is None else surfaces:
+        if surfaces is None:
+            surfaces = [one for name in self.heliostats if (one := self._measured(name))]
+        for one in surfaces:
             rows, twin = self._rows(one.heliostat), store.context(one.heliostat)
             mirror = one.control_points, one.degree
             add_photographs(store.session, inputs, twin, rows, *mirror, one.images)
@@ -430,10 +432,13 @@ class PlantFolder:
         known: dict[str, Receiver] = {**plant.targets, **plant.receivers}
         return known[require_known("on", on, known)]
 
-    def _measured(self) -> list[Surface]:
-        """The measured surfaces of all heliostats that have one."""
-        known = self._folder.measured_surface
-        return [self.surface(name) for name in self.heliostats if known(name) is not None]
+    def _measured(self, heliostat: str) -> Surface | None:
+        """The measured surface of a heliostat, if the folder has one."""
+        known = self._folder.measured_surface(heliostat)
+        if known is None:
+            return None
+        heights = measured_heights(self._folder.plant.heliostats[heliostat], known)
+        return Surface(heliostat, "measured", heights, *known)
 
     def _store(self, with_photographs: bool = True) -> FolderStore:
         """The folder in a temporary store, with or without measured photographs."""
