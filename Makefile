@@ -26,7 +26,7 @@ lock: install ## the image's packages with their hashes, in the versions of cons
 	PATH=$(BIN):$$PATH $(BIN)/python docker/lock.py $(ARGS)
 
 docs: install ## the guide, into build/docs and into the service, which shows it on /docs/guide
-	$(BIN)/sphinx-build -W --keep-going -q -d build/doctrees -b html docs build/docs
+	$(BIN)/sphinx-build -W --keep-going -q -a -d build/doctrees -b html docs build/docs
 	rm -rf service/web/root/guide
 	cp -r build/docs service/web/root/guide
 
