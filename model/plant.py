@@ -64,6 +64,16 @@ def require_cylinder_shape(radius: float, height: float, opening_deg: float) -> 
         )
 
 
+Outline = tuple[tuple[float, float], ...]
+"""Corners (x, y) of a facet's edge in half widths and half heights, in either direction."""
+
+
+def outline_share(outline: Outline) -> float:
+    """Share of the rectangle from -1 to 1 that is inside an outline, by the shoelace formula."""
+    x, y = np.array(outline, dtype=np.float64).T
+    return float(abs(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 8)
+
+
 def _vector(name: str, value: ArrayLike) -> Vector:
     vector = np.array(value, dtype=np.float64)
     if vector.shape != (3,) or not np.isfinite(vector).all():
@@ -83,17 +93,59 @@ class Facet:
     canting_x, canting_y : (3,) [m]
         Half its width and half its height, as vectors in mirror coordinates (PAINT's ``canting_e``,
         ``canting_n``).
+    focal_length : float or None [m]
+        Of the paraboloid that it is; None for a flat facet.
+    outline : tuple of (x, y), or None
+        Corners of its edge in half widths and half heights; None for the whole rectangle.
     """
 
     position: Vector
     canting_x: Vector
     canting_y: Vector
+    focal_length: float | None = None
+    outline: Outline | None = None
 
     def __post_init__(self) -> None:
         for name in ("position", "canting_x", "canting_y"):
             object.__setattr__(self, name, _vector(f"facet {name}", getattr(self, name)))
         if np.linalg.norm(np.cross(self.canting_x, self.canting_y)) < 1e-9:
             raise InvalidInputError("facet canting vectors must span an area")
+        if self.focal_length is not None and not self.focal_length > 0:
+            raise InvalidInputError(f"facet focal_length must be positive, got {self.focal_length}")
+
+    @property
+    def area(self) -> float:
+        """Area [m2] within its outline, as if it were flat."""
+        rectangle = 4 * float(np.linalg.norm(np.cross(self.canting_x, self.canting_y)))
+        return rectangle if self.outline is None else rectangle * outline_share(self.outline)
+
+
+@dataclass(frozen=True)
+class MirrorOptics:
+    """What a heliostat's mirror does to light besides its shape.
+
+    Attributes
+    ----------
+    reflectance : float
+        Multiplies the plant's, `model.tracing.Optics.reflectivity`.
+    slope_error : float [rad]
+        Standard deviation of the normals per axis.
+    pointing_error : float [rad]
+        Standard deviation of the reflected beam's direction per axis.
+    """
+
+    reflectance: float = 1.0
+    slope_error: float = 0.0
+    pointing_error: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.reflectance <= 1:
+            raise InvalidInputError(f"reflectance must lie in (0, 1], got {self.reflectance:g}")
+        for name in ("slope_error", "pointing_error"):
+            if not 0 <= getattr(self, name) < 0.1:
+                raise InvalidInputError(
+                    f"{name} [rad] must lie in [0, 0.1), got {getattr(self, name):g}"
+                )
 
 
 class FacetFrames(NamedTuple):
@@ -121,6 +173,7 @@ class Heliostat:
         In PAINT's order: upper left, upper right, lower left, lower right, seen from the front.
     width, height : float [m]
         Of the whole mirror.
+    optics : MirrorOptics
     """
 
     name: str
@@ -129,6 +182,7 @@ class Heliostat:
     facets: tuple[Facet, ...]
     width: float = 3.22
     height: float = 2.56
+    optics: MirrorOptics = MirrorOptics()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "position", _vector(f"position of {self.name}", self.position))
@@ -162,12 +216,19 @@ class Heliostat:
         return cls(name, np.asarray(position, dtype=np.float64), mount or Mount.juelich(), facets)
 
     @property
+    def area(self) -> float:
+        """Area [m2] of its facets."""
+        return sum(facet.area for facet in self.facets)
+
+    @property
     def has_facets_in_order(self) -> bool:
         """Whether four facets in two rows and two columns have the order of `facets`; true for
         other mirrors.
 
         Surfaces are lists of facets: a facet in another place would be confused with another one.
         """
+        if len(self.facets) != 4:
+            return True
         places = np.array([facet.position[:2] for facet in self.facets])
         quarters = [(bool(x), bool(y)) for x, y in places > places.mean(axis=0)]
         return len(set(quarters)) < 4 or quarters == [
@@ -226,6 +287,8 @@ class TargetPlane:
     up : (3,)
         Unit vector of the image's upward direction, made perpendicular to ``normal``.
     width, height : float [m]
+    absorptance : float
+        Share of the light on it that it takes up.
     """
 
     name: str
@@ -234,6 +297,7 @@ class TargetPlane:
     up: Vector
     width: float
     height: float
+    absorptance: float = 1.0
 
     def __post_init__(self) -> None:
         if not (0 < self.width < 1e4 and 0 < self.height < 1e4):
@@ -379,6 +443,8 @@ class Cylinder:
     radius, height : float [m]
     opening_deg : float [deg]
         Angle of the lit surface, half of it to each side of the middle; 360 for all around.
+    absorptance : float
+        As of `TargetPlane`.
     """
 
     name: str
@@ -388,6 +454,7 @@ class Cylinder:
     radius: float
     height: float
     opening_deg: float = 360.0
+    absorptance: float = 1.0
 
     def __post_init__(self) -> None:
         if not (0 < self.radius < 1e3 and 0 < self.height < 1e4):
