@@ -17,7 +17,7 @@ from model.actuator import LinearActuator
 from model.errors import InvalidInputError
 from model.frames import sun_direction
 from model.mount import Mount, bisector
-from model.plant import Facet, Heliostat, MirrorOptics, Outline
+from model.plant import PERFECT, Facet, Heliostat, MirrorOptics, Outline
 
 Array = NDArray[np.float64]
 
@@ -223,7 +223,7 @@ class HeliostatType:
     mount: MountDesign = field(default_factory=MountDesign)
     focus: Focus = "flat"
     canting: Canting = Canting()
-    optics: MirrorOptics = MirrorOptics()
+    optics: MirrorOptics = PERFECT
 
     def __post_init__(self) -> None:
         if not self.facets:

@@ -4,23 +4,19 @@ Frozen dataclasses in numpy; the tracers convert them to batched tensors (`model
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from model.errors import InvalidInputError
+from model.errors import InvalidInputError, UnreachableError
 from model.frames import enu_to_wgs84, wgs84_to_enu
 from model.mount import Mount
 from model.site import Site
 
 Vector = NDArray[np.float64]
-
-STEP_DEG = 8.0
-"""Largest angle [deg] between a cylinder's planes: they deviate by 1 % of the radius at most."""
-
 
 MAX_ASPECT = 20.0
 """Largest ratio of the longer to the shorter side of a plane or of an unrolled cylinder."""
@@ -148,6 +144,10 @@ class MirrorOptics:
                 )
 
 
+PERFECT = MirrorOptics()
+"""A mirror that reflects all light where it should."""
+
+
 class FacetFrames(NamedTuple):
     """Centres (F, 3) [m], axes (F, 3 axes, 3) and half sizes (F, 2) [m] of facets.
 
@@ -182,7 +182,7 @@ class Heliostat:
     facets: tuple[Facet, ...]
     width: float = 3.22
     height: float = 2.56
-    optics: MirrorOptics = MirrorOptics()
+    optics: MirrorOptics = PERFECT
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "position", _vector(f"position of {self.name}", self.position))
@@ -273,6 +273,78 @@ def _orient(surface: "TargetPlane | Cylinder", kind: str) -> None:
     object.__setattr__(surface, "up", _vector(f"{kind} up", up / np.linalg.norm(up)))
 
 
+class SurfaceGrid(NamedTuple):
+    """Places of a receiver's map: points [m] and unit normals (rows, columns, 3), areas (rows,
+    columns) [m2].
+    """
+
+    points: Vector
+    normals: Vector
+    areas: Vector
+
+
+@dataclass(frozen=True, eq=False)
+class TouchingPlanes:
+    """Planes in front of a receiver, one for each of B mirrors, that its light passes.
+
+    Attributes
+    ----------
+    centers : (B, 3) [m]
+        Middles of the windows.
+    axes : (B, 3, 3)
+        Right, up and normal as rows; the normal points to the mirror.
+    size : (width, height) [m]
+        Of windows that show the whole receiver from each mirror.
+    opening : callable or None
+        Share of light that passes each cell of a window of (rows, columns).
+    """
+
+    centers: Vector
+    axes: Vector
+    size: tuple[float, float]
+    opening: Callable[[int, int], Vector] | None = None
+
+
+def windows_on(grid: SurfaceGrid, mirrors: Vector, origins: Vector, axes: Vector) -> TouchingPlanes:
+    """Windows on planes that show all places of a grid which face the mirrors.
+
+    Parameters
+    ----------
+    grid : SurfaceGrid
+        A few places, those on the surface's edges among them.
+    mirrors, origins : (B, 3) [m]
+        Middles of the mirrors, and points of their planes.
+    axes : (B, 3, 3)
+        Of the planes.
+
+    Raises
+    ------
+    UnreachableError
+        If a mirror sees nothing of the surface.
+    """
+    ways = grid.points.reshape(-1, 3) - mirrors[:, None]
+    faces = (ways * grid.normals.reshape(-1, 3)).sum(axis=-1) < 0
+    apart = np.einsum("bij,bj->bi", axes, origins - mirrors)
+    turned = np.einsum("bij,bpj->bpi", axes, ways)
+    is_seen = faces & (turned[..., 2] < 0)
+    if not is_seen.any(axis=1).all():
+        raise UnreachableError(
+            "a mirror is behind the lit part of the receiver; leave it out or aim it elsewhere"
+        )
+    scale = apart[:, None, 2] / np.where(is_seen, turned[..., 2], -1.0)
+    places = turned[..., :2] * scale[..., None] - apart[:, None, :2]
+    low = np.where(is_seen[..., None], places, np.inf).min(axis=1)
+    high = np.where(is_seen[..., None], places, -np.inf).max(axis=1)
+    middles = (low + high) / 2
+    width, height = _MARGIN * (high - low).max(axis=0)
+    centers = origins + np.einsum("bi,bij->bj", middles, axes[:, :2])
+    return TouchingPlanes(centers, axes, (float(width), float(height)))
+
+
+_MARGIN = 1.04
+"""Windows are larger than the receiver by this factor, so that its edges are inside."""
+
+
 @dataclass(frozen=True, eq=False)
 class TargetPlane:
     """A rectangle that light falls on: a calibration target, or another plane.
@@ -351,9 +423,27 @@ class TargetPlane:
         """No numbers besides those of the rectangle."""
         return {}
 
-    def patches(self, columns: int) -> "Iterator[Patch]":
-        """The plane as one patch."""
-        yield Patch(slice(0, columns), np.ones(columns), self)
+    @property
+    def aim(self) -> Vector:
+        """Its middle."""
+        return self.center
+
+    def grid(self, rows: int, columns: int) -> SurfaceGrid:
+        """Places of the map."""
+        x = ((np.arange(columns) + 0.5) / columns - 0.5) * self.width
+        y = (0.5 - (np.arange(rows) + 0.5) / rows) * self.height
+        points = self.to_enu(np.stack(np.broadcast_arrays(x, y[:, None]), axis=-1))
+        area = self.width * self.height / (rows * columns)
+        return SurfaceGrid(
+            points, np.broadcast_to(self.normal, points.shape), np.full((rows, columns), area)
+        )
+
+    def touching(self, mirrors: Vector) -> TouchingPlanes:
+        """The plane itself, for each mirror."""
+        n = len(mirrors)
+        return TouchingPlanes(
+            np.tile(self.center, (n, 1)), np.tile(self.axes, (n, 1, 1)), (self.width, self.height)
+        )
 
     def to_plane(self, points: ArrayLike) -> NDArray[np.float64]:
         """Coordinates (..., 2) [m] right and up of the centre, of ENU points (..., 3)."""
@@ -368,24 +458,6 @@ class TargetPlane:
         return bool((np.abs(self.to_plane(point)) <= np.array([self.width, self.height]) / 2).all())
 
 
-@dataclass(frozen=True, eq=False)
-class Patch:
-    """A plane that replaces a part of a receiver's surface.
-
-    Attributes
-    ----------
-    columns : slice
-        Of the receiver's map.
-    shares : (n,)
-        Weights of the plane's light in each of those columns.
-    plane : TargetPlane
-    """
-
-    columns: slice
-    shares: Vector
-    plane: TargetPlane
-
-
 class Receiver(Protocol):
     """A surface that the light of a field falls on; its map is the unrolled surface."""
 
@@ -394,8 +466,16 @@ class Receiver(Protocol):
         """Its name."""
 
     @property
+    def absorptance(self) -> float:
+        """Share of the light on it that it takes up."""
+
+    @property
     def center(self) -> Vector:
-        """Middle of the lit surface (3,) [m] in ENU, the default aim of mirrors."""
+        """Middle of the lit surface (3,) [m] in ENU."""
+
+    @property
+    def aim(self) -> Vector:
+        """Default aim of mirrors (3,) [m] in ENU."""
 
     @property
     def normal(self) -> Vector:
@@ -421,8 +501,17 @@ class Receiver(Protocol):
     def middle(self) -> TargetPlane:
         """A plane that touches the surface in its middle."""
 
-    def patches(self, columns: int) -> Iterator[Patch]:
-        """Planes that replace the surface, for a map of ``columns`` columns."""
+    def grid(self, rows: int, columns: int) -> SurfaceGrid:
+        """Places of a map of (rows, columns)."""
+
+    def touching(self, mirrors: Vector) -> TouchingPlanes:
+        """Planes in front of it toward mirrors whose middles are (B, 3) [m].
+
+        Raises
+        ------
+        UnreachableError
+            If a mirror sees nothing of it.
+        """
 
 
 @dataclass(frozen=True, eq=False)
@@ -498,23 +587,55 @@ class Cylinder:
         """The plane that touches it in its middle, as wide as the cylinder."""
         return self.tangent(0.0, self.radius, self.radius)
 
-    def patches(self, columns: int) -> Iterator[Patch]:
-        """Planes that touch it, every few degrees.
+    @property
+    def axis(self) -> Vector:
+        """The point (3,) [m] of its axis at mid height."""
+        return self.center - self.radius * self.normal
 
-        Between two lines of contact the light of both planes is blended in proportion, so that the
-        cosine of incidence changes from column to column as on the cylinder.
+    @property
+    def aim(self) -> Vector:
+        """The middle of a surface up to half around; else the axis, so that each mirror aims at the
+        surface toward it.
         """
-        step = np.radians(self.opening_deg) / columns
-        count = min(columns, math.ceil(self.opening_deg / STEP_DEG))
-        edges = np.linspace(0, columns, count + 1).round().astype(int)
-        # A cosine that is approximated by straight lines is too small by this factor on average.
-        blended = np.sinc(self.opening_deg / count / 360) ** 2
-        for index, edge in enumerate(edges):
-            first, last = edges[max(index - 1, 0)], edges[min(index + 1, count)]
-            shares = np.interp(np.arange(first, last) + 0.5, edges, np.eye(count + 1)[index])
-            left, right = (edge - first) * step * self.radius, (last - edge) * step * self.radius
-            plane = self.tangent((edge - columns / 2) * step, left, right)
-            yield Patch(slice(first, last), shares / blended, plane)
+        return self.center if self.opening_deg <= 180 else self.axis
+
+    def _at(self, angles: Vector, heights: Vector) -> SurfaceGrid:
+        """Places at angles [rad] from the middle and heights [m] over it; areas are zero."""
+        normals = np.cos(angles)[:, None] * self.normal + np.sin(angles)[:, None] * self.right
+        points = self.axis + self.radius * normals + heights[:, None, None] * self.up
+        return SurfaceGrid(points, np.broadcast_to(normals, points.shape), np.zeros(()))
+
+    def grid(self, rows: int, columns: int) -> SurfaceGrid:
+        """Places of the unrolled map."""
+        angles = ((np.arange(columns) + 0.5) / columns - 0.5) * np.radians(self.opening_deg)
+        heights = (0.5 - (np.arange(rows) + 0.5) / rows) * self.height
+        places = self._at(angles, heights)
+        area = self.width * self.height / (rows * columns)
+        return places._replace(areas=np.full((rows, columns), area))
+
+    def touching(self, mirrors: Vector) -> TouchingPlanes:
+        """Planes that touch it along the line nearest to each mirror."""
+        outward = mirrors - self.axis
+        angles = np.arctan2(outward @ self.right, outward @ self.normal)
+        half = np.radians(self.opening_deg) / 2
+        angles = angles.clip(-half, half)[:, None]
+        normals = np.cos(angles) * self.normal + np.sin(angles) * self.right
+        axes = np.stack(
+            [np.cross(self.up, normals), np.broadcast_to(self.up, normals.shape), normals], axis=1
+        )
+        origins = self.axis + self.radius * normals
+        if (((mirrors - origins) * normals).sum(axis=1) <= 0).any():
+            raise UnreachableError(
+                "a mirror is behind the lit part of the receiver; leave it out or aim it elsewhere"
+            )
+        edges = self._at(
+            np.linspace(-half, half, _EDGE_PLACES), np.array([0.5, -0.5]) * self.height
+        )
+        return windows_on(edges, mirrors, origins, axes)
+
+
+_EDGE_PLACES = 73
+"""Places around a cylinder's edges by which its windows are found: five degrees apart."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -44,9 +44,9 @@ def sensitivity(
     """
     rays = central_rays(scene, samples)
     center = rays.spot if window.on_spot else torch.zeros_like(rays.spot)
-    rays_on_grid = raster(
-        rays, center, window, optics, optics.irradiance(rays.slant_range), (padding, padding)
-    )
+    optics = scene.optics_with(optics)
+    irradiance = scene.irradiance(optics, rays.slant_range)
+    rays_on_grid = raster(rays, center, window, optics, irradiance, (padding, padding))
     moved = (
         _moved(scene, rays, samples)
         / rays_on_grid.x.new_tensor([window.pixel[0], -window.pixel[1]])[:, None, None, None]
