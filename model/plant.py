@@ -663,3 +663,20 @@ class Plant:
     def to_wgs84(self, enu: ArrayLike) -> NDArray[np.float64]:
         """WGS84 positions (..., 3) [deg, deg, m] of ENU (..., 3) [m]."""
         return enu_to_wgs84(enu, self.origin)
+
+
+@dataclass(frozen=True)
+class Tower:
+    """The tower: an upright cylinder on the origin, which casts a shadow.
+
+    Attributes
+    ----------
+    radius, height : float [m]
+    """
+
+    radius: float
+    height: float
+
+    def __post_init__(self) -> None:
+        if not (0 < self.radius < 1e3 and 0 < self.height < 1e4):
+            raise InvalidInputError("tower radius and height must be positive metres")
