@@ -15,10 +15,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from model.errors import InvalidInputError
+from model.neighbours import clear
 from model.plant import Receiver, SurfaceGrid, TouchingPlanes
 from model.sunshape import half_angle
 from model.tracing.convolution import MAX_GRID, Raster, Rays, central_rays, raster, splat
@@ -141,13 +143,14 @@ def project(
     if touching.opening is not None:
         opening = touching.opening(window.rows, window.columns)
         kernels = kernels * torch.tensor(opening).to(kernels)
-    places = grid.areas.size
-    step = max(1, _PROJECTED // places)
+    step = max(1, _PROJECTED // grid.areas.size)
     image, intercepted = torch.zeros(resolution), []
     areas = torch.tensor(grid.areas).to(kernels)
     for start in range(0, scene.batch, step):
         part = slice(start, start + step)
         seen = _projected(kernels[part], scene, part, window, grid)
+        if touching.screens is not None:
+            seen = seen * _in_sight(touching.screens, scene.center[part], grid)
         image = image + seen.sum(0)
         intercepted.append((seen * areas).sum(dim=(-2, -1)))
     return SuperposedFlux(image, Beams.of(rays, irradiance), torch.cat(intercepted))
@@ -188,3 +191,20 @@ def _projected(
     light = grid_sample(kernels[:, None], places, padding_mode="border", align_corners=False)[:, 0]
     seen: Tensor = light * scale**2 * toward.clamp(max=0) / ahead[2].clamp(max=-1e-6)
     return seen
+
+
+def _in_sight(screens: NDArray[np.float64], mirrors: Tensor, grid: SurfaceGrid) -> Tensor:
+    """Share (b, rows, columns) of places that no screen (K, 3, 3) hides from mirrors (b, 3)."""
+    count = len(mirrors)
+    points = torch.tensor(grid.points).to(mirrors).flatten(0, 1).T.expand(count, -1, -1)
+    ways = mirrors[:, :, None] - points
+    ways = ways / ways.norm(dim=1, keepdim=True)
+    # A place does not hide itself.
+    points = points + _OFF * ways
+    rectangles = torch.tensor(screens).to(mirrors).expand(count, -1, -1, -1)
+    free = clear(rectangles, points, ways, mirrors.new_full((count,), _OFF))
+    return free.view(count, *grid.areas.shape)
+
+
+_OFF = 0.01
+"""Distance [m] before a receiver from which screens are looked for, and width of their edges."""
