@@ -2,12 +2,12 @@
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 from rich.console import Console
 
-from service.cli.output import AsJson, require_file
+from service.cli.output import AsJson, require_file, require_folder
 
 app = typer.Typer(
     name="plant",
@@ -15,6 +15,7 @@ app = typer.Typer(
     no_args_is_help=True,
 )
 
+ForeignFormat = Literal["solarpilot", "soltrace"]
 PlantFile = Annotated[Path, typer.Argument(help="The plant's file.", metavar="PLANT.yaml")]
 
 
@@ -76,6 +77,70 @@ def show(
     )
     out.parent.mkdir(parents=True, exist_ok=True)
     out.write_bytes(picture)
+    typer.echo(json.dumps({"written": [str(out)]}) if as_json else f"{out} is written")
+
+
+@app.command("import")
+def import_(
+    file: Annotated[
+        Path,
+        typer.Argument(
+            help="SolTrace's .stinput, or CSV of SolarPILOT or OpenCSP.", metavar="FILE"
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="The folder for plant.yaml and its files.")],
+    as_json: AsJson = False,
+) -> None:
+    """Make a plant of another program's file; notes say what the file leaves open."""
+    from service.sources.plant_file import read_plant
+    from service.sources.plant_formats.formats import read_foreign
+
+    require_folder(out)
+    imported = read_foreign(file)
+    written = imported.write(out)
+    count = len(read_plant(written[0]).plant.heliostats)
+    report = {
+        "written": [str(path) for path in written],
+        "heliostats": count,
+        "notes": list(imported.notes),
+    }
+    if as_json:
+        typer.echo(json.dumps(report, indent=1))
+        return
+    typer.echo("\n".join([f"{count:,} heliostats in {written[0]}", *imported.notes]))
+
+
+@app.command()
+def export(
+    file: PlantFile,
+    to: Annotated[ForeignFormat, typer.Option("--format", help="The other program.")],
+    out: Annotated[Path, typer.Option(help="The file to write.")],
+    sun: Annotated[
+        tuple[float, float] | None,
+        typer.Option(
+            help="Sun azimuth from north over east and elevation [deg]; SolTrace needs it.",
+            metavar="AZIMUTH ELEVATION",
+        ),
+    ] = None,
+    aims: Annotated[
+        Path | None,
+        typer.Option(
+            help="Aim points, name,east_m,north_m,up_m; without it the receivers' middles."
+        ),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Write a plant for another program."""
+    from service.sources.plant_file import read_plant
+    from service.sources.plant_formats.formats import foreign_text
+    from service.sources.plant_tables import read_aims
+
+    require_file(out)
+    described = read_plant(file)
+    points = None if aims is None else read_aims(aims, described.plant.heliostats)
+    text = foreign_text(described, to, sun, points)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    out.write_text(text, encoding="utf-8")
     typer.echo(json.dumps({"written": [str(out)]}) if as_json else f"{out} is written")
 
 
