@@ -4,7 +4,7 @@ Frozen dataclasses in numpy; the tracers convert them to batched tensors (`model
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
@@ -68,6 +68,16 @@ def outline_share(outline: Outline) -> float:
     """Share of the rectangle from -1 to 1 that is inside an outline, by the shoelace formula."""
     x, y = np.array(outline, dtype=np.float64).T
     return float(abs(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 8)
+
+
+def inside_outline(x: Vector, y: Vector, outline: ArrayLike) -> NDArray[np.bool_]:
+    """Which places (...) are inside a polygon (V, 2), by the even-odd rule."""
+    corners = np.asarray(outline, dtype=np.float64)
+    inside = np.zeros(np.broadcast_shapes(x.shape, y.shape), dtype=bool)
+    for (ax, ay), (bx, by) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        if ay != by:
+            inside ^= ((ay > y) != (by > y)) & (x < ax + (y - ay) / (by - ay) * (bx - ax))
+    return inside
 
 
 def _vector(name: str, value: ArrayLike) -> Vector:
@@ -646,7 +656,7 @@ class Plant:
     origin: Vector
     targets: dict[str, TargetPlane] = field(default_factory=dict)
     heliostats: dict[str, Heliostat] = field(default_factory=dict)
-    receivers: dict[str, Cylinder] = field(default_factory=dict)
+    receivers: Mapping[str, Receiver] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "origin", _vector("plant origin", self.origin))
@@ -680,3 +690,11 @@ class Tower:
     def __post_init__(self) -> None:
         if not (0 < self.radius < 1e3 and 0 < self.height < 1e4):
             raise InvalidInputError("tower radius and height must be positive metres")
+
+    def outline(self, sun: Vector) -> TargetPlane:
+        """The upright rectangle that casts the tower's shadow under a ``sun`` (3,)."""
+        level = np.array([sun[0], sun[1], 0.0])
+        normal = level if np.linalg.norm(level) > 1e-9 else np.array([0.0, 1.0, 0.0])
+        center = np.array([0.0, 0.0, self.height / 2])
+        up = np.array([0.0, 0.0, 1.0])
+        return TargetPlane("tower", center, normal, up, 2 * self.radius, self.height)

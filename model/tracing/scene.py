@@ -13,7 +13,7 @@ from torch import Tensor
 from model.errors import InvalidInputError
 from model.images import FLUX_SIZE, FLUX_WINDOW
 from model.mount import Mount
-from model.plant import PERFECT, Outline, TargetPlane, outline_share
+from model.plant import PERFECT, Outline, TargetPlane, inside_outline, outline_share
 from model.setup import Setup
 from model.sunshape import Buie, SunShape
 from model.surface import DEGREE
@@ -317,11 +317,6 @@ def coverage(outline: Outline | None) -> Array:
         return np.ones((COVERAGE_CELLS, COVERAGE_CELLS))
     fine = 8 * COVERAGE_CELLS
     places = (np.arange(fine) + 0.5) / fine * 2 - 1
-    x, y = np.meshgrid(places, places, indexing="ij")
-    inside = np.zeros_like(x, dtype=bool)
-    for (ax, ay), (bx, by) in zip(outline, (*outline[1:], outline[0]), strict=True):
-        crosses = (ay > y) != (by > y)
-        if ay != by:
-            inside ^= crosses & (x < ax + (y - ay) / (by - ay) * (bx - ax))
+    inside = inside_outline(places[:, None], places[None, :], outline)
     cells = inside.reshape(COVERAGE_CELLS, 8, COVERAGE_CELLS, 8).mean(axis=(1, 3))
     return np.asarray(cells * (outline_share(outline) / cells.mean()))

@@ -47,7 +47,11 @@ def tower_json(plant: Plant, corners: Mapping[str, dict[str, Any] | None]) -> di
             name: _target_json(plane, plant, corners.get(name))
             for name, plane in plant.targets.items()
         },
-        **{name: _receiver_json(cylinder, plant) for name, cylinder in plant.receivers.items()},
+        **{
+            name: _receiver_json(receiver, plant)
+            for name, receiver in plant.receivers.items()
+            if isinstance(receiver, Cylinder)  # PAINT has no others
+        },
     }
 
 

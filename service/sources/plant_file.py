@@ -115,7 +115,7 @@ class _PlantReader:
         heliostats = self._heliostats(layout, types, goals, receiver_of)
         site = Site(**header.model_dump(include={field.name for field in fields(Site)}))
         return PlantDescription(
-            plant=Plant(header.name, np.array(site.origin), targets, heliostats, receivers),  # type: ignore[arg-type]
+            plant=Plant(header.name, np.array(site.origin), targets, heliostats, receivers),
             types=types,
             receivers=receivers,
             type_of={placed.entry.name: placed.entry.type for placed in layout},

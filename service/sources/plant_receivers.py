@@ -91,7 +91,7 @@ def _receiver(name: str, entry: ReceiverEntry) -> AnyReceiver:
         )
         if isinstance(entry, PanelsReceiver):
             return Panels(name, panels, entry.absorptance)
-        return Cavity(name, np.array(entry.aperture_m), panels, entry.absorptance)
+        return Cavity(name, panels, entry.absorptance, np.array(entry.aperture_m))
     return _plane(name, entry, entry.absorptance)
 
 
