@@ -12,10 +12,10 @@ from model.errors import InvalidInputError, ModelError
 from service.base.validation_messages import message_of
 from service.sources.plant_schema import (
     Drive,
+    KeyMistakeError,
     PlantDocument,
     ReceiverEntry,
     SunEntry,
-    UnknownKeyError,
     nearest,
 )
 from service.sources.yaml_text import KeyPath, YamlDocument, read_yaml
@@ -114,8 +114,8 @@ def _path(document: YamlDocument, entry: Mapping[str, Any]) -> KeyPath:
     kind, context = entry["type"], entry.get("ctx", {})
     if kind == "missing":
         return (*path, entry["loc"][-1])
-    if isinstance(unknown := context.get("error"), UnknownKeyError):
-        return (*path, unknown.key)
+    if isinstance(mistake := context.get("error"), KeyMistakeError):
+        return (*path, mistake.key)
     if kind in ("union_tag_invalid", "union_tag_not_found"):
         return (*path, context["discriminator"].strip("'"))
     return path

@@ -112,10 +112,9 @@ def aim_of(receiver: AnyReceiver, foot: Array) -> Array:
 
 def _facing(cylinder: Cylinder, foot: Array) -> Array:
     """The place (3,) [m] of a cylinder's lit surface at mid height nearest to ``foot`` (3,)."""
-    axis = cylinder.center - cylinder.radius * cylinder.normal
-    outward = foot - axis
+    outward = foot - cylinder.axis
     half = math.radians(cylinder.opening_deg) / 2
     angle = math.atan2(float(outward @ cylinder.right), float(outward @ cylinder.normal))
     angle = max(-half, min(half, angle))
     direction = math.cos(angle) * cylinder.normal + math.sin(angle) * cylinder.right
-    return np.asarray(axis + cylinder.radius * direction)
+    return np.asarray(cylinder.axis + cylinder.radius * direction)

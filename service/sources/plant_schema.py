@@ -47,9 +47,12 @@ class PlantPart(Model):
     @classmethod
     def _known_keys(cls, data: Any) -> Any:
         if isinstance(data, dict):
-            for key in data:
-                if key not in cls.model_fields:
-                    raise UnknownKeyError(key, list(cls.model_fields))
+            known = list(cls.model_fields)
+            for key, value in data.items():
+                if key not in known:
+                    raise KeyMistakeError(key, f"is not known here; {nearest(key, known)}")
+                if value is None:
+                    raise KeyMistakeError(key, "has no value; write one, or leave the key out")
         return data
 
     def require_one(self, *keys: str) -> None:
@@ -61,11 +64,11 @@ class PlantPart(Model):
             raise ValueError(f"{listed} {problem}; give one of {', '.join(keys)}")
 
 
-class UnknownKeyError(ValueError):
-    """A key that is not known; its message suggests the nearest one."""
+class KeyMistakeError(ValueError):
+    """A mistake of one ``key`` of a part, found before its values are."""
 
-    def __init__(self, key: str, known: Sequence[str]) -> None:
-        super().__init__(f"is not known here; {nearest(key, known)}")
+    def __init__(self, key: str, message: str) -> None:
+        super().__init__(message)
         self.key = key
 
 
@@ -91,7 +94,7 @@ def _facet_source(value: Any) -> str:
     return "(file)" if is_file else "(grid)"
 
 
-NumberedName = Annotated[Name, BeforeValidator(_as_name)]
+NumberedName = Annotated[Name, BeforeValidator(_as_name, json_schema_input_type=Name | int)]
 FileName = Annotated[
     str,
     StringConstraints(pattern=LINE, min_length=1, max_length=200),
@@ -484,15 +487,46 @@ class PlantDocument(PlantPart):
     atmosphere: AtmosphereEntry | None = None
 
 
+def json_schema() -> dict[str, object]:
+    """The JSON schema of ``plant.yaml``."""
+    schema = PlantDocument.model_json_schema()
+    dialect = "https://json-schema.org/draft/2020-12/schema"
+    return {"$schema": dialect, **_without_null(schema), "title": "plant.yaml"}
+
+
+def _without_null(schema: Any) -> Any:
+    """A schema in which a key is left out instead of being null."""
+    if isinstance(schema, list):
+        return [_without_null(entry) for entry in schema if entry != {"type": "null"}]
+    if not isinstance(schema, dict):
+        return schema
+    kept = {key: _without_null(entry) for key, entry in schema.items() if key != "title"}
+    if kept.get("default", "") is None:
+        del kept["default"]
+    if len(kept.get("anyOf", ())) == 1:
+        kept = {**kept.pop("anyOf")[0], **kept}
+    return kept
+
+
 def assumed(part: BaseModel, path: str = "") -> Iterator[str]:
     """Yield what a document leaves to its defaults, as lines ``key.path: value``."""
     for name in type(part).model_fields:
         value, where = getattr(part, name), f"{path}{name}"
-        if name not in part.model_fields_set and name not in ("heliostats", "file"):
-            if value is not None and value != {}:
+        if name not in part.model_fields_set:
+            if value is None:
+                yield from [f"{where}: {_ABSENT[name]}"] if name in _ABSENT else []
+            elif value != {}:
                 yield f"{where}: {_brief(value)}"
         else:
             yield from _assumed_below(value, where)
+
+
+_ABSENT = {
+    "tower": "none, and no shadow of one",
+    "atmosphere": "clear, no light is lost",
+    "canting": "on_axis, or individual if the facets' file has normals",
+}
+"""What is assumed if a part is absent that has no default."""
 
 
 def _assumed_below(value: Any, where: str) -> Iterator[str]:

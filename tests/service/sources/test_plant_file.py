@@ -154,6 +154,7 @@ MISTAKES = [
     ("width_m: 12,", "width_m: 12, marks: dots,", 19, "targets.cal.marks", "'dots' is none of none, l_brackets"),
     ("width_m: 12,", "width_m: 12, camera: {homography: [[1, 0, 0], [0, 1, 0], [0, 0, 0]]},", 19, "targets.cal.camera.homography", "invertible"),
     ("tower: {radius_m: 8, height_m: 140}", "tower: 140", 20, "tower", "key: value, got 140"),
+    ("tower: {radius_m: 8, height_m: 140}", "tower:", 20, "tower", "has no value"),
     ("tower:", "towers:", 20, "towers", "did you mean tower?"),
     ("shape: pillbox", "shape: disc", 21, "sun.shape", "'disc' is none of pillbox, gaussian, buie"),
     ("{shape: pillbox, half_angle_mrad: 4.65}", "{shape: buie, csr: 0.9}", 21, "sun.csr", "must lie in"),
