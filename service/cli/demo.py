@@ -69,7 +69,9 @@ class HeliostatResult:
     pictures: tuple[str, ...]
 
 
-def run_demo(data: Path | None, out: Path, console: Console, quiet: bool = False) -> dict[str, Any]:
+def run_demo(
+    data: Path | None, out: Path, console: Console, quiet: bool = False
+) -> Mapping[str, object]:
     """Run the demonstration on the embedded plant or on a folder.
 
     All files are written to ``out``. Return the report.
@@ -326,7 +328,7 @@ def _print(console: Console, results: list[HeliostatResult], out: Path, store: P
     console.print(said, highlight=False, markup=False, soft_wrap=True)
 
 
-def _page(report: dict[str, Any], results: list[HeliostatResult]) -> str:
+def _page(report: Mapping[str, object], results: list[HeliostatResult]) -> str:
     """HTML page with a conclusion, the table and links to the pictures."""
     judging = [result for result in results if result.held_out] or results
     photographs = sum(result.judged for result in judging)

@@ -150,7 +150,7 @@ def observations_of(
 
 def predict_heliostat(
     opened: FolderStore, name: str, method: Method, images: int
-) -> tuple[SurfacePrediction, dict[str, Any]]:
+) -> tuple[SurfacePrediction, dict[str, object]]:
     """Predict one heliostat's surface; also return its entry in ``predictions.json``."""
     twin, (rows, refused) = opened.context(name), opened.photographs(name)
     if not rows:
@@ -161,7 +161,7 @@ def predict_heliostat(
     with opened.runtime.computing(f"predict_{method}") as operations:
         chosen, apart = choose_observations(operations, twin, rows, images)
         predicted = operations.predict(twin.heliostat, chosen, twin.model, method)
-    entry: dict[str, Any] = {
+    entry: dict[str, object] = {
         "method": method,
         "weights": predicted.weights,
         "images": list(predicted.used),

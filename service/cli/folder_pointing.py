@@ -85,7 +85,7 @@ def spot_folder(
     return report
 
 
-def _spot(stored: StoredMount, row: MeasurementRow) -> dict[str, Any]:
+def _spot(stored: StoredMount, row: MeasurementRow) -> dict[str, object]:
     plane, motors = store.target_plane(row.target), motors_of(stored.heliostat, row)
     sun = stored.sun(sun_direction(row.sun_azimuth_deg, row.sun_elevation_deg), row.taken_at)
     spot = forecast_spot(stored.mount, stored.heliostat, plane, motors, sun, day_of(row.taken_at))

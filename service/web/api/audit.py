@@ -1,6 +1,6 @@
 """The audit trail."""
 
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Query
 from pydantic import BaseModel, Field
@@ -23,7 +23,7 @@ class AuditOut(BaseModel):
     )
     action: str = Field(description="What was done.")
     subject: str = Field(description="What it was done to.")
-    detail: dict[str, Any] = Field(description="More about it, by the kind of action.")
+    detail: dict[str, object] = Field(description="More about it, by the kind of action.")
 
 
 def audit_out(row: AuditRow) -> AuditOut:

@@ -1,6 +1,6 @@
 """Corrections of photographs: another sun, target or time, or exclusion."""
 
-from typing import Annotated, Any, Self
+from typing import Annotated, Self
 
 from fastapi import APIRouter, Depends, Query
 from pydantic import BaseModel, Field, model_validator
@@ -59,8 +59,8 @@ class CorrectionOut(BaseModel):
     created_at: CreatedAt
     created_by: Author
     reason: Why
-    before: dict[str, Any] = Field(description="Previous values, by the fields that changed.")
-    after: dict[str, Any] = Field(description="New values.")
+    before: dict[str, object] = Field(description="Previous values, by the fields that changed.")
+    after: dict[str, object] = Field(description="New values.")
 
 
 class DeletedOut(BaseModel):

@@ -1,7 +1,7 @@
 """Heliostats."""
 
 from datetime import datetime
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Depends, Query, Response, status
 from pydantic import BaseModel, Field
@@ -43,7 +43,7 @@ class HeliostatSummary(BaseModel):
 class HeliostatOut(HeliostatSummary):
     """A heliostat with its properties."""
 
-    properties: dict[str, Any] = Field(description="PAINT properties as they were sent.")
+    properties: dict[str, object] = Field(description="PAINT properties as they were sent.")
     updated_at: datetime = Field(description="When it was last changed.")
 
 

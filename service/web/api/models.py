@@ -1,7 +1,6 @@
 """Versions of the plant model."""
 
 from datetime import datetime
-from typing import Any
 
 from fastapi import APIRouter
 from pydantic import BaseModel, Field
@@ -22,10 +21,10 @@ class ModelOut(BaseModel):
 
     version: int = Field(description="Ask for it as `model_version`.")
     is_current: bool = Field(description="Whether forecasts and predictions are made by it.")
-    effects: list[dict[str, Any]] = Field(
+    effects: list[dict[str, object]] = Field(
         description="Its effects with parameters and scopes, but for declared ones."
     )
-    declared: dict[str, Any] | None = Field(
+    declared: dict[str, object] | None = Field(
         description=(
             "What was declared when it was made, as in twin.json; null: Buie's sun with a ratio of"
             " 0.02."
@@ -40,7 +39,7 @@ class ModelOut(BaseModel):
     withdrawn_by: str | None = Field(description="Name of the key that withdrew it.")
 
 
-def declared_model(declared: dict[str, Any] | None, is_current: bool) -> ModelOut:
+def declared_model(declared: dict[str, object] | None, is_current: bool) -> ModelOut:
     """The declared model, which is the first version."""
     unknown = dict.fromkeys(("study", "adopted_at", "adopted_by", "withdrawn_at", "withdrawn_by"))
     about = {"version": model_versions.DECLARED, "effects": [], "declared": declared}

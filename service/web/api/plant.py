@@ -1,6 +1,6 @@
 """The plant, its target planes and its receivers."""
 
-from typing import Any, Self
+from typing import Self
 
 from fastapi import APIRouter, Depends, Response, status
 from pydantic import BaseModel, Field, model_validator
@@ -35,7 +35,7 @@ class PlantOut(BaseModel):
     origin_wgs84: tuple[float, float, float] = Field(
         description="Tower base: latitude [deg], longitude [deg], altitude [m]."
     )
-    declared: dict[str, Any] | None = Field(
+    declared: dict[str, object] | None = Field(
         description=(
             "What is declared of its model, as in twin.json; null: Buie's sun with a ratio of 0.02,"
             " no effects, and optics of reflectivity 1 without attenuation."
@@ -89,7 +89,7 @@ class TargetOut(BaseModel):
     up: tuple[float, float, float] = Field(description="Unit vector up the image.")
     width: float = Field(description="[m]")
     height: float = Field(description="[m]")
-    corners: dict[str, Any] | None = Field(
+    corners: dict[str, object] | None = Field(
         description="The WGS84 corners that it was made from, if it was."
     )
 
@@ -142,11 +142,6 @@ def _from_corners(session: Session, name: str, corners: Corners) -> TargetPlane:
     )
 
 
-def _paint_corners(document: dict[str, Any], name: str) -> dict[str, list[float]]:
-    coordinates = document[name]["coordinates"]
-    return {corner: [float(value) for value in coordinates[corner]] for corner in _CORNERS}
-
-
 @router.get("/plant", responses=problems(409), dependencies=[READ])
 def get_plant(runtime: RuntimeDep) -> PlantOut:
     """Get the plant: its name, tower base and declared model."""
@@ -169,7 +164,11 @@ def put_plant(document: TowerMeasurements, runtime: RuntimeDep, identity: Identi
     origin, targets = read_targets(document.raw)
     receivers = read_receivers(document.raw)
     parse_declared(document.declared or {}, "declared")  # refuse models that cannot be computed
-    corners = {name: _paint_corners(document.raw, name) for name in targets}
+    places = {name: document.raw[name]["coordinates"] for name in targets}
+    corners = {
+        name: {corner: list(map(float, place[corner])) for corner in _CORNERS}
+        for name, place in places.items()
+    }
 
     def write(session: Session) -> PlantOut:
         plant = Plant(document.power_plant_properties.ID, origin, targets, receivers=receivers)

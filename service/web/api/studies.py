@@ -1,7 +1,7 @@
 """Studies, and the versions of the plant model that are adopted from them."""
 
 from datetime import datetime
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Path, Query, Response, status
 from fastapi.responses import HTMLResponse
@@ -37,7 +37,7 @@ class StudySummary(BaseModel):
     id: Id
     created_at: CreatedAt
     created_by: str = Field(description="Name of the key that asked for it.")
-    options: dict[str, Any] = Field(description="What was asked.")
+    options: dict[str, object] = Field(description="What was asked.")
     heliostats: list[str] = Field(description="Those whose photographs were studied.")
     first_taken_at: datetime | None = Field(
         description="When the first photograph was taken, where that is known."
@@ -82,7 +82,7 @@ class AdoptIn(Model):
     )
 
 
-def _study_fields(row: StudyRow, adopted: int | None) -> dict[str, Any]:
+def _study_fields(row: StudyRow, adopted: int | None) -> dict[str, object]:
     names = StudySummary.model_fields.keys() - {"adopted"}
     return {name: getattr(row, name) for name in names} | {"adopted": adopted}
 

@@ -6,8 +6,9 @@ Maps share one scale. The page also shows the forecasts of both surfaces, and th
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, date, datetime, time, timedelta
+from functools import partial
 from statistics import fmean
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from fastapi import APIRouter, Depends, Query, Request
@@ -367,14 +368,10 @@ def get_compare_page(
 ) -> HTMLResponse:
     """The comparison of two surfaces, or the form that asks for them."""
     target = query.target or next(iter(read.targets), None)
-    filled: dict[str, Any] = {
-        "query": query,
-        "sun": read.sun,
-        "target": target,
-        "targets": read.targets,
-    }
+    filled = {"query": query, "sun": read.sun, "target": target, "targets": read.targets}
+    page = partial(render, request, "compare.html", **filled)
     if read.sides is None:
-        return render(request, "compare.html", **filled, sides=None)
+        return page(sides=None)
     known = [one for one in read.compared if one is not None]
     forecasts, trouble = None, next((one.trouble for one in known if one.trouble), None)
     try:
@@ -382,10 +379,7 @@ def get_compare_page(
     except ModelError as error:
         trouble = str(error)
     is_whole = len(known) == len(read.compared)
-    return render(
-        request,
-        "compare.html",
-        **filled,
+    return page(
         sides=read.sides,
         surfaces=_surfaces(*read.sides, runtime.settings.figure_scales),
         change_mm=1e3 * float(np.sqrt(np.mean((read.sides[1].z - read.sides[0].z) ** 2))),

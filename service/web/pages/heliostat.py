@@ -199,7 +199,7 @@ _UNDER_WAY = ComparisonResult(
 
 def _surface_context(
     surface: SurfaceRow, size: tuple[float, float], ends: Mapping[str, float]
-) -> dict[str, Any]:
+) -> dict[str, object]:
     arrays = unpack(surface.arrays)
     shown = field_totals(surface.arrays)
     title = f"Surface {surface.version}: deviation from the ideal mirror, seen from the front"
@@ -214,7 +214,7 @@ def _surface_context(
     }
 
 
-def _mount_context(mount: MountRow) -> dict[str, Any]:
+def _mount_context(mount: MountRow) -> dict[str, object]:
     """What the page shows of a mount: changes of its drives, and contradicting measurements."""
     return {
         "steps": [
