@@ -26,6 +26,7 @@ from model.setup import Setup
 from model.surface import DEGREE, control_points
 from service.base.arrays import unpack
 from service.base.choices import Method
+from service.base.errors import list_reasons
 from service.base.fields import Sun
 from service.base.settings import Settings
 from service.cli.demo_plant import write_plant
@@ -102,7 +103,7 @@ def run_demo(
         finally:
             runtime.close()
     if not made:
-        reasons = "; ".join(f"{name}: {reason}" for name, reason in list(skipped.items())[:3])
+        reasons = list_reasons(skipped)
         raise ModelError(f"{root}: no heliostat had an image that could be used ({reasons})")
     results = _drawn(out, made, runtime.settings.figure_scales)
     report = {

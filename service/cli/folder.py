@@ -26,6 +26,7 @@ from model.surface import DEGREE, control_points, split_canting
 from service import store
 from service.base.arrays import pair_or_none, unpack
 from service.base.choices import Method, require_images
+from service.base.errors import list_reasons
 from service.base.progress import Progress, no_progress
 from service.cli.folder_store import FolderStore, open_folder
 from service.sources.documents import optics_to_json, read_json
@@ -73,9 +74,7 @@ def finish(
     """Write the report with all skipped items; raise ModelError if ``report[done]`` is empty."""
     _write_report(folder, report, path)
     if not report[done]:
-        reasons = "; ".join(
-            f"{name}: {reason}" for name, reason in list(report["skipped"].items())[:3]
-        )
+        reasons = list_reasons(report["skipped"])
         raise ModelError(f"nothing was left to do, everything was skipped ({reasons}); see {path}")
     return report
 

@@ -12,7 +12,7 @@ from model.frames import sun_direction
 from model.pointing.report import day_of, field_to_json
 from model.pointing.spots import forecast_spot
 from service import store
-from service.base.errors import SKIPPED
+from service.base.errors import SKIPPED, list_reasons
 from service.base.progress import Progress, no_progress
 from service.cli.folder import write_json
 from service.cli.folder_store import open_folder
@@ -80,8 +80,7 @@ def spot_folder(
     report = {"spots": spots, "skipped": skipped}
     write_json(out, report)
     if not spots:
-        reasons = "; ".join(f"{name}: {reason}" for name, reason in list(skipped.items())[:3])
-        raise ModelError(f"no spot can be measured ({reasons}); see {out}")
+        raise ModelError(f"no spot can be measured ({list_reasons(skipped)}); see {out}")
     return report
 
 

@@ -84,6 +84,11 @@ class HeliostatRow(Base):
     updated_at: Mapped[datetime] = mapped_column(default=now, onupdate=now)
     photographs_changed_at: Mapped[datetime | None]
 
+    @property
+    def size_m(self) -> tuple[float, float]:
+        """Width and height of the mirror [m]."""
+        return float(self.properties["width"]), float(self.properties["height"])
+
 
 class TargetRow(Base):
     """A target plane in ENU [m]; ``corners`` are its WGS84 corners, if known."""

@@ -24,6 +24,7 @@ from service.jobs.kinds import KINDS
 from service.store.listing import Order, Period
 from service.store.tables import StudyRow
 from service.twin.plant import model_versions
+from service.twin.runtime.runtime import Runtime
 from service.web.api.jobs import add_creator
 from service.web.api.models import ModelOut, current_out, model_out
 from service.web.auth.dependencies import OPERATE, READ, IdentityDep, Limit, RuntimeDep
@@ -99,6 +100,15 @@ def study_out(row: StudyRow, adopted: int | None) -> StudyOut:
     )
 
 
+def study_html(runtime: Runtime, number: int) -> str:
+    """The report of a study as a page; NotFoundError if it has none."""
+    with runtime.database.reading() as session:
+        row = store.get_study(session, number, page=True)
+    if row.html is None:
+        raise NotFoundError(f"study {number} came as a report without a page")
+    return row.html
+
+
 router = APIRouter(tags=["studies"])
 Number = Annotated[Version, Path(description="Id of the study.")]
 
@@ -161,11 +171,8 @@ def get_study(number: Number, runtime: RuntimeDep) -> StudyOut:
 )
 def get_study_report(number: Number, runtime: RuntimeDep) -> HTMLResponse:
     """Get the report of a study as a page for people."""
-    with runtime.database.reading() as session:
-        row = store.get_study(session, number, page=True)
-    if row.html is None:
-        raise NotFoundError(f"study {number} came as a report without a page")
-    return HTMLResponse(row.html, headers={"Content-Security-Policy": REPORT_POLICY})
+    headers = {"Content-Security-Policy": REPORT_POLICY}
+    return HTMLResponse(study_html(runtime, number), headers=headers)
 
 
 @router.post(
