@@ -5,7 +5,7 @@ from typing import Annotated
 from fastapi import APIRouter, Query
 from pydantic import BaseModel, Field
 
-from service.base.fields import CreatedAt, Id, Version
+from service.base.fields import CreatedAt, Id, Version, from_row
 from service.store import audit
 from service.store.job_tables import AuditRow
 from service.web.auth.dependencies import ADMIN, Limit, RuntimeDep
@@ -28,7 +28,7 @@ class AuditOut(BaseModel):
 
 def audit_out(row: AuditRow) -> AuditOut:
     """An entry of the audit trail as JSON."""
-    return AuditOut.model_validate(row, from_attributes=True)
+    return from_row(AuditOut, row)
 
 
 router = APIRouter(tags=["audit"])

@@ -6,7 +6,18 @@ from fastapi import APIRouter, Depends, Query
 from pydantic import BaseModel, Field, model_validator
 
 from service import store
-from service.base.fields import Author, CreatedAt, Flag, Model, Moment, Name, Reason, Sun, Why
+from service.base.fields import (
+    Author,
+    CreatedAt,
+    Flag,
+    Model,
+    Moment,
+    Name,
+    Reason,
+    Sun,
+    Why,
+    from_row,
+)
 from service.jobs.enqueuing import enqueue
 from service.jobs.kinds import predictions
 from service.jobs.kinds.predictions import PredictionsIn
@@ -88,9 +99,7 @@ class CorrectedOut(BaseModel):
 
 def correction_out(row: CorrectionRow) -> CorrectionOut:
     """A correction as JSON."""
-    return CorrectionOut.model_validate(
-        {name: getattr(row, name) for name in CorrectionOut.model_fields}
-    )
+    return from_row(CorrectionOut, row)
 
 
 def predict_again(runtime: Runtime, heliostat: str, actor: str) -> int:

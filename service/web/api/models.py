@@ -6,6 +6,7 @@ from fastapi import APIRouter
 from pydantic import BaseModel, Field
 from sqlalchemy.orm import Session
 
+from service.base.fields import from_row
 from service.store.plant.model_versions import declared_of
 from service.store.tables import ModelRow
 from service.twin.plant import model_versions
@@ -48,10 +49,7 @@ def declared_model(declared: dict[str, object] | None, is_current: bool) -> Mode
 
 def model_out(row: ModelRow, is_current: bool) -> ModelOut:
     """An adopted version of the plant model."""
-    names = ModelOut.model_fields.keys() - {"version", "is_current", "study"}
-    fields = {name: getattr(row, name) for name in names}
-    about = {"version": row.number, "is_current": is_current, "study": row.study_id}
-    return ModelOut.model_validate(fields | about)
+    return from_row(ModelOut, row, version=row.number, is_current=is_current, study=row.study_id)
 
 
 def all_models(session: Session) -> list[ModelOut]:

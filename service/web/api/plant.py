@@ -9,7 +9,7 @@ from sqlalchemy.orm import Session
 from model.frames import wgs84_to_enu
 from model.plant import Plant, TargetPlane
 from service import store
-from service.base.fields import Model, Plane, ReceiverIn, TargetOf, Wgs84
+from service.base.fields import Model, Plane, ReceiverIn, TargetOf, Wgs84, from_row
 from service.sources.documents import parse_declared, read_receivers, read_targets
 from service.sources.schema import TowerMeasurements
 from service.store.plant.model_versions import declared_of, find_current
@@ -102,32 +102,12 @@ def plant_out(session: Session) -> PlantOut:
 
 def target_out(row: TargetRow) -> TargetOut:
     """A target plane as JSON."""
-    return TargetOut.model_validate(
-        {
-            "name": row.name,
-            "center": row.center_m,
-            "normal": row.normal,
-            "up": row.up,
-            "width": row.width_m,
-            "height": row.height_m,
-            "corners": row.corners,
-        }
-    )
+    return from_row(TargetOut, row, center=row.center_m, width=row.width_m, height=row.height_m)
 
 
 def receiver_out(row: ReceiverRow) -> ReceiverOut:
     """A cylindrical receiver as JSON."""
-    return ReceiverOut.model_validate(
-        {
-            "name": row.name,
-            "center": row.center_m,
-            "normal": row.normal,
-            "up": row.up,
-            "radius": row.radius_m,
-            "height": row.height_m,
-            "opening_deg": row.opening_deg,
-        }
-    )
+    return from_row(ReceiverOut, row, center=row.center_m, radius=row.radius_m, height=row.height_m)
 
 
 router = APIRouter(tags=["plant"])

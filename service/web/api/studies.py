@@ -19,6 +19,7 @@ from service.base.fields import (
     StudyReport,
     Verdict,
     Version,
+    from_row,
 )
 from service.jobs.kinds import KINDS
 from service.store.listing import Order, Period
@@ -83,20 +84,15 @@ class AdoptIn(Model):
     )
 
 
-def _study_fields(row: StudyRow, adopted: int | None) -> dict[str, object]:
-    names = StudySummary.model_fields.keys() - {"adopted"}
-    return {name: getattr(row, name) for name in names} | {"adopted": adopted}
-
-
 def study_summary(row: StudyRow, adopted: int | None) -> StudySummary:
     """A study without its figures. ``adopted`` is the version that was adopted from it."""
-    return StudySummary.model_validate(_study_fields(row, adopted))
+    return from_row(StudySummary, row, adopted=adopted)
 
 
 def study_out(row: StudyRow, adopted: int | None) -> StudyOut:
     """A study, loaded with its report, as JSON."""
     return StudyOut.model_validate(
-        {**row.report, **_study_fields(row, adopted), "skipped": row.skipped}
+        {**row.report, **dict(study_summary(row, adopted)), "skipped": row.skipped}
     )
 
 
