@@ -7,7 +7,6 @@ from pydantic import BaseModel, Field
 
 from service.base.fields import CreatedAt, Id, Version, from_row
 from service.store import audit
-from service.store.job_tables import AuditRow
 from service.web.auth.dependencies import ADMIN, Limit, RuntimeDep
 from service.web.responses.openapi import problems
 from service.web.responses.paging import Page, page
@@ -26,11 +25,6 @@ class AuditOut(BaseModel):
     detail: dict[str, object] = Field(description="More about it, by the kind of action.")
 
 
-def audit_out(row: AuditRow) -> AuditOut:
-    """An entry of the audit trail as JSON."""
-    return from_row(AuditOut, row)
-
-
 router = APIRouter(tags=["audit"])
 
 
@@ -43,5 +37,4 @@ def list_audit(
     """List the audit trail: who did what, newest first."""
     with runtime.database.reading() as session:
         rows = audit.entries(session, limit + 1, after)
-    items = [audit_out(row) for row in rows]
-    return page(items, limit)
+    return page([from_row(AuditOut, row) for row in rows], limit)

@@ -23,7 +23,7 @@ from service.jobs.kinds import predictions
 from service.jobs.kinds.predictions import PredictionsIn
 from service.sources.schema import WeatherFields
 from service.store.photographs.correction_log import list_corrections, made_from
-from service.store.tables import CorrectionRow, MeasurementRow
+from service.store.tables import MeasurementRow
 from service.twin.photographs.corrections import PhotographChanges, correct_photograph
 from service.twin.photographs.deletion import delete_photograph
 from service.twin.runtime.runtime import Runtime
@@ -95,11 +95,6 @@ class CorrectedOut(BaseModel):
     job: int | None = Field(
         description="The job that predicts the surface again, if one was requested."
     )
-
-
-def correction_out(row: CorrectionRow) -> CorrectionOut:
-    """A correction as JSON."""
-    return from_row(CorrectionOut, row)
 
 
 def predict_again(runtime: Runtime, heliostat: str, actor: str) -> int:
@@ -191,5 +186,5 @@ def get_corrections(
         row: MeasurementRow = store.get_measurement(
             session, store.get_heliostat(session, name), measurement
         )
-        items = [correction_out(correction) for correction in list_corrections(session, row)]
+        items = [from_row(CorrectionOut, one) for one in list_corrections(session, row)]
     return Page(items=items, next=None)
