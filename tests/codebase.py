@@ -209,7 +209,7 @@ def _is_record(annotation: ast.expr) -> bool:
 
 
 LIMITS = {
-    "lines of code": 35_057,
+    "lines of code": 34_930,
     "words that WORDS.md replaces": 0,
     "names of two or more classes": 0,
     f"functions above {MAX_PARAMETERS} parameters": 0,
@@ -217,7 +217,7 @@ LIMITS = {
     f"classes above {MAX_CLASS_LINES} lines": 0,
     "lines with latitude_deg": 15,
     "names of a forecast request's fields": 21,
-    "dict[str, Any] in service": 120,
+    "dict[str, Any] in service": 64,
 }
 """The most of each count. A limit is lowered when its count falls; it never rises."""
 
