@@ -24,7 +24,7 @@ from model.neighbours import clear
 from model.plant import Receiver, SurfaceGrid, TouchingPlanes
 from model.sunshape import half_angle
 from model.tracing.convolution import MAX_GRID, Raster, Rays, central_rays, raster, splat
-from model.tracing.scene import Optics, Scene, Window
+from model.tracing.scene import Optics, Scene, Size, Window, irradiance_of, optics_of
 
 # Light is traced beyond a window's edge up to this share of the sun's cone, plus a margin for
 # errors [rad].
@@ -86,8 +86,8 @@ def superpose(
     Parameters are those of `model.tracing.trace`. Raises `UnreachableError` if a mirror faces away
     from the sun or from the target.
     """
-    optics, rays = scene.optics_with(optics or Optics()), central_rays(scene, samples)
-    irradiance = scene.irradiance(optics, rays.slant_range)
+    optics, rays = optics_of(scene, optics or Optics()), central_rays(scene, samples)
+    irradiance = irradiance_of(scene, optics, rays.slant_range)
     center = rays.hits.new_zeros(scene.batch, 2)
     grid = raster(rays, center, window, optics, irradiance, _padding(rays, window, optics))
     spectra = torch.fft.rfft2(splat(grid.x, grid.y, grid.weight, *grid.shape)) * grid.transfer
@@ -96,7 +96,7 @@ def superpose(
     return SuperposedFlux(image, Beams.of(rays, irradiance), area * _sums(spectra, grid))
 
 
-def _padding(rays: Rays, window: Window, optics: Optics) -> tuple[float, float]:
+def _padding(rays: Rays, window: Window, optics: Optics) -> Size:
     """Heights and widths of the window beyond it up to which light is followed."""
     cone = half_angle(optics.sun_shape, _CONE_SHARE) + _ERRORS
     beyond = float((rays.slant_range * cone / -rays.direction[:, 2].clamp(max=-0.25)).max())
@@ -134,8 +134,8 @@ def project(
         plane_center=torch.tensor(touching.centers).to(scene.sun),
         plane_axes=torch.tensor(touching.axes).to(scene.sun),
     )
-    optics, rays = scene.optics_with(optics or Optics()), central_rays(scene, samples)
-    irradiance = scene.irradiance(optics, rays.slant_range)
+    optics, rays = optics_of(scene, optics or Optics()), central_rays(scene, samples)
+    irradiance = irradiance_of(scene, optics, rays.slant_range)
     window = _window(touching, grid)
     center = rays.hits.new_zeros(scene.batch, 2)
     on_grid = raster(rays, center, window, optics, irradiance, _padding(rays, window, optics))
