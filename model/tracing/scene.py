@@ -300,7 +300,7 @@ def _mirror_tensors(
     """Coverage and mirror optics of setups, where any is not that of a perfect rectangle."""
     heliostats = [setup.heliostat for setup in setups]
     tensors = {}
-    if any(heliostat.optics is not PERFECT for heliostat in heliostats):
+    if any(heliostat.optics != PERFECT for heliostat in heliostats):
         for name in ("reflectance", "slope_error", "pointing_error"):
             tensors[name] = tensor([getattr(h.optics, name) for h in heliostats])
     outlines = {tuple(facet.outline for facet in h.facets) for h in heliostats}

@@ -64,6 +64,10 @@ class MeasurementFolder(ABC):
         """
         return [m for m in self.read_measurements(heliostat) if m.images or not with_images]
 
+    def declared(self) -> dict[str, object]:
+        """The declared model in the form of ``twin.json``."""
+        return dict(declared_json(self.root / "twin.json"))
+
     @abstractmethod
     def read_measurements(self, heliostat: str) -> Iterator[Measurement]:
         """Iterate over all measurements of a heliostat by identifier, with their image files."""

@@ -299,7 +299,7 @@ class CalibrationProperties(Document, WeatherDocument):
     focal_spot: Spots | None = None
 
 
-def _parse_time(given: Any) -> Any:
+def parse_time(given: Any) -> Any:
     """A time in UTC, which is also the default zone; None stays."""
     if given is None:
         return None
@@ -313,5 +313,5 @@ def _parse_time(given: Any) -> Any:
 class ItemProperties(WeatherDocument):
     """Properties of a STAC item: its time, or a period, and the weather."""
 
-    taken_at: Annotated[datetime | None, BeforeValidator(_parse_time)] = Field(alias="datetime")
+    taken_at: Annotated[datetime | None, BeforeValidator(parse_time)] = Field(alias="datetime")
     start_datetime: Any = None
