@@ -22,7 +22,10 @@ from model.plant import PERFECT, Facet, Heliostat, MirrorOptics, Outline
 Array = NDArray[np.float64]
 
 CIRCLE_CORNERS = 48
-"""Corners of the polygon that stands for a round facet; it has the circle's area."""
+"""Corners of the polygon in place of a round facet; it has the circle's area."""
+
+Size = tuple[float, float]
+"""Width and height [m]."""
 
 # --- mounts
 # --------------------------------------------------------------------------------------------------
@@ -234,7 +237,7 @@ class HeliostatType:
             )
 
     @property
-    def size(self) -> tuple[float, float]:
+    def size(self) -> Size:
         """Width and height [m] of the rectangle that bounds the whole mirror."""
         reach = [(abs(f.center[:2]) + np.array([f.width, f.height]) / 2) for f in self.facets]
         width, height = 2 * np.max(reach, axis=0)

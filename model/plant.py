@@ -307,12 +307,15 @@ class TouchingPlanes:
         Of windows that show the whole receiver from each mirror.
     opening : callable or None
         Share of light that passes each cell of a window of (rows, columns).
+    screens : (K, 3, 3) [m] or None
+        Rectangles, centre and half sides, behind which the receiver gets no light.
     """
 
     centers: Vector
     axes: Vector
     size: tuple[float, float]
     opening: Callable[[int, int], Vector] | None = None
+    screens: Vector | None = None
 
 
 def windows_on(grid: SurfaceGrid, mirrors: Vector, origins: Vector, axes: Vector) -> TouchingPlanes:

@@ -3,7 +3,7 @@
 Their map has the panels from left to right, with columns by their widths.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from model.plant import SurfaceGrid, TargetPlane, TouchingPlanes, Vector, inside
 
 @dataclass(frozen=True, eq=False)
 class Panels:
-    """Planes of one height side by side, lit from outside; none hides another.
+    """Planes of one height side by side, lit from outside.
 
     Attributes
     ----------
@@ -99,7 +99,14 @@ class Panels:
         edges = _joined(self.panels, 3, 3 * len(self.panels), edges=True)
         depth = (edges.points.reshape(-1, 3) - self.center) @ normals.T
         origins = self.center + depth.max(axis=0)[:, None] * normals
-        return windows_on(edges, mirrors, origins, axes)
+        return replace(windows_on(edges, mirrors, origins, axes), screens=self._screens)
+
+    @property
+    def _screens(self) -> Vector:
+        """The panels as rectangles (K, 3, 3) [m], which may hide each other."""
+        return np.array(
+            [[p.center, p.width / 2 * p.right, p.height / 2 * p.up] for p in self.panels]
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +161,7 @@ class Cavity(Panels):
             inside = inside_outline(places[..., 0], places[..., 1], outline)
             return np.asarray(inside.reshape(rows, _FINE, columns, _FINE).mean(axis=(1, 3)))
 
-        return TouchingPlanes(same.centers, same.axes, same.size, opening)
+        return replace(same, opening=opening, screens=self._screens)
 
 
 _FINE = 8

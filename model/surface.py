@@ -218,6 +218,13 @@ def nominal_heights(heliostat: Heliostat, shape: tuple[int, int] = (ROWS, COLUMN
     return np.asarray(heights - heights.mean(axis=(1, 2), keepdims=True))
 
 
+def heights_or_ideal(heliostat: Heliostat, z: ArrayLike | None) -> Array:
+    """Heights ``z`` (F, I, J) [m]; zeros, the ideal surface, for None."""
+    if z is None:
+        return np.zeros((len(heliostat.facets), ROWS, COLUMNS))
+    return np.asarray(z, dtype=np.float64)
+
+
 def control_points(heliostat: Heliostat, z: ArrayLike | None = None) -> Array:
     """Control points (F, I, J, 3) [m] in mirror coordinates of heights ``z`` (F, I, J) [m] over the
     ideal facets.
@@ -225,11 +232,7 @@ def control_points(heliostat: Heliostat, z: ArrayLike | None = None) -> Array:
     None gives the ideal surface: flat or focused facets in their ideal poses.
     """
     centers, axes, half_sizes = heliostat.facet_frames
-    heights = (
-        np.zeros((len(heliostat.facets), ROWS, COLUMNS))
-        if z is None
-        else np.asarray(z, dtype=np.float64)
-    )
+    heights = heights_or_ideal(heliostat, z)
     if heights.ndim != 3 or len(heights) != len(heliostat.facets) or not np.isfinite(heights).all():
         raise InvalidInputError(
             f"z must be finite heights (facets, i, j) for {len(heliostat.facets)} facets"

@@ -44,7 +44,7 @@ from model.neighbours import clear
 from model.sunshape import FREQUENCY_COUNT, FREQUENCY_STEP, SunShape, half_angle, transfer_table
 from model.sunshape.base import SOFT_FROM
 from model.surface import edge_basis, midpoint_basis, sample
-from model.tracing.scene import Optics, Scene, Size, Window
+from model.tracing.scene import Optics, Scene, Size, Window, irradiance_of, optics_of
 
 Result = TypeVar("Result")
 
@@ -503,8 +503,8 @@ def trace(
         tracking_jitter=_of_parts(optics.tracking_jitter, parts),
         pointing_error=_of_parts(optics.pointing_error, parts),
     )
-    optics = traced.optics_with(optics)
-    irradiance = traced.irradiance(optics, rays.slant_range)
+    optics = optics_of(traced, optics)
+    irradiance = irradiance_of(traced, optics, rays.slant_range)
     image = _image(
         rays,
         center.repeat_interleave(parts, dim=0),

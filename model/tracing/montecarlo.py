@@ -19,7 +19,7 @@ from model.errors import InvalidInputError
 from model.mount import rotation
 from model.sunshape import Pillbox, random_angles
 from model.surface import basis
-from model.tracing.scene import Optics, Scene, Window
+from model.tracing.scene import Optics, Scene, Window, optics_of
 
 Array = NDArray[np.float64]
 
@@ -194,7 +194,7 @@ def trace_montecarlo(
     """Trace every mirror of a scene with ``rays`` random rays, at least one."""
     if rays < 1:
         raise InvalidInputError("rays must be at least one")
-    optics = scene.optics_with(optics or Optics())
+    optics = optics_of(scene, optics or Optics())
     rng = np.random.default_rng(seed)
     images, spots = [], []
     for index in range(scene.batch):

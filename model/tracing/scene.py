@@ -265,24 +265,6 @@ class Scene:
         sun = torch.einsum("bij,bj->bi", self.plane_axes, self.sun)
         return PlaneScene(points, center, sun)
 
-    def optics_with(self, optics: Optics) -> Optics:
-        """The optics with the mirrors' own slope and pointing errors, which add in variance."""
-        if self.slope_error is None or self.pointing_error is None:
-            return optics
-        slope, pointing = (
-            (torch.as_tensor(common).to(own) ** 2 + own**2).sqrt()
-            for common, own in (
-                (optics.slope_error, self.slope_error),
-                (optics.pointing_error, self.pointing_error),
-            )
-        )
-        return replace(optics, slope_error=slope, pointing_error=pointing)
-
-    def irradiance(self, optics: Optics, slant_range: Tensor) -> Tensor:
-        """Irradiance (B,) [W/m2] of the light after mirror and air, for slant ranges (B,) [m]."""
-        common = optics.irradiance(slant_range)
-        return common if self.reflectance is None else common * self.reflectance
-
     def in_plane_frame(self, rectangles: Tensor | None) -> Tensor | None:
         """Obstacles or shades (B, K, 3, 3) [m] in the frame of each target plane."""
         if rectangles is None:
@@ -290,6 +272,26 @@ class Scene:
         origin = torch.zeros_like(rectangles)
         origin[..., 0, :] = self.plane_center[:, None]
         return (rectangles - origin) @ self.plane_axes.transpose(-1, -2)[:, None]
+
+
+def optics_of(scene: Scene, optics: Optics) -> Optics:
+    """The optics with the mirrors' own slope and pointing errors, which add in variance."""
+    if scene.slope_error is None or scene.pointing_error is None:
+        return optics
+    slope, pointing = (
+        (torch.as_tensor(common).to(own) ** 2 + own**2).sqrt()
+        for common, own in (
+            (optics.slope_error, scene.slope_error),
+            (optics.pointing_error, scene.pointing_error),
+        )
+    )
+    return replace(optics, slope_error=slope, pointing_error=pointing)
+
+
+def irradiance_of(scene: Scene, optics: Optics, slant_range: Tensor) -> Tensor:
+    """Irradiance (B,) [W/m2] of the light after mirrors and air, for slant ranges (B,) [m]."""
+    common = optics.irradiance(slant_range)
+    return common if scene.reflectance is None else common * scene.reflectance
 
 
 def _mirror_tensors(

@@ -15,14 +15,16 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from model.errors import InvalidInputError
+from model.neighbours import clear
 from model.plant import Receiver, SurfaceGrid, TouchingPlanes
 from model.sunshape import half_angle
 from model.tracing.convolution import MAX_GRID, Raster, Rays, central_rays, raster, splat
-from model.tracing.scene import Optics, Scene, Window
+from model.tracing.scene import Optics, Scene, Size, Window, irradiance_of, optics_of
 
 # Light is traced beyond a window's edge up to this share of the sun's cone, plus a margin for
 # errors [rad].
@@ -84,8 +86,8 @@ def superpose(
     Parameters are those of `model.tracing.trace`. Raises `UnreachableError` if a mirror faces away
     from the sun or from the target.
     """
-    optics, rays = scene.optics_with(optics or Optics()), central_rays(scene, samples)
-    irradiance = scene.irradiance(optics, rays.slant_range)
+    optics, rays = optics_of(scene, optics or Optics()), central_rays(scene, samples)
+    irradiance = irradiance_of(scene, optics, rays.slant_range)
     center = rays.hits.new_zeros(scene.batch, 2)
     grid = raster(rays, center, window, optics, irradiance, _padding(rays, window, optics))
     spectra = torch.fft.rfft2(splat(grid.x, grid.y, grid.weight, *grid.shape)) * grid.transfer
@@ -94,7 +96,7 @@ def superpose(
     return SuperposedFlux(image, Beams.of(rays, irradiance), area * _sums(spectra, grid))
 
 
-def _padding(rays: Rays, window: Window, optics: Optics) -> tuple[float, float]:
+def _padding(rays: Rays, window: Window, optics: Optics) -> Size:
     """Heights and widths of the window beyond it up to which light is followed."""
     cone = half_angle(optics.sun_shape, _CONE_SHARE) + _ERRORS
     beyond = float((rays.slant_range * cone / -rays.direction[:, 2].clamp(max=-0.25)).max())
@@ -132,8 +134,8 @@ def project(
         plane_center=torch.tensor(touching.centers).to(scene.sun),
         plane_axes=torch.tensor(touching.axes).to(scene.sun),
     )
-    optics, rays = scene.optics_with(optics or Optics()), central_rays(scene, samples)
-    irradiance = scene.irradiance(optics, rays.slant_range)
+    optics, rays = optics_of(scene, optics or Optics()), central_rays(scene, samples)
+    irradiance = irradiance_of(scene, optics, rays.slant_range)
     window = _window(touching, grid)
     center = rays.hits.new_zeros(scene.batch, 2)
     on_grid = raster(rays, center, window, optics, irradiance, _padding(rays, window, optics))
@@ -141,13 +143,14 @@ def project(
     if touching.opening is not None:
         opening = touching.opening(window.rows, window.columns)
         kernels = kernels * torch.tensor(opening).to(kernels)
-    places = grid.areas.size
-    step = max(1, _PROJECTED // places)
+    step = max(1, _PROJECTED // grid.areas.size)
     image, intercepted = torch.zeros(resolution), []
     areas = torch.tensor(grid.areas).to(kernels)
     for start in range(0, scene.batch, step):
         part = slice(start, start + step)
         seen = _projected(kernels[part], scene, part, window, grid)
+        if touching.screens is not None:
+            seen = seen * _in_sight(touching.screens, scene.center[part], grid)
         image = image + seen.sum(0)
         intercepted.append((seen * areas).sum(dim=(-2, -1)))
     return SuperposedFlux(image, Beams.of(rays, irradiance), torch.cat(intercepted))
@@ -188,3 +191,20 @@ def _projected(
     light = grid_sample(kernels[:, None], places, padding_mode="border", align_corners=False)[:, 0]
     seen: Tensor = light * scale**2 * toward.clamp(max=0) / ahead[2].clamp(max=-1e-6)
     return seen
+
+
+def _in_sight(screens: NDArray[np.float64], mirrors: Tensor, grid: SurfaceGrid) -> Tensor:
+    """Share (b, rows, columns) of places that no screen (K, 3, 3) hides from mirrors (b, 3)."""
+    count = len(mirrors)
+    points = torch.tensor(grid.points).to(mirrors).flatten(0, 1).T.expand(count, -1, -1)
+    ways = mirrors[:, :, None] - points
+    ways = ways / ways.norm(dim=1, keepdim=True)
+    # A place does not hide itself.
+    points = points + _OFF * ways
+    rectangles = torch.tensor(screens).to(mirrors).expand(count, -1, -1, -1)
+    free = clear(rectangles, points, ways, mirrors.new_full((count,), _OFF))
+    return free.view(count, *grid.areas.shape)
+
+
+_OFF = 0.01
+"""Distance [m] before a receiver from which screens are looked for, and width of their edges."""

@@ -15,7 +15,7 @@ from model.ephemeris import sun_angles_at
 from model.errors import InvalidInputError
 from model.fleet import LOSSES, FleetFlux, Losses, aligned_field, field_losses, superpose, tiles
 from model.fleet import Superposition as Task
-from model.frames import sun_direction
+from model.frames import SunAngles, sun_direction
 from model.plant import Heliostat, Receiver
 from model.plant_model import PlantModel
 from model.setup import Setup
@@ -36,7 +36,8 @@ _RAYS = 24
 
 _LEAST_RAYS = 4
 
-_HORIZON_DEG = 0.0
+Resolution = tuple[int, int]
+"""Rows and columns."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +64,7 @@ class FieldRequest:
     dni_w_m2: float | None = None
     aims: dict[str, Array | None] | None = None
     surfaces: Path | None = None
-    resolution: tuple[int, int] | None = None
+    resolution: Resolution | None = None
 
 
 class FieldReport(TypedDict):
@@ -88,7 +89,7 @@ class FieldFlux:
 
 def sun_of(
     plant: PlantDescription, sun: tuple[float, float] | None, at: datetime | None
-) -> tuple[float, float]:
+) -> SunAngles[float]:
     """Azimuth from north and elevation [deg] of the sun, given or at a time.
 
     Raises
@@ -101,10 +102,10 @@ def sun_of(
     azimuth, elevation = sun or (0.0, 0.0)
     if at is not None:
         azimuth, elevation = sun_angles_at(at, plant.plant.origin)
-    if not (math.isfinite(azimuth) and _HORIZON_DEG < elevation <= 90):
+    if not (math.isfinite(azimuth) and 0 < elevation <= 90):
         given = "--sun: elevation" if at is None else "--at: the sun's elevation"
         raise InvalidInputError(f"{given} must lie in (0, 90] degrees, got {elevation:g}")
-    return float(azimuth) % 360, float(elevation)
+    return SunAngles(float(azimuth) % 360, float(elevation))
 
 
 def clear_sky_dni(elevation_deg: float, altitude_m: float) -> float:
@@ -168,7 +169,7 @@ def _aim(row: dict[str, str], where: str) -> Array | None:
     return aim
 
 
-def resolution_of(receiver: Receiver) -> tuple[int, int]:
+def resolution_of(receiver: Receiver) -> Resolution:
     """Rows and columns of a map with square pixels."""
     columns = round(ROWS * receiver.width / receiver.height)
     return ROWS, min(max(columns, ROWS // 4), _MAX_COLUMNS)

@@ -351,7 +351,7 @@ def _optics(declared: Any, where: str) -> Optics:
     return Optics(reflectivity=document.reflectivity, attenuation=attenuation)
 
 
-def optics_to_json(optics: Optics) -> dict[str, Any]:
+def optics_to_json(optics: Optics) -> dict[str, object]:
     """Reflectivity and attenuation in the form of ``twin.json``, with defaults."""
     return {"reflectivity": optics.reflectivity, "attenuation": list(optics.attenuation)}
 

@@ -54,7 +54,7 @@ class MeasurementFolder(ABC):
     plant: Plant
     model: PlantModel
     skipped: dict[str, str]
-    properties: dict[str, Any] = field(default_factory=dict)
+    properties: dict[str, dict[str, object]] = field(default_factory=dict)
     broken: dict[str, str] = field(default_factory=dict)
 
     def measurements(self, heliostat: str, with_images: bool = True) -> list[Measurement]:

@@ -22,6 +22,7 @@ from service.base.errors import (
     NotFoundError,
     TooLargeError,
     UnsupportedImageError,
+    list_reasons,
 )
 from service.base.names import escape_control_characters
 from service.base.progress import Progress, no_progress
@@ -112,9 +113,7 @@ def import_folder(
         except UNREADABLE as error:
             imported.skipped[name] = str(error)
     if not any(what.startswith("heliostats ") for what in imported.counts):
-        reasons = "; ".join(
-            f"{what}: {why}" for what, why in list(imported.to_json()["skipped"].items())[:3]
-        )
+        reasons = list_reasons(imported.to_json()["skipped"])
         raise ModelError(f"no heliostat could be imported ({reasons})")
     return imported.to_json()
 
