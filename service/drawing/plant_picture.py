@@ -25,7 +25,7 @@ def plant_picture(
     type_of: Mapping[str, str],
     tower: Tower | None,
 ) -> bytes:
-    """A plant from above, heliostats coloured by type, and its tower from the side.
+    """A plant from above, its heliostats coloured by type, and its tower from the side.
 
     ``type_of`` has the names of types by heliostat.
     """

@@ -3,7 +3,7 @@
 import csv
 import io
 import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -186,45 +186,6 @@ def _heliostat(row: CsvRow) -> HeliostatEntry:
         receiver=row.cells.get("receiver") or None,
         focal_length_m=row.optional("focal_length_m", 0.01, 1e5),
     )
-
-
-# --- aim points
-# --------------------------------------------------------------------------------------------------
-
-_AIMS = CsvColumns(("name", "east_m", "north_m", "up_m"), ("active",))
-_ACTIVE = {"true": True, "false": False, "1": True, "0": False, "": True}
-
-
-@dataclass(frozen=True, eq=False)
-class AimPoints:
-    """Aim points (3,) [m] by heliostat, and the heliostats that are not active."""
-
-    points: Mapping[str, Array]
-    inactive: frozenset[str] = frozenset()
-
-
-def read_aims(path: Path, heliostats: Collection[str]) -> AimPoints:
-    """Aim points of a CSV file: ``name,east_m,north_m,up_m`` and optionally ``active``.
-
-    Raises
-    ------
-    InvalidInputError
-        It names file and line, also of a heliostat that is none of ``heliostats``.
-    """
-    points: dict[str, Array] = {}
-    inactive = set()
-    for row in read_rows(path, _AIMS, MAX_HELIOSTATS):
-        name, active = row.cells["name"], row.cells.get("active", "").lower()
-        if name not in heliostats:
-            raise row.wrong("name", f"{name[:60]!r} is no heliostat of the plant")
-        if name in points:
-            raise row.wrong("name", f"{name} is there twice; keep one")
-        if active not in _ACTIVE:
-            raise row.wrong("active", f"must be true or false, got {active[:60]!r}")
-        points[name] = np.array([row.number(axis) for axis in ("east_m", "north_m", "up_m")])
-        if not _ACTIVE[active]:
-            inactive.add(name)
-    return AimPoints(points, frozenset(inactive))
 
 
 # --- facets

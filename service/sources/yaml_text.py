@@ -119,7 +119,9 @@ def _problem(error: yaml.YAMLError) -> str:
 
 
 def _shown(key: str) -> str:
-    return key if len(key) <= 60 else f"{key[:60]}.."
+    """A key in one line of a message."""
+    line = " ".join(key.split())
+    return line if len(line) <= 60 else f"{line[:60]}.."
 
 
 class _Composer:

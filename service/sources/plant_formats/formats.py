@@ -1,6 +1,10 @@
 """Formats of other programs: which one a file has, and how a plant is written in one."""
 
+from collections.abc import Mapping
 from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
 
 from model.errors import InvalidInputError
 from model.frames import sun_direction
@@ -11,7 +15,8 @@ from service.sources.plant_formats.solarpilot import read_solarpilot, solarpilot
 from service.sources.plant_formats.soltrace import read_soltrace
 from service.sources.plant_formats.soltrace_export import soltrace_text
 from service.sources.plant_formats.text import read_lines
-from service.sources.plant_tables import AimPoints
+
+Array = NDArray[np.float64]
 
 
 def read_foreign(path: Path) -> ImportedPlant:
@@ -33,22 +38,23 @@ def foreign_text(
     described: PlantDescription,
     to: str,
     sun_deg: tuple[float, float] | None,
-    aims: AimPoints | None,
+    aims: Mapping[str, Array | None],
 ) -> str:
     """A plant as text for ``solarpilot`` or ``soltrace``.
 
-    ``sun_deg`` is azimuth from north over east and elevation [deg]; SolTrace needs it.
+    ``sun_deg`` is azimuth from north over east and elevation [deg]; SolTrace needs it. ``aims`` are
+    points (3,) [m] by heliostat, None for one that is not active.
 
     Raises
     ------
     InvalidInputError
         If the format cannot say what the plant has, or the sun is missing or below the horizon.
     """
-    points = {} if aims is None else aims.points
-    if aims is not None and aims.inactive:
+    points = {name: aim for name, aim in aims.items() if aim is not None}
+    if len(points) < len(aims):
         raise InvalidInputError(
-            f"{len(aims.inactive)} heliostats are not active; neither format can say that, leave"
-            " them out of the plant"
+            f"{len(aims) - len(points)} heliostats are not active, which neither format can say;"
+            " leave them out of the plant"
         )
     if to == "solarpilot":
         return solarpilot_layout(described, points)

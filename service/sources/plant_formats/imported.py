@@ -2,7 +2,7 @@
 
 import csv
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,6 +11,7 @@ import yaml
 from numpy.typing import NDArray
 
 from model.errors import InvalidInputError
+from model.site import Origin, Site
 from service.sources.plant_schema import HeliostatEntry
 
 Array = NDArray[np.float64]
@@ -108,3 +109,9 @@ def placed(
         receiver=None,
         focal_length_m=focal_length,
     )
+
+
+def site(name: str, origin: Origin, time_zone: str) -> dict[str, object]:
+    """The part ``plant`` of plant.yaml."""
+    keys = [entry.name for entry in fields(Site)]
+    return {"name": name, **dict(zip(keys, origin, strict=True)), "time_zone": time_zone}

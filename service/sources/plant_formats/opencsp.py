@@ -10,7 +10,7 @@ from pathlib import Path
 
 from model.errors import InvalidInputError
 from service.base.names import NAME, require_name
-from service.sources.plant_formats.imported import ImportedPlant, placed
+from service.sources.plant_formats.imported import ImportedPlant, placed, site
 from service.sources.plant_formats.text import ForeignLine, read_lines
 from service.sources.plant_schema import MAX_HELIOSTATS, HeliostatEntry
 
@@ -57,13 +57,7 @@ def read_opencsp(path: Path) -> ImportedPlant:
         heliostats.append(placed(name, kind, (east, north, up - mirror[3])))
     return ImportedPlant(
         parts={
-            "plant": {
-                "name": "nsttf",
-                "latitude_deg": 34.962,
-                "longitude_deg": -106.509,
-                "altitude_m": 1649.0,
-                "time_zone": "America/Denver",
-            },
+            "plant": site("nsttf", (34.962, -106.509, 1649.0), "America/Denver"),
             "heliostat_types": {name: _type(mirror) for mirror, name in kinds.items()},
             "receivers": {
                 "main": {

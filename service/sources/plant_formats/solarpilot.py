@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from model.errors import InvalidInputError
 from service.sources.plant_file import PlantDescription
-from service.sources.plant_formats.imported import ImportedPlant, placed
+from service.sources.plant_formats.imported import ImportedPlant, placed, site
 from service.sources.plant_formats.text import ForeignLine, read_lines
 from service.sources.plant_receivers import aim_of
 from service.sources.plant_schema import MAX_HELIOSTATS, HeliostatEntry
@@ -103,13 +103,7 @@ def _plant(
     }
     return ImportedPlant(
         parts={
-            "plant": {
-                "name": "solarpilot",
-                "latitude_deg": 34.867,
-                "longitude_deg": -116.783,
-                "altitude_m": 586.0,
-                "time_zone": "America/Los_Angeles",
-            },
+            "plant": site("solarpilot", (34.867, -116.783, 586.0), "America/Los_Angeles"),
             "heliostat_types": {kind: dict(mirror) for kind in sorted(kinds)},
             "receivers": {"main": guess.entry},
         },

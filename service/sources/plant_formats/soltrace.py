@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from model.errors import InvalidInputError
 from model.frames import sun_angles
-from service.sources.plant_formats.imported import ImportedPlant, placed
+from service.sources.plant_formats.imported import ImportedPlant, placed, site
 from service.sources.plant_formats.text import ForeignLine, read_lines
 from service.sources.plant_schema import MAX_HELIOSTATS, HeliostatEntry
 from service.sources.yaml_text import file_name
@@ -228,7 +228,7 @@ def read_soltrace(path: Path) -> ImportedPlant:
     azimuth, elevation = (float(angle) for angle in sun_angles(given.sun))
     return ImportedPlant(
         parts={
-            "plant": {"name": "soltrace", **_NOWHERE},
+            "plant": site("soltrace", (0.0, 0.0, 0.0), "UTC"),
             "heliostat_types": {name: _type(kind, given.optics) for kind, name in kinds.items()},
             "receivers": {"main": entry},
             "sun": _sun(given),
@@ -249,9 +249,6 @@ def read_soltrace(path: Path) -> ImportedPlant:
             ),
         ),
     )
-
-
-_NOWHERE = {"latitude_deg": 0.0, "longitude_deg": 0.0, "altitude_m": 0.0}
 
 
 def _kind(mirror: Element) -> tuple[object, ...]:

@@ -36,6 +36,32 @@ atmosphere: {attenuation: [0.006789, 0.1046, -0.0107, 0.002845]}
 """
 """The plant of the file format's contract, with a second type."""
 
+RICH = PLANT.replace(
+    "mount: {kind: pitch_roll}",
+    "mount: {kind: target_aligned, drives: [{kind: rotary, gear: 18000}, {kind: linear,"
+    " increment_steps_per_m: 154166666, initial_stroke_length_m: 0.075, offset_m: 0.34,"
+    " pivot_radius_m: 0.3191, initial_angle_rad: -0.01, clockwise: false,"
+    " max_increment_steps: 69296}]}",
+)
+for _old, _new in (
+    ("canting: on_axis", "canting: {off_axis: {azimuth_deg: 180, elevation_deg: 40}}"),
+    ("facet_shape: flat", "facet_shape: {focal_length_m: 300}"),
+    ("{shape: pillbox, half_angle_mrad: 4.65}", "{shape: buie, csr: 0.05}"),
+    ("{attenuation: [0.006789, 0.1046, -0.0107, 0.002845]}", "{visibility_km: 23}"),
+    ("width_m: 12,", "width_m: 12, camera: {homography: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]},"),
+    (
+        "  board:",
+        "  cave: {kind: cavity, aperture_m: [[7, -1, 94], [-7, -1, 94], [-7, 1, 106], [7, 1, 106]],"
+        " panels: [{center_m: [0, -5, 100], normal: [0, 1, 0], width_m: 5.4, height_m: 12}]}\n"
+        "  walls: {kind: panels, panels: [{center_m: [0, -5, 100], normal: [0, 1, 0],"
+        " width_m: 5.4, height_m: 12}]}\n"
+        "  board:",
+    ),
+):
+    assert _old in RICH
+    RICH = RICH.replace(_old, _new, 1)
+"""The same plant with what else the format has."""
+
 LAYOUT = """\
 name,type,east_m,north_m,up_m,receiver,focal_length_m
 A1,large,0,200,0,,

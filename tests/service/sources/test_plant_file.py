@@ -1,5 +1,6 @@
 """plant.yaml: what is read, and that every mistake is named with its line and key."""
 
+import re
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -16,7 +17,7 @@ from model.sunshape import Buie, Pillbox
 from model.sunshape.buie import csr_of_chi
 from service.sources.plant_file import read_plant
 from tests.service.sources import plant_files
-from tests.service.sources.plant_files import FACETS, LAYOUT, PLANT, write_plant
+from tests.service.sources.plant_files import FACETS, LAYOUT, PLANT, RICH, write_plant
 
 
 def test_contract_is_read(tmp_path: Path):
@@ -285,6 +286,40 @@ def test_nothing_but_a_refusal(
     layout = LAYOUT[: row[0]] + cell + LAYOUT[row[0] + row[1] :]
     path = write_plant(tmp_path_factory.mktemp("fuzz"), text, layout)
     assert "\n" not in _refusal(path)
+
+
+VALUES = [
+    (text, found.span())
+    for text in (PLANT, RICH)
+    for found in re.finditer(r"(?<=[ \[])(-?[0-9.]+|[A-Za-z_/]+)(?=[,}\]\n])", text)
+]
+ODD = [
+    "0",
+    "-1",
+    "1e-300",
+    "1e300",
+    "1e5",
+    "-1e6",
+    "360",
+    "x",
+    "[]",
+    "{}",
+    "null",
+    "true",
+    '""',
+    "[1, 2, 3]",
+]
+
+
+@settings(max_examples=250, deadline=None, suppress_health_check=list(HealthCheck))
+@given(value=st.sampled_from(VALUES), odd=st.sampled_from(ODD))
+def test_odd_values_are_read_or_named_with_their_line(
+    tmp_path_factory: pytest.TempPathFactory, value: tuple[str, tuple[int, int]], odd: str
+):
+    text, (begin, end) = value
+    path = write_plant(tmp_path_factory.mktemp("odd"), text[:begin] + odd + text[end:])
+    refusal = _refusal(path)
+    assert not refusal or re.search(r", line [0-9]+: ", refusal)
 
 
 @settings(max_examples=100, deadline=None, suppress_health_check=list(HealthCheck))
