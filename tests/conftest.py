@@ -4,6 +4,8 @@ import fcntl
 import gc
 import os
 import shutil
+import subprocess
+import sys
 import tempfile
 
 # Two cores, several test processes: threads of linear algebra would only spin against each other.
@@ -11,6 +13,7 @@ for _library in ("OMP", "OPENBLAS", "MKL"):
     os.environ.setdefault(f"{_library}_NUM_THREADS", "1")
 
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +29,7 @@ from service.cli.demo_plant import write_plant
 from tests.benchmarks import data_folder
 from tests.undeclared import camera
 from tests.waiting import WAIT_LIMIT_S
+from tests.watched import NotWatchedError, environment, watching
 
 torch.set_num_threads(1)
 
@@ -145,6 +149,34 @@ def pair_plant(made_plant: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
                 shutil.copytree(path, root / path.name)
 
     return made_once(tmp_path_factory, "pair-plant", copy)
+
+
+@pytest.fixture(scope="session")
+def demonstration(pair_plant: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder in which ``heliotwin demo`` ran; read it only.
+
+    ``out/demo`` is what it leaves, ``said`` what it said. ``calls`` is the record of its
+    connections (`tests.watched`), where they can be watched.
+    """
+
+    def make(folder: Path) -> None:
+        shutil.copytree(pair_plant, folder / "out" / "demo" / "plant")
+        watch: list[str] = []
+        with suppress(NotWatchedError):
+            watch = watching(folder / "calls")
+        command = [*watch, sys.executable, "-m", "service", "demo", "--data", "out/demo/plant"]
+        done = subprocess.run(
+            command,
+            cwd=folder,
+            env=environment(folder),
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
+        (folder / "said").write_text(done.stderr, encoding="utf-8")
+
+    return made_once(tmp_path_factory, "demonstration", make)
 
 
 def flat_heliostat(
