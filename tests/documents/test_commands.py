@@ -20,7 +20,7 @@ from tests.service.conftest import QUIET, serving
 
 from .prose import DOCS, ROOT
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("documents")]
+pytestmark = [pytest.mark.slow]
 
 PAGES = [
     ROOT / "README.md",
