@@ -232,13 +232,12 @@ def _cases(figure: Entry) -> str:
 
 
 def _reference(key: Entry) -> str:
-    """What a key figure is compared with, and the published figures next to it."""
+    """What a key figure is compared with, and the published figure next to it."""
     parts = [key["figure"]["compared_with"]] if "compared_with" in key["figure"] else []
     if "published" in key:
-        own = [one for one in read("published")["figures"] if one["row"] == key["published"]]
-        values = ", ".join(f"{one['name']} {_value(one)}" for one in own)
-        cases = _cases(own[0])
-        parts.append(f"{key['published']}: {values}{f' ({cases})' * bool(cases)}")
+        published = find("published", "Published figures", *key["published"])
+        cases = _cases(published)
+        parts.append(f"{key['published'][0]}: {_value(published)}{f' ({cases})' * bool(cases)}")
     return "; ".join(parts)
 
 
@@ -246,39 +245,40 @@ def _missed(figure: Entry) -> str:
     return goal(figure) if is_missed(figure) else ""
 
 
+KEY_HEAD = ["figure", "value", "n", "compared with", "goal, if missed"]
+
+
+def _key_row(key: Entry) -> list[str]:
+    figure = key["figure"]
+    value = shown(figure, figure.get("unit", ""))
+    return [key["what"], value, _cases(figure), _reference(key), _missed(figure)]
+
+
 def key_table(prefix: str = "") -> str:
-    """The key figures with their origin; links to topic pages begin with ``prefix``."""
-    pages = topic_pages()
-    rows = [
-        [
-            f"[{key['what']}]({prefix}{pages[key['at'][0]]})",
-            _value(key["figure"]),
-            _cases(key["figure"]),
-            _reference(key),
-            _missed(key["figure"]),
-            place(key["record"]) + ", transcribed" * ("transcribed" in key["record"]),
-            f"`{key['record']['command']}`",
-        ]
-        for key in key_figures()
+    """The key figures, and below them their runs; links to topic pages begin with ``prefix``."""
+    pages, keys = topic_pages(), key_figures()
+    runs = list(dict.fromkeys(key["at"][0] for key in keys))
+    rows = []
+    for key in keys:
+        run = key["at"][0]
+        what, _, *cells = _key_row(key)
+        link = f"[{what}]({prefix}{pages[run]})"
+        rows.append(
+            [link, _value(key["figure"]), *cells, key["record"]["date"], str(runs.index(run) + 1)]
+        )
+    figures = markdown([*KEY_HEAD, "date", "run"], rows)
+    origins = [
+        [str(number), f"`{one['command']}`", place(one), "yes" * ("transcribed" in one)]
+        for number, one in enumerate(map(read, runs), 1)
     ]
-    head = ["figure", "value", "n", "compared with", "goal, if missed", "measured", "command"]
-    return markdown(head, rows)
+    head = ["run", "command", "date, commit and machine", "transcribed"]
+    return f"{figures}\n\n{markdown(head, origins)}"
 
 
 def readme_table() -> str:
     """The key figures of README."""
-    rows = [
-        [
-            key["what"],
-            _value(key["figure"]),
-            _cases(key["figure"]),
-            _reference(key),
-            _missed(key["figure"]),
-        ]
-        for key in key_figures()
-        if key.get("in_readme")
-    ]
-    return markdown(["what", "result", "n", "compared with", "goal, if missed"], rows)
+    rows = [_key_row(key) for key in key_figures() if key.get("in_readme")]
+    return markdown(KEY_HEAD, rows)
 
 
 def comparison_table() -> str:

@@ -187,13 +187,16 @@ def table(cases: list[Case]) -> None:
         ]
         print(f"| {law} | {used.sum()} of {len(cases)} | {' | '.join(figures)} |")
         is_light = law == "light"
+        days = [case.day for case, is_used in zip(cases, used, strict=True) if is_used]
         log_row(
             "All photographs, nothing fitted",
             f"taken as {law}",
             {
                 "used [%]": Estimate(100 * used.mean(), goal=">= 80" if is_light else None),
                 "accuracy, mean": Estimate(
-                    plain[used].mean(), goal=">= 0.92" if is_light else None
+                    plain[used].mean(),
+                    interval(plain[used], days, rounds=1000),
+                    goal=">= 0.92" if is_light else None,
                 ),
                 "median": Estimate(np.median(plain[used]), goal=">= 0.935" if is_light else None),
                 "below 0.85": int((plain < 0.85).sum()),
@@ -202,7 +205,7 @@ def table(cases: list[Case]) -> None:
             },
             n=int(used.sum()),
             of="photographs",
-            compared_with="forecasts by the measured surface",
+            compared_with="forecasts by the measured surface, intervals over days",
         )
     reasons = {case.name: case.measured["light"].quality.reason for case in cases}
     print(f"refused: { {name: reason for name, reason in reasons.items() if reason} }")

@@ -28,7 +28,7 @@ from model.site import JUELICH, Site
 from service.sources.folder import read_folder
 from tests.benchmarks import data_folder
 from tests.benchmarks.folders import read_readings
-from tests.benchmarks.record import Estimate, log_row, recording
+from tests.benchmarks.record import Estimate, log_row, proportion, recording
 
 Array = NDArray[np.float64]
 
@@ -283,6 +283,8 @@ def steps(plant: Plant) -> None:
         f"steps in the series as they are: {real} in {_years(many.values()):.1f} heliostat-years,"
         f" all of {moved}"
     )
+    cells = {"steps": real, "heliostat-years": _years(many.values()), "of": ", ".join(moved)}
+    log_row("Steps in real series", "as they are", cells, n=len(many), of="heliostats")
     print(
         "| step [mrad] | found within one measurement | others that came with it, a"
         " heliostat-year |"
@@ -311,7 +313,7 @@ def steps(plant: Plant) -> None:
             "Steps put into real series",
             f"{size:g} mrad",
             {
-                "found within one measurement [%]": 100 * found / TRIALS,
+                "found within one measurement [%]": proportion(found, TRIALS),
                 "others, a heliostat-year": others / looked,
             },
             n=TRIALS,

@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.stats import binomtest
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "results"
@@ -60,6 +61,12 @@ class Estimate:
     goal: str | None = None
     n: int | None = None
     std: float | None = None
+
+
+def proportion(count: int, n: int, goal: str | None = None) -> Estimate:
+    """The share of ``count`` in ``n`` cases [%], with its 95 % interval (Wilson 1927)."""
+    ends = binomtest(count, n).proportion_ci(0.95, method="wilson")
+    return Estimate(100 * count / n, (100 * ends.low, 100 * ends.high), goal=goal)
 
 
 def log_row(

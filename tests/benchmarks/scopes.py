@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 
 from service.cli.folder_study import study_folder
 from service.sources.folder import read_folder
-from tests.benchmarks.record import Estimate, log_row, recording
+from tests.benchmarks.record import log_row, proportion, recording
 from tests.benchmarks.study import (
     STRENGTHS,
     Case,
@@ -235,7 +235,7 @@ def log_right(row: str, some: Sequence[Record], goal: str | None = None) -> None
     """Record how many sets are right in effect, scope, heliostat and date."""
     if some:
         count = sum(map(right, some))
-        cells = {"sets": count, "share [%]": Estimate(100 * count / len(some), goal=goal)}
+        cells = {"count": count, "share [%]": proportion(count, len(some), goal)}
         truth = "the known effects"
         log_row("Right in all of it", row, cells, n=len(some), of="sets", compared_with=truth)
 

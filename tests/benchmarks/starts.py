@@ -27,7 +27,7 @@ from model.plant_model import JUELICH_MODEL
 from model.prior import FREEDOM, GROUPS, SurfacePrior, default_prior
 from model.refinement import RefinementOptions, refine
 from tests.benchmarks import data_folder
-from tests.benchmarks.record import Estimate, log_row, recording
+from tests.benchmarks.record import log_row, proportion, recording
 from training.cases import Case, make_cases
 from training.methods import held_out_of
 from training.render import CleanCamera, load_field
@@ -132,9 +132,7 @@ def main(arguments: list[str]) -> None:
                     "Refinement from several starts",
                     f"{kind} mirrors, from {name}",
                     {
-                        "no worse than from the truth [%]": Estimate(
-                            100 * good / len(found), goal=">= 95"
-                        ),
+                        "no worse than from the truth [%]": proportion(good, len(found), ">= 95"),
                         "error, median [mm]": middle[start],
                         "from the truth, median [mm]": middle[-1],
                         "error, worst [mm]": worst[start],

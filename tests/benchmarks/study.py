@@ -36,7 +36,7 @@ from model.study.flux_images import Forecaster
 from service.cli.folder_study import study_folder
 from service.sources.folder import read_folder
 from tests.benchmarks import data_folder
-from tests.benchmarks.record import log_row, recording
+from tests.benchmarks.record import log_row, proportion, recording
 from tests.undeclared.adapter import effects_of, flux_images
 from tests.undeclared.generator import MeasurementSet, generate
 from tests.undeclared.world import CATALOGUE, MOVING, OUTSIDE
@@ -391,7 +391,7 @@ def log_summary(
     for row, (some, rule) in rows.items():
         if some:
             count = sum(bool(rule(r)) for r in some)
-            cells = {"sets": count, "share [%]": 100 * count / len(some)}
+            cells = {"count": count, "share [%]": proportion(count, len(some))}
             log_row(table, row, cells, n=len(some), of="sets", compared_with=truth)
 
 
