@@ -72,9 +72,9 @@ def is_missed(figure: Entry) -> bool:
     return not REACHED[sign](figure["value"], float(bound))
 
 
-def goal(figure: Entry) -> str:
-    """The goal of a figure with its sign."""
-    sign, bound = figure["goal"].split()
+def goal(text: str) -> str:
+    """A goal with its sign."""
+    sign, bound = text.split()
     return f"{_SIGNS[sign]} {bound}"
 
 
@@ -88,13 +88,13 @@ def shown(figure: Entry, unit: str = "") -> str:
     return text
 
 
-def _cell(figure: Entry | None, unit: str) -> str:
+def _cell(figure: Entry | None, unit: str, shared_goal: str | None) -> str:
+    """A figure, with its goal unless the column's head has it."""
     if figure is None:
         return ""
-    text = shown(figure, unit)
-    if "goal" not in figure:
-        return text
-    return f"{text} (goal {goal(figure)}{', missed' * is_missed(figure)})"
+    notes = [f"goal {goal(figure['goal'])}"] if "goal" in figure and not shared_goal else []
+    notes += ["missed"] if is_missed(figure) else []
+    return shown(figure, unit) + (f" ({', '.join(notes)})" if notes else "")
 
 
 # --- tables of a record
@@ -126,10 +126,8 @@ def provenance(record: dict[str, Any]) -> str:
     """How a record was measured."""
     if "source" in record:
         return f"Source: {record['source']}."
-    measured = f"`{record['command']}`: {place(record)}."
-    if record.get("transcribed"):
-        return f"{measured} Transcribed from the run of {record['date']}."
-    return measured
+    origin = "transcribed from the run of " if "transcribed" in record else ""
+    return f"`{record['command']}`: {origin}{place(record)}."
 
 
 def place(record: dict[str, Any]) -> str:
@@ -146,7 +144,7 @@ def table(figures: Sequence[Entry]) -> str:
     """A table with a row for each `row` and a column for each `name`.
 
     A unit or a number of cases is in the head, if all figures of a column share it, else in the
-    row.
+    row. A goal is in the head or in the cell.
     """
     rows, names = (list(dict.fromkeys(one[key] for one in figures)) for key in ("row", "name"))
     cells = {(one["row"], one["name"]): one for one in figures}
@@ -154,19 +152,23 @@ def table(figures: Sequence[Entry]) -> str:
     counts = {key: _shared(figures, key, "n") for key in ("row", "name")}
     unit_in = next((key for key in ("name", "row") if None not in units[key].values()), None)
     count_in = next((key for key in ("row", "name") if None not in counts[key].values()), None)
+    goals = _shared(figures, "name", "goal")
     has_counts = count_in == "row" and any(counts["row"].values())
     head = ["", *([_kind(figures)] if has_counts else [])]
     for name in names:
         count = counts["name"][name] if count_in == "name" else ""
-        note = f" (n = {number(count)})" if count else ""
-        head.append(_titled(name, units["name"][name] if unit_in == "name" else "") + note)
+        notes = [f"n = {number(count)}"] if count else []
+        notes += [f"goal {goal(goals[name])}"] if goals[name] else []
+        title = _titled(name, units["name"][name] if unit_in == "name" else "")
+        head.append(title + (f" ({', '.join(notes)})" if notes else ""))
     lines = []
     for row in rows:
         line = [_titled(row, units["row"][row] if unit_in == "row" else "")]
         line += [number(counts["row"][row])] if has_counts else []
         for name in names:
             figure = cells.get((row, name))
-            line.append(_cell(figure, "" if figure is None or unit_in else figure.get("unit", "")))
+            unit = "" if figure is None or unit_in else figure.get("unit", "")
+            line.append(_cell(figure, unit, goals[name]))
         lines.append(line)
     return markdown(head, lines)
 
@@ -242,7 +244,7 @@ def _reference(key: Entry) -> str:
 
 
 def _missed(figure: Entry) -> str:
-    return goal(figure) if is_missed(figure) else ""
+    return goal(figure["goal"]) if is_missed(figure) else ""
 
 
 KEY_HEAD = ["figure", "value", "n", "compared with", "goal, if missed"]

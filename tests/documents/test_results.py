@@ -79,7 +79,7 @@ def test_overview_has_goals_that_are_missed():
     missed = [one for one in figures.key_figures() if figures.is_missed(one["figure"])]
     assert missed
     for one in missed:
-        assert figures.goal(one["figure"]) in figures.key_table()
+        assert figures.goal(one["figure"]["goal"]) in figures.key_table()
 
 
 def test_number_has_three_significant_digits():
