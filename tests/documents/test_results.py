@@ -132,3 +132,13 @@ def test_units_and_counts_are_in_the_head_or_in_the_rows():
         "| a [mm] | 3 | 0.500 |",
         "| b [s] | 3 | 2.00 |",
     ]
+
+
+def test_every_benchmark_records_its_figures():
+    programs = [
+        path.stem
+        for path in (ROOT / "tests" / "benchmarks").glob("*.py")
+        if '__name__ == "__main__"' in (text := path.read_text(encoding="utf-8"))
+        and "recording(" not in text
+    ]
+    assert programs == ["pages"]  # it takes pictures
