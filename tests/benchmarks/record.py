@@ -4,6 +4,7 @@
         log_row("Recorded suns", "0 to 10 deg", {"median [mrad]": 0.015}, n=17)
 
 `log_row` does nothing outside of a `recording`, so that other programs may call the same functions.
+``HELIOTWIN_RESULTS`` names another folder, for a run with fewer cases than the published one.
 """
 
 import json
@@ -26,7 +27,7 @@ import numpy as np
 from scipy.stats import binomtest
 
 ROOT = Path(__file__).parents[2]
-RESULTS = ROOT / "results"
+RESULTS = Path(os.environ.get("HELIOTWIN_RESULTS", ROOT / "results"))
 PRODUCT = ("model", "service", "training", "heliotwin")
 """Packages whose last change is the commit of a record."""
 
