@@ -250,9 +250,9 @@ def _require_all(store: Store, base: str, acknowledged: set[str]) -> None:
     report = store.check()
     print(
         f"{len(acknowledged)} photographs acknowledged, {len(acknowledged - stored)} lost,"
-        f" {len(report['bad'])} bad"
+        f" {len(report.bad)} bad"
     )
-    lost = {"lost": len(acknowledged - stored), "bad": len(report["bad"])}
+    lost = {"lost": len(acknowledged - stored), "bad": len(report.bad)}
     log_row("Photographs acknowledged", "all", lost, n=len(acknowledged), of="photographs")
 
 
