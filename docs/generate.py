@@ -22,6 +22,7 @@ from model.effects import CATALOGUE
 from service.base import settings as settings_module
 from service.base.settings import Settings
 from service.cli.main import app as command_line
+from service.sources.plant_schema import json_schema
 from service.twin.alerts.field_overview import FieldOverviewCache
 from service.twin.runtime.runtime import Runtime
 from service.web.app import create_app
@@ -186,6 +187,8 @@ def _resolved(schema: dict[str, Any], schemas: dict[str, Any]) -> dict[str, Any]
 def _type(schema: dict[str, Any]) -> str:
     if "$ref" in schema:
         return str(schema["$ref"]).rpartition("/")[2]
+    if "const" in schema:
+        return str(schema["const"])
     if "enum" in schema:
         return ", ".join(map(str, schema["enum"]))
     for key in ("anyOf", "oneOf", "allOf"):
@@ -193,6 +196,8 @@ def _type(schema: dict[str, Any]) -> str:
             return " or ".join(dict.fromkeys(_type(inner) for inner in schema[key]))
     if schema.get("type") == "array" and "items" in schema:
         return f"list of {_type(schema['items'])}"
+    if patterns := schema.get("patternProperties"):
+        return f"by name: {' or '.join(map(_type, patterns.values()))}"
     return str(schema.get("format") or schema.get("type", "any"))
 
 
@@ -319,6 +324,35 @@ def roles_page() -> str:
 NOTEBOOKS = ("surfaces_from_photographs", "forecast_anywhere", "hidden_effect")
 
 
+def plant_schema_page() -> str:
+    """Every key of ``plant.yaml``, by part."""
+    schema: Any = json_schema()
+    parts = schema.pop("$defs")
+    lines = ["# Keys of plant.yaml", "", _prose(schema["description"]), ""]
+    lines += ["`heliotwin plant schema` prints the same as a JSON schema.", ""]
+    for name, part in {"plant.yaml": schema, **parts}.items():
+        lines += [f"## {name}", ""] + ([] if part is schema else [_prose(part["description"]), ""])
+        required = part.get("required", ())
+        lines += _table(
+            ["key", "type", "default", "meaning"],
+            [
+                (
+                    _code(key),
+                    _cell(_type(field)),
+                    "required" if key in required else _code(_plain_default(field)),
+                    _cell(field.get("description", "")),
+                )
+                for key, field in part["properties"].items()
+            ],
+        )
+    return "\n".join(lines) + "\n"
+
+
+def _plain_default(field: dict[str, Any]) -> str:
+    value = field.get("default", {})
+    return "" if value == {} or isinstance(value, dict) else _default(value)
+
+
 def notebook_page(name: str) -> str:
     """A notebook in Jupytext's percent format as a page; tests execute the notebook."""
     source = Path(__file__).with_name("notebooks") / f"{name}.py"
@@ -342,6 +376,7 @@ PAGES: Pages = {
     "metrics": metrics_page,
     "effects": effects_page,
     "roles": roles_page,
+    "plant-schema": plant_schema_page,
     **{name: partial(notebook_page, name) for name in NOTEBOOKS},
 }
 """Name of each page, and the function that writes it."""

@@ -10,33 +10,33 @@ Forecasts for a receiver are light in W/m2: effects of the camera (stage "image"
 neighbours are given (`model.neighbours`), their shadows are traced, and the effect `blocking`,
 their mean, does not act either.
 
-Approximations: the sun's cone is that of each mirror's centre; a cylinder is traced on planes that
-touch it.
+Each heliostat's losses are listed in the order of the light (`Losses`).
+
+Approximations: the sun's cone is that of each mirror's centre; light reaches a curved receiver as
+from the mirror's centre (`model.tracing.superposition`).
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
-from itertools import islice
-from typing import NamedTuple, Protocol, Self, TypeVar
+from dataclasses import dataclass, field, fields, replace
+from itertools import islice, pairwise
+from typing import Protocol, Self, TypeVar
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
-from torch import Tensor
 
 from model.effects import Effect, acting, apply_mount_effects, apply_optics_effects, light_effects
 from model.effects.blocking import Blocking
-from model.errors import ModelError, UnreachableError
+from model.errors import ModelError
 from model.forecast import align, true_suns
 from model.neighbours import Neighbours, Outlines, outlines
 from model.plant import Heliostat, Receiver, TargetPlane
 from model.plant_model import PlantModel
 from model.progress import nothing_between
 from model.setup import Setup
-from model.sunshape import half_angle
 from model.tracing import Optics, Scene, Window
-from model.tracing.convolution import SuperposedFlux
-from model.tracing.convolution import superpose as superpose_scene
+from model.tracing.superposition import SuperposedFlux, project
+from model.tracing.superposition import superpose as superpose_scene
 
 Array = NDArray[np.float64]
 Item = TypeVar("Item")
@@ -61,11 +61,6 @@ _TILE_PIXELS = 2**16
 
 # Pixels of maps that are traced at once: they fit into the processor's cache.
 _PIXELS = 2**18
-# Light is traced beyond a map's edge up to this share of the sun's cone, plus a margin for errors
-# [rad].
-_CONE_SHARE, _ERRORS = 0.98, 3e-3
-# Cosine to a plane's normal below which grazing light is neglected.
-_GRAZING = 0.02
 
 
 # --- one tile
@@ -95,6 +90,52 @@ class Tile:
         return len(self.setups)
 
 
+@dataclass(frozen=True)
+class Losses:
+    """What the light of a heliostat loses, as factors in the order of the light.
+
+    Their product is the optical efficiency. Without light a factor is 1 and those before say why.
+
+    Attributes
+    ----------
+    area : float [m2]
+        Of its facets.
+    cosine, shading, blocking, reflectance, attenuation, intercept, absorptance : float
+    """
+
+    area: float
+    cosine: float
+    shading: float
+    blocking: float
+    reflectance: float
+    attenuation: float
+    intercept: float
+    absorptance: float
+
+    @property
+    def efficiency(self) -> float:
+        """Absorbed share of the light on the mirror's area, if it faced the sun."""
+        return self.intercepted * self.absorptance
+
+    @property
+    def intercepted(self) -> float:
+        """Share of that light that reaches the receiver."""
+        mirror = self.cosine * self.shading * self.blocking * self.reflectance
+        return mirror * self.attenuation * self.intercept
+
+
+LOSSES = tuple(f.name for f in fields(Losses) if f.name != "area")
+"""The factors, in the order of the light."""
+
+
+def field_losses(losses: Iterable[Losses]) -> Losses:
+    """Factors of a whole field: those of the sums of the light before and after each of them."""
+    some = list(losses)
+    stages = np.array([[one.area, *(getattr(one, name) for name in LOSSES)] for one in some])
+    sums = np.cumprod(stages, axis=1).sum(axis=0)
+    return Losses(sums[0], *(sums[1:] / np.maximum(sums[:-1], 1e-300)).tolist())
+
+
 @dataclass(frozen=True, eq=False)
 class FleetFlux:
     """Superposed flux.
@@ -109,12 +150,15 @@ class FleetFlux:
         Number of heliostats included.
     skipped : dict
         Reasons why others are not, by name.
+    losses : dict
+        Of the heliostats included, by name.
     """
 
     irradiance: Array
     power: float = 0.0
     heliostats: int = 0
     skipped: dict[str, str] = field(default_factory=dict)
+    losses: dict[str, Losses] = field(default_factory=dict)
 
     def __add__(self, other: "FleetFlux") -> "FleetFlux":
         return FleetFlux(
@@ -122,6 +166,7 @@ class FleetFlux:
             self.power + other.power,
             self.heliostats + other.heliostats,
             self.skipped | other.skipped,
+            self.losses | other.losses,
         )
 
 
@@ -141,6 +186,8 @@ class Superposition:
     resolution : (rows, columns)
     samples : int
         Rays along each side of each facet.
+    tower : TargetPlane or None
+        Outline of the tower as the sun sees it, which shades mirrors.
     between : callable
         Called repeatedly while a tile is traced; an exception ends the work.
     """
@@ -149,6 +196,7 @@ class Superposition:
     model: PlantModel
     resolution: tuple[int, int] = (256, 256)
     samples: int = 16
+    tower: TargetPlane | None = None
     between: Callable[[], None] = nothing_between
 
     def __call__(self, tile: Tile) -> FleetFlux:
@@ -163,20 +211,52 @@ class Superposition:
         return total
 
     def _trace(self, tile: Tile) -> FleetFlux:
-        flux, power = torch.zeros(self.resolution, dtype=torch.float64), 0.0
+        total = FleetFlux(np.zeros(self.resolution))
         with torch.no_grad():
             for there, part in self._alike(tile):
                 optics = apply_optics_effects(there, self.model.optics)
                 for group in align(part.setups, replace(self.model, effects=there)).groups:
-                    scene = group.scene
-                    if part.obstacles is not None:
-                        scene = scene.with_(
-                            obstacles=torch.as_tensor(part.obstacles[group.rows]).to(scene.sun)
-                        )
-                    for image, thrown in self._images(scene, group.aims, optics):
-                        flux += image
-                        power += thrown
-        return FleetFlux(flux.numpy(), power, len(tile))
+                    scene = self._obstructed(group.scene, part, group.rows)
+                    heliostats = [setup.heliostat for setup in group.setups]
+                    for rows, light in self._lights(scene, optics):
+                        total = total + self._flux([heliostats[row] for row in rows], light, optics)
+        return total
+
+    def _obstructed(self, scene: Scene, part: Tile, rows: list[int]) -> Scene:
+        """The scene of a part's mirrors in some rows, with neighbours and tower."""
+        if part.obstacles is not None:
+            scene = scene.with_(obstacles=torch.as_tensor(part.obstacles[rows]).to(scene.sun))
+        if self.tower is not None:
+            sides = self.tower.axes[:2] * np.array([[self.tower.width], [self.tower.height]]) / 2
+            outline = torch.as_tensor(np.stack([self.tower.center, *sides])).to(scene.sun)
+            scene = scene.with_(shades=outline.expand(scene.batch, 1, 3, 3))
+        return scene
+
+    def _flux(
+        self, heliostats: Sequence[Heliostat], light: SuperposedFlux, optics: Optics
+    ) -> FleetFlux:
+        """The light of mirrors with their losses."""
+        areas = np.array([heliostat.area for heliostat in heliostats])
+        reflectance = optics.reflectivity * np.array([h.optics.reflectance for h in heliostats])
+        beams = light.beams
+        lit, free, power, intercepted = (
+            values.double().numpy()
+            for values in (beams.lit, beams.free, beams.power, light.intercepted)
+        )
+        stages = [areas, *lit.T, free, free * reflectance, power / max(optics.dni, 1e-300)]
+        stages.append(intercepted.clip(min=0, max=power) / max(optics.dni, 1e-300))
+        shares = [
+            np.where(before > 0, after / np.where(before > 0, before, 1.0), 1.0)
+            for before, after in pairwise(stages)
+        ]
+        shares.append(np.full(len(areas), self.receiver.absorptance))
+        factors = [dict(zip(LOSSES, row, strict=True)) for row in np.stack(shares, axis=1).tolist()]
+        losses = {
+            heliostat.name: Losses(area=heliostat.area, **some)
+            for heliostat, some in zip(heliostats, factors, strict=True)
+        }
+        image = light.irradiance.double().numpy()
+        return FleetFlux(image, float(power.sum()), len(heliostats), losses=losses)
 
     def _alike(self, tile: Tile) -> Iterator[tuple[tuple[Effect, ...], Tile]]:
         """Group the heliostats of a tile by the effects on light that act on them at present."""
@@ -190,8 +270,8 @@ class Superposition:
             obstacles = None if tile.obstacles is None else tile.obstacles[alike]
             yield there, Tile([tile.setups[row] for row in alike], obstacles)
 
-    def _images(self, scene: Scene, aims: Array, optics: Optics) -> Iterator[tuple[Tensor, float]]:
-        """Maps (rows, columns) [W/m2] and power [W], of a few mirrors at once."""
+    def _lights(self, scene: Scene, optics: Optics) -> Iterator[tuple[list[int], SuperposedFlux]]:
+        """Rows of a few mirrors at once, and their light."""
         sides = self.receiver.width, self.receiver.height
         # A narrow plane is padded by its longer side.
         step = max(
@@ -200,62 +280,21 @@ class Superposition:
         for start in range(0, scene.batch, step):
             self.between()
             rows = list(range(start, min(start + step, scene.batch)))
-            part = scene.subset(rows), aims[rows], optics
+            part = scene.subset(rows)
             if isinstance(self.receiver, TargetPlane):
-                image, power = self._on_plane(self.receiver, self.resolution[1], *part)
+                yield rows, self._on_plane(self.receiver, part, optics)
             else:
-                image, power = self._on_patches(*part)
-            yield image, float(power.sum())
+                light = project(part, self.receiver, self.resolution, optics, samples=self.samples)
+                yield rows, light
 
-    def _on_plane(
-        self, plane: TargetPlane, columns: int, scene: Scene, aims: Array, optics: Optics
-    ) -> SuperposedFlux:
+    def _on_plane(self, plane: TargetPlane, scene: Scene, optics: Optics) -> SuperposedFlux:
         """Trace the flux on a plane that replaces the scene's planes."""
         scene = scene.with_(
             plane_center=torch.tensor(plane.center).to(scene.sun).expand(scene.batch, 3),
             plane_axes=torch.tensor(plane.axes).to(scene.sun).expand(scene.batch, 3, 3),
         )
-        directions, ranges = _beams(scene, aims)
-        cone = half_angle(optics.sun_shape, _CONE_SHARE) + _ERRORS
-        beyond = float((ranges * cone / -(directions @ plane.normal).clip(max=-0.25)).max())
-        beyond = min(beyond, max(plane.width, plane.height))
-        padding = max(0.1, beyond / plane.height), max(0.1, beyond / plane.width)
-        window = Window.of(plane, self.resolution[0], columns)
-        return superpose_scene(scene, window, optics, samples=self.samples, padding=padding)
-
-    def _on_patches(self, scene: Scene, aims: Array, optics: Optics) -> SuperposedFlux:
-        """Trace the flux on the unrolled surface, plane by plane."""
-        image, power = torch.zeros(self.resolution), torch.zeros(scene.batch)
-        directions, is_reached = _beams(scene, aims).directions, np.zeros(scene.batch, dtype=bool)
-        for patch in self.receiver.patches(self.resolution[1]):
-            self.between()
-            plane, shares = patch.plane, torch.as_tensor(patch.shares, dtype=torch.float32)
-            before = (scene.center.double().numpy() - plane.center) @ plane.normal > 0
-            reaching = np.flatnonzero(before & (directions @ plane.normal < -_GRAZING)).tolist()
-            if reaching:
-                lit = scene.subset(reaching), aims[reaching], optics
-                part, thrown = self._on_plane(plane, len(shares), *lit)
-                image[:, patch.columns] += part * shares
-                power[reaching] = torch.maximum(power[reaching], thrown)
-                is_reached[reaching] = True
-        if not is_reached.all():
-            raise UnreachableError(
-                "a mirror is behind the lit part of the receiver; leave it out or aim it elsewhere"
-            )
-        return SuperposedFlux(image, power)
-
-
-class _Beams(NamedTuple):
-    """Unit vectors (B, 3) from mirrors to their aims, and the distances (B,) [m]."""
-
-    directions: Array
-    ranges: Array
-
-
-def _beams(scene: Scene, aims: Array) -> _Beams:
-    outgoing = aims - scene.center.double().numpy()
-    ranges = np.linalg.norm(outgoing, axis=1)
-    return _Beams(outgoing / ranges[:, None], ranges)
+        window = Window.of(plane, *self.resolution)
+        return superpose_scene(scene, window, optics, samples=self.samples)
 
 
 def in_parts(

@@ -4,23 +4,19 @@ Frozen dataclasses in numpy; the tracers convert them to batched tensors (`model
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from model.errors import InvalidInputError
+from model.errors import InvalidInputError, UnreachableError
 from model.frames import enu_to_wgs84, wgs84_to_enu
 from model.mount import Mount
 from model.site import Site
 
 Vector = NDArray[np.float64]
-
-STEP_DEG = 8.0
-"""Largest angle [deg] between a cylinder's planes: they deviate by 1 % of the radius at most."""
-
 
 MAX_ASPECT = 20.0
 """Largest ratio of the longer to the shorter side of a plane or of an unrolled cylinder."""
@@ -64,6 +60,26 @@ def require_cylinder_shape(radius: float, height: float, opening_deg: float) -> 
         )
 
 
+Outline = tuple[tuple[float, float], ...]
+"""Corners (x, y) of a facet's edge in half widths and half heights, in either direction."""
+
+
+def outline_share(outline: Outline) -> float:
+    """Share of the rectangle from -1 to 1 that is inside an outline, by the shoelace formula."""
+    x, y = np.array(outline, dtype=np.float64).T
+    return float(abs(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 8)
+
+
+def inside_outline(x: Vector, y: Vector, outline: ArrayLike) -> NDArray[np.bool_]:
+    """Which places (...) are inside a polygon (V, 2), by the even-odd rule."""
+    corners = np.asarray(outline, dtype=np.float64)
+    inside = np.zeros(np.broadcast_shapes(x.shape, y.shape), dtype=bool)
+    for (ax, ay), (bx, by) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        if ay != by:
+            inside ^= ((ay > y) != (by > y)) & (x < ax + (y - ay) / (by - ay) * (bx - ax))
+    return inside
+
+
 def _vector(name: str, value: ArrayLike) -> Vector:
     vector = np.array(value, dtype=np.float64)
     if vector.shape != (3,) or not np.isfinite(vector).all():
@@ -83,17 +99,63 @@ class Facet:
     canting_x, canting_y : (3,) [m]
         Half its width and half its height, as vectors in mirror coordinates (PAINT's ``canting_e``,
         ``canting_n``).
+    focal_length : float or None [m]
+        Of the paraboloid that it is; None for a flat facet.
+    outline : tuple of (x, y), or None
+        Corners of its edge in half widths and half heights; None for the whole rectangle.
     """
 
     position: Vector
     canting_x: Vector
     canting_y: Vector
+    focal_length: float | None = None
+    outline: Outline | None = None
 
     def __post_init__(self) -> None:
         for name in ("position", "canting_x", "canting_y"):
             object.__setattr__(self, name, _vector(f"facet {name}", getattr(self, name)))
         if np.linalg.norm(np.cross(self.canting_x, self.canting_y)) < 1e-9:
             raise InvalidInputError("facet canting vectors must span an area")
+        if self.focal_length is not None and not self.focal_length > 0:
+            raise InvalidInputError(f"facet focal_length must be positive, got {self.focal_length}")
+
+    @property
+    def area(self) -> float:
+        """Area [m2] within its outline, as if it were flat."""
+        rectangle = 4 * float(np.linalg.norm(np.cross(self.canting_x, self.canting_y)))
+        return rectangle if self.outline is None else rectangle * outline_share(self.outline)
+
+
+@dataclass(frozen=True)
+class MirrorOptics:
+    """What a heliostat's mirror does to light besides its shape.
+
+    Attributes
+    ----------
+    reflectance : float
+        Multiplies the plant's, `model.tracing.Optics.reflectivity`.
+    slope_error : float [rad]
+        Standard deviation of the normals per axis.
+    pointing_error : float [rad]
+        Standard deviation of the reflected beam's direction per axis.
+    """
+
+    reflectance: float = 1.0
+    slope_error: float = 0.0
+    pointing_error: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.reflectance <= 1:
+            raise InvalidInputError(f"reflectance must lie in (0, 1], got {self.reflectance:g}")
+        for name in ("slope_error", "pointing_error"):
+            if not 0 <= getattr(self, name) < 0.1:
+                raise InvalidInputError(
+                    f"{name} [rad] must lie in [0, 0.1), got {getattr(self, name):g}"
+                )
+
+
+PERFECT = MirrorOptics()
+"""A mirror that reflects all light where it should."""
 
 
 class FacetFrames(NamedTuple):
@@ -121,6 +183,7 @@ class Heliostat:
         In PAINT's order: upper left, upper right, lower left, lower right, seen from the front.
     width, height : float [m]
         Of the whole mirror.
+    optics : MirrorOptics
     """
 
     name: str
@@ -129,6 +192,7 @@ class Heliostat:
     facets: tuple[Facet, ...]
     width: float = 3.22
     height: float = 2.56
+    optics: MirrorOptics = PERFECT
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "position", _vector(f"position of {self.name}", self.position))
@@ -162,12 +226,19 @@ class Heliostat:
         return cls(name, np.asarray(position, dtype=np.float64), mount or Mount.juelich(), facets)
 
     @property
+    def area(self) -> float:
+        """Area [m2] of its facets."""
+        return sum(facet.area for facet in self.facets)
+
+    @property
     def has_facets_in_order(self) -> bool:
         """Whether four facets in two rows and two columns have the order of `facets`; true for
         other mirrors.
 
         Surfaces are lists of facets: a facet in another place would be confused with another one.
         """
+        if len(self.facets) != 4:
+            return True
         places = np.array([facet.position[:2] for facet in self.facets])
         quarters = [(bool(x), bool(y)) for x, y in places > places.mean(axis=0)]
         return len(set(quarters)) < 4 or quarters == [
@@ -212,6 +283,81 @@ def _orient(surface: "TargetPlane | Cylinder", kind: str) -> None:
     object.__setattr__(surface, "up", _vector(f"{kind} up", up / np.linalg.norm(up)))
 
 
+class SurfaceGrid(NamedTuple):
+    """Places of a receiver's map: points [m] and unit normals (rows, columns, 3), areas (rows,
+    columns) [m2].
+    """
+
+    points: Vector
+    normals: Vector
+    areas: Vector
+
+
+@dataclass(frozen=True, eq=False)
+class TouchingPlanes:
+    """Planes in front of a receiver, one for each of B mirrors, that its light passes.
+
+    Attributes
+    ----------
+    centers : (B, 3) [m]
+        Middles of the windows.
+    axes : (B, 3, 3)
+        Right, up and normal as rows; the normal points to the mirror.
+    size : (width, height) [m]
+        Of windows that show the whole receiver from each mirror.
+    opening : callable or None
+        Share of light that passes each cell of a window of (rows, columns).
+    screens : (K, 3, 3) [m] or None
+        Rectangles, centre and half sides, behind which the receiver gets no light.
+    """
+
+    centers: Vector
+    axes: Vector
+    size: tuple[float, float]
+    opening: Callable[[int, int], Vector] | None = None
+    screens: Vector | None = None
+
+
+def windows_on(grid: SurfaceGrid, mirrors: Vector, origins: Vector, axes: Vector) -> TouchingPlanes:
+    """Windows on planes that show all places of a grid which face the mirrors.
+
+    Parameters
+    ----------
+    grid : SurfaceGrid
+        A few places, those on the surface's edges among them.
+    mirrors, origins : (B, 3) [m]
+        Middles of the mirrors, and points of their planes.
+    axes : (B, 3, 3)
+        Of the planes.
+
+    Raises
+    ------
+    UnreachableError
+        If a mirror sees nothing of the surface.
+    """
+    ways = grid.points.reshape(-1, 3) - mirrors[:, None]
+    faces = (ways * grid.normals.reshape(-1, 3)).sum(axis=-1) < 0
+    apart = np.einsum("bij,bj->bi", axes, origins - mirrors)
+    turned = np.einsum("bij,bpj->bpi", axes, ways)
+    is_seen = faces & (turned[..., 2] < 0)
+    if not is_seen.any(axis=1).all():
+        raise UnreachableError(
+            "a mirror is behind the lit part of the receiver; leave it out or aim it elsewhere"
+        )
+    scale = apart[:, None, 2] / np.where(is_seen, turned[..., 2], -1.0)
+    places = turned[..., :2] * scale[..., None] - apart[:, None, :2]
+    low = np.where(is_seen[..., None], places, np.inf).min(axis=1)
+    high = np.where(is_seen[..., None], places, -np.inf).max(axis=1)
+    middles = (low + high) / 2
+    width, height = _MARGIN * (high - low).max(axis=0)
+    centers = origins + np.einsum("bi,bij->bj", middles, axes[:, :2])
+    return TouchingPlanes(centers, axes, (float(width), float(height)))
+
+
+_MARGIN = 1.04
+"""Windows are larger than the receiver by this factor, so that its edges are inside."""
+
+
 @dataclass(frozen=True, eq=False)
 class TargetPlane:
     """A rectangle that light falls on: a calibration target, or another plane.
@@ -226,6 +372,8 @@ class TargetPlane:
     up : (3,)
         Unit vector of the image's upward direction, made perpendicular to ``normal``.
     width, height : float [m]
+    absorptance : float
+        Share of the light on it that it takes up.
     """
 
     name: str
@@ -234,6 +382,7 @@ class TargetPlane:
     up: Vector
     width: float
     height: float
+    absorptance: float = 1.0
 
     def __post_init__(self) -> None:
         if not (0 < self.width < 1e4 and 0 < self.height < 1e4):
@@ -287,9 +436,27 @@ class TargetPlane:
         """No numbers besides those of the rectangle."""
         return {}
 
-    def patches(self, columns: int) -> "Iterator[Patch]":
-        """The plane as one patch."""
-        yield Patch(slice(0, columns), np.ones(columns), self)
+    @property
+    def aim(self) -> Vector:
+        """Its middle."""
+        return self.center
+
+    def grid(self, rows: int, columns: int) -> SurfaceGrid:
+        """Places of the map."""
+        x = ((np.arange(columns) + 0.5) / columns - 0.5) * self.width
+        y = (0.5 - (np.arange(rows) + 0.5) / rows) * self.height
+        points = self.to_enu(np.stack(np.broadcast_arrays(x, y[:, None]), axis=-1))
+        area = self.width * self.height / (rows * columns)
+        return SurfaceGrid(
+            points, np.broadcast_to(self.normal, points.shape), np.full((rows, columns), area)
+        )
+
+    def touching(self, mirrors: Vector) -> TouchingPlanes:
+        """The plane itself, for each mirror."""
+        n = len(mirrors)
+        return TouchingPlanes(
+            np.tile(self.center, (n, 1)), np.tile(self.axes, (n, 1, 1)), (self.width, self.height)
+        )
 
     def to_plane(self, points: ArrayLike) -> NDArray[np.float64]:
         """Coordinates (..., 2) [m] right and up of the centre, of ENU points (..., 3)."""
@@ -304,24 +471,6 @@ class TargetPlane:
         return bool((np.abs(self.to_plane(point)) <= np.array([self.width, self.height]) / 2).all())
 
 
-@dataclass(frozen=True, eq=False)
-class Patch:
-    """A plane that replaces a part of a receiver's surface.
-
-    Attributes
-    ----------
-    columns : slice
-        Of the receiver's map.
-    shares : (n,)
-        Weights of the plane's light in each of those columns.
-    plane : TargetPlane
-    """
-
-    columns: slice
-    shares: Vector
-    plane: TargetPlane
-
-
 class Receiver(Protocol):
     """A surface that the light of a field falls on; its map is the unrolled surface."""
 
@@ -330,8 +479,16 @@ class Receiver(Protocol):
         """Its name."""
 
     @property
+    def absorptance(self) -> float:
+        """Share of the light on it that it takes up."""
+
+    @property
     def center(self) -> Vector:
-        """Middle of the lit surface (3,) [m] in ENU, the default aim of mirrors."""
+        """Middle of the lit surface (3,) [m] in ENU."""
+
+    @property
+    def aim(self) -> Vector:
+        """Default aim of mirrors (3,) [m] in ENU."""
 
     @property
     def normal(self) -> Vector:
@@ -357,8 +514,17 @@ class Receiver(Protocol):
     def middle(self) -> TargetPlane:
         """A plane that touches the surface in its middle."""
 
-    def patches(self, columns: int) -> Iterator[Patch]:
-        """Planes that replace the surface, for a map of ``columns`` columns."""
+    def grid(self, rows: int, columns: int) -> SurfaceGrid:
+        """Places of a map of (rows, columns)."""
+
+    def touching(self, mirrors: Vector) -> TouchingPlanes:
+        """Planes in front of it toward mirrors whose middles are (B, 3) [m].
+
+        Raises
+        ------
+        UnreachableError
+            If a mirror sees nothing of it.
+        """
 
 
 @dataclass(frozen=True, eq=False)
@@ -379,6 +545,8 @@ class Cylinder:
     radius, height : float [m]
     opening_deg : float [deg]
         Angle of the lit surface, half of it to each side of the middle; 360 for all around.
+    absorptance : float
+        As of `TargetPlane`.
     """
 
     name: str
@@ -388,6 +556,7 @@ class Cylinder:
     radius: float
     height: float
     opening_deg: float = 360.0
+    absorptance: float = 1.0
 
     def __post_init__(self) -> None:
         if not (0 < self.radius < 1e3 and 0 < self.height < 1e4):
@@ -431,23 +600,55 @@ class Cylinder:
         """The plane that touches it in its middle, as wide as the cylinder."""
         return self.tangent(0.0, self.radius, self.radius)
 
-    def patches(self, columns: int) -> Iterator[Patch]:
-        """Planes that touch it, every few degrees.
+    @property
+    def axis(self) -> Vector:
+        """The point (3,) [m] of its axis at mid height."""
+        return self.center - self.radius * self.normal
 
-        Between two lines of contact the light of both planes is blended in proportion, so that the
-        cosine of incidence changes from column to column as on the cylinder.
+    @property
+    def aim(self) -> Vector:
+        """The middle of a surface up to half around; else the axis, so that each mirror aims at the
+        surface toward it.
         """
-        step = np.radians(self.opening_deg) / columns
-        count = min(columns, math.ceil(self.opening_deg / STEP_DEG))
-        edges = np.linspace(0, columns, count + 1).round().astype(int)
-        # A cosine that is approximated by straight lines is too small by this factor on average.
-        blended = np.sinc(self.opening_deg / count / 360) ** 2
-        for index, edge in enumerate(edges):
-            first, last = edges[max(index - 1, 0)], edges[min(index + 1, count)]
-            shares = np.interp(np.arange(first, last) + 0.5, edges, np.eye(count + 1)[index])
-            left, right = (edge - first) * step * self.radius, (last - edge) * step * self.radius
-            plane = self.tangent((edge - columns / 2) * step, left, right)
-            yield Patch(slice(first, last), shares / blended, plane)
+        return self.center if self.opening_deg <= 180 else self.axis
+
+    def _at(self, angles: Vector, heights: Vector) -> SurfaceGrid:
+        """Places at angles [rad] from the middle and heights [m] over it; areas are zero."""
+        normals = np.cos(angles)[:, None] * self.normal + np.sin(angles)[:, None] * self.right
+        points = self.axis + self.radius * normals + heights[:, None, None] * self.up
+        return SurfaceGrid(points, np.broadcast_to(normals, points.shape), np.zeros(()))
+
+    def grid(self, rows: int, columns: int) -> SurfaceGrid:
+        """Places of the unrolled map."""
+        angles = ((np.arange(columns) + 0.5) / columns - 0.5) * np.radians(self.opening_deg)
+        heights = (0.5 - (np.arange(rows) + 0.5) / rows) * self.height
+        places = self._at(angles, heights)
+        area = self.width * self.height / (rows * columns)
+        return places._replace(areas=np.full((rows, columns), area))
+
+    def touching(self, mirrors: Vector) -> TouchingPlanes:
+        """Planes that touch it along the line nearest to each mirror."""
+        outward = mirrors - self.axis
+        angles = np.arctan2(outward @ self.right, outward @ self.normal)
+        half = np.radians(self.opening_deg) / 2
+        angles = angles.clip(-half, half)[:, None]
+        normals = np.cos(angles) * self.normal + np.sin(angles) * self.right
+        axes = np.stack(
+            [np.cross(self.up, normals), np.broadcast_to(self.up, normals.shape), normals], axis=1
+        )
+        origins = self.axis + self.radius * normals
+        if (((mirrors - origins) * normals).sum(axis=1) <= 0).any():
+            raise UnreachableError(
+                "a mirror is behind the lit part of the receiver; leave it out or aim it elsewhere"
+            )
+        edges = self._at(
+            np.linspace(-half, half, _EDGE_PLACES), np.array([0.5, -0.5]) * self.height
+        )
+        return windows_on(edges, mirrors, origins, axes)
+
+
+_EDGE_PLACES = 73
+"""Places around a cylinder's edges by which its windows are found: five degrees apart."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -458,7 +659,7 @@ class Plant:
     origin: Vector
     targets: dict[str, TargetPlane] = field(default_factory=dict)
     heliostats: dict[str, Heliostat] = field(default_factory=dict)
-    receivers: dict[str, Cylinder] = field(default_factory=dict)
+    receivers: Mapping[str, Receiver] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "origin", _vector("plant origin", self.origin))
@@ -475,3 +676,28 @@ class Plant:
     def to_wgs84(self, enu: ArrayLike) -> NDArray[np.float64]:
         """WGS84 positions (..., 3) [deg, deg, m] of ENU (..., 3) [m]."""
         return enu_to_wgs84(enu, self.origin)
+
+
+@dataclass(frozen=True)
+class Tower:
+    """The tower: an upright cylinder on the origin, which casts a shadow.
+
+    Attributes
+    ----------
+    radius, height : float [m]
+    """
+
+    radius: float
+    height: float
+
+    def __post_init__(self) -> None:
+        if not (0 < self.radius < 1e3 and 0 < self.height < 1e4):
+            raise InvalidInputError("tower radius and height must be positive metres")
+
+    def outline(self, sun: Vector) -> TargetPlane:
+        """The upright rectangle that casts the tower's shadow under a ``sun`` (3,)."""
+        level = np.array([sun[0], sun[1], 0.0])
+        normal = level if np.linalg.norm(level) > 1e-9 else np.array([0.0, 1.0, 0.0])
+        center = np.array([0.0, 0.0, self.height / 2])
+        up = np.array([0.0, 0.0, 1.0])
+        return TargetPlane("tower", center, normal, up, 2 * self.radius, self.height)

@@ -195,24 +195,52 @@ def evaluate(
     return FacetGrid(product(value_u, value_v), normals)
 
 
+def squares(count: int, degree: int = DEGREE) -> Array:
+    """Heights (count,) of the spline u**2 on [0, 1]: the blossom of the square at its knots."""
+    t = knots(count, degree)
+    inner = np.array([t[i + 1 : i + 1 + degree] for i in range(count)])
+    pairs = inner.sum(axis=1) ** 2 - (inner**2).sum(axis=1)
+    return np.asarray(pairs / (degree * (degree - 1)))
+
+
+def nominal_heights(heliostat: Heliostat, shape: tuple[int, int] = (ROWS, COLUMNS)) -> Array:
+    """Heights (F, *shape) [m] of the ideal facets over their planes, with zero facet means.
+
+    A focused facet is the paraboloid z = (x**2 + y**2) / 4f, which splines are exactly.
+    """
+    half_sizes = heliostat.facet_frames.half_sizes
+    curved = np.array([f.focal_length or np.inf for f in heliostat.facets])[:, None]
+    # (2 u - 1)**2 = 4 u**2 - 4 u + 1 is the square of the place in half sizes.
+    along_x, along_y = (4 * squares(n) - 4 * greville(n) + 1 for n in shape)
+    x = half_sizes[:, :1] ** 2 / (4 * curved) * along_x
+    y = half_sizes[:, 1:] ** 2 / (4 * curved) * along_y
+    heights = x[:, :, None] + y[:, None, :]
+    return np.asarray(heights - heights.mean(axis=(1, 2), keepdims=True))
+
+
+def heights_or_ideal(heliostat: Heliostat, z: ArrayLike | None) -> Array:
+    """Heights ``z`` (F, I, J) [m]; zeros, the ideal surface, for None."""
+    if z is None:
+        return np.zeros((len(heliostat.facets), ROWS, COLUMNS))
+    return np.asarray(z, dtype=np.float64)
+
+
 def control_points(heliostat: Heliostat, z: ArrayLike | None = None) -> Array:
     """Control points (F, I, J, 3) [m] in mirror coordinates of heights ``z`` (F, I, J) [m] over the
-    canted facets.
+    ideal facets.
 
-    None gives the ideal surface: flat facets in their ideal poses.
+    None gives the ideal surface: flat or focused facets in their ideal poses.
     """
     centers, axes, half_sizes = heliostat.facet_frames
-    heights = (
-        np.zeros((len(heliostat.facets), ROWS, COLUMNS))
-        if z is None
-        else np.asarray(z, dtype=np.float64)
-    )
+    heights = heights_or_ideal(heliostat, z)
     if heights.ndim != 3 or len(heights) != len(heliostat.facets) or not np.isfinite(heights).all():
         raise InvalidInputError(
             f"z must be finite heights (facets, i, j) for {len(heliostat.facets)} facets"
         )
     x = (2 * greville(heights.shape[1]) - 1)[None, :, None] * half_sizes[:, 0, None, None]
     y = (2 * greville(heights.shape[2]) - 1)[None, None, :] * half_sizes[:, 1, None, None]
+    if any(facet.focal_length for facet in heliostat.facets):
+        heights = heights + nominal_heights(heliostat, heights.shape[1:])
     local = np.stack(np.broadcast_arrays(x, y, heights), axis=-1)
     return np.asarray(centers[:, None, None, :] + np.einsum("fijc,fcd->fijd", local, axes))
 
@@ -241,9 +269,12 @@ def heights(
     normals = evaluate(points, grid, grid, degree).normals
     u, v = (a.ravel() for a in np.meshgrid(grid, grid, indexing="ij"))
     local = np.einsum("fnmd,fcd->fnmc", normals, axes).reshape(len(axes), -1, 3)
-    return np.array(
+    fitted = np.array(
         [fit_heights(u, v, n, size, shape) for n, size in zip(local, half_sizes, strict=True)]
     )
+    if any(facet.focal_length for facet in heliostat.facets):
+        fitted = fitted - nominal_heights(heliostat, shape)
+    return fitted
 
 
 def fit_heights(

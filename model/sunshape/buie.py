@@ -7,7 +7,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from model.sunshape.base import SOLAR_DISC, SunShape, check
+from model.errors import InvalidInputError
+from model.sunshape.base import SOLAR_DISC, SunShape, check, integral
 
 AUREOLE_EDGE = 43.6e-3
 """Where the circumsolar aureole ends in Buie's sun shape [rad]."""
@@ -50,3 +51,50 @@ class Buie(SunShape):
         return torch.where(
             inside, disc, torch.where(angle <= AUREOLE_EDGE, aureole, torch.zeros_like(aureole))
         )
+
+
+MAX_CHI = 0.5
+"""Largest chi of `Buie`."""
+
+
+def csr_of_chi(chi: float) -> float:
+    """True circumsolar ratio, the share of the light that comes from the aureole.
+
+    By integration of the profile; the formula's ``chi`` (0 to 0.5) differs from it, by a factor of
+    20 at 0.01. Source: Wang, Asselineau, Fontanges, Logie, Pye and Coventry, *Verification of
+    optical modelling of sunshape and surface slope error*, Solar Energy 195 (2020).
+    """
+    whole = Buie(chi)
+    disc = integral(_Disc(chi))
+    return float(1 - disc / integral(whole))
+
+
+def chi_of_csr(csr: float) -> float:
+    """The ``chi`` of `Buie` whose true circumsolar ratio is ``csr``: the inverse of `csr_of_chi`.
+
+    Raises
+    ------
+    InvalidInputError
+        If no chi has it.
+    """
+    most = csr_of_chi(MAX_CHI)
+    if not 0 <= csr <= most:
+        raise InvalidInputError(f"csr must lie in [0, {most:.3f}], got {csr:g}")
+    low, high = 0.0, MAX_CHI
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        low, high = (middle, high) if csr_of_chi(middle) < csr else (low, middle)
+    return 0.0 if csr == 0 else (low + high) / 2
+
+
+# Of the interval of chi, until it is smaller than a double resolves.
+_HALVINGS = 52
+
+
+class _Disc(Buie):
+    """The solar disc of Buie's sun shape without its aureole."""
+
+    @property
+    def edges(self) -> tuple[float, ...]:
+        """Centre and rim of the disc [rad]."""
+        return (0.0, SOLAR_DISC)

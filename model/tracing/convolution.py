@@ -36,6 +36,7 @@ from typing import Any, Literal, NamedTuple, TypeVar, cast
 import torch
 from scipy.fft import next_fast_len
 from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool2d
 
 from model.errors import InvalidInputError, UnreachableError
 from model.images import normalized
@@ -43,7 +44,7 @@ from model.neighbours import clear
 from model.sunshape import FREQUENCY_COUNT, FREQUENCY_STEP, SunShape, half_angle, transfer_table
 from model.sunshape.base import SOFT_FROM
 from model.surface import edge_basis, midpoint_basis, sample
-from model.tracing.scene import Optics, Scene, Size, Window
+from model.tracing.scene import Optics, Scene, Size, Window, irradiance_of, optics_of
 
 Result = TypeVar("Result")
 
@@ -87,6 +88,8 @@ class Rays:
         Right and up of the plane's centre.
     power : Tensor (B, S) [m2]
         Projected mirror area of each ray.
+    lit : Tensor (B, 2) [m2]
+        Projected mirror area before shading and blocking, and before blocking.
     direction : Tensor (B, 3)
         Mean unit direction from mirror to target, in the plane's frame.
     slant_range : Tensor (B,) [m]
@@ -102,6 +105,7 @@ class Rays:
 
     hits: Tensor
     power: Tensor
+    lit: Tensor
     direction: Tensor
     slant_range: Tensor
     normal: Tensor
@@ -152,11 +156,9 @@ def central_rays(scene: Scene, samples: int) -> Rays:
         )
     if scene.blocked_below is not None:
         power = power * _unblocked(scene, scene.blocked_below, samples)
-    obstacles = scene.obstacles_in_plane()
-    if obstacles is not None:
-        cell = normals.norm(dim=1).mean(dim=-1).sqrt()
-        ways = (sun[..., None], direction)
-        power = power * torch.minimum(*(clear(obstacles, points, way, cell) for way in ways))
+    if scene.coverage is not None:
+        power = power * _covered(scene.coverage, samples)
+    power, lit = _unobstructed(scene, power, points, normals, direction)
     slant_range = mean_point[:, 2] / -beam[:, 2]
     spot_per_angle = (
         None
@@ -164,8 +166,37 @@ def central_rays(scene: Scene, samples: int) -> Rays:
         else _spot_per_angle(scene, scene.first_axis, mean_normal, sun, beam, slant_range)
     )
     return Rays(
-        hits, power, beam, slant_range, mean_normal, _footprint(hits, samples), spot_per_angle
+        hits, power, lit, beam, slant_range, mean_normal, _footprint(hits, samples), spot_per_angle
     )
+
+
+def _covered(coverage: Tensor, samples: int) -> Tensor:
+    """Share (B, F * samples**2) of samples within their facets' outlines (B, F, n, n)."""
+    whole = coverage.mean(dim=(-2, -1), keepdim=True)
+    cells = adaptive_avg_pool2d(coverage, samples)
+    return (cells * (whole / cells.mean(dim=(-2, -1), keepdim=True))).flatten(1)
+
+
+def _unobstructed(
+    scene: Scene, power: Tensor, points: Tensor, normals: Tensor, direction: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Projected areas (B, S) [m2] of samples that see sun and target, and `Rays.lit` (B, 2) [m2].
+
+    ``points`` [m], ``normals`` [m2] and ``direction`` are (B, 3, S) in the plane's frame.
+    """
+    sun = torch.einsum("bij,bj->bi", scene.plane_axes, scene.sun)[..., None]
+    cell = normals.norm(dim=1).mean(dim=-1).sqrt()
+    everything = power.sum(-1)
+    obstacles, shades = (scene.in_plane_frame(some) for some in (scene.obstacles, scene.shades))
+    sees_sun = torch.ones_like(power)
+    for some in (obstacles, shades):
+        if some is not None:
+            sees_sun = torch.minimum(sees_sun, clear(some, points, sun, cell))
+    free = sees_sun
+    if obstacles is not None:
+        free = torch.minimum(free, clear(obstacles, points, direction, cell))
+    lit = torch.stack([everything, (power * sees_sun).sum(-1)], dim=-1)
+    return (power if free is sees_sun and shades is None else power * free), lit
 
 
 def _unblocked(scene: Scene, line: Tensor, samples: int) -> Tensor:
@@ -288,38 +319,55 @@ def _cone_transfer(rays: Rays, optics: Optics, right: Tensor, up: Tensor, table:
     the slope error, which rotates the ray by twice the error in that plane, and by
     2 cos(incidence) times the error across it.
     """
-    d = rays.direction[:, :, None, None]
-    slope = -(d[:, 0] * right + d[:, 1] * up) / d[:, 2]
-    angular = rays.slant_range[:, None, None]
+    d, n = rays.direction, rays.normal
+    slope = -d[:, :2] / d[:, 2:]
+    across_beam = _square(slope) + d.new_tensor([1.0, 0.0, 1.0])
     # The tiny term keeps the root's gradient finite at frequency zero.
-    transfer = _interpolate(table, angular * torch.sqrt(right**2 + up**2 + slope**2 + 1e-24))
-    if isinstance(optics.slope_error, Tensor) or optics.slope_error > 0:
-        sigma = torch.as_tensor(optics.slope_error, dtype=right.dtype, device=right.device).reshape(
-            -1, 1, 1
-        )
-        n = rays.normal
-        cosine = (n * rays.direction).sum(-1)[:, None, None]
-        across = torch.linalg.cross(n, rays.direction)
-        across = (across / across.norm(dim=-1, keepdim=True).clamp(min=1e-12))[:, :, None, None]
-        total = right**2 + up**2 + slope**2
-        perpendicular = (across[:, 0] * right + across[:, 1] * up + across[:, 2] * slope) ** 2
-        variance = 4 * sigma**2 * (total - perpendicular * (1 - cosine**2)) * angular**2
-        transfer = transfer * torch.exp(-2 * math.pi**2 * variance)
-    if isinstance(optics.tracking_jitter, Tensor) or optics.tracking_jitter > 0:
+    angular = rays.slant_range[:, None, None] * (_evaluate(across_beam, right, up) + 1e-24).sqrt()
+    transfer = _interpolate(table, angular)
+    variance = torch.zeros_like(across_beam)
+    if _is_given(optics.slope_error):
+        cosine = (n * d).sum(-1, keepdim=True)
+        across = torch.linalg.cross(n, d)
+        across = across / across.norm(dim=-1, keepdim=True).clamp(min=1e-12)
+        perpendicular = _square(across[:, :2] + across[:, 2:] * slope)
+        of_normals = 4 * (across_beam - perpendicular * (1 - cosine**2))
+        variance = variance + _variance(optics.slope_error, rays) * of_normals
+    if _is_given(optics.pointing_error):
+        variance = variance + _variance(optics.pointing_error, rays) * across_beam
+    variance = variance * rays.slant_range[:, None] ** 2
+    if _is_given(optics.tracking_jitter):
         if rays.spot_per_angle is None:
             raise InvalidInputError("tracking jitter needs a scene with 'first_axis'")
-        sigma = torch.as_tensor(
-            optics.tracking_jitter, dtype=right.dtype, device=right.device
-        ).reshape(-1, 1, 1)
-        moved = (
-            rays.spot_per_angle[:, 0, None, None] * right
-            + rays.spot_per_angle[:, 1, None, None] * up
-        )
-        transfer = transfer * torch.exp(-2 * math.pi**2 * (sigma * moved) ** 2)
+        moved = _square(rays.spot_per_angle)
+        variance = variance + _variance(optics.tracking_jitter, rays) * moved
+    if any(map(_is_given, (optics.slope_error, optics.pointing_error, optics.tracking_jitter))):
+        transfer = transfer * torch.exp(_evaluate(-2 * math.pi**2 * variance, right, up))
     return transfer
 
 
-def _splat(x: Tensor, y: Tensor, weight: Tensor, rows: int, columns: int) -> Tensor:
+def _is_given(error: float | Tensor) -> bool:
+    return isinstance(error, Tensor) or error > 0
+
+
+def _variance(error: float | Tensor, rays: Rays) -> Tensor:
+    """Variance (B or 1, 1) [rad2] of an error."""
+    return torch.as_tensor(error).to(rays.direction).reshape(-1, 1) ** 2
+
+
+def _square(vector: Tensor) -> Tensor:
+    """The quadratic form (B, 3) of frequencies that is the square of (v.f), of vectors v (B, 2)."""
+    x, y = vector.unbind(-1)
+    return torch.stack([x * x, 2 * x * y, y * y], dim=-1)
+
+
+def _evaluate(form: Tensor, right: Tensor, up: Tensor) -> Tensor:
+    """Values (B, R, C) of quadratic forms (B, 3) at frequencies right (1, C) and up (R, 1)."""
+    xx, xy, yy = form[:, :, None, None].unbind(1)
+    return (xx * right**2 + yy * up**2) + (xy * right) * up
+
+
+def splat(x: Tensor, y: Tensor, weight: Tensor, rows: int, columns: int) -> Tensor:
     """Spread weights (B, S) over pixels (B, rows, columns) at coordinates x, y (B, S).
 
     Each becomes a quadratic B-spline, three pixels wide. The regular grid of rays would interfere
@@ -362,7 +410,7 @@ def _reach(rays: Rays, optics: Optics) -> float:
     """Distance [m] on the plane from a ray's hit within which nearly all of its light lands."""
     errors = [
         float(torch.as_tensor(sigma).detach().max())
-        for sigma in (optics.slope_error, optics.tracking_jitter)
+        for sigma in (optics.slope_error, optics.tracking_jitter, optics.pointing_error)
     ]
     angle = _MARGIN * _cached(half_angle, optics.sun_shape, _CONE_SHARE) + 6 * math.hypot(*errors)
     return float(angle * _per_angle(rays).max())
@@ -444,7 +492,8 @@ def trace(
     if samples < 1:
         raise InvalidInputError("samples must be at least one")
     optics = optics or Optics()
-    rays = central_rays(scene if cones == "mirror" else scene.by_facet(), samples)
+    traced = scene if cones == "mirror" else scene.by_facet()
+    rays = central_rays(traced, samples)
     parts = len(rays.power) // scene.batch
     spot = rays.spot_of(parts)
     center = spot if window.on_spot else torch.zeros_like(spot)
@@ -452,8 +501,10 @@ def trace(
         optics,
         slope_error=_of_parts(optics.slope_error, parts),
         tracking_jitter=_of_parts(optics.tracking_jitter, parts),
+        pointing_error=_of_parts(optics.pointing_error, parts),
     )
-    irradiance = optics.irradiance(rays.slant_range)
+    optics = optics_of(traced, optics)
+    irradiance = irradiance_of(traced, optics, rays.slant_range)
     image = _image(
         rays,
         center.repeat_interleave(parts, dim=0),
@@ -465,36 +516,6 @@ def trace(
     )
     power = (rays.power.sum(-1) * irradiance).view(-1, parts).sum(1)
     return Flux(irradiance=image, spot=spot, center=center, power=power)
-
-
-class SuperposedFlux(NamedTuple):
-    """Irradiance (rows, columns) [W/m2] over a window, and the mirrors' reflected power (B,) [W].
-
-    The power is that inside and outside of the window.
-    """
-
-    irradiance: Tensor
-    power: Tensor
-
-
-def superpose(
-    scene: Scene,
-    window: Window,
-    optics: Optics | None = None,
-    *,
-    samples: int = 16,
-    padding: tuple[float, float] = (0.25, 0.25),
-) -> SuperposedFlux:
-    """Add up the flux of all mirrors of a scene, which have one target plane.
-
-    Parameters are those of `trace`; ``padding`` is vertical and horizontal. Spectra are added, so
-    that one inverse transform is enough. Raises `UnreachableError` if a mirror faces away from the
-    sun or from the target.
-    """
-    optics, rays = optics or Optics(), central_rays(scene, samples)
-    irradiance, center = optics.irradiance(rays.slant_range), rays.hits.new_zeros(scene.batch, 2)
-    image = _image(rays, center, window, optics, irradiance, padding, parts=scene.batch)
-    return SuperposedFlux(image[0], rays.power.sum(-1) * irradiance)
 
 
 def _of_parts(value: float | Tensor, parts: int) -> float | Tensor:
@@ -590,5 +611,5 @@ def _image(
     """Irradiance (B / parts, rows, columns) [W/m2] of rays (B) in windows about ``center``."""
     rays_on_grid = raster(rays, center, window, optics, irradiance, padding)
     return rays_on_grid.blurred(
-        _splat(rays_on_grid.x, rays_on_grid.y, rays_on_grid.weight, *rays_on_grid.shape), parts
+        splat(rays_on_grid.x, rays_on_grid.y, rays_on_grid.weight, *rays_on_grid.shape), parts
     )

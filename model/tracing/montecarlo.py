@@ -19,7 +19,7 @@ from model.errors import InvalidInputError
 from model.mount import rotation
 from model.sunshape import Pillbox, random_angles
 from model.surface import basis
-from model.tracing.scene import Optics, Scene, Window
+from model.tracing.scene import Optics, Scene, Window, optics_of
 
 Array = NDArray[np.float64]
 
@@ -39,24 +39,26 @@ def _across(axis: Array) -> Array:
 
 
 class _FacetPoints(NamedTuple):
-    """Points [m] of a facet and their area vectors [m2], each (n, 3)."""
+    """Points [m] of a facet, their area vectors [m2], each (n, 3), and parameters (n, 2)."""
 
     points: Array
     areas: Array
+    parameters: Array
 
 
 def _facet_points(
     control_points: Array, degree: int, count: int, rng: np.random.Generator
 ) -> _FacetPoints:
     """Random points of one facet (I, J, 3), uniform in the parameters."""
-    value_u, slope_u = basis(control_points.shape[0], degree, rng.random(count))
-    value_v, slope_v = basis(control_points.shape[1], degree, rng.random(count))
+    u, v = rng.random((2, count))
+    value_u, slope_u = basis(control_points.shape[0], degree, u)
+    value_v, slope_v = basis(control_points.shape[1], degree, v)
 
     def product(a: Array, b: Array) -> Array:
         return np.asarray(np.einsum("nj,njc->nc", b, np.tensordot(a, control_points, axes=1)))
 
     areas = np.cross(product(slope_u, value_v), product(value_u, slope_v))
-    return _FacetPoints(product(value_u, value_v), areas)
+    return _FacetPoints(product(value_u, value_v), areas, np.stack([u, v], axis=-1))
 
 
 def _sun_rays(sun: Array, optics: Optics, count: int, rng: np.random.Generator) -> Array:
@@ -79,15 +81,20 @@ def _rays(
     points, centers, suns = scene.in_plane()
     facets = (points[index].double() + centers[index].double()[:, None, None]).numpy()
     sun = _unit(suns[index].double().numpy())
-    slope_error, jitter = (
-        _sigma(v, scene, index) for v in (optics.slope_error, optics.tracking_jitter)
+    slope_error, jitter, pointing_error = (
+        _sigma(value, scene, index)
+        for value in (optics.slope_error, optics.tracking_jitter, optics.pointing_error)
     )
-    inside = scene.obstacles_in_plane()
-    obstacles = np.zeros((0, 3, 3)) if inside is None else inside[index].double().numpy()
+    obstacles, shades = (
+        np.zeros((0, 3, 3)) if some is None else some[index].double().numpy()
+        for some in map(scene.in_plane_frame, (scene.obstacles, scene.shades))
+    )
     shares = rng.multinomial(count, np.full(len(facets), 1 / len(facets)))
     for facet, share in enumerate(shares):
-        place, area = _facet_points(np.moveaxis(facets[facet], 0, -1), scene.degree, share, rng)
-        visible = _visible_share(scene, index, facet, place)
+        place, area, spots = _facet_points(
+            np.moveaxis(facets[facet], 0, -1), scene.degree, share, rng
+        )
+        visible = _visible_share(scene, index, facet, place, spots)
         if jitter > 0:
             angle = rng.normal(0, jitter, share)
             place, area = _rotate_about_first_axis(scene, index, place, area, angle)
@@ -102,6 +109,11 @@ def _rays(
             normal = _unit(normal + tilt[0] * first + tilt[1] * second)
         out = 2 * (normal * toward_sun).sum(axis=-1, keepdims=True) * normal - toward_sun
         weight = weight * _is_free(obstacles, place, toward_sun) * _is_free(obstacles, place, out)
+        weight = weight * _is_free(shades, place, toward_sun)
+        if pointing_error > 0:
+            first, second = _across(out)
+            tilt = rng.normal(0, pointing_error, (2, share, 1))
+            out = _unit(out + tilt[0] * first + tilt[1] * second)
         distance = -place[:, 2] / out[:, 2]
         hits = place[:, :2] + distance[:, None] * out[:, :2]
         ahead = (distance > 0) & (out[:, 2] < 0)
@@ -121,9 +133,13 @@ def _plane_frame(scene: Scene, index: int) -> _PlaneFrame:
     return _PlaneFrame(turn @ center, turn)
 
 
-def _visible_share(scene: Scene, index: int, facet: int, place: Array) -> Array:
+def _visible_share(scene: Scene, index: int, facet: int, place: Array, parameters: Array) -> Array:
     """Share (n,) of the light at mirror points (n, 3) in the plane's frame that is not lost."""
     share = np.ones(len(place))
+    if scene.coverage is not None:
+        cells = scene.coverage[index, facet].double().numpy()
+        u, v = np.minimum(parameters * len(cells), len(cells) - 1).astype(int).T
+        share *= cells[u, v]
     if scene.facet_reflectivity is not None:
         share *= float(scene.facet_reflectivity[index, facet])
     if scene.blocked_below is not None:
@@ -147,14 +163,14 @@ def _is_free(obstacles: Array, place: Array, direction: Array) -> NDArray[np.boo
 
 def _rotate_about_first_axis(
     scene: Scene, index: int, place: Array, area: Array, angle: Array
-) -> _FacetPoints:
+) -> tuple[Array, Array]:
     """Rotate a mirror's points and area vectors about its first axis by angles (n,) [rad]."""
     if scene.first_axis is None:
         raise InvalidInputError("tracking jitter needs a scene with 'first_axis'")
     center, turn = _plane_frame(scene, index)
     jitter = rotation(turn @ scene.first_axis[index].double().numpy(), angle)
     points = center + np.einsum("nij,nj->ni", jitter, place - center)
-    return _FacetPoints(points, np.einsum("nij,nj->ni", jitter, area))
+    return points, np.einsum("nij,nj->ni", jitter, area)
 
 
 class MonteCarloFlux(NamedTuple):
@@ -178,7 +194,7 @@ def trace_montecarlo(
     """Trace every mirror of a scene with ``rays`` random rays, at least one."""
     if rays < 1:
         raise InvalidInputError("rays must be at least one")
-    optics = optics or Optics()
+    optics = optics_of(scene, optics or Optics())
     rng = np.random.default_rng(seed)
     images, spots = [], []
     for index in range(scene.batch):
@@ -195,7 +211,9 @@ def trace_montecarlo(
 
 def _spot(scene: Scene, index: int, optics: Optics, rng: np.random.Generator) -> Array:
     """Centre of mass (2,) [m] of the light from the sun's centre, as in the convolution tracer."""
-    point_sun = replace(optics, sun_shape=Pillbox(1e-6), slope_error=0.0, tracking_jitter=0.0)
+    point_sun = replace(
+        optics, sun_shape=Pillbox(1e-6), slope_error=0.0, tracking_jitter=0.0, pointing_error=0.0
+    )
     total, moment = 0.0, np.zeros(2)
     for hits, weight in _rays(scene, index, point_sun, 200_000, rng):
         total += weight.sum()
@@ -216,4 +234,5 @@ def _histogram(hits: Array, weight: Array, window: Window) -> Array:
 
 def _irradiance(scene: Scene, index: int, optics: Optics) -> float:
     distance = (scene.center[index] - scene.plane_center[index]).double().norm()
-    return float(optics.irradiance(torch.as_tensor(distance)))
+    own = 1.0 if scene.reflectance is None else float(scene.reflectance[index])
+    return own * float(optics.irradiance(torch.as_tensor(distance)))

@@ -2,20 +2,26 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from model.errors import InvalidInputError
 from model.images import FLUX_SIZE, FLUX_WINDOW
 from model.mount import Mount
-from model.plant import TargetPlane
+from model.plant import PERFECT, Outline, TargetPlane, inside_outline, outline_share
 from model.setup import Setup
 from model.sunshape import Buie, SunShape
 from model.surface import DEGREE
+
+Array = NDArray[np.float64]
+
+COVERAGE_CELLS = 48
+"""Cells along each side of a facet in which its outline is resolved."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +35,8 @@ class Optics:
         Standard deviation of the mirror's normals per axis, below the resolution of the surface.
     tracking_jitter : float or Tensor (B,) [rad]
         Standard deviation of the mirror's rotation about the first mount axis during an exposure.
+    pointing_error : float or Tensor (B,) [rad]
+        Standard deviation of the reflected beam's direction per axis.
     dni : float [W/m2]
     reflectivity : float
     attenuation : tuple of float
@@ -39,6 +47,7 @@ class Optics:
     sun_shape: SunShape = field(default_factory=Buie)
     slope_error: float | Tensor = 0.0
     tracking_jitter: float | Tensor = 0.0
+    pointing_error: float | Tensor = 0.0
     dni: float = 1000.0
     reflectivity: float = 1.0
     attenuation: tuple[float, ...] = ()
@@ -146,6 +155,12 @@ class Scene:
     obstacles : Tensor (B, K, 3, 3) or None [m]
         Rectangles in ENU, centre and half sides, that shade and block the mirrors
         (`model.neighbours`).
+    shades : Tensor (B, K, 3, 3) or None [m]
+        Rectangles that shade the mirrors only, such as the tower's outline.
+    coverage : Tensor (B, F, n, n) or None
+        Share of each facet's cells within its outline; None for facets that are rectangles.
+    reflectance, slope_error, pointing_error : Tensor (B,) or None
+        `MirrorOptics` of each mirror, in addition to `Optics`.
     """
 
     control_points: Tensor
@@ -159,6 +174,11 @@ class Scene:
     first_axis: Tensor | None = None
     blocked_below: Tensor | None = None
     obstacles: Tensor | None = None
+    shades: Tensor | None = None
+    coverage: Tensor | None = None
+    reflectance: Tensor | None = None
+    slope_error: Tensor | None = None
+    pointing_error: Tensor | None = None
 
     @classmethod
     def from_setups(
@@ -190,6 +210,7 @@ class Scene:
             plane_axes=tensor([axes[id(plane)] for plane in planes]),
             degree=setups[0].degree,
             first_axis=tensor(mount.first_axis),
+            **_mirror_tensors(setups, tensor),
         )
 
     def with_(self, **changes: Tensor) -> "Scene":
@@ -244,10 +265,60 @@ class Scene:
         sun = torch.einsum("bij,bj->bi", self.plane_axes, self.sun)
         return PlaneScene(points, center, sun)
 
-    def obstacles_in_plane(self) -> Tensor | None:
-        """Obstacles (B, K, 3, 3) [m] in the frame of each target plane."""
-        if self.obstacles is None:
+    def in_plane_frame(self, rectangles: Tensor | None) -> Tensor | None:
+        """Obstacles or shades (B, K, 3, 3) [m] in the frame of each target plane."""
+        if rectangles is None:
             return None
-        origin = torch.zeros_like(self.obstacles)
+        origin = torch.zeros_like(rectangles)
         origin[..., 0, :] = self.plane_center[:, None]
-        return (self.obstacles - origin) @ self.plane_axes.transpose(-1, -2)[:, None]
+        return (rectangles - origin) @ self.plane_axes.transpose(-1, -2)[:, None]
+
+
+def optics_of(scene: Scene, optics: Optics) -> Optics:
+    """The optics with the mirrors' own slope and pointing errors, which add in variance."""
+    if scene.slope_error is None or scene.pointing_error is None:
+        return optics
+    slope, pointing = (
+        (torch.as_tensor(common).to(own) ** 2 + own**2).sqrt()
+        for common, own in (
+            (optics.slope_error, scene.slope_error),
+            (optics.pointing_error, scene.pointing_error),
+        )
+    )
+    return replace(optics, slope_error=slope, pointing_error=pointing)
+
+
+def irradiance_of(scene: Scene, optics: Optics, slant_range: Tensor) -> Tensor:
+    """Irradiance (B,) [W/m2] of the light after mirrors and air, for slant ranges (B,) [m]."""
+    common = optics.irradiance(slant_range)
+    return common if scene.reflectance is None else common * scene.reflectance
+
+
+def _mirror_tensors(
+    setups: Sequence[Setup], tensor: Callable[[object], Tensor]
+) -> dict[str, Tensor]:
+    """Coverage and mirror optics of setups, where any is not that of a perfect rectangle."""
+    heliostats = [setup.heliostat for setup in setups]
+    tensors = {}
+    if any(heliostat.optics != PERFECT for heliostat in heliostats):
+        for name in ("reflectance", "slope_error", "pointing_error"):
+            tensors[name] = tensor([getattr(h.optics, name) for h in heliostats])
+    outlines = {tuple(facet.outline for facet in h.facets) for h in heliostats}
+    if any(outline is not None for facets in outlines for outline in facets):
+        cells = {facets: tensor([coverage(outline) for outline in facets]) for facets in outlines}
+        tensors["coverage"] = torch.stack(
+            [cells[tuple(facet.outline for facet in h.facets)] for h in heliostats]
+        )
+    return tensors
+
+
+@lru_cache(maxsize=256)
+def coverage(outline: Outline | None) -> Array:
+    """Share (n, n) of the cells of a facet, along its x and y, that an outline encloses."""
+    if outline is None:
+        return np.ones((COVERAGE_CELLS, COVERAGE_CELLS))
+    fine = 8 * COVERAGE_CELLS
+    places = (np.arange(fine) + 0.5) / fine * 2 - 1
+    inside = inside_outline(places[:, None], places[None, :], outline)
+    cells = inside.reshape(COVERAGE_CELLS, 8, COVERAGE_CELLS, 8).mean(axis=(1, 3))
+    return np.asarray(cells * (outline_share(outline) / cells.mean()))

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from model.surface import canted, midpoint_basis
 from model.tracing.convolution import Raster, Rays, central_rays, quadratic, raster
-from model.tracing.scene import Optics, Scene, Window
+from model.tracing.scene import Optics, Scene, Window, irradiance_of, optics_of
 
 TILT = 1e-4
 """Slope [rad] of the finite difference for the movement of light with the slope."""
@@ -44,9 +44,9 @@ def sensitivity(
     """
     rays = central_rays(scene, samples)
     center = rays.spot if window.on_spot else torch.zeros_like(rays.spot)
-    rays_on_grid = raster(
-        rays, center, window, optics, optics.irradiance(rays.slant_range), (padding, padding)
-    )
+    optics = optics_of(scene, optics)
+    irradiance = irradiance_of(scene, optics, rays.slant_range)
+    rays_on_grid = raster(rays, center, window, optics, irradiance, (padding, padding))
     moved = (
         _moved(scene, rays, samples)
         / rays_on_grid.x.new_tensor([window.pixel[0], -window.pixel[1]])[:, None, None, None]

@@ -8,6 +8,11 @@ from collections.abc import Mapping
 from model.errors import InvalidInputError, ModelError
 
 
+def list_reasons(skipped: Mapping[str, str], most: int = 3) -> str:
+    """The first of the skipped items with their reasons, in one line."""
+    return "; ".join(f"{name}: {reason}" for name, reason in list(skipped.items())[:most])
+
+
 class ServiceError(Exception):
     """Base class of expected errors. Their messages are for the caller."""
 

@@ -7,7 +7,7 @@ URLs.
 from collections.abc import Iterable
 from datetime import UTC, date, datetime
 from itertools import islice
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 import numpy as np
 from pydantic import (
@@ -111,6 +111,7 @@ ELEVATION = Field(gt=0, le=90, description="Sun elevation as seen, with refracti
 Azimuth = Annotated[Number, AZIMUTH]
 Elevation = Annotated[Number, ELEVATION]
 Extent = Annotated[Number, Field(ge=0.01, le=1e3)]
+Irradiance = Annotated[Number, Field(gt=0, le=2000, description="Direct normal irradiance [W/m2].")]
 
 
 def parse_moment(moment: datetime) -> datetime:
@@ -196,6 +197,9 @@ def _shortened(value: Any, fields: Iterable[str] = ()) -> Any:
     return [_shortened(entry) for entry in value[:_FIRST]] if isinstance(value, list) else value
 
 
+Schema = TypeVar("Schema", bound=BaseModel)
+
+
 class Model(BaseModel):
     """Base class of requests: finite numbers, no unknown keys."""
 
@@ -217,6 +221,12 @@ class Model(BaseModel):
             if error.error_count() <= _MAX_FAULTS:
                 raise
         raise ValueError(f"has {count} faults; send fewer entries to see which")
+
+
+def from_row(schema: type[Schema], row: object, /, **others: object) -> Schema:
+    """The schema of a row: ``others``, and for the other fields the attributes of their names."""
+    names = schema.model_fields.keys() - others.keys()
+    return schema.model_validate({name: getattr(row, name) for name in names} | others)
 
 
 class Plane(Model):

@@ -26,6 +26,7 @@ from model.setup import Setup
 from model.surface import DEGREE, control_points
 from service.base.arrays import unpack
 from service.base.choices import Method
+from service.base.errors import list_reasons
 from service.base.fields import Sun
 from service.base.settings import Settings
 from service.cli.demo_plant import write_plant
@@ -69,7 +70,9 @@ class HeliostatResult:
     pictures: tuple[str, ...]
 
 
-def run_demo(data: Path | None, out: Path, console: Console, quiet: bool = False) -> dict[str, Any]:
+def run_demo(
+    data: Path | None, out: Path, console: Console, quiet: bool = False
+) -> Mapping[str, object]:
     """Run the demonstration on the embedded plant or on a folder.
 
     All files are written to ``out``. Return the report.
@@ -100,7 +103,7 @@ def run_demo(data: Path | None, out: Path, console: Console, quiet: bool = False
         finally:
             runtime.close()
     if not made:
-        reasons = "; ".join(f"{name}: {reason}" for name, reason in list(skipped.items())[:3])
+        reasons = list_reasons(skipped)
         raise ModelError(f"{root}: no heliostat had an image that could be used ({reasons})")
     results = _drawn(out, made, runtime.settings.figure_scales)
     report = {
@@ -326,7 +329,7 @@ def _print(console: Console, results: list[HeliostatResult], out: Path, store: P
     console.print(said, highlight=False, markup=False, soft_wrap=True)
 
 
-def _page(report: dict[str, Any], results: list[HeliostatResult]) -> str:
+def _page(report: Mapping[str, object], results: list[HeliostatResult]) -> str:
     """HTML page with a conclusion, the table and links to the pictures."""
     judging = [result for result in results if result.held_out] or results
     photographs = sum(result.judged for result in judging)

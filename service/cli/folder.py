@@ -26,6 +26,7 @@ from model.surface import DEGREE, control_points, split_canting
 from service import store
 from service.base.arrays import pair_or_none, unpack
 from service.base.choices import Method, require_images
+from service.base.errors import list_reasons
 from service.base.progress import Progress, no_progress
 from service.cli.folder_store import FolderStore, open_folder
 from service.sources.documents import optics_to_json, read_json
@@ -73,9 +74,7 @@ def finish(
     """Write the report with all skipped items; raise ModelError if ``report[done]`` is empty."""
     _write_report(folder, report, path)
     if not report[done]:
-        reasons = "; ".join(
-            f"{name}: {reason}" for name, reason in list(report["skipped"].items())[:3]
-        )
+        reasons = list_reasons(report["skipped"])
         raise ModelError(f"nothing was left to do, everything was skipped ({reasons}); see {path}")
     return report
 
@@ -150,7 +149,7 @@ def observations_of(
 
 def predict_heliostat(
     opened: FolderStore, name: str, method: Method, images: int
-) -> tuple[SurfacePrediction, dict[str, Any]]:
+) -> tuple[SurfacePrediction, dict[str, object]]:
     """Predict one heliostat's surface; also return its entry in ``predictions.json``."""
     twin, (rows, refused) = opened.context(name), opened.photographs(name)
     if not rows:
@@ -161,7 +160,7 @@ def predict_heliostat(
     with opened.runtime.computing(f"predict_{method}") as operations:
         chosen, apart = choose_observations(operations, twin, rows, images)
         predicted = operations.predict(twin.heliostat, chosen, twin.model, method)
-    entry: dict[str, Any] = {
+    entry: dict[str, object] = {
         "method": method,
         "weights": predicted.weights,
         "images": list(predicted.used),

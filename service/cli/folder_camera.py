@@ -15,6 +15,7 @@ from model.imaging.light import Measured, Srgb, Transfer
 from model.imaging.measured_law import LitSheet, fit_law, lit_sheet
 from model.plant import Heliostat, TargetPlane
 from model.setup import Setup
+from service.base.errors import list_reasons
 from service.base.progress import Progress, no_progress
 from service.cli.folder import check_surfaces, finish, points_of, surfaces_of
 from service.cli.folder_forecast import agreement
@@ -99,9 +100,7 @@ def measure_camera(
     photographs, skipped = _read_photographs(folder, surfaces, targets, progress)
     days = sorted({photo.day for photo in photographs})
     if len(days) < FEWEST_DAYS:
-        reasons = "; ".join(
-            f"{name}: {reason}" for name, reason in list((folder.skipped | skipped).items())[:3]
-        )
+        reasons = list_reasons(folder.skipped | skipped)
         raise InvalidInputError(
             f"a camera response curve needs photographs of {FEWEST_DAYS} days;"
             f" {len(days)} are left" + (f" ({reasons})" if reasons else "")

@@ -179,7 +179,7 @@ def _accuracy_of(compared: Sequence[dict[str, Any]]) -> dict[str, float | None]:
     }
 
 
-def _accuracy_by_surface(compared: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def _accuracy_by_surface(compared: Sequence[dict[str, Any]]) -> dict[str, object]:
     """Accuracy of all measurements.
 
     If ideal mirrors replace only some of the surfaces, they are counted separately.
@@ -188,11 +188,11 @@ def _accuracy_by_surface(compared: Sequence[dict[str, Any]]) -> dict[str, Any]:
         surface: _accuracy_of([entry for entry in compared if entry["surface"] == surface])
         for surface in sorted({entry["surface"] for entry in compared})
     }
-    found: dict[str, Any] = next(
+    found = next(
         (accuracy for surface, accuracy in by_surface.items() if surface != "ideal"),
         by_surface.get("ideal", _accuracy_of([])),
     )
-    return found | ({"accuracy_by_surface": by_surface} if len(by_surface) > 1 else {})
+    return {**found, **({"accuracy_by_surface": by_surface} if len(by_surface) > 1 else {})}
 
 
 def circularity(report: dict[str, Any]) -> str | None:
@@ -214,7 +214,7 @@ def circularity(report: dict[str, Any]) -> str | None:
     return f"{said} by them, {others:.3f} by those not used"
 
 
-def _entry(out: Path, row: MeasurementRow, traced: operations.Forecast) -> dict[str, Any]:
+def _entry(out: Path, row: MeasurementRow, traced: operations.Forecast) -> dict[str, object]:
     """Write the forecast of one measurement and return its entry in ``forecast.json``."""
     out.mkdir(parents=True, exist_ok=True)
     path = out / f"{row.identifier}-forecast.npz"

@@ -12,7 +12,7 @@ from model.frames import sun_direction
 from model.pointing.report import day_of, field_to_json
 from model.pointing.spots import forecast_spot
 from service import store
-from service.base.errors import SKIPPED
+from service.base.errors import SKIPPED, list_reasons
 from service.base.progress import Progress, no_progress
 from service.cli.folder import write_json
 from service.cli.folder_store import open_folder
@@ -80,12 +80,11 @@ def spot_folder(
     report = {"spots": spots, "skipped": skipped}
     write_json(out, report)
     if not spots:
-        reasons = "; ".join(f"{name}: {reason}" for name, reason in list(skipped.items())[:3])
-        raise ModelError(f"no spot can be measured ({reasons}); see {out}")
+        raise ModelError(f"no spot can be measured ({list_reasons(skipped)}); see {out}")
     return report
 
 
-def _spot(stored: StoredMount, row: MeasurementRow) -> dict[str, Any]:
+def _spot(stored: StoredMount, row: MeasurementRow) -> dict[str, object]:
     plane, motors = store.target_plane(row.target), motors_of(stored.heliostat, row)
     sun = stored.sun(sun_direction(row.sun_azimuth_deg, row.sun_elevation_deg), row.taken_at)
     spot = forecast_spot(stored.mount, stored.heliostat, plane, motors, sun, day_of(row.taken_at))

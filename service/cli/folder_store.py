@@ -20,7 +20,7 @@ from service.base.progress import Progress, no_progress
 from service.base.settings import Settings
 from service.sources.documents import IMAGE_KINDS, get, read_json
 from service.sources.files import read_file
-from service.sources.folder import MeasurementFolder, declared_json
+from service.sources.folder import MeasurementFolder
 from service.store.columns import Base
 from service.store.keys import RESERVED
 from service.store.photographs.image_files import digest, media_type
@@ -168,7 +168,7 @@ def _store_plant(
     runtime: Runtime, folder: MeasurementFolder, effects: Sequence[Effect], known: dict[str, Any]
 ) -> None:
     """Store the plant, its model, its heliostats and their calibrated mounts."""
-    plant, declared = folder.plant, declared_json(folder.root / "twin.json")
+    plant, declared = folder.plant, folder.declared()
     every = [effect_to_json(effect) for effect in (*folder.model.effects, *effects)]
     declared = declared | ({"effects": every} if every else {})
     with runtime.database.writing() as session:

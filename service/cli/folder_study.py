@@ -8,6 +8,7 @@ from typing import Any
 from model.effects import Effect, effect_to_json
 from model.errors import InvalidInputError
 from model.study import FluxImage, Study, StudyOptions, study_to_json
+from service.base.errors import list_reasons
 from service.base.progress import Progress, no_progress
 from service.cli.folder import check_surfaces, points_of, predicted_from, surfaces_of
 from service.cli.folder_store import FolderStore, open_folder
@@ -82,6 +83,6 @@ def study_folder(
         try:
             found = opened.runtime.operations.study(photographs, model, options, progress)
         except InvalidInputError as error:
-            reasons = "; ".join(f"{name}: {reason}" for name, reason in list(skipped.items())[:5])
+            reasons = list_reasons(skipped, 5)
             raise InvalidInputError(f"{error}" + (f" ({reasons})" if reasons else "")) from None
     return FolderStudy(found, skipped, list(model.effects), clocks)

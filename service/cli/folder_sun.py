@@ -156,7 +156,7 @@ def forecast_for(
     return finish(folder, report, out / "forecast.json", "heliostats")
 
 
-def _entry(out: Path, receiver: Receiver, traced: operations.Forecast) -> dict[str, Any]:
+def _entry(out: Path, receiver: Receiver, traced: operations.Forecast) -> dict[str, object]:
     """Write a heliostat's forecast and return its entry in ``forecast.json``."""
     maps, center = {"flux": traced.flux}, None
     if isinstance(receiver, TargetPlane):

@@ -14,7 +14,8 @@ from model.surface import DEGREE, basis
 _FACETS = ("upper left", "upper right", "lower left", "lower right")
 
 
-def _png(figure: Figure) -> bytes:
+def png(figure: Figure) -> bytes:
+    """The figure as a PNG file."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
     return buffer.getvalue()
@@ -58,7 +59,7 @@ def map_picture(
     axes.set(xlabel="right [m]" if size else "column", ylabel="up [m]" if size else "row")
     axes.set_title(title, wrap=True)
     figure.colorbar(image, ax=axes, label=label, extend=_extend(values, low, high))
-    return _png(figure)
+    return png(figure)
 
 
 def places_picture(
@@ -82,7 +83,7 @@ def places_picture(
     )
     axes.set(xlabel="east of the tower [m]", ylabel="north [m]", aspect="equal")
     figure.colorbar(shown, ax=axes, label=title)
-    return _png(figure)
+    return png(figure)
 
 
 def series_picture(
@@ -98,7 +99,7 @@ def series_picture(
     axes.grid(alpha=0.3)
     if len(series) > 1:
         axes.legend()
-    return _png(figure)
+    return png(figure)
 
 
 def photograph_picture(
@@ -156,7 +157,7 @@ def surface_picture(z: NDArray[np.floating], title: str, bound: float) -> bytes:
     figure.colorbar(
         image, ax=panes.tolist(), label="deviation from the ideal facet [mm]", extend=extend
     )
-    return _png(figure)
+    return png(figure)
 
 
 Array = NDArray[np.floating]
@@ -191,4 +192,4 @@ def comparison_picture(
         shown, ax=panes[2], label="of the measured peak", extend=_extend(b - a, -bound, bound)
     )
     figure.suptitle(title)
-    return _png(figure)
+    return png(figure)

@@ -205,7 +205,7 @@ class Kind(Generic[Payload]):
     summary: str
     due: Callable[[Session, Settings], str | None] | None = None
     so_far: Callable[[Mapping[str, Mapping[str, Any]]], Mapping[str, object]] | None = None
-    require: Callable[[Settings], None] | None = None
+    require: Callable[[Settings], object] | None = None
     expected_s: Callable[[Payload, int], float] | None = None
 
 

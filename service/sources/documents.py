@@ -4,7 +4,7 @@ Source: the PAINT database of the Solar Tower Juelich, https://paint-database.or
 """
 
 import json
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,6 +27,7 @@ from service.base.fields import Sun
 from service.base.names import require_text
 from service.base.validation_messages import not_json, place_of
 from service.sources.files import MAX_JSON_BYTES, MAX_JSON_VALUES, read_file
+from service.sources.heliostat_document import heliostat_from_json, is_heliostat_document
 from service.sources.paint_documents import azimuth_from_north
 from service.sources.photograph import Photograph
 from service.sources.schema import (
@@ -197,7 +198,8 @@ def _mount(document: KinematicsProperties, where: str) -> Mount:
 def read_heliostat(
     name: str, properties: Any, origin: Array, context: object | None = None
 ) -> Heliostat:
-    """Parse a heliostat from the contents of PAINT's ``heliostat-properties.json``.
+    """Parse a heliostat from the contents of PAINT's ``heliostat-properties.json``, or of a
+    `service.sources.heliostat_document`.
 
     ``origin`` (3,) is the tower base in WGS84. ``context`` is `STORED` for stored properties.
     Raises `InvalidInputError`, which names the field.
@@ -205,6 +207,8 @@ def read_heliostat(
     have the order of its properties.
     """
     where = f"properties of {name}"
+    if is_heliostat_document(properties):
+        return heliostat_from_json(name, properties)
     document = parse(HeliostatProperties, properties, where, context)
     heliostat = Heliostat(
         name=name,
@@ -351,7 +355,15 @@ def _optics(declared: Any, where: str) -> Optics:
     return Optics(reflectivity=document.reflectivity, attenuation=attenuation)
 
 
-def optics_to_json(optics: Optics) -> dict[str, Any]:
+def sun_to_json(sun: SunShape) -> dict[str, object]:
+    """A declarable sun shape in the form of ``twin.json``."""
+    name = next(name for name, shape in SHAPES.items() if isinstance(sun, shape))
+    values = (getattr(sun, field.name) for field in fields(sun))  # type: ignore[arg-type]
+    given = zip(sun.units.items(), values, strict=True)
+    return {"shape": name, **{key: float(value) / unit for (key, unit), value in given}}
+
+
+def optics_to_json(optics: Optics) -> dict[str, object]:
     """Reflectivity and attenuation in the form of ``twin.json``, with defaults."""
     return {"reflectivity": optics.reflectivity, "attenuation": list(optics.attenuation)}
 

@@ -35,7 +35,7 @@ def confined_to(root: Path) -> Iterator[None]:
         _ROOT.reset(token)
 
 
-def require_regular(path: Path, name: str | None = None, max_bytes: int | None = None) -> Path:
+def require_regular(path: Path, max_bytes: int | None = None) -> Path:
     """Return ``path`` if it is or leads to a regular file of at most ``max_bytes``.
 
     The file is not opened.
@@ -44,27 +44,27 @@ def require_regular(path: Path, name: str | None = None, max_bytes: int | None =
     ------
     InvalidInputError
         If it is missing, too large, outside of what `confined_to` allows, or not a regular file.
-        Opening a pipe, for example, would block forever. ``name`` replaces the path in the message.
+        Opening a pipe, for example, would block forever.
     """
-    shown, root, most = str(path) if name is None else name, _ROOT.get(), max_bytes or _MAX_BYTES
+    root, most = _ROOT.get(), max_bytes or _MAX_BYTES
     try:
         if root is not None and not path.resolve().is_relative_to(root):
-            raise InvalidInputError(f"{shown}: leads outside of the folder; copy what it links to")
+            raise InvalidInputError(f"{path}: leads outside of the folder; copy what it links to")
         found = path.stat()
     except FileNotFoundError:
-        raise InvalidInputError(f"{shown}: no such file") from None
+        raise InvalidInputError(f"{path}: no such file") from None
     except OSError as error:
-        raise InvalidInputError(f"{shown}: {error.strerror}") from None
+        raise InvalidInputError(f"{path}: {error.strerror}") from None
     if not stat.S_ISREG(found.st_mode):
-        raise InvalidInputError(f"{shown}: no regular file")
+        raise InvalidInputError(f"{path}: no regular file")
     if found.st_size > most:
-        raise InvalidInputError(f"{shown}: {found.st_size} bytes, {most} are the most")
+        raise InvalidInputError(f"{path}: {found.st_size} bytes, {most} are the most")
     return path
 
 
 def read_file(path: Path, max_bytes: int | None = None) -> bytes:
     """Read a file that `require_regular` accepts; InvalidInputError if it cannot be read."""
     try:
-        return require_regular(path, max_bytes=max_bytes).read_bytes()
+        return require_regular(path, max_bytes).read_bytes()
     except OSError as error:
         raise InvalidInputError(f"{path}: {error.strerror}") from None

@@ -54,7 +54,7 @@ class MeasurementFolder(ABC):
     plant: Plant
     model: PlantModel
     skipped: dict[str, str]
-    properties: dict[str, Any] = field(default_factory=dict)
+    properties: dict[str, dict[str, object]] = field(default_factory=dict)
     broken: dict[str, str] = field(default_factory=dict)
 
     def measurements(self, heliostat: str, with_images: bool = True) -> list[Measurement]:
@@ -63,6 +63,10 @@ class MeasurementFolder(ABC):
         A file that cannot be read is added to ``skipped``; the others are still read.
         """
         return [m for m in self.read_measurements(heliostat) if m.images or not with_images]
+
+    def declared(self) -> dict[str, object]:
+        """The declared model in the form of ``twin.json``."""
+        return dict(declared_json(self.root / "twin.json"))
 
     @abstractmethod
     def read_measurements(self, heliostat: str) -> Iterator[Measurement]:

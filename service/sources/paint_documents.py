@@ -17,6 +17,8 @@ Its Item has a ``datetime`` or, if that is null, a period.
 """
 
 CATALOGUE = "catalog.json"
+Corners = dict[str, list[float]]
+"""WGS84 corners of a target by name."""
 
 
 def azimuth_from_north(paint_deg: float) -> float:
@@ -36,7 +38,7 @@ When = datetime | tuple[datetime, datetime]
 """A time, or the first and the last possible time."""
 
 
-def tower_json(plant: Plant, corners: Mapping[str, dict[str, Any] | None]) -> dict[str, Any]:
+def tower_json(plant: Plant, corners: Mapping[str, Corners | None]) -> dict[str, object]:
     """``tower-measurements.json`` of a plant.
 
     ``corners`` are the WGS84 corners of targets as they were received, or None.
@@ -47,13 +49,15 @@ def tower_json(plant: Plant, corners: Mapping[str, dict[str, Any] | None]) -> di
             name: _target_json(plane, plant, corners.get(name))
             for name, plane in plant.targets.items()
         },
-        **{name: _receiver_json(cylinder, plant) for name, cylinder in plant.receivers.items()},
+        **{
+            name: _receiver_json(receiver, plant)
+            for name, receiver in plant.receivers.items()
+            if isinstance(receiver, Cylinder)  # PAINT has no others
+        },
     }
 
 
-def _target_json(
-    plane: TargetPlane, plant: Plant, corners: dict[str, Any] | None
-) -> dict[str, Any]:
+def _target_json(plane: TargetPlane, plant: Plant, corners: Corners | None) -> dict[str, object]:
     right, up = plane.right * plane.width / 2, plane.up * plane.height / 2
     made = {
         "upper_left": up - right,
@@ -72,7 +76,7 @@ def _target_json(
     }
 
 
-def _receiver_json(cylinder: Cylinder, plant: Plant) -> dict[str, Any]:
+def _receiver_json(cylinder: Cylinder, plant: Plant) -> dict[str, object]:
     half, places = np.radians(cylinder.opening_deg) / 2, {}
     for side, angle in (("left", -half), ("right", half)):
         normal = np.cos(angle) * cylinder.normal + np.sin(angle) * cylinder.right
@@ -89,9 +93,9 @@ def _receiver_json(cylinder: Cylinder, plant: Plant) -> dict[str, Any]:
     }
 
 
-def measurement_json(photograph: Photograph) -> dict[str, Any]:
+def measurement_json(photograph: Photograph) -> dict[str, object]:
     """``calibration-properties.json`` of a photograph."""
-    document: dict[str, Any] = {
+    document: dict[str, object] = {
         "target_name": photograph.target_name,
         "sun_azimuth": azimuth_from_south(photograph.sun.azimuth_deg),
         "sun_elevation": photograph.sun.elevation_deg,
@@ -118,7 +122,7 @@ def stac_item(
     wgs84: Iterable[float],
     assets: Mapping[str, tuple[str, str]],
     **more: Any,
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """A STAC item at latitude [deg], longitude [deg], altitude [m], to be written to ``path``.
 
     ``when`` is its time, or the first and the last possible time. ``assets`` are names with files
@@ -153,7 +157,7 @@ def _when_json(when: When) -> dict[str, str | None]:
     }
 
 
-def stac_catalog(name: str, items: Iterable[str]) -> dict[str, Any]:
+def stac_catalog(name: str, items: Iterable[str]) -> dict[str, object]:
     """A STAC catalogue of items, given by their paths below it."""
     links = [{"rel": "item", "href": f"./{path}", "type": "application/geo+json"} for path in items]
     return {

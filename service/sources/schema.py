@@ -165,7 +165,7 @@ class TowerMeasurements(Document):
     """PAINT's ``tower-measurements.json``: the tower base, and planar targets by WGS84 corners."""
 
     power_plant_properties: PowerPlantProperties = Field(description="Name and tower base.")
-    declared: dict[str, Any] | None = Field(
+    declared: dict[str, object] | None = Field(
         default=None,
         description=(
             "What twin.json declares of the plant's model: `sun`, `effects`, and `optics` with"
@@ -200,7 +200,7 @@ class LinearAxis(DocumentPart):
 class KinematicsProperties(DocumentPart):
     """PAINT's ``kinematics_properties`` [m]: the mount and its actuators."""
 
-    actuators: list[dict[str, Any]] = Field(max_length=2, description="Drives of both axes.")
+    actuators: list[dict[str, object]] = Field(max_length=2, description="Drives of both axes.")
     joint_translation_e_1: Meters
     joint_translation_n_1: Meters
     joint_translation_u_1: Meters
@@ -299,7 +299,7 @@ class CalibrationProperties(Document, WeatherDocument):
     focal_spot: Spots | None = None
 
 
-def _parse_time(given: Any) -> Any:
+def parse_time(given: Any) -> Any:
     """A time in UTC, which is also the default zone; None stays."""
     if given is None:
         return None
@@ -313,5 +313,5 @@ def _parse_time(given: Any) -> Any:
 class ItemProperties(WeatherDocument):
     """Properties of a STAC item: its time, or a period, and the weather."""
 
-    taken_at: Annotated[datetime | None, BeforeValidator(_parse_time)] = Field(alias="datetime")
+    taken_at: Annotated[datetime | None, BeforeValidator(parse_time)] = Field(alias="datetime")
     start_datetime: Any = None

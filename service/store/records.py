@@ -33,7 +33,7 @@ FORMER_NAMES: dict[tuple[type[Base], str], str] = {
 def record(table: type[Base], without: tuple[str, ...] = (), **more: Any) -> Any:
     """Create the pydantic model for the documents of a table's rows.
 
-    `read` makes a document from a row; ``model_dump`` gives the columns.
+    `service.base.fields.from_row` makes a document from a row; ``model_dump`` gives the columns.
 
     Parameters
     ----------
@@ -81,9 +81,3 @@ def _bounded(kind: Any, column: ColumnElement[Any]) -> Any:
     if kind is str and isinstance(column.type, String) and column.type.length:
         return Annotated[str, Field(max_length=column.type.length)]
     return kind
-
-
-def read(document: Any, row: Base, **more: Any) -> Any:
-    """The document of a row, with ``more`` fields."""
-    columns = {name: getattr(row, name) for name in document.model_fields if name not in more}
-    return document.model_validate({**columns, **more})

@@ -84,6 +84,11 @@ class HeliostatRow(Base):
     updated_at: Mapped[datetime] = mapped_column(default=now, onupdate=now)
     photographs_changed_at: Mapped[datetime | None]
 
+    @property
+    def size_m(self) -> tuple[float, float]:
+        """Width and height of the mirror [m]."""
+        return float(self.properties["width"]), float(self.properties["height"])
+
 
 class TargetRow(Base):
     """A target plane in ENU [m]; ``corners`` are its WGS84 corners, if known."""
@@ -97,7 +102,7 @@ class TargetRow(Base):
     up: Mapped[list[float]]
     width_m: Mapped[float]
     height_m: Mapped[float]
-    corners: Mapped[dict[str, Any] | None]
+    corners: Mapped[dict[str, list[float]] | None]
     updated_at: Mapped[datetime] = mapped_column(default=now, onupdate=now)
 
 
@@ -462,7 +467,7 @@ class StudyRow(Base):
     verdict: Mapped[str] = mapped_column(String(16))
     conclusion: Mapped[str] = mapped_column(Text)
     report: Mapped[dict[str, Any]] = mapped_column(deferred=True)
-    skipped: Mapped[dict[str, Any]] = mapped_column(deferred=True)
+    skipped: Mapped[dict[str, str]] = mapped_column(deferred=True)
     html: Mapped[str | None] = mapped_column(Text, deferred=True)
 
 

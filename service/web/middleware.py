@@ -55,14 +55,18 @@ _BODY_PAUSE_S = 30.0
 _MULTIPART_OVERHEAD = 64 * 1024
 
 
-class RequestIdMiddleware:
+class _Middleware:
+    """Base of middleware that has no settings."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+
+class RequestIdMiddleware(_Middleware):
     """Middleware that assigns an id to every request and logs it.
 
     A well-formed id from the client is used. The response has the id, too.
     """
-
-    def __init__(self, app: ASGIApp) -> None:
-        self.app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """One ASGI call."""
@@ -106,14 +110,11 @@ def _template(scope: Scope) -> str:
     return path if not scope["path"].startswith("/v1/") or path.startswith("/v1/") else f"/v1{path}"
 
 
-class HeadMiddleware:
+class HeadMiddleware(_Middleware):
     """Middleware that answers HEAD like GET, without the body.
 
     A streamed response, such as events, is cancelled after its headers.
     """
-
-    def __init__(self, app: ASGIApp) -> None:
-        self.app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """One ASGI call."""
@@ -140,11 +141,8 @@ class HeadMiddleware:
             scope["method"] = "HEAD"
 
 
-class PartMiddleware:
+class PartMiddleware(_Middleware):
     """Middleware that moves the requested part of a page from the query to the request state."""
-
-    def __init__(self, app: ASGIApp) -> None:
-        self.app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """One ASGI call."""
@@ -153,15 +151,12 @@ class PartMiddleware:
         await self.app(scope, receive, send)
 
 
-class SecurityHeadersMiddleware:
+class SecurityHeadersMiddleware(_Middleware):
     """Middleware that adds security headers.
 
     Browsers then load nothing from other origins, guess no media types, and show no page in a
     frame of another site.
     """
-
-    def __init__(self, app: ASGIApp) -> None:
-        self.app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """One ASGI call."""
@@ -317,15 +312,12 @@ def _is_cross_site(headers: Headers) -> bool:
     return origin is not None and origin.partition("://")[2] != headers.get("host")
 
 
-class StoppingMiddleware:
+class StoppingMiddleware(_Middleware):
     """Middleware that answers 503 if a route takes too long during shutdown.
 
     A thread that runs the model cannot be ended. It is abandoned, its result is lost, and the
     process ends without it.
     """
-
-    def __init__(self, app: ASGIApp) -> None:
-        self.app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """One ASGI call."""

@@ -302,14 +302,14 @@ def test_cylinder_in_parallel_light_has_the_cosine_of_its_angle():
     """
     flat = Facet(np.zeros(3), np.array([10.0, 0, 0]), np.array([0, 8.0, 0]))
     far = replace(
-        Heliostat.juelich("far", np.array([0.0, 400.0, 40.0])),
+        Heliostat.juelich("far", np.array([0.0, 1200.0, 40.0])),
         facets=(flat,),
         width=20.0,
         height=16.0,
     )
     cylinder = Cylinder("r", [0, 2.0, 40], [0, 1, 0], [0, 0, 1], 2.0, 2.0, 120.0)
     task = Superposition(
-        cylinder, PlantModel(JUELICH, Optics(sun_shape=Pillbox(1e-3))), (8, 60), samples=96
+        cylinder, PlantModel(JUELICH, Optics(sun_shape=Pillbox(3e-4))), (8, 60), samples=96
     )
     found = superpose(
         task, tiles(setups([far], sun_direction(0.0, 60.0), np.array([0.0, 0.0, 40.0])))

@@ -15,6 +15,7 @@ from model.sunshape import (
     random_angles,
     transfer_table,
 )
+from model.sunshape.buie import chi_of_csr, csr_of_chi
 from model.tracing import Optics
 
 CPU = torch.device("cpu")
@@ -115,3 +116,26 @@ def test_light_beyond_an_end_is_lost_and_the_rest_stays():
     angles = random_angles(Buie(0.3), 400_000, np.random.default_rng(3))
     assert (angles < 18e-3).mean() < near[0, 0] < (angles < 20e-3).mean()
     assert half_angle(Buie(0.3), 0.9) == pytest.approx(np.quantile(angles, 0.9), rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("chi", "csr"), [(0.01, 0.0004), (0.02, 0.0058), (0.05, 0.043), (0.1, 0.100)]
+)
+def test_true_circumsolar_ratio_of_chi(chi: float, csr: float):
+    """As published with the six tools' cases (Wang et al. 2020)."""
+    assert csr_of_chi(chi) == pytest.approx(csr, abs=6e-4)
+
+
+def test_true_circumsolar_ratio_is_the_light_beyond_the_disc():
+    angles = random_angles(Buie(0.2), 400_000, np.random.default_rng(4))
+    assert csr_of_chi(0.2) == pytest.approx((angles > SOLAR_DISC).mean(), abs=2e-3)
+
+
+@pytest.mark.parametrize("csr", [0.0, 1e-4, 0.01, 0.1, 0.48])
+def test_chi_has_the_true_circumsolar_ratio(csr: float):
+    assert csr_of_chi(chi_of_csr(csr)) == pytest.approx(csr, abs=1e-12)
+
+
+def test_circumsolar_ratio_without_a_chi_is_refused():
+    with pytest.raises(InvalidInputError, match="csr must lie in"):
+        chi_of_csr(0.6)

@@ -97,10 +97,8 @@ def serve(
     from service.web import server
 
     keep_private()
-    given: dict[str, Any] = {
-        key: value for key, value in {"host": host, "port": port}.items() if value is not None
-    }
-    settings = Settings(**given)
+    given = {"host": host, "port": port}
+    settings = Settings.model_validate({k: v for k, v in given.items() if v is not None})
     address = f"http://{settings.host}:{settings.port}"
 
     def say() -> None:

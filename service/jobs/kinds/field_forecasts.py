@@ -17,10 +17,10 @@ from service import store
 from service.base.fields import (
     AnySun,
     Flag,
+    Irradiance,
     Model,
     ModelVersion,
     Name,
-    Number,
     Plane,
     Position,
     ReceiverIn,
@@ -66,9 +66,7 @@ class FleetIn(Model):
         default=True,
         description="Whether the mirrors of these heliostats shade and block each other.",
     )
-    dni_w_m2: Number = Field(
-        default=1000.0, gt=0, le=2000, description="Direct normal irradiance [W/m2]."
-    )
+    dni_w_m2: Irradiance = 1000.0
     resolution: Resolution = (256, 256)
     model_version: ModelVersion = None
 

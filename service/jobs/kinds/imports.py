@@ -38,10 +38,6 @@ def allowed_root(settings: Settings) -> Path:
     return settings.import_root
 
 
-def _require_root(settings: Settings) -> None:
-    allowed_root(settings)
-
-
 def allowed_folder(root: Path, folder: str) -> Path:
     """The folder of this name inside ``root``, with links and ``..`` resolved.
 
@@ -96,5 +92,5 @@ KIND = Kind(
     import_allowed,
     "Load a measurement folder into the store.",
     so_far=_until_then,
-    require=_require_root,
+    require=allowed_root,
 )

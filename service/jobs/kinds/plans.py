@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Self, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -107,12 +107,23 @@ def _suns(context: Context, payload: PlanIn) -> list[tuple[datetime, Sun]]:
     ]
 
 
-def load_of(flux: FleetFlux, receiver: Receiver, allowed_w_m2: float | None) -> dict[str, object]:
+class ReceiverLoad(TypedDict):
     """Key figures of the flux on a receiver.
 
     ``intercept`` is the share of the reflected power that hits it, and ``spillage`` the rest.
     ``exceeded_m2`` is the area above the allowed flux.
     """
+
+    peak_w_m2: float
+    power_w: float
+    reflected_w: float
+    intercept: float | None
+    spillage: float | None
+    exceeded_m2: float | None
+
+
+def load_of(flux: FleetFlux, receiver: Receiver, allowed_w_m2: float | None) -> ReceiverLoad:
+    """Key figures of a fleet's flux on a receiver."""
     pixel_m2 = receiver.width * receiver.height / flux.irradiance.size
     power = float(flux.irradiance.sum() * pixel_m2)
     intercept = min(power / flux.power, 1.0) if flux.power > 0 else None

@@ -70,7 +70,7 @@ def _read(root: Path, heliostats: list[str] | None) -> PaintFolder:
     found: dict[str, Heliostat] = {}
     skipped: dict[str, str] = {}
     broken: dict[str, str] = {}
-    properties: dict[str, Any] = {}
+    properties: dict[str, dict[str, object]] = {}
     for own in sorted(filter(Path.is_dir, root.iterdir())):
         name, folder = own.name, own / "Properties"
         files = sorted(folder.glob("*heliostat-properties.json"))

@@ -12,6 +12,7 @@ from sqlalchemy import ColumnElement, Select, and_, exists, func, not_, select, 
 from sqlalchemy.orm import InstrumentedAttribute, Session, aliased
 
 from service.base.errors import NotFoundError
+from service.store.listing import Period
 from service.store.photographs.measurements import EXCLUDED, PREFERENCE
 from service.store.tables import HeliostatRow, MeasurementRow, TargetRow
 
@@ -105,11 +106,8 @@ def dated_groups(
     """Select up to ``limit`` photographs with a known time, newest first, after the mark
     ``before``.
     """
-    query = _groups(filters).where(_Row.taken_at.is_not(None))
-    if filters.since is not None:
-        query = query.where(_Row.taken_at >= filters.since)
-    if filters.until is not None:
-        query = query.where(_Row.taken_at < filters.until)
+    taken = Period(filters.since, filters.until).conditions(_Row.taken_at)
+    query = _groups(filters).where(_Row.taken_at.is_not(None), *taken)
     if before is not None:
         query = query.where(tuple_(_Row.taken_at, _Row.id) < before)
     return query.order_by(_Row.taken_at.desc(), _Row.id.desc()).limit(limit)

@@ -221,10 +221,7 @@ def recent_measurements(
     query = _measurements(heliostat).where(
         MeasurementRow.accepted, MeasurementRow.arrays.is_not(None)
     )
-    if since is not None:
-        query = query.where(moment >= since)
-    if until is not None:
-        query = query.where(moment < until)
+    query = query.where(*Period(since, until).conditions(moment))
     # Several kinds of images show the same photograph, so query more rows than needed.
     query = query.order_by(moment.desc().nulls_last(), MeasurementRow.id.desc()).limit(
         len(PREFERENCE) * limit

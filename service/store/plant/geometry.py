@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike
 from sqlalchemy import select
 from sqlalchemy.orm import Session, defer
 
+from model.errors import InvalidInputError
 from model.plant import Cylinder, Receiver, TargetPlane
 from service.base import names
 from service.base.errors import ConflictError, NotFoundError
@@ -241,17 +242,21 @@ def get_receiver(session: Session, name: str) -> ReceiverRow:
     return row
 
 
-def put_receiver(session: Session, cylinder: Cylinder) -> Put[ReceiverRow]:
+def put_receiver(session: Session, cylinder: Receiver) -> Put[ReceiverRow]:
     """Store or update a receiver.
 
     Raises
     ------
     InvalidInputError
-        For an invalid name.
+        For an invalid name, or a receiver that is no cylinder.
     ConflictError
         If a target has this name.
     """
     names.require_name(names.NAME, cylinder.name, "receiver")
+    if not isinstance(cylinder, Cylinder):
+        raise InvalidInputError(
+            f"receiver {cylinder.name}: the store keeps cylinders only; give it to heliotwin field"
+        )
     serialize_writers(session)
     if find_target(session, cylinder.name) is not None:
         raise ConflictError(

@@ -10,6 +10,7 @@ from sqlalchemy.orm import Session, undefer
 
 from service.base.errors import ConflictError, NotFoundError
 from service.store.columns import now
+from service.store.listing import Period
 from service.store.photographs.measurements import EXCLUDED
 from service.store.rows import ROUNDS, insert, lock_row
 from service.store.tables import HeliostatRow, MeasurementRow, MountRow
@@ -167,8 +168,5 @@ def pointing_measurements(
     query = select(row).where(
         row.id.in_(first.group_by(func.coalesce(row.external_id, row.identifier)))
     )
-    if since is not None:
-        query = query.where(moment >= since)
-    if until is not None:
-        query = query.where(moment < until)
+    query = query.where(*Period(since, until).conditions(moment))
     return session.scalars(query.order_by(row.id)).all()

@@ -14,13 +14,11 @@ from sqlalchemy.orm import Session
 from model.plant import Cylinder, Plant, TargetPlane
 from service import store
 from service.sources.documents import read_heliostat
+from service.sources.paint_documents import Corners
 from service.store import Change, audit
 from service.store.plant.model_versions import put_declared
 from service.store.rows import Put
 from service.store.tables import HeliostatRow, ReceiverRow, TargetRow
-
-Corners = dict[str, list[float]]
-"""WGS84 corners of a target by name."""
 
 
 @dataclass(frozen=True)

@@ -331,8 +331,8 @@ _QUARTER = timedelta(minutes=15)
 _MIN_ELEVATION_DEG = 10.0
 
 
-def best_slot(runtime: Runtime, name: str, begin: datetime | None = None) -> CalibrationSlot | None:
-    """The most informative photograph of one heliostat within a day.
+def best_slot(runtime: Runtime, name: str) -> CalibrationSlot | None:
+    """The most informative photograph of one heliostat within a day from now.
 
     Suns are tried each quarter of an hour. The result is None if no target is in reach. Raises what
     `load_mount` raises.
@@ -340,7 +340,7 @@ def best_slot(runtime: Runtime, name: str, begin: datetime | None = None) -> Cal
     with runtime.database.reading() as session:
         stored = load_mount(session, name)
         planes = [store.target_plane(row) for row in store.list_targets(session)]
-    start = begin or now()
+    start = now()
     start += (datetime.min.replace(tzinfo=start.tzinfo) - start) % _QUARTER
     moments = [start + place * _QUARTER for place in range(96)]
     days = _suns_above(_MIN_ELEVATION_DEG, moments, stored.model.site.origin)

@@ -9,7 +9,6 @@ import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -158,7 +157,7 @@ def pointing_state(
         trend_mrad=trend,
         beyond_since=_beyond_since(days, off, limit_mrad),
         moved=moved,
-        drifted=_drifted(kept.document),
+        drifted=_drifted(kept),
     )
 
 
@@ -196,8 +195,8 @@ def _beyond_since(days: Array, off: Array, limit: float) -> datetime | None:
     return begun
 
 
-def _drifted(document: dict[str, Any]) -> PointingDrift | None:
-    drift, at = document["drift"], document["history"]["at"]
+def _drifted(mount: MountRow) -> PointingDrift | None:
+    drift, at = mount.document["drift"], mount.document["history"]["at"]
     if not drift["is_sure"]:
         return None
     size = float(np.linalg.norm(drift["zeros_mrad"]))

@@ -21,7 +21,7 @@ from model.progress import Progress, silent
 from model.refinement import refine
 from model.setup import Setup
 from model.study import study
-from model.surface import COLUMNS, ROWS
+from model.surface import heights_or_ideal
 from model.tracing.convolution import central_rays
 from service.base.choices import Method, require_images
 from service.sources.juelich import CENTERED_WINDOW, mark_layouts
@@ -94,11 +94,7 @@ def render(
     ``z`` are heights (F, 8, 8) [m]; None is the ideal surface. The result is (M, 64, 64), each with
     sum 100, in the windows of the observations.
     """
-    heights = (
-        np.zeros((len(heliostat.facets), ROWS, COLUMNS))
-        if z is None
-        else np.asarray(z, dtype=np.float64)
-    )
+    heights = heights_or_ideal(heliostat, z)
     return render_observations(heliostat, observations, heights, model)
 
 

@@ -23,7 +23,7 @@ from model.study.loop import MIN_IMAGES
 from model.surface import DEGREE, control_points
 from service import store
 from service.base.arrays import to_json_value
-from service.base.errors import SKIPPED, ConflictError, NotFoundError
+from service.base.errors import SKIPPED, ConflictError, NotFoundError, list_reasons
 from service.base.fields import CheckedStudyReport
 from service.base.progress import Report, Steps, no_report
 from service.base.validation_messages import format_validation_error
@@ -255,9 +255,7 @@ def study_store(runtime: Runtime, request: StudyRequest, report: Report = no_rep
 def _require_enough(material: StudyInputs) -> None:
     count = len(material.photographs)
     if count < MIN_IMAGES:
-        reasons = "; ".join(
-            f"{name}: {reason}" for name, reason in list(material.skipped.items())[:5]
-        )
+        reasons = list_reasons(material.skipped, 5)
         raise ConflictError(
             f"a study takes at least {MIN_IMAGES} photographs with surfaces, the store has {count}"
             + (f" ({reasons})" if reasons else "")

@@ -23,6 +23,7 @@ from model.metrics import flux_accuracy
 from service import store
 from service.base.errors import ServiceError
 from service.base.settings import Settings
+from service.store.listing import Period
 from service.store.photographs.measurements import PREFERENCE
 from service.store.tables import DriftRow, HeliostatRow, MeasurementRow, MountRow, SurfaceRow
 from service.twin.heliostats.measurements import (
@@ -70,14 +71,6 @@ class Comparison:
     was_used: bool
 
 
-@dataclass(frozen=True)
-class Span:
-    """Time span in which photographs were taken; None is open."""
-
-    since: datetime | None = None
-    until: datetime | None = None
-
-
 # Newest photographs of a span that are compared with forecasts.
 _MAX_OF_SPAN = 24
 
@@ -122,7 +115,7 @@ def held_out_first(
     return HeldOutFirst(rows, min(len(unseen), RECENT))
 
 
-def _in_span(session: Session, heliostat: HeliostatRow, span: Span) -> list[MeasurementRow]:
+def _in_span(session: Session, heliostat: HeliostatRow, span: Period) -> list[MeasurementRow]:
     """A heliostat's newest photographs of a span, with arrays, held out or not."""
     recent = store.recent_measurements(session, heliostat, _MAX_OF_SPAN, span.since, span.until)
     return store.get_measurements(
@@ -131,7 +124,7 @@ def _in_span(session: Session, heliostat: HeliostatRow, span: Span) -> list[Meas
 
 
 def compare(
-    runtime: Runtime, name: str, surface: SurfaceRow | None, span: Span | None = None
+    runtime: Runtime, name: str, surface: SurfaceRow | None, span: Period | None = None
 ) -> list[Comparison]:
     """Compare a heliostat's newest photographs with forecasts.
 
@@ -271,7 +264,7 @@ class ComparisonKey:
     corrected: datetime | None
     model: int
     calibrated_at: datetime | None = None
-    span: Span | None = None
+    span: Period | None = None
 
 
 @dataclass(frozen=True)
@@ -297,7 +290,7 @@ class ComparisonCache:
         session: Session,
         heliostat: HeliostatRow,
         surface: SurfaceRow | None,
-        span: Span | None = None,
+        span: Period | None = None,
     ) -> ComparisonKey | None:
         """What the comparisons with a surface depend on now; None without a photograph."""
         photographs = select(func.max(MeasurementRow.id)).where(

@@ -27,7 +27,15 @@ from model.imaging import ImageKind
 from model.pointing.report import mount_from_json
 from service import store
 from service.base.arrays import unpack_untrusted
-from service.base.fields import CheckedMountReport, CheckedStudyReport, Source, Sun, Verdict, Wgs84
+from service.base.fields import (
+    CheckedMountReport,
+    CheckedStudyReport,
+    Source,
+    Sun,
+    Verdict,
+    Wgs84,
+    from_row,
+)
 from service.base.validation_messages import format_validation_error
 from service.sources.documents import parse_declared, read_json
 from service.sources.files import read_file
@@ -40,7 +48,7 @@ from service.store.photographs.measurements import (
     find_measurement_of_image,
     find_position,
 )
-from service.store.records import many, read, record
+from service.store.records import many, record
 from service.store.tables import (
     AliasRow,
     CorrectionRow,
@@ -208,8 +216,8 @@ def plant_history(session: Session) -> Any:
     models = session.scalars(select(ModelRow).order_by(ModelRow.number)).all()
     return _Models(
         declared=store.get_plant(session).declared,
-        studies=[read(_Study, row, number=row.id) for row in studies],
-        models=[read(_Model, row, study=row.study_id) for row in models],
+        studies=[from_row(_Study, row, number=row.id) for row in studies],
+        models=[from_row(_Model, row, study=row.study_id) for row in models],
     )
 
 
@@ -316,7 +324,7 @@ def heliostat_history(session: Session, row: HeliostatRow, images: Mapping[str, 
     )
     return _History(
         photographs=[
-            read(
+            from_row(
                 _Photograph,
                 one,
                 sun=one.sun,
@@ -324,14 +332,14 @@ def heliostat_history(session: Session, row: HeliostatRow, images: Mapping[str, 
                 image=images.get(one.identifier),
                 excluded=one.reason == EXCLUDED,
                 corrections=[
-                    read(_Correction, correction) for correction in corrections.get(one.id, ())
+                    from_row(_Correction, correction) for correction in corrections.get(one.id, ())
                 ],
                 aliases=aliases.get(one.id, []),
             )
             for one in of_heliostat
         ],
         surfaces=[
-            read(
+            from_row(
                 _Surface,
                 one,
                 photographs=[m.identifier for m in one.measurements if m.identifier in images],
@@ -339,9 +347,12 @@ def heliostat_history(session: Session, row: HeliostatRow, images: Mapping[str, 
             for one in store.list_surfaces(session, row, None)
         ],
         decisions=[
-            read(_Decision, one, version=one.surface.version) for one in session.scalars(decided)
+            from_row(_Decision, one, version=one.surface.version)
+            for one in session.scalars(decided)
         ],
-        mounts=[read(_Mount, one) for one in session.scalars(mounts.order_by(MountRow.version))],
+        mounts=[
+            from_row(_Mount, one) for one in session.scalars(mounts.order_by(MountRow.version))
+        ],
     )
 
 

@@ -22,12 +22,13 @@ from service.base.errors import (
     NotFoundError,
     TooLargeError,
     UnsupportedImageError,
+    list_reasons,
 )
 from service.base.names import escape_control_characters
 from service.base.progress import Progress, no_progress
 from service.sources.documents import IMAGE_KINDS
 from service.sources.files import read_file
-from service.sources.folder import MeasurementFolder, declared_json, measured_heights
+from service.sources.folder import MeasurementFolder, measured_heights
 from service.sources.photograph import Photograph
 from service.store import audit
 from service.store.keys import RESERVED
@@ -112,9 +113,7 @@ def import_folder(
         except UNREADABLE as error:
             imported.skipped[name] = str(error)
     if not any(what.startswith("heliostats ") for what in imported.counts):
-        reasons = "; ".join(
-            f"{what}: {why}" for what, why in list(imported.to_json()["skipped"].items())[:3]
-        )
+        reasons = list_reasons(imported.to_json()["skipped"])
         raise ModelError(f"no heliostat could be imported ({reasons})")
     return imported.to_json()
 
@@ -190,7 +189,7 @@ def _restore(
 def _put_plant(runtime: Runtime, folder: MeasurementFolder, actor: str) -> Counter[str]:
     """Store the plant with targets, receivers and declared model in one transaction."""
     plant, has_history = folder.plant, (folder.root / history.PLANT).exists()
-    declared = None if has_history else declared_json(folder.root / "twin.json")
+    declared = None if has_history else folder.declared()
     changes = runtime.database.run_in_transaction(
         lambda session: setup.set_plant(session, actor, plant, declared)
     )

@@ -1,13 +1,12 @@
 """The audit trail."""
 
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Query
 from pydantic import BaseModel, Field
 
-from service.base.fields import CreatedAt, Id, Version
+from service.base.fields import CreatedAt, Id, Version, from_row
 from service.store import audit
-from service.store.job_tables import AuditRow
 from service.web.auth.dependencies import ADMIN, Limit, RuntimeDep
 from service.web.responses.openapi import problems
 from service.web.responses.paging import Page, page
@@ -23,12 +22,7 @@ class AuditOut(BaseModel):
     )
     action: str = Field(description="What was done.")
     subject: str = Field(description="What it was done to.")
-    detail: dict[str, Any] = Field(description="More about it, by the kind of action.")
-
-
-def audit_out(row: AuditRow) -> AuditOut:
-    """An entry of the audit trail as JSON."""
-    return AuditOut.model_validate(row, from_attributes=True)
+    detail: dict[str, object] = Field(description="More about it, by the kind of action.")
 
 
 router = APIRouter(tags=["audit"])
@@ -43,5 +37,4 @@ def list_audit(
     """List the audit trail: who did what, newest first."""
     with runtime.database.reading() as session:
         rows = audit.entries(session, limit + 1, after)
-    items = [audit_out(row) for row in rows]
-    return page(items, limit)
+    return page([from_row(AuditOut, row) for row in rows], limit)

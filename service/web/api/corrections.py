@@ -1,18 +1,29 @@
 """Corrections of photographs: another sun, target or time, or exclusion."""
 
-from typing import Annotated, Any, Self
+from typing import Annotated, Self
 
 from fastapi import APIRouter, Depends, Query
 from pydantic import BaseModel, Field, model_validator
 
 from service import store
-from service.base.fields import Author, CreatedAt, Flag, Model, Moment, Name, Reason, Sun, Why
+from service.base.fields import (
+    Author,
+    CreatedAt,
+    Flag,
+    Model,
+    Moment,
+    Name,
+    Reason,
+    Sun,
+    Why,
+    from_row,
+)
 from service.jobs.enqueuing import enqueue
 from service.jobs.kinds import predictions
 from service.jobs.kinds.predictions import PredictionsIn
 from service.sources.schema import WeatherFields
 from service.store.photographs.correction_log import list_corrections, made_from
-from service.store.tables import CorrectionRow, MeasurementRow
+from service.store.tables import MeasurementRow
 from service.twin.photographs.corrections import PhotographChanges, correct_photograph
 from service.twin.photographs.deletion import delete_photograph
 from service.twin.runtime.runtime import Runtime
@@ -59,8 +70,8 @@ class CorrectionOut(BaseModel):
     created_at: CreatedAt
     created_by: Author
     reason: Why
-    before: dict[str, Any] = Field(description="Previous values, by the fields that changed.")
-    after: dict[str, Any] = Field(description="New values.")
+    before: dict[str, object] = Field(description="Previous values, by the fields that changed.")
+    after: dict[str, object] = Field(description="New values.")
 
 
 class DeletedOut(BaseModel):
@@ -83,13 +94,6 @@ class CorrectedOut(BaseModel):
     forecasts: int = Field(description="How many forecasts were made with those.")
     job: int | None = Field(
         description="The job that predicts the surface again, if one was requested."
-    )
-
-
-def correction_out(row: CorrectionRow) -> CorrectionOut:
-    """A correction as JSON."""
-    return CorrectionOut.model_validate(
-        {name: getattr(row, name) for name in CorrectionOut.model_fields}
     )
 
 
@@ -182,5 +186,5 @@ def get_corrections(
         row: MeasurementRow = store.get_measurement(
             session, store.get_heliostat(session, name), measurement
         )
-        items = [correction_out(correction) for correction in list_corrections(session, row)]
+        items = [from_row(CorrectionOut, one) for one in list_corrections(session, row)]
     return Page(items=items, next=None)

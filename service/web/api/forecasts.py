@@ -18,6 +18,7 @@ from service.base.fields import (
     Flag,
     HeliostatOf,
     Id,
+    Irradiance,
     Model,
     ModelNumber,
     ModelVersion,
@@ -33,6 +34,7 @@ from service.base.fields import (
     SunPosition,
     Version,
     VersionIn,
+    from_row,
 )
 from service.drawing.pictures import flux_picture
 from service.store.listing import Order, Period
@@ -104,9 +106,7 @@ class ForecastIn(Model):
             " surface is forecast by its ideal mirror; the first of `warnings` says so."
         ),
     )
-    dni_w_m2: Number = Field(
-        default=1000.0, gt=0, le=2000, description="Direct normal irradiance [W/m2]."
-    )
+    dni_w_m2: Irradiance = 1000.0
     resolution: Resolution = (256, 256)
     window_m: Number | None = Field(
         default=None,
@@ -204,30 +204,19 @@ class ForecastOut(ForecastSummary):
 
 def forecast_summary(row: ForecastRow) -> ForecastSummary:
     """A forecast without its pixels."""
-    return ForecastSummary.model_validate(
-        {
-            "id": row.id,
-            "heliostat": row.heliostat.name,
-            "warnings": row.warnings or [],
-            "surface": "ideal" if row.surface is None else "stored",
-            "surface_version": None if row.surface is None else row.surface.version,
-            "target": row.target_name,
-            "plane": row.plane,
-            "sun": {"azimuth_deg": row.sun_azimuth_deg, "elevation_deg": row.sun_elevation_deg},
-            "at": row.sun_at,
-            "aim_point_m": row.aim_point_m,
-            "motor_position": row.motor_position,
-            "dni_w_m2": row.dni_w_m2,
-            "window_m": row.window_m,
-            "resolution": (row.rows, row.columns),
-            "normalised": row.normalised,
-            "unit": "1" if row.normalised else "W/m2",
-            "peak_w_m2": row.peak_w_m2,
-            "power_w": row.power_w,
-            "center_of_mass_m": pair_or_none(row.center_right_m, row.center_up_m),
-            "model_version": row.model_version,
-            "created_at": row.created_at,
-        }
+    return from_row(
+        ForecastSummary,
+        row,
+        heliostat=row.heliostat.name,
+        warnings=row.warnings or [],
+        surface="ideal" if row.surface is None else "stored",
+        surface_version=None if row.surface is None else row.surface.version,
+        target=row.target_name,
+        sun={"azimuth_deg": row.sun_azimuth_deg, "elevation_deg": row.sun_elevation_deg},
+        at=row.sun_at,
+        resolution=(row.rows, row.columns),
+        unit="1" if row.normalised else "W/m2",
+        center_of_mass_m=pair_or_none(row.center_right_m, row.center_up_m),
     )
 
 

@@ -1,13 +1,13 @@
 """Heliostats."""
 
 from datetime import datetime
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Depends, Query, Response, status
 from pydantic import BaseModel, Field
 
 from service import store
-from service.base.fields import HeliostatOf, Model, Name, Search
+from service.base.fields import HeliostatOf, Model, Name, Search, from_row
 from service.sources.schema import HeliostatProperties
 from service.store.tables import HeliostatRow
 from service.twin.plant import setup
@@ -43,21 +43,18 @@ class HeliostatSummary(BaseModel):
 class HeliostatOut(HeliostatSummary):
     """A heliostat with its properties."""
 
-    properties: dict[str, Any] = Field(description="PAINT properties as they were sent.")
+    properties: dict[str, object] = Field(description="PAINT properties as they were sent.")
     updated_at: datetime = Field(description="When it was last changed.")
 
 
 def heliostat_summary(row: HeliostatRow) -> HeliostatSummary:
     """A heliostat without its properties."""
-    return HeliostatSummary(name=row.name, position_m=(row.east_m, row.north_m, row.up_m))
+    return from_row(HeliostatSummary, row, position_m=(row.east_m, row.north_m, row.up_m))
 
 
 def heliostat_out(row: HeliostatRow) -> HeliostatOut:
     """A heliostat as JSON."""
-    position = (row.east_m, row.north_m, row.up_m)
-    return HeliostatOut(
-        name=row.name, position_m=position, properties=row.properties, updated_at=row.updated_at
-    )
+    return from_row(HeliostatOut, row, position_m=(row.east_m, row.north_m, row.up_m))
 
 
 router = APIRouter(tags=["heliostats"])

@@ -12,7 +12,6 @@ from starlette.datastructures import UploadFile as StarletteUploadFile
 
 from model.errors import InvalidInputError
 from model.frames import enu_to_wgs84
-from model.pointing import Weather
 from service import store
 from service.base.arrays import pair_or_none, unpack
 from service.base.errors import GoneError, NotFoundError, StoreDamagedError, TooLargeError
@@ -32,6 +31,7 @@ from service.base.fields import (
     Rows,
     SunPosition,
     TargetOf,
+    from_row,
 )
 from service.drawing.pictures import flux_picture
 from service.sources.photograph import Photograph
@@ -222,32 +222,19 @@ class MeasurementFluxOut(MeasurementOut):
 def measurement_out(session: Session, heliostat_name: str, row: MeasurementRow) -> MeasurementOut:
     """A measurement as JSON."""
     origin = store.get_plant(session).origin
-    return MeasurementOut.model_validate(
-        {
-            "id": row.identifier,
-            "heliostat": heliostat_name,
-            "external_id": row.external_id,
-            "kind": row.kind,
-            "target": row.target.name,
-            "sun": row.sun,
-            "motor_position": pair_or_none(row.motor_axis_1, row.motor_axis_2),
-            "taken_at": row.taken_at,
-            "focal_spot_m": spot_m(row.focal_spot_wgs84, origin),
-            "helios_spot_m": spot_m(row.helios_spot_wgs84, origin),
-            **vars(Weather.of(row)),
-            "accepted": row.accepted,
-            "reason": row.reason,
-            "warnings": row.warnings or [],
-            "quality": row.quality,
-            "center_of_mass_m": pair_or_none(row.center_right_m, row.center_up_m),
-            "image_sha256": row.image_sha256,
-            "image_media_type": row.image and row.image.media_type,
-            "image_pruned_at": row.image and row.image.pruned_at,
-            "corrected_at": row.corrected_at,
-            "forced": row.forced,
-            "created_at": row.created_at,
-            "sent_by": row.sent_by,
-        }
+    return from_row(
+        MeasurementOut,
+        row,
+        id=row.identifier,
+        heliostat=heliostat_name,
+        target=row.target.name,
+        motor_position=pair_or_none(row.motor_axis_1, row.motor_axis_2),
+        focal_spot_m=spot_m(row.focal_spot_wgs84, origin),
+        helios_spot_m=spot_m(row.helios_spot_wgs84, origin),
+        warnings=row.warnings or [],
+        center_of_mass_m=pair_or_none(row.center_right_m, row.center_up_m),
+        image_media_type=row.image and row.image.media_type,
+        image_pruned_at=row.image and row.image.pruned_at,
     )
 
 

@@ -1,12 +1,12 @@
 """Versions of the plant model."""
 
 from datetime import datetime
-from typing import Any
 
 from fastapi import APIRouter
 from pydantic import BaseModel, Field
 from sqlalchemy.orm import Session
 
+from service.base.fields import from_row
 from service.store.plant.model_versions import declared_of
 from service.store.tables import ModelRow
 from service.twin.plant import model_versions
@@ -22,10 +22,10 @@ class ModelOut(BaseModel):
 
     version: int = Field(description="Ask for it as `model_version`.")
     is_current: bool = Field(description="Whether forecasts and predictions are made by it.")
-    effects: list[dict[str, Any]] = Field(
+    effects: list[dict[str, object]] = Field(
         description="Its effects with parameters and scopes, but for declared ones."
     )
-    declared: dict[str, Any] | None = Field(
+    declared: dict[str, object] | None = Field(
         description=(
             "What was declared when it was made, as in twin.json; null: Buie's sun with a ratio of"
             " 0.02."
@@ -40,7 +40,7 @@ class ModelOut(BaseModel):
     withdrawn_by: str | None = Field(description="Name of the key that withdrew it.")
 
 
-def declared_model(declared: dict[str, Any] | None, is_current: bool) -> ModelOut:
+def declared_model(declared: dict[str, object] | None, is_current: bool) -> ModelOut:
     """The declared model, which is the first version."""
     unknown = dict.fromkeys(("study", "adopted_at", "adopted_by", "withdrawn_at", "withdrawn_by"))
     about = {"version": model_versions.DECLARED, "effects": [], "declared": declared}
@@ -49,10 +49,7 @@ def declared_model(declared: dict[str, Any] | None, is_current: bool) -> ModelOu
 
 def model_out(row: ModelRow, is_current: bool) -> ModelOut:
     """An adopted version of the plant model."""
-    names = ModelOut.model_fields.keys() - {"version", "is_current", "study"}
-    fields = {name: getattr(row, name) for name in names}
-    about = {"version": row.number, "is_current": is_current, "study": row.study_id}
-    return ModelOut.model_validate(fields | about)
+    return from_row(ModelOut, row, version=row.number, is_current=is_current, study=row.study_id)
 
 
 def all_models(session: Session) -> list[ModelOut]:

@@ -1,6 +1,6 @@
 """The plant, its target planes and its receivers."""
 
-from typing import Any, Self
+from typing import Self
 
 from fastapi import APIRouter, Depends, Response, status
 from pydantic import BaseModel, Field, model_validator
@@ -9,7 +9,7 @@ from sqlalchemy.orm import Session
 from model.frames import wgs84_to_enu
 from model.plant import Plant, TargetPlane
 from service import store
-from service.base.fields import Model, Plane, ReceiverIn, TargetOf, Wgs84
+from service.base.fields import Model, Plane, ReceiverIn, TargetOf, Wgs84, from_row
 from service.sources.documents import parse_declared, read_receivers, read_targets
 from service.sources.schema import TowerMeasurements
 from service.store.plant.model_versions import declared_of, find_current
@@ -35,7 +35,7 @@ class PlantOut(BaseModel):
     origin_wgs84: tuple[float, float, float] = Field(
         description="Tower base: latitude [deg], longitude [deg], altitude [m]."
     )
-    declared: dict[str, Any] | None = Field(
+    declared: dict[str, object] | None = Field(
         description=(
             "What is declared of its model, as in twin.json; null: Buie's sun with a ratio of 0.02,"
             " no effects, and optics of reflectivity 1 without attenuation."
@@ -89,7 +89,7 @@ class TargetOut(BaseModel):
     up: tuple[float, float, float] = Field(description="Unit vector up the image.")
     width: float = Field(description="[m]")
     height: float = Field(description="[m]")
-    corners: dict[str, Any] | None = Field(
+    corners: dict[str, object] | None = Field(
         description="The WGS84 corners that it was made from, if it was."
     )
 
@@ -102,32 +102,12 @@ def plant_out(session: Session) -> PlantOut:
 
 def target_out(row: TargetRow) -> TargetOut:
     """A target plane as JSON."""
-    return TargetOut.model_validate(
-        {
-            "name": row.name,
-            "center": row.center_m,
-            "normal": row.normal,
-            "up": row.up,
-            "width": row.width_m,
-            "height": row.height_m,
-            "corners": row.corners,
-        }
-    )
+    return from_row(TargetOut, row, center=row.center_m, width=row.width_m, height=row.height_m)
 
 
 def receiver_out(row: ReceiverRow) -> ReceiverOut:
     """A cylindrical receiver as JSON."""
-    return ReceiverOut.model_validate(
-        {
-            "name": row.name,
-            "center": row.center_m,
-            "normal": row.normal,
-            "up": row.up,
-            "radius": row.radius_m,
-            "height": row.height_m,
-            "opening_deg": row.opening_deg,
-        }
-    )
+    return from_row(ReceiverOut, row, center=row.center_m, radius=row.radius_m, height=row.height_m)
 
 
 router = APIRouter(tags=["plant"])
@@ -140,11 +120,6 @@ def _from_corners(session: Session, name: str, corners: Corners) -> TargetPlane:
     return TargetPlane.from_corners(
         name, *(wgs84_to_enu(getattr(corners, corner), origin) for corner in _CORNERS)
     )
-
-
-def _paint_corners(document: dict[str, Any], name: str) -> dict[str, list[float]]:
-    coordinates = document[name]["coordinates"]
-    return {corner: [float(value) for value in coordinates[corner]] for corner in _CORNERS}
 
 
 @router.get("/plant", responses=problems(409), dependencies=[READ])
@@ -169,7 +144,11 @@ def put_plant(document: TowerMeasurements, runtime: RuntimeDep, identity: Identi
     origin, targets = read_targets(document.raw)
     receivers = read_receivers(document.raw)
     parse_declared(document.declared or {}, "declared")  # refuse models that cannot be computed
-    corners = {name: _paint_corners(document.raw, name) for name in targets}
+    places = {name: document.raw[name]["coordinates"] for name in targets}
+    corners = {
+        name: {corner: list(map(float, place[corner])) for corner in _CORNERS}
+        for name, place in places.items()
+    }
 
     def write(session: Session) -> PlantOut:
         plant = Plant(document.power_plant_properties.ID, origin, targets, receivers=receivers)

@@ -1,7 +1,7 @@
 """Studies, and the versions of the plant model that are adopted from them."""
 
 from datetime import datetime
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Path, Query, Response, status
 from fastapi.responses import HTMLResponse
@@ -19,11 +19,13 @@ from service.base.fields import (
     StudyReport,
     Verdict,
     Version,
+    from_row,
 )
 from service.jobs.kinds import KINDS
 from service.store.listing import Order, Period
 from service.store.tables import StudyRow
 from service.twin.plant import model_versions
+from service.twin.runtime.runtime import Runtime
 from service.web.api.jobs import add_creator
 from service.web.api.models import ModelOut, current_out, model_out
 from service.web.auth.dependencies import OPERATE, READ, IdentityDep, Limit, RuntimeDep
@@ -37,7 +39,7 @@ class StudySummary(BaseModel):
     id: Id
     created_at: CreatedAt
     created_by: str = Field(description="Name of the key that asked for it.")
-    options: dict[str, Any] = Field(description="What was asked.")
+    options: dict[str, object] = Field(description="What was asked.")
     heliostats: list[str] = Field(description="Those whose photographs were studied.")
     first_taken_at: datetime | None = Field(
         description="When the first photograph was taken, where that is known."
@@ -82,21 +84,25 @@ class AdoptIn(Model):
     )
 
 
-def _study_fields(row: StudyRow, adopted: int | None) -> dict[str, Any]:
-    names = StudySummary.model_fields.keys() - {"adopted"}
-    return {name: getattr(row, name) for name in names} | {"adopted": adopted}
-
-
 def study_summary(row: StudyRow, adopted: int | None) -> StudySummary:
     """A study without its figures. ``adopted`` is the version that was adopted from it."""
-    return StudySummary.model_validate(_study_fields(row, adopted))
+    return from_row(StudySummary, row, adopted=adopted)
 
 
 def study_out(row: StudyRow, adopted: int | None) -> StudyOut:
     """A study, loaded with its report, as JSON."""
     return StudyOut.model_validate(
-        {**row.report, **_study_fields(row, adopted), "skipped": row.skipped}
+        {**row.report, **dict(study_summary(row, adopted)), "skipped": row.skipped}
     )
+
+
+def study_html(runtime: Runtime, number: int) -> str:
+    """The report of a study as a page; NotFoundError if it has none."""
+    with runtime.database.reading() as session:
+        row = store.get_study(session, number, page=True)
+    if row.html is None:
+        raise NotFoundError(f"study {number} came as a report without a page")
+    return row.html
 
 
 router = APIRouter(tags=["studies"])
@@ -161,11 +167,8 @@ def get_study(number: Number, runtime: RuntimeDep) -> StudyOut:
 )
 def get_study_report(number: Number, runtime: RuntimeDep) -> HTMLResponse:
     """Get the report of a study as a page for people."""
-    with runtime.database.reading() as session:
-        row = store.get_study(session, number, page=True)
-    if row.html is None:
-        raise NotFoundError(f"study {number} came as a report without a page")
-    return HTMLResponse(row.html, headers={"Content-Security-Policy": REPORT_POLICY})
+    headers = {"Content-Security-Policy": REPORT_POLICY}
+    return HTMLResponse(study_html(runtime, number), headers=headers)
 
 
 @router.post(

@@ -28,6 +28,7 @@ from service.base.fields import (
     VersionIn,
     Whole,
     Why,
+    from_row,
 )
 from service.base.settings import Settings
 from service.drawing.pictures import surface_picture
@@ -163,8 +164,7 @@ class DecisionOut(BaseModel):
 
 def decision_out(row: DecisionRow) -> DecisionOut:
     """A decision as JSON."""
-    names = set(DecisionOut.model_fields) - {"version"}
-    return DecisionOut(version=row.surface.version, **{name: getattr(row, name) for name in names})
+    return from_row(DecisionOut, row, version=row.surface.version)
 
 
 class SurfaceOut(SurfaceSummary):
@@ -180,36 +180,15 @@ class SurfaceOut(SurfaceSummary):
     control_points: list[Any] = Field(description="(4, 8, 8, 3) [m] in heliostat coordinates.")
 
 
-_TOLD = (
-    "trusted",
-    "warnings",
-    "warned_since",
-    "suspicious",
-    "mahalanobis_distance",
-    "sun_span_deg",
-    "acknowledged_at",
-    "acknowledged_by",
-)
-
-
 def surface_summary(heliostat_name: str, row: SurfaceRow) -> SurfaceSummary:
     """A surface without its arrays."""
-    return SurfaceSummary.model_validate(
-        {
-            "heliostat": heliostat_name,
-            "version": row.version,
-            "source": row.source,
-            "model": row.model,
-            "model_version": row.model_version,
-            "created_at": row.created_at,
-            "valid_from": row.valid_from,
-            "measurements": [measurement_out.identifier for measurement_out in row.measurements],
-            "outdated": [measurement_out.identifier for measurement_out in row.outdated],
-            "deleted": row.deleted or [],
-            "misfit": row.misfit,
-            **{name: getattr(row, name) for name in _TOLD},
-            "is_candidate": row.is_candidate,
-        }
+    return from_row(
+        SurfaceSummary,
+        row,
+        heliostat=heliostat_name,
+        measurements=[measurement.identifier for measurement in row.measurements],
+        outdated=[measurement.identifier for measurement in row.outdated],
+        deleted=row.deleted or [],
     )
 
 

@@ -6,15 +6,16 @@ Maps share one scale. The page also shows the forecasts of both surfaces, and th
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, date, datetime, time, timedelta
+from functools import partial
 from statistics import fmean
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import HTMLResponse
 from pydantic import model_validator
 from sqlalchemy import func, select
-from sqlalchemy.orm import Session, undefer
+from sqlalchemy.orm import Session
 
 from model.errors import ModelError
 from model.metrics import flux_accuracy
@@ -24,17 +25,18 @@ from service.base.errors import NotFoundError
 from service.base.fields import AZIMUTH, ELEVATION, Model, Name, Sun, Version, drop_empty_fields
 from service.drawing import charts
 from service.drawing.charts import HeatMap, Timeline, Value
+from service.store.listing import Period
 from service.store.pointing import mounts
 from service.store.tables import HeliostatRow, MountRow, PlantRow, SurfaceRow, TargetRow
 from service.twin.alerts.field_overview import SurfaceErrors, field_totals, surface_errors
 from service.twin.forecasts.heliostat_forecast import ForecastRequest, trace_request
 from service.twin.runtime.operations import Forecast
 from service.twin.runtime.runtime import Runtime
-from service.twin.surfaces.accuracy import Comparison, ComparisonResult, Span
+from service.twin.surfaces.accuracy import Comparison, ComparisonResult
 from service.twin.surfaces.accuracy import photograph_name as photograph_of
 from service.web.auth.dependencies import COMPUTE_SLOT, READ, RENDER_SLOT, RuntimeDep
 from service.web.pages.forecast import sun_now
-from service.web.pages.heliostat import ComparisonCacheDep
+from service.web.pages.heliostat import ComparisonCacheDep, newest_surfaces
 from service.web.responses.pages import render
 
 router = APIRouter(include_in_schema=False, dependencies=[READ])
@@ -63,9 +65,9 @@ class CompareQuery(Model):
     _filled = model_validator(mode="before")(drop_empty_fields)
 
     @property
-    def span(self) -> Span:
+    def span(self) -> Period:
         """From the beginning of the first day to the end of the last, in UTC."""
-        return Span(
+        return Period(
             None if self.since is None else datetime.combine(self.since, time(), UTC),
             (
                 None
@@ -93,7 +95,7 @@ class Side:
     @property
     def size(self) -> tuple[float, float]:
         """Width and height of the mirror [m]."""
-        return float(self.heliostat.properties["width"]), float(self.heliostat.properties["height"])
+        return self.heliostat.size_m
 
     @property
     def shape(self) -> SurfaceErrors:
@@ -111,19 +113,13 @@ def since_of(surface: SurfaceRow) -> datetime:
     return surface.valid_from or surface.created_at
 
 
-_MAX_VERSIONS = 40
 _MAX_MOUNTS = 40
 
 
 def _side(session: Session, name: str, version: int | None) -> Side:
     """Load a surface of a heliostat: this version, or the active one."""
     heliostat = store.get_heliostat(session, name)
-    query = (
-        select(SurfaceRow)
-        .where(SurfaceRow.heliostat_id == heliostat.id)
-        .options(undefer(SurfaceRow.arrays))
-    )
-    versions = list(session.scalars(query.order_by(SurfaceRow.version.desc()).limit(_MAX_VERSIONS)))
+    versions = newest_surfaces(session, heliostat)
     if version is None:
         surface = store.get_surface_at(session, heliostat)
     else:
@@ -227,7 +223,7 @@ def _forecasts(
 # --------------------------------------------------------------------------------------------------
 
 
-def _within(values: Sequence[Value], span: Span) -> list[Value]:
+def _within(values: Sequence[Value], span: Period) -> list[Value]:
     return [
         value
         for value in sorted(values, key=lambda value: value.at)
@@ -260,7 +256,7 @@ def _pointing(side: Side) -> list[Value]:
 
 
 def _timelines(
-    sides: tuple[Side, Side], compared: Sequence[ComparisonResult], span: Span
+    sides: tuple[Side, Side], compared: Sequence[ComparisonResult], span: Period
 ) -> list[Timeline]:
     """Timelines of accuracy, shape and pointing on one time axis.
 
@@ -367,14 +363,10 @@ def get_compare_page(
 ) -> HTMLResponse:
     """The comparison of two surfaces, or the form that asks for them."""
     target = query.target or next(iter(read.targets), None)
-    filled: dict[str, Any] = {
-        "query": query,
-        "sun": read.sun,
-        "target": target,
-        "targets": read.targets,
-    }
+    filled = {"query": query, "sun": read.sun, "target": target, "targets": read.targets}
+    page = partial(render, request, "compare.html", **filled)
     if read.sides is None:
-        return render(request, "compare.html", **filled, sides=None)
+        return page(sides=None)
     known = [one for one in read.compared if one is not None]
     forecasts, trouble = None, next((one.trouble for one in known if one.trouble), None)
     try:
@@ -382,10 +374,7 @@ def get_compare_page(
     except ModelError as error:
         trouble = str(error)
     is_whole = len(known) == len(read.compared)
-    return render(
-        request,
-        "compare.html",
-        **filled,
+    return page(
         sides=read.sides,
         surfaces=_surfaces(*read.sides, runtime.settings.figure_scales),
         change_mm=1e3 * float(np.sqrt(np.mean((read.sides[1].z - read.sides[0].z) ** 2))),

@@ -236,7 +236,7 @@ def draw(
     )
 
 
-def _totals(session: Session) -> dict[str, Any]:
+def _totals(session: Session) -> dict[str, object]:
     plant = session.get(PlantRow, 1)
     running = (
         select(func.count()).select_from(JobRow).where(JobRow.state.in_(("queued", "running")))

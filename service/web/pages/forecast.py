@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
 from fastapi import APIRouter, Form, Path, Query, Request, Response
 from fastapi.responses import HTMLResponse
@@ -118,7 +118,7 @@ def sun_now(plant: PlantRow | None) -> tuple[float, float]:
     return (round(azimuth, 2) % 360, round(elevation, 2)) if elevation > 5 else (180.0, 45.0)
 
 
-def _choices(session: Session) -> dict[str, Any]:
+def _choices(session: Session) -> dict[str, object]:
     return {
         "heliostats": store.list_heliostats(session, _OFFERED),
         "targets": session.scalars(select(TargetRow.name).order_by(TargetRow.name)).all(),
@@ -156,12 +156,6 @@ def _recent(session: Session) -> list[Made]:
     return sorted([*of_one, *of_many], key=lambda made: made.created_at, reverse=True)[:_RECENT]
 
 
-def _filled(**known: Any) -> dict[str, Any]:
-    """Values of the form fields: those ``known``, else defaults."""
-    likely = {"target": None, "surface": "current", "dni_w_m2": 1000.0}
-    return {**likely, "sun_by": "position", "moment": None, **known}
-
-
 @router.get("/forecast/heliostats", dependencies=[READ])
 def get_offered_heliostats(
     request: Request,
@@ -189,13 +183,15 @@ def get_forecast_form(
             filled = _filled_as(session, queue.get_job(session, job))
             return _page(request, runtime, choices, filled, forecast=None)
         azimuth, elevation = sun_now(session.get(PlantRow, 1))
-    first = next((row.name for row in choices["heliostats"]), "")
-    filled = _filled(heliostat=heliostat or first, azimuth_deg=azimuth, elevation_deg=elevation)
+        name = heliostat or next((row.name for row in store.list_heliostats(session, 1)), "")
+    filled = ForecastForm.model_construct(
+        heliostat=name, target="", azimuth_deg=azimuth, elevation_deg=elevation
+    )
     return _page(request, runtime, choices, filled, forecast=None)
 
 
-def _filled_as(session: Session, job: JobRow) -> dict[str, Any]:
-    """Values of the form from which a forecast of all heliostats was requested."""
+def _filled_as(session: Session, job: JobRow) -> ForecastForm:
+    """The form from which a forecast of all heliostats was requested."""
     if job.kind != "forecasts":
         raise NotFoundError(f"job {job.id} is no forecast")
     try:
@@ -204,35 +200,30 @@ def _filled_as(session: Session, job: JobRow) -> dict[str, Any]:
         raise InvalidInputError(
             f"job: what job {job.id} asked for is refused since: {format_validation_error(error)}"
         ) from error
+    moment = asked.sun.at if isinstance(asked.sun, SunAt) else None
     sun = position_of(session, asked.sun)
-    return _filled(
+    return ForecastForm.model_construct(
         heliostat="",
-        target=asked.target,
+        target=asked.target or "",
         azimuth_deg=round(sun.azimuth_deg, 3) % 360,
         elevation_deg=round(sun.elevation_deg, 3),
         surface=asked.surface,
         dni_w_m2=asked.dni_w_m2,
-        **({"sun_by": "time", "moment": asked.sun.at} if isinstance(asked.sun, SunAt) else {}),
+        sun_by="position" if moment is None else "time",
+        moment=moment,
     )
 
 
 def _page(
     request: Request,
     runtime: Runtime,
-    choices: dict[str, Any],
-    filled: dict[str, Any],
-    **shown: Any,
+    choices: dict[str, object],
+    filled: ForecastForm,
+    **shown: object,
 ) -> HTMLResponse:
     zone = runtime.settings.time_zone
-    return render(
-        request,
-        "forecast.html",
-        **choices,
-        filled=filled,
-        zone=zone,
-        in_zone=in_zone(zone),
-        **shown,
-    )
+    context = {**choices, **shown, "filled": filled, "zone": zone, "in_zone": in_zone(zone)}
+    return render(request, "forecast.html", **context)
 
 
 def _ask_for_all(runtime: Runtime, form: ForecastForm, identity: Identity) -> str:
@@ -286,9 +277,9 @@ def get_forecast_page(
         f"Flux of {row.heliostat.name} on {row.target_name or 'a plane'}, peak {row.peak_w_m2:.0f}"
         " W/m²"
     )
-    filled = _filled(
+    filled = ForecastForm.model_construct(
         heliostat=row.heliostat.name,
-        target=row.target_name,
+        target=row.target_name or "",
         sun_by="position" if row.sun_at is None else "time",
         azimuth_deg=round(row.sun_azimuth_deg, 3) % 360,
         elevation_deg=round(row.sun_elevation_deg, 3),

@@ -95,7 +95,8 @@ class ComparisonFigure:
         )
 
 
-def _newest_surfaces(session: Session, heliostat: HeliostatRow) -> list[SurfaceRow]:
+def newest_surfaces(session: Session, heliostat: HeliostatRow) -> list[SurfaceRow]:
+    """The newest surfaces of a heliostat with their arrays, newest first."""
     query = (
         select(SurfaceRow)
         .where(SurfaceRow.heliostat_id == heliostat.id)
@@ -199,7 +200,7 @@ _UNDER_WAY = ComparisonResult(
 
 def _surface_context(
     surface: SurfaceRow, size: tuple[float, float], ends: Mapping[str, float]
-) -> dict[str, Any]:
+) -> dict[str, object]:
     arrays = unpack(surface.arrays)
     shown = field_totals(surface.arrays)
     title = f"Surface {surface.version}: deviation from the ideal mirror, seen from the front"
@@ -214,7 +215,7 @@ def _surface_context(
     }
 
 
-def _mount_context(mount: MountRow) -> dict[str, Any]:
+def _mount_context(mount: MountRow) -> dict[str, object]:
     """What the page shows of a mount: changes of its drives, and contradicting measurements."""
     return {
         "steps": [
@@ -231,10 +232,6 @@ def _mount_context(mount: MountRow) -> dict[str, Any]:
             for name in ("drift", "outliers", "measurements", "residual_mrad")
         },
     }
-
-
-def _size(row: HeliostatRow) -> tuple[float, float]:
-    return float(row.properties["width"]), float(row.properties["height"])
 
 
 @dataclass(frozen=True)
@@ -271,7 +268,7 @@ def _read(
         row = store.get_heliostat(session, name)
         today = store.find_surface_at(session, row)
         surface = today if version is None else store.get_surface(session, row, version)
-        surfaces = _newest_surfaces(session, row)
+        surfaces = newest_surfaces(session, row)
         decided = decisions.list_decisions(session, row, _MAX_DECISIONS)
         undoable = decisions.find_undoable(session, row)
         groups = list_groups(
@@ -316,7 +313,7 @@ def get_heliostat_page(
         request,
         "heliostat.html",
         heliostat=read.row,
-        size=_size(read.row),
+        size=read.row.size_m,
         surface=read.surface,
         today=read.today,
         versions=listed,
@@ -337,7 +334,7 @@ def get_heliostat_page(
         best=read.best,
         pointing=None if read.mount is None else _mount_context(read.mount),
         **(
-            _surface_context(read.surface, _size(read.row), ends)
+            _surface_context(read.surface, read.row.size_m, ends)
             if read.surface is not None
             else {}
         ),

@@ -119,7 +119,7 @@ def _entry(name: str, value: Any) -> tuple[str, str]:
     return label, f"{value:.10g}{_UNITS.get(ending, '')}" if is_number else in_words(value)
 
 
-def _asked(payload: dict[str, Any]) -> dict[str, str]:
+def _asked(payload: Mapping[str, object]) -> dict[str, str]:
     """Fields of a payload in words and with units. Long lists are reduced to their length."""
     return dict(
         _entry(name, value) for name, value in payload.items() if value not in (None, {}, [])

@@ -32,8 +32,9 @@ _ENDED = (
 
 
 def _form(request: Request, next_: str, trouble: str = "") -> HTMLResponse:
-    status = HTTPStatus.UNAUTHORIZED if trouble == _WRONG else HTTPStatus.OK
-    return render(request, "login.html", status, next=own_path(next_), trouble=trouble)
+    page = render(request, "login.html", next=own_path(next_), trouble=trouble)
+    page.status_code = HTTPStatus.UNAUTHORIZED if trouble == _WRONG else HTTPStatus.OK
+    return page
 
 
 @router.get("/login")

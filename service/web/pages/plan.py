@@ -5,7 +5,7 @@ A plan compares the twin with ideal mirrors, and with the flux that the receiver
 
 from dataclasses import dataclass
 from datetime import datetime, timedelta
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from fastapi import APIRouter, Form, Path, Query, Request, Response
@@ -24,10 +24,11 @@ from service.drawing.charts import HeatMap, Timeline, Value
 from service.drawing.templates import in_zone
 from service.jobs.enqueuing import delete_plan_for, enqueue
 from service.jobs.kinds import plans
-from service.jobs.kinds.plans import PlanIn, PlanName, map_name
+from service.jobs.kinds.plans import PlanIn, PlanName, ReceiverLoad, map_name
 from service.store.columns import now
 from service.store.job_tables import JobRow
 from service.store.jobs import queue
+from service.twin.runtime.runtime import Runtime
 from service.web.auth.dependencies import OPERATE, READ, RENDER_SLOT, IdentityDep, RuntimeDep
 from service.web.responses.pages import go_to, leave_for, render
 
@@ -94,23 +95,19 @@ class PlanForm(Model):
             raise RequestValidationError(error.errors()) from error
 
 
-def _likely(targets: list[str]) -> dict[str, Any]:
+def _likely(targets: list[str], name: str) -> PlanForm:
     """Defaults of the form: a day from morning to evening."""
     morning = now().replace(hour=6, minute=0, second=0, microsecond=0)
-    return {
-        "name": "",
-        "target": targets[0] if targets else None,
-        "first_at": morning,
-        "last_at": morning + timedelta(hours=12),
-        "step_minutes": 60.0,
-        "heliostats": "",
-        "allowed_kw_m2": None,
-        "dni_w_m2": 1000.0,
-    }
+    return PlanForm.model_construct(
+        name=name,
+        target=next(iter(targets), ""),
+        first_at=morning,
+        last_at=morning + timedelta(hours=12),
+    )
 
 
-def _filled(asked: PlanIn) -> dict[str, Any]:
-    """Values of the form from which a plan was requested."""
+def _filled(asked: PlanIn) -> PlanForm:
+    """The form from which a plan was requested."""
     aims = {name: f"{name} {right:g} {up:g}" for name, (right, up) in asked.aim_offsets_m.items()}
     lines = [aims.get(name, name) for name in asked.heliostats or ()]
     given = {
@@ -118,7 +115,7 @@ def _filled(asked: PlanIn) -> dict[str, Any]:
         for name in ("name", "target", "first_at", "last_at", "step_minutes", "dni_w_m2")
     }
     allowed = None if asked.allowed_w_m2 is None else asked.allowed_w_m2 / 1e3
-    return {**given, "heliostats": "\n".join(lines), "allowed_kw_m2": allowed}
+    return PlanForm.model_construct(**given, heliostats="\n".join(lines), allowed_kw_m2=allowed)
 
 
 # --- results
@@ -131,8 +128,8 @@ class Step:
 
     at: datetime
     sun: dict[str, float]
-    twin: dict[str, Any]
-    ideal: dict[str, Any]
+    twin: ReceiverLoad
+    ideal: ReceiverLoad
 
 
 @dataclass(frozen=True)
@@ -245,11 +242,18 @@ def _day(session: Session, row: JobRow, at: int | None) -> Day:
 # --------------------------------------------------------------------------------------------------
 
 
-def _choices(session: Session, after: int | None) -> dict[str, Any]:
+def _context(
+    runtime: Runtime, session: Session, after: int | None, asked: PlanIn | None, name: str = ""
+) -> dict[str, object]:
+    """The form, filled with a request or with defaults, and the list of plans."""
     receivers = [row.name for row in store.list_receivers(session)]
+    targets = [*receivers, *(row.name for row in store.list_targets(session))]
     plans = store.list_plans(session, LISTED + 1, after)
     return {
-        "targets": [*receivers, *(row.name for row in store.list_targets(session))],
+        "filled": _likely(targets, name) if asked is None else _filled(asked),
+        "in_zone": in_zone(runtime.settings.time_zone),
+        "plan_days": runtime.settings.plan_retention_days,
+        "targets": targets,
         "plans": plans[:LISTED],
         "after": after,
         "older": plans[LISTED - 1].job if len(plans) > LISTED else None,
@@ -264,19 +268,8 @@ Number = Annotated[Version, Path(description="Id of the plan's job.")]
 def get_plans_page(request: Request, runtime: RuntimeDep, after: After = None) -> HTMLResponse:
     """The form, and the list of plans."""
     with runtime.database.reading() as session:
-        choices = _choices(session, after)
-    zone = in_zone(runtime.settings.time_zone)
-    filled, plan_days = _likely(choices["targets"]), runtime.settings.plan_retention_days
-    return render(
-        request,
-        "plan.html",
-        **choices,
-        filled=filled,
-        job=None,
-        day=None,
-        in_zone=zone,
-        plan_days=plan_days,
-    )
+        context = _context(runtime, session, after, None)
+    return render(request, "plan.html", **context, job=None, day=None)
 
 
 @router.get("/plans/{number}", dependencies=[READ, RENDER_SLOT])
@@ -289,26 +282,13 @@ def get_plan_page(
 ) -> HTMLResponse:
     """A plan, followed until it is done, with its request in the form."""
     with runtime.database.reading() as session:
-        row, choices = queue.get_job(session, number, arrays=True), _choices(session, after)
+        row = queue.get_job(session, number, arrays=True)
         if row.kind != "plans":
             raise NotFoundError(f"job {number} is no plan")
         day = None if row.result is None else _day(session, row, at)
-    asked = _stored_request(row)
-    return render(
-        request,
-        "plan.html",
-        **choices,
-        filled=(
-            _likely(choices["targets"]) | {"name": row.payload["name"]}
-            if asked is None
-            else _filled(asked)
-        ),
-        job=row,
-        is_live=row.state not in queue.ENDED,
-        day=day,
-        plan_days=runtime.settings.plan_retention_days,
-        in_zone=in_zone(runtime.settings.time_zone),
-    )
+        context = _context(runtime, session, after, _stored_request(row), name=row.payload["name"])
+    is_live = row.state not in queue.ENDED
+    return render(request, "plan.html", **context, job=row, day=day, is_live=is_live)
 
 
 @router.post("/plans/{number}/delete", dependencies=[OPERATE])

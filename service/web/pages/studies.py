@@ -6,7 +6,7 @@ from fastapi import APIRouter, Form, Path, Query, Request, Response
 from fastapi.responses import HTMLResponse
 
 from service import store
-from service.base.errors import ConflictError, NotFoundError
+from service.base.errors import ConflictError
 from service.base.fields import CheckedStudyReport, Method, Model, Version
 from service.jobs.enqueuing import enqueue
 from service.jobs.kinds import predictions, studies
@@ -14,7 +14,7 @@ from service.jobs.kinds.predictions import PredictionsIn
 from service.jobs.kinds.studies import StudyIn
 from service.store.tables import PlantRow
 from service.twin.plant import model_versions
-from service.web.api.studies import REPORT_POLICY
+from service.web.api.studies import REPORT_POLICY, study_html
 from service.web.auth.dependencies import OPERATE, READ, IdentityDep, RuntimeDep
 from service.web.responses.pages import go_to, render
 
@@ -96,17 +96,12 @@ def get_study_page(number: Number, request: Request, runtime: RuntimeDep) -> HTM
 @router.get("/studies/{number}/report", dependencies=[READ])
 def get_study_report_page(number: Number, runtime: RuntimeDep) -> HTMLResponse:
     """The report as a separate page, with links back to its study."""
-    with runtime.database.reading() as session:
-        row = store.get_study(session, number, page=True)
-    if row.html is None:
-        raise NotFoundError(f"study {number} came as a report without a page")
     back = (
         f'heliotwin / <a href="/studies">studies</a> / <a href="/studies/{number}">{number}</a> /'
         " report</p>"
     )
-    return HTMLResponse(
-        row.html.replace(_CRUMB, back, 1), headers={"Content-Security-Policy": REPORT_POLICY}
-    )
+    report = study_html(runtime, number).replace(_CRUMB, back, 1)
+    return HTMLResponse(report, headers={"Content-Security-Policy": REPORT_POLICY})
 
 
 @router.post("/studies", dependencies=[OPERATE])

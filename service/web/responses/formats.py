@@ -86,8 +86,8 @@ def _quality(media_type: str, ranges: list[_Range]) -> float:
     return max(matching)[1] if matching else 0.0
 
 
-def choose(accept: str | None, offered: tuple[str, ...] = ARRAYS) -> str:
-    """Choose the offered media type that the client prefers. On a tie, the first one wins.
+def choose(accept: str | None) -> str:
+    """Choose the media type of `ARRAYS` that the client prefers. On a tie, the first one wins.
 
     Raises
     ------
@@ -95,11 +95,11 @@ def choose(accept: str | None, offered: tuple[str, ...] = ARRAYS) -> str:
         If the client accepts none of them.
     """
     if accept is None or not accept.strip():
-        return offered[0]
+        return ARRAYS[0]
     ranges = _ranges(accept)
-    best = max(offered, key=lambda media_type: _quality(media_type, ranges))
+    best = max(ARRAYS, key=lambda media_type: _quality(media_type, ranges))
     if _quality(best, ranges) <= 0:
-        raise NotAcceptableError(offered)
+        raise NotAcceptableError(ARRAYS)
     return best
 
 

@@ -15,7 +15,7 @@ from pydantic import BaseModel, Field
 from starlette.types import Receive, Scope, Send
 
 from service.base.errors import BusyError, TooManyError
-from service.base.fields import CreatedAt, Id, State
+from service.base.fields import CreatedAt, Id, State, from_row
 from service.store.job_tables import JobRow
 from service.store.jobs import queue
 from service.twin.runtime.runtime import Runtime
@@ -56,8 +56,7 @@ class JobSummary(BaseModel):
 
 def job_summary(row: JobRow) -> JobSummary:
     """Summarize a job."""
-    names = JobSummary.model_fields.keys() - {"href"}
-    return JobSummary(**{name: getattr(row, name) for name in names}, href=f"/v1/jobs/{row.id}")
+    return from_row(JobSummary, row, href=f"/v1/jobs/{row.id}")
 
 
 @dataclass(frozen=True, eq=False)

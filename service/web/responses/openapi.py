@@ -81,12 +81,6 @@ def arrays(model: Any, description: str) -> dict[int | str, dict[str, object]]:
     return {200: {"model": model, "description": description, "content": binary}}
 
 
-def _as_problem(response: dict[str, Any]) -> None:
-    content = response.get("content", {})
-    if "application/json" in content:
-        content[PROBLEM_MEDIA_TYPE] = content.pop("application/json")
-
-
 def _as_form(body: dict[str, Any]) -> None:
     """Describe the form of a photograph as client generators and Swagger UI expect it.
 
@@ -150,8 +144,9 @@ def _document(app: FastAPI) -> dict[str, Any]:
                 )
             operation["responses"] = dict(sorted(responses.items()))
             for status, response in responses.items():
-                if int(status) >= 400 and "Problem" in str(response):
-                    _as_problem(response)
+                content = response.get("content", {})
+                if int(status) >= 400 and "Problem" in str(content.get("application/json")):
+                    content[PROBLEM_MEDIA_TYPE] = content.pop("application/json")
     schemas = document["components"]["schemas"]
     _as_form(schemas["Body_post_measurement"])
     # The form of the documentation page begins with this example.

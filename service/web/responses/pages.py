@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -146,13 +146,7 @@ def _text(scope: Scope, template: str, context: dict[str, object]) -> tuple[str,
         _RENDERING.reset(token)
 
 
-def _page(scope: Scope, template: str, status: int, context: dict[str, object]) -> HTMLResponse:
-    return HTMLResponse(_text(scope, template, context)[0], status)
-
-
-def render(
-    request: Request, template: str, status: int = HTTPStatus.OK, **context: Any
-) -> HTMLResponse:
+def render(request: Request, template: str, /, **context: object) -> HTMLResponse:
     """Render a page, or the requested part of it.
 
     Raises
@@ -161,10 +155,10 @@ def render(
         If the page has no such part.
     """
     part: Part | None = request.scope.get("state", {}).get("part")
+    text, rendering = _text(request.scope, template, context)
     if part is None:
-        return _page(request.scope, template, status, context)
+        return HTMLResponse(text)
     name = "-".join(filter(None, [*request.scope["path"].split("/"), part.table or part.figure]))
-    rendering = _text(request.scope, template, context)[1]
     if part.table is not None:
         if part.table not in rendering.tables:
             raise NotFoundError(f"table: this page has no table {part.table!r} now")
@@ -213,12 +207,11 @@ def wants_page(scope: Scope) -> bool:
     return is_browser and not scope.get("path", "").startswith("/v1/")
 
 
-def error_page(scope: Scope, document: dict[str, Any]) -> HTMLResponse:
+def error_page(scope: Scope, status: int, document: Mapping[str, object]) -> HTMLResponse:
     """Render a problem document: a page, or for htmx only the message."""
     is_part = "hx-request" in Headers(scope=scope)
-    page = _page(
-        scope, "alert.html" if is_part else "error.html", document["status"], {"problem": document}
-    )
+    template = "alert.html" if is_part else "error.html"
+    page = HTMLResponse(_text(scope, template, {"problem": document})[0], status)
     page.headers.update(_NOTICE if is_part else {})
     return page
 

@@ -135,7 +135,7 @@ def problem(
         **extension,
     }
     if pages.wants_page(scope):
-        answer = pages.error_page(scope, document)
+        answer = pages.error_page(scope, status, document)
         answer.headers.update(headers or {})
         return answer
     return Response(

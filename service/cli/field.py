@@ -1,0 +1,305 @@
+"""``heliotwin field``: the flux of all heliostats of a plant file on a receiver, watt by watt."""
+
+import csv
+import math
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, field
+from datetime import datetime
+from pathlib import Path
+from typing import TypedDict
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.ephemeris import sun_angles_at
+from model.errors import InvalidInputError
+from model.fleet import LOSSES, FleetFlux, Losses, aligned_field, field_losses, superpose, tiles
+from model.fleet import Superposition as Task
+from model.frames import SunAngles, sun_direction
+from model.plant import Heliostat, Receiver
+from model.plant_model import PlantModel
+from model.setup import Setup
+from model.surface import DEGREE, control_points
+from service.base.progress import Progress
+from service.sources.folder import read_surface
+from service.sources.plant_file import PlantDescription
+
+Array = NDArray[np.float64]
+
+ROWS = 64
+"""Rows of a map if none are asked for; columns follow from the receiver's shape."""
+
+_MAX_COLUMNS = 1024
+
+_RAYS = 24
+"""Rays along each side of a mirror, at least; each facet has `_LEAST_RAYS` or more."""
+
+_LEAST_RAYS = 4
+
+Resolution = tuple[int, int]
+"""Rows and columns."""
+
+
+@dataclass(frozen=True, eq=False)
+class FieldRequest:
+    """What is asked of a field.
+
+    Attributes
+    ----------
+    receiver : str
+    azimuth_deg, elevation_deg : float [deg]
+        Of the sun, azimuth from north over east.
+    dni_w_m2 : float or None
+        None for that of a clear sky.
+    aims : dict or None
+        Aim points (3,) [m] by heliostat, None for one that is not active; None for default aims.
+    surfaces : Path or None
+        Folder of surfaces; None for the nominal mirrors.
+    resolution : (rows, columns), or None
+    """
+
+    receiver: str
+    azimuth_deg: float
+    elevation_deg: float
+    dni_w_m2: float | None = None
+    aims: dict[str, Array | None] | None = None
+    surfaces: Path | None = None
+    resolution: Resolution | None = None
+
+
+class FieldReport(TypedDict):
+    """``field.json``; DESIGN.md, section 8."""
+
+    sun: dict[str, float]
+    dni_w_m2: float
+    receiver: str
+    field: dict[str, float]
+    by_heliostat: dict[str, dict[str, float]]
+    skipped: dict[str, str]
+    warnings: list[str]
+
+
+@dataclass(frozen=True, eq=False)
+class FieldFlux:
+    """The map (rows, columns) [W/m2] of incident light, unrolled, and the report."""
+
+    flux: Array
+    report: FieldReport
+
+
+def sun_of(
+    plant: PlantDescription, sun: tuple[float, float] | None, at: datetime | None
+) -> SunAngles[float]:
+    """Azimuth from north and elevation [deg] of the sun, given or at a time.
+
+    Raises
+    ------
+    InvalidInputError
+        If none or both are given, or the sun is below the horizon.
+    """
+    if (sun is None) == (at is None):
+        raise InvalidInputError("--sun, --at: give one of them, a position or a time")
+    azimuth, elevation = sun or (0.0, 0.0)
+    if at is not None:
+        azimuth, elevation = sun_angles_at(at, plant.plant.origin)
+    if not (math.isfinite(azimuth) and 0 < elevation <= 90):
+        given = "--sun: elevation" if at is None else "--at: the sun's elevation"
+        raise InvalidInputError(f"{given} must lie in (0, 90] degrees, got {elevation:g}")
+    return SunAngles(float(azimuth) % 360, float(elevation))
+
+
+def clear_sky_dni(elevation_deg: float, altitude_m: float) -> float:
+    """Direct normal irradiance [W/m2] of a clear sky.
+
+    Source: Ineichen 2008, *A broadband simplified version of the Solis clear sky model*, as pvlib
+    has it, with its default aerosol and water.
+    """
+    from pvlib import atmosphere, clearsky
+
+    pressure = atmosphere.alt2pres(altitude_m)
+    sky = clearsky.simplified_solis(np.array([elevation_deg]), pressure=pressure)
+    return float(sky["dni"][0])
+
+
+def read_aims(path: Path, plant: PlantDescription) -> dict[str, Array | None]:
+    """Read aim points from CSV: ``name,east_m,north_m,up_m,active``, the last one optional.
+
+    Raises
+    ------
+    InvalidInputError
+        It names the file and the line.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InvalidInputError(f"{path}: cannot be read ({error})") from None
+    rows = csv.DictReader(text.splitlines())
+    missing = {"name", "east_m", "north_m", "up_m"} - set(rows.fieldnames or ())
+    if missing:
+        raise InvalidInputError(
+            f"{path}, line 1: columns must be name,east_m,north_m,up_m,active;"
+            f" {', '.join(sorted(missing))} is missing"
+        )
+    aims: dict[str, Array | None] = {}
+    for row in rows:
+        where, name = f"{path}, line {rows.line_num}", row["name"]
+        if name not in plant.plant.heliostats:
+            raise InvalidInputError(f"{where}: name: {name!r} is no heliostat of the plant")
+        if name in aims:
+            raise InvalidInputError(f"{where}: name: {name} is listed twice; keep one line")
+        aims[name] = _aim(row, where)
+    return aims
+
+
+_YES, _NO = {"1", "true", "yes"}, {"0", "false", "no"}
+
+
+def _aim(row: dict[str, str], where: str) -> Array | None:
+    active = (row.get("active") or "1").strip().lower()
+    if active not in _YES | _NO:
+        raise InvalidInputError(f"{where}: active: must be 1 or 0, got {active!r}")
+    if active in _NO:
+        return None
+    try:
+        aim = np.array([float(row[key]) for key in ("east_m", "north_m", "up_m")])
+    except (TypeError, ValueError):
+        aim = np.full(3, np.nan)
+    if not (np.abs(aim) < 1e6).all():
+        raise InvalidInputError(f"{where}: east_m, north_m, up_m: must be numbers of metres")
+    return aim
+
+
+def resolution_of(receiver: Receiver) -> Resolution:
+    """Rows and columns of a map with square pixels."""
+    columns = round(ROWS * receiver.width / receiver.height)
+    return ROWS, min(max(columns, ROWS // 4), _MAX_COLUMNS)
+
+
+@dataclass
+class _Aimed:
+    """Heliostats with their aims: those whose light is asked for, and those that stand around."""
+
+    setups: list[Setup] = field(default_factory=list)
+    others: list[tuple[Heliostat, Array]] = field(default_factory=list)
+    without_surface: int = 0
+
+
+def trace_field(plant: PlantDescription, request: FieldRequest, step: Progress) -> FieldFlux:
+    """Trace the flux of a plant's heliostats on one receiver.
+
+    Heliostats that the layout gives to another receiver aim there: they cast shadows only.
+
+    Raises
+    ------
+    InvalidInputError
+        If the plant has no such receiver, or no heliostat sends light to it.
+    """
+    receiver = _receiver(plant, request.receiver)
+    sun = sun_direction(request.azimuth_deg, request.elevation_deg)
+    dni = request.dni_w_m2
+    if dni is None:
+        dni = clear_sky_dni(request.elevation_deg, plant.altitude)
+    model = PlantModel(plant.plant.site, plant.optics).with_dni(dni)
+    aimed = _aimed(plant, receiver, request, sun)
+    field_around = [(one.heliostat, one.goal) for one in aimed.setups] + aimed.others
+    neighbours = aligned_field(field_around, sun, model)
+    task = Task(
+        receiver,
+        model,
+        request.resolution or resolution_of(receiver),
+        samples=_samples(aimed.setups),
+        tower=None if plant.tower is None else plant.tower.outline(sun),
+    )
+    total = superpose(
+        task, tiles(aimed.setups, neighbours), done=lambda flux: step(f"{flux.heliostats}")
+    )
+    if not total.heliostats:
+        reason = next(iter(total.skipped.values()), "no heliostat is active")
+        raise InvalidInputError(f"no heliostat sends light to {receiver.name}: {reason}")
+    return FieldFlux(total.irradiance, _report(request, receiver, dni, total, aimed))
+
+
+def _receiver(plant: PlantDescription, name: str) -> Receiver:
+    if name not in plant.receivers:
+        known = ", ".join(plant.receivers) or "none"
+        raise InvalidInputError(f"--receiver: {name!r} is no receiver of the plant; known: {known}")
+    return plant.receivers[name]
+
+
+def _aimed(
+    plant: PlantDescription, receiver: Receiver, request: FieldRequest, sun: Array
+) -> _Aimed:
+    """Heliostats with aims and surfaces."""
+    found = _Aimed()
+    for name, heliostat in plant.plant.heliostats.items():
+        own = plant.receiver_of.get(name, receiver.name)
+        if request.aims is not None:
+            aim = request.aims.get(name)
+            if aim is None:
+                continue
+        elif own != receiver.name and own in plant.receivers and _is_shared(plant):
+            found.others.append((heliostat, plant.receivers[own].aim))
+            continue
+        else:
+            aim = receiver.aim
+        surface = None if request.surfaces is None else read_surface(request.surfaces, heliostat)
+        found.without_surface += surface is None and request.surfaces is not None
+        points, degree = (control_points(heliostat), DEGREE) if surface is None else surface
+        found.setups.append(
+            Setup(heliostat, points, sun, receiver.middle, aim=aim, degree=degree, identifier=name)
+        )
+    return found
+
+
+def _is_shared(plant: PlantDescription) -> bool:
+    """Whether the layout gives heliostats to different receivers."""
+    return len(set(plant.receiver_of.values())) > 1
+
+
+def _samples(setups: Iterable[Setup]) -> int:
+    """Rays along each side of a facet, for the mirror with the fewest facets."""
+    facets = min((len(setup.heliostat.facets) for setup in setups), default=1)
+    return max(_LEAST_RAYS, math.ceil(_RAYS / math.sqrt(facets)))
+
+
+def _report(
+    request: FieldRequest, receiver: Receiver, dni: float, total: FleetFlux, aimed: _Aimed
+) -> FieldReport:
+    whole = field_losses(total.losses.values())
+    warnings = []
+    if aimed.without_surface:
+        warnings.append(
+            f"{aimed.without_surface} of {len(aimed.setups)} heliostats have no surface in"
+            f" {request.surfaces} and are traced as nominal mirrors"
+        )
+    incident = dni * whole.area
+    return FieldReport(
+        sun={"azimuth_deg": request.azimuth_deg, "elevation_deg": request.elevation_deg},
+        dni_w_m2=dni,
+        receiver=receiver.name,
+        field={
+            "heliostats": total.heliostats,
+            "mirror_area_m2": whole.area,
+            "incident_w": incident,
+            **_factors(whole),
+            "optical_efficiency": whole.efficiency,
+            "intercepted_w": incident * whole.intercepted,
+            "absorbed_w": incident * whole.efficiency,
+            "peak_w_m2": float(total.irradiance.max()),
+        },
+        by_heliostat={
+            name: {
+                **_factors(one),
+                "optical_efficiency": one.efficiency,
+                "intercepted_w": dni * one.area * one.intercepted,
+            }
+            for name, one in total.losses.items()
+        },
+        skipped=total.skipped,
+        warnings=warnings,
+    )
+
+
+def _factors(losses: Losses) -> dict[str, float]:
+    factors = asdict(losses)
+    return {name: factors[name] for name in LOSSES}

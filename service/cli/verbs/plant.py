@@ -1,0 +1,152 @@
+"""The commands ``heliotwin plant ...``: the file that describes any solar tower plant."""
+
+import json
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+from rich.console import Console
+
+from service.cli.output import AsJson, require_file, require_folder
+
+app = typer.Typer(
+    name="plant",
+    help="A plant's file, plant.yaml: begin one, check it, draw it.",
+    no_args_is_help=True,
+)
+
+ForeignFormat = Literal["solarpilot", "soltrace"]
+PlantFile = Annotated[Path, typer.Argument(help="The plant's file.", metavar="PLANT.yaml")]
+
+
+@app.command()
+def check(file: PlantFile, as_json: AsJson = False) -> None:
+    """Say what is understood of a plant's file, and what is assumed; a mistake ends with its
+    line.
+    """
+    from service.cli.plant_report import plant_lines, plant_report, types_table
+    from service.sources.plant_file import read_plant
+
+    described = read_plant(file)
+    if as_json:
+        typer.echo(json.dumps(plant_report(described), indent=1))
+        return
+    console = Console()
+    for warning in described.warnings:
+        console.print(warning, style="yellow", highlight=False, markup=False)
+    first, *others = plant_lines(described)
+    console.print(first, highlight=False, markup=False)
+    console.print(types_table(described))
+    for line in others:
+        console.print(line, highlight=False, markup=False)
+
+
+@app.command()
+def new(
+    file: Annotated[Path, typer.Argument(help="Where to write it.", metavar="[PLANT.yaml]")] = Path(
+        "plant.yaml"
+    ),
+    as_json: AsJson = False,
+) -> None:
+    """Write a commented plant to begin with, and its layout.csv beside it."""
+    from service.sources.plant_template import LAYOUT, write_template
+
+    require_file(file)
+    write_template(file)
+    written = [str(file), str(file.with_name(LAYOUT))]
+    if as_json:
+        typer.echo(json.dumps({"written": written}))
+        return
+    typer.echo(f"{' and '.join(written)} are written; heliotwin plant check {file} reads them")
+
+
+@app.command()
+def show(
+    file: PlantFile,
+    out: Annotated[Path, typer.Option(help="The picture, a PNG file.")],
+    as_json: AsJson = False,
+) -> None:
+    """Draw a plant: the field from above, and tower, receivers and targets from the side."""
+    from service.drawing.plant_picture import plant_picture
+    from service.sources.plant_file import read_plant
+
+    require_file(out)
+    described = read_plant(file)
+    picture = plant_picture(
+        described.plant, described.receivers, described.type_of, described.tower
+    )
+    out.parent.mkdir(parents=True, exist_ok=True)
+    out.write_bytes(picture)
+    typer.echo(json.dumps({"written": [str(out)]}) if as_json else f"{out} is written")
+
+
+@app.command("import")
+def import_(
+    file: Annotated[
+        Path,
+        typer.Argument(
+            help="SolTrace's .stinput, or CSV of SolarPILOT or OpenCSP.", metavar="FILE"
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="The folder for plant.yaml and its files.")],
+    as_json: AsJson = False,
+) -> None:
+    """Make a plant of another program's file; notes say what the file leaves open."""
+    from service.sources.plant_file import read_plant
+    from service.sources.plant_formats.formats import read_foreign
+
+    require_folder(out)
+    imported = read_foreign(file)
+    written = imported.write(out)
+    count = len(read_plant(written[0]).plant.heliostats)
+    report = {
+        "written": [str(path) for path in written],
+        "heliostats": count,
+        "notes": list(imported.notes),
+    }
+    if as_json:
+        typer.echo(json.dumps(report, indent=1))
+        return
+    typer.echo("\n".join([f"{count:,} heliostats in {written[0]}", *imported.notes]))
+
+
+@app.command()
+def export(
+    file: PlantFile,
+    to: Annotated[ForeignFormat, typer.Option("--format", help="The other program.")],
+    out: Annotated[Path, typer.Option(help="The file to write.")],
+    sun: Annotated[
+        tuple[float, float] | None,
+        typer.Option(
+            help="Sun azimuth from north over east and elevation [deg]; SolTrace needs it.",
+            metavar="AZIMUTH ELEVATION",
+        ),
+    ] = None,
+    aims: Annotated[
+        Path | None,
+        typer.Option(
+            help="Aim points, name,east_m,north_m,up_m; without it the receivers' middles."
+        ),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Write a plant for another program."""
+    from service.cli.field import read_aims
+    from service.sources.plant_file import read_plant
+    from service.sources.plant_formats.formats import foreign_text
+
+    require_file(out)
+    described = read_plant(file)
+    points = {} if aims is None else read_aims(aims, described)
+    text = foreign_text(described, to, sun, points)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    out.write_text(text, encoding="utf-8")
+    typer.echo(json.dumps({"written": [str(out)]}) if as_json else f"{out} is written")
+
+
+@app.command()
+def schema() -> None:
+    """Print the JSON schema of plant.yaml, for editors and other programs."""
+    from service.sources.plant_schema import json_schema
+
+    typer.echo(json.dumps(json_schema(), indent=1))

@@ -1,0 +1,173 @@
+"""A heliostat of any type as one JSON document, as the store and exports keep it.
+
+PAINT's documents describe heliostats of the Solar Tower Juelich. This one has the axes of any mount
+and facets of any number, outline and focal length, in metres of east, north and up.
+"""
+
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from model.actuator import LinearActuator
+from model.mount import Mount
+from model.plant import Facet, Heliostat, MirrorOptics
+from service.base.fields import Number
+from service.sources.schema import parse
+
+FORMAT = "heliotwin heliostat 1"
+
+Point = tuple[Number, Number, Number]
+Matrix = tuple[Point, Point, Point]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(allow_inf_nan=False, extra="forbid")
+
+
+class DriveDocument(_Part):
+    """`model.actuator.LinearActuator`."""
+
+    increment: Number
+    initial_stroke_length: Number
+    offset: Number
+    pivot_radius: Number
+    initial_angle: Number
+    clockwise: bool
+    max_increment: Number
+
+
+class MountDocument(_Part):
+    """`model.mount.Mount`."""
+
+    first_axis: Point
+    second_axis: Point
+    zero_attitude: Matrix
+    joint_m: Point
+    mirror_offset_m: Point
+    axis_zero_rad: tuple[Number, Number] = (0.0, 0.0)
+    drives: tuple[DriveDocument, DriveDocument] | None = None
+
+
+class FacetDocument(_Part):
+    """`model.plant.Facet`."""
+
+    center_m: Point
+    half_width_m: Point
+    half_height_m: Point
+    focal_length_m: Number | None = None
+    outline: tuple[tuple[Number, Number], ...] | None = None
+
+
+class OpticsDocument(_Part):
+    """`model.plant.MirrorOptics`."""
+
+    reflectance: Number = 1.0
+    slope_error_mrad: Number = 0.0
+    pointing_error_mrad: Number = 0.0
+
+
+class HeliostatDocument(_Part):
+    """A heliostat of any type."""
+
+    format: Literal["heliotwin heliostat 1"]
+    type: str = ""
+    position_m: Point
+    width_m: Number = Field(gt=0)
+    height_m: Number = Field(gt=0)
+    mount: MountDocument
+    facets: tuple[FacetDocument, ...] = Field(min_length=1, max_length=256)
+    optics: OpticsDocument = OpticsDocument()
+
+
+def is_heliostat_document(properties: Any) -> bool:
+    """Whether properties are in this format, not in PAINT's."""
+    return isinstance(properties, dict) and properties.get("format") == FORMAT
+
+
+def heliostat_to_json(heliostat: Heliostat, kind: str = "") -> dict[str, object]:
+    """The document of a heliostat of a type ``kind``."""
+    mount = heliostat.mount
+    first, second = mount.actuators or (None, None)
+    drives = first and second and (DriveDocument(**vars(first)), DriveDocument(**vars(second)))
+    document = HeliostatDocument(
+        format=FORMAT,
+        type=kind,
+        position_m=_point(heliostat.position),
+        width_m=heliostat.width,
+        height_m=heliostat.height,
+        mount=MountDocument(
+            first_axis=_point(mount.first_axis),
+            second_axis=_point(mount.second_axis),
+            zero_attitude=(
+                _point(mount.zero_attitude[0]),
+                _point(mount.zero_attitude[1]),
+                _point(mount.zero_attitude[2]),
+            ),
+            joint_m=_point(mount.joint),
+            mirror_offset_m=_point(mount.mirror_offset),
+            axis_zero_rad=mount.axis_zero,
+            drives=drives,
+        ),
+        facets=tuple(map(_facet_document, heliostat.facets)),
+        optics=OpticsDocument(
+            reflectance=heliostat.optics.reflectance,
+            slope_error_mrad=heliostat.optics.slope_error * 1e3,
+            pointing_error_mrad=heliostat.optics.pointing_error * 1e3,
+        ),
+    )
+    return document.model_dump(mode="json")
+
+
+def _point(vector: Any) -> Point:
+    x, y, z = np.asarray(vector, dtype=np.float64).tolist()
+    return x, y, z
+
+
+def _facet_document(facet: Facet) -> FacetDocument:
+    return FacetDocument(
+        center_m=_point(facet.position),
+        half_width_m=_point(facet.canting_x),
+        half_height_m=_point(facet.canting_y),
+        focal_length_m=facet.focal_length,
+        outline=facet.outline,
+    )
+
+
+def _actuator(drive: DriveDocument | None) -> LinearActuator | None:
+    return None if drive is None else LinearActuator(**drive.model_dump())
+
+
+def heliostat_from_json(name: str, properties: Any) -> Heliostat:
+    """The heliostat of a document; `InvalidInputError` names a wrong field."""
+    document = parse(HeliostatDocument, properties, f"properties of {name}")
+    mount, optics = document.mount, document.optics
+    first, second = map(_actuator, mount.drives or (None, None))
+    return Heliostat(
+        name,
+        np.array(document.position_m),
+        Mount(
+            np.array(mount.first_axis),
+            np.array(mount.second_axis),
+            np.array(mount.zero_attitude),
+            np.array(mount.joint_m),
+            np.array(mount.mirror_offset_m),
+            None if first is None or second is None else (first, second),
+            axis_zero=mount.axis_zero_rad,
+        ),
+        tuple(
+            Facet(
+                np.array(facet.center_m),
+                np.array(facet.half_width_m),
+                np.array(facet.half_height_m),
+                facet.focal_length_m,
+                facet.outline,
+            )
+            for facet in document.facets
+        ),
+        document.width_m,
+        document.height_m,
+        MirrorOptics(
+            optics.reflectance, optics.slope_error_mrad / 1e3, optics.pointing_error_mrad / 1e3
+        ),
+    )

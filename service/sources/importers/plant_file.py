@@ -1,0 +1,149 @@
+"""Folders of a plant that ``plant.yaml`` describes; DESIGN.md, section 8."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import BeforeValidator, ConfigDict, Field
+
+from model.errors import InvalidInputError
+from model.plant import Cylinder, Plant
+from model.plant_model import PlantModel
+from service.base.fields import Elevation, Number
+from service.sources.documents import (
+    IMAGE_KINDS,
+    SUFFIXES,
+    Measurement,
+    optics_to_json,
+    read_json,
+    sun_to_json,
+)
+from service.sources.folder import Importer, MeasurementFolder, declared_json, read_declared
+from service.sources.heliostat_document import heliostat_to_json
+from service.sources.plant_file import PlantDescription, read_plant
+from service.sources.schema import WeatherDocument, parse, parse_time
+
+PLANT = "plant.yaml"
+_ENDING = "-calibration-properties.json"
+
+
+class MeasurementProperties(WeatherDocument):
+    """``ID-calibration-properties.json`` of such a folder."""
+
+    model_config = ConfigDict(allow_inf_nan=False, extra="forbid")
+
+    target_name: str
+    sun_azimuth_deg: Annotated[Number, Field(ge=-360, le=360)]
+    sun_elevation_deg: Elevation
+    time: Annotated[Any, BeforeValidator(parse_time)] = None
+    focal_spot_m: tuple[Number, Number, Number] | None = None
+    motor_position: tuple[Number, Number] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class PlantFolder(MeasurementFolder):
+    """A folder with ``plant.yaml`` at its root.
+
+    Attributes
+    ----------
+    description : PlantDescription
+    """
+
+    description: PlantDescription = None  # type: ignore[assignment]  # the base has defaults
+
+    def declared(self) -> dict[str, object]:
+        """Sun and air of ``plant.yaml``; ``twin.json`` adds effects and cameras."""
+        return _declared(self.description) | super().declared()
+
+    def read_measurements(self, heliostat: str) -> Iterator[Measurement]:
+        """Iterate over the measurements of ``H/Calibration``."""
+        folder = self.root / heliostat / "Calibration"
+        for path in sorted(folder.glob(f"*{_ENDING}")):
+            identifier = path.name.removesuffix(_ENDING)
+            try:
+                yield self._measurement(identifier, heliostat, folder, read_json(path))
+            except InvalidInputError as error:
+                self.skipped[f"{heliostat}/{identifier}"] = str(error)
+
+    def _measurement(self, identifier: str, heliostat: str, folder: Path, data: Any) -> Measurement:
+        where = f"measurement {heliostat}/{identifier}"
+        document = parse(MeasurementProperties, data, where)
+        if document.target_name not in self.plant.targets:
+            raise InvalidInputError(
+                f"{where}: target_name: {document.target_name[:80]!r} is none of"
+                f" {', '.join(self.plant.targets) or 'the plant, which has no targets'}"
+            )
+        spot = None if document.focal_spot_m is None else np.array(document.focal_spot_m)
+        wgs84 = None if spot is None else tuple(self.plant.to_wgs84(spot).tolist())
+        motors = document.motor_position
+        return Measurement(
+            identifier=identifier,
+            heliostat=heliostat,
+            target=document.target_name,
+            azimuth_deg=document.sun_azimuth_deg % 360,
+            elevation_deg=document.sun_elevation_deg,
+            spot=spot,
+            spot_wgs84=wgs84,
+            motor_position=None if motors is None else np.array(motors),
+            images=_images(folder, identifier),
+            taken_at=document.time,
+            weather=document.weather,
+        )
+
+
+def _images(folder: Path, identifier: str) -> dict[Any, Path]:
+    """Image files of a measurement by kind."""
+    found = {}
+    for kind in IMAGE_KINDS:
+        files = [folder / f"{identifier}-{kind}.{suffix}" for suffix in SUFFIXES.values()]
+        file = next(filter(Path.is_file, files), None)
+        if file is not None:
+            found[kind] = file
+    return found
+
+
+def _declared(description: PlantDescription) -> dict[str, object]:
+    optics = description.optics
+    return {"sun": sun_to_json(optics.sun_shape), "optics": optics_to_json(optics)}
+
+
+def _read(root: Path, heliostats: list[str] | None) -> PlantFolder:
+    description = read_plant(root / PLANT)
+    plant, skipped = description.plant, {}
+    kept = {
+        name: heliostat
+        for name, heliostat in plant.heliostats.items()
+        if (root / name).is_dir() and (heliostats is None or name in heliostats)
+    }
+    if not kept:
+        raise InvalidInputError(
+            f"{root}: no heliostat of {PLANT} has a folder of its name with Calibration or"
+            " Deflectometry; add one"
+        )
+    cylinders = {}
+    for name, receiver in plant.receivers.items():
+        if isinstance(receiver, Cylinder):
+            cylinders[name] = receiver
+        else:
+            skipped[f"receiver {name}"] = (
+                f"the store keeps cylinders only; heliotwin field traces {name}"
+            )
+    properties = {
+        name: heliostat_to_json(heliostat, description.type_of[name])
+        for name, heliostat in kept.items()
+    }
+    declared = read_declared(root / "twin.json")
+    model = PlantModel(plant.site, description.optics, declared.effects, declared.cameras)
+    if "sun" in declared_json(root / "twin.json"):
+        model = replace(model, optics=replace(model.optics, sun_shape=declared.optics.sun_shape))
+    whole = Plant(plant.name, plant.origin, plant.targets, kept, cylinders)
+    return PlantFolder(root, whole, model, skipped, properties, description=description)
+
+
+IMPORTER = Importer(
+    recognises=lambda root: (root / PLANT).is_file(),
+    read=_read,
+    otherwise=f"no '{PLANT}' at the root",
+)

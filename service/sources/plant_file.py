@@ -1,0 +1,275 @@
+"""Read ``plant.yaml``, the file that describes any solar tower plant."""
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from pathlib import Path
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.atmosphere import attenuation_of_visibility
+from model.errors import InvalidInputError
+from model.heliostat_type import HeliostatType
+from model.plant import Heliostat, Plant, Tower
+from model.site import Site
+from model.sunshape import Buie, Gaussian, Pillbox, SunShape
+from model.sunshape.buie import chi_of_csr
+from model.tracing import Optics
+from service.sources.plant_errors import PlantText, mistakes_at
+from service.sources.plant_receivers import (
+    AnyReceiver,
+    aim_of,
+    read_homographies,
+    read_receivers,
+    read_targets,
+)
+from service.sources.plant_schema import BuieSun, Drive, GaussianSun, assumed, nearest
+from service.sources.plant_tables import PlacedHeliostat, read_layout
+from service.sources.plant_types import read_type
+
+Array = NDArray[np.float64]
+
+# Least distance between a heliostat's pivot and what it aims at [m].
+_NEAREST = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class PlantDescription:
+    """A plant as its file describes it.
+
+    Attributes
+    ----------
+    plant : Plant
+        With its heliostats and targets, and the planes and cylinders of its receivers.
+    types : dict
+        Heliostat types by name.
+    receivers : dict
+        All receivers by name.
+    type_of : dict
+        Names of types by heliostat.
+    receiver_of : dict
+        What each heliostat is canted and focused to: a receiver, or a target.
+    optics : Optics
+        Sun shape and attenuation; reflectance and errors are the heliostats'.
+    tower : Tower or None
+    time_zone : str
+        Name in the IANA time zone database.
+    altitude : float [m]
+    marks_of : dict
+        Marks by target: ``none`` or ``l_brackets``.
+    homography_of : dict
+        By target with a known camera, (3, 3): pixels (column, row, 1) to metres right and up of its
+        centre.
+    drives_of : dict
+        Drives of both axes by type, as given; `MountDesign.drives` has linear ones.
+    assumed : tuple of str
+        What the file leaves to its defaults, as lines ``key.path: value``.
+    warnings : tuple of str
+    """
+
+    plant: Plant
+    types: dict[str, HeliostatType]
+    receivers: dict[str, AnyReceiver]
+    type_of: dict[str, str]
+    receiver_of: dict[str, str]
+    optics: Optics
+    tower: Tower | None
+    time_zone: str
+    altitude: float
+    marks_of: dict[str, str]
+    homography_of: dict[str, Array]
+    drives_of: dict[str, tuple[Drive, ...]]
+    assumed: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+
+def read_plant(path: Path) -> PlantDescription:
+    """Read a plant from its file, and the files that it names.
+
+    Raises
+    ------
+    InvalidInputError
+        It names file, line and key path of the first mistake, and what to do.
+    """
+    return _PlantReader(PlantText.read(path)).plant()
+
+
+class _PlantReader:
+    """Builds the parts of a plant from its document."""
+
+    def __init__(self, text: PlantText) -> None:
+        self.text = text
+        self.entries = text.entries
+
+    def plant(self) -> PlantDescription:
+        """The whole plant."""
+        header = self.entries.plant
+        receivers = read_receivers(self.text)
+        targets = read_targets(self.text)
+        types = {name: read_type(self.text, name) for name in self.entries.heliostat_types}
+        layout = self._layout()
+        goals = {**receivers, **targets}
+        receiver_of = self._receiver_of(layout, goals)
+        heliostats = self._heliostats(layout, types, goals, receiver_of)
+        site = Site(**header.model_dump(include={field.name for field in fields(Site)}))
+        return PlantDescription(
+            plant=Plant(header.name, np.array(site.origin), targets, heliostats, receivers),
+            types=types,
+            receivers=receivers,
+            type_of={placed.entry.name: placed.entry.type for placed in layout},
+            receiver_of=receiver_of,
+            optics=Optics(sun_shape=self._sun(), attenuation=self._attenuation()),
+            tower=self._tower(),
+            time_zone=self._time_zone(),
+            altitude=header.altitude_m,
+            marks_of={name: target.marks for name, target in self.entries.targets.items()},
+            homography_of=read_homographies(self.text),
+            drives_of={
+                name: tuple(entry.mount.drives)
+                for name, entry in self.entries.heliostat_types.items()
+                if entry.mount.drives
+            },
+            assumed=tuple(assumed(self.entries)),
+            warnings=tuple(self._warnings(layout)),
+        )
+
+    def _place(self, *path: str | int) -> str:
+        return self.text.place(*path)
+
+    # --- site, sun, air
+
+    def _time_zone(self) -> str:
+        name = self.entries.plant.time_zone
+        try:
+            ZoneInfo(name)
+        except (ZoneInfoNotFoundError, ValueError, OSError):
+            raise InvalidInputError(
+                f"{self._place('plant', 'time_zone')}: {name[:60]!r} is no name of the IANA time"
+                " zone database; write one such as America/Los_Angeles"
+            ) from None
+        return name
+
+    def _sun(self) -> SunShape:
+        sun = self.entries.sun
+        if isinstance(sun, BuieSun):
+            if sun.csr is not None:
+                with mistakes_at(self._place("sun", "csr")):
+                    return Buie(chi_of_csr(sun.csr))
+            return Buie(sun.chi if sun.chi is not None else float(sun.circumsolar_ratio or 0))
+        if isinstance(sun, GaussianSun):
+            return Gaussian(sun.sigma_mrad / 1e3)
+        return Pillbox(sun.half_angle_mrad / 1e3)
+
+    def _attenuation(self) -> tuple[float, ...]:
+        air = self.entries.atmosphere
+        if air is None:
+            return ()
+        if air.visibility_km is None:
+            return tuple(air.attenuation or ())
+        with mistakes_at(self._place("atmosphere")):
+            return attenuation_of_visibility(air.visibility_km)
+
+    def _tower(self) -> Tower | None:
+        tower = self.entries.tower
+        return None if tower is None else Tower(tower.radius_m, tower.height_m)
+
+    # --- heliostats
+
+    def _layout(self) -> list[PlacedHeliostat]:
+        layout = self.entries.layout
+        if layout.file is not None:
+            placed = read_layout(self.text.file(layout.file, "layout", "file"))
+        else:
+            placed = [
+                PlacedHeliostat(self._place("layout", "heliostats", index), entry)
+                for index, entry in enumerate(layout.heliostats or ())
+            ]
+        _require_different(placed)
+        return placed
+
+    def _receiver_of(
+        self, layout: list[PlacedHeliostat], goals: dict[str, AnyReceiver]
+    ) -> dict[str, str]:
+        if not goals:
+            raise InvalidInputError(
+                f"{self._place()}: has neither receivers nor targets; heliostats need something to"
+                " aim at"
+            )
+        first = next(iter(goals))
+        for placed in layout:
+            if (placed.entry.receiver or first) not in goals:
+                known = nearest(str(placed.entry.receiver), list(goals))
+                raise InvalidInputError(
+                    f"{placed.place}: receiver: {placed.entry.receiver!r} is no receiver or target;"
+                    f" {known}"
+                )
+        return {placed.entry.name: placed.entry.receiver or first for placed in layout}
+
+    def _heliostats(
+        self,
+        layout: list[PlacedHeliostat],
+        types: dict[str, HeliostatType],
+        goals: dict[str, AnyReceiver],
+        receiver_of: dict[str, str],
+    ) -> dict[str, Heliostat]:
+        heliostats = {}
+        for placed in layout:
+            entry = placed.entry
+            if entry.type not in types:
+                known = nearest(entry.type, list(types))
+                raise InvalidInputError(
+                    f"{placed.place}: type: {entry.type[:60]!r} is no heliostat type; {known}"
+                )
+            goal = goals[receiver_of[entry.name]]
+            heliostats[entry.name] = _heliostat(placed, types[entry.type], goal)
+        return heliostats
+
+    def _warnings(self, layout: list[PlacedHeliostat]) -> Iterable[str]:
+        sun = self.entries.sun
+        if isinstance(sun, BuieSun) and sun.has_old_name:
+            place = self._place("sun", "circumsolar_ratio")
+            yield f"{place}: is read as chi of Buie's formula; write chi, or csr for the true share"
+        used = {placed.entry.type for placed in layout}
+        for name, entry in self.entries.heliostat_types.items():
+            if name not in used:
+                yield f"{self._place('heliostat_types', name)}: has no heliostat in the layout"
+            kinds = {drive.kind for drive in entry.mount.drives or ()}
+            if kinds - {"linear"}:
+                place = self._place("heliostat_types", name, "mount", "drives")
+                yield f"{place}: motor positions are modelled if both drives are linear only"
+
+
+def _require_different(layout: list[PlacedHeliostat]) -> None:
+    """Refuse two heliostats of one name, or within a centimetre of one place."""
+    names: dict[str, str] = {}
+    places: dict[tuple[float, ...], PlacedHeliostat] = {}
+    for placed in layout:
+        entry = placed.entry
+        if entry.name in names:
+            raise InvalidInputError(
+                f"{placed.place}: name: {entry.name} is there twice, first in"
+                f" {names[entry.name]}; rename one"
+            )
+        foot = tuple(round(value, 2) for value in (entry.east_m, entry.north_m, entry.up_m))
+        if foot in places:
+            raise InvalidInputError(
+                f"{placed.place}: {entry.name} is at the place of {places[foot].entry.name},"
+                f" {places[foot].place}; move or remove one"
+            )
+        names[entry.name], places[foot] = placed.place, placed
+
+
+def _heliostat(placed: PlacedHeliostat, of_type: HeliostatType, goal: AnyReceiver) -> Heliostat:
+    entry = placed.entry
+    foot = np.array([entry.east_m, entry.north_m, entry.up_m])
+    aim = aim_of(goal, foot)
+    pivot = foot + np.array([0.0, 0.0, of_type.mount.pivot_height])
+    if math.dist(aim, pivot) < _NEAREST:
+        raise InvalidInputError(
+            f"{placed.place}: {entry.name} is less than {_NEAREST:g} m from its aim on {goal.name};"
+            " move one of them"
+        )
+    with mistakes_at(placed.place):
+        return of_type.heliostat(entry.name, foot, aim, entry.focal_length_m)

@@ -1,0 +1,1 @@
+"""Plants in the formats of other programs, one file a format."""

@@ -1,0 +1,69 @@
+"""Formats of other programs: which one a file has, and how a plant is written in one."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.errors import InvalidInputError
+from model.frames import sun_direction
+from service.sources.plant_file import PlantDescription
+from service.sources.plant_formats.imported import ImportedPlant
+from service.sources.plant_formats.opencsp import COLUMNS, read_opencsp
+from service.sources.plant_formats.solarpilot import read_solarpilot, solarpilot_layout
+from service.sources.plant_formats.soltrace import read_soltrace
+from service.sources.plant_formats.soltrace_export import soltrace_text
+from service.sources.plant_formats.text import read_lines
+
+Array = NDArray[np.float64]
+
+
+def read_foreign(path: Path) -> ImportedPlant:
+    """Read a file of SolTrace (``.stinput``), OpenCSP or SolarPILOT (CSV by its first line).
+
+    Raises
+    ------
+    InvalidInputError
+        It names file and line of what is not understood.
+    """
+    if path.suffix.lower() == ".stinput":
+        return read_soltrace(path)
+    lines = read_lines(path, ",")
+    is_opencsp = bool(lines) and [cell.strip() for cell in lines[0].cells[:5]] == list(COLUMNS[:5])
+    return read_opencsp(path) if is_opencsp else read_solarpilot(path)
+
+
+def foreign_text(
+    described: PlantDescription,
+    to: str,
+    sun_deg: tuple[float, float] | None,
+    aims: Mapping[str, Array | None],
+) -> str:
+    """A plant as text for ``solarpilot`` or ``soltrace``.
+
+    ``sun_deg`` is azimuth from north over east and elevation [deg]; SolTrace needs it. ``aims`` are
+    points (3,) [m] by heliostat, None for one that is not active.
+
+    Raises
+    ------
+    InvalidInputError
+        If the format cannot say what the plant has, or the sun is missing or below the horizon.
+    """
+    points = {name: aim for name, aim in aims.items() if aim is not None}
+    if len(points) < len(aims):
+        raise InvalidInputError(
+            f"{len(aims) - len(points)} heliostats are not active, which neither format can say;"
+            " leave them out of the plant"
+        )
+    if to == "solarpilot":
+        return solarpilot_layout(described, points)
+    if sun_deg is None:
+        raise InvalidInputError("SolTrace needs the sun; give --sun AZIMUTH ELEVATION")
+    azimuth, elevation = sun_deg
+    if not (-360 <= azimuth <= 360 and 0 < elevation <= 90):
+        raise InvalidInputError(
+            f"--sun {azimuth:g} {elevation:g}: elevation must lie in (0, 90], azimuth"
+            " in [-360, 360]"
+        )
+    return soltrace_text(described, sun_direction(azimuth, elevation), points)

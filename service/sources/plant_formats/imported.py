@@ -1,0 +1,117 @@
+"""A plant that another program's file describes, and its files."""
+
+import csv
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from model.errors import InvalidInputError
+from model.site import Origin, Site
+from service.sources.plant_schema import HeliostatEntry
+
+Array = NDArray[np.float64]
+
+PLANT, LAYOUT, AIMS = "plant.yaml", "layout.csv", "aims.csv"
+
+
+@dataclass(frozen=True, eq=False)
+class ImportedPlant:
+    """What a file of another program describes.
+
+    Attributes
+    ----------
+    parts : mapping
+        Of plant.yaml, without its layout.
+    heliostats : sequence of HeliostatEntry
+    aims : dict
+        Aim points (3,) [m] by heliostat; empty if the file has none.
+    notes : sequence of str
+        What the file does not say, and what is written in its place.
+    """
+
+    parts: Mapping[str, object]
+    heliostats: Sequence[HeliostatEntry]
+    aims: Mapping[str, Array] = field(default_factory=dict)
+    notes: Sequence[str] = ()
+
+    def write(self, folder: Path) -> list[Path]:
+        """Write plant.yaml, layout.csv and, if there are aims, aims.csv; return their paths.
+
+        Raises
+        ------
+        InvalidInputError
+            If one of them exists.
+        """
+        names = [PLANT, LAYOUT, *([AIMS] if self.aims else [])]
+        paths = [folder / name for name in names]
+        for path in paths:
+            if path.exists() or path.is_symlink():
+                raise InvalidInputError(f"{path} exists; name another folder, or move it")
+        folder.mkdir(parents=True, exist_ok=True)
+        paths[0].write_text(self._plant(), encoding="utf-8")
+        _write_csv(paths[1], *self._layout())
+        if self.aims:
+            rows = [[name, *_millimetres(aim), "true"] for name, aim in self.aims.items()]
+            _write_csv(paths[2], ["name", "east_m", "north_m", "up_m", "active"], rows)
+        return paths
+
+    def _plant(self) -> str:
+        notes = "".join(f"# {note}\n" for note in self.notes)
+        parts = {**self.parts, "layout": {"file": LAYOUT}}
+        return notes + yaml.safe_dump(parts, sort_keys=False, width=100, default_flow_style=None)
+
+    def _layout(self) -> "_Table":
+        optional = [
+            name
+            for name in ("receiver", "focal_length_m")
+            if any(getattr(entry, name) is not None for entry in self.heliostats)
+        ]
+        columns = ["name", "type", "east_m", "north_m", "up_m", *optional]
+        rows = [[_cell(getattr(entry, name)) for name in columns] for entry in self.heliostats]
+        return _Table(columns, rows)
+
+
+class _Table(NamedTuple):
+    columns: list[str]
+    rows: list[list[str]]
+
+
+def _cell(value: object) -> str:
+    if value is None:
+        return ""
+    return f"{value:.10g}" if isinstance(value, float) else str(value)
+
+
+def _millimetres(point: Array) -> list[str]:
+    return [f"{value:.6f}" for value in point]
+
+
+def _write_csv(path: Path, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    with path.open("w", encoding="utf-8", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows([columns, *rows])
+
+
+def placed(
+    name: str, kind: str, foot: Sequence[float], focal_length: float | None = None
+) -> HeliostatEntry:
+    """A heliostat of the layout with its pylon's ``foot`` (3,) [m]."""
+    return HeliostatEntry.model_construct(
+        name=name,
+        type=kind,
+        east_m=float(foot[0]),
+        north_m=float(foot[1]),
+        up_m=float(foot[2]),
+        receiver=None,
+        focal_length_m=focal_length,
+    )
+
+
+def site(name: str, origin: Origin, time_zone: str) -> dict[str, object]:
+    """The part ``plant`` of plant.yaml."""
+    keys = [entry.name for entry in fields(Site)]
+    return {"name": name, **dict(zip(keys, origin, strict=True)), "time_zone": time_zone}

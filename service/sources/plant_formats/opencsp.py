@@ -1,0 +1,102 @@
+"""Heliostats as OpenCSP lists them, such as those of Sandia's National Solar Thermal Test Facility.
+
+Columns: Name, X, Y, Z of the torque tube's middle [m], numbers of facets, rows and columns, pivot
+height, pivot offset, facet width and height [m].
+
+Source: Sandia National Laboratories, OpenCSP, ``NSTTF_Heliostats_origin_at_torque_tube.csv``.
+"""
+
+from pathlib import Path
+
+from model.errors import InvalidInputError
+from service.base.names import NAME, require_name
+from service.sources.plant_formats.imported import ImportedPlant, placed, site
+from service.sources.plant_formats.text import ForeignLine, read_lines
+from service.sources.plant_schema import MAX_HELIOSTATS, HeliostatEntry
+
+COLUMNS = (
+    "Name",
+    "X",
+    "Y",
+    "Z",
+    "Num. Facets",
+    "Num. Rows",
+    "Num. Cols",
+    "Pivot Height",
+    "Pivot Offset",
+    "Facet Width",
+    "Facet Height",
+)
+
+# From the middles of facets in the same project's facet file: 1.27 m less 1.2192 m.
+_GAP_M = 0.0508
+
+
+def read_opencsp(path: Path) -> ImportedPlant:
+    """Read a list of heliostats; those with equal mirrors and mounts are one type.
+
+    Raises
+    ------
+    InvalidInputError
+        It names file and line of what is not understood.
+    """
+    lines = read_lines(path, ",")
+    if not lines or [cell.strip() for cell in lines[0].cells] != list(COLUMNS):
+        raise InvalidInputError(f"{path}, line 1: must be {','.join(COLUMNS)}")
+    if len(lines) > MAX_HELIOSTATS + 1:
+        raise lines[-1].refuse(f"at most {MAX_HELIOSTATS} heliostats are read")
+    kinds: dict[tuple[float, ...], str] = {}
+    heliostats: list[HeliostatEntry] = []
+    for line in lines[1:]:
+        name = line.cells[0].strip()
+        require_name(NAME, name, f"{line.place}: Name")
+        mirror = tuple(line.numbers(4, 7))
+        _require_grid(line)
+        kind = kinds.setdefault(mirror, f"type-{len(kinds) + 1}")
+        east, north, up = line.numbers(1, 3)
+        heliostats.append(placed(name, kind, (east, north, up - mirror[3])))
+    return ImportedPlant(
+        parts={
+            "plant": site("nsttf", (34.962, -106.509, 1649.0), "America/Denver"),
+            "heliostat_types": {name: _type(mirror) for mirror, name in kinds.items()},
+            "receivers": {
+                "main": {
+                    "kind": "plane",
+                    "center_m": [0, 0, 60],
+                    "normal": [0, 1, 0],
+                    "width_m": 6.0,
+                    "height_m": 6.0,
+                }
+            },
+        },
+        heliostats=heliostats,
+        notes=(
+            "The file has positions, mounts and mirrors. The rest is assumed; change it to yours.",
+            "plant: the National Solar Thermal Test Facility; positions as in the file.",
+            "heliostat_types: flat facets, canted to the slant range; reflectance 1, no errors.",
+            f"facets: gaps of {_GAP_M:g} m, as between the inner columns of the NSTTF's mirrors.",
+            "layout: feet are one pivot height below the torque tube.",
+            "receivers: a plane 60 m up that faces north.",
+        ),
+    )
+
+
+def _require_grid(line: ForeignLine) -> None:
+    count, rows, columns = (line.number(index, 1, 256) for index in (4, 5, 6))
+    if count != rows * columns or rows != int(rows) or columns != int(columns):
+        raise line.refuse(f"{count:g} facets are not {rows:g} rows of {columns:g}")
+
+
+def _type(mirror: tuple[float, ...]) -> dict[str, object]:
+    _, rows, columns, pivot, offset, width, height = mirror
+    return {
+        "mount": {"kind": "azimuth_elevation", "pivot_height_m": pivot, "mirror_offset_m": offset},
+        "facets": {
+            "rows": int(rows),
+            "columns": int(columns),
+            "width_m": width,
+            "height_m": height,
+            "gap_m": _GAP_M,
+        },
+        "canting": "on_axis",
+    }

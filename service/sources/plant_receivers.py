@@ -1,0 +1,120 @@
+"""Receivers and targets of ``plant.yaml``."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.errors import InvalidInputError
+from model.frames import sun_direction
+from model.plant import Cylinder, TargetPlane
+from model.receivers import Cavity, Panels
+from service.sources.plant_errors import PlantText, mistakes_at
+from service.sources.plant_schema import (
+    UP,
+    CavityReceiver,
+    CylinderReceiver,
+    PanelEntry,
+    PanelsReceiver,
+    ReceiverEntry,
+)
+
+Array = NDArray[np.float64]
+
+AnyReceiver = Cylinder | TargetPlane | Panels | Cavity
+
+
+def read_receivers(plant: PlantText) -> dict[str, AnyReceiver]:
+    """Receivers by name."""
+    receivers = {}
+    for name, entry in plant.entries.receivers.items():
+        with mistakes_at(plant.place("receivers", name)):
+            receivers[name] = _receiver(name, entry)
+    return receivers
+
+
+def read_targets(plant: PlantText) -> dict[str, TargetPlane]:
+    """Targets by name."""
+    targets = {}
+    for name, entry in plant.entries.targets.items():
+        place = plant.place("targets", name)
+        if name in plant.entries.receivers:
+            raise InvalidInputError(f"{place}: is a receiver's name too; rename one of them")
+        with mistakes_at(place):
+            targets[name] = _plane(name, entry)
+    return targets
+
+
+def read_homographies(plant: PlantText) -> dict[str, Array]:
+    """Homographies (3, 3) of targets whose camera is known, by name."""
+    found = {}
+    for name, target in plant.entries.targets.items():
+        if target.camera is not None:
+            matrix = np.array(target.camera.homography, dtype=np.float64)
+            if abs(np.linalg.det(matrix / np.abs(matrix).max(initial=1e-300))) < 1e-15:
+                place = plant.place("targets", name, "camera", "homography")
+                raise InvalidInputError(f"{place}: must be invertible")
+            found[name] = matrix
+    return found
+
+
+def _plane(name: str, entry: PanelEntry, absorptance: float = 1.0) -> TargetPlane:
+    return TargetPlane(
+        name,
+        np.array(entry.center_m),
+        np.array(entry.normal),
+        np.array(entry.up),
+        entry.width_m,
+        entry.height_m,
+        absorptance,
+    )
+
+
+def _receiver(name: str, entry: ReceiverEntry) -> AnyReceiver:
+    """The receiver of an entry."""
+    if isinstance(entry, CylinderReceiver):
+        facing = sun_direction(entry.facing_azimuth_deg, 0.0)
+        return Cylinder(
+            name,
+            np.array(entry.center_m) + entry.radius_m * facing,
+            facing,
+            np.array(UP),
+            entry.radius_m,
+            entry.height_m,
+            entry.opening_deg,
+            entry.absorptance,
+        )
+    if isinstance(entry, PanelsReceiver | CavityReceiver):
+        panels = tuple(
+            _plane(f"{name}-{number}", panel, entry.absorptance)
+            for number, panel in enumerate(entry.panels, start=1)
+        )
+        if isinstance(entry, PanelsReceiver):
+            return Panels(name, panels, entry.absorptance)
+        return Cavity(name, panels, entry.absorptance, np.array(entry.aperture_m))
+    return _plane(name, entry, entry.absorptance)
+
+
+def aim_of(receiver: AnyReceiver, foot: Array) -> Array:
+    """What a heliostat with its pylon's ``foot`` (3,) [m] is canted and focused to (3,) [m].
+
+    The middle of a plane or of panels, of a cavity's aperture, and on a cylinder the place at mid
+    height that faces the heliostat.
+    """
+    if isinstance(receiver, Cylinder):
+        return _facing(receiver, foot)
+    if isinstance(receiver, Panels):
+        return np.asarray(np.mean([panel.center for panel in receiver.panels], axis=0))
+    if isinstance(receiver, Cavity):
+        return np.asarray(receiver.aperture.mean(axis=0))
+    return receiver.center
+
+
+def _facing(cylinder: Cylinder, foot: Array) -> Array:
+    """The place (3,) [m] of a cylinder's lit surface at mid height nearest to ``foot`` (3,)."""
+    outward = foot - cylinder.axis
+    half = math.radians(cylinder.opening_deg) / 2
+    angle = math.atan2(float(outward @ cylinder.right), float(outward @ cylinder.normal))
+    angle = max(-half, min(half, angle))
+    direction = math.cos(angle) * cylinder.normal + math.sin(angle) * cylinder.right
+    return np.asarray(cylinder.axis + cylinder.radius * direction)

@@ -1,0 +1,546 @@
+"""Schema of ``plant.yaml``, the file that describes any solar tower plant.
+
+Unknown keys are refused, a kind that is not understood too: nothing is read as something else.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from difflib import get_close_matches
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    Discriminator,
+    Field,
+    StringConstraints,
+    Tag,
+    model_validator,
+)
+
+from model.plant import require_cylinder_shape, require_plane_shape
+from service.base.fields import (
+    Direction,
+    Extent,
+    Flag,
+    Metres,
+    Model,
+    Name,
+    Number,
+    Position,
+    Whole,
+)
+from service.base.names import LINE, NAME
+
+MAX_HELIOSTATS = 50_000
+"""Most heliostats of a plant."""
+
+MAX_FACETS = 256
+"""Most facets of a heliostat."""
+
+UP = (0.0, 0.0, 1.0)
+
+
+class PlantPart(Model):
+    """Base of all parts: suggests the nearest key for one that is unknown."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _known_keys(cls, data: Any) -> Any:
+        if isinstance(data, dict):
+            known = list(cls.model_fields)
+            for key, value in data.items():
+                if key not in known:
+                    raise KeyMistakeError(key, f"is not known here; {nearest(key, known)}")
+                if value is None:
+                    raise KeyMistakeError(key, "has no value; write one, or leave the key out")
+        return data
+
+    def require_one(self, *keys: str) -> None:
+        """Refuse the part unless exactly one of ``keys`` is given."""
+        given = [key for key in keys if getattr(self, key) is not None]
+        if len(given) != 1:
+            problem = "are given" if given else "are all missing"
+            listed = " and ".join(given) if given else ", ".join(keys)
+            raise ValueError(f"{listed} {problem}; give one of {', '.join(keys)}")
+
+
+class KeyMistakeError(ValueError):
+    """A mistake of one ``key`` of a part, found before its values are."""
+
+    def __init__(self, key: str, message: str) -> None:
+        super().__init__(message)
+        self.key = key
+
+
+def nearest(word: str, known: Sequence[str]) -> str:
+    """What to write in place of a word that is not one of ``known``."""
+    close = get_close_matches(word[:80], known, 1, 0.6)
+    return f"did you mean {close[0]}?" if close else f"known are {', '.join(known)}"
+
+
+def _as_name(value: Any) -> Any:
+    """The text of a whole number: heliostats are often numbered."""
+    if isinstance(value, float):
+        raise ValueError("must be text; put it in quotes")
+    return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
+
+
+def _form(value: Any) -> str:
+    return "(object)" if isinstance(value, dict | BaseModel) else "(word)"
+
+
+def _facet_source(value: Any) -> str:
+    is_file = "file" in value if isinstance(value, dict) else isinstance(value, FacetFileEntry)
+    return "(file)" if is_file else "(grid)"
+
+
+NumberedName = Annotated[Name, BeforeValidator(_as_name, json_schema_input_type=Name | int)]
+FileName = Annotated[
+    str,
+    StringConstraints(pattern=LINE, min_length=1, max_length=200),
+    Field(description="Path relative to the folder of plant.yaml, inside of it."),
+]
+Length = Annotated[Number, Field(gt=0, le=1e5)]
+Share = Annotated[Number, Field(ge=0, le=1)]
+Reflectance = Annotated[Number, Field(gt=0, le=1)]
+ErrorMrad = Annotated[Number, Field(ge=0, lt=100)]
+Azimuth360 = Annotated[Number, Field(ge=-360, le=360, description="From north over east [deg].")]
+
+
+class PlantHeader(PlantPart):
+    """Name and location of the plant; the tower base is the origin of all positions."""
+
+    name: NumberedName
+    latitude_deg: Annotated[Number, Field(ge=-90, le=90)]
+    longitude_deg: Annotated[Number, Field(ge=-180, le=180)]
+    altitude_m: Annotated[Number, Field(ge=-1000, le=9000)] = 0.0
+    time_zone: Annotated[str, StringConstraints(pattern=LINE, max_length=64)] = Field(
+        "UTC", description="Name in the IANA time zone database, such as America/Los_Angeles."
+    )
+
+
+# --- heliostat types
+# --------------------------------------------------------------------------------------------------
+
+
+class LinearDrive(PlantPart):
+    """A spindle that turns an axis, as of `model.actuator.LinearActuator`."""
+
+    kind: Literal["linear"]
+    increment_steps_per_m: Annotated[Number, Field(gt=0, le=1e12)]
+    initial_stroke_length_m: Annotated[Number, Field(ge=0, le=100)]
+    offset_m: Annotated[Number, Field(gt=0, le=100)]
+    pivot_radius_m: Annotated[Number, Field(gt=0, le=100)]
+    initial_angle_rad: Annotated[Number, Field(ge=-10, le=10)] = Field(
+        description="Axis angle at zero steps."
+    )
+    clockwise: Flag = Field(description="Whether the angle decreases as the stroke increases.")
+    max_increment_steps: Annotated[Number, Field(gt=0, le=1e12)] = Field(
+        description="The end of travel."
+    )
+
+
+class RotaryDrive(PlantPart):
+    """A drive whose motor position is proportional to the axis angle."""
+
+    kind: Literal["rotary"]
+    steps_per_rad: Annotated[Number, Field(gt=0, le=1e12)] | None = None
+    gear: Annotated[Number, Field(gt=0, le=1e9)] | None = Field(
+        None, description="Motor turns for one turn of the axis."
+    )
+
+    @model_validator(mode="after")
+    def _one_ratio(self) -> Self:
+        self.require_one("steps_per_rad", "gear")
+        return self
+
+
+class IdealDrive(PlantPart):
+    """A drive that reaches every angle."""
+
+    kind: Literal["ideal"]
+
+
+Drive = Annotated[LinearDrive | RotaryDrive | IdealDrive, Field(discriminator="kind")]
+
+
+class MountEntry(PlantPart):
+    """The mount: its two axes, and where they are."""
+
+    kind: Literal["azimuth_elevation", "juelich", "pitch_roll", "target_aligned"]
+    pivot_height_m: Annotated[Number, Field(ge=-100, le=100)] = Field(
+        0.0, description="Of both axes above the foot of the pylon."
+    )
+    mirror_offset_m: Annotated[Number, Field(ge=-10, le=10)] = Field(
+        0.0, description="From the pivot to the mirror's middle along its normal."
+    )
+    drives: Annotated[list[Drive], Field(min_length=2, max_length=2)] | None = Field(
+        None, description="Drives of the first and the second axis; ideal ones without it."
+    )
+
+
+class FacetGridEntry(PlantPart):
+    """Equal facets in rows and columns."""
+
+    rows: Annotated[Whole, Field(ge=1, le=MAX_FACETS)]
+    columns: Annotated[Whole, Field(ge=1, le=MAX_FACETS)]
+    width_m: Extent = Field(description="Of one facet.")
+    height_m: Extent = Field(description="Of one facet.")
+    gap_m: Annotated[Number, Field(ge=0, le=10)] = Field(0.0, description="Between two facets.")
+
+    @model_validator(mode="after")
+    def _few(self) -> Self:
+        if self.rows * self.columns > MAX_FACETS:
+            raise ValueError(
+                f"has {self.rows * self.columns} facets; at most {MAX_FACETS} are read"
+            )
+        return self
+
+
+class FacetFileEntry(PlantPart):
+    """Facets by a CSV file, one a line."""
+
+    file: FileName
+
+
+class FocusEntry(PlantPart):
+    """A focal length that all facets of a type have."""
+
+    focal_length_m: Length
+
+
+class SunDirection(PlantPart):
+    """A sun as seen: azimuth from north over east, elevation."""
+
+    azimuth_deg: Azimuth360
+    elevation_deg: Annotated[Number, Field(gt=0, le=90)]
+
+
+class CantingEntry(PlantPart):
+    """Canting to a focal length, or for one position of the sun."""
+
+    focal_length_m: Length | None = None
+    off_axis: SunDirection | None = None
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Self:
+        self.require_one("focal_length_m", "off_axis")
+        return self
+
+
+class HeliostatTypeEntry(PlantPart):
+    """What the heliostats of one type have in common."""
+
+    mount: MountEntry
+    facets: Annotated[
+        Annotated[FacetGridEntry, Tag("(grid)")] | Annotated[FacetFileEntry, Tag("(file)")],
+        Discriminator(_facet_source),
+    ]
+    facet_shape: Annotated[
+        Annotated[Literal["flat", "slant_range"], Tag("(word)")]
+        | Annotated[FocusEntry, Tag("(object)")],
+        Discriminator(_form),
+    ] = Field("flat", description="Each facet is a paraboloid of this focal length, or flat.")
+    canting: (
+        Annotated[
+            Annotated[Literal["on_axis", "flat", "individual"], Tag("(word)")]
+            | Annotated[CantingEntry, Tag("(object)")],
+            Discriminator(_form),
+        ]
+        | None
+    ) = Field(
+        None, description="on_axis without it, or individual if the facets' file has their normals."
+    )
+    reflectance: Reflectance = 1.0
+    slope_error_mrad: ErrorMrad = Field(
+        0.0, description="Of the normals, standard deviation per axis."
+    )
+    pointing_error_mrad: ErrorMrad = Field(
+        0.0, description="Of the reflected beam, standard deviation per axis."
+    )
+
+
+# --- layout
+# --------------------------------------------------------------------------------------------------
+
+
+class HeliostatEntry(PlantPart):
+    """A heliostat: its type, and the foot of its pylon."""
+
+    name: NumberedName
+    type: NumberedName
+    east_m: Metres
+    north_m: Metres
+    up_m: Metres
+    receiver: NumberedName | None = Field(
+        None, description="What it is canted and focused to; the first receiver without it."
+    )
+    focal_length_m: Length | None = Field(None, description="In place of its slant range.")
+
+
+class LayoutEntry(PlantPart):
+    """The heliostats, by a CSV file or as a list."""
+
+    file: FileName | None = None
+    heliostats: (
+        Annotated[list[HeliostatEntry], Field(min_length=1, max_length=MAX_HELIOSTATS)] | None
+    ) = None
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Self:
+        self.require_one("file", "heliostats")
+        return self
+
+
+# --- receivers and targets
+# --------------------------------------------------------------------------------------------------
+
+
+class PanelEntry(PlantPart):
+    """A rectangle; its normal is on the lit side."""
+
+    center_m: Position
+    normal: Direction = Field(description="East, north, up; of any length.")
+    up: Direction = Field(UP, description="Upwards in its map; not parallel to the normal.")
+    width_m: Extent
+    height_m: Extent
+
+    @model_validator(mode="after")
+    def _near_square(self) -> Self:
+        require_plane_shape(self.width_m, self.height_m)
+        return self
+
+
+class PlaneReceiver(PanelEntry):
+    """A flat receiver."""
+
+    kind: Literal["plane"]
+    absorptance: Reflectance = 1.0
+
+
+class CylinderReceiver(PlantPart):
+    """An upright cylinder or a part of one, lit from outside."""
+
+    kind: Literal["cylinder"]
+    center_m: Position = Field(description="On the axis, at mid height.")
+    radius_m: Annotated[Number, Field(ge=0.01, lt=1e3)]
+    height_m: Extent
+    facing_azimuth_deg: Azimuth360 = Field(
+        0.0, description="Where the middle column of its map faces, from north over east."
+    )
+    opening_deg: Annotated[Number, Field(gt=0, le=360)] = Field(
+        360.0, description="Angle of the lit surface, half of it to each side of the middle."
+    )
+    absorptance: Reflectance = 1.0
+
+    @model_validator(mode="after")
+    def _near_square(self) -> Self:
+        require_cylinder_shape(self.radius_m, self.height_m, self.opening_deg)
+        return self
+
+
+Panelled = Annotated[list[PanelEntry], Field(min_length=1, max_length=64)]
+
+
+class PanelsReceiver(PlantPart):
+    """Planes of one height side by side, lit from outside, from left to right."""
+
+    kind: Literal["panels"]
+    panels: Panelled
+    absorptance: Reflectance = 1.0
+
+
+class CavityReceiver(PlantPart):
+    """Panels behind an opening."""
+
+    kind: Literal["cavity"]
+    aperture_m: Annotated[list[Position], Field(min_length=3, max_length=64)] = Field(
+        description="Corners of the opening, in one plane, counter-clockwise seen from outside."
+    )
+    panels: Panelled
+    absorptance: Reflectance = 1.0
+
+
+ReceiverEntry = Annotated[
+    PlaneReceiver | CylinderReceiver | PanelsReceiver | CavityReceiver, Field(discriminator="kind")
+]
+
+
+class CameraEntry(PlantPart):
+    """The camera that looks at a target."""
+
+    homography: Annotated[
+        list[Annotated[list[Annotated[Number, Field(ge=-1e9, le=1e9)]], Field(min_length=3)]],
+        Field(min_length=3),
+    ] = Field(
+        description="3 x 3: from its pixels (column, row, 1) to metres right and up of the"
+        " target's centre."
+    )
+
+    @model_validator(mode="after")
+    def _three_by_three(self) -> Self:
+        if [len(row) for row in self.homography] != [3, 3, 3]:
+            raise ValueError("homography must have three rows of three numbers")
+        return self
+
+
+class TargetEntry(PanelEntry):
+    """A calibration target."""
+
+    kind: Literal["plane"]
+    marks: Literal["none", "l_brackets"] = Field(
+        "none", description="Marks at its corners by which photographs are rectified."
+    )
+    camera: CameraEntry | None = None
+
+
+class TowerEntry(PlantPart):
+    """The tower, an upright cylinder that casts a shadow."""
+
+    radius_m: Annotated[Number, Field(gt=0, lt=1e3)]
+    height_m: Annotated[Number, Field(gt=0, lt=1e4)]
+
+
+# --- sun and air
+# --------------------------------------------------------------------------------------------------
+
+
+class PillboxSun(PlantPart):
+    """A disc of even radiance."""
+
+    shape: Literal["pillbox"]
+    half_angle_mrad: Annotated[Number, Field(ge=0.001, le=100)] = 4.65
+
+
+class GaussianSun(PlantPart):
+    """A Gaussian."""
+
+    shape: Literal["gaussian"]
+    sigma_mrad: Annotated[Number, Field(ge=0.001, le=100)] = Field(
+        description="Standard deviation per axis."
+    )
+
+
+class BuieSun(PlantPart):
+    """Buie's disc with aureole."""
+
+    shape: Literal["buie"]
+    chi: Annotated[Number, Field(ge=0, le=0.5)] | None = Field(
+        None, description="Of Buie's formula."
+    )
+    csr: Share | None = Field(None, description="True share of the light from the aureole.")
+    circumsolar_ratio: Annotated[Number, Field(ge=0, le=0.5)] | None = Field(
+        None,
+        description="The older name of chi; not the true share.",
+        json_schema_extra={"deprecated": True},
+    )
+
+    @model_validator(mode="after")
+    def _one_ratio(self) -> Self:
+        self.require_one("chi", "csr", *(["circumsolar_ratio"] * self.has_old_name))
+        return self
+
+    @property
+    def has_old_name(self) -> bool:
+        """Whether chi is given by its older name."""
+        return self.circumsolar_ratio is not None
+
+
+SunEntry = Annotated[PillboxSun | GaussianSun | BuieSun, Field(discriminator="shape")]
+
+
+class AtmosphereEntry(PlantPart):
+    """The light that is lost between mirror and receiver."""
+
+    attenuation: (
+        Annotated[
+            list[Annotated[Number, Field(ge=-1e6, le=1e6)]], Field(min_length=1, max_length=8)
+        ]
+        | None
+    ) = Field(None, description="Lost share, a polynomial in the slant range [km], constant first.")
+    visibility_km: Annotated[Number, Field(gt=0)] | None = None
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Self:
+        self.require_one("attenuation", "visibility_km")
+        return self
+
+
+NamedParts = Annotated[str, StringConstraints(pattern=NAME)]
+
+
+class PlantDocument(PlantPart):
+    """A plant in one file. SI units; a key's name has its unit if it is not SI or not evident.
+
+    Positions are east, north and up [m] of the tower base, azimuths from north over east.
+    """
+
+    plant: PlantHeader
+    heliostat_types: Annotated[
+        dict[NamedParts, HeliostatTypeEntry], Field(min_length=1, max_length=64)
+    ]
+    layout: LayoutEntry
+    receivers: Annotated[dict[NamedParts, ReceiverEntry], Field(max_length=64)] = Field({})
+    targets: Annotated[dict[NamedParts, TargetEntry], Field(max_length=64)] = Field({})
+    tower: TowerEntry | None = None
+    sun: SunEntry = BuieSun(shape="buie", chi=0.02)
+    atmosphere: AtmosphereEntry | None = None
+
+
+def json_schema() -> dict[str, object]:
+    """The JSON schema of ``plant.yaml``."""
+    schema = PlantDocument.model_json_schema()
+    dialect = "https://json-schema.org/draft/2020-12/schema"
+    return {"$schema": dialect, **_without_null(schema), "title": "plant.yaml"}
+
+
+def _without_null(schema: Any) -> Any:
+    """A schema in which a key is left out instead of being null."""
+    if isinstance(schema, list):
+        return [_without_null(entry) for entry in schema if entry != {"type": "null"}]
+    if not isinstance(schema, dict):
+        return schema
+    kept = {key: _without_null(entry) for key, entry in schema.items() if key != "title"}
+    if kept.get("default", "") is None:
+        del kept["default"]
+    if len(kept.get("anyOf", ())) == 1:
+        kept = {**kept.pop("anyOf")[0], **kept}
+    return kept
+
+
+def assumed(part: BaseModel, path: str = "") -> Iterator[str]:
+    """Yield what a document leaves to its defaults, as lines ``key.path: value``."""
+    for name in type(part).model_fields:
+        value, where = getattr(part, name), f"{path}{name}"
+        if name not in part.model_fields_set:
+            if value is None:
+                yield from [f"{where}: {_ABSENT[name]}"] if name in _ABSENT else []
+            elif value != {}:
+                yield f"{where}: {_brief(value)}"
+        else:
+            yield from _assumed_below(value, where)
+
+
+_ABSENT = {
+    "tower": "none, and no shadow of one",
+    "atmosphere": "clear, no light is lost",
+    "canting": "on_axis, or individual if the facets' file has normals",
+}
+"""What is assumed if a part is absent that has no default."""
+
+
+def _assumed_below(value: Any, where: str) -> Iterator[str]:
+    if isinstance(value, BaseModel):
+        yield from assumed(value, f"{where}.")
+    elif isinstance(value, Mapping):
+        for key, entry in value.items():
+            yield from _assumed_below(entry, f"{where}.{key}")
+
+
+def _brief(value: object) -> str:
+    if isinstance(value, BaseModel):
+        given = ", ".join(
+            f"{key}: {entry}" for key, entry in value.model_dump(exclude_none=True).items()
+        )
+        return f"{{{given}}}"
+    return f"{value:g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,98 @@
+"""Heliostat types of ``plant.yaml``."""
+
+from model.actuator import LinearActuator
+from model.errors import InvalidInputError
+from model.heliostat_type import Canting, FacetDesign, Focus, HeliostatType, MountDesign, facet_grid
+from model.plant import MirrorOptics
+from service.sources.plant_errors import PlantText, mistakes_at
+from service.sources.plant_schema import (
+    CantingEntry,
+    FacetFileEntry,
+    FacetGridEntry,
+    FocusEntry,
+    HeliostatTypeEntry,
+    LinearDrive,
+    MountEntry,
+)
+from service.sources.plant_tables import read_facets
+from service.sources.yaml_text import KeyPath
+
+
+def read_type(plant: PlantText, name: str) -> HeliostatType:
+    """The heliostat type of this name."""
+    entry = plant.entries.heliostat_types[name]
+    path: KeyPath = ("heliostat_types", name)
+    facets = _facets(plant, entry.facets, path)
+    optics = MirrorOptics(
+        entry.reflectance, entry.slope_error_mrad / 1e3, entry.pointing_error_mrad / 1e3
+    )
+    canting = _canting(plant, entry.canting, facets, path)
+    with mistakes_at(plant.place(*path)):
+        return HeliostatType(name, facets, _mount(entry.mount), _focus(entry), canting, optics)
+
+
+def _facets(
+    plant: PlantText, grid: FacetGridEntry | FacetFileEntry, path: KeyPath
+) -> tuple[FacetDesign, ...]:
+    if isinstance(grid, FacetFileEntry):
+        return read_facets(plant.file(grid.file, *path, "facets", "file"))
+    return facet_grid(grid.rows, grid.columns, grid.width_m, grid.height_m, grid.gap_m)
+
+
+def _canting(
+    plant: PlantText,
+    chosen: str | CantingEntry | None,
+    facets: tuple[FacetDesign, ...],
+    path: KeyPath,
+) -> Canting:
+    """The canting; that of the facets' file is individual."""
+    has_normals = facets[0].normal is not None
+    given = chosen or ("individual" if has_normals else "on_axis")
+    if has_normals and given != "individual":
+        raise InvalidInputError(
+            f"{plant.place(*path, 'canting')}: the facets' file has their normals; write"
+            " individual, or leave them out of it"
+        )
+    if given == "individual" and not has_normals:
+        raise InvalidInputError(
+            f"{plant.place(*path, 'canting')}: individual needs each facet's normal; write a"
+            " facets file with normal_x, normal_y, normal_z, or another canting"
+        )
+    return _model_canting(given)
+
+
+def _mount(entry: MountEntry) -> MountDesign:
+    """The mount of an entry; its drives if both are linear."""
+    drives = [_actuator(drive) for drive in entry.drives or () if isinstance(drive, LinearDrive)]
+    return MountDesign(
+        entry.kind,
+        entry.pivot_height_m,
+        entry.mirror_offset_m,
+        (drives[0], drives[1]) if len(drives) == 2 else None,
+    )
+
+
+def _actuator(drive: LinearDrive) -> LinearActuator:
+    return LinearActuator(
+        increment=drive.increment_steps_per_m,
+        initial_stroke_length=drive.initial_stroke_length_m,
+        offset=drive.offset_m,
+        pivot_radius=drive.pivot_radius_m,
+        initial_angle=drive.initial_angle_rad,
+        clockwise=drive.clockwise,
+        max_increment=drive.max_increment_steps,
+    )
+
+
+def _focus(entry: HeliostatTypeEntry) -> Focus:
+    shape = entry.facet_shape
+    return shape.focal_length_m if isinstance(shape, FocusEntry) else shape
+
+
+def _model_canting(given: str | CantingEntry) -> Canting:
+    if not isinstance(given, CantingEntry):
+        return Canting(given)  # type: ignore[arg-type]
+    if given.off_axis is None:
+        return Canting("on_axis", focal_length=given.focal_length_m)
+    sun = given.off_axis
+    return Canting("off_axis", sun_deg=(sun.azimuth_deg, sun.elevation_deg))
