@@ -40,8 +40,9 @@ lint: install ## ruff, mypy, imports between packages, and limits of what makes 
 serve: install ## the service on http://127.0.0.1:8000
 	$(BIN)/heliotwin serve $(ARGS)
 
-bench: install ## the figures of RESULTS.md
+bench: install ## the short benchmarks, into results/, and their figures into RESULTS.md and README
 	$(BIN)/python -m tests.benchmarks
+	$(BIN)/python -m docs.figures
 
 train: install ## the shipped weights from scratch: network, prior, export, evaluation; resumes what is in RUN
 	$(BIN)/python -m training.train --config training/configs/best.json --run $(RUN)

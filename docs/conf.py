@@ -10,7 +10,7 @@ from sphinx.application import Sphinx
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent))
 
-from docs import generate  # noqa: E402  # it needs the path above
+from docs import figures, generate  # noqa: E402  # it needs the path above
 
 project = "heliotwin"
 html_show_copyright = False
@@ -52,7 +52,15 @@ def _display_math(translator: nodes.NodeVisitor, node: nodes.math_block) -> None
     raise nodes.SkipNode
 
 
+def _insert_figures(_: Sphinx, __: str, source: list[str]) -> None:
+    source[0] = figures.fill(source[0])
+
+
 def setup(app: Sphinx) -> None:
-    """Write the generated pages, and draw equations as MathML, which needs no script."""
+    """Write the generated pages, insert measured figures, and draw equations as MathML.
+
+    MathML needs no script.
+    """
+    app.connect("source-read", _insert_figures)
     generate.write_pages(HERE / "reference" / "generated")
     app.add_html_math_renderer("mathml", (_inline_math, None), (_display_math, None))

@@ -1,4 +1,4 @@
-"""Measured comparisons: ``make bench`` prints the figures of RESULTS.md.
+"""Measured comparisons, which print their figures and write them to ``results/``.
 
 They compute in as many threads as the service does, which says so when it is imported: before NumPy
 and torch are.

@@ -1,8 +1,12 @@
 """Every benchmark in turn: ``python -m tests.benchmarks``."""
 
 from tests.benchmarks import forecast, imaging, speed, surfaces
+from tests.benchmarks.record import recording
 
-forecast.main()
 surfaces.main([])
-speed.main()
-imaging.main([])
+with recording("forecast"):
+    forecast.main()
+with recording("speed"):
+    speed.main()
+with recording("imaging"):
+    imaging.main([])

@@ -19,6 +19,7 @@ from pathlib import Path
 
 from model.plant_model import JUELICH_MODEL
 from tests.benchmarks import data_folder
+from tests.benchmarks.record import log_row, recording
 
 HELIOSTAT = "AA39"
 
@@ -162,10 +163,13 @@ def main() -> None:
                     " times",
                     flush=True,
                 )
+                cells = {"alone [s]": idle, "on a busy machine [s]": busy, "ratio": ratio}
+                log_row("Next to a process on all cores", f"{name}, {kind}", cells)
 
 
 if __name__ == "__main__":
     if len(sys.argv) > 1:
         print(*measure(sys.argv[1]))
     else:
-        main()
+        with recording("busy"):
+            main()

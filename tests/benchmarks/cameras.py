@@ -18,6 +18,7 @@ from service.base.settings import Settings
 from service.cli.folder_store import open_folder
 from service.sources.folder import read_folder
 from service.twin.studies.camera_watch import FIGURES, CameraChange, find_camera_change
+from tests.benchmarks.record import log_row, recording
 
 DRAWS, LONG, DAYS, LAST = 200, 60, 45, 7
 FACTORS = (1.5, 2.0, 3.0)
@@ -62,20 +63,30 @@ def main() -> None:
         values = np.array([by_day[day] for day in sorted(by_day)])
         if len(values) < 15:
             continue
-        alarms = np.mean([_change(rng.choice(values, LONG)) is not None for _ in range(DRAWS)])
+        alarms = 100 * np.mean(
+            [_change(rng.choice(values, LONG)) is not None for _ in range(DRAWS)]
+        )
         row = [
             target,
             len(values),
             values.std(axis=0).round(2).tolist(),
             find_camera_change(target, by_day, Settings()),
         ]
-        row.append(f"{alarms:.1%}")
+        row.append(f"{alarms:.1f}%")
+        cells = {
+            "changes in the days as recorded": int(row[-2] is not None),
+            f"alarms in {LONG} days drawn by chance [%]": alarms,
+        }
         for factor in FACTORS:
             drawn = (rng.choice(values, DAYS) for _ in range(DRAWS))
             step = np.log(factor) * np.outer(np.arange(DAYS) >= DAYS - LAST, (1, 0, 0))
-            row.append(f"{np.mean([_change(one + step) is not None for one in drawn]):.0%}")
+            found = 100 * np.mean([_change(one + step) is not None for one in drawn])
+            row.append(f"{found:.0f}%")
+            cells[f"a factor of {factor:g} found [%]"] = found
+        log_row("Cameras watched without a study", target, cells, n=len(values), of="days")
         print("|", " | ".join(map(str, row)), "|", flush=True)
 
 
 if __name__ == "__main__":
-    main()
+    with recording("cameras"):
+        main()

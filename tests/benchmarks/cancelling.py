@@ -24,6 +24,7 @@ from service.store.database import Database
 from tests.benchmarks import data_folder
 from tests.benchmarks.fleet import Field
 from tests.benchmarks.load import HELIOSTATS, SUN, import_two
+from tests.benchmarks.record import Estimate, log_row, recording
 from tests.faults.harness import Process, Store, new_store
 
 ENDED = ("done", "failed", "cancelled")
@@ -125,6 +126,16 @@ def cancelled(http: httpx.Client, kind: str, after: list[float]) -> str:
         phases.append(job["phase"])
         times.append(cancel(http, path))
     each = ", ".join(f"{took:.2f}" for took in times)
+    log_row(
+        "Jobs that are cancelled",
+        kind,
+        {
+            "ended after, at most [s]": Estimate(max(times), goal="<= 2"),
+            "cancelled after [s]": ", ".join(f"{a:g}" for a in after[: len(times)]),
+        },
+        n=len(times),
+        of="jobs",
+    )
     return f"| {kind} | {each} | {max(times):.2f} | {'; '.join(dict.fromkeys(phases))} |"
 
 
@@ -168,4 +179,5 @@ def main(arguments: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    with recording("cancelling"):
+        main(sys.argv[1:])

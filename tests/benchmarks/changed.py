@@ -21,6 +21,7 @@ from model.refinement import refine
 from service.sources.folder import read_folder
 from tests.benchmarks import data_folder
 from tests.benchmarks.folders import read_observations
+from tests.benchmarks.record import Estimate, log_row, recording
 from tests.benchmarks.surfaces import BRIGHT, spread
 from tests.benchmarks.years import interval
 
@@ -58,6 +59,17 @@ def row(name: str, heliostat: Heliostat, sides: Sequence[list[Observation]]) -> 
         f" {high:+.4f}] | {1e3 * surface_error(*surfaces):.3f} |",
         flush=True,
     )
+    log_row(
+        "Surfaces from either side of a date",
+        name,
+        {
+            "advantage in accuracy of the own side's": Estimate(advantage.mean(), (low, high)),
+            "surfaces differ by [mm]": 1e3 * surface_error(*surfaces),
+        },
+        n=len(advantage),
+        of="photographs",
+        compared_with="the other photographs of both sides, intervals over days",
+    )
 
 
 def main() -> int:
@@ -93,4 +105,6 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    with recording("changed"):
+        status = main()
+    sys.exit(status)

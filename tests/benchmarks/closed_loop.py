@@ -33,6 +33,7 @@ from service.cli.folder_study import study_folder
 from service.sources.folder import measured_heights, read_folder
 from tests.benchmarks import data_folder
 from tests.benchmarks.folders import read_observations, read_photographs
+from tests.benchmarks.record import log_row, recording
 from training.render import CleanCamera, SceneSampler, load_field, places
 from training.surfaces import load_part
 
@@ -108,6 +109,21 @@ def row(label: str, study: Study) -> str:
     found = "<br>".join(f"{e['name']}: {plain(e['parameters'])}" for e in report["effects"]) or "-"
     before, after = (report[key]["accuracy_mean"] for key in ("before", "after"))
     share = report["unexplained_share"]
+    effects = "; ".join(f"`{e['name']}` {plain(e['parameters'])}" for e in report["effects"])
+    log_row(
+        "Studies of data with unknown effects",
+        label,
+        {
+            "verdict": report["verdict"],
+            "effect with 95 % interval": effects or "none",
+            "accuracy without": before,
+            "accuracy with": after,
+            "share of the error beyond noise that is left": share,
+        },
+        n=report["images"]["held_out"],
+        of="held-out images",
+        compared_with="measured flux images",
+    )
     return f"| {label} | {report['verdict']} | {found} | {before:.3f} | {after:.3f} | {share:.2f} |"
 
 
@@ -174,6 +190,14 @@ def real_plant(root: Path) -> None:
             f"| {label} | {values.mean():.4f} | {np.median(values):.4f} | {values.min():.3f} |",
             flush=True,
         )
+        log_row(
+            "AA39 and AC43, each photograph forecast with effects fitted to the others",
+            " + ".join(f"`{kind}`" for kind in kinds) or "none",
+            {"mean": values.mean(), "median": np.median(values), "worst": values.min()},
+            n=len(values),
+            of="photographs",
+            compared_with="measured flux images",
+        )
 
 
 Method = Callable[[Heliostat, list[Observation], Sequence[Effect]], np.ndarray]
@@ -218,8 +242,26 @@ def real_surfaces(root: Path, effects: Sequence[Effect]) -> None:
                     if len(images) > 2
                     else float("nan")
                 )
+                log_errors(f"{name}, {method}, {label} the effect", errors, len(images[:8]), fresh)
                 label = f"{name}, {len(images[:8])} photographs, {method} | {label}"
                 print(f"| {label} | {figures(errors)} | {fresh:.3f} |", flush=True)
+
+
+def log_errors(row: str, errors: dict[str, float], n: int, accuracy: float | None = None) -> None:
+    """Record the errors of a surface from ``n`` images."""
+    log_row(
+        "Surfaces with and without the effect that the study finds",
+        row,
+        {
+            "error [mm]": errors["mae_mm"],
+            "canting [mm]": errors["mae_canting_mm"],
+            "waviness [mm]": errors["mae_waviness_mm"],
+            "accuracy of images left out": accuracy,
+        },
+        n=n,
+        of="images",
+        compared_with="deflectometry",
+    )
 
 
 def figures(errors: dict[str, float]) -> str:
@@ -262,6 +304,8 @@ def simulated_surfaces(root: Path, effects: Sequence[Effect], count: int) -> Non
                 found.setdefault(f"{method} | {label}", []).append(errors)
     for label, own in found.items():
         mean = {key: float(np.mean([errors[key] for errors in own])) for key in own[0]}
+        method, _, model = label.partition(" | ")
+        log_errors(f"{count} held-out surfaces, {method}, {model} the effect", mean, 8)
         print(f"| {count} held-out surfaces, 8 rendered images each, {label} | {figures(mean)} | |")
 
 
@@ -324,12 +368,15 @@ def main() -> None:
     if not root.is_dir():
         print(f"closed loop: no real measurements at {root}; set HELIOTWIN_STJ")
         return
-    if arguments.only in (None, "studies"):
-        studies(root)
-    if arguments.only in (None, "plant"):
-        real_plant(root)
-    if arguments.only in (None, "surfaces"):
-        surfaces(root, arguments.simulated)
+    parts: dict[str, Callable[[], None]] = {
+        "studies": lambda: studies(root),
+        "plant": lambda: real_plant(root),
+        "surfaces": lambda: surfaces(root, arguments.simulated),
+    }
+    for name, part in parts.items():
+        if arguments.only in (None, name):
+            with recording(f"closed-loop-{name}"):
+                part()
     if arguments.pictures is not None:
         arguments.pictures.mkdir(parents=True, exist_ok=True)
         picture(real_study(root)).savefig(arguments.pictures / "real-plant.png", dpi=50)

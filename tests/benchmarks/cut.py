@@ -25,6 +25,7 @@ from model.tracing import Optics
 from service.sources.decode import decode_image
 from service.sources.folder import read_folder
 from tests.benchmarks import data_folder
+from tests.benchmarks.record import log_row, recording
 
 SHARES = (0.0, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5)
 SIDES = ("left", "right", "top", "bottom")
@@ -127,7 +128,20 @@ def main() -> None:
     for share, rows in found.items():
         cut, shown, old = np.mean(rows, axis=0)
         print(f"| {share:.0%} | {len(rows)} | {cut:.0%} | {shown:.3f} | {old:.3f} |")
+        log_row(
+            "Spots that the target truncates",
+            f"{share:.0%} of the light beside the target",
+            {
+                "estimated share [%]": 100 * cut,
+                "accuracy, aligned by the part shown": shown,
+                "accuracy, aligned by all light": old,
+            },
+            n=len(rows),
+            of="photographs",
+            compared_with="forecasts by the measured surface",
+        )
 
 
 if __name__ == "__main__":
-    main()
+    with recording("cut"):
+        main()

@@ -28,6 +28,7 @@ from service.store.recovery.backup import images_of
 from service.store.surfaces.surface_versions import NewSurface
 from service.store.tables import ImageRow
 from service.twin.photographs.ingest import measurement_row
+from tests.benchmarks.record import log_row, recording
 from tests.service.conftest import ORIGIN, properties_document, tower_document
 
 
@@ -102,7 +103,13 @@ def main() -> None:
             f" {megabytes:.0f} MB",
             flush=True,
         )
+        log_row(
+            "Export of a store",
+            f"{heliostats} heliostats with {options.photographs} photographs each",
+            {"files": files, "time [s]": seconds, "memory at most [MB]": megabytes},
+        )
 
 
 if __name__ == "__main__":
-    main()
+    with recording("exporting"):
+        main()

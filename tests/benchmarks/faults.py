@@ -7,6 +7,7 @@ import tempfile
 import time
 from pathlib import Path
 
+from tests.benchmarks.record import log_row, recording
 from tests.faults.harness import new_store
 from tests.faults.scenarios import SCENARIOS, NotTriedError
 
@@ -34,8 +35,11 @@ def main(arguments: list[str]) -> int:
             except AssertionError as failure:
                 outcome, lost = f"FAILED: {failure}", 1
             print(f"{name}, {engine} ({time.monotonic() - started:.0f} s): {outcome}", flush=True)
+            log_row("Faults and their outcomes", name, {engine: outcome})
     return lost
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    with recording("faults"):
+        status = main(sys.argv[1:])
+    sys.exit(status)

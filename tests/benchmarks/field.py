@@ -29,6 +29,7 @@ from service.store.database import Database
 from service.store.tables import HeliostatRow, ImageRow, MeasurementRow, SurfaceRow
 from service.twin.surfaces.accuracy import AccuracyCache, AccuracyState, Rank
 from service.web.app import create_app
+from tests.benchmarks.record import Estimate, log_row, recording
 from tests.faults.harness import new_store
 from tests.service.conftest import (
     ORIGIN,
@@ -175,6 +176,12 @@ def _settle(client: TestClient) -> None:
         time.sleep(1)
 
 
+def log_page(name: str, first: float, then: float | None, size: int) -> None:
+    """Record the server's time for a page [s] and its size [bytes]."""
+    cells = {"first [s]": first, "then [s]": Estimate(then, goal="<= 0.3"), "size [kB]": size / 1e3}
+    log_row("Server time of pages and routes", name, cells)
+
+
 def pages(settings: Settings) -> None:
     """A row for each path: the first answer after the start, then the median of five, and how large
     it is.
@@ -187,6 +194,7 @@ def pages(settings: Settings) -> None:
             f"| the page after a start | {took:.2f} | | {len(answer.content) / 1e3:.0f} |",
             flush=True,
         )
+        log_page("the page after a start", took, None, len(answer.content))
         _settle(client)
         for name, path in PATHS.items():
             first, answer = _timed(client, path)
@@ -195,6 +203,7 @@ def pages(settings: Settings) -> None:
                 f"| {name} | {first:.2f} | {then:.2f} | {len(answer.content) / 1e3:.0f} |",
                 flush=True,
             )
+            log_page(name, first, then, len(answer.content))
 
 
 def main() -> None:
@@ -213,7 +222,8 @@ def main() -> None:
         fill(database, options.heliostats)
         database.close()
         print(f"{options.database}, {options.heliostats} heliostats of {PHOTOGRAPHS} images each")
-        pages(settings)
+        with recording(f"field-{options.database}"):
+            pages(settings)
 
 
 if __name__ == "__main__":

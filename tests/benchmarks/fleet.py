@@ -37,6 +37,7 @@ from service.store.jobs import queue
 from service.store.surfaces.surface_versions import NewSurface
 from service.twin.runtime.engines import Threads
 from service.twin.runtime.runtime import Runtime
+from tests.benchmarks.record import Estimate, log_row, recording
 from tests.field_rays import Land, onto_cylinder, onto_plane, trace_field
 
 AREA = 33.0
@@ -157,6 +158,26 @@ def against_monte_carlo() -> None:
             f" {found.power / powers.sum():.4f}); land {coarse.sum() / expected.sum():.4f}, L1 of"
             f" the maps {np.abs(coarse - expected).sum() / expected.sum():.4f}"
         )
+        log_row(
+            "Blocking and shading of a dense field",
+            name,
+            {
+                "light that neighbours leave": powers.sum() / traced[False][1].sum(),
+                "forecast over reference, thrown": found.power / powers.sum(),
+                "landed": coarse.sum() / expected.sum(),
+                "L1 of the maps": np.abs(coarse - expected).sum() / expected.sum(),
+            },
+            n=len(heliostats),
+            of="heliostats",
+            compared_with="a Monte Carlo tracer that shares no code",
+        )
+
+
+def log_meter(row: str, meter: Meter, n: int) -> None:
+    """Record the time of a field forecast."""
+    goal = "<= 10" if row == "plane, 256 x 256, neighbours shade and block" else None
+    cells = {"processor [s]": meter.cpu, "wall, two threads [s]": Estimate(meter.wall, goal=goal)}
+    log_row("Flux of a field", row, cells, n=n, of="heliostats")
 
 
 def field_of_2000() -> None:
@@ -187,6 +208,7 @@ def field_of_2000() -> None:
             f"  2,000 heliostats, {name}: {meter}; {total.power / 1e6:.2f} MW thrown,"
             f" {landed / 1e6:.2f} MW land"
         )
+        log_meter(name, meter, 2000)
 
 
 def stored_field() -> None:
@@ -223,6 +245,7 @@ def stored_field() -> None:
             f"  the same as a job of the service, SQLite: {meter}; {result['heliostats']}"
             " heliostats"
         )
+        log_meter("plane, as a job of the service", meter, result["heliostats"])
         runtime.close()
 
 
@@ -235,6 +258,9 @@ def field_of_200000(part: int) -> None:
             ((one, square.center) for one in field.every()), sun_direction(*SUN), JUELICH_MODEL
         )
     print(f"  where all 200,000 mirrors stand: {meter}; memory {peak_mib():.0f} MiB")
+    table = "A field of 200,000 heliostats, of which a part is traced"
+    cells = {"processor [s]": meter.cpu, "memory [MiB]": peak_mib()}
+    log_row(table, "positions of all", cells, n=200_000, of="heliostats")
     rates = []
     for count in (part // 16, part // 4, part):
         some = setups(field, square, every=200_000 // count)
@@ -249,11 +275,15 @@ def field_of_200000(part: int) -> None:
             f"  {total.heliostats:,} of them traced, 128 x 128: {meter.cpu:.1f} s of CPU, "
             f"{1e3 * meter.cpu / total.heliostats:.2f} ms each; memory {peak_mib():.0f} MiB"
         )
+        cells = {"processor [s]": meter.cpu, "memory [MiB]": peak_mib()}
+        log_row(table, f"{total.heliostats} traced", cells, n=total.heliostats, of="heliostats")
     slope, start = np.polyfit(*np.array(rates).T, 1)
     print(
         f"  projected, linear in the number: {(start + slope * 200_000) / 60:.1f} min of CPU for"
         " all 200,000"
     )
+    cells = {"processor [s]": start + slope * 200_000}
+    log_row(table, "all, projected from the parts", cells, n=200_000, of="heliostats")
 
 
 def main() -> None:
@@ -272,4 +302,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with recording("fleet"):
+        main()

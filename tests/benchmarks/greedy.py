@@ -31,6 +31,7 @@ from service.store import keys
 from service.store.database import Database, migrate
 from tests.benchmarks import data_folder, field
 from tests.benchmarks.load import HELIOSTATS, SUN, Tally, Visitor, import_two
+from tests.benchmarks.record import log_row, recording
 from tests.faults.harness import Process, Store, new_store
 
 CONNECTIONS = 16
@@ -176,6 +177,18 @@ async def _beside(
         one.cancel()
     await asyncio.gather(*crowd, return_exceptions=True)
     p50, p99 = np.percentile(times, [50, 99]) * 1e3
+    log_row(
+        f"{options.victim.capitalize()} requests of one key next to a greedy key",
+        name or "alone",
+        {
+            "median [ms]": p50,
+            "99 % [ms]": p99,
+            "longest [ms]": max(times) * 1e3,
+            "answers other than 2xx": sum(n for kind, n in answers.items() if kind[0] != "2"),
+        },
+        n=len(times),
+        of="requests",
+    )
     sent = [
         ", ".join(f"{count} x {kind}" for kind, count in sorted(some.items())) or "-"
         for some in (answers, met)
@@ -264,7 +277,11 @@ def main(arguments: list[str]) -> None:
             field.fill(database, options.heliostats)
             database.close()
         import_two(store)
-        with Process(store, "serve", module="service", **limits) as service:
+        size = f"-{options.heliostats}" if options.heliostats else ""
+        with (
+            Process(store, "serve", module="service", **limits) as service,
+            recording(f"greedy-{options.database}{size}"),
+        ):
             asyncio.run(_run(service.base, _keys(store), options))
 
 

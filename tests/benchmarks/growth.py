@@ -11,7 +11,7 @@ import argparse
 import statistics
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from itertools import cycle, islice
@@ -45,6 +45,7 @@ from service.twin.alerts.field_overview import read_summaries
 from service.twin.photographs.ingest import measurement_row
 from service.twin.runtime import operations
 from tests.benchmarks import data_folder
+from tests.benchmarks.record import log_row, recording
 from tests.faults.harness import new_store
 from tests.service.conftest import ORIGIN, properties_document, tower_document
 
@@ -424,6 +425,8 @@ def project(filler: Filler, taken: dict[str, int], rows: dict[str, int]) -> None
             f"{rate.what:26} {rate.a_year:10,.0f} {each:11,.0f} {_gb(rate.a_year * each):>10}"
             f" {_gb(standing[0]):>13} {_gb(standing[1]):>14}"
         )
+        log_size(rate.what, rate.a_year * each, standing, each)
+    log_size("database, together", year, (kept_1, kept_5))
     print(
         f"{'database, together':26} {'':10} {'':11} {_gb(year):>10} {_gb(kept_1):>13}"
         f" {_gb(kept_5):>14}"
@@ -443,6 +446,13 @@ def _measurement_bytes(
     return plain + size / good, plain
 
 
+def log_size(what: str, a_year: float, kept: Sequence[float], each: float | None = None) -> None:
+    """Record bytes of one row, of a year, and of what is kept after one and five years."""
+    cells = {"each [kB]": None if each is None else each / 1e3, "a year [GB]": a_year / 1e9}
+    cells |= {"kept, 1 year [GB]": kept[0] / 1e9, "kept, 5 years [GB]": kept[1] / 1e9}
+    log_row(f"A year of {HELIOSTATS} heliostats on the disk", what, cells)
+
+
 def _project_images(settings: Settings) -> None:
     a_year = HELIOSTATS * 8 * 365 * IMAGE_KB * 1e3
     standing = []
@@ -454,6 +464,8 @@ def _project_images(settings: Settings) -> None:
         f"{'images, by age alone':26} {HELIOSTATS * 8 * 365:10,} {IMAGE_KB * 1e3:11,.0f}"
         f" {_gb(a_year):>10} {_gb(standing[0][0]):>13} {_gb(standing[1][0]):>14}"
     )
+    for row, index in (("images, by age alone", 0), ("images, with the quota", 1)):
+        log_size(row, a_year, [one[index] for one in standing])
     print(
         f"{'images, quota too':26} {'':10} {'':11} {'':10} {_gb(standing[0][1]):>13}"
         f" {_gb(standing[1][1]):>14}"
@@ -466,7 +478,11 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--database", choices=("sqlite", "postgres"), default="sqlite")
     parser.add_argument("--share", type=float, default=0.001, help="Of a year.")
     options = parser.parse_args(arguments)
-    with tempfile.TemporaryDirectory() as folder, new_store(options.database, Path(folder)) as made:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        new_store(options.database, Path(folder)) as made,
+        recording(f"growth-{options.database}"),
+    ):
         made.settings.data_dir.mkdir(parents=True, exist_ok=True)
         filler = Filler(made.settings, options.share)
         filler.database.upgrade()
@@ -496,9 +512,12 @@ def main(arguments: list[str] | None = None) -> None:
         project(filler, taken, rows)
         print(f"\n{'ms at this size':44}")
         for name, question in questions(filler).items():
-            print(f"{name:44} {1e3 * timed(filler.database, question):8.1f}")
+            taken_ms = 1e3 * timed(filler.database, question)
+            print(f"{name:44} {taken_ms:8.1f}")
+            log_row("Queries and pruning", name, {"time [ms]": taken_ms})
         for name, seconds in pruning(filler).items():
             print(f"{name:44} {1e3 * seconds:8.1f}")
+            log_row("Queries and pruning", name, {"time [ms]": 1e3 * seconds})
         filler.database.close()
 
 

@@ -9,9 +9,11 @@ sums) and the focal spot (distance of the centres of mass). The data are read fr
 import argparse
 import json
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
+from typing import Any
 
 import cv2
 import matplotlib as mpl
@@ -25,6 +27,7 @@ from service.sources.decode import decode_image
 from service.sources.documents import read_json, read_targets
 from service.sources.juelich import mark_layouts
 from tests.benchmarks import data_folder
+from tests.benchmarks.record import Estimate, log_row, recording
 
 TOWER = "WRI1030197-tower-measurements.json"
 Image = NDArray[np.generic]
@@ -119,6 +122,18 @@ def figures(case: Case) -> dict[str, float]:
     }
 
 
+FIGURES: dict[str, tuple[str, Callable[[Any], Any], tuple[str | None, str | None]]] = {
+    "crop NCC": ("crop from the frame, correlation", np.nanmin, (None, ">= 0.97")),
+    "flux raw": ("flux from the frame, accuracy", np.nanmin, (">= 0.85", None)),
+    "flux crop": ("flux from PAINT's crop, accuracy", np.nanmin, (">= 0.85", None)),
+    "CoM raw": ("centre of mass from the frame [m]", np.nanmax, ("<= 0.1", None)),
+    "CoM crop": ("centre of mass from PAINT's crop [m]", np.nanmax, ("<= 0.1", None)),
+}
+"""Of each column that is recorded: its name, which value is the worst, and the goals of median and
+worst.
+"""
+
+
 def mark_shift(case: Case) -> float:
     """How far PAINT's crop lies from ours [crop px], the largest of its corners, by registering one
     onto the other.
@@ -148,10 +163,21 @@ def print_table(cases: list[Case]) -> None:
             f"{case.name:>10} {case.target:28}{values} "
             f" {', '.join(sorted(map(str, reasons))) or '-'}"
         )
-    medians = "".join(
-        f"{np.nanmedian([row[name] for row in rows.values()]):11.3f}" for name in names
-    )
+    columns = {name: np.array([row[name] for row in rows.values()]) for name in names}
+    medians = "".join(f"{np.nanmedian(column):11.3f}" for column in columns.values())
     print(f"{'median':>10} {'':28}{medians}")
+    for name, (label, worst, goals) in FIGURES.items():
+        log_row(
+            "Photographs measured, against PAINT",
+            label,
+            {
+                "median": Estimate(np.nanmedian(columns[name]), goal=goals[0]),
+                "worst": Estimate(worst(columns[name]), goal=goals[1]),
+            },
+            n=int(np.isfinite(columns[name]).sum()),
+            of="photographs",
+            compared_with="what PAINT published",
+        )
     print("goals: crop NCC >= 0.97, flux >= 0.85 (median), CoM <= 0.10 m (median)")
     print(
         "raw: from the camera frame; crop: from PAINT's crop (separation alone); paint dx: shift of"
@@ -256,6 +282,19 @@ def composites(folder: Path, plane: TargetPlane, count: int, *, foreign: bool) -
         miss = result.center_of_mass - center_of_mass(truth, (plane.width, plane.height))
         rows.append((accuracy(result.flux, truth), float(np.linalg.norm(miss))))
     score, miss = np.array(rows).T
+    log_row(
+        "Real fluxes on real empty targets",
+        "with a foreign spot" if foreign else "alone",
+        {
+            "accuracy, median": np.median(score),
+            "accuracy, 5 % below": np.percentile(score, 5),
+            "centre of mass, median [m]": np.median(miss),
+            "centre of mass, 95 % within [m]": np.percentile(miss, 95),
+        },
+        n=len(rows),
+        of="images",
+        compared_with="the fluxes laid on",
+    )
     return (
         f"accuracy median {np.median(score):.3f}, 5 % below {np.percentile(score, 5):.3f}; centre"
         f" of mass median {np.median(miss):.3f} m, 95 % within {np.percentile(miss, 95):.3f} m;"
@@ -295,6 +334,8 @@ def main(argv: list[str] | None = None) -> int:
             f"{name}: "
             + ", ".join(f"{reason} {count}/{total}" for reason, count in verdicts.most_common())
         )
+        accepted = {"accepted": verdicts["accepted"]}
+        log_row("Verdicts on folders of crops", name, accepted, n=total, of="crops")
     for foreign in (False, True):
         label = "real fluxes on real empty targets" + (", a foreign spot beside" if foreign else "")
         print(
@@ -305,4 +346,6 @@ def main(argv: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    with recording("imaging"):
+        status = main()
+    raise SystemExit(status)

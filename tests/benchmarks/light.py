@@ -64,6 +64,7 @@ from service.twin.heliostats.outliers import reject_outliers
 from service.twin.runtime import operations
 from tests.benchmarks import data_folder
 from tests.benchmarks.folders import read_observations
+from tests.benchmarks.record import Estimate, log_row, recording
 from tests.benchmarks.years import interval
 
 Array = NDArray[np.float64]
@@ -185,6 +186,27 @@ def table(cases: list[Case]) -> None:
             f"{np.median(best[used]):.3f}",
         ]
         print(f"| {law} | {used.sum()} of {len(cases)} | {' | '.join(figures)} |")
+        is_light = law == "light"
+        days = [case.day for case, is_used in zip(cases, used, strict=True) if is_used]
+        log_row(
+            "All photographs, nothing fitted",
+            f"taken as {law}",
+            {
+                "used [%]": Estimate(100 * used.mean(), goal=">= 80" if is_light else None),
+                "accuracy, mean": Estimate(
+                    plain[used].mean(),
+                    interval(plain[used], days, rounds=1000),
+                    goal=">= 0.92" if is_light else None,
+                ),
+                "median": Estimate(np.median(plain[used]), goal=">= 0.935" if is_light else None),
+                "below 0.85": int((plain < 0.85).sum()),
+                "mean by the best circumsolar ratio of each": best[used].mean(),
+                "median by the best ratio": np.median(best[used]),
+            },
+            n=int(used.sum()),
+            of="photographs",
+            compared_with="forecasts by the measured surface, intervals over days",
+        )
     reasons = {case.name: case.measured["light"].quality.reason for case in cases}
     print(f"refused: { {name: reason for name, reason in reasons.items() if reason} }")
     low = {
@@ -241,7 +263,7 @@ def left_out(cases: list[Case], apart: Collection[str]) -> None:
     )
     print("| --- | --- | --- | --- |")
     for label, found in rows.items():
-        _print_row(label, used, found)
+        _print_row(f"{label}; all", used, found)
     agreed = [case for case in used if case.name not in apart]
     for label, found in rows.items():
         _print_row(f"{label}; the {len(agreed)} that agree", agreed, found)
@@ -263,6 +285,14 @@ def _print_row(label: str, cases: list[Case], found: dict[str, float]) -> None:
     print(
         f"| {label} | {np.mean(values):.3f} ({low:.3f} to {high:.3f}) | {np.median(values):.3f} |"
         f" {targets} |"
+    )
+    log_row(
+        "Accuracy in linear intensity, by what is known or fitted",
+        label,
+        {"mean": Estimate(np.mean(values), (low, high)), "median": np.median(values)},
+        n=len(values),
+        of="photographs",
+        compared_with="forecasts by the measured surface, intervals over days",
     )
 
 
@@ -290,22 +320,32 @@ def consensus(folder: MeasurementFolder, heliostat: str) -> None:
     print("| --- | --- |")
     for name in apart:
         print(f"| {name} | {1 - against[name]:.3f} |")
+        accuracy = {"accuracy by the measured surface": 1 - against[name]}
+        log_row("Photographs that contradict the others", name, accuracy)
     worst = sorted(against, key=lambda name: -against[name])[: len(apart)]
     print(
         f"of the {len(apart)} that the measured surface forecasts worst,"
         f" {len(set(worst) & set(apart))} are among them"
     )
+    shared = {"also found without a surface": len(set(worst) & set(apart))}
+    log_row("Worst by the measured surface", "photographs", shared, n=len(apart), of="photographs")
     print("| surface | from all [mm] | from those that agree [mm] |")
     print("| --- | --- | --- |")
     methods: tuple[Method, ...] = ("network", "refined")
     for method in methods:
-        errors = []
+        errors: list[float] = []
         for pool in (usable, kept):
             found = operations.predict(
                 mirror, choose_diverse(pool, MAX_IMAGES), folder.model, method
             )
-            errors.append(f"{surface_errors(found.z, truth)['mae_mm']:.3f}")
-        print(f"| {method} | {' | '.join(errors)} |")
+            errors.append(surface_errors(found.z, truth)["mae_mm"])
+        print(f"| {method} | {' | '.join(f'{error:.3f}' for error in errors)} |")
+        log_row(
+            f"Surfaces of {heliostat} from {MAX_IMAGES} photographs, chosen by their suns",
+            method,
+            {"from all [mm]": errors[0], "from consistent ones [mm]": errors[1]},
+            compared_with="deflectometry",
+        )
 
 
 def differences() -> None:
@@ -358,8 +398,28 @@ def differences() -> None:
             f"| {name} | {figures} ({own[0]:.2f}) | {row[both]:.3f} ({both[0]:.2f},"
             f" {both[1]:.2f}) |"
         )
-    print(f"| mean | {' | '.join(f'{value:.3f}' for value in np.mean(table, axis=0))} |")
+    means = np.mean(table, axis=0)
+    print(f"| mean | {' | '.join(f'{value:.3f}' for value in means)} |")
+    for label, value in zip(WAYS, means, strict=True):
+        log_row(
+            "PAINT's differences of counts through the camera response curve",
+            label,
+            {"accuracy, mean": Estimate(value, goal=">= 0.92")},
+            n=len(table),
+            of="photographs",
+            compared_with="forecasts by the measured surface",
+        )
 
+
+WAYS = (
+    "as counts",
+    "ambient light 0.53",
+    "ambient light by the other photographs",
+    "ambient light and exposure by the other photographs",
+    "ambient light of each (fitted)",
+    "ambient light and exposure of each (fitted)",
+)
+"""How `differences` converts counts."""
 
 FITTED = {
     "blur [m]": (0.0, 0.2),
@@ -389,7 +449,7 @@ def ceiling(cases: list[Case], apart: Collection[str]) -> None:
     print("| --- | --- | --- | --- |")
     for index, label in enumerate(stages):
         row = {name: values[index] for name, values in found.items()}
-        _print_row(label, used, row)
+        _print_row(f"{label}; all", used, row)
         _print_row(f"{label}; the {len(agreed)} that agree", agreed, row)
 
 
@@ -491,6 +551,16 @@ def shadows(folder: MeasurementFolder, heliostat: str, cases: list[Case]) -> Non
             f" {with_them:.3f}"
         )
         print(f"| {one.identifier} | {figures} |")
+        log_row(
+            "Photographs that neighbours may shade",
+            one.identifier,
+            {
+                "sun's elevation [degrees]": one.elevation_deg,
+                "light left [%]": 100 * left,
+                "accuracy without neighbours": case.accuracy("light", 0.02),
+                "accuracy with them": with_them,
+            },
+        )
         gained[case.name] = max(0.0, with_them - case.accuracy("light", 0.02))
     plain = np.array(
         [case.accuracy("light", 0.02) for case in cases if case.measured["light"].flux is not None]
@@ -601,6 +671,9 @@ def draw(cases: list[Case], path: Path) -> None:
         f" {by_srgb}); correlation with ln(total / ambient)"
         f" {np.corrcoef(contrast, found)[0, 1]:.2f}"
     )
+    cells = {"mean": found.mean()}
+    cells |= {"correlation with ln(total / ambient)": np.corrcoef(contrast, found)[0, 1]}
+    log_row("Compression of the counts", "AA39", cells, n=len(found), of="photographs")
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
     print(f"drawn: {path}")
@@ -657,21 +730,25 @@ def main(arguments: list[str]) -> None:
         parser.error(f"no photographs at {root}; set HELIOTWIN_STJ to its neighbour stj")
     folder = read_folder(root)
     if options.differences:
-        differences()
+        with recording("light-differences"):
+            differences()
     if options.consensus:
-        consensus(folder, "AA39")
+        with recording("light-consensus"):
+            consensus(folder, "AA39")
     if options.differences or options.consensus:
         return
     cases = read_cases(folder, "AA39")
     mirror, usable = folder.plant.heliostats["AA39"], read_observations(folder, "AA39")
     _, apart = reject_outliers(operations, mirror, usable, folder.model)
     if options.ceiling:
-        ceiling(cases, apart)
+        with recording("light-ceiling"):
+            ceiling(cases, apart)
         return
-    table(cases)
-    left_out(cases, apart)
-    shadows(folder, "AA39", cases)
-    draw(cases, options.out / "light.png")
+    with recording("light"):
+        table(cases)
+        left_out(cases, apart)
+        shadows(folder, "AA39", cases)
+        draw(cases, options.out / "light.png")
     draw_pictures(cases, options.out / "light-pictures.png")
 
 

@@ -28,6 +28,7 @@ import httpx
 import numpy as np
 
 from tests.benchmarks import data_folder
+from tests.benchmarks.record import log_row, recording
 from tests.faults.harness import ROOT, Process, Store, new_store
 from tests.service.conftest import metadata_of
 
@@ -64,9 +65,7 @@ class Visitor:
         answer = await self.http.post(
             f"/v1/heliostats/{name}/measurements",
             files={"image": ("spot.png", cv2.imencode(".png", noisy)[1].tobytes(), "image/png")},
-            data={
-                "metadata": json.dumps(metadata_of(document) | {"kind": "flux", "id": identifier})
-            },
+            data={"metadata": json.dumps(document | {"kind": "flux", "id": identifier})},
         )
         if answer.status_code == 201:
             self.tally.acknowledged.add(identifier)
@@ -203,6 +202,13 @@ def import_two(store: Store) -> None:
 def _row(name: str, times: list[float], failures: Counter[str]) -> str:
     p50, p99 = np.percentile(times, [50, 99]) * 1e3
     counts = ", ".join(f"{count} x {kind}" for kind, count in failures.items()) or "0"
+    log_row(
+        "Answers of the service",
+        name,
+        {"errors": counts, "median [ms]": p50, "99 % [ms]": p99, "longest [ms]": max(times) * 1e3},
+        n=len(times),
+        of="requests",
+    )
     return f"| {name} | {len(times)} | {counts} | {p50:.0f} | {p99:.0f} | {max(times) * 1e3:.0f} |"
 
 
@@ -223,6 +229,10 @@ def _report(
         f" {cpu_s[1]:.0f} s"
     )
     print("memory [MB]: " + ", ".join(f"{name} {value:.0f}" for name, value in memory.items()))
+    log_row("Load", "answers a second", {"value": len(everything) / seconds})
+    log_row("Load", "processor time of the service [s]", {"value": cpu_s[0]})
+    for name, value in memory.items():
+        log_row("Memory of the service", name, {"memory [MB]": value})
 
 
 def _require_all(store: Store, base: str, acknowledged: set[str]) -> None:
@@ -240,8 +250,10 @@ def _require_all(store: Store, base: str, acknowledged: set[str]) -> None:
     report = store.check()
     print(
         f"{len(acknowledged)} photographs acknowledged, {len(acknowledged - stored)} lost,"
-        f" {len(report['bad'])} bad"
+        f" {len(report.bad)} bad"
     )
+    lost = {"lost": len(acknowledged - stored), "bad": len(report.bad)}
+    log_row("Photographs acknowledged", "all", lost, n=len(acknowledged), of="photographs")
 
 
 def main(arguments: list[str]) -> None:
@@ -273,7 +285,11 @@ def main(arguments: list[str]) -> None:
             "HELIOTWIN_JOB_LEASE_S": "30",
             "HELIOTWIN_JOB_POLL_S": "0.5",
         }
-        with Process(store, "serve", module="service", **extra) as service:
+        minutes = round(options.seconds / 60)
+        with (
+            Process(store, "serve", module="service", **extra) as service,
+            recording(f"load-{options.database}-{options.clients}-clients-{minutes}-minutes"),
+        ):
             asyncio.run(_warm_up(service.base))
             tally, number = Tally(), service.number
             memory, cpu_s = {"before": _status(number, "VmRSS")}, _cpu_s(number)

@@ -33,6 +33,7 @@ from service.sources.files import MAX_JSON_VALUES
 from service.store.database import Database, migrate
 from tests.benchmarks import data_folder, field
 from tests.benchmarks.load import import_two
+from tests.benchmarks.record import Estimate, log_row, recording
 from tests.faults.harness import Process, new_store
 from tests.service.conftest import metadata_of
 
@@ -512,6 +513,11 @@ def main(arguments: list[str]) -> None:
                     f" {taken_s:.0f} | {answer} |",
                     flush=True,
                 )
+                log_row(
+                    "Peak memory under the largest inputs",
+                    what,
+                    {"service and its children [MB]": Estimate(total, goal=f"<= {BOUND_MB:.0f}")},
+                )
     print(
         f"highest: {highest:.0f} MB, {'below' if highest <= BOUND_MB else 'ABOVE'} the bound of"
         f" {BOUND_MB:.0f} MB"
@@ -521,4 +527,5 @@ def main(arguments: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    with recording("memory"):
+        main(sys.argv[1:])

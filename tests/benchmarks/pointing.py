@@ -28,6 +28,7 @@ from model.site import JUELICH, Site
 from service.sources.folder import read_folder
 from tests.benchmarks import data_folder
 from tests.benchmarks.folders import read_readings
+from tests.benchmarks.record import Estimate, log_row, proportion, recording
 
 Array = NDArray[np.float64]
 
@@ -45,6 +46,13 @@ CLOCK_TRIALS = 12
 
 # How often the mounts are calibrated again as the last third comes in.
 PARTS = 4
+
+GOALS = {
+    "a random third": "<= 0.8",
+    "the last third in time": "<= 1.2",
+    "the third of suns farthest from all others": "<= 1",
+}
+"""Goals of the median error [mrad] by what is left out."""
 
 Series = dict[str, list[Reading]]
 
@@ -129,14 +137,28 @@ def covered(plant: Plant, mounts: dict[str, CalibratedMount], judged: Series) ->
     return float(np.mean(inside))
 
 
-def median_row(label: str, errors: dict[str, Array]) -> str:
-    """A row: median of medians with its interval, those of each half, and how many heliostats."""
+def median_row(label: str, errors: dict[str, Array], goal: str | None = None) -> str:
+    """A row: median of medians with its interval, those of each half, and how many heliostats.
+
+    ``goal`` is that of the median.
+    """
     medians = {name: float(np.median(error)) for name, error in errors.items()}
     apart = [value for name, value in medians.items() if name not in DEVELOPED_ON]
     values = np.array(list(medians.values()))
     low, high = bootstrap(
         (values,), np.median, n_resamples=4000, confidence_level=0.9, method="percentile", rng=0
     ).confidence_interval
+    log_row(
+        "Beam errors of measurements left out",
+        label,
+        {
+            "median [mrad]": Estimate(np.median(values), (low, high), 90, goal),
+            "heliostats not developed on [mrad]": np.median(apart),
+        },
+        n=len(values),
+        of="heliostats",
+        compared_with="measured spots",
+    )
     return (
         f"| {label} | {np.median(values):.2f} ({low:.2f} to {high:.2f}) | {np.median(apart):.2f} |"
         f" {len(values)} |"
@@ -168,17 +190,21 @@ def accuracy(plant: Plant) -> None:
         few = {name: own for name, own in plant.readings.items() if name not in many}
         mounts, _ = plant.calibrate({name: kept for name, (kept, _) in parts.items()} | few)
         judged = {name: apart for name, (_, apart) in parts.items()}
-        print(median_row(label, errors_mrad(plant, mounts, judged)))
+        print(median_row(label, errors_mrad(plant, mounts, judged), GOALS[label]))
         shares[label] = covered(plant, mounts, judged)
     print(
         median_row(
             f"the last third, each of {PARTS} parts by all before it", as_it_comes(plant, many)
         )
     )
-    print(median_row("all but five in a row, prior of the others", five_only(plant, many)))
+    print(
+        median_row("all but five in a row, prior of the others", five_only(plant, many), "<= 2.5")
+    )
     print()
     for label, share in shares.items():
         print(f"within their 90 % interval, {label}: {100 * share:.0f} %")
+        cells = {"within their 90 % intervals [%]": 100 * share}
+        log_row("Intervals of beam errors", label, cells, n=len(many), of="heliostats")
 
 
 def as_it_comes(plant: Plant, many: Series) -> dict[str, Array]:
@@ -257,6 +283,8 @@ def steps(plant: Plant) -> None:
         f"steps in the series as they are: {real} in {_years(many.values()):.1f} heliostat-years,"
         f" all of {moved}"
     )
+    cells = {"steps": real, "heliostat-years": _years(many.values()), "of": ", ".join(moved)}
+    log_row("Steps in real series", "as they are", cells, n=len(many), of="heliostats")
     print(
         "| step [mrad] | found within one measurement | others that came with it, a"
         " heliostat-year |"
@@ -281,6 +309,17 @@ def steps(plant: Plant) -> None:
             others += sum(min(abs(step - other) for other in known) > 1 for step in places)
             looked += _years([own])
         print(f"| {size:g} | {100 * found / TRIALS:.0f} % | {others / looked:.2f} |")
+        log_row(
+            "Steps put into real series",
+            f"{size:g} mrad",
+            {
+                "found within one measurement [%]": proportion(found, TRIALS),
+                "others, a heliostat-year": others / looked,
+            },
+            n=TRIALS,
+            of="trials",
+            compared_with="the steps put in",
+        )
 
 
 def clocks(plant: Plant) -> None:
@@ -303,6 +342,21 @@ def clocks(plant: Plant) -> None:
         else ""
     )
     dated = sum(apart == 0 for apart in late)
+    log_row(
+        "A clock that goes a minute wrong",
+        "put into real series",
+        {
+            "found": len(errors),
+            "on its day": dated,
+            "off by, root mean square [minutes]": np.sqrt(np.mean(np.square(errors or [np.nan]))),
+        },
+        n=CLOCK_TRIALS,
+        of="trials",
+        compared_with="the faults put in",
+    )
+    log_row(
+        "A clock that goes a minute wrong", "series as they are", {"found": int(found is not None)}
+    )
     print(
         f"a minute, at {CLOCK_TRIALS} times: {len(errors)} found, {dated} of them on its day,"
         f" {said}"
@@ -319,6 +373,19 @@ def covariates(plant: Plant) -> None:
             f"{100 * share:.1f} % ({100 * one.ci95[way][0]:.1f} to {100 * one.ci95[way][1]:.1f})"
             for way, share in one.share.items()
         ]
+        cells = {
+            f"{way}, share of squared errors [%]": Estimate(
+                100 * share, (100 * one.ci95[way][0], 100 * one.ci95[way][1])
+            )
+            for way, share in one.share.items()
+        }
+        log_row(
+            "Covariates of errors of measurements left out",
+            name,
+            cells or {"measurements": "not stored"},
+            n=one.measurements,
+            of="measurements",
+        )
         print(
             f"| {name} | {one.measurements} |"
             f" {' | '.join(shares or ['not stored', 'not stored'])} |"
@@ -386,8 +453,17 @@ def spots(plant: Plant) -> None:
                 )
                 held_out = [judges[name] for name in sorted(apart)]
                 found.append(1e3 * pointing_error(mirror, done.mounts["AA39"], held_out))
-            medians.append(f"{np.median(np.concatenate(found)):.2f}")
-        print(f"| {label} | {judge} | {' | '.join(medians)} |")
+            medians.append(float(np.median(np.concatenate(found))))
+        print(f"| {label} | {judge} | {' | '.join(f'{one:.2f}' for one in medians)} |")
+        columns = ("a random third [mrad]", "the last third [mrad]", "the far suns [mrad]")
+        log_row(
+            "AA39's mounts by spots shown in photographs and by spots that PAINT gives",
+            f"by {label}, judged by {judge}",
+            dict(zip(columns, medians, strict=True)),
+            n=len(fitted),
+            of="spots",
+            compared_with="spots left out",
+        )
 
 
 def speed(plant: Plant, heliostats: int = 2000, measurements: int = 60) -> None:
@@ -400,6 +476,11 @@ def speed(plant: Plant, heliostats: int = 2000, measurements: int = 60) -> None:
     print(
         f"{heliostats} heliostats x {measurements} measurements: {wall:.1f} s, {busy:.1f} s of a"
         f" core, {found} steps"
+    )
+    log_row(
+        "Calibration of a large field",
+        f"{heliostats} heliostats with {measurements} measurements each",
+        {"processor [s]": Estimate(busy, goal="<= 60"), "steps found": found},
     )
 
 
@@ -498,7 +579,8 @@ def main() -> None:
     }
     for name, part in parts.items():
         if not options.only or name in options.only:
-            part()
+            with recording(f"pointing-{name}"):
+                part()
             print()
 
 

@@ -23,6 +23,7 @@ from matplotlib.figure import Figure
 
 from service.cli.folder_study import study_folder
 from service.sources.folder import read_folder
+from tests.benchmarks.record import log_row, proportion, recording
 from tests.benchmarks.study import (
     STRENGTHS,
     Case,
@@ -182,12 +183,28 @@ def table(records: Sequence[Record]) -> Iterator[str]:
                 by_strength(own, lambda r, k=key: r[k], mean) for key in ("before", "after")
             )
             true = by_strength(own, lambda r: r["true"], mean) if known or name == "calm" else ""
+            columns = ("effect", "kind of scope", "heliostat", "date", "all of it")
+            cells = {f"{c} [%]": s for c, s in zip(columns, shares.split(" | "), strict=True)}
+            log_row(
+                "Seasons, each answered rightly in",
+                f"`{name}`",
+                {"forecast changes where it acts [%]": change or None}
+                | cells
+                | dict(
+                    zip(("accuracy without", "accuracy with"), accuracy.split(" | "), strict=True)
+                )
+                | {"with the truth": true or None},
+                n=len(own),
+                of="sets",
+                compared_with="the known effects",
+            )
             yield f"| `{name}` | {len(own)} | {change} | {shares} | {accuracy} | {true} |"
 
 
 def summary(records: Sequence[Record]) -> Iterator[str]:
     """The figures that the study is measured by."""
     changed = [r for r in records if r["truth"] and _scope(r["truth"])["kind"] != "set"]
+    log_right("effects that come and go", changed, ">= 90")
     yield (
         f"Effects that come and go: {len(changed)} sets, all right in"
         f" {percent([right(r) for r in changed])} %,"
@@ -197,8 +214,10 @@ def summary(records: Sequence[Record]) -> Iterator[str]:
     for what, named in (("Effects of the whole set", False), ("Effects of one heliostat", True)):
         some = [r for r in always if ("heliostats" in _scope(r["truth"])) == named]
         yield f"{what}: {len(some)} sets, right in {percent([right(r) for r in some])} %."
+        log_right(what[0].lower() + what[1:], some)
     calm = [r for r in records if r["name"] == "calm"]
     quiet = [r["verdict"] == "none" for r in calm]
+    log_right("calm seasons: nothing found", calm)
     yield (
         f"Calm seasons: {len(calm)}, false alarms {percent([not right(r) for r in calm])} %, none"
         f" {percent(quiet)} %."
@@ -210,6 +229,15 @@ def summary(records: Sequence[Record]) -> Iterator[str]:
             " is there)."
         )
         yield f"A study takes {np.median([r['seconds'] for r in records]):.0f} s of one core."
+
+
+def log_right(row: str, some: Sequence[Record], goal: str | None = None) -> None:
+    """Record how many sets are right in effect, scope, heliostat and date."""
+    if some:
+        count = sum(map(right, some))
+        cells = {"count": count, "share [%]": proportion(count, len(some), goal)}
+        truth = "the known effects"
+        log_row("Right in all of it", row, cells, n=len(some), of="sets", compared_with=truth)
 
 
 def column(r: Record) -> str:
@@ -270,7 +298,8 @@ def main() -> None:
         run(wanted, path, options.jobs, answer, line)
     records = list(read(path).values())
     states = len({r["code"] for r in records})
-    text = [*summary(records), "", *table(records)]
+    with recording("scopes"):
+        text = [*summary(records), "", *table(records)]
     text += [f"Answered by {states} states of the code."] if states > 1 else []
     (options.out / "scopes.md").write_text("\n".join(text) + "\n", encoding="utf-8")
     matrix(records).savefig(options.out / "scopes.png", dpi=80)

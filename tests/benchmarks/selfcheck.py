@@ -25,6 +25,7 @@ from service.twin.heliostats.measurements import choose_diverse
 from service.twin.runtime.operations import predict
 from tests.benchmarks import data_folder
 from tests.benchmarks.folders import read_observations
+from tests.benchmarks.record import log_row, recording
 from tests.benchmarks.surfaces import IMAGES
 from training.cases import Case, make_cases
 from training.render import CleanCamera, load_field
@@ -126,6 +127,20 @@ def line(label: str, cases: list[Case], predictions: list[SurfacePrediction]) ->
     distances = [p.mahalanobis_distance for p in predictions]
     named = Counter(" ".join(reason.split()[:3]) for p in predictions for reason in p.warnings)
     third = sum(p.suspicious == p.used[2:3] for p in predictions)
+    log_row(
+        "Predictions with a known fault",
+        label,
+        {
+            "flagged": untrusted,
+            "the third image alone named": third,
+            "misfit of the worst image, median": np.median(worst),
+            "Mahalanobis distance, median": np.median(distances),
+            "error, median [mm]": np.median(errors),
+        },
+        n=len(cases),
+        of="mirrors",
+        compared_with="the true fault",
+    )
     return (
         f"  {label:<32} untrusted {untrusted:>2} of {len(mean):<3} third image alone {third:>2}  "
         f" misfit median {np.median(mean):.3f}   worst image min {worst.min():.3f} median"
@@ -172,6 +187,13 @@ def photographed() -> None:
                 "trusted" if predicted.trusted else "untrusted",
                 " ".join(f"{m:.3f}" for m in predicted.misfits),
             )
+            log_row(
+                "Real photographs, by the own and the other heliostat",
+                f"{heliostat.name} from photographs of {owner}",
+                {"verdict": verdict, "Mahalanobis distance": predicted.mahalanobis_distance},
+                n=len(predicted.misfits),
+                of="photographs",
+            )
             print(f"  {heliostat.name} from photographs of {owner}: {verdict}", end="   ")
             print(f"mahalanobis {predicted.mahalanobis_distance:.2f}   misfits {shown}")
 
@@ -189,4 +211,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with recording("selfcheck"):
+        main()

@@ -17,6 +17,7 @@ from model.setup import Setup
 from model.surface import control_points
 from model.tracing import Scene, Window, trace
 from model.tracing.montecarlo import trace_montecarlo
+from tests.benchmarks.record import Estimate, log_row, recording
 from training.export import example
 from training.render import CleanCamera, SceneSampler, observe, places
 
@@ -74,8 +75,13 @@ def main() -> None:
                 f"  convolution, {samples}^2 points a facet, batch {BATCH}: {each:.3f} ms a 64 x 64"
                 f" flux, L1 to the converged image {float(error.mean()):.2f} %"
             )
+            table, row = "One flux of 64 x 64 pixels", f"convolution, {samples} x {samples} points"
+            log_row(table, row, {"time [ms]": Estimate(each, goal="<= 1")}, n=BATCH, of="fluxes")
+            apart, truth = {"error, L1 [%]": float(error.mean())}, "the converged image"
+            log_row(table, row, apart, n=BATCH, of="fluxes", compared_with=truth)
         rays = seconds(lambda: trace_montecarlo(one, window, rays=1_000_000), 3)
         print(f"  Monte Carlo, 1e6 rays: {rays:.2f} s a flux")
+        log_row("One flux of 64 x 64 pixels", "Monte Carlo, 1e6 rays", {"time [ms]": 1e3 * rays})
         if torch.cuda.is_available():
             many = scene(4096, "cuda")
 
@@ -83,10 +89,10 @@ def main() -> None:
                 trace(many, window, samples=24, padding=0.25)
                 torch.cuda.synchronize()
 
-            print(
-                f"  convolution on {torch.cuda.get_device_name()}:"
-                f" {seconds(on_gpu, 10) / 4096 * 1e3:.4f} ms a flux"
-            )
+            each = seconds(on_gpu, 10) / 4096 * 1e3
+            device = torch.cuda.get_device_name()
+            print(f"  convolution on {device}: {each:.4f} ms a flux")
+            log_row("One flux of 64 x 64 pixels", f"convolution on {device}", {"time [ms]": each})
     predictor, mirror = (
         SurfacePredictor(threads=1),
         Heliostat.juelich("synthetic", np.array([20.0, 95.0, 1.8]), 100.0),
@@ -108,6 +114,7 @@ def main() -> None:
         * 1e3
     )
     print(f"  network, one heliostat, 8 images, 1 core, {N_ITERATIONS} iterations: {taken:.1f} ms")
+    log_row("A surface from 8 images", "network alone", {"time [ms]": taken})
     for n_iterations in (1, N_ITERATIONS):
         taken = (
             seconds(
@@ -122,10 +129,14 @@ def main() -> None:
             f"  the same with alignment and tracing of its guesses, iterations {n_iterations}:"
             f" {taken:.1f} ms"
         )
+        label = f"network with alignment and tracing, iterations: {n_iterations}"
+        log_row("A surface from 8 images", label, {"time [ms]": taken})
     torch.set_num_threads(threads)
     taken = seconds(lambda: refine(mirror, images, JUELICH_MODEL), 3)
     print(f"  refinement, one heliostat, 8 images: {taken:.1f} s")
+    log_row("A surface from 8 images", "refinement", {"time [ms]": 1e3 * taken})
 
 
 if __name__ == "__main__":
-    main()
+    with recording("speed"):
+        main()

@@ -13,6 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
+from tests.benchmarks.record import log_row, recording
+
 PROCESSES = 5
 """Number of processes per command, whose median is printed."""
 
@@ -49,7 +51,16 @@ def main() -> None:
                 f"  python {' '.join(command)}: {wall:.2f} s of wall time ({wall / base[0]:.0f}"
                 f" times), {cpu:.2f} s of processor time ({cpu / base[1]:.0f} times)"
             )
+            log_row(
+                "Start of a command",
+                f"`python {' '.join(command)}`",
+                {"wall [s]": wall, "processor [s]": cpu, "processor, ratio": cpu / base[1]},
+                n=PROCESSES,
+                of="processes",
+                compared_with="an interpreter that does nothing",
+            )
 
 
 if __name__ == "__main__":
-    main()
+    with recording("startup"):
+        main()

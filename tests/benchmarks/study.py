@@ -36,6 +36,7 @@ from model.study.flux_images import Forecaster
 from service.cli.folder_study import study_folder
 from service.sources.folder import read_folder
 from tests.benchmarks import data_folder
+from tests.benchmarks.record import log_row, proportion, recording
 from tests.undeclared.adapter import effects_of, flux_images
 from tests.undeclared.generator import MeasurementSet, generate
 from tests.undeclared.world import CATALOGUE, MOVING, OUTSIDE
@@ -278,6 +279,22 @@ def table(records: Sequence[Record]) -> Iterator[str]:
                 by_strength(own, lambda r, k=key: r[k], mean) for key in ("before", "after")
             )
             truth = "" if name in OUTSIDE else by_strength(own, lambda r: r["true"], mean)
+            cells = dict(
+                zip(("found first [%]", "among those found [%]"), shares.split(" | "), strict=True)
+            )
+            log_row(
+                "Sets with undeclared effects, by strength: weak / middle / strong",
+                f"`{name}`",
+                {"forecast changes [%]": change or None}
+                | cells
+                | dict(
+                    zip(("accuracy without", "accuracy with"), accuracy.split(" | "), strict=True)
+                )
+                | {"with the truth": truth or None},
+                n=len(own),
+                of="sets",
+                compared_with="the known effects",
+            )
             yield f"| `{name}` | {len(own)} | {change} | {shares} | {accuracy} | {truth} |"
 
 
@@ -304,6 +321,17 @@ def parameters(records: Sequence[Record]) -> Iterator[str]:
     for name in dict.fromkeys(error["name"] for error in found):
         own = [error for error in found if error["name"] == name]
         relative = 100 * np.median([error["relative"] for error in own])
+        log_row(
+            "Parameters that were found",
+            f"`{name}`",
+            {
+                "error relative to the truth, median [%]": relative,
+                "truth within the 95 % interval [%]": 100 * np.mean([e["inside"] for e in own]),
+            },
+            n=len(own),
+            of="sets",
+            compared_with="the known effects",
+        )
         yield (
             f"| `{name}` | {len(own)} | {relative:.1f} |"
             f" {percent([error['inside'] for error in own])} |"
@@ -316,6 +344,7 @@ def summary(records: Sequence[Record]) -> Iterator[str]:
     large = [r for r in single if r["change"] > 2 * r["noise"]]
     clean = [r for r in records if r["name"] == "clean"]
     outside = [r for r in records if r["name"] in OUTSIDE]
+    log_summary(large, clean, outside)
     yield f"Noise alone costs {decimal([r['noise'] for r in records])} % of accuracy."
     yield (
         f"Effects that change the forecast by more than twice that: {len(large)} sets; found"
@@ -343,6 +372,27 @@ def summary(records: Sequence[Record]) -> Iterator[str]:
             f"of those effects {percent(rest)} % are reported with an error that stays unexplained."
         )
     yield f"A study takes {np.median([r['seconds'] for r in records]):.0f} s of one core."
+
+
+def log_summary(
+    large: Sequence[Record], clean: Sequence[Record], outside: Sequence[Record]
+) -> None:
+    """Record how many sets of each kind are answered rightly."""
+    table, truth = "Sets answered rightly", "the known effects"
+    rows = {
+        "effects that change the forecast by more than twice the noise: found first": (
+            large,
+            first,
+        ),
+        "clean sets: nothing found": (clean, first),
+        "effects outside of the catalogue: unexplained": (outside, first),
+        "effects outside of the catalogue: imitated": (outside, lambda r: r["verdict"] == "effect"),
+    }
+    for row, (some, rule) in rows.items():
+        if some:
+            count = sum(bool(rule(r)) for r in some)
+            cells = {"count": count, "share [%]": proportion(count, len(some))}
+            log_row(table, row, cells, n=len(some), of="sets", compared_with=truth)
 
 
 def confusion(records: Sequence[Record]) -> tuple[list[str], list[str], Array]:
@@ -422,6 +472,18 @@ def moving(seeds: Sequence[int]) -> None:
                 f" {np.mean(after):.1f} |",
                 flush=True,
             )
+            log_row(
+                f"Effects that move spots, {title}",
+                f"`{case}`",
+                {
+                    "found first": ", ".join(f"{c} {found[c]}" for c in columns if found[c]),
+                    "spots without [mrad]": np.mean(before),
+                    "spots with [mrad]": np.mean(after),
+                },
+                n=len(seeds),
+                of="sets",
+                compared_with="the known effects",
+            )
         print()
 
 
@@ -434,6 +496,10 @@ def folders(root: Path) -> None:
     for folder in sorted(root.glob("set-*")):
         report = study_to_json(study_folder(read_folder(folder)).study)
         before, after = (report[when]["accuracy_mean"] for when in ("before", "after"))
+        found = ", ".join(f"`{effect['name']}`" for effect in report["effects"]) or "none"
+        cells = {"verdict": report["verdict"], "effect": found}
+        cells |= {"accuracy without": before, "accuracy with": after}
+        log_row("Sets whose effects are not known here", folder.name, cells)
         print(
             f"{folder.name}: {report['verdict']}, {before:.3f} -> {after:.3f}, noise"
             f" {report['noise_floor']:.3f}"
@@ -469,10 +535,12 @@ def main() -> None:
     )
     options = parser.parse_args()
     if options.moving:
-        moving(range(options.first_seed, options.first_seed + options.seeds))
+        with recording("study-moving"):
+            moving(range(options.first_seed, options.first_seed + options.seeds))
         return
     if options.folders:
-        folders(data_folder().parent / "undeclared")
+        with recording("study-folders"):
+            folders(data_folder().parent / "undeclared")
         return
     path = options.out / "cases.jsonl"
     levels = [STRENGTHS.index(name) for name in options.strengths.split(",")]
@@ -483,7 +551,8 @@ def main() -> None:
         )
     records = list(read(path).values())
     states = len({r["code"] for r in records})
-    text = [*summary(records), "", *table(records), "", *parameters(records)]
+    with recording("study"):
+        text = [*summary(records), "", *table(records), "", *parameters(records)]
     text += [f"Answered by {states} states of the code."] if states > 1 else []
     (options.out / "study.md").write_text("\n".join(text) + "\n", encoding="utf-8")
     matrix(records).savefig(options.out / "matrix.png", dpi=60)

@@ -25,6 +25,7 @@ from service.sources.documents import Measurement
 from service.sources.folder import MeasurementFolder, read_folder
 from tests.benchmarks import data_folder
 from tests.benchmarks.pointing import Plant
+from tests.benchmarks.record import Estimate, log_row, recording
 
 Array = NDArray[np.float64]
 
@@ -70,13 +71,29 @@ def suns(folder: MeasurementFolder, measurements: Sequence[tuple[Measurement, da
                 f"| {low} to {high} | {len(own)} |"
                 f" {' | '.join(f'{figure:.3f}' for figure in figures)} |"
             )
+            goal = "<= 0.05" if (low, high) == BANDS_DEG[-1] else None
+            cells = {"median [mrad]": Estimate(figures[0], goal=goal)}
+            cells |= {"95 % [mrad]": Estimate(figures[1]), "largest [mrad]": Estimate(figures[2])}
+            log_row(
+                "Sun at a time, by the sun's elevation",
+                f"{low} to {high} degrees",
+                cells,
+                n=len(own),
+                of="suns",
+                compared_with="recorded suns",
+            )
     moments = [moment for _, moment in measurements]
     flagged = clock_faults(
         np.array([one.sun for one, _ in measurements]), moments, folder.plant.origin
     )
-    print(
-        f"beyond the clock's tolerance of {TOLERANCE_DEG} degrees:"
-        f" {sum(one is not None for one in flagged)}"
+    beyond = sum(one is not None for one in flagged)
+    print(f"beyond the clock's tolerance of {TOLERANCE_DEG} degrees: {beyond}")
+    log_row(
+        "Times that the clock check flags",
+        "recorded suns",
+        {"flagged": beyond},
+        n=len(apart),
+        of="suns",
     )
 
 
@@ -110,6 +127,15 @@ def motors(plant: Plant, folder: MeasurementFolder) -> None:
             f"| {label} | {np.median(values):.2f} | {np.quantile(values, 0.95):.2f} |"
             f" {np.max(values):.2f} |"
         )
+        cells = {"median": np.median(values), "95 %": np.quantile(values, 0.95)}
+        log_row(
+            "Motors and light by the sun at a time",
+            label,
+            cells | {"largest": np.max(values)},
+            n=len(values),
+            of="measurements",
+            compared_with="motors for the recorded sun",
+        )
 
 
 def speed(folder: MeasurementFolder) -> None:
@@ -122,7 +148,9 @@ def speed(folder: MeasurementFolder) -> None:
         began = time.process_time()
         for _ in range(20):
             sun_positions(moments, folder.plant.origin)
-        print(f"{count} suns: {(time.process_time() - began) / 20 * 1e3:.1f} ms")
+        taken_ms = (time.process_time() - began) / 20 * 1e3
+        print(f"{count} suns: {taken_ms:.1f} ms")
+        log_row("Processor time", f"{count} suns", {"time [ms]": taken_ms}, n=20, of="repeats")
 
 
 def main() -> None:
@@ -145,4 +173,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with recording("sun"):
+        main()

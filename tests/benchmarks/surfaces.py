@@ -57,6 +57,7 @@ from service.twin.heliostats.outliers import reject_outliers
 from service.twin.runtime import operations
 from tests.benchmarks import data_folder
 from tests.benchmarks.folders import read_observations
+from tests.benchmarks.record import Estimate, log_row, recording
 from tests.benchmarks.years import interval
 
 Array = NDArray[np.float64]
@@ -69,14 +70,24 @@ WITHIN_90 = 1.645
 BRIGHT = 0.3
 """Share of a spot's brighter half that may be cut off for a photograph to be taken here."""
 
+RENDERED = "Mirrors as deflectometry has them, rendered by Monte Carlo"
+FAR_AWAY = "The same mirrors farther away, by distance and window"
+REAL = "AA39 from real photographs"
+
 HEAD = (
     "| | error [mm] | canting | waviness | mean sigma | within 90 % | processor [s] | wall [s] |"
     " left out |\n| --- | --- | --- | --- | --- | --- | --- | --- | --- |"
 )
 
 
-def row(name: str, predict: Callable[[], SurfacePrediction], truth: Array) -> SurfacePrediction:
-    """Print what a prediction is worth."""
+def row(
+    table: str,
+    name: str,
+    predict: Callable[[], SurfacePrediction],
+    truth: Array,
+    goal: str | None = None,
+) -> SurfacePrediction:
+    """Print what a prediction is worth; ``goal`` is that of its error."""
     start, begun = time.process_time(), time.perf_counter()
     found = predict()
     seconds, wall = time.process_time() - start, time.perf_counter() - begun
@@ -87,6 +98,21 @@ def row(name: str, predict: Callable[[], SurfacePrediction], truth: Array) -> Su
         f" {errors['mae_waviness_mm']:.3f} | {1e3 * found.z_std.mean():.3f} | {covered:.0%} |"
         f" {seconds:.1f} | {wall:.1f} | {', '.join(found.contradicting)} |",
         flush=True,
+    )
+    log_row(
+        table,
+        name,
+        {
+            "error [mm]": Estimate(errors["mae_mm"], goal=goal),
+            "canting [mm]": errors["mae_canting_mm"],
+            "waviness [mm]": errors["mae_waviness_mm"],
+            "standard deviation, mean [mm]": 1e3 * found.z_std.mean(),
+            "heights within 90 % intervals [%]": 100 * covered,
+            "processor [s]": seconds,
+        },
+        n=len(found.misfits),
+        of="photographs",
+        compared_with="deflectometry",
     )
     return found
 
@@ -157,15 +183,21 @@ def rendered(folder: MeasurementFolder, years: MeasurementFolder, rays: int) -> 
             heliostat, fine, places_of(years, IMAGES), rays, np.random.default_rng(1)
         )
         row(
+            RENDERED,
             f"{name} network",
             lambda h=heliostat, o=seen: default_predictor().predict(h, o, JUELICH_MODEL),
             truth,
         )
         ends = {
             "refined from the mean": row(
-                f"{name} refined", lambda h=heliostat, o=seen: refine(h, o, JUELICH_MODEL), truth
+                RENDERED,
+                f"{name} refined",
+                lambda h=heliostat, o=seen: refine(h, o, JUELICH_MODEL),
+                truth,
+                "<= 0.07",
             ),
             "from the truth": row(
+                RENDERED,
                 f"{name} refined from the truth",
                 lambda h=heliostat, o=seen, t=truth: refine(h, o, JUELICH_MODEL, t),
                 truth,
@@ -174,6 +206,7 @@ def rendered(folder: MeasurementFolder, years: MeasurementFolder, rays: int) -> 
         apart = surface_error(*(end.z for end in ends.values())) * 1e3
         left = ", ".join(f"{label} {end.misfit:.4f}" for label, end in ends.items())
         row(
+            RENDERED,
             f"{name} refined without ripples",
             lambda h=heliostat, o=seen: refine(
                 h, o, JUELICH_MODEL, options=RefinementOptions(with_ripples=False)
@@ -182,13 +215,16 @@ def rendered(folder: MeasurementFolder, years: MeasurementFolder, rays: int) -> 
         )
         generic = generic_prior(heliostat.facet_frames[2])
         row(
+            RENDERED,
             f"{name} refined, generic prior",
             lambda h=heliostat, o=seen, p=generic: refine(h, o, JUELICH_MODEL, prior=p),
             truth,
+            "<= 0.12",
         )
         larger, shape = enlarged(heliostat, 1.5), 1.5 * truth
         images = held(larger, 1.5 * fine, places_of(years, IMAGES), rays)
         row(
+            RENDERED,
             f"{name} with facets half as large again, refined",
             lambda h=larger, o=images: refine(h, o, JUELICH_MODEL),
             shape,
@@ -197,14 +233,17 @@ def rendered(folder: MeasurementFolder, years: MeasurementFolder, rays: int) -> 
             heliostat, truth, places_of(years, IMAGES), rays, np.random.default_rng(1)
         )
         row(
+            RENDERED,
             f"{name} of 8 x 8 heights, network",
             lambda h=heliostat, o=smooth: default_predictor().predict(h, o, JUELICH_MODEL),
             truth,
         )
         row(
+            RENDERED,
             f"{name} of 8 x 8 heights, refined",
             lambda h=heliostat, o=smooth: refine(h, o, JUELICH_MODEL),
             truth,
+            "<= 0.07",
         )
         print(f"| | both ends {apart:.3f} mm apart, misfit {left} | | | | | | | |")
 
@@ -240,11 +279,13 @@ def far(folder: MeasurementFolder, years: MeasurementFolder, rays: int) -> None:
             ):
                 label = f"{name} at {distance:.0f} m, {taken[0].side:g} m"
                 row(
+                    FAR_AWAY,
                     f"{label}, network",
                     lambda h=heliostat, o=taken: default_predictor().predict(h, o, JUELICH_MODEL),
                     truth,
                 )
                 row(
+                    FAR_AWAY,
                     f"{label}, refined",
                     lambda h=heliostat, o=taken: refine(h, o, JUELICH_MODEL),
                     truth,
@@ -257,7 +298,12 @@ def scaling(folder: MeasurementFolder, years: MeasurementFolder, rays: int) -> N
     seen = photographed(heliostat, fine, places_of(years, 64), rays, np.random.default_rng(1))
     print(f"From 8 to 64 images\n{HEAD}")
     for count in (8, 16, 32, 64):
-        row(f"{count} images", lambda n=count: refine(heliostat, seen[:n], JUELICH_MODEL), truth)
+        row(
+            "AA39 rendered, by the number of images",
+            f"{count} images",
+            lambda n=count: refine(heliostat, seen[:n], JUELICH_MODEL),
+            truth,
+        )
 
 
 def real(years: MeasurementFolder) -> None:
@@ -282,7 +328,20 @@ def real(years: MeasurementFolder) -> None:
     print(f"AA39, real photographs; median flux accuracy on {len(others)} others\n{HEAD}")
     for name, chosen in sets.items():
         start = default_predictor().predict(heliostat, spread(chosen, 8), JUELICH_MODEL)
-        found = row(name, lambda c=chosen, s=start: refine(heliostat, c, JUELICH_MODEL, s.z), truth)
+        found = row(
+            REAL,
+            name,
+            lambda c=chosen, s=start: refine(heliostat, c, JUELICH_MODEL, s.z),
+            truth,
+            "<= 0.25",
+        )
+        by_surface = {
+            "accuracy on other photographs, median": Estimate(accuracy(found.z), n=len(others)),
+            "of the network": Estimate(accuracy(start.z), n=len(others)),
+            "of deflectometry": Estimate(accuracy(truth), n=len(others)),
+            "network's error [mm]": 1e3 * surface_error(start.z, truth),
+        }
+        log_row(REAL, name, by_surface, of="photographs", compared_with="deflectometry")
         print(
             f"| | accuracy {accuracy(found.z):.3f}, network {accuracy(start.z):.3f}, deflectometry"
             f" {accuracy(truth):.3f}; network's error {1e3 * surface_error(start.z, truth):.3f} | |"
@@ -361,7 +420,22 @@ def photographs(years: MeasurementFolder) -> None:
         accuracy = 1 - np.concatenate(missed)
         first = accuracy if first is None else first
         low, high = interval(accuracy - first, [day_of(o) for o in judges])
-        errors = ", ".join(f"{1e3 * surface_error(z, truth):.3f}" for z in surfaces)
+        apart = [1e3 * surface_error(z, truth) for z in surfaces]
+        log_row(
+            "AA39 from photographs of half of the days, judged by the others",
+            name,
+            {
+                "error, first half [mm]": apart[0],
+                "error, second half [mm]": apart[1],
+                "accuracy, mean": accuracy.mean(),
+                "accuracy, median": np.median(accuracy),
+                "gain over the first row": Estimate((accuracy - first).mean(), (low, high)),
+            },
+            n=len(judges),
+            of="photographs",
+            compared_with="deflectometry and photographs of other days, intervals over days",
+        )
+        errors = ", ".join(f"{error:.3f}" for error in apart)
         print(
             f"| {name} | {errors} | {accuracy.mean():.3f} | {np.median(accuracy):.3f} | "
             f"{(accuracy - first).mean():+.4f} [{low:+.4f}, {high:+.4f}] |",
@@ -395,7 +469,8 @@ def main(arguments: list[str]) -> None:
         return
     folder, years = read_folder(root), read_folder(root.parent / "stj-years")
     for name in (options.only,) if options.only else ("rendered", "real"):
-        TABLES[name](folder, years, options.rays)
+        with recording(f"surfaces-{name}"):
+            TABLES[name](folder, years, options.rays)
 
 
 if __name__ == "__main__":

@@ -32,6 +32,7 @@ from service.twin.photographs import likeness
 from service.twin.runtime import operations
 from tests.benchmarks import data_folder
 from tests.benchmarks.folders import read_accepted
+from tests.benchmarks.record import Estimate, log_row, recording
 from training.render import TOWER_TOP
 from training.surfaces import load_surfaces
 
@@ -39,6 +40,11 @@ Array = NDArray[np.float64]
 
 PHOTOGRAPHED = ("AA39", "AC43", "AD37", "AA23")
 DRAWS = 20
+LABELS = {
+    "measure": "measure",
+    "forecast": "forecast as its heliostat's",
+    "others": f"forecast as each of {likeness.CANDIDATES} others'",
+}
 NEAR = 200
 """Anonymous mirrors stand at places drawn among so many that are nearest to AA39's."""
 
@@ -134,8 +140,8 @@ def judge(
     )
 
 
-def report(photographs: Photographs) -> None:
-    """Print false alarms and hits."""
+def report(photographs: Photographs, used: float) -> None:
+    """Print false alarms and hits; ``used`` is the margin of the service."""
     rng, mirrors = np.random.default_rng(1), list(photographs.accuracies)
     alarms: dict[str, list[bool]] = {name: [] for name in PHOTOGRAPHED}
     named: list[tuple[bool, bool]] = []
@@ -176,6 +182,19 @@ def report(photographs: Photographs) -> None:
         " right name"
     )
     print(f"swapped, true heliostat not among them: {np.mean(absent):.1%} warned of")
+    log_row(
+        "Photographs sent for the wrong heliostat, by the margin",
+        f"margin {likeness.MARGIN:g}" + " (used)" * (used == likeness.MARGIN),
+        {
+            "false alarms [%]": Estimate(100 * np.mean(every), goal="<= 2"),
+            "warned, true heliostat compared [%]": 100 * warned,
+            "warned with the right name [%]": 100 * right,
+            "warned, true heliostat not compared [%]": 100 * np.mean(absent),
+        },
+        n=len(photographs.owners),
+        of="photographs",
+        compared_with="the true heliostat",
+    )
 
 
 def timing() -> None:
@@ -205,6 +224,8 @@ def timing() -> None:
             work()
             taken.append(time.process_time() - began)
         print(f"{work.__name__}: {1e3 * np.median(taken):.1f} ms of processor time")
+        cells = {"processor [ms]": 1e3 * np.median(taken)}
+        log_row("Time of a photograph", LABELS[work.__name__], cells, n=len(taken), of="repeats")
 
 
 def main() -> None:
@@ -218,15 +239,22 @@ def main() -> None:
     parser.add_argument("--time", action="store_true")
     options = parser.parse_args()
     if options.time:
-        timing()
+        with recording("swaps-time"):
+            timing()
         return
-    photographs = compare()
-    for margin in options.margin:
+    with recording("swaps"):
+        report_margins(options.margin)
+
+
+def report_margins(margins: Sequence[float]) -> None:
+    """Print the figures of each margin."""
+    photographs, used = compare(), likeness.MARGIN
+    for margin in margins:
         likeness.MARGIN = margin
         print(
             f"\nmargin {margin:g}, least accuracy {likeness.MIN_ACCURACY:g}, drop {likeness.DROP:g}"
         )
-        report(photographs)
+        report(photographs, used)
 
 
 if __name__ == "__main__":

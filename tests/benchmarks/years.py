@@ -37,6 +37,7 @@ from service.cli.folder_pointing import calibrate_folder
 from service.sources.folder import read_folder
 from tests.benchmarks import data_folder
 from tests.benchmarks.folders import read_photographs
+from tests.benchmarks.record import Estimate, log_row, recording
 
 Array = NDArray[np.float64]
 
@@ -95,7 +96,7 @@ def fitted(taken: Sequence[FluxImage], names: Sequence[str]) -> list[Effect]:
     return unknowns.effects(Fitter(*pair).fit(unknowns, unknowns.neutral).values)
 
 
-def gains(both: Sequence[Sequence[FluxImage]], names: Sequence[str]) -> str:
+def gains(both: Sequence[Sequence[FluxImage]], label: str, names: Sequence[str]) -> str:
     """What effects give together on the days that they were not fitted to, over both halves."""
     changes = [
         accuracies(unseen, fitted(seen, names)) - accuracies(unseen, [])
@@ -103,6 +104,14 @@ def gains(both: Sequence[Sequence[FluxImage]], names: Sequence[str]) -> str:
     ]
     gain = np.concatenate(changes)
     low, high = interval(gain, [day_of(p) for half in reversed(both) for p in half])
+    log_row(
+        "The best effects, fitted to half of the days and judged by the others",
+        label,
+        {"gain in accuracy": Estimate(gain.mean(), (low, high))},
+        n=len(gain),
+        of="photographs",
+        compared_with="forecasts without effects, intervals over days",
+    )
     return f"{gain.mean():+.4f} [{low:+.4f}, {high:+.4f}]"
 
 
@@ -146,6 +155,16 @@ def moved(until: datetime) -> None:
         f"{conclude(found)}\nfound: {described(found)}; from motors [mrad]:"
         f" {found.position_error_mrad}"
     )
+    cells = {"finds": described(found)}
+    if (error := found.position_error_mrad) is not None:
+        cells |= {"spots without [mrad]": error.before, "spots with [mrad]": error.after}
+    log_row(
+        "What moved AA39's spots since a calibration",
+        str(until.date()),
+        cells,
+        n=len(newer),
+        of="photographs",
+    )
     print(f"  {json.dumps([effect_to_json(e) for e in found.effects])[:400]}")
     print("alone: " + ", ".join(f"{c.name} {c.gain.mean:+.4f}" for c in found.candidates))
 
@@ -163,21 +182,37 @@ def main() -> None:
     )
     options = parser.parse_args()
     if options.moved:
-        moved(datetime.fromisoformat(options.moved).replace(tzinfo=UTC))
+        with recording(f"years-moved-{options.moved}"):
+            moved(datetime.fromisoformat(options.moved).replace(tzinfo=UTC))
         return
+    with recording("years"):
+        of_halves(options.out)
+
+
+def of_halves(out: Path | None) -> None:
+    """Print what the whole says, and what each half says of the other."""
     taken, asked = photographs(), StudyOptions(window=WINDOW)
     whole = study(taken, JUELICH_MODEL, options=asked)
     print(f"{len(taken)} photographs on {len({day_of(p) for p in taken})} days: {conclude(whole)}")
     before, after = whole.accuracy_before.mean(), whole.accuracy_after.mean()
     print(f"found: {described(whole)}; without effects {before:.4f}, with {after:.4f}")
+    verdict = {"finds": described(whole), "accuracy without": before, "accuracy with": after}
+    log_row(
+        "Studies",
+        "all days, judged by held-out photographs",
+        verdict,
+        n=len(taken),
+        of="photographs",
+    )
     both, best = halves(taken), [c.name for c in whole.candidates[:FEW]]
     print("| the best effects | gain on the days that they were not fitted to, 95 % over days |")
     print("| --- | --- |")
-    for names in ([name] for name in best):
-        print(f"| {names[0]} alone | {gains(both, names)} |", flush=True)
-    print(f"| {' and '.join(best)} jointly | {gains(both, best)} |", flush=True)
-    if options.out:
-        options.out.write_text(json.dumps(study_to_json(whole), indent=1), encoding="utf-8")
+    for name in best:
+        print(f"| {name} alone | {gains(both, f'`{name}` alone', [name])} |", flush=True)
+    jointly = f"{' and '.join(best)} jointly"
+    print(f"| {jointly} | {gains(both, jointly, best)} |", flush=True)
+    if out:
+        out.write_text(json.dumps(study_to_json(whole), indent=1), encoding="utf-8")
     print(
         "| a study of | finds | photographs of the other days | before | after | gain, 95 % over"
         " days |"
@@ -188,6 +223,12 @@ def main() -> None:
         before, after = accuracies(unseen, []), accuracies(unseen, found.effects)
         low, high = interval(after - before, [day_of(p) for p in unseen])
         gain = f"{(after - before).mean():+.4f} [{low:+.4f}, {high:+.4f}]"
+        cells = {"finds": described(found), "accuracy without": before.mean()}
+        cells |= {"accuracy with": after.mean()}
+        cells["gain"] = Estimate((after - before).mean(), (low, high))
+        log_row(
+            "Studies", f"{name}, judged by the other days", cells, n=len(unseen), of="photographs"
+        )
         print(
             f"| {name} | {described(found)} | {len(unseen)} | {before.mean():.4f} |"
             f" {after.mean():.4f} | {gain} |"

@@ -22,15 +22,6 @@ def test_readme_is_short_and_has_a_picture():
     assert re.search(r"^!\[", text, re.MULTILINE)
 
 
-def test_figures_of_the_readme_are_those_of_the_results():
-    text = README.read_text(encoding="utf-8")
-    table = text.partition("## Results")[2].partition("\n\n| what")[2].partition("\n\n")[0]
-    numbers = re.findall(r"\d+\.\d+|\d+ of \d+", table)
-    assert len(numbers) > 10
-    results = (ROOT / "RESULTS.md").read_text(encoding="utf-8")
-    assert not [number for number in numbers if number not in results]
-
-
 def test_answer_in_the_readme_is_that_of_its_photograph():
     """A photograph without an id is named by the hash of its file."""
     digest = hashlib.sha256((DOCS / "images" / "photograph.jpg").read_bytes()).hexdigest()
