@@ -213,11 +213,11 @@ def solarpilot() -> None:
     given = {name: aims[n] for n, name in enumerate(heliostats)}
     losses = list(traced(heliostats, receiver, sun, optics, given).values())
     pairs = {
-        "cosine": ([one.cosine for one in losses], columns("Cosine eff")[:, 0], "<= 2e-4"),
+        "cosine": ([one.cosine for one in losses], columns("Cosine eff")[:, 0], "<= 0.0002"),
         "attenuation": (
             [one.attenuation for one in losses],
             columns("Attenuation")[:, 0],
-            "<= 2e-4",
+            "<= 0.0002",
         ),
         "shading times blocking": (
             [one.shading * one.blocking for one in losses],
@@ -276,7 +276,7 @@ def layouts() -> None:
             {
                 "processor time [s]": taken,
                 "time of the clock [s]": Estimate(waited, goal="<= 30"),
-                "map against sums": Estimate(abs(closes), goal="<= 1e-3"),
+                "map against sums": Estimate(abs(closes), goal="<= 0.001"),
             },
             n=int(total["heliostats"]),
             of="heliostats",
