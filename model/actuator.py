@@ -1,4 +1,4 @@
-"""Linear actuators: from motor steps to axis angles, and back."""
+"""Actuators of an axis: from motor steps to axis angles, and back."""
 
 from dataclasses import dataclass
 
@@ -103,3 +103,44 @@ class LinearActuator:
         position = np.asarray((stroke - self.initial_stroke_length) * self.increment)
         self.require_within(position)
         return position
+
+
+@dataclass(frozen=True)
+class RotaryActuator:
+    """A gear that rotates an axis in proportion to its motor's position.
+
+    Attributes
+    ----------
+    increment : float [steps/rad]
+        One for motor positions that are angles in radians.
+    initial_angle : float [rad]
+        The axis angle at zero steps.
+    clockwise : bool
+        Whether the angle decreases as the position increases.
+    """
+
+    increment: float = 1.0
+    initial_angle: float = 0.0
+    clockwise: bool = False
+
+    def __post_init__(self) -> None:
+        if self.increment <= 0:
+            raise InvalidInputError("actuator increment must be positive")
+
+    def angle(self, steps: ArrayLike) -> Array:
+        """Axis angle (...) [rad] at motor position ``steps`` (...)."""
+        turned = np.asarray(steps, dtype=np.float64) / self.increment
+        return np.asarray(self.initial_angle + (-turned if self.clockwise else turned))
+
+    def steps(self, angle: ArrayLike) -> Array:
+        """Motor position (...) [steps] at an axis angle (...) [rad]; the inverse of `angle`."""
+        turned = np.asarray(angle, dtype=np.float64) - self.initial_angle
+        return np.asarray((-turned if self.clockwise else turned) * self.increment)
+
+    def require_within(self, steps: ArrayLike) -> None:
+        """Accept every position: the axis has no end of travel."""
+
+
+Actuator = LinearActuator | RotaryActuator
+Actuators = tuple[Actuator, Actuator]
+"""Of the first and of the second axis."""

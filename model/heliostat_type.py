@@ -13,7 +13,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from model.actuator import LinearActuator
+from model.actuator import Actuators
 from model.errors import InvalidInputError
 from model.frames import sun_direction
 from model.mount import Mount, bisector
@@ -43,8 +43,8 @@ class MountDesign:
         Of both axes above the foot of the pylon.
     mirror_offset : float [m]
         From the pivot to the mirror's middle, along its normal.
-    drives : pair of LinearActuator, or None
-        None for axes that are driven ideally, or whose drives are not known.
+    drives : pair of Actuator, or None
+        None for axes whose drives are not known.
     axis_zero : (2,) [rad]
         Axis angles at which the drives' angles are zero.
     """
@@ -52,7 +52,7 @@ class MountDesign:
     kind: str = "azimuth_elevation"
     pivot_height: float = 0.0
     mirror_offset: float = 0.0
-    drives: tuple[LinearActuator, LinearActuator] | None = None
+    drives: Actuators | None = None
     axis_zero: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:

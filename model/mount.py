@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from model.actuator import LinearActuator
+from model.actuator import Actuators
 from model.errors import InvalidInputError, UnreachableError
 
 Array = NDArray[np.float64]
@@ -82,7 +82,7 @@ class Mount:
         From the heliostat's position to the pivot of both axes, in ENU.
     mirror_offset : (..., 3) [m]
         From the pivot to the mirror's centre, in mirror coordinates.
-    actuators : pair of LinearActuator, or None
+    actuators : pair of Actuator, or None
         None if an axis is driven directly, or its drive is not known.
     axis_zero : (2,) [rad]
         Added to the actuators' angles to give the axis angles.
@@ -100,7 +100,7 @@ class Mount:
     zero_attitude: Array
     joint: Array
     mirror_offset: Array
-    actuators: tuple[LinearActuator, LinearActuator] | None = None
+    actuators: Actuators | None = None
     axis_zero: tuple[float, float] = (0.0, 0.0)
     is_calibrated: bool = False
     calibrated_until: date | None = None
@@ -109,7 +109,7 @@ class Mount:
     @classmethod
     def juelich(
         cls,
-        actuators: tuple[LinearActuator, LinearActuator] | None = None,
+        actuators: Actuators | None = None,
         joint: ArrayLike = (0.0, 0.0, 0.0),
         mirror_offset: ArrayLike = (0.0, 0.0, 0.175),
     ) -> "Mount":

@@ -3,7 +3,9 @@ its parameters.
 
 Notes
 -----
-The kinematic chain is PAINT's with the small errors of a real mount. E is the rotation of the
+The kinematic chain is that of two axes at right angles, with the small errors of a real mount. Its
+frame has x along the first axis and z along the second one at zero angles. In Juelich that is east,
+north and up; `KinematicChain.frame` turns other mounts into it. E is the rotation of the
 foundation, T the lack of a right angle between the axes, and m the mirror's normal at zero angles::
 
     n = E R_x(t1) T R_z(t2) m,   E = R_z(foundation_up) R_y(foundation_north),   T = R_y(axes_skew),
@@ -28,7 +30,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from model.actuator import LinearActuator
+from model.actuator import Actuator, LinearActuator
 from model.errors import InvalidInputError
 from model.mount import Mount, rotation
 from model.plant import Heliostat
@@ -134,21 +136,48 @@ class Readings:
         )
 
 
+class AxesFrame(NamedTuple):
+    """The frame of a mount's axes.
+
+    ``turn`` (3, 3) leads from ENU to it. ``phase`` [rad] is the second angle at which the mirror's
+    normal, (0, -1, 0) in the chain, is the mount's at zero.
+    """
+
+    turn: Array
+    phase: float
+
+    @classmethod
+    def of(cls, mount: Mount) -> "AxesFrame":
+        """The frame of a mount whose axes and normal at zero are at right angles."""
+        first, second = mount.first_axis, mount.second_axis
+        turn = np.stack([first, np.cross(second, first), second])
+        x, y, _ = turn @ mount.zero_attitude[:, 2]
+        return cls(turn, float(np.arctan2(x, -y)))
+
+
 @dataclass(frozen=True, eq=False)
 class KinematicChain:
     """Kinematics of H heliostats from their property files, before any calibration.
 
     Attributes
     ----------
+    frame : (H, 3, 3)
+        ENU to the frame of the axes.
+    axis_zero : (H, 2) [rad]
+        Added to the drives' angles.
     pivot : (H, 3) [m]
+        In ENU.
     ahead : (H,) [m]
         The mirror's centre before the pivot, along the normal.
-    increment, offset, radius, stroke, zero : (H, 2) [steps/m, m, m, m, rad]
-        Of the drives, as in `model.actuator.LinearActuator`.
+    increment, offset, radius, stroke, zero : (H, 2) [steps/m or steps/rad, m, m, m, rad]
+        Of the drives, as in `model.actuator`; a rotary drive has no lengths, here one.
     sense : (H, 2)
         1, or -1 if the angle decreases with the stroke.
+    is_rotary : (H, 2) of bool
     """
 
+    frame: Array
+    axis_zero: Array
     pivot: Array
     ahead: Array
     increment: Array
@@ -157,6 +186,7 @@ class KinematicChain:
     stroke: Array
     zero: Array
     sense: Array
+    is_rotary: NDArray[np.bool_]
 
     @classmethod
     def of(cls, heliostats: Sequence[Heliostat]) -> "KinematicChain":
@@ -164,16 +194,24 @@ class KinematicChain:
         for heliostat in heliostats:
             if heliostat.mount.actuators is None:
                 raise InvalidInputError(
-                    f"heliostat {heliostat.name} has no linear actuators in its kinematics"
+                    f"heliostat {heliostat.name} has no actuators in its kinematics"
                 )
         drives = [heliostat.mount.actuators or () for heliostat in heliostats]
 
         def values(name: str) -> Array:
             return np.array(
-                [[getattr(drive, name) for drive in pair] for pair in drives], dtype=np.float64
+                [[getattr(drive, name, 1.0) for drive in pair] for pair in drives], dtype=np.float64
             )
 
+        frames = [AxesFrame.of(heliostat.mount) for heliostat in heliostats]
         return cls(
+            frame=np.array([frame.turn for frame in frames]),
+            axis_zero=np.array(
+                [
+                    np.add(heliostat.mount.axis_zero, (0.0, frame.phase))
+                    for heliostat, frame in zip(heliostats, frames, strict=True)
+                ]
+            ),
             pivot=np.array(
                 [heliostat.position + heliostat.mount.joint for heliostat in heliostats]
             ),
@@ -184,6 +222,9 @@ class KinematicChain:
             stroke=values("initial_stroke_length"),
             zero=values("initial_angle"),
             sense=np.where(values("clockwise") > 0, -1.0, 1.0),
+            is_rotary=np.array(
+                [[not isinstance(drive, LinearActuator) for drive in pair] for pair in drives]
+            ),
         )
 
     def kinds(self) -> list[NDArray[np.intp]]:
@@ -196,8 +237,9 @@ class KinematicChain:
         while left.size:
             first = left[0]
             alike = (self.sense[left] == self.sense[first]) & (
-                np.abs(self.increment[left] / self.increment[first] - 1) < _ANOTHER_KIND
+                self.is_rotary[left] == self.is_rotary[first]
             )
+            alike &= np.abs(self.increment[left] / self.increment[first] - 1) < _ANOTHER_KIND
             for lengths in (self.offset, self.radius):
                 alike &= np.abs(lengths[left] - lengths[first]) < ANOTHER_KIND_M
             of_kind = alike.all(axis=1)
@@ -211,21 +253,23 @@ class KinematicChain:
 
 
 def apply_parameters(mount: Mount, parameters: Array) -> Mount:
-    """Return a mount of PAINT's kind with ``parameters`` (P,), in the order of `PARAMETERS`."""
+    """Return a mount with ``parameters`` (P,), in the order of `PARAMETERS`."""
     if mount.actuators is None:
         raise InvalidInputError("this mount has no actuators, so there is nothing to calibrate")
     p = dict(zip(NAMES, parameters.tolist(), strict=True))
+    frame = AxesFrame.of(mount)
     foundation = rotation(_Z, p["foundation_up"]) @ rotation(_Y, p["foundation_north"])
     second = foundation @ rotation(_Y, p["axes_skew"])
+    tilt = rotation(rotation(_Z, frame.phase) @ _X, p["mirror_tilt"])
     first_drive, second_drive = (
         _longer(drive, p[f"{which}_radius"], p[f"{which}_offset"], p[f"{which}_stroke"])
         for which, drive in zip(("first", "second"), mount.actuators, strict=True)
     )
     return replace(
         mount,
-        first_axis=foundation @ _X,
-        second_axis=second @ _Z,
-        zero_attitude=second @ rotation(_X, p["mirror_tilt"]) @ mount.zero_attitude,
+        first_axis=frame.turn.T @ foundation @ _X,
+        second_axis=frame.turn.T @ second @ _Z,
+        zero_attitude=frame.turn.T @ second @ tilt @ frame.turn @ mount.zero_attitude,
         joint=mount.joint + parameters[:3],
         mirror_offset=mount.mirror_offset + p["mirror_ahead"] * _Z,
         actuators=(first_drive, second_drive),
@@ -234,7 +278,9 @@ def apply_parameters(mount: Mount, parameters: Array) -> Mount:
     )
 
 
-def _longer(drive: LinearActuator, radius: float, offset: float, stroke: float) -> LinearActuator:
+def _longer(drive: Actuator, radius: float, offset: float, stroke: float) -> Actuator:
+    if not isinstance(drive, LinearActuator):
+        return drive
     return replace(
         drive,
         pivot_radius=drive.pivot_radius + radius,
@@ -265,7 +311,7 @@ def residuals(
     """
     p = dict(zip(NAMES, parameters.T[:, :, None], strict=True))
     angles, slopes = _drive_angles(chain, readings.steps, parameters)
-    angles = angles + parameters[:, None, ZEROS] + zeros
+    angles = angles + parameters[:, None, ZEROS] + zeros + chain.axis_zero[:, None]
     # Rotations are written out by component: matrix products would take most of the time.
     normal = _turn(0, p["mirror_tilt"], np.broadcast_to(-_Y, (*angles.shape[:2], 3)))
     tilt_axis = np.broadcast_to(_X, normal.shape)
@@ -275,9 +321,7 @@ def residuals(
         _turn(1, p["axes_skew"], v) for v in (normal, tilt_axis, second_axis)
     )
     skew_axis = np.broadcast_to(_Y, normal.shape)
-    turned = (
-        _turn(0, angles[..., 0] - np.pi / 2, v) for v in (normal, tilt_axis, second_axis, skew_axis)
-    )
+    turned = (_turn(0, angles[..., 0], v) for v in (normal, tilt_axis, second_axis, skew_axis))
     normal, tilt_axis, second_axis, skew_axis = turned
     first_axis = np.broadcast_to(_X, normal.shape)
     moved = [normal, tilt_axis, second_axis, skew_axis, first_axis]
@@ -286,25 +330,26 @@ def residuals(
     normal, tilt_axis, second_axis, skew_axis, first_axis, north_axis = moved
 
     ahead = (chain.ahead[:, None] + p["mirror_ahead"])[..., None]
-    center = chain.pivot[:, None] + parameters[:, None, :3] + ahead * normal
-    cosine = (readings.sun * normal).sum(axis=-1, keepdims=True)
-    to_spot = readings.spot - center
+    # Light is seen in the frame of the axes, too.
+    turn = chain.frame[:, None]
+    sun, spot = (_turned(turn, vectors) for vectors in (readings.sun, readings.spot))
+    center = _turned(turn, chain.pivot[:, None] + parameters[:, None, :3]) + ahead * normal
+    cosine = (sun * normal).sum(axis=-1, keepdims=True)
+    to_spot = spot - center
     distance = np.linalg.norm(to_spot, axis=-1, keepdims=True)
     to_spot = to_spot / distance
-    sidewards = np.cross(_Z, to_spot)
+    sidewards = np.cross(turn[..., 2], to_spot)
     sidewards = sidewards / np.linalg.norm(sidewards, axis=-1, keepdims=True)
     seen = (
         np.stack([sidewards, np.cross(to_spot, sidewards)], axis=-2)
         * readings.used[..., None, None]
     )
     # Sines of angles decrease beyond a right angle; a robust fit stays far below it.
-    residual = -(seen @ (2 * cosine * normal - readings.sun)[..., None])[..., 0]
+    residual = -(seen @ (2 * cosine * normal - sun)[..., None])[..., 0]
 
     # residual = -seen . direction, with seen at right angles to the direction from the mirror to
     # the spot.
-    by_normal = -2 * (
-        cosine[..., None] * seen + (seen @ normal[..., None]) * readings.sun[..., None, :]
-    )
+    by_normal = -2 * (cosine[..., None] * seen + (seen @ normal[..., None]) * sun[..., None, :])
     shift = -seen / distance[..., None]
     by_normal = by_normal + ahead[..., None] * shift
     axes = {
@@ -315,7 +360,7 @@ def residuals(
         "first_zero": first_axis,
         "second_zero": second_axis,
     }
-    columns = dict(zip(NAMES[:3], np.moveaxis(shift, -1, 0), strict=True))
+    columns = dict(zip(NAMES[:3], np.moveaxis(shift @ turn, -1, 0), strict=True))
     for name, axis in axes.items():
         columns[name] = (by_normal @ np.cross(axis, normal)[..., None])[..., 0]
     for drive, which in enumerate(("first", "second")):
@@ -323,6 +368,11 @@ def residuals(
             columns[f"{which}_{name}"] = columns[f"{which}_zero"] * slope[..., drive, None]
     columns["mirror_ahead"] = (shift @ normal[..., None])[..., 0]
     return Residuals(residual, np.stack([columns[name] for name in NAMES], axis=-1))
+
+
+def _turned(turn: Array, vectors: Array) -> Array:
+    """Vectors (..., 3) after rotations (..., 3, 3)."""
+    return np.asarray((turn @ vectors[..., None])[..., 0])
 
 
 def _turn(axis: int, angle: Array, vector: Array) -> Array:
@@ -351,9 +401,13 @@ def _drive_angles(chain: KinematicChain, steps: Array, parameters: Array) -> _An
     reference = chain.stroke[:, None] + stroke
     at, at_slopes = _pivot(steps / chain.increment[:, None] + reference, offset, radius)
     zero, zero_slopes = _pivot(reference, offset, radius)
-    sense = chain.sense[:, None]
-    slopes = {name: sense * (at_slopes[name] - zero_slopes[name]) for name in at_slopes}
-    return _Angles(chain.zero[:, None] + sense * (at - zero), slopes)
+    sense, is_rotary = chain.sense[:, None], chain.is_rotary[:, None]
+    slopes = {
+        name: np.where(is_rotary, 0.0, sense * (at_slopes[name] - zero_slopes[name]))
+        for name in at_slopes
+    }
+    turned = np.where(is_rotary, steps / chain.increment[:, None], at - zero)
+    return _Angles(chain.zero[:, None] + sense * turned, slopes)
 
 
 # The triangle of a spindle degenerates if its sides lie in one line; a fit is kept away from it.

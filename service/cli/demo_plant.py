@@ -72,7 +72,11 @@ def properties(mirror: Heliostat, plant: Plant) -> dict[str, object]:
         "width": mirror.width,
         "initial_orientation": [0.0, -1.0, 0.0],
         "kinematics_properties": {
-            "actuators": [_actuator(one) for one in mirror.mount.actuators or ()]
+            "actuators": [
+                _actuator(one)
+                for one in mirror.mount.actuators or ()
+                if isinstance(one, LinearActuator)
+            ]
             or [{"type_axis": "ideal"}] * 2,
             **translations,
             "concentrator_translation_e": 0.0,

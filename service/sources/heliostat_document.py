@@ -4,12 +4,12 @@ PAINT's documents describe heliostats of the Solar Tower Juelich. This one has t
 and facets of any number, outline and focal length, in metres of east, north and up.
 """
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from model.actuator import LinearActuator
+from model.actuator import Actuator, LinearActuator, RotaryActuator
 from model.mount import Mount
 from model.plant import Facet, Heliostat, MirrorOptics
 from service.base.fields import Number
@@ -25,9 +25,10 @@ class _Part(BaseModel):
     model_config = ConfigDict(allow_inf_nan=False, extra="forbid")
 
 
-class DriveDocument(_Part):
+class LinearDriveDocument(_Part):
     """`model.actuator.LinearActuator`."""
 
+    kind: Literal["linear"] = "linear"
     increment: Number
     initial_stroke_length: Number
     offset: Number
@@ -35,6 +36,18 @@ class DriveDocument(_Part):
     initial_angle: Number
     clockwise: bool
     max_increment: Number
+
+
+class RotaryDriveDocument(_Part):
+    """`model.actuator.RotaryActuator`."""
+
+    kind: Literal["rotary"] = "rotary"
+    increment: Number
+    initial_angle: Number
+    clockwise: bool
+
+
+DriveDocument = Annotated[LinearDriveDocument | RotaryDriveDocument, Field(discriminator="kind")]
 
 
 class MountDocument(_Part):
@@ -89,7 +102,7 @@ def heliostat_to_json(heliostat: Heliostat, kind: str = "") -> dict[str, object]
     """The document of a heliostat of a type ``kind``."""
     mount = heliostat.mount
     first, second = mount.actuators or (None, None)
-    drives = first and second and (DriveDocument(**vars(first)), DriveDocument(**vars(second)))
+    drives = first and second and (_drive_document(first), _drive_document(second))
     document = HeliostatDocument(
         format=FORMAT,
         type=kind,
@@ -134,15 +147,22 @@ def _facet_part(facet: Facet) -> MirrorFacet:
     )
 
 
-def _actuator(drive: DriveDocument | None) -> LinearActuator | None:
-    return None if drive is None else LinearActuator(**drive.model_dump())
+def _drive_document(drive: Actuator) -> LinearDriveDocument | RotaryDriveDocument:
+    if isinstance(drive, LinearActuator):
+        return LinearDriveDocument(**vars(drive))
+    return RotaryDriveDocument(**vars(drive))
+
+
+def _actuator(drive: LinearDriveDocument | RotaryDriveDocument) -> Actuator:
+    made = LinearActuator if isinstance(drive, LinearDriveDocument) else RotaryActuator
+    return made(**drive.model_dump(exclude={"kind"}))
 
 
 def heliostat_from_json(name: str, properties: Any) -> Heliostat:
     """The heliostat of a document; `InvalidInputError` names a wrong field."""
     document = parse(HeliostatDocument, properties, f"properties of {name}")
     mount, optics = document.mount, document.optics
-    first, second = map(_actuator, mount.drives or (None, None))
+    drives = mount.drives and (_actuator(mount.drives[0]), _actuator(mount.drives[1]))
     return Heliostat(
         name,
         np.array(document.position_m),
@@ -152,7 +172,7 @@ def heliostat_from_json(name: str, properties: Any) -> Heliostat:
             np.array(mount.zero_attitude),
             np.array(mount.joint_m),
             np.array(mount.mirror_offset_m),
-            None if first is None or second is None else (first, second),
+            drives,
             axis_zero=mount.axis_zero_rad,
         ),
         tuple(

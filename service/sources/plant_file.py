@@ -25,7 +25,7 @@ from service.sources.plant_receivers import (
     read_receivers,
     read_targets,
 )
-from service.sources.plant_schema import BuieSun, Drive, GaussianSun, assumed, nearest
+from service.sources.plant_schema import BuieSun, GaussianSun, assumed, nearest
 from service.sources.plant_tables import PlacedHeliostat, read_layout
 from service.sources.plant_types import read_type
 
@@ -62,8 +62,6 @@ class PlantDescription:
     homography_of : dict
         By target with a known camera, (3, 3): pixels (column, row, 1) to metres right and up of its
         centre.
-    drives_of : dict
-        Drives of both axes by type, as given; `MountDesign.drives` has linear ones.
     assumed : tuple of str
         What the file leaves to its defaults, as lines ``key.path: value``.
     warnings : tuple of str
@@ -80,7 +78,6 @@ class PlantDescription:
     altitude: float
     marks_of: dict[str, str]
     homography_of: dict[str, Array]
-    drives_of: dict[str, tuple[Drive, ...]]
     assumed: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
 
@@ -126,11 +123,6 @@ class _PlantReader:
             altitude=header.altitude_m,
             marks_of={name: target.marks for name, target in self.entries.targets.items()},
             homography_of=read_homographies(self.text),
-            drives_of={
-                name: tuple(entry.mount.drives)
-                for name, entry in self.entries.heliostat_types.items()
-                if entry.mount.drives
-            },
             assumed=tuple(assumed(self.entries)),
             warnings=tuple(self._warnings(layout)),
         )
@@ -232,13 +224,9 @@ class _PlantReader:
             place = self._place("sun", "circumsolar_ratio")
             yield f"{place}: is read as chi of Buie's formula; write chi, or csr for the true share"
         used = {placed.entry.type for placed in layout}
-        for name, entry in self.entries.heliostat_types.items():
+        for name in self.entries.heliostat_types:
             if name not in used:
                 yield f"{self._place('heliostat_types', name)}: has no heliostat in the layout"
-            kinds = {drive.kind for drive in entry.mount.drives or ()}
-            if kinds - {"linear"}:
-                place = self._place("heliostat_types", name, "mount", "drives")
-                yield f"{place}: motor positions are modelled if both drives are linear only"
 
 
 def _require_different(layout: list[PlacedHeliostat]) -> None:

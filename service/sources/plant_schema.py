@@ -148,6 +148,12 @@ class RotaryDrive(PlantPart):
     gear: Annotated[Number, Field(gt=0, le=1e9)] | None = Field(
         None, description="Motor turns for one turn of the axis."
     )
+    initial_angle_rad: Annotated[Number, Field(ge=-10, le=10)] = Field(
+        0.0, description="Axis angle at zero steps."
+    )
+    clockwise: Flag = Field(
+        False, description="Whether the angle decreases as the position increases."
+    )
 
     @model_validator(mode="after")
     def _one_ratio(self) -> Self:
@@ -156,7 +162,7 @@ class RotaryDrive(PlantPart):
 
 
 class IdealDrive(PlantPart):
-    """A drive that reaches every angle."""
+    """A drive that reaches every angle; its motor position is the axis angle in radians."""
 
     kind: Literal["ideal"]
 

@@ -1,6 +1,8 @@
 """Heliostat types of ``plant.yaml``."""
 
-from model.actuator import LinearActuator
+import math
+
+from model.actuator import Actuator, LinearActuator, RotaryActuator
 from model.errors import InvalidInputError
 from model.heliostat_type import Canting, FacetDesign, Focus, HeliostatType, MountDesign, facet_grid
 from model.plant import MirrorOptics
@@ -11,8 +13,10 @@ from service.sources.plant_schema import (
     FacetGridEntry,
     FocusEntry,
     HeliostatTypeEntry,
+    IdealDrive,
     LinearDrive,
     MountEntry,
+    RotaryDrive,
 )
 from service.sources.plant_tables import read_facets
 from service.sources.yaml_text import KeyPath
@@ -62,8 +66,8 @@ def _canting(
 
 
 def _mount(entry: MountEntry) -> MountDesign:
-    """The mount of an entry; its drives if both are linear."""
-    drives = [_actuator(drive) for drive in entry.drives or () if isinstance(drive, LinearDrive)]
+    """The mount of an entry, with its drives if they are given."""
+    drives = [_actuator(drive) for drive in entry.drives or ()]
     return MountDesign(
         entry.kind,
         entry.pivot_height_m,
@@ -72,7 +76,13 @@ def _mount(entry: MountEntry) -> MountDesign:
     )
 
 
-def _actuator(drive: LinearDrive) -> LinearActuator:
+def _actuator(drive: LinearDrive | RotaryDrive | IdealDrive) -> Actuator:
+    """The model's drive; the motor position of an ideal one is its angle in radians."""
+    if isinstance(drive, IdealDrive):
+        return RotaryActuator()
+    if isinstance(drive, RotaryDrive):
+        increment = drive.steps_per_rad or (drive.gear or 1.0) / (2 * math.pi)
+        return RotaryActuator(increment, drive.initial_angle_rad, drive.clockwise)
     return LinearActuator(
         increment=drive.increment_steps_per_m,
         initial_stroke_length=drive.initial_stroke_length_m,

@@ -589,7 +589,7 @@ def test_the_unseen_field_has_the_spreads_of_its_parameters(world):
 
 def test_mounts_without_actuators_are_refused():
     bare = Heliostat.juelich("bare", (0.0, 100.0, 1.7))
-    with pytest.raises(InvalidInputError, match="bare has no linear actuators"):
+    with pytest.raises(InvalidInputError, match="bare has no actuators"):
         KinematicChain.of([bare])
 
 

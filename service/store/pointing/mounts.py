@@ -127,7 +127,7 @@ class CalibrationState:
 
 
 def calibration_states(session: Session) -> list[CalibrationState]:
-    """Calibration states of all heliostats with linear actuators, sorted by name.
+    """Calibration states of all heliostats whose drives are known, sorted by name.
 
     Only the needed parts of the JSON documents are read.
     """
@@ -135,12 +135,13 @@ def calibration_states(session: Session) -> list[CalibrationState]:
     document, properties = MountRow.document, HeliostatRow.properties
     # Older PAINT files use the other name.
     kinds = [properties[name]["actuators"][1]["type_axis"].as_string() for name in _KINEMATICS]
+    of_any = properties["mount"]["drives"][1]["kind"].as_string()
     query = (
         select(HeliostatRow.name, document["measurements"].as_integer(), document["history"]["at"])
         .outerjoin(
             MountRow, and_(MountRow.heliostat_id == HeliostatRow.id, MountRow.id.in_(newest))
         )
-        .where(or_(*(kind == "linear" for kind in kinds)))
+        .where(or_(*(kind == "linear" for kind in kinds), of_any.is_not(None)))
         .order_by(HeliostatRow.name)
     )
     return [

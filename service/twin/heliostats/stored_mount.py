@@ -132,8 +132,9 @@ def with_drive_zeros(row: HeliostatRow, origin: tuple[float, float, float]) -> H
     heliostat = read_heliostat(row.name, row.properties, np.array(origin), STORED)
     if heliostat.mount.actuators is None:
         raise ConflictError(
-            "its kinematics have no linear actuators, so motor positions say nothing of its angles;"
-            " PUT properties that have kinematics_properties.actuators"
+            "its kinematics have no actuators, so motor positions say nothing of its angles;"
+            " PUT properties that have kinematics_properties.actuators, or give the mount's drives"
+            " in plant.yaml"
         )
     return heliostat
 

@@ -18,7 +18,7 @@ from model.surface import control_points
 from service.sources.folder import read_folder
 from service.sources.plant_file import read_plant
 from tests.service.command import ends, heliotwin, heliotwin_on
-from tests.service.sources.plant_files import write_plant
+from tests.service.sources.plant_files import PLANT, write_plant
 
 LAYOUT = """\
 name,type,east_m,north_m,up_m
@@ -28,10 +28,15 @@ C1,large,200,400,0
 """
 
 
+SUNS = [(140.0, 40.0), (200.0, 55.0), (110.0, 30.0), (230.0, 35.0), (170.0, 60.0)]
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("plant")
-    plant = read_plant(write_plant(root, layout=LAYOUT))
+    drives = "[{kind: rotary, steps_per_rad: 9000}, {kind: rotary, steps_per_rad: 7000}]"
+    text = PLANT.replace("mirror_offset_m: 0.2}", f"mirror_offset_m: 0.2, drives: {drives}}}")
+    plant = read_plant(write_plant(root, text, layout=LAYOUT))
     target = plant.plant.targets["cal"]
     model = PlantModel(plant.plant.site, plant.optics)
     rng = np.random.default_rng(4)
@@ -40,10 +45,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         tilts = rng.normal(0, 2e-4, (2, len(heliostat.facets), 1, 1))
         across = np.linspace(-1, 1, 8)
         z = tilts[0] * across[:, None] + tilts[1] * across
-        for number, (azimuth, elevation) in enumerate([(140.0, 40.0), (200.0, 55.0)], start=1):
+        for number, (azimuth, elevation) in enumerate(SUNS if name == "A1" else SUNS[:2], start=1):
             sun = sun_direction(azimuth, elevation)
             setup = Setup(heliostat, control_points(heliostat, z), sun, target)
-            image = align([setup], model).flux(View(256, 256))[0].numpy()
+            aligned = align([setup], model)
+            image = aligned.flux(View(256, 256))[0].numpy()
             places = target.grid(256, 256).points
             spot = (image[..., None] * places).sum(axis=(0, 1)) / image.sum()
             own = root / name / "Calibration"
@@ -55,6 +61,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 "sun_elevation_deg": elevation,
                 "focal_spot_m": spot.tolist(),
             }
+            if name == "A1":
+                steps = heliostat.mount.motors_from_angles(aligned.angles[0])
+                properties["motor_position"] = (steps + [60.0, -40.0]).tolist()
             path = own / f"{number}-calibration-properties.json"
             path.write_text(json.dumps(properties))
     return root
@@ -63,7 +72,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_folder_is_read_as_its_file_describes_it(folder: Path):
     read = read_folder(folder)
     assert list(read.plant.heliostats) == ["A1", "B1"]  # C1 has no photographs
-    assert [one.identifier for one in read.measurements("A1")] == ["1", "2"]
+    assert [one.identifier for one in read.measurements("A1")] == ["1", "2", "3", "4", "5"]
     first = read.measurements("A1")[0]
     assert (first.azimuth_deg, first.elevation_deg, first.taken_at) == (140.0, 40.0, None)
     assert read.skipped == {
@@ -75,7 +84,7 @@ def test_flux_and_forecast_work_on_it(folder: Path, tmp_path: Path):
     done = heliotwin("flux", folder, "--out", tmp_path / "flux")
     assert done.returncode == 0, done.stderr
     quality = json.loads((tmp_path / "flux" / "quality.json").read_text())["images"]
-    assert [one["accepted"] for one in quality.values()] == [True] * 4
+    assert [one["accepted"] for one in quality.values()] == [True] * 7
     done = heliotwin("forecast", folder, "--surfaces", "ideal", "--out", tmp_path / "forecast")
     assert done.returncode == 0, done.stderr
     report = json.loads((tmp_path / "forecast" / "forecast.json").read_text())
@@ -84,6 +93,20 @@ def test_flux_and_forecast_work_on_it(folder: Path, tmp_path: Path):
     # 28 facets of 1.8 x 1.35 m and a reflectance of 0.95, in light of 1000 W/m2.
     power = flux.sum() * 12 * 12 / 256**2
     assert 0.75 < power / (28 * 1.8 * 1.35 * 1000 * 0.95) < 0.98
+
+
+def test_mounts_of_other_kinds_are_calibrated(folder: Path, tmp_path: Path):
+    """A1's azimuth-elevation mount has rotary drives whose zeros are 7 and 6 mrad off."""
+    mounts, spots = tmp_path / "mounts.json", tmp_path / "spots.json"
+    done = heliotwin("calibrate", folder, "--out", mounts)
+    assert done.returncode == 0, done.stderr
+    done = heliotwin("spot", folder, "--mounts", mounts, "--out", spots)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(spots.read_text())["spots"]
+    for one in read_folder(folder).measurements("A1"):
+        assert one.spot is not None
+        apart = np.linalg.norm(np.array(found[one.key]["spot"]) - one.spot)
+        assert apart < 0.15  # 1 mrad of 190 m; before, 2.6 m
 
 
 def test_store_gives_back_what_was_imported(folder: Path, tmp_path: Path):
@@ -124,7 +147,7 @@ def test_a_wrong_measurement_is_skipped_by_name(
     path = tmp_path / "A1" / "Calibration" / "1-calibration-properties.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | change))
     read = read_folder(tmp_path)
-    assert [one.identifier for one in read.measurements("A1")] == ["2"]
+    assert [one.identifier for one in read.measurements("A1")] == ["2", "3", "4", "5"]
     assert said in read.skipped["A1/1"]
 
 

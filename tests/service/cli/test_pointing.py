@@ -68,7 +68,7 @@ def test_what_cannot_be_used_is_listed_and_costs_nothing_else(folder: Path, tmp_
         "AA39/202": "sun_azimuth: is missing",
         "AA39/203": "off every target",
         "AA39/204": "beyond the travel",
-        "AB01": "no linear actuators",
+        "AB01": "no actuators",
         "AB02": "no measurement",
         "AB09": "no 'AB09-heliostat-properties.json'",
     }

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from model.actuator import LinearActuator
 from model.errors import InvalidInputError
 from model.plant import Cylinder, TargetPlane
 from model.receivers import Cavity
@@ -89,13 +90,16 @@ def test_drives_are_carried(tmp_path: Path):
         " max_increment_steps: 69296}"
     )
     rotary = "{kind: rotary, gear: 18000}"
-    for drives, is_modelled in (([linear] * 2, True), ([rotary, "{kind: ideal}"], False)):
+    for drives in ([linear] * 2, [rotary, "{kind: ideal}"], [linear, rotary]):
         mount = f"{{kind: pitch_roll, drives: [{', '.join(drives)}]}}"
         text = PLANT.replace("mount: {kind: pitch_roll}", f"mount: {mount}")
         plant = read_plant(write_plant(tmp_path, text))
-        assert (plant.types["small"].mount.drives is not None) == is_modelled
-        assert len(plant.drives_of["small"]) == 2
-        assert bool(plant.warnings) != is_modelled
+        found = plant.types["small"].mount.drives
+        assert found is not None
+        kinds = [isinstance(drive, LinearActuator) for drive in found]
+        assert kinds == [drive == linear for drive in drives]
+        assert plant.warnings == ()
+    assert found[1].angle(18000) == pytest.approx(2 * np.pi)
 
 
 def test_suns(tmp_path: Path):
