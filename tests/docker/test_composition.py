@@ -9,7 +9,7 @@ import os
 import re
 import subprocess
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -59,21 +59,21 @@ def previous(version: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator
 
 
 @contextmanager
-def composed(checkout: Path, tag: str, stj: Path) -> Iterator[Composition]:
-    """A composition that runs, and may import the real measurements; removed at the end."""
+def composed(
+    checkout: Path, tag: str, stj: Path, images: Mapping[str, str] | None = None
+) -> Iterator[Composition]:
+    """A composition that runs, and may import the real measurements; removed at the end.
+
+    ``images`` are those of services that start from others than the file names.
+    """
     made = Composition(checkout, tag, stj.resolve().parent)
+    if images:
+        made.instead(images)
     try:
         made.up()
         yield made
     finally:
         made.tear_down()
-
-
-@pytest.fixture(scope="module")
-def plant(checkout: Path, version: str, stj: Path) -> Iterator[Composition]:
-    """The composition of this version, for all tests of it; the last of them restores it."""
-    with composed(checkout, version, stj) as running:
-        yield running
 
 
 @pytest.fixture
@@ -226,6 +226,101 @@ def test_upgrade_from_the_previous_image(
         predicts_and_forecasts(client)
 
 
+@pytest.fixture(scope="module")
+def monitors(checkout: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
+    """Images with real Prometheus and Alertmanager, by the services that they are for."""
+    programs = {
+        "prometheus": (binary("prometheus"), "tsdb.path"),
+        "alertmanager": (binary("alertmanager", "prometheus-alertmanager"), "path"),
+    }
+    folder = tmp_path_factory.mktemp("monitors")
+    images = {
+        name: engine.build_monitor(program, name, kind, folder / name, f"heliotwin-test-{name}")
+        for name, (program, kind) in programs.items()
+    }
+    yield images
+    engine.run("docker", "rmi", "--force", *images.values())
+
+
+@pytest.fixture
+def monitored(
+    checkout: Path, version: str, stj: Path, monitors: dict[str, str]
+) -> Iterator[Composition]:
+    """The composition's profile as it is, but for the images, and Grafana, which there is no
+    program of in Debian.
+    """
+    with composed(checkout, version, stj, monitors) as running:
+        running("--profile", "monitoring", "up", "-d", *monitors)
+        yield running
+
+
+def test_monitoring_reports_that_service_or_worker_is_away(
+    monitored: Composition, monitors: dict[str, str]
+):
+    base = {
+        name: f"http://127.0.0.1:{monitored.environment[f'HELIOTWIN_{name.upper()}_PORT']}"
+        for name in monitors
+    }
+
+    def asked(name: str, path: str) -> Any:
+        try:
+            answer = httpx.get(base[name] + path)
+        except httpx.TransportError:
+            return None
+        return answer.json() if answer.is_success else None
+
+    def up() -> set[str]:
+        found = asked("prometheus", "/api/v1/targets")
+        targets = found["data"]["activeTargets"] if found else []
+        return {target["labels"]["job"] for target in targets if target["health"] == "up"}
+
+    until(lambda: up() == {"heliotwin", "heliotwin-worker"}, "service and worker are watched")
+    rules = asked("prometheus", "/api/v1/rules")["data"]["groups"]
+    declared = (
+        (monitored.folder / "prometheus-rules.yml").read_text(encoding="utf-8").count("alert:")
+    )
+    health = [rule["health"] for group in rules for rule in group["rules"]]
+    assert len(health) == declared
+    assert set(health) <= {"ok", "unknown"}
+    until(
+        lambda: asked("prometheus", "/api/v1/alertmanagers")["data"]["activeAlertmanagers"],
+        "alerts have a way",
+    )
+
+    # Written in place: both files are mounted.
+    rules_file, configuration = (
+        monitored.folder / name for name in ("prometheus-rules.yml", "prometheus.yml")
+    )
+    patient, seldom = (path.read_text(encoding="utf-8") for path in (rules_file, configuration))
+    often = "scrape_interval: 5s\n  scrape_timeout: 5s\n  evaluation_interval: 1s"
+    assert "scrape_interval: 15s" in seldom
+    try:
+        rules_file.write_text(re.sub(r"for: \d+[mh]", "for: 0s", patient), encoding="utf-8")
+        configuration.write_text(seldom.replace("scrape_interval: 15s", often), encoding="utf-8")
+        monitored("kill", "-s", "HUP", "prometheus")
+        monitored("stop", "service")
+        until(
+            lambda: (
+                "HeliotwinDown"
+                in {
+                    one["labels"]["alertname"]
+                    for one in asked("alertmanager", "/api/v2/alerts") or ()
+                }
+            ),
+            "an alert reports that the service is away",
+        )
+    finally:
+        rules_file.write_text(patient, encoding="utf-8")
+        configuration.write_text(seldom, encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def plant(checkout: Path, version: str, stj: Path) -> Iterator[Composition]:
+    """The composition of this version, for all tests of it; the last of them restores it."""
+    with composed(checkout, version, stj) as running:
+        yield running
+
+
 def test_containers_have_bounds_and_few_rights(plant: Composition):
     """What the engine holds each container to, the database among them."""
     for name in ("database", "service", "worker"):
@@ -278,93 +373,6 @@ def test_database_is_out_of_reach_from_other_containers(plant: Composition, vers
                 network,
                 host,
             )
-
-
-@pytest.fixture(scope="module")
-def monitors(checkout: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
-    """Images with real Prometheus and Alertmanager, by the services that they are for."""
-    programs = {
-        "prometheus": (binary("prometheus"), "tsdb.path"),
-        "alertmanager": (binary("alertmanager", "prometheus-alertmanager"), "path"),
-    }
-    folder = tmp_path_factory.mktemp("monitors")
-    images = {
-        name: engine.build_monitor(program, name, kind, folder / name, f"heliotwin-test-{name}")
-        for name, (program, kind) in programs.items()
-    }
-    yield images
-    engine.run("docker", "rmi", "--force", *images.values())
-
-
-@pytest.fixture
-def monitored(plant: Composition, monitors: dict[str, str]) -> Iterator[Composition]:
-    """The composition's profile as it is, but for the images, and Grafana, which there is no
-    program of in Debian.
-    """
-    plant.instead(monitors)
-    plant("--profile", "monitoring", "up", "-d", *monitors)
-    yield plant
-    plant("--profile", "monitoring", "rm", "--force", "--stop", "-v", *monitors)
-
-
-def test_monitoring_reports_that_service_or_worker_is_away(
-    monitored: Composition, monitors: dict[str, str]
-):
-    base = {
-        name: f"http://127.0.0.1:{monitored.environment[f'HELIOTWIN_{name.upper()}_PORT']}"
-        for name in monitors
-    }
-
-    def asked(name: str, path: str) -> Any:
-        try:
-            answer = httpx.get(base[name] + path)
-        except httpx.TransportError:
-            return None
-        return answer.json() if answer.is_success else None
-
-    def up() -> set[str]:
-        found = asked("prometheus", "/api/v1/targets")
-        targets = found["data"]["activeTargets"] if found else []
-        return {target["labels"]["job"] for target in targets if target["health"] == "up"}
-
-    until(lambda: up() == {"heliotwin", "heliotwin-worker"}, "service and worker are watched")
-    rules = asked("prometheus", "/api/v1/rules")["data"]["groups"]
-    declared = (
-        (monitored.folder / "prometheus-rules.yml").read_text(encoding="utf-8").count("alert:")
-    )
-    health = [rule["health"] for group in rules for rule in group["rules"]]
-    assert len(health) == declared
-    assert set(health) <= {"ok", "unknown"}
-    until(
-        lambda: asked("prometheus", "/api/v1/alertmanagers")["data"]["activeAlertmanagers"],
-        "alerts have a way",
-    )
-
-    # Written in place: both files are mounted.
-    rules_file, configuration = (
-        monitored.folder / name for name in ("prometheus-rules.yml", "prometheus.yml")
-    )
-    patient, seldom = (path.read_text(encoding="utf-8") for path in (rules_file, configuration))
-    often = "scrape_interval: 5s\n  scrape_timeout: 5s\n  evaluation_interval: 1s"
-    assert "scrape_interval: 15s" in seldom
-    try:
-        rules_file.write_text(re.sub(r"for: \d+[mh]", "for: 0s", patient), encoding="utf-8")
-        configuration.write_text(seldom.replace("scrape_interval: 15s", often), encoding="utf-8")
-        plant("kill", "-s", "HUP", "prometheus")
-        plant("stop", "service")
-        until(
-            lambda: (
-                "HeliotwinDown"
-                in {
-                    one["labels"]["alertname"]
-                    for one in asked("alertmanager", "/api/v2/alerts") or ()
-                }
-            ),
-            "an alert reports that the service is away",
-        )
-    finally:
-        rules_file.write_text(patient, encoding="utf-8")
-        configuration.write_text(seldom, encoding="utf-8")
 
 
 def test_plant_from_empty_to_restored(plant: Composition, stj: Path, backups: Path):

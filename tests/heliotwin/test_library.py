@@ -136,10 +136,10 @@ def test_a_comparison_is_the_commands(plant, single_plant, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_study_is_the_commands_and_its_effects_act(pair_plant, tmp_path):
+def test_a_study_is_the_commands_and_its_effects_act(made_plant, tmp_path):
     root = tmp_path / "plant"
     root.mkdir()
-    for path in pair_plant.iterdir():
+    for path in made_plant.iterdir():
         (root / path.name).symlink_to(path)
     declared = {"declared": {"sun": {"shape": "buie", "circumsolar_ratio": 0.3}}}
     (root / "twin.json").write_text(json.dumps(declared))

@@ -327,7 +327,7 @@ def test_a_heliostat_without_images_is_skipped_with_its_reason(made_plant, tmp_p
 
 
 @pytest.mark.slow
-def test_demo_leaves_table_pictures_report_and_store(tmp_path, stj, demonstration):
+def test_demo_leaves_table_pictures_report_and_store(tmp_path, stj, pair_plant):
     """On one plant and then on another under the same folder, as README has it.
 
     The real heliostats are one with many photographs, one with few, and one without a surface.
@@ -336,7 +336,11 @@ def test_demo_leaves_table_pictures_report_and_store(tmp_path, stj, demonstratio
     for name in ("AA39", "AC43", "AD37"):
         shutil.copytree(stj / name, real / name)
     shutil.copy(stj / "WRI1030197-tower-measurements.json", real)
-    shutil.copytree(demonstration / "out" / "demo", tmp_path / "demo")
+    made = tmp_path / "made"
+    shutil.copytree(pair_plant / "AB12", made / "AB12")
+    shutil.copy(pair_plant / "demo-tower-measurements.json", made)
+    before = heliotwin("demo", "--data", made, "--out", tmp_path / "demo")
+    assert before.returncode == 0, before.stderr
     done = heliotwin("demo", "--data", real, "--out", tmp_path / "demo")
     assert done.returncode == 0, done.stderr
     report = json.loads((tmp_path / "demo" / "report.json").read_text())
