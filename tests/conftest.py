@@ -4,6 +4,8 @@ import fcntl
 import gc
 import os
 import shutil
+import subprocess
+import sys
 import tempfile
 
 # Two cores, several test processes: threads of linear algebra would only spin against each other.
@@ -11,6 +13,7 @@ for _library in ("OMP", "OPENBLAS", "MKL"):
     os.environ.setdefault(f"{_library}_NUM_THREADS", "1")
 
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -26,17 +29,21 @@ from service.cli.demo_plant import write_plant
 from tests.benchmarks import data_folder
 from tests.undeclared import camera
 from tests.waiting import WAIT_LIMIT_S
+from tests.watched import NotWatchedError, environment, watching
 
 torch.set_num_threads(1)
 
-FILES_OF_ONE_WORKER = {
-    "tests/docker/test_client.py",
+OF_ONE_WORKER = (
     "tests/docker/test_composition.py",
-    "tests/model/test_refinement.py",
-    "tests/test_additions.py",
+    "tests/service/browser/",
     "tests/test_wheel.py",
-}
-"""Files whose tests share what is expensive to make: an image, an environment, a surface."""
+    "tests/test_additions.py",
+    "tests/model/test_refinement.py",
+    "tests/docker/test_client.py",
+)
+"""Files and folders whose tests share what is expensive to make: an image, a browser, an
+environment, a surface. The longest come first, and they come before all others.
+"""
 
 # Time limit of requests that set none: the default of 5 s would fail on a busy machine.
 _patient = httpx.Timeout(WAIT_LIMIT_S)
@@ -45,27 +52,38 @@ for _phase in ("connect", "read", "write", "pool"):
 
 
 class FileScheduling(LoadScopeScheduling):  # type: ignore[misc]
-    """Distributes single tests, but `FILES_OF_ONE_WORKER` whole.
+    """Distributes single tests, but those `OF_ONE_WORKER` together.
 
     It replaces pytest-xdist's ``loadgroup``, which has no effect from pytest 9.2 on: xdist 3.8
     writes the group to ``Item._nodeid``, which pytest does not read any more.
     """
 
     def _split_scope(self, nodeid: str) -> str:
-        file = nodeid.partition("::")[0]
-        return file if file in FILES_OF_ONE_WORKER else nodeid
+        return next((place for place in OF_ONE_WORKER if nodeid.startswith(place)), nodeid)
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> FileScheduling | None:
     """The scheduler for ``--dist loadgroup``."""
-    return FileScheduling(config, log) if config.getvalue("dist") == "loadgroup" else None
+    if config.getvalue("dist") != "loadgroup":
+        return None
+    config.option.loadscopereorder = False  # the order is that of the collection
+    return FileScheduling(config, log)
 
 
+@pytest.hookimpl(trylast=True)  # after pytest has grouped those with the same parameters
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with the files that hold long tests: at the end no worker has one alone."""
+    """Begin with the longest, and with files that hold long tests: at the end no worker has one
+    alone.
+    """
     long = {item.path for item in items if item.get_closest_marker("slow")}
-    items.sort(key=lambda item: item.path not in long)
+
+    def order(item: pytest.Item) -> tuple[int, bool]:
+        places = (item.nodeid.startswith(place) for place in OF_ONE_WORKER)
+        place = next((n for n, is_it in enumerate(places) if is_it), len(OF_ONE_WORKER))
+        return place, item.path not in long
+
+    items.sort(key=order)
 
 
 def pytest_collection_finish() -> None:
@@ -133,18 +151,57 @@ def made_plant(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
 
 
+def _some_of(plant: Path, root: Path, *heliostats: str) -> None:
+    """Copy the plant with these heliostats."""
+    for path in plant.iterdir():
+        if path.is_file():
+            shutil.copy(path, root)
+        elif path.name in heliostats:
+            shutil.copytree(path, root / path.name)
+
+
 @pytest.fixture(scope="session")
 def pair_plant(made_plant: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same plant with two of its heliostats, for what holds for each alone; read it only."""
+    return made_once(
+        tmp_path_factory, "pair-plant", lambda root: _some_of(made_plant, root, "AB12", "AC31")
+    )
 
-    def copy(root: Path) -> None:
-        for path in made_plant.iterdir():
-            if path.is_file():
-                shutil.copy(path, root)
-            elif path.name in ("AB12", "AC31"):
-                shutil.copytree(path, root / path.name)
 
-    return made_once(tmp_path_factory, "pair-plant", copy)
+@pytest.fixture(scope="session")
+def single_plant(made_plant: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same plant with one heliostat, for what holds for each photograph; read it only."""
+    return made_once(
+        tmp_path_factory, "single-plant", lambda root: _some_of(made_plant, root, "AB12")
+    )
+
+
+@pytest.fixture(scope="session")
+def demonstration(pair_plant: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder in which ``heliotwin demo`` ran; read it only.
+
+    ``out/demo`` is what it leaves, ``said`` what it said. ``calls`` is the record of its
+    connections (`tests.watched`), where they can be watched.
+    """
+
+    def make(folder: Path) -> None:
+        shutil.copytree(pair_plant, folder / "out" / "demo" / "plant")
+        watch: list[str] = []
+        with suppress(NotWatchedError):
+            watch = watching(folder / "calls")
+        command = [*watch, sys.executable, "-m", "service", "demo", "--data", "out/demo/plant"]
+        done = subprocess.run(
+            command,
+            cwd=folder,
+            env=environment(folder),
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
+        (folder / "said").write_text(done.stderr, encoding="utf-8")
+
+    return made_once(tmp_path_factory, "demonstration", make)
 
 
 def flat_heliostat(

@@ -3,8 +3,6 @@ all libraries.
 """
 
 import os
-import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -14,54 +12,27 @@ from pathlib import Path
 import httpx
 import pytest
 
-from tests.faults.harness import ROOT
 from tests.service.conftest import free_port
 from tests.waiting import WAIT_LIMIT_S, child_process, until
+from tests.watched import NotWatchedError, environment, opened, watching
 
 pytestmark = [pytest.mark.slow]
 
-CALLS = "connect,sendto,sendmsg,sendmmsg"
 HELIOTWIN = [sys.executable, "-m", "service"]
 # onnxruntime's telemetry, where it is on, looks its host up about ten seconds after it was loaded.
 LONG_ENOUGH_S = 15.0
 
 
-def watching(record: Path) -> list[str]:
-    """What a command begins with whose connections are written to ``record``, and refused."""
-    program = shutil.which("strace")
-    if program is None:
-        pytest.skip("strace is not installed: apt-get install strace")
-    watch = [
-        program,
-        "-f",
-        "-qq",
-        "-e",
-        "signal=none",
-        "-e",
-        f"trace={CALLS}",
-        "-e",
-        "inject=connect:error=ENETUNREACH",
-    ]
-    asked = subprocess.run(
-        [*watch, "-o", str(record), "true"], capture_output=True, text=True, check=False
-    )
-    if asked.returncode:
-        pytest.skip(f"this machine lets nobody watch a process: {asked.stderr.strip()}")
-    return [*watch, "-o", str(record)]
+@pytest.fixture(scope="module", autouse=True)
+def can_watch() -> None:
+    try:
+        watching(Path(os.devnull))
+    except NotWatchedError as reason:
+        pytest.skip(str(reason))
 
 
-def opened(record: Path) -> list[str]:
-    """The connections that were tried; those of one machine's processes with each other
-    are none.
-    """
-    lines = record.read_text(encoding="utf-8").splitlines()
-    return [
-        line for line in lines if re.search(r"sa_family=(?!AF_UNIX|AF_NETLINK|AF_UNSPEC)", line)
-    ]
-
-
-def watched(folder: Path, *command: object) -> tuple[str, list[str]]:
-    """What a command prints, and the connections that it tried."""
+def watched(folder: Path, *command: object) -> list[str]:
+    """The connections that a command tries."""
     record = folder / "calls"
     done = subprocess.run(
         [*watching(record), *map(str, command)],
@@ -72,15 +43,7 @@ def watched(folder: Path, *command: object) -> tuple[str, list[str]]:
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    return done.stdout, opened(record)
-
-
-def environment(folder: Path, **more: str) -> dict[str, str]:
-    """That of a machine where nothing is set, not even that it is one for tests; some libraries
-    mind those.
-    """
-    places = {"HOME": str(folder / "home"), "PATH": "/usr/bin:/bin", "PYTHONPATH": str(ROOT)}
-    return places | {"HELIOTWIN_DATA_DIR": str(folder / "data"), "OMP_NUM_THREADS": "1"} | more
+    return opened(record)
 
 
 _CALLS_OUT = """
@@ -94,14 +57,14 @@ for ask in (lambda: socket.create_connection(("192.0.2.1", 443), 1), lambda: soc
 
 
 def test_a_connection_does_not_escape(tmp_path: Path):
-    _, calls = watched(tmp_path, sys.executable, "-c", _CALLS_OUT)
+    calls = watched(tmp_path, sys.executable, "-c", _CALLS_OUT)
     assert any("192.0.2.1" in call for call in calls)
     assert any("htons(53)" in call for call in calls)
 
 
 @pytest.mark.parametrize("word", ["--help", "migrate"])
 def test_verbs_of_the_store(tmp_path: Path, word: str):
-    _, calls = watched(tmp_path, *HELIOTWIN, word)
+    calls = watched(tmp_path, *HELIOTWIN, word)
     assert calls == []
 
 
@@ -112,13 +75,12 @@ def test_verbs_of_the_store(tmp_path: Path, word: str):
 )
 def test_verbs_on_a_folder(tmp_path: Path, pair_plant: Path, words: list[str]):
     verb, *options = words
-    _, calls = watched(tmp_path, *HELIOTWIN, verb, pair_plant, *options)
+    calls = watched(tmp_path, *HELIOTWIN, verb, pair_plant, *options)
     assert calls == []
 
 
-def test_demonstration(tmp_path: Path, pair_plant: Path):
-    _, calls = watched(tmp_path, *HELIOTWIN, "demo", "--data", pair_plant)
-    assert calls == []
+def test_demonstration(demonstration: Path):
+    assert opened(demonstration / "calls") == []
 
 
 def test_service(tmp_path: Path):

@@ -177,10 +177,17 @@ def _covered(coverage: Tensor, samples: int) -> Tensor:
     return (cells * (whole / cells.mean(dim=(-2, -1), keepdim=True))).flatten(1)
 
 
+class _Unobstructed(NamedTuple):
+    """Projected areas (B, S) [m2] that see sun and target, and `Rays.lit` (B, 2) [m2]."""
+
+    power: Tensor
+    lit: Tensor
+
+
 def _unobstructed(
     scene: Scene, power: Tensor, points: Tensor, normals: Tensor, direction: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Projected areas (B, S) [m2] of samples that see sun and target, and `Rays.lit` (B, 2) [m2].
+) -> _Unobstructed:
+    """Take the light that neighbours and the tower hide.
 
     ``points`` [m], ``normals`` [m2] and ``direction`` are (B, 3, S) in the plane's frame.
     """
@@ -196,7 +203,8 @@ def _unobstructed(
     if obstacles is not None:
         free = torch.minimum(free, clear(obstacles, points, direction, cell))
     lit = torch.stack([everything, (power * sees_sun).sum(-1)], dim=-1)
-    return (power if free is sees_sun and shades is None else power * free), lit
+    is_free = free is sees_sun and shades is None
+    return _Unobstructed(power if is_free else power * free, lit)
 
 
 def _unblocked(scene: Scene, line: Tensor, samples: int) -> Tensor:

@@ -161,16 +161,23 @@ def _is_free(obstacles: Array, place: Array, direction: Array) -> NDArray[np.boo
     return free
 
 
+class _Turned(NamedTuple):
+    """Points [m] and their area vectors [m2], each (n, 3)."""
+
+    points: Array
+    areas: Array
+
+
 def _rotate_about_first_axis(
     scene: Scene, index: int, place: Array, area: Array, angle: Array
-) -> tuple[Array, Array]:
+) -> _Turned:
     """Rotate a mirror's points and area vectors about its first axis by angles (n,) [rad]."""
     if scene.first_axis is None:
         raise InvalidInputError("tracking jitter needs a scene with 'first_axis'")
     center, turn = _plane_frame(scene, index)
     jitter = rotation(turn @ scene.first_axis[index].double().numpy(), angle)
     points = center + np.einsum("nij,nj->ni", jitter, place - center)
-    return points, np.einsum("nij,nj->ni", jitter, area)
+    return _Turned(points, np.einsum("nij,nj->ni", jitter, area))
 
 
 class MonteCarloFlux(NamedTuple):

@@ -246,11 +246,12 @@ class Scene:
         facets = self.control_points.shape[1]
         apart = self._each(lambda tensor: tensor.repeat_interleave(facets, dim=0))
         points = self.control_points.expand(self.batch, -1, -1, -1, -1).flatten(0, 1)[:, None]
-        if self.facet_reflectivity is None:
-            return apart.with_(control_points=points)
-        return apart.with_(
-            control_points=points, facet_reflectivity=self.facet_reflectivity.reshape(-1, 1)
-        )
+        own = {"control_points": points}
+        if self.facet_reflectivity is not None:
+            own["facet_reflectivity"] = self.facet_reflectivity.reshape(-1, 1)
+        if self.coverage is not None:
+            own["coverage"] = self.coverage.flatten(0, 1)[:, None]
+        return apart.with_(**own)
 
     def in_plane(self) -> PlaneScene:
         """Transform the scene to the frame of each target plane.

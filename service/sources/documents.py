@@ -21,7 +21,8 @@ from model.imaging.light import cameras_from_json
 from model.mount import Mount
 from model.plant import Cylinder, Facet, Heliostat, Plant, TargetPlane, require_cylinder_shape
 from model.pointing import Weather
-from model.sunshape import SHAPES, SunShape
+from model.sunshape import SHAPES, Buie, SunShape
+from model.sunshape.buie import chi_of_csr
 from model.tracing import Optics
 from service.base.fields import Sun
 from service.base.names import require_text
@@ -345,6 +346,14 @@ def _sun_shape(declared: Any, where: str) -> SunShape:
             f"{where}: 'shape' must be {', '.join(names)} or {last}, got {name!r}"
         )
     shape = SHAPES[name]
+    if shape is Buie and isinstance(declared, dict):
+        given = sorted({"chi", "csr", "circumsolar_ratio"} & set(declared))
+        if len(given) > 1:
+            raise InvalidInputError(f"{where}: {' and '.join(given)} are the same; give one")
+        if given == ["csr"]:
+            return Buie(chi_of_csr(_number(declared, where, "csr")))
+        if given == ["chi"]:
+            return Buie(_number(declared, where, "chi"))
     return shape(*(_number(declared, where, key) * unit for key, unit in shape.units.items()))
 
 

@@ -49,7 +49,7 @@ class MountDocument(_Part):
     drives: tuple[DriveDocument, DriveDocument] | None = None
 
 
-class FacetDocument(_Part):
+class MirrorFacet(_Part):
     """`model.plant.Facet`."""
 
     center_m: Point
@@ -76,7 +76,7 @@ class HeliostatDocument(_Part):
     width_m: Number = Field(gt=0)
     height_m: Number = Field(gt=0)
     mount: MountDocument
-    facets: tuple[FacetDocument, ...] = Field(min_length=1, max_length=256)
+    facets: tuple[MirrorFacet, ...] = Field(min_length=1, max_length=256)
     optics: OpticsDocument = OpticsDocument()
 
 
@@ -109,7 +109,7 @@ def heliostat_to_json(heliostat: Heliostat, kind: str = "") -> dict[str, object]
             axis_zero_rad=mount.axis_zero,
             drives=drives,
         ),
-        facets=tuple(map(_facet_document, heliostat.facets)),
+        facets=tuple(map(_facet_part, heliostat.facets)),
         optics=OpticsDocument(
             reflectance=heliostat.optics.reflectance,
             slope_error_mrad=heliostat.optics.slope_error * 1e3,
@@ -124,8 +124,8 @@ def _point(vector: Any) -> Point:
     return x, y, z
 
 
-def _facet_document(facet: Facet) -> FacetDocument:
-    return FacetDocument(
+def _facet_part(facet: Facet) -> MirrorFacet:
+    return MirrorFacet(
         center_m=_point(facet.position),
         half_width_m=_point(facet.canting_x),
         half_height_m=_point(facet.canting_y),

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+import pytest
 
 from tests.service.conftest import free_port
 from tests.waiting import WAIT_LIMIT_S, until
@@ -316,3 +317,12 @@ class Client:
         )
         assert ended["state"] == "done", json.dumps(ended, indent=1)
         return dict(ended)
+
+
+def binary(*names: str) -> str:
+    """The first of these programs that there is; skips the test where there is none."""
+    path = os.environ.get("HELIOTWIN_TEST_PROMETHEUS", os.environ["PATH"])
+    found = next((place for name in names if (place := shutil.which(name, path=path))), None)
+    if found is None:
+        pytest.skip(f"no {names[0]}: apt-get install prometheus prometheus-alertmanager")
+    return found

@@ -6,9 +6,7 @@ are prometheus and prometheus-alertmanager.
 
 import http.server
 import json
-import os
 import re
-import shutil
 import subprocess
 import threading
 from collections.abc import Iterator
@@ -27,7 +25,8 @@ from service.store.columns import now
 from service.store.jobs import queue
 from service.store.tables import HeliostatRow
 from service.web.app import create_app
-from tests.docker.test_docker import drawn_expressions
+from tests.docker.engine import binary
+from tests.docker.files import drawn_expressions
 from tests.service.conftest import (
     QUIET,
     FakeOperations,
@@ -42,15 +41,6 @@ from tests.service.spots import photographs
 from tests.waiting import child_process, until
 
 DOCKER = Path(__file__).parents[2] / "docker"
-
-
-def binary(*names: str) -> str:
-    """The first of these programs that there is; skips the test where there is none."""
-    path = os.environ.get("HELIOTWIN_TEST_PROMETHEUS", os.environ["PATH"])
-    found = next((place for name in names if (place := shutil.which(name, path=path))), None)
-    if found is None:
-        pytest.skip(f"no {names[0]}: apt-get install prometheus prometheus-alertmanager")
-    return found
 
 
 def test_rules_and_configurations_are_sound():

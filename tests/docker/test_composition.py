@@ -9,7 +9,8 @@ import os
 import re
 import subprocess
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -20,15 +21,13 @@ from numpy.typing import ArrayLike
 from model.frames import wgs84_to_enu
 from service.sources.paint_documents import azimuth_from_north
 from service.store.records import FORMER_NAMES
+from tests.docker.engine import binary
 from tests.waiting import until
 
 from . import engine
 from .engine import Client, Composition
-from .test_alerts import binary
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]
-
-Start = Callable[[str], Composition]
 
 
 @pytest.fixture(scope="module")
@@ -59,18 +58,22 @@ def previous(version: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator
     engine.run("docker", "rmi", "--force", f"heliotwin:{version}-previous")
 
 
-@pytest.fixture
-def start(checkout: Path, stj: Path) -> Iterator[Start]:
-    """Makes compositions that may import the real measurements; removes them at the end."""
-    started: list[Composition] = []
+@contextmanager
+def composed(checkout: Path, tag: str, stj: Path) -> Iterator[Composition]:
+    """A composition that runs, and may import the real measurements; removed at the end."""
+    made = Composition(checkout, tag, stj.resolve().parent)
+    try:
+        made.up()
+        yield made
+    finally:
+        made.tear_down()
 
-    def make(tag: str) -> Composition:
-        started.append(Composition(checkout, tag, stj.resolve().parent))
-        return started[-1]
 
-    yield make
-    for composition in started:
-        composition.tear_down()
+@pytest.fixture(scope="module")
+def plant(checkout: Path, version: str, stj: Path) -> Iterator[Composition]:
+    """The composition of this version, for all tests of it; the last of them restores it."""
+    with composed(checkout, version, stj) as running:
+        yield running
 
 
 @pytest.fixture
@@ -143,132 +146,6 @@ def test_image_starts_without_a_place_to_write(version: str):
     assert done.stderr == ""
 
 
-def test_plant_from_empty_to_restored(start: Start, version: str, stj: Path, backups: Path):
-    plant = start(version)
-    plant.up()
-    has_bounds_and_few_rights(plant)
-    database_is_out_of_reach_from_other_containers(plant, version)
-    key = plant.verb("keys", "create", "admin", "--role", "admin").strip()
-    with plant.client("wrong") as stranger, pytest.raises(AssertionError, match="401"):
-        stranger.get("/v1/heliostats")
-    with plant.client(key) as client:
-        first, again = imported(client, stj), imported(client, stj)
-        assert first["heliostats new"] >= 1
-        assert first["images new"] >= 1
-        assert again == unchanged(first)
-        predicts_and_forecasts(client)
-        survives_a_killed_worker(plant, client)
-        before = kept(client)
-        assert before["AA39"]["measurements"]["items"]
-    plant.verb("check")  # ends with 1 where something is lost
-    plant.verb("backup", "/backup/today", mounted=backups)
-    assert json.loads((backups / "today" / "manifest.json").read_text(encoding="utf-8"))["images"]
-    says_nothing_wrong(plant)
-
-    plant.tear_down()
-    plant.up("database")
-    plant.verb("restore", "/backup/today", mounted=backups)
-    plant.up()
-    with plant.client(key) as client:
-        assert kept(client) == before
-
-
-def has_bounds_and_few_rights(plant: Composition) -> None:
-    """What the engine holds each container to, the database among them."""
-    for name in ("database", "service", "worker"):
-        host = json.loads(plant.inspect(name, "{{json .HostConfig}}"))
-        assert host["Memory"] >= 2**30, name
-        assert host["NanoCpus"] >= 10**9, name
-        assert 0 < host["PidsLimit"] <= 512, name
-        assert host["LogConfig"] == {
-            "Type": "json-file",
-            "Config": {"max-file": "5", "max-size": "10m"},
-        }, name
-        assert host["ReadonlyRootfs"], name
-        assert host["CapDrop"] == ["ALL"], name
-        assert host["SecurityOpt"] == ["no-new-privileges:true"], name
-    assert json.loads(plant.inspect("database", "{{json .NetworkSettings.Ports}}")) in (
-        {},
-        {"5432/tcp": None},
-    )
-
-
-_ASK = """
-import socket, sys
-try:
-    socket.create_connection((sys.argv[1], 5432), 5).close()
-    print("reached")
-except OSError:
-    print("out of reach")
-"""
-
-
-def database_is_out_of_reach_from_other_containers(plant: Composition, version: str) -> None:
-    """By name and by address: from the network that prometheus and grafana are in; service and
-    worker reach it.
-    """
-    networks = json.loads(plant.inspect("database", "{{json .NetworkSettings.Networks}}"))
-    (address,) = (network["IPAddress"] for network in networks.values())
-    assert list(networks) == [f"{plant.project}_database"]
-    for network, found in (("default", "out of reach"), ("database", "reached")):
-        ask = [
-            "docker",
-            "run",
-            "--rm",
-            "--network",
-            f"{plant.project}_{network}",
-            "--entrypoint",
-            "python",
-        ]
-        for host in ("database", address):
-            assert engine.run(*ask, f"heliotwin:{version}", "-c", _ASK, host).strip() == found, (
-                network,
-                host,
-            )
-
-
-def predicts_and_forecasts(client: Client) -> None:
-    surface = client.post("/v1/heliostats/AA39/surfaces", {"method": "network"}).json()
-    assert surface["version"] >= 1
-    sun = {"azimuth_deg": 200, "elevation_deg": 45}
-    wanted = {"heliostat": "AA39", "target": "multi_focus_tower", "sun": sun}
-    assert client.post("/v1/forecasts", wanted).json()["power_w"] > 1000
-    field = {"target": "multi_focus_tower", "sun": sun, "surface": "ideal", "resolution": [64, 64]}
-    job = client.done(client.post("/v1/jobs/forecasts", field).headers["Location"])
-    assert job["result"]["heliostats"] >= 1
-
-
-def survives_a_killed_worker(plant: Composition, client: Client) -> None:
-    """Killed in the middle of a job, the worker comes back and ends it, and nothing of it is there
-    twice.
-    """
-    before, wanted = (
-        versions(client),
-        ["AC43", "AA39"],
-    )  # the second has many images, and takes long enough
-    asked = {"heliostats": wanted, "method": "refined", "images": 8}
-    path = client.post("/v1/jobs/predictions", asked).headers["Location"]
-    until(lambda: client.job(path).get("progress", 0) > 0, "the job is under way")
-    plant("restart", "-t", "0", "worker")
-    assert client.job(path)["state"] == "running"
-    job = client.done(path)
-    assert job["attempts"] == 2
-    made = {name: count - before[name] for name, count in versions(client).items()}
-    assert made == {name: int(name in wanted) for name in before}
-    assert sorted(job["result"]["surfaces"]) == sorted(wanted)
-
-
-def says_nothing_wrong(plant: Composition) -> None:
-    """No traceback and nothing about telemetry in the logs; of the schema one line for
-    each start.
-    """
-    for name in ("service", "worker"):
-        log = plant("logs", "--no-color", name)
-        assert "Traceback" not in log
-        assert "telemetry" not in log
-        assert 1 <= log.count("schema") <= 2
-
-
 _RENAMED = {former: name for (_, name), former in FORMER_NAMES.items()} | {
     "target_name": "target",
     "center_of_mass": "center_of_mass_m",
@@ -315,33 +192,92 @@ def changes(new: Any, old: Any, path: str = "") -> Iterator[str]:
         yield f"{path}: {old!r:.80} became {new!r:.80}"
 
 
+@pytest.fixture
+def former(checkout: Path, previous: str, stj: Path) -> Iterator[Composition]:
+    """The composition of the version before."""
+    with composed(checkout, previous, stj) as running:
+        yield running
+
+
 def test_upgrade_from_the_previous_image(
-    start: Start, version: str, previous: str, stj: Path, backups: Path
+    former: Composition, version: str, stj: Path, backups: Path
 ):
-    plant = start(previous)
-    plant.up()
-    key = plant.verb("keys", "create", "admin", "--role", "admin").strip()
-    with plant.client(key) as client:
+    key = former.verb("keys", "create", "admin", "--role", "admin").strip()
+    with former.client(key) as client:
         imported(client, stj)
         client.post("/v1/heliostats/AA39/surfaces", {"method": "network"})
         before = kept(client)
-    plant.verb("backup", "/backup/before-upgrade", mounted=backups)
+    former.verb("backup", "/backup/before-upgrade", mounted=backups)
     manifest = json.loads(
         (backups / "before-upgrade" / "manifest.json").read_text(encoding="utf-8")
     )
     assert manifest["revision"] < engine.newest_revision()
 
-    plant.environment["HELIOTWIN_VERSION"] = version
-    plant.up()
-    plant.verb("check")
-    assert plant.inspect("service", "{{.Config.Image}}") == f"heliotwin:{version}"
-    with plant.client(key) as client:
+    former.environment["HELIOTWIN_VERSION"] = version
+    former.up()
+    former.verb("check")
+    assert former.inspect("service", "{{.Config.Image}}") == f"heliotwin:{version}"
+    with former.client(key) as client:
         now = kept(client)
         tower = json.loads((stj / "WRI1030197-tower-measurements.json").read_text(encoding="utf-8"))
         before = in_present_names(before, tower["power_plant_properties"]["coordinates"])
         assert not list(changes(now, before))
         assert "images new" not in imported(client, stj)
         predicts_and_forecasts(client)
+
+
+def test_containers_have_bounds_and_few_rights(plant: Composition):
+    """What the engine holds each container to, the database among them."""
+    for name in ("database", "service", "worker"):
+        host = json.loads(plant.inspect(name, "{{json .HostConfig}}"))
+        assert host["Memory"] >= 2**30, name
+        assert host["NanoCpus"] >= 10**9, name
+        assert 0 < host["PidsLimit"] <= 512, name
+        assert host["LogConfig"] == {
+            "Type": "json-file",
+            "Config": {"max-file": "5", "max-size": "10m"},
+        }, name
+        assert host["ReadonlyRootfs"], name
+        assert host["CapDrop"] == ["ALL"], name
+        assert host["SecurityOpt"] == ["no-new-privileges:true"], name
+    assert json.loads(plant.inspect("database", "{{json .NetworkSettings.Ports}}")) in (
+        {},
+        {"5432/tcp": None},
+    )
+
+
+_ASK = """
+import socket, sys
+try:
+    socket.create_connection((sys.argv[1], 5432), 5).close()
+    print("reached")
+except OSError:
+    print("out of reach")
+"""
+
+
+def test_database_is_out_of_reach_from_other_containers(plant: Composition, version: str):
+    """By name and by address: from the network that prometheus and grafana are in; service and
+    worker reach it.
+    """
+    networks = json.loads(plant.inspect("database", "{{json .NetworkSettings.Networks}}"))
+    (address,) = (network["IPAddress"] for network in networks.values())
+    assert list(networks) == [f"{plant.project}_database"]
+    for network, found in (("default", "out of reach"), ("database", "reached")):
+        ask = [
+            "docker",
+            "run",
+            "--rm",
+            "--network",
+            f"{plant.project}_{network}",
+            "--entrypoint",
+            "python",
+        ]
+        for host in ("database", address):
+            assert engine.run(*ask, f"heliotwin:{version}", "-c", _ASK, host).strip() == found, (
+                network,
+                host,
+            )
 
 
 @pytest.fixture(scope="module")
@@ -360,18 +296,22 @@ def monitors(checkout: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterat
     engine.run("docker", "rmi", "--force", *images.values())
 
 
-def test_monitoring_reports_that_service_or_worker_is_away(
-    start: Start, version: str, monitors: dict[str, str]
-):
+@pytest.fixture
+def monitored(plant: Composition, monitors: dict[str, str]) -> Iterator[Composition]:
     """The composition's profile as it is, but for the images, and Grafana, which there is no
     program of in Debian.
     """
-    plant = start(version)
     plant.instead(monitors)
-    plant.up()
     plant("--profile", "monitoring", "up", "-d", *monitors)
+    yield plant
+    plant("--profile", "monitoring", "rm", "--force", "--stop", "-v", *monitors)
+
+
+def test_monitoring_reports_that_service_or_worker_is_away(
+    monitored: Composition, monitors: dict[str, str]
+):
     base = {
-        name: f"http://127.0.0.1:{plant.environment[f'HELIOTWIN_{name.upper()}_PORT']}"
+        name: f"http://127.0.0.1:{monitored.environment[f'HELIOTWIN_{name.upper()}_PORT']}"
         for name in monitors
     }
 
@@ -389,7 +329,9 @@ def test_monitoring_reports_that_service_or_worker_is_away(
 
     until(lambda: up() == {"heliotwin", "heliotwin-worker"}, "service and worker are watched")
     rules = asked("prometheus", "/api/v1/rules")["data"]["groups"]
-    declared = (plant.folder / "prometheus-rules.yml").read_text(encoding="utf-8").count("alert:")
+    declared = (
+        (monitored.folder / "prometheus-rules.yml").read_text(encoding="utf-8").count("alert:")
+    )
     health = [rule["health"] for group in rules for rule in group["rules"]]
     assert len(health) == declared
     assert set(health) <= {"ok", "unknown"}
@@ -400,7 +342,7 @@ def test_monitoring_reports_that_service_or_worker_is_away(
 
     # Written in place: both files are mounted.
     rules_file, configuration = (
-        plant.folder / name for name in ("prometheus-rules.yml", "prometheus.yml")
+        monitored.folder / name for name in ("prometheus-rules.yml", "prometheus.yml")
     )
     patient, seldom = (path.read_text(encoding="utf-8") for path in (rules_file, configuration))
     often = "scrape_interval: 5s\n  scrape_timeout: 5s\n  evaluation_interval: 1s"
@@ -423,3 +365,71 @@ def test_monitoring_reports_that_service_or_worker_is_away(
     finally:
         rules_file.write_text(patient, encoding="utf-8")
         configuration.write_text(seldom, encoding="utf-8")
+
+
+def test_plant_from_empty_to_restored(plant: Composition, stj: Path, backups: Path):
+    key = plant.verb("keys", "create", "admin", "--role", "admin").strip()
+    with plant.client("wrong") as stranger, pytest.raises(AssertionError, match="401"):
+        stranger.get("/v1/heliostats")
+    with plant.client(key) as client:
+        first, again = imported(client, stj), imported(client, stj)
+        assert first["heliostats new"] >= 1
+        assert first["images new"] >= 1
+        assert again == unchanged(first)
+        predicts_and_forecasts(client)
+        survives_a_killed_worker(plant, client)
+        before = kept(client)
+        assert before["AA39"]["measurements"]["items"]
+    plant.verb("check")  # ends with 1 where something is lost
+    plant.verb("backup", "/backup/today", mounted=backups)
+    assert json.loads((backups / "today" / "manifest.json").read_text(encoding="utf-8"))["images"]
+    says_nothing_wrong(plant)
+
+    plant.tear_down()
+    plant.up("database")
+    plant.verb("restore", "/backup/today", mounted=backups)
+    plant.up()
+    with plant.client(key) as client:
+        assert kept(client) == before
+
+
+def predicts_and_forecasts(client: Client) -> None:
+    surface = client.post("/v1/heliostats/AA39/surfaces", {"method": "network"}).json()
+    assert surface["version"] >= 1
+    sun = {"azimuth_deg": 200, "elevation_deg": 45}
+    wanted = {"heliostat": "AA39", "target": "multi_focus_tower", "sun": sun}
+    assert client.post("/v1/forecasts", wanted).json()["power_w"] > 1000
+    field = {"target": "multi_focus_tower", "sun": sun, "surface": "ideal", "resolution": [64, 64]}
+    job = client.done(client.post("/v1/jobs/forecasts", field).headers["Location"])
+    assert job["result"]["heliostats"] >= 1
+
+
+def survives_a_killed_worker(plant: Composition, client: Client) -> None:
+    """Killed in the middle of a job, the worker comes back and ends it, and nothing of it is there
+    twice.
+    """
+    before, wanted = (
+        versions(client),
+        ["AC43", "AA39"],
+    )  # the second has many images, and takes long enough
+    asked = {"heliostats": wanted, "method": "refined", "images": 8}
+    path = client.post("/v1/jobs/predictions", asked).headers["Location"]
+    until(lambda: client.job(path).get("progress", 0) > 0, "the job is under way")
+    plant("restart", "-t", "0", "worker")
+    assert client.job(path)["state"] == "running"
+    job = client.done(path)
+    assert job["attempts"] == 2
+    made = {name: count - before[name] for name, count in versions(client).items()}
+    assert made == {name: int(name in wanted) for name in before}
+    assert sorted(job["result"]["surfaces"]) == sorted(wanted)
+
+
+def says_nothing_wrong(plant: Composition) -> None:
+    """No traceback and nothing about telemetry in the logs; of the schema one line for
+    each start.
+    """
+    for name in ("service", "worker"):
+        log = plant("logs", "--no-color", name)
+        assert "Traceback" not in log
+        assert "telemetry" not in log
+        assert 1 <= log.count("schema") <= 2

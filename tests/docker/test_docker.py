@@ -28,23 +28,7 @@ from service.twin.alerts.alerts import REASONS
 from service.twin.alerts.field_overview import FieldOverviewCache
 from service.twin.runtime.runtime import Runtime
 from service.web.store_metrics import registry
-
-ROOT = Path(__file__).parents[2]
-DOCKER = ROOT / "docker"
-SECRET = "/run/secrets/database_password"
-
-
-def _substituted(text: str) -> str:
-    """The file with the defaults of its ``${NAME:-default}``."""
-    return re.sub(r"\$\{\w+:-([^}]*)\}", r"\1", text)
-
-
-@pytest.fixture(scope="module")
-def compose() -> dict[str, Any]:
-    document: dict[str, Any] = yaml.safe_load(
-        _substituted((DOCKER / "compose.yaml").read_text(encoding="utf-8"))
-    )
-    return document
+from tests.docker.files import DOCKER, ROOT, SECRET, drawn_expressions
 
 
 @pytest.fixture(scope="module")
@@ -240,14 +224,6 @@ def test_prometheus_sends_alerts_to_alertmanager(compose: dict[str, Any]):
     alertmanager = compose["services"]["alertmanager"]
     assert alertmanager["profiles"] == ["monitoring"]
     assert "./alertmanager.yml:/etc/alertmanager/alertmanager.yml:ro" in alertmanager["volumes"]
-
-
-def drawn_expressions() -> list[str]:
-    """What the dashboard asks Prometheus for."""
-    panels = json.loads((DOCKER / "grafana" / "heliotwin.json").read_text(encoding="utf-8"))[
-        "panels"
-    ]
-    return [target["expr"] for panel in panels for target in panel["targets"]]
 
 
 def test_grafana_draws_what_prometheus_has(compose: dict[str, Any]):

@@ -14,13 +14,12 @@ import httpx
 import psycopg
 import pytest
 
+from tests.docker.files import SECRET
 from tests.faults.harness import postgres_database
 from tests.forked import ForkedProcess
 from tests.service.command import heliotwin_process
 from tests.service.conftest import free_port
 from tests.waiting import WAIT_LIMIT_S, until
-
-from .test_docker import SECRET, compose  # noqa: F401  # a fixture
 
 
 def running(
@@ -54,7 +53,7 @@ def healthy(service: dict[str, Any], changes: dict[str, str], process: ForkedPro
 
 @pytest.mark.slow
 @pytest.mark.postgres
-def test_composition_starts_from_empty(compose: dict[str, Any], tmp_path: Path):  # noqa: F811
+def test_composition_starts_from_empty(compose: dict[str, Any], tmp_path: Path):
     services = compose["services"]
     (tmp_path / "import").mkdir()
     secret = tmp_path / "database_password"

@@ -8,19 +8,19 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from service.base.settings import Settings
 from service.web.app import create_app
-from tests.conftest import made_once
-from tests.service.command import heliotwin
+from tests.service.command import heliotwin_program
 from tests.service.conftest import QUIET, serving
 
 from .prose import DOCS, ROOT
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("documents")]
+pytestmark = [pytest.mark.slow]
 
 PAGES = [
     ROOT / "README.md",
@@ -54,6 +54,10 @@ _BLOCK = re.compile(
 )
 ADDRESS = "http://127.0.0.1:8000"
 CURL = "curl --no-progress-meter --fail-with-body "
+FORECASTS = ("forecasts/5", "forecasts/3")
+"""The next forecast after those of the shipped demonstration, one for each of four heliostats; and
+after those of the tests' demonstration, which has two.
+"""
 EMPTY = "first-photograph.md"
 """The page whose service begins without a plant."""
 
@@ -74,28 +78,16 @@ def test_blocks_are_run_or_have_a_listed_reason():
     assert sum(map(runs, PAGES)) > 8
 
 
-@pytest.fixture(scope="module")
-def demonstration(made_plant: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What ``heliotwin demo`` leaves, made of few rays; read it only."""
-
-    def make(folder: Path) -> None:
-        shutil.copytree(made_plant, folder / "out" / "demo" / "plant")
-        assert heliotwin("demo", "--data", "out/demo/plant", cwd=folder).returncode == 0
-
-    return made_once(tmp_path_factory, "demonstration", make)
-
-
 @pytest.fixture
-def folder(demonstration: Path, tmp_path: Path) -> Path:
+def folder(demonstration: Path, tmp_path: Path) -> Iterator[Path]:
     """A checkout after the demonstration, with ``heliotwin`` and ``python`` in ``bin``."""
     shutil.copytree(demonstration / "out", tmp_path / "out")
     (tmp_path / "docs").symlink_to(DOCS)
     programs = tmp_path / "bin"
     programs.mkdir()
-    for name, command in {"heliotwin": "-m service", "python": ""}.items():
-        (programs / name).write_text(f'#!/bin/sh\nexec {sys.executable} {command} "$@"\n')
-        (programs / name).chmod(0o755)
-    return tmp_path
+    (programs / "python").symlink_to(sys.executable)
+    with heliotwin_program(programs / "heliotwin"):
+        yield tmp_path
 
 
 @pytest.mark.skipif(shutil.which("curl") is None, reason="no curl")
@@ -129,6 +121,7 @@ def test_commands_of_a_page_run_in_its_order(page: Path, folder: Path):
     if ADDRESS not in script:
         run(script)
         return
+    script = script.replace(*FORECASTS)
     settings = Settings(data_dir=data, **QUIET | {"job_workers": 1})
     with serving(create_app(settings)) as address:
         run(script.replace(ADDRESS, address).replace("curl ", CURL))

@@ -19,7 +19,6 @@ from service.sources.folder import read_folder
 from tests.service.command import heliotwin as command
 
 NOON = datetime(2026, 6, 21, 11, 36, tzinfo=UTC)
-CANDIDATES = ["camera_response", "slope_error"]
 
 
 @pytest.fixture(scope="module")
@@ -109,8 +108,8 @@ def test_power_scales_with_irradiance_and_the_spot_follows_the_aim(plant):
     assert half.center_of_mass_m[0] - full.center_of_mass_m[0] == pytest.approx(-1, abs=0.02)
 
 
-def test_a_prediction_is_the_commands(plant, made_plant, tmp_path):
-    out = written(tmp_path, "predict", made_plant)
+def test_a_prediction_is_the_commands(plant, single_plant, tmp_path):
+    out = written(tmp_path, "predict", single_plant)
     entry = json.loads((out / "predictions.json").read_text())["heliostats"]["AB12"]
     found = plant.predict("AB12")
     stored = np.load(out / "AB12" / "Deflectometry" / "AB12-nurbs-surface.npz")
@@ -127,20 +126,20 @@ def test_named_photographs_are_held_out_or_not(plant):
     assert [one.is_held_out for one in compared] == [False, True, False, True]
 
 
-def test_a_comparison_is_the_commands(plant, made_plant, tmp_path):
-    out = written(tmp_path, "forecast", made_plant, "--surfaces", "measured")
+def test_a_comparison_is_the_commands(plant, single_plant, tmp_path):
+    out = written(tmp_path, "forecast", single_plant, "--surfaces", "measured")
     entries = json.loads((out / "forecast.json").read_text())["measurements"]
-    for one in plant.compare(plant.surface("AF27")):
-        entry = entries[f"AF27/{one.photograph.identifier}"]
+    for one in plant.compare(plant.surface("AB12")):
+        entry = entries[f"AB12/{one.photograph.identifier}"]
         assert (one.accuracy, one.window_m) == (entry["accuracy"], entry["window"])
         assert one.forecast.shape == one.photograph.flux.shape
 
 
 @pytest.mark.slow
-def test_a_study_is_the_commands_and_its_effects_act(made_plant, tmp_path):
+def test_a_study_is_the_commands_and_its_effects_act(pair_plant, tmp_path):
     root = tmp_path / "plant"
     root.mkdir()
-    for path in made_plant.iterdir():
+    for path in pair_plant.iterdir():
         (root / path.name).symlink_to(path)
     declared = {"declared": {"sun": {"shape": "buie", "circumsolar_ratio": 0.3}}}
     (root / "twin.json").write_text(json.dumps(declared))

@@ -24,10 +24,10 @@ from model.frames import sun_direction
 from model.imaging import center_of_mass, flux_window
 from model.metrics import flux_accuracy
 from model.plant_model import JUELICH_MODEL
-from model.setup import Setup
 from model.surface import control_points
 from model.tracing.convolution import central_rays
-from tests.conftest import flat_heliostat, target
+from tests.conftest import target
+from tests.model.scenes import setups
 
 GEOMETRY = [
     SunPosition(20.0),
@@ -36,19 +36,6 @@ GEOMETRY = [
     GravityBending(5.0),
     Blocking({"flat": 0.3}),
 ]
-
-
-def setups(count: int = 3) -> list[Setup]:
-    """Setups of several heliostats and suns at spots off the target's centre."""
-    rng = np.random.default_rng(5)
-    made = []
-    for index in range(count):
-        heliostat = flat_heliostat((-30.0 + 25 * index, 70.0 + 10 * index, 1.8), 85.0)
-        points = control_points(heliostat, rng.normal(0, 2e-4, (4, 8, 8)))
-        sun, plane = sun_direction(180 - rng.uniform(-60, 60), rng.uniform(20, 60)), target()
-        spot = plane.to_enu(rng.uniform(-0.5, 0.5, 2))
-        made.append(Setup(heliostat, points, sun, plane, spot=spot, identifier=str(index)))
-    return made
 
 
 @pytest.mark.parametrize("effects", [[], GEOMETRY], ids=["none", "geometry"])

@@ -21,8 +21,7 @@ from model.prediction_warnings import (
 from model.prior import default_prior
 from model.refinement import refine
 from tests.conftest import flat_heliostat, target
-from tests.model.test_forecast import setups
-from tests.model.test_refinement import SUNS
+from tests.model.scenes import SUNS, setups
 from tests.rendered import observe
 
 

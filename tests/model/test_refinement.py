@@ -18,11 +18,8 @@ from model.refinement import RefinementOptions, refine
 from model.refinement.half_samples import half_samples
 from model.surface import halved
 from tests.conftest import flat_heliostat, target
+from tests.model.scenes import SUNS
 from tests.rendered import observe
-
-SUNS = sun_direction_at(
-    np.array([-20.0, -5, 5, 20, 15, 0]), np.array([-40.0, 30, -15, 50, 0, 10]), 50.9
-)
 
 
 def images(heliostat: Heliostat, z: np.ndarray) -> list[Observation]:

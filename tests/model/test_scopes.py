@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from datetime import UTC, date, datetime, timedelta
+from datetime import UTC, date, datetime
 
 import numpy as np
 import pytest
@@ -16,56 +16,24 @@ from model.effects.slope_error import SlopeError
 from model.effects.sun_shape import SunShapeEffect
 from model.errors import InvalidInputError
 from model.forecast import View, align
-from model.frames import sun_direction
-from model.plant import Heliostat
 from model.plant_model import JUELICH_MODEL
-from model.setup import Setup
-from model.study import FluxImage, Study, StudyOptions, conclude, study, study_to_json
+from model.study import Study, StudyOptions, conclude, study, study_to_json
 from model.study.judging import few_gain, split
 from model.study.parameters import ParameterVector, Term, copied
 from model.study.scopes import StartDay, best_start_day, single_heliostat_scopes, time_scopes
-from model.surface import control_points
 from service.base.settings import FIGURE_SCALES
 from service.drawing.study_report import study_page
-from tests.conftest import target
+from tests.model.scenes import FIRST, photographs
 
-FIRST = datetime(2024, 6, 1, 12, tzinfo=UTC)
 CHANGE = date(2024, 6, 16)
 HAZY = {
     date(2024, 6, 7): {"circumsolar_ratio": 0.15},
     date(2024, 6, 16): {"circumsolar_ratio": 0.2},
 }
-PLACES = {"near": (-8.0, 45.0, 1.8), "far": (35.0, 110.0, 1.8), "middle": (-40.0, 75.0, 1.8)}
 TILTS = {"far": np.array([0.5, -0.3, 0.0, -0.2])}, {"far": np.array([-0.4, 0.4, 0.2, -0.2])}
 CANTED = FacetCanting(*TILTS, scope=Since(CHANGE, ("far",)))
 ROUGH = SlopeError(1.0, scope=Always(("far",)))
 LEANING = AxisTilt(2.0, scope=Always(("near",)))
-
-
-def photographs(effects: Sequence[Effect] = (), days: int = 8) -> list[FluxImage]:
-    """What the forecaster expects of three mirrors, once every third day each, with some noise."""
-    rng, plane, made = np.random.default_rng(3), target(), []
-    for name, place in PLACES.items():
-        mirror = Heliostat.juelich(
-            name, place, float(np.linalg.norm(np.array(place) - plane.center)), facet_depth=0.0
-        )
-        points = control_points(mirror, rng.normal(0, 2e-4, (4, 8, 8)))
-        for day in range(days):
-            azimuth, spot = rng.uniform(-60, 60), plane.to_enu(rng.uniform(-0.3, 0.3, 2))
-            sun, moment = (
-                sun_direction(180 - azimuth, 50 - abs(azimuth) / 2),
-                FIRST + timedelta(days=3 * day),
-            )
-            made.append(
-                Setup(mirror, points, sun, plane, spot, identifier=f"{name}/{day}", taken_at=moment)
-            )
-    images = (
-        align(made, JUELICH_MODEL.with_effects(effects)).images(View(256, 256, samples=12)).numpy()
-    )
-    images = images + 0.003 * images.max(axis=(1, 2), keepdims=True) * rng.standard_normal(
-        images.shape
-    )
-    return [FluxImage(setup, image) for setup, image in zip(made, images, strict=True)]
 
 
 def found_in(effects: Sequence[Effect], *candidates: str) -> Study:

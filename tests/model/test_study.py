@@ -35,8 +35,8 @@ from model.study.position import whiten
 from model.study.trials import TrialFitter
 from model.surface import control_points
 from tests.conftest import target
+from tests.model.scenes import PLACES
 
-PLACES = {"near": (-8.0, 45.0, 1.8), "far": (35.0, 110.0, 1.8), "middle": (-40.0, 75.0, 1.8)}
 SMALL = View(40, 40, samples=8, padding=0.125)
 FINE = View(96, 96, samples=12)
 CAMERA = View(256, 256, samples=12)

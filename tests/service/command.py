@@ -6,10 +6,14 @@ A separate process takes seconds to load them. Tests of starting, listening and 
 
 import os
 import sys
-from contextlib import AbstractContextManager, redirect_stderr, redirect_stdout
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, redirect_stderr, redirect_stdout
 from io import StringIO
+from multiprocessing.connection import Client, Listener
 from pathlib import Path
 from subprocess import CompletedProcess
+from tempfile import TemporaryDirectory
 
 import pytest
 
@@ -81,6 +85,59 @@ def heliotwin_process(
         *map(str, arguments),
         output=Output(folder / "stdout", folder / "stderr"),
     )
+
+
+_PROGRAM = """#!{python} -SE
+import os, sys
+from multiprocessing.connection import Client
+
+with Client({address!r}) as tests:
+    tests.send((os.getcwd(), dict(os.environ), sys.argv[1:]))
+    code, output, errors = tests.recv()
+sys.stdout.buffer.write(output)
+sys.stderr.buffer.write(errors)
+sys.exit(code)
+"""
+
+
+@contextmanager
+def heliotwin_program(file: Path) -> Iterator[None]:
+    """The command as a program for scripts, in ``file``.
+
+    Each run is a separate process as that of `heliotwin_process`.
+    """
+    with Listener() as listener:
+        file.write_text(_PROGRAM.format(python=sys.executable, address=listener.address))
+        file.chmod(0o755)
+        answering = threading.Thread(target=_answer, args=(listener,))
+        answering.start()
+        try:
+            yield
+        finally:
+            with Client(listener.address) as end:
+                end.send(None)
+            answering.join()
+
+
+def _answer(listener: Listener) -> None:
+    while True:
+        with listener.accept() as program:
+            asked = program.recv()
+            if asked is None:
+                return
+            program.send(_run(*asked))
+
+
+def _run(
+    folder: str, environment: Mapping[str, str], arguments: Sequence[str]
+) -> tuple[int, bytes, bytes]:
+    with TemporaryDirectory() as said:
+        files = Path(said, "stdout"), Path(said, "stderr")
+        with forked_process(
+            _call_main, environment, folder, *arguments, output=Output(*files)
+        ) as process:
+            code = process.wait()
+        return code, files[0].read_bytes(), files[1].read_bytes()
 
 
 def ends(done: CompletedProcess[str], code: int, says: str) -> None:

@@ -130,15 +130,16 @@ def copied_schema(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     migrated.close()
     upgrade = Database.upgrade
 
-    def copy_and_upgrade(self: Database, revision: str = "head") -> None:
+    def copy_or_upgrade(self: Database, revision: str = "head") -> None:
         if revision == "head" and self.url.get_backend_name() == "sqlite" and self.url.database:
             file = Path(self.url.database)
             if not file.exists():
                 shutil.copyfile(template, file)
+                return
         upgrade(self, revision)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Database, "upgrade", copy_and_upgrade)
+        patch.setattr(Database, "upgrade", copy_or_upgrade)
         yield
 
 

@@ -19,7 +19,6 @@ from opentelemetry.sdk.trace import TracerProvider
 from opentelemetry.sdk.trace.export import SimpleSpanProcessor
 from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
 from prometheus_client import CollectorRegistry
-from prometheus_client.parser import text_string_to_metric_families
 
 from model.errors import InvalidInputError
 from service import store
@@ -32,24 +31,10 @@ from service.store.tables import DriftRow, HeliostatRow
 from service.twin.runtime.runtime import Runtime
 from service.web import store_metrics
 from tests.service.conftest import FakeOperations, Post, client_of, free_port, png
+from tests.service.metrics import samples, value
 from tests.waiting import WAIT_LIMIT_S, child_process, until
 
 ROOT = Path(__file__).parents[3]
-
-
-def samples(client: TestClient) -> dict[tuple[str, frozenset[tuple[str, str]]], float]:
-    answer = client.get("/metrics")
-    assert answer.status_code == 200
-    assert answer.headers["content-type"].startswith("text/plain; version=")
-    return {
-        (sample.name, frozenset(sample.labels.items())): sample.value
-        for family in text_string_to_metric_families(answer.text)
-        for sample in family.samples
-    }
-
-
-def value(found: dict[Any, float], name: str, **labels: str) -> float:
-    return found.get((name, frozenset(labels.items())), 0.0)
 
 
 # --- metrics

@@ -179,15 +179,15 @@ SHOULDER = {"name": "camera_shoulder", "parameters": {"compression": 2.0}}
 @pytest.mark.parametrize(
     "effects", [[], [SHOULDER], [{"name": "sun_shape", "parameters": {"circumsolar_ratio": 0.4}}]]
 )
-def test_no_effect_of_a_camera_makes_light(pair_plant, tmp_path, effects):
+def test_no_effect_of_a_camera_makes_light(single_plant, tmp_path, effects):
     """Whatever the camera: an adopted shoulder made 8.8 kW out of a mirror of 8.2 m2 under 1000
     W/m2.
     """
     (tmp_path / "effects.json").write_text(json.dumps({"effects": effects}))
     report = succeeds(
-        "forecast", pair_plant, "--out", tmp_path, "--effects", tmp_path / "effects.json"
+        "forecast", single_plant, "--out", tmp_path, "--effects", tmp_path / "effects.json"
     )
-    folder = read_folder(pair_plant)
+    folder = read_folder(single_plant)
     for key, entry in report["measurements"].items():
         _, _, half_sizes = folder.plant.heliostats[key.split("/")[0]].facet_frames
         area = 4 * half_sizes.prod(axis=1).sum()
@@ -197,16 +197,16 @@ def test_no_effect_of_a_camera_makes_light(pair_plant, tmp_path, effects):
             assert np.array_equal(made["flux"], made["camera_view"]) == (effects != [SHOULDER])
 
 
-def test_effects_of_a_studys_report_are_added_to_the_declared_ones(pair_plant, tmp_path):
+def test_effects_of_a_studys_report_are_added_to_the_declared_ones(single_plant, tmp_path):
     sigma = {"sigma_mrad": {"value": 2.0, "ci95": [1.9, 2.1], "unit": "mrad"}}
     found = {"verdict": "effect", "effects": [{"name": "slope_error", "parameters": sigma}]}
     (tmp_path / "report.json").write_text(json.dumps(found))
-    folder = read_folder(pair_plant, ["AB12"])
+    folder = read_folder(single_plant)
     plain = forecast_folder(folder, tmp_path / "plain")
     known = replace(folder, model=folder.model.with_effects([GravityBending(3.0)]))
     declared = forecast_folder(known, tmp_path / "declared")
     added = succeeds(
-        "forecast", pair_plant, "--out", tmp_path / "added", "--effects", tmp_path / "report.json"
+        "forecast", single_plant, "--out", tmp_path / "added", "--effects", tmp_path / "report.json"
     )
     assert [effect["name"] for effect in declared["effects"]] == ["gravity_bending"]
     assert added["effects"] == [{"name": "slope_error", "parameters": {"sigma_mrad": 2.0}}]
@@ -327,7 +327,7 @@ def test_a_heliostat_without_images_is_skipped_with_its_reason(made_plant, tmp_p
 
 
 @pytest.mark.slow
-def test_demo_leaves_table_pictures_report_and_store(tmp_path, stj, pair_plant):
+def test_demo_leaves_table_pictures_report_and_store(tmp_path, stj, demonstration):
     """On one plant and then on another under the same folder, as README has it.
 
     The real heliostats are one with many photographs, one with few, and one without a surface.
@@ -336,11 +336,7 @@ def test_demo_leaves_table_pictures_report_and_store(tmp_path, stj, pair_plant):
     for name in ("AA39", "AC43", "AD37"):
         shutil.copytree(stj / name, real / name)
     shutil.copy(stj / "WRI1030197-tower-measurements.json", real)
-    made = tmp_path / "made"
-    shutil.copytree(pair_plant / "AB12", made / "AB12")
-    shutil.copy(pair_plant / "demo-tower-measurements.json", made)
-    before = heliotwin("demo", "--data", made, "--out", tmp_path / "demo")
-    assert before.returncode == 0, before.stderr
+    shutil.copytree(demonstration / "out" / "demo", tmp_path / "demo")
     done = heliotwin("demo", "--data", real, "--out", tmp_path / "demo")
     assert done.returncode == 0, done.stderr
     report = json.loads((tmp_path / "demo" / "report.json").read_text())

@@ -4,7 +4,6 @@ heliostats.
 
 import json
 import shutil
-from copy import deepcopy
 from datetime import UTC, date, datetime
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,6 @@ from model.effects import Since
 from model.effects.encoder_offset import EncoderOffset
 from model.errors import InvalidInputError
 from model.forecast import align
-from model.frames import enu_to_wgs84
 from model.imaging import center_of_mass
 from model.plant_model import PlantModel
 from model.pointing import Weather, calibrate_field
@@ -31,72 +29,15 @@ from service.cli.folder_pointing import calibrate_folder, spot_folder
 from service.cli.folder_store import open_folder
 from service.cli.main import app
 from service.sources.folder import read_folder
-from service.sources.paint_documents import azimuth_from_south
 from service.twin.heliostats.stored_mount import load_mount
 from service.twin.pointing.calibration import calibrate_store, make_plan
 from service.twin.runtime.runtime import Runtime
 from service.twin.transfer.importing import import_folder
 from tests.benchmarks.folders import read_readings
 from tests.benchmarks.pointing import Plant, with_clock
-from tests.service.conftest import ORIGIN, QUIET, properties_document, tower_document
+from tests.service.cli.motor_folder import write, write_measurement
+from tests.service.conftest import QUIET, properties_document, tower_document
 from tests.service.spots import photographs
-
-
-def write(path: Path, document: Any) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(document))
-
-
-def write_measurement(
-    root: Path, name: str, number: int, taken: dict[str, Any], **changes: Any
-) -> None:
-    document = {
-        "motor_position": dict(
-            zip(
-                ("axis_1_motor_position", "axis_2_motor_position"),
-                taken["motor_position"],
-                strict=True,
-            )
-        ),
-        "target_name": "lower",
-        "sun_azimuth": azimuth_from_south(taken["sun"]["azimuth_deg"]),
-        "sun_elevation": taken["sun"]["elevation_deg"],
-        "focal_spot": {"UTIS": enu_to_wgs84(taken["focal_spot_m"], ORIGIN).tolist()},
-        **changes,
-    }
-    kept = {key: value for key, value in document.items() if value is not None}
-    write(root / name / "Calibration" / f"{number}-calibration-properties.json", kept)
-
-
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    """AA39 with 16 good measurements and others; AB01 has no drives, AB02 no measurement, AB09 no
-    properties.
-    """
-    root = tmp_path / "plant"
-    write(root / "P-tower-measurements.json", tower_document())
-    for name in ("AA39", "AB01", "AB02"):
-        properties = deepcopy(properties_document())
-        if name == "AB01":
-            properties["kinematics_properties"]["actuators"] = []
-        write(root / name / "Properties" / f"{name}-heliostat-properties.json", properties)
-    taken = photographs(tower_document(), properties_document())
-    for number, one in enumerate(taken):
-        write_measurement(root, "AA39", 100 + number, one)
-        item = {"properties": {"datetime": one["taken_at"]}}
-        if number % 3 != 1:  # the time of the others is not known
-            write(
-                root / "AA39" / "Calibration" / f"{100 + number}-calibration-item-stac.json", item
-            )
-    far = [50.92, 6.39, 100.0]
-    write_measurement(root, "AA39", 200, taken[0], motor_position=None)
-    write_measurement(root, "AA39", 201, taken[0], focal_spot=None)
-    write_measurement(root, "AA39", 202, taken[0], sun_azimuth=None)
-    write_measurement(root, "AA39", 203, taken[0], focal_spot={"UTIS": far})
-    write_measurement(root, "AA39", 204, {**taken[0], "motor_position": [82519.0, 100.0]})
-    write_measurement(root, "AB01", 300, taken[0])
-    write_measurement(root, "AB09", 400, taken[0])
-    return root
 
 
 def test_the_demonstrations_motors_tell_where_its_mirrors_point(pair_plant: Path, tmp_path: Path):

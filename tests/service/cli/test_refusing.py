@@ -13,7 +13,6 @@ from typer.testing import CliRunner
 from service.cli.folder_pointing import calibrate_folder
 from service.cli.main import app
 from service.sources.folder import read_folder
-from tests.service.cli.test_pointing import folder  # noqa: F401 - a fixture
 from tests.service.command import ends, heliotwin_on
 
 
@@ -79,7 +78,7 @@ def test_a_broken_heliostat_costs_only_itself_and_is_no_success(
     assert made is None or (tmp_path / "out" / made).is_file()
 
 
-def test_a_broken_heliostat_costs_no_mount_of_others(folder: Path, tmp_path: Path):  # noqa: F811
+def test_a_broken_heliostat_costs_no_mount_of_others(folder: Path, tmp_path: Path):
     (folder / "AB02" / "Properties" / "AB02-heliostat-properties.json").write_text('{"width": 3.2')
     mounts, spots = tmp_path / "mounts.json", tmp_path / "spots.json"
     for verb, out in (("calibrate", mounts), ("spot", spots)):
@@ -98,7 +97,7 @@ def test_where_nothing_is_left_the_broken_file_is_named(broken: Path, tmp_path: 
     ends(done, 2, "ZZ99-heliostat-properties.json: is no JSON")
 
 
-def test_until_says_how_many_without_a_time_it_leaves_out(folder: Path, tmp_path: Path):  # noqa: F811
+def test_until_says_how_many_without_a_time_it_leaves_out(folder: Path, tmp_path: Path):
     out = tmp_path / "mounts.json"
     done = CliRunner().invoke(
         app, ["calibrate", str(folder), "--out", str(out), "--until", "2024-05-10"]

@@ -9,7 +9,6 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import date
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +27,7 @@ from service.cli.folder_study import FolderStudy, study_folder
 from service.cli.main import main
 from service.drawing.study_report import study_page
 from service.sources.folder import read_folder
+from tests.page import Page
 
 HELIOSTATS = ("AD34", "AR18")
 
@@ -203,38 +203,9 @@ def test_a_spot_off_its_target_is_skipped_by_name(few, tmp_path):
 # --------------------------------------------------------------------------------------------------
 
 
-class _Reader(HTMLParser):
-    """The words of a page, its tags, and every address it names."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.words: list[str] = []
-        self.tags: list[str] = []
-        self.addresses: list[str] = []
-        self.labels: list[str] = []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append(tag)
-        given = dict(attrs)
-        self.addresses += [
-            given[name] or "" for name in ("src", "href", "action", "data") if name in given
-        ]
-        if tag == "svg" and given.get("role") == "img":
-            self.labels.append(given.get("aria-label") or given.get("aria-labelledby") or "")
-
-    def handle_data(self, data: str) -> None:
-        self.words.append(data)
-
-
-def read(page: str) -> _Reader:
-    reader = _Reader()
-    reader.feed(page)
-    return reader
-
-
 def text(page: str) -> str:
     """The words of a page, blanks made one."""
-    return re.sub(r"\s+", " ", "".join(read(page).words))
+    return re.sub(r"\s+", " ", Page(page).words)
 
 
 def test_accuracies_are_in_percent_as_on_all_pages(hazy):
@@ -251,13 +222,15 @@ def test_accuracies_are_in_percent_as_on_all_pages(hazy):
 
 def test_the_page_stands_alone(hazy):
     page = study_page(hazy.study, "few", FIGURE_SCALES)
-    reader = read(page)
-    assert not {"script", "link", "iframe", "object", "form"} & set(reader.tags)
-    assert all(address.startswith("data:image/png;base64,") for address in reader.addresses)
-    assert len(reader.addresses) == 3 * 5 + 1
+    elements = Page(page).all()
+    assert not {"script", "link", "iframe", "object", "form"} & {one.tag for one in elements}
+    addresses = Page(page).links
+    assert all(address.startswith("data:image/png;base64,") for address in addresses)
+    assert len(addresses) == 3 * 5 + 1
     rest = re.sub(r"data:image/png;base64,[^\"]*", "", page)
     assert not re.search(r"https?:|//[a-z]|url\((?!#)|@import|style=", rest)
-    assert all(reader.labels)
+    for drawing in Page(page).all("svg", role="img"):
+        assert drawing.attributes.get("aria-label") or drawing.attributes.get("aria-labelledby")
 
 
 def test_the_page_says_what_was_found(hazy):
@@ -301,7 +274,8 @@ def test_parameters_of_facets_stand_in_columns(hazy):
     assert "Facet 4" in text(page)
     assert page.count("<code>x_mrad</code>") == page.count("<code>y_mrad</code>") == 2
     telling = [abs(v) > 0.196 for v in values]
-    assert len(re.findall(r"<strong>[−0-9.]+</strong><small>", page)) == sum(telling)
+    strong = [cell for cell in Page(page).all("td") if cell.all("strong") and cell.all("small")]
+    assert len(strong) == sum(telling)
 
 
 def test_what_comes_and_goes_is_shown_by_day(hazy):
@@ -328,5 +302,5 @@ def test_names_are_text_wherever_they_come_from(hazy):
     ]
     page = study_page(replace(hazy.study, images=photographs), evil, FIGURE_SCALES, {evil: evil})
     assert "<script" not in page
-    assert "script" not in read(page).tags
-    assert evil in "".join(read(page).words)
+    assert not Page(page).all("script")
+    assert evil in Page(page).words

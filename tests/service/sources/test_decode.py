@@ -16,6 +16,7 @@ from model.errors import InvalidInputError
 from service.base.errors import BusyError
 from service.sources import decode
 from service.sources.decode import decode_image
+from tests.service.sources.pictures import PIXELS, gray_tiff, jpeg_of_scans, tiff
 
 
 @pytest.fixture(scope="module")
@@ -172,48 +173,10 @@ def test_a_second_frame_is_refused(picture):
         decode_image(data[:frame] + data[frame : frame + 2 + length] + data[frame:])
 
 
-def jpeg_of_scans(count):
-    """A small file of 500 x 800 pixels with so many scans, the last of which refine nothing."""
-    data = cv2.imencode(
-        ".jpg", np.full((500, 800), 90, np.uint8), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1]
-    )[1].tobytes()
-    last = data.rindex(b"\xff\xda")
-    return data[:last] + data[last:-2] * (count - data.count(b"\xff\xda") + 1) + data[-2:]
-
-
 def test_a_progressive_jpeg_is_decoded_and_one_of_endless_scans_is_not():
     assert decode_image(jpeg_of_scans(20)).shape == (500, 800)
     with pytest.raises(InvalidInputError, match="2501 scans over 800 x 500 pixels takes too long"):
         decode_image(jpeg_of_scans(2501))
-
-
-def tiff(*entries, data=b""):
-    """A little-endian TIFF of entries (tag, type, count, value), with ``data`` behind its
-    directory.
-    """
-    directory = b"".join(struct.pack("<HHII", *entry) for entry in entries)
-    return b"II*\0" + struct.pack("<IH", 8, len(entries)) + directory + bytes(4) + data
-
-
-SHORT, LONG = 3, 4
-GRAY = {
-    256: (SHORT, 1, 8),
-    257: (SHORT, 1, 8),
-    258: (SHORT, 1, 8),
-    259: (SHORT, 1, 1),
-    262: (SHORT, 1, 1),
-}
-"""An image of 8 x 8 pixels."""
-BEHIND = {273: (LONG, 1, 122), 277: (SHORT, 1, 1), 278: (SHORT, 1, 8), 279: (LONG, 1, 64)}
-"""Its pixels lie behind nine entries."""
-PIXELS = bytes(range(64))
-
-
-def gray_tiff(*more, **changed):
-    """With ``more`` entries behind; ``changed`` are entries by ``_TAG``."""
-    changes = {int(name[1:]): entry for name, entry in changed.items()}
-    fields = GRAY | BEHIND | changes
-    return tiff(*[(tag, *fields[tag]) for tag in sorted(fields)], *more, data=PIXELS)
 
 
 def test_a_plain_tiff_is_decoded():

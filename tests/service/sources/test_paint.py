@@ -12,6 +12,7 @@ from model.effects import effect_to_json
 from model.errors import InvalidInputError
 from model.metrics import surface_error
 from model.sunshape import Buie, Gaussian, Pillbox
+from model.sunshape.buie import chi_of_csr
 from model.surface import control_points, evaluate
 from service.sources.documents import (
     optics_to_json,
@@ -89,6 +90,8 @@ def test_deflectometry_h5_is_fitted(tmp_path):
     ("sun", "shape"),
     [
         ({"shape": "buie", "circumsolar_ratio": 0.1}, Buie(0.1)),
+        ({"shape": "buie", "chi": 0.1}, Buie(0.1)),
+        ({"shape": "buie", "csr": 0.05}, Buie(chi_of_csr(0.05))),
         ({"shape": "pillbox", "half_angle_mrad": 4.7}, Pillbox(4.7e-3)),
         ({"shape": "gaussian", "sigma_mrad": 2.5}, Gaussian(2.5e-3)),
     ],
@@ -130,6 +133,10 @@ def test_declared_effects(tmp_path):
         ("{}", "'declared' is missing"),
         ('{"declared": {"sun": {"shape": "square"}}}', "'shape' must be"),
         ('{"declared": {"sun": {"shape": "buie", "circumsolar_ratio": NaN}}}', "finite number"),
+        (
+            '{"declared": {"sun": {"shape": "buie", "chi": 0.02, "csr": 0.02}}}',
+            "chi and csr are the same; give one",
+        ),
         ('{"declared": {"effects": [{"name": "dust"}]}}', "twin.json: effect 'dust' is unknown"),
         (
             '{"declared": {"effects": [{"name": "slope_error", "parameters": {"sigma_mrad": 9}}]}}',

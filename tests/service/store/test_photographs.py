@@ -37,9 +37,7 @@ from service.twin.plant import setup
 from service.twin.runtime.runtime import Runtime
 from service.twin.surfaces.prediction import predict_surface
 from tests.service.conftest import png, properties_document, sun_at
-from tests.service.store.test_recovery import PHOTOGRAPH, elsewhere, runtime
-
-__all__ = ["elsewhere", "runtime"]  # fixtures
+from tests.service.store.stores import PHOTOGRAPH
 
 # `runtime` has the photographs 0 to 3, a surface made from them, and 9, which came after it.
 TODAYS = {1, 2, 3}

@@ -13,7 +13,6 @@ from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from model.errors import InvalidInputError
-from model.plant import TargetPlane
 from service import store
 from service.base.arrays import pack, unpack
 from service.base.errors import ConflictError, NotFoundError
@@ -25,11 +24,10 @@ from service.store.jobs import queue
 from service.store.photographs.measurements import MeasurementFilter
 from service.store.rows import Change
 from service.store.surfaces.surface_versions import NewSurface
-from service.store.tables import HeliostatRow, ImageRow, MeasurementRow, SurfaceRow, TargetRow
+from service.store.tables import HeliostatRow, SurfaceRow, TargetRow
 from tests.service.conftest import ORIGIN
+from tests.service.store.rows import PLANE, new
 from tests.waiting import WAIT_LIMIT_S
-
-PLANE = TargetPlane("lower", np.zeros(3), np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), 8.6, 7.2)
 
 
 def setup(session: Session) -> tuple[HeliostatRow, TargetRow]:
@@ -37,24 +35,6 @@ def setup(session: Session) -> tuple[HeliostatRow, TargetRow]:
     return store.put_heliostat(session, "AA39", {"a": 1}, (1, 2, 3))[0], store.put_target(
         session, PLANE
     )[0]
-
-
-def new(
-    target: TargetRow, image: str = "a", kind: str = "flux", **changes: Any
-) -> tuple[ImageRow, MeasurementRow]:
-    values: dict[str, Any] = {
-        "kind": kind,
-        "target_id": target.id,
-        "sun_azimuth_deg": 170.0,
-        "sun_elevation_deg": 40.0,
-        "accepted": True,
-        "quality": {"accepted": True},
-        "arrays": pack({"centered": np.ones((64, 64), np.float32)}),
-    }
-    stored = ImageRow(
-        sha256=image * 64, media_type="image/png", size_bytes=10, width_px=4, height_px=5
-    )
-    return stored, MeasurementRow(**(values | changes))
 
 
 def test_plant_target_and_heliostat_are_written_once(database: Database):

@@ -18,7 +18,7 @@ from service.store.jobs import queue
 from service.store.tables import ForecastRow
 from service.twin.runtime.runtime import Runtime
 from tests.service.conftest import FakeOperations
-from tests.service.store.test_statements import fill
+from tests.service.store.rows import fill
 
 _RETENTIONS = ("job_retention_days", "forecast_retention_days", "audit_retention_days")
 

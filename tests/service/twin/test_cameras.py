@@ -14,7 +14,7 @@ from service.base.settings import Settings
 from service.store.columns import now
 from service.store.tables import ImageRow, MeasurementRow
 from service.twin.studies.camera_watch import FIGURES, find_camera_change
-from tests.service.web.test_pages import HTML
+from tests.service.web.pages import HTML
 
 SETTINGS = Settings()
 SPREAD = (0.16, 0.2, 0.17)

@@ -24,7 +24,7 @@ from service.jobs.kinds import KINDS
 from service.jobs.worker import Worker
 from service.twin.runtime.engines import Ray, Threads, engine_of
 from tests.conftest import target
-from tests.service.twin.test_field_light import FLEET, field, runtime_of  # noqa: F401  # a fixture
+from tests.service.twin.fields import FLEET, runtime_of
 
 SUN = sun_direction(160.0, 30.0)
 
@@ -100,7 +100,7 @@ def test_cluster_gives_the_same_light_also_where_a_worker_is_killed(cluster: Any
 
 @pytest.mark.slow
 @pytest.mark.parametrize("store_url", ["sqlite"], indirect=True)
-def test_service_forecasts_on_the_cluster(cluster: Any, field: Any):  # noqa: F811
+def test_service_forecasts_on_the_cluster(cluster: Any, field: Any):
     runtime = runtime_of(field)
     fluxes = []
     for address in (None, "local"):

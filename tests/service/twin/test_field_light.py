@@ -1,77 +1,26 @@
 """Forecasts of a whole field over HTTP, with the real tracer, on both databases."""
 
 import threading
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
-from fastapi import FastAPI
 from fastapi.testclient import TestClient
-from sqlalchemy import URL
 
 from model.fleet import Superposition
 from model.frames import sun_direction
-from model.plant import Heliostat, Plant
-from model.surface import control_points
-from service import store
-from service.base.settings import Settings
-from service.cli.demo_plant import ORIGIN, TARGET, properties
+from service.cli.demo_plant import TARGET
 from service.jobs.kinds import KINDS, field_forecasts
 from service.jobs.worker import Worker
 from service.sources.documents import read_receivers
 from service.sources.folder import read_folder
-from service.store.database import Database
 from service.store.jobs import queue
-from service.store.surfaces.surface_versions import NewSurface
 from service.twin.forecasts import field_forecast
 from service.twin.plant import model_versions
-from service.twin.runtime.runtime import Runtime
-from service.web.app import create_app
-from tests.service.conftest import QUIET, FakeOperations, Post, client_of, png
+from tests.service.conftest import FakeOperations, Post, png
 from tests.service.studies import add, adopt
-from tests.service.twin.test_study import heights
-
-SUN = {"azimuth_deg": 200.0, "elevation_deg": 20.0}
-FLEET = {"target": TARGET.name, "sun": SUN, "resolution": 32}
-FIELD = {
-    f"B{row}{column}": (column * 4.2 - 4.2, 60 + row * 3.6, 1.8)
-    for row in range(3)
-    for column in range(3)
-}
-
-
-def fill(database: Database) -> None:
-    """A dense field of nine; all but the last have a surface."""
-    rng, plant = np.random.default_rng(3), Plant("demo", ORIGIN)
-    with database.writing() as session:
-        store.put_plant(session, "demo", ORIGIN)
-        store.put_target(session, TARGET)
-        for name, position in FIELD.items():
-            mirror = Heliostat.juelich(name, position, 70.0)
-            row, _ = store.put_heliostat(
-                session, name, properties(mirror, plant), np.array(position)
-            )
-            if name != "B22":
-                for _ in range(2):  # the second is the current one
-                    z = heights(rng)
-                    store.add_surface(
-                        session, row, NewSurface("measured", z, 0 * z, control_points(mirror, z))
-                    )
-
-
-@pytest.fixture
-def field(store_url: URL, tmp_path: Path) -> Iterator[TestClient]:
-    url = store_url.render_as_string(hide_password=False).replace("+psycopg", "")
-    app = create_app(Settings(data_dir=tmp_path / "data", database_url=url, **QUIET))
-    with client_of(app) as client:
-        fill(app.state.runtime.database)
-        yield client
-
-
-def runtime_of(client: TestClient) -> Runtime:
-    return cast(Runtime, cast(FastAPI, client.app).state.runtime)
+from tests.service.twin.fields import FIELD, FLEET, SUN, runtime_of
 
 
 def fleet(client: TestClient, **changes: Any) -> tuple[dict[str, Any], np.ndarray]:

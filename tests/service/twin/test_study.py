@@ -40,6 +40,7 @@ from service.twin.runtime.slots import ComputeSlots
 from service.twin.studies.study import StudyRequest, load_study_inputs, study_store
 from service.web.app import create_app
 from tests.service.conftest import QUIET, client_of, until
+from tests.service.twin.fields import heights
 from tests.waiting import WAIT_LIMIT_S
 
 GAMMA = 0.6
@@ -53,16 +54,6 @@ FORECAST = {
     "resolution": 32,
     "surface": 1,
 }
-
-
-def heights(rng: np.random.Generator) -> np.ndarray:
-    """A mirror's surface (4, 8, 8) [m]: a few waves of half a millimetre on each facet."""
-    x = np.linspace(0, np.pi, 8)
-    waves = [
-        np.outer(np.cos(i * x), np.cos(j * x)) for i in range(3) for j in range(3) if i + j > 1
-    ]
-    z = np.tensordot(rng.normal(0, 2e-4, (4, len(waves))), np.array(waves), axes=1)
-    return np.asarray(z - z.mean(axis=(1, 2), keepdims=True))
 
 
 def photographs(

@@ -13,8 +13,7 @@ from service.cli.main import app as command
 from service.store import outdated_surfaces
 from tests.service.conftest import FakeOperations, Post, png
 from tests.service.studies import SLOPE, report_of
-from tests.service.web.test_pages import HTML, keep_study, make_key, text_of
-from tests.service.web.test_plans import work
+from tests.service.web.pages import HTML, keep_study, make_key, text_of, work
 
 
 @pytest.fixture

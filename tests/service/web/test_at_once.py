@@ -3,8 +3,7 @@ taken back.
 """
 
 import threading
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -25,6 +24,7 @@ from service.store.tables import HeliostatRow, ImageRow, MeasurementRow
 from service.web.app import create_app
 from service.web.responses.problems import database_away
 from tests.service.conftest import QUIET, FakeOperations, client_of, png, poster
+from tests.service.web.at_once import at_once
 from tests.waiting import WAIT_LIMIT_S
 
 PLANE = {"plane": {"center": [0, -3, 36], "normal": [0, 2, 0], "width": 8.6, "height": 7.2}}
@@ -45,18 +45,6 @@ def both(store_url: URL, tmp_path: Path) -> Iterator[TestClient]:
         create_app(Settings(data_dir=tmp_path, database_url=address, **QUIET), FakeOperations())
     ) as client:
         yield client
-
-
-def at_once(*calls: Callable[[], Any]) -> list[Any]:
-    """What each of these gives, all begun at one moment."""
-    barrier = threading.Barrier(len(calls))
-
-    def run(call: Callable[[], Any]) -> Any:
-        barrier.wait()
-        return call()
-
-    with ThreadPoolExecutor(len(calls)) as pool:
-        return list(pool.map(run, calls))
 
 
 def test_target_and_receiver_never_have_one_name(both: TestClient):

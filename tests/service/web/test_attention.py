@@ -41,7 +41,7 @@ from tests.service.conftest import (
 )
 from tests.service.spots import calibrate, photographs
 from tests.service.studies import SLOPE, study_row
-from tests.service.web.test_trust import Doubter
+from tests.service.web.operations import Doubter
 
 HTML = {"Accept": "text/html"}
 PATH = "/v1/attention"

@@ -1,6 +1,5 @@
 """The page that holds two surfaces against each other."""
 
-import re
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
@@ -12,7 +11,7 @@ from model.surface import greville
 from service.drawing.charts import Value, timeline
 from service.twin.alerts.field_overview import surface_errors
 from tests.service.conftest import FakeOperations, Post, png, sun_at
-from tests.service.web.test_pages import HTML, settled, text_of
+from tests.service.web.pages import HTML, settled, text_of
 
 DAYS = ("2024-06-01", "2024-07-01", "2024-08-01")
 
@@ -53,7 +52,8 @@ def test_versions_are_compared_with_their_forecasts(pages: TestClient, operation
     assert "they agree by 100.0" in page
     # Only the third photograph has been seen by neither.
     assert "of 1 photographs that neither was made from" in page
-    assert re.search(r'Forecast accuracy</th>(\s*<td class="number">100\.0\s*%</td>){2}', page)
+    accuracies = page.cells("Forecast accuracy")[:2]
+    assert [accuracy.split() for accuracy in accuracies] == [["100.0", "%"]] * 2
 
 
 def test_active_surface_is_compared_with_the_version_before(pages: TestClient):

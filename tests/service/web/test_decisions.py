@@ -3,7 +3,6 @@
 Such a decision can be undone.
 """
 
-import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -12,15 +11,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
 from model.observation import Observation, SurfacePrediction
 from model.plant import Heliostat
 from service import store
 from service.base.settings import Settings
-from service.jobs.kinds import KINDS
-from service.jobs.worker import Worker
 from service.web.app import create_app
 from tests.service.conftest import (
     QUIET,
@@ -32,6 +28,7 @@ from tests.service.conftest import (
     sun_at,
     tower_document,
 )
+from tests.service.web.pages import work
 
 BASE = "/v1/heliostats/AA39/surfaces"
 
@@ -268,12 +265,6 @@ def measure(client: TestClient, bend_m: float, valid_from: datetime | None = Non
 
 def page_of(client: TestClient, path: str) -> str:
     return str(client.get(path, headers={"Accept": "text/html"}).text)
-
-
-def work(app: FastAPI) -> None:
-    worker = Worker(app.state.runtime, KINDS, "tester", threading.Event())
-    while worker.work():
-        pass
 
 
 def test_cancelled_job_says_what_it_changed(

@@ -2,7 +2,6 @@
 over REST.
 """
 
-import re
 from collections.abc import Iterator
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -28,6 +27,7 @@ from service.twin.runtime.runtime import Runtime
 from service.twin.surfaces.accuracy import Rank
 from service.web.app import create_app
 from service.web.pages.field_page import FieldView
+from tests.page import Page
 from tests.service.conftest import (
     QUIET,
     FakeOperations,
@@ -36,7 +36,7 @@ from tests.service.conftest import (
     tower_document,
     until,
 )
-from tests.service.web.test_pages import HTML, settled, text_of
+from tests.service.web.pages import HTML, settled, text_of
 from tests.waiting import WAIT_LIMIT_S
 
 OF_1970 = field_overview.datetime.fromisoformat("2026-01-01T00:00:00+00:00")
@@ -140,8 +140,9 @@ def surface(height: float, is_doubted: bool) -> NewSurface:
     return NewSurface("refined", z, 0 * z, points, datetime.now(UTC), trust=trust)
 
 
-def names_in(page: str) -> list[str]:
-    return re.findall(r'<th scope="row"><a href="/heliostats/(\w+)"', page)
+def names_in(page: Page) -> list[str]:
+    rows = page.all("th", scope="row")
+    return [link["href"].removeprefix("/heliostats/") for row in rows for link in row.all("a")]
 
 
 def test_table_comes_in_pages_of_a_hundred(large: TestClient):
@@ -158,11 +159,8 @@ def test_table_comes_in_pages_of_a_hundred(large: TestClient):
 
 
 def test_map_shows_all_and_highlights_matches(large: TestClient):
-    def drawn(page: str, path: str) -> int:
-        return sum(
-            found.count("M")
-            for found in re.findall(rf'<path class="{path}[^"]*"[^>]* d="([^"]*)"', page)
-        )
+    def drawn(page: Page, kind: str) -> int:
+        return sum(path["d"].count("M") for path in page.all("path", class_=kind))
 
     page = settled(large)
     assert (drawn(page, "mirrors"), drawn(page, "left-out"), drawn(page, "flagged")) == (250, 0, 3)
@@ -177,11 +175,8 @@ def test_map_shows_all_and_highlights_matches(large: TestClient):
 
 def test_columns_lead_to_their_order_and_back(large: TestClient):
     page = settled(large, "/?metric=deviation_mm")
-    assert re.search(
-        r'aria-sort="descending">'
-        r'<a href="/\?metric=deviation_mm&amp;sort=deviation_mm&amp;order=up">',
-        page,
-    )
+    (link,) = page.one("th", aria_sort="descending").all("a")
+    assert link["href"] == "/?metric=deviation_mm&sort=deviation_mm&order=up"
     assert names_in(page)[:2] == ["H240", "H230"]
     assert names_in(text_of(large, "/?metric=deviation_mm&sort=deviation_mm&order=up"))[:2] == [
         "H000",

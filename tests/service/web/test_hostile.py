@@ -23,7 +23,7 @@ from schemathesis.checks import not_a_server_error
 
 from service.base.settings import Settings
 from tests.service.conftest import QUIET, FakeOperations, Post, metadata, png, poster, serving
-from tests.service.sources.test_decode import gray_tiff, jpeg_of_scans, tiff
+from tests.service.sources.pictures import gray_tiff, jpeg_of_scans, tiff
 from tests.waiting import WAIT_LIMIT_S
 
 JSON = {"Content-Type": "application/json"}

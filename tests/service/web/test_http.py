@@ -16,7 +16,7 @@ from service.jobs.kinds import KINDS
 from service.web.auth import security
 from tests.service.access import all_routes
 from tests.service.conftest import Post, metadata, png, serving, sun_at
-from tests.service.web.test_problems import check
+from tests.service.web.problems import check
 
 SUN = {"azimuth_deg": 180.0, "elevation_deg": 45.0}
 STAND_INS = [True, False, "1", "45.0", ""]

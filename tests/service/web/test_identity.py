@@ -28,7 +28,7 @@ from tests.service.conftest import (
     sun_at,
     tower_document,
 )
-from tests.service.web.test_at_once import at_once
+from tests.service.web.at_once import at_once
 
 BASE = "/v1/heliostats/AA39/measurements"
 HTML = {"Accept": "text/html"}

@@ -16,6 +16,7 @@ from service.store.jobs import queue
 from service.store.pointing.mounts import CalibrationState
 from service.twin.pointing import calibration
 from service.web.app import create_app
+from tests.page import Page
 from tests.service.conftest import (
     QUIET,
     FakeOperations,
@@ -27,7 +28,7 @@ from tests.service.conftest import (
 )
 from tests.service.statements import statements
 from tests.service.studies import SLOPE
-from tests.service.web.test_pages import HTML, form, keep_study, text_of
+from tests.service.web.pages import HTML, form, keep_study, text_of
 
 NAMES = [f"H{number:04d}" for number in range(3000)]
 
@@ -82,9 +83,8 @@ def test_page_does_not_grow_with_the_field(large: TestClient, path: str):
 
 def test_form_offers_names_that_begin_so(large: TestClient):
     def offered(**query: str) -> list[str]:
-        return re.findall(
-            r'<option value="([^"]*)">', large.get("/forecast/heliostats", params=query).text
-        )
+        answer = large.get("/forecast/heliostats", params=query)
+        return [option["value"] for option in Page(answer.text).all("option")]
 
     assert offered()[:2] == ["AA_39", "H0000"]
     assert offered(heliostat="h29") == NAMES[2900:2920]
@@ -95,7 +95,8 @@ def test_form_offers_names_that_begin_so(large: TestClient):
         item["name"] for item in large.get("/v1/heliostats?prefix=h299").json()["items"]
     ] == NAMES[2990:]
     page = text_of(large, "/forecast?heliostat=H2999")
-    assert re.search(r'<input name="heliostat" value="H2999" list="offered"', page)
+    field = page.one("input", name="heliostat")
+    assert (field["value"], field["list"]) == ("H2999", "offered")
 
 
 def test_name_that_is_typed_and_wrong_is_said(large: TestClient):

@@ -1,7 +1,6 @@
 """Calibrated mounts over HTTP: the job, motors for an aim, forecasts from motors, the plan."""
 
 import itertools
-import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ from model.tracing.convolution import central_rays
 from service.base.settings import Settings
 from service.sources.documents import read_heliostat
 from service.twin.studies.study import StudyRequest, load_study_inputs
+from tests.page import Page
 from tests.service.conftest import ORIGIN, QUIET, FakeOperations, Post, png, until
 from tests.service.spots import calibrate, photographs
 
@@ -334,7 +334,8 @@ def test_the_plan_asks_for_what_is_known_least(
     assert night.status_code == 422
     asked = {"at": NOON, "photographs": 3, "minutes": 30}
     page = client.get("/calibration-plan", params=asked, headers={"Accept": "text/html"}).text
-    assert re.findall(r'<td><a href="/heliostats/(\w+)"', page) == ["AB01", "AA39"]
+    rows = Page(page).one("tbody").all("tr")
+    assert [row.all("a")[0]["href"] for row in rows] == ["/heliostats/AB01", "/heliostats/AA39"]
     dark = client.get(
         "/calibration-plan", params={"at": "2024-06-03T00:00"}, headers={"Accept": "text/html"}
     ).text

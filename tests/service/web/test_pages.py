@@ -3,8 +3,6 @@ nobody else.
 """
 
 import re
-import threading
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,74 +10,35 @@ import pytest
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
-from service import store
 from service.base.settings import Settings
-from service.jobs.kinds import KINDS
-from service.jobs.worker import Worker
-from service.store import keys
-from service.store.jobs.queue import add_job, get_job
+from service.store.jobs.queue import get_job
 from service.twin.alerts.field_filter import METRICS
 from service.web.app import create_app
 from service.web.auth import security
 from service.web.pages.login import own_path
 from service.web.responses.pages import ASSETS
+from tests.page import Page
 from tests.service.conftest import (
     QUIET,
     FakeOperations,
     client_of,
-    png,
-    poster,
     properties_document,
-    sun_at,
     tower_document,
 )
-from tests.service.studies import SLOPE, study_row
-from tests.waiting import until
-
-HTML = {"Accept": "text/html,application/xhtml+xml"}
-HTMX = {"HX-Request": "true"}
-
-# What a browser would load or follow: nothing of it may name another host.
-_LINK = re.compile(
-    r"""(?:href|src|action|hx-get|hx-post|sse-connect|data|poster|srcset)\s*=\s*["']([^"']*)["']"""
+from tests.service.studies import SLOPE
+from tests.service.web.pages import (
+    HTML,
+    HTMX,
+    PATHS,
+    field_of,
+    fill,
+    form,
+    keep_study,
+    make_key,
+    settled,
+    text_of,
+    work,
 )
-
-
-def fill(client: TestClient) -> None:
-    """Photographs, one of them refused, two surfaces, a forecast, and a job that waits."""
-    post = poster(client)
-    assert post(png(1), id="101").status_code == 201
-    assert post(png(2), id="102", sun=sun_at(210.0)).status_code == 201
-    assert post(png(3, refused=True), id="103").status_code == 201
-    for method in ("network", "refined"):
-        assert (
-            client.post(
-                "/v1/heliostats/AA39/surfaces", json={"method": method, "measurements": ["101"]}
-            ).status_code
-            == 201
-        )
-    sun = {"azimuth_deg": 200, "elevation_deg": 45}
-    assert (
-        client.post(
-            "/v1/forecasts", json={"heliostat": "AA39", "target": "lower", "sun": sun}
-        ).status_code
-        == 201
-    )
-    app: Any = client.app
-    with app.state.runtime.database.writing() as session:
-        add_job(session, "imports", {"folder": "<script>alert(1)</script>"}, "local")
-    client.headers.update(HTML)
-
-
-_REPORT = "<style>p{}</style><p>heliotwin study</p><p>found</p><script>alert(1)</script>"
-
-
-def keep_study(app: FastAPI, *effects: dict[str, Any], **about: Any) -> int:
-    """A study that somebody made, with what no report of ours would hold."""
-    row = study_row(*effects, **about)
-    row.conclusion, row.html = "<img src=x onerror=alert(1)>", _REPORT
-    with app.state.runtime.database.writing() as session:
-        return store.add_study(session, row).id
 
 
 @pytest.fixture
@@ -89,63 +48,6 @@ def pages(client: TestClient) -> TestClient:
     return client
 
 
-@pytest.fixture(scope="module")
-def shown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
-    """The same for tests that only look."""
-    settings = Settings(data_dir=tmp_path_factory.mktemp("shown"), **QUIET)
-    with client_of(create_app(settings, FakeOperations())) as client:
-        client.put("/v1/plant", json=tower_document())
-        client.put("/v1/heliostats/AA39", json=properties_document())
-        fill(client)
-        keep_study(client.app, SLOPE)  # type: ignore[arg-type]
-        yield client
-
-
-PATHS = (
-    "/",
-    "/?metric=age_days",
-    "/heliostats/AA39",
-    "/heliostats/AA39?version=1",
-    "/heliostats/AA39/photographs/101",
-    "/forecast",
-    "/forecast?heliostat=AA39",
-    "/forecasts/1",
-    "/jobs",
-    "/jobs/1",
-    "/studies",
-    "/studies/1",
-    "/attention",
-    "/attention?acknowledged=true",
-    "/compare",
-    "/plans",
-    "/compare?heliostat=AA39",
-    "/plant",
-    "/plant/settings",
-    "/plant/keys",
-    "/plant/audit",
-    "/login",
-    "/nothing",
-    "/heliostats/none",
-)
-
-
-def text_of(client: TestClient, path: str, status: int = 200) -> str:
-    answer = client.get(path)
-    assert answer.status_code == status, answer.text
-    assert answer.headers["Content-Type"].startswith("text/html")
-    return str(answer.text)
-
-
-def settled(client: TestClient, path: str = "/") -> str:
-    """The field's page after all background computations."""
-
-    def page() -> str | None:
-        text = text_of(client, path)
-        return None if "being computed" in text else text
-
-    return str(until(page, "nothing is being computed any more"))
-
-
 @pytest.mark.parametrize("path", PATHS)
 def test_page_loads_nothing_from_other_hosts_and_runs_no_inline_code(shown: TestClient, path: str):
     answer = shown.get(path)
@@ -153,7 +55,7 @@ def test_page_loads_nothing_from_other_hosts_and_runs_no_inline_code(shown: Test
     policy = answer.headers["Content-Security-Policy"]
     assert "default-src 'self'" in policy
     assert "unsafe" not in policy
-    for link in _LINK.findall(answer.text):
+    for link in Page(answer.text).links:
         assert re.match(r"/(?!/)|data:image/|#|\?", link) or ":" not in link, link
     # What the policy would refuse must not be there.
     assert not re.search(
@@ -163,21 +65,23 @@ def test_page_loads_nothing_from_other_hosts_and_runs_no_inline_code(shown: Test
 
 @pytest.mark.parametrize("path", PATHS)
 def test_page_has_landmarks_one_heading_and_labels(shown: TestClient, path: str):
-    page = shown.get(path).text
-    assert '<html lang="en">' in page
-    assert page.count("<main") == page.count("<h1") == 1
-    assert 'class="skip" href="#main"' in page
-    for control in re.findall(r"<(?:input|select)\b[^>]*>", page):
-        if 'type="hidden"' not in control:
-            name = re.search(r'id="([^"]+)"', control)
-            is_inside = re.search(
-                r"<label[^>]*>[^<]*(?:<(?!/label)[^>]*>)*[^<]*" + re.escape(control), page
-            )
-            assert is_inside or (name and f'for="{name[1]}"' in page), control
-    for drawing in re.findall(r"<(?:svg|canvas|img|progress)\b[^>]*>", page):
-        assert re.search(r"aria-label|alt=", drawing), drawing
-    numbers = re.findall(r'\bid="([^"]+)"', page)
-    assert len(numbers) == len(set(numbers))
+    page = Page(shown.get(path).text)
+    assert page.one("html")["lang"] == "en"
+    assert page.one("main")
+    assert page.one("h1")
+    assert page.one("a", class_="skip")["href"] == "#main"
+    labels = page.all("label")
+    labelled = [control for label in labels for control in label.all()]
+    named = {label["for"] for label in labels if "for" in label.attributes}
+    for control in page.all("input") + page.all("select"):
+        is_hidden = control.attributes.get("type") == "hidden"
+        assert is_hidden or control in labelled or control["id"] in named, control
+    for tag in ("svg", "canvas", "img", "progress"):
+        for drawing in page.all(tag):
+            given = drawing.attributes.keys()
+            assert given & {"aria-label", "aria-labelledby", "alt"}, drawing
+    ids = [one["id"] for one in page.all(id=True)]
+    assert len(ids) == len(set(ids))
 
 
 def test_what_senders_wrote_is_escaped(shown: TestClient):
@@ -197,11 +101,8 @@ def test_what_senders_wrote_is_escaped(shown: TestClient):
 
 
 def test_assets_come_from_the_package_and_stay_in_the_browser(shown: TestClient):
-    found = set(
-        re.findall(
-            r'"(/static/[^"]+)"', "".join(text_of(shown, p) for p in ("/", "/heliostats/AA39"))
-        )
-    )
+    links = [link for path in ("/", "/heliostats/AA39") for link in text_of(shown, path).links]
+    found = {link for link in links if link.startswith("/static/")}
     assert {path.partition("?")[0] for path in found} == {
         f"/static/{name}"
         for name in (
@@ -254,12 +155,9 @@ def test_empty_store_says_what_to_do(bare: TestClient):
 def test_field_shows_every_figure_as_colour_and_as_number(shown: TestClient, metric: str):
     page = settled(shown, f"/?metric={metric}")
     assert f'<h2 id="map-title">{METRICS[metric].label}</h2>' in page
-    mark = re.search(
-        r'<path class="mirrors" fill="#[0-9a-f]{6}"[^>]* data-names="AA39" data-texts="([^"]+)"',
-        page,
-    )
-    assert mark is not None
-    number = mark[1].split("\N{NO-BREAK SPACE}")[0]
+    mark = page.one("path", class_="mirrors", data_names="AA39")
+    assert re.fullmatch("#[0-9a-f]{6}", mark["fill"])
+    number = mark["data-texts"].split("\N{NO-BREAK SPACE}")[0]
     assert f'<td class="number">{number}' in page
 
 
@@ -292,9 +190,7 @@ def test_colours_mean_the_same_in_every_field(tmp_path: Path):
             client.put("/v1/plant", json=tower_document())
             client.put("/v1/heliostats/AA39", json=properties_document())
             fill(client)
-            found = re.search(r'<path [^>]*fill="(#[0-9a-f]{6})"', settled(client))
-            assert found is not None
-            colours[name] = found[1]
+            colours[name] = settled(client).one("path", class_="mirrors")["fill"]
     assert colours == {"usual": "#fde724", "strict": "#fde724", "lax": "#440154"}
 
 
@@ -314,7 +210,9 @@ def test_accuracy_is_computed_once_for_each_surface(pages: TestClient, operation
 def test_heliostat_without_anything_is_drawn_hollow(pages: TestClient, properties: dict[str, Any]):
     assert pages.put("/v1/heliostats/AB01", json=properties).status_code == 201
     page = settled(pages)
-    assert re.search(r'class="mirrors unknown"[^>]* data-names="AB01" data-texts="not known"', page)
+    mark = page.one("path", class_="unknown", data_names="AB01")
+    assert mark["class"] == "mirrors unknown"
+    assert mark["data-texts"] == "not known"
     assert "No surface yet" in text_of(pages, "/heliostats/AB01")
 
 
@@ -328,17 +226,6 @@ def test_heliostat_page_has_all_its_sections(shown: TestClient):
     assert 'data-surface="{' in page
     assert ", not active" in text_of(shown, "/heliostats/AA39?version=1")
     assert shown.get("/heliostats/AA39?version=9").status_code == 404
-
-
-def form(**changes: Any) -> dict[str, Any]:
-    return {
-        "heliostat": "AA39",
-        "target": "lower",
-        "azimuth_deg": "200",
-        "elevation_deg": "45",
-        "moment": "",
-        **changes,
-    }
 
 
 def test_forecast_form_leads_to_its_flux_map(pages: TestClient, operations: FakeOperations):
@@ -360,13 +247,6 @@ def test_forecast_form_takes_a_time(pages: TestClient, operations: FakeOperation
     assert abs(east) < 0.02
     assert north < 0
     assert up == pytest.approx(0.887, abs=0.002)
-
-
-def field_of(page: str, name: str) -> str:
-    """The value of a form's field."""
-    found = re.search(rf'name="{name}"[^>]* value="([^"]*)"', page)
-    assert found is not None
-    return found[1]
 
 
 def test_forecast_page_keeps_the_request(pages: TestClient):
@@ -447,9 +327,7 @@ def test_forecast_of_all_heliostats_is_a_job(pages: TestClient):
 def test_forecast_of_all_heliostats_shows_its_light(app: FastAPI, pages: TestClient):
     asked = form(heliostat="", sun_by="time", moment="2026-06-21T11:36", dni_w_m2="900")
     path = pages.post("/forecast", data=asked, follow_redirects=False).headers["Location"]
-    worker = Worker(app.state.runtime, KINDS, "tester", threading.Event())
-    while worker.work():
-        pass
+    work(app)
     page = text_of(pages, path)
     for text in (
         "Power on lower",
@@ -459,9 +337,9 @@ def test_forecast_of_all_heliostats_shows_its_light(app: FastAPI, pages: TestCli
     ):
         assert text in page
     assert 'href="data:image/png' in page
-    request = dict(
-        re.findall("<dt>([^<]*)</dt><dd>([^<]*)</dd>", page.partition("<summary>Request")[2])
-    )
+    (about,) = [one for one in page.all("details") if one.all("summary")[0].words == "Request"]
+    terms, values = ([one.words for one in about.all(tag)] for tag in ("dt", "dd"))
+    request = dict(zip(terms, values, strict=True))
     assert request == {
         "target": "lower",
         "mirrors shade and block each other": "yes",
@@ -573,11 +451,6 @@ def test_rest_answers_browsers_in_json_as_ever(shown: TestClient):
 
 # --- the door
 # --------------------------------------------------------------------------------------------------
-
-
-def make_key(app: FastAPI, role: str) -> str:
-    with app.state.runtime.database.writing() as session:
-        return keys.create(session, role, role, "tester")
 
 
 def test_browser_without_a_key_is_sent_to_the_login(app: FastAPI, pages: TestClient):

@@ -3,7 +3,6 @@ them.
 """
 
 import csv
-import html
 import io
 import re
 from collections import Counter
@@ -17,17 +16,14 @@ from fastapi.testclient import TestClient
 
 from service.drawing.templates import figure, percent, power
 from service.web.responses.csv_tables import PageTable
+from tests.page import Page
 from tests.service.conftest import Post, png
-from tests.service.web.test_pages import HTML, PATHS, shown, text_of
-from tests.service.web.test_plans import pages, planned
-
-__all__ = ["pages", "shown"]
-
-_PART = re.compile(r'href="([^"]*[?&](?:amp;)?(?:table|figure)=[^"]*)"')
+from tests.service.web.pages import HTML, PATHS, text_of
+from tests.service.web.plans import planned
 
 
-def parts_of(page: str) -> list[str]:
-    return [html.unescape(link) for link in _PART.findall(page)]
+def parts_of(page: Page) -> list[str]:
+    return [link for link in page.links if re.search("[?&](table|figure)=", link)]
 
 
 def table_of(*rows: dict[str, Any], page_only: str = "") -> list[list[str]]:
@@ -74,13 +70,13 @@ def test_numbers_in_texts_have_their_units():
 def test_every_table_and_figure_is_a_file(shown: TestClient):
     found = set()
     for path in PATHS:
-        page = shown.get(path).text
-        tables = re.findall(r'<table id="([^"]+)"', page)
+        page = Page(shown.get(path).text)
+        tables = [table["id"] for table in page.all("table", id=True)]
         links = parts_of(page)
         assert [link for link in links if "table=" in link] == [
             link for name in tables for link in links if link.endswith(f"table={name}")
         ]
-        figures = len(re.findall(r'<svg class="figure"', page))
+        figures = len(page.all("svg", class_="figure"))
         assert len({link.partition("&format")[0] for link in links if "figure=" in link}) >= figures
         for link in links:
             answer = shown.get(link)
@@ -180,17 +176,17 @@ def test_parts_need_what_their_page_needs(shown: TestClient):
     assert shown.get("/v1/heliostats?table=x").status_code == 422  # which only pages take
 
 
-def test_plan_as_tables_maps_and_timelines(app: FastAPI, pages: TestClient):
-    job = planned(app, pages)
-    rows = sheet(pages, f"/plans/{job['id']}?table=series")
-    steps = pages.get(f"/v1/jobs/{job['id']}").json()["result"]["steps"]
+def test_plan_as_tables_maps_and_timelines(app: FastAPI, two_heliostats: TestClient):
+    job = planned(app, two_heliostats)
+    rows = sheet(two_heliostats, f"/plans/{job['id']}?table=series")
+    steps = two_heliostats.get(f"/v1/jobs/{job['id']}").json()["result"]["steps"]
     assert [float(row["Power of ideal mirrors [W]"]) for row in rows] == [
         step["ideal"]["power_w"] for step in steps
     ]
     assert [float(row["Sun elevation [°]"]) for row in rows] == [
         step["sun"]["elevation_deg"] for step in steps
     ]
-    links = parts_of(pages.get(f"/plans/{job['id']}", headers=HTML).text)
+    links = parts_of(text_of(two_heliostats, f"/plans/{job['id']}"))
     formats = Counter(link.rpartition("=")[2] for link in links)
     assert formats == {
         "npz": 3,
@@ -200,4 +196,4 @@ def test_plan_as_tables_maps_and_timelines(app: FastAPI, pages: TestClient):
         "plans": 1,
     }  # three maps, three timelines, two tables
     for link in links:
-        check(pages.get(link))
+        check(two_heliostats.get(link))

@@ -3,7 +3,6 @@ its light.
 """
 
 import csv
-import html
 import io
 import re
 from dataclasses import replace
@@ -31,17 +30,26 @@ from service.store.photographs.groups import (
 from service.store.tables import TargetRow
 from service.twin.runtime import runtime
 from service.web.pages import heliostat, photograph_list
+from tests.page import Page
 from tests.service.conftest import FakeOperations, Post, png, poster
-from tests.service.web.test_pages import HTML, text_of
+from tests.service.web.pages import HTML, text_of
 
 HERE = "/heliostats/AA39/photographs"
 
 
-def rows_of(page: str) -> list[str]:
-    table = page.partition('id="photographs-title"')[2]
-    return re.findall(
-        r'<th scope="row"><a href="/heliostats/AA39/photographs/[\w-]+">(\w+)</a>', table
-    )
+def names_of(page: Page) -> list[str]:
+    """Heliostats and names of the photographs in a page's table."""
+    links = [link for row in page.all("th", scope="row") for link in row.all("a")[:1]]
+    return [
+        f"{link['href'].split('/')[2]} {link.words}"
+        for link in links
+        if link["href"].split("/")[3:4] == ["photographs"]
+    ]
+
+
+def rows_of(page: Page) -> list[str]:
+    """Names of AA39's photographs in a page's table."""
+    return [name.removeprefix("AA39 ") for name in names_of(page)]
 
 
 @pytest.fixture
@@ -64,11 +72,7 @@ def test_photograph_has_one_row(filled: TestClient):
     page = text_of(filled, "/heliostats/AA39")
     assert rows_of(page) == ["3", "2", "1"]
     assert page.count("thumbnail.jpg") == 3
-    assert re.findall(r'class="note" href="[^"]*">([\w-]+)</a>', page)[-3:] == [
-        "flux",
-        "cropped",
-        "raw",
-    ]
+    assert page.texts("a", class_="note")[-3:] == ["flux", "cropped", "raw"]
 
 
 @pytest.mark.parametrize(
@@ -77,7 +81,7 @@ def test_photograph_has_one_row(filled: TestClient):
 def test_photographs_are_chosen_by_verdict(filled: TestClient, verdict: str, names: list[str]):
     page = text_of(filled, f"/heliostats/AA39?photographs={verdict}")
     assert rows_of(page) == names
-    assert re.search(rf'aria-current="true">{verdict}</a>', page)
+    assert verdict in page.texts("a", aria_current="true")
     assert ("no spot" in page) == (verdict == "refused")
 
 
@@ -85,17 +89,10 @@ def test_older_photographs_are_a_page_away(filled: TestClient, monkeypatch: pyte
     monkeypatch.setattr(heliostat, "MAX_PHOTOGRAPHS", 2)
     page = text_of(filled, "/heliostats/AA39")
     assert rows_of(page) == ["3", "2"]
-    (older,) = re.findall(r'href="(/photographs[^"]*before=\d+)"', page)
-    page = text_of(filled, html.unescape(older))
+    (older,) = [link for link in page.links if re.search(r"^/photographs.*before=\d+$", link)]
+    page = text_of(filled, older)
     assert rows_of(page) == ["1"]
     assert 'href="/photographs?heliostat=AA39">Newest' in page
-
-
-def names_of(page: str) -> list[str]:
-    found = re.findall(
-        r'<th scope="row"><a href="/heliostats/(\w+)/photographs/[\w-]+">(\w+)</a>', page
-    )
-    return [f"{heliostat} {name}" for heliostat, name in found]
 
 
 @pytest.fixture
@@ -147,7 +144,7 @@ def test_pages_of_photographs_meet(field: TestClient, monkeypatch: pytest.Monkey
     while path:
         page = text_of(field, path)
         seen += names_of(page)
-        path = "".join(map(html.unescape, re.findall(r'rel="next" href="([^"]*)"', page)))
+        path = "".join(link["href"] for link in page.all("a", rel="next"))
     assert seen == OF_FIELD
     assert field.get("/photographs?before=999").status_code == 404
     assert field.get("/photographs?heliostat=XX99").status_code == 404
@@ -325,7 +322,8 @@ def test_photograph_is_next_to_its_flux_and_the_forecast(filled: TestClient):
     ):
         assert shown in page
     assert page.count('class="scale"') == 2
-    assert re.search(r'also as <a href="[^"]*/1-flux">flux</a>', page)
+    assert "also as flux" in page.words
+    assert [a.words for a in page.all("a") if a["href"].endswith("/1-flux")] == ["flux"]
     refused = text_of(filled, f"{HERE}/2")
     assert "crop.jpg" in refused
     assert "measured flux" not in refused

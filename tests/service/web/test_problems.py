@@ -13,18 +13,8 @@ from service.base.errors import SchemaError
 from service.base.settings import Settings
 from service.web.api.measurements import MeasurementIn
 from service.web.app import create_app
-from service.web.responses.problem_schema import Problem
 from tests.service.conftest import client_of, metadata
-
-
-def check(answer: Any, status: int) -> dict[str, Any]:
-    assert answer.status_code == status
-    assert answer.headers["Content-Type"] == "application/problem+json"
-    document: dict[str, Any] = answer.json()
-    Problem.model_validate(document)
-    assert document["status"] == status
-    assert document["request_id"] == answer.headers["X-Request-ID"]
-    return document
+from tests.service.web.problems import check
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 the end.
 """
 
-import re
 from collections.abc import Iterator
 from datetime import timedelta
 from pathlib import Path
@@ -19,7 +18,7 @@ from service.store.columns import now
 from service.store.tables import ImageRow
 from service.twin.runtime.runtime import Runtime
 from service.web.app import create_app
-from tests.service.base.test_watch import samples, value
+from tests.page import Page
 from tests.service.conftest import (
     QUIET,
     FakeOperations,
@@ -29,6 +28,7 @@ from tests.service.conftest import (
     properties_document,
     tower_document,
 )
+from tests.service.metrics import samples, value
 
 BASE = "/v1/heliostats/AA39/measurements"
 
@@ -103,13 +103,8 @@ def test_job_and_audit_trail_say_what_went(pruned: TestClient):
 
 def test_sizes_are_on_the_page_and_in_the_metrics(pruned: TestClient):
     poster(pruned)(png(3, refused=True), id="3")
-    page = pruned.get("/jobs", headers={"Accept": "text/html"}).text
-    rows = {
-        verdict: re.findall(r"<td[^>]*>(?:<time[^>]*>)?([^<]*)", row)
-        for verdict, row in re.findall(
-            r'<th scope="row">(accepted|refused)</th>(.*?)</tr>', page, re.DOTALL
-        )
-    }
+    page = Page(pruned.get("/jobs", headers={"Accept": "text/html"}).text)
+    rows = {verdict: page.cells(verdict) for verdict in ("accepted", "refused")}
     space = "\N{NO-BREAK SPACE}"
     assert rows["accepted"][:2] == ["1", f"{len(png(1)) / 1e3:.1f}{space}kB"]
     assert rows["refused"][0] == "1"

@@ -7,7 +7,6 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from datetime import date
-from html import unescape
 from pathlib import Path
 from typing import Any
 from urllib.parse import urldefrag
@@ -32,10 +31,10 @@ from service.twin.studies.study import (
     row_of_report,
     study_row,
 )
-from tests.model.test_scopes import photographs
+from tests.model.scenes import photographs
+from tests.page import Page
 from tests.service import real
 
-LINKS = re.compile(r'\b(?:href|src|hx-get)="([^"]+)"')
 GAIN = Gain(0.02, 0.01, 0.03, 4.0)
 DAY = date(2024, 6, 16)
 
@@ -139,7 +138,7 @@ def every_study(real_store: Path, tmp_path_factory: pytest.TempPathFactory) -> I
 
 def links_of(text: str) -> set[str]:
     """Where a page's links lead, on this service."""
-    found = (urldefrag(unescape(link))[0] for link in LINKS.findall(text))
+    found = (urldefrag(link)[0] for link in Page(text).links)
     return {link for link in found if link.startswith("/")}
 
 

@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from service.base.settings import FIGURE_SCALES, Settings
 from service.web.app import create_app
 from tests.service.conftest import FakeOperations, Post, client_of, png, sun_at
-from tests.service.web.test_pages import text_of
+from tests.service.web.pages import text_of
 
 ENDS = r"Surface \d: deviation[^;]*; from (\S+) to (\S+) mm"
 

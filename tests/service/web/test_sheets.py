@@ -12,7 +12,7 @@ from fastapi.testclient import TestClient
 
 from service.web.responses.csv_tables import cell
 from tests.service.conftest import Post, png
-from tests.service.web.test_pages import HTML, fill, settled, text_of
+from tests.service.web.pages import HTML, fill, settled, text_of
 
 
 @pytest.mark.parametrize(
@@ -44,9 +44,8 @@ def pages(client: TestClient) -> TestClient:
 
 def test_field_as_a_table(pages: TestClient):
     page = settled(pages)
-    link = re.search(r'href="(/field\.csv[^"]*)"', page)
-    assert link is not None
-    (row,) = sheet(pages, link[1])
+    (link,) = [link for link in page.links if link.startswith("/field.csv")]
+    (row,) = sheet(pages, link)
     assert (row["name"], row["accuracy"], row["photographs"], row["refused"]) == (
         "AA39",
         "1.0",

@@ -31,7 +31,7 @@ from tests.service.conftest import (
     properties_document,
     tower_document,
 )
-from tests.service.web.test_wording import operations, sample
+from tests.service.web.documents import operations, sample
 
 JSON = {"Content-Type": "application/json"}
 NOT_TEXT = ["a\x00b", "a\x1bb", "a\x7f", "\x85", "\ud800"]

@@ -4,20 +4,16 @@ who has seen it.
 
 import re
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
 
-from model.observation import Observation
-from model.plant import Heliostat
 from service.base.settings import Settings
 from service.web.app import create_app
 from tests.service.conftest import (
     QUIET,
-    FakeOperations,
     client_of,
     png,
     poster,
@@ -25,22 +21,10 @@ from tests.service.conftest import (
     sun_at,
     tower_document,
 )
+from tests.service.web.operations import Doubter
 
 BASE = "/v1/heliostats/AA39/surfaces"
 HTML = {"Accept": "text/html"}
-
-
-class Doubter(FakeOperations):
-    """Explains no photograph under a sun in the east, and finds refined mirrors strange."""
-
-    def predict(
-        self, heliostat: Heliostat, observations: list[Observation], *rest: Any, **more: Any
-    ) -> Any:
-        made = super().predict(heliostat, observations, *rest, **more)
-        misfits = tuple(0.31 if observation.sun[0] > 0.5 else 0.05 for observation in observations)
-        return replace(
-            made, misfits=misfits, mahalanobis_distance=2.4 if made.method == "refined" else 1.0
-        )
 
 
 @pytest.fixture

@@ -1,17 +1,9 @@
 """The pages in a real browser: what an operator does in a shift, by mouse and by keyboard, on a
 desk and on a phone.
-
-Needs Chromium, `HELIOTWIN_TEST_CHROMIUM` or one on the path, and its driver from the package
-playwright.
 """
 
-import itertools
-import os
 import re
-import shutil
-import threading
 from collections.abc import Iterator
-from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -30,6 +22,15 @@ from service.store.columns import now
 from service.store.job_tables import KeyRow
 from service.store.tables import HeliostatRow
 from service.web.app import create_app
+from tests.service.browser.browsing import (
+    DESK,
+    PHONE,
+    GatedOperations,
+    Served,
+    expect,
+    follow,
+    violations,
+)
 from tests.service.conftest import (
     ORIGIN,
     QUIET,
@@ -43,33 +44,8 @@ from tests.service.conftest import (
     tower_document,
 )
 from tests.service.studies import SLOPE, study_row
-from tests.waiting import WAIT_LIMIT_S
 
-playwright = pytest.importorskip(
-    "playwright.sync_api", reason="no browser driver: pip install playwright"
-)
-axe = pytest.importorskip(
-    "axe_playwright_python.sync_playwright", reason="no axe: pip install axe-playwright-python"
-)
-expect = playwright.expect
-expect.set_options(timeout=120_000)
-
-CHROMIUM = (
-    os.environ.get("HELIOTWIN_TEST_CHROMIUM")
-    or shutil.which("chromium")
-    or shutil.which("google-chrome")
-)
-FLAGS = [
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-]
 SCHEMES = ("light", "dark")
-DESK, PHONE = {"width": 1440, "height": 900}, {"width": 390, "height": 844}
 PATHS = (
     "/",
     "/heliostats/AA39",
@@ -91,28 +67,6 @@ PATHS = (
     "/plant/keys",
     "/plant/audit",
 )
-
-
-class GatedOperations(FakeOperations):
-    """Predicts while its gate is open."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.gate = threading.Event()
-        self.gate.set()
-
-    def predict(self, *arguments: Any, **options: Any) -> Any:
-        assert self.gate.wait(WAIT_LIMIT_S)
-        return super().predict(*arguments, **options)
-
-
-@dataclass
-class Served:
-    """A service that listens."""
-
-    app: FastAPI
-    address: str
-    operations: GatedOperations
 
 
 def fill(app: FastAPI) -> None:
@@ -157,48 +111,6 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
             yield Served(app, address, operations)
         finally:
             operations.gate.set()
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    if CHROMIUM is None:
-        pytest.skip("no Chromium: apt-get install chromium, or set HELIOTWIN_TEST_CHROMIUM")
-    with playwright.sync_playwright() as driver:
-        opened = driver.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        yield opened
-        opened.close()
-
-
-@pytest.fixture
-def page(browser: Any, served: Served) -> Iterator[Any]:
-    """A fresh browser window; at the end nothing went elsewhere, and no policy was broken."""
-    context = browser.new_context(base_url=served.address, viewport=DESK)
-    context.set_default_timeout(120_000)
-    opened, elsewhere, complaints = context.new_page(), [], []
-    context.on(
-        "request",
-        lambda r: None if r.url.startswith((served.address, "data:")) else elsewhere.append(r.url),
-    )
-    opened.on(
-        "console",
-        lambda message: complaints.append(message.text) if message.type == "error" else None,
-    )
-    opened.on("pageerror", lambda error: complaints.append(str(error)))
-    yield opened
-    context.close()
-    assert not elsewhere
-    # Refusals that a test provokes are answers with a status; anything else is a fault of the page.
-    assert not [
-        text
-        for text in complaints
-        if "status of 4" not in text and "Status Error Code 4" not in text
-    ]
-
-
-def follow(page: Any, selector: str) -> None:
-    """Press a link or button and wait for where it leads."""
-    with page.expect_navigation():
-        page.click(selector)
 
 
 def test_operator_looks_at_the_field_and_at_a_heliostat(page: Any):
@@ -360,47 +272,42 @@ def test_operator_sees_what_needs_attention(page: Any, served: Served, size: dic
     expect(page.locator(".attention li")).to_contain_text("acknowledged by local")
 
 
-def test_pages_fit_desk_and_phone(page: Any):
-    for size in (DESK, PHONE):
-        page.set_viewport_size(size)
-        for path in PATHS:
-            page.goto(path)
-            too_wide = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
-            assert page.evaluate(too_wide) <= 0, (path, size)
-            page.keyboard.press("Tab")
-            assert page.evaluate("document.activeElement.className") == "skip"
-            assert page.evaluate("getComputedStyle(document.activeElement).outlineStyle") == "solid"
-
-
-def test_text_has_contrast(page: Any):
-    """WCAG 2.2 AA: 4.5 for text; measured on what the browser computed."""
-    script = (Path(__file__).parent / "contrast.js").read_text("utf-8")
-    for path, scheme in itertools.product((*PATHS, "/login"), SCHEMES):
-        page.emulate_media(color_scheme=scheme)
-        page.goto(path)
-        assert page.evaluate(script) == [], (path, scheme)
-
-
 # What axe-core knows of WCAG 2.2, levels A and AA; it counts 2.5.3 (names contain visible texts) as
 # experimental.
 AXE = {
     "runOnly": ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa"],
     "rules": {"label-content-name-mismatch": {"enabled": True}},
-    "resultTypes": ["violations"],
 }
 
 
-@pytest.mark.parametrize("scheme", SCHEMES)
+# What a finger shall meet and is less than 40 px high; heliostats on the map are met by their
+# places.
+LOW = """() => [...document.querySelectorAll("button, select, input, textarea, summary, .choice, a")]
+    .filter((e) => !e.matches("[type=hidden], [type=radio], [type=checkbox], svg *") && e.getClientRects().length)
+    .filter((e) => e.getBoundingClientRect().height < 39.5).map((e) => e.outerHTML.slice(0, 80))"""
+TOO_WIDE = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
+CONTRAST = (Path(__file__).parent / "contrast.js").read_text("utf-8")
+
+
 @pytest.mark.parametrize("size", [DESK, PHONE], ids=["desk", "phone"])
-def test_axe_finds_nothing(page: Any, scheme: str, size: dict[str, int]):
+def test_pages_fit_and_can_be_read_and_pressed(page: Any, size: dict[str, int]):
     page.set_viewport_size(size)
-    page.emulate_media(color_scheme=scheme)
     for path in (*PATHS, "/login"):
         page.goto(path)
-        found = axe.Axe().run(page, options=AXE).response["violations"]
-        assert not [(entry["id"], [node["html"] for node in entry["nodes"]]) for entry in found], (
-            path
-        )
+        assert page.evaluate(TOO_WIDE) <= 0, path
+        if size is PHONE:
+            assert page.evaluate(LOW) == [], path
+        for scheme in SCHEMES:
+            # At once, without the moving from one colour to the other.
+            page.emulate_media(color_scheme=scheme, reduced_motion="reduce")
+            # WCAG 2.2 AA: 4.5 for text; measured on what the browser computed.
+            assert page.evaluate(CONTRAST) == [], (path, scheme)
+            assert violations(page, **AXE) == [], (path, scheme)
+        if path != "/login":  # which begins in its field
+            page.keyboard.press("Tab")
+            assert page.evaluate("document.activeElement.className") == "skip", path
+            outline = "getComputedStyle(document.activeElement).outlineStyle"
+            assert page.evaluate(outline) == "solid", path
 
 
 def test_dark_is_dark(page: Any):
@@ -416,13 +323,6 @@ def test_dark_is_dark(page: Any):
 # --------------------------------------------------------------------------------------------------
 
 
-# What a finger shall meet and is less than 40 px high; heliostats on the map are met by their
-# places.
-LOW = """() => [...document.querySelectorAll("button, select, input, textarea, summary, .choice, a")]
-    .filter((e) => !e.matches("[type=hidden], [type=radio], [type=checkbox], svg *") && e.getClientRects().length)
-    .filter((e) => e.getBoundingClientRect().height < 39.5).map((e) => e.outerHTML.slice(0, 80))"""
-
-
 # Where on the screen a heliostat's square on the map has its middle.
 MIDDLE = """(name) => {
     const map = document.querySelector("[data-map]"), half = Number(map.dataset.side) / 2;
@@ -434,12 +334,8 @@ MIDDLE = """(name) => {
 }"""
 
 
-def test_fingers_meet_what_they_mean(page: Any):
+def test_tap_beside_a_heliostat_means_it(page: Any):
     page.set_viewport_size(PHONE)
-    for path in PATHS:
-        page.goto(path)
-        assert page.evaluate(LOW) == [], path
-    # On the map a tap beside a heliostat means it.
     page.goto("/")
     page.locator("[data-map]").scroll_into_view_if_needed()
     x, y = page.evaluate(MIDDLE, "AB01")
@@ -503,8 +399,7 @@ def test_operator_plans_a_day_and_compares_surfaces(page: Any, scheme: str):
     expect(page.locator("#maps-title")).to_contain_text("On the receiver")  # without a reload
     expect(page.locator(".timeline")).to_have_count(3)
     expect(page.locator(".timeline .limit")).to_have_count(1)
-    found = axe.Axe().run(page, options=AXE).response["violations"]
-    assert not [entry["id"] for entry in found]
+    assert violations(page, **AXE) == []
     follow(page, "tbody a >> nth=1")
     assert page.url.endswith("?at=1")
     follow(page, f"text=by {scheme} >> nth=-1")

@@ -2,7 +2,6 @@
 export, plan.
 """
 
-import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
@@ -13,9 +12,8 @@ import pytest
 from model.imaging import MeasuredFlux
 from service import store
 from service.base.settings import Settings
-from service.jobs.kinds import KINDS
-from service.jobs.worker import Worker
 from service.web.app import create_app
+from tests.service.browser.browsing import DESK, PHONE, GatedOperations, Served, expect, follow
 from tests.service.conftest import (
     QUIET,
     client_of,
@@ -29,18 +27,7 @@ from tests.service.conftest import (
     until,
 )
 from tests.service.studies import SLOPE, study_row
-from tests.service.web.test_pages_browser import (
-    DESK,
-    PHONE,
-    GatedOperations,
-    Served,
-    browser,
-    expect,
-    follow,
-    page,
-)
-
-assert (browser, page) is not None  # fixtures of this module, too
+from tests.service.web.pages import work
 
 SIZES = pytest.mark.parametrize("size", [DESK, PHONE], ids=["desk", "phone"])
 
@@ -100,9 +87,7 @@ def fill(settings: Settings) -> None:
         sun = {"azimuth_deg": 200, "elevation_deg": 45}
         made = client.post("/v1/jobs/forecasts", json={"target": "lower", "sun": sun})
         assert made.status_code == 202
-        worker = Worker(app.state.runtime, KINDS, "tester", threading.Event())
-        while worker.work():
-            pass
+        work(app)
         with app.state.runtime.database.writing() as session:
             store.add_study(session, study_row(SLOPE))
             store.add_study(session, study_row(verdict="none"))
@@ -249,9 +234,7 @@ def test_plan_is_deleted_by_who_asked_twice(seen: Any, served: Served):
     job = seen.request.post(
         "/v1/jobs/plans", data=day | {"name": "to go", "target": "lower"}
     ).json()["id"]
-    worker = Worker(served.app.state.runtime, KINDS, "tester", threading.Event())
-    while worker.work():
-        pass
+    work(served.app)
     seen.goto(f"/plans/{job}")
     seen.click("summary >> text=Delete this plan")
     follow(seen, "text=Delete to go for good")

@@ -12,18 +12,8 @@ import pytest
 
 from service.web.app import create_app
 from tests.service import real
+from tests.service.browser.browsing import GatedOperations, Served, expect, follow, violations
 from tests.service.conftest import free_port, serving
-from tests.service.web.test_pages_browser import (
-    GatedOperations,
-    Served,
-    axe,
-    browser,
-    expect,
-    follow,
-    page,
-)
-
-assert (browser, page) is not None  # fixtures of this module, too
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +54,6 @@ MISNAMED = """() => {
         .map((e) => [e.getAttribute("aria-label"), e.labels?.[0]?.innerText ?? e.innerText ?? e.textContent])
         .filter(([name, text]) => !plain(name).includes(plain(text)));
 }"""
-AXE = {"runOnly": ["label-content-name-mismatch"], "resultTypes": ["violations"]}
 PAGES = """() => [...document.querySelectorAll("a[href^='/']")].map((a) => a.getAttribute("href").split("#")[0])
     .filter((path) => !/^\\/(v1|docs)|[.]csv|report$|table=|figure=|format=/.test(path))"""
 
@@ -76,9 +65,7 @@ def test_names_of_buttons_and_links_contain_what_is_written_on_them(page: Any):
         path = waiting.pop(0)
         page.goto(path)
         found = page.evaluate(MISNAMED)
-        found += [
-            entry["nodes"] for entry in axe.Axe().run(page, options=AXE).response["violations"]
-        ]
+        found += violations(page, runOnly=["label-content-name-mismatch"])
         if found:
             misnamed[path] = found
         for link in page.evaluate(PAGES):

@@ -1,0 +1,134 @@
+"""A measurement folder of a plant that ``plant.yaml`` describes, from photographs to exports.
+
+Its photographs are traced from mirrors with errors, on mounts and of facets that Juelich has not.
+"""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from model.forecast import View, align
+from model.frames import sun_direction
+from model.plant_model import PlantModel
+from model.setup import Setup
+from model.surface import control_points
+from service.sources.folder import read_folder
+from service.sources.plant_file import read_plant
+from tests.service.command import ends, heliotwin, heliotwin_on
+from tests.service.sources.plant_files import write_plant
+
+LAYOUT = """\
+name,type,east_m,north_m,up_m
+A1,large,0,150,0
+B1,small,60,120,0
+C1,large,200,400,0
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("plant")
+    plant = read_plant(write_plant(root, layout=LAYOUT))
+    target = plant.plant.targets["cal"]
+    model = PlantModel(plant.plant.site, plant.optics)
+    rng = np.random.default_rng(4)
+    for name in ("A1", "B1"):
+        heliostat = plant.plant.heliostats[name]
+        tilts = rng.normal(0, 2e-4, (2, len(heliostat.facets), 1, 1))
+        across = np.linspace(-1, 1, 8)
+        z = tilts[0] * across[:, None] + tilts[1] * across
+        for number, (azimuth, elevation) in enumerate([(140.0, 40.0), (200.0, 55.0)], start=1):
+            sun = sun_direction(azimuth, elevation)
+            setup = Setup(heliostat, control_points(heliostat, z), sun, target)
+            image = align([setup], model).flux(View(256, 256))[0].numpy()
+            places = target.grid(256, 256).points
+            spot = (image[..., None] * places).sum(axis=(0, 1)) / image.sum()
+            own = root / name / "Calibration"
+            own.mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(own / f"{number}-flux.png"), np.uint8(255 * image / image.max()))
+            properties = {
+                "target_name": "cal",
+                "sun_azimuth_deg": azimuth,
+                "sun_elevation_deg": elevation,
+                "focal_spot_m": spot.tolist(),
+            }
+            path = own / f"{number}-calibration-properties.json"
+            path.write_text(json.dumps(properties))
+    return root
+
+
+def test_folder_is_read_as_its_file_describes_it(folder: Path):
+    read = read_folder(folder)
+    assert list(read.plant.heliostats) == ["A1", "B1"]  # C1 has no photographs
+    assert [one.identifier for one in read.measurements("A1")] == ["1", "2"]
+    first = read.measurements("A1")[0]
+    assert (first.azimuth_deg, first.elevation_deg, first.taken_at) == (140.0, 40.0, None)
+    assert read.skipped == {
+        "receiver board": "the store keeps cylinders only; heliotwin field traces board"
+    }
+
+
+def test_flux_and_forecast_work_on_it(folder: Path, tmp_path: Path):
+    done = heliotwin("flux", folder, "--out", tmp_path / "flux")
+    assert done.returncode == 0, done.stderr
+    quality = json.loads((tmp_path / "flux" / "quality.json").read_text())["images"]
+    assert [one["accepted"] for one in quality.values()] == [True] * 4
+    done = heliotwin("forecast", folder, "--surfaces", "ideal", "--out", tmp_path / "forecast")
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / "forecast" / "forecast.json").read_text())
+    assert all(one["accuracy"] > 0.85 for one in report["measurements"].values())
+    flux = np.load(tmp_path / "forecast" / "A1" / "1-forecast.npz")["flux"]
+    # 28 facets of 1.8 x 1.35 m and a reflectance of 0.95, in light of 1000 W/m2.
+    power = flux.sum() * 12 * 12 / 256**2
+    assert 0.75 < power / (28 * 1.8 * 1.35 * 1000 * 0.95) < 0.98
+
+
+def test_store_gives_back_what_was_imported(folder: Path, tmp_path: Path):
+    done = heliotwin_on(tmp_path / "data", "import", folder)
+    assert done.returncode == 0, done.stderr
+    again = heliotwin_on(tmp_path / "data", "import", folder, "--json")
+    counts = json.loads(again.stdout)["counts"]
+    assert not any(what.endswith("new") for what in counts)
+    done = heliotwin_on(tmp_path / "data", "export", tmp_path / "exported")
+    assert done.returncode == 0, done.stderr
+    before, after = read_folder(folder), read_folder(tmp_path / "exported")
+    for name, heliostat in before.plant.heliostats.items():
+        exported = after.plant.heliostats[name]
+        np.testing.assert_allclose(exported.position, heliostat.position, atol=1e-9)
+        np.testing.assert_allclose(control_points(exported), control_points(heliostat), atol=1e-12)
+        assert exported.optics == heliostat.optics
+        assert [f.outline for f in exported.facets] == [f.outline for f in heliostat.facets]
+        spots = [[one.spot for one in read.measurements(name)] for read in (before, after)]
+        np.testing.assert_allclose(spots[0], spots[1], atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"target_name": "north"}, "target_name: 'north' is none of cal"),
+        ({"sun_azimuth": 10.0}, "sun_azimuth"),
+        ({"sun_elevation_deg": None}, "sun_elevation_deg"),
+    ],
+)
+def test_a_wrong_measurement_is_skipped_by_name(
+    folder: Path, tmp_path: Path, change: dict[str, object], said: str
+):
+    for path in folder.rglob("*.*"):
+        if path.suffix in (".yaml", ".csv") or path.parent.parent.name == "A1":
+            copy = tmp_path / path.relative_to(folder)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            copy.write_bytes(path.read_bytes())
+    path = tmp_path / "A1" / "Calibration" / "1-calibration-properties.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    read = read_folder(tmp_path)
+    assert [one.identifier for one in read.measurements("A1")] == ["2"]
+    assert said in read.skipped["A1/1"]
+
+
+def test_a_folder_without_photographs_is_refused(tmp_path: Path):
+    write_plant(tmp_path, layout=LAYOUT)
+    done = heliotwin("flux", tmp_path, "--out", tmp_path / "out")
+    ends(done, 2, "no heliostat of plant.yaml has a folder of its name")
