@@ -234,7 +234,7 @@ def stored_field() -> None:
                 store.add_surface(
                     session, row, NewSurface("measured", z, 0 * z, control_points(one, z))
                 )
-        sun = {"azimuth_deg": SUN[0], "elevation_deg": SUN[1]}
+        sun = {"azimuth_deg": SUN[0] % 360, "elevation_deg": SUN[1]}
         payload = field_forecasts.FleetForecastIn.model_validate({"target": "plane", "sun": sun})
         job = enqueue(runtime, field_forecasts.KIND, payload, "bench")
         with Meter() as meter:
