@@ -426,7 +426,7 @@ class PlantFolder:
         return require_known("heliostat", heliostat, self.heliostats)
 
     def _receiver(self, on: str | Receiver) -> Receiver:
-        if not isinstance(on, str) and hasattr(on, "patches"):
+        if not isinstance(on, str) and hasattr(on, "touching"):
             return on
         plant = self._folder.plant
         known: dict[str, Receiver] = {**plant.targets, **plant.receivers}
