@@ -16,7 +16,7 @@ International Statistical Institute 37.
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from itertools import chain, combinations
+from itertools import chain, combinations, cycle
 from typing import NamedTuple
 
 import numpy as np
@@ -112,15 +112,17 @@ def squared_difference(one: HalfEstimate, other: HalfEstimate) -> Array:
 
 def exchange_facets(prior: SurfacePrior, coefficients: Array) -> Iterator[Array]:
     """Coefficients (K,) with the deviations of two facets from the prior's mean exchanged, for each
-    pair of facets.
+    pair of facets, without end.
 
-    Four facets have six pairs, the largest number of halves. The ripples are zero.
+    Four facets have six pairs, the largest number of halves. A single facet is turned by half a
+    turn. The ripples are zero.
     """
     smooth, fine = np.split(coefficients, [len(prior.basis)])
     deviation = prior.surface(smooth) - prior.mean
-    for a, b in combinations(range(len(deviation)), 2):
-        exchanged = deviation.copy()
-        exchanged[[a, b]] = deviation[[b, a]]
+    n_facets = len(deviation)
+    for a, b in cycle([*combinations(range(n_facets), 2)] or [(0, 0)]):
+        exchanged = deviation[:, ::-1, ::-1].copy() if n_facets == 1 else deviation.copy()
+        exchanged[[a, b]] = exchanged[[b, a]]
         yield np.concatenate([prior.coefficients(prior.mean + exchanged), np.zeros_like(fine)])
 
 

@@ -24,6 +24,7 @@ from model.least_squares import MinimizerOptions, minimize
 from model.observation import spread_suns
 from model.refinement.image_model import ImageModel, SurfaceState
 from model.refinement.posterior import Hyperparameters, Mode, PosteriorCost
+from model.surface import FACETS
 
 Array = NDArray[np.float64]
 
@@ -62,7 +63,8 @@ class RefinementOptions:
     resolution : int
         Pixels along a side of the compared images.
     samples : int
-        Traced rays along each side of a facet.
+        Traced rays along each side of a facet of four; others have about as many in total
+        (`samples_of`).
     max_steps : int
         Of one minimization.
     """
@@ -75,6 +77,12 @@ class RefinementOptions:
     resolution: int = COARSE_SIZE
     samples: int = 32
     max_steps: int = 12
+
+    def samples_of(self, n_facets: int) -> int:
+        """Traced rays along each side of one of a mirror's facets; half as many as of four at
+        least.
+        """
+        return max(round(self.samples * np.sqrt(FACETS / n_facets)), self.samples // 2)
 
     @property
     def minimizer(self) -> MinimizerOptions:

@@ -1,0 +1,91 @@
+"""Variance between modes: which other surfaces explain the images of a mirror of many facets.
+
+Notes
+-----
+The light of many facets overlaps. Images then show how facets are canted, and hardly which of them
+is canted how: surfaces with exchanged facets explain them nearly as well. The curvature at one mode
+does not show the others. So the facets' deviations are permuted, and the fit is repeated from
+there. The true surface may be near any of the modes: the mean square difference of the others from
+the best one is added to the variance, in each group of coefficients.
+
+Mirrors of up to four facets have no such modes: their half-samples begin with exchanged facets
+(`half_samples`).
+"""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.observation import spread_suns
+from model.prior import SurfacePrior
+from model.refinement.image_model import ImageModel
+from model.refinement.modes import RefinementOptions, anneal, find_optimum
+from model.refinement.posterior import Mode
+from model.surface import FACETS
+
+Array = NDArray[np.float64]
+
+N_MODES = 4
+"""Number of other modes that are sought."""
+
+
+class OtherModes(NamedTuple):
+    """Coefficients (N, K) of other modes, and by how much their costs (N,) exceed the best one's."""
+
+    coefficients: Array
+    excess: Array
+
+
+def n_other_minimizations(n_facets: int, options: RefinementOptions) -> int:
+    """Number of minimizations of `find_other_modes`."""
+    return N_MODES * (len(options.annealing) + 1) if n_facets > FACETS else 0
+
+
+def find_other_modes(model: ImageModel, mode: Mode, options: RefinementOptions) -> OtherModes:
+    """Find modes from permuted facets; none for mirrors of up to four."""
+    if len(model.prior.mean) <= FACETS:
+        return OtherModes(np.zeros((0, len(mode.state.coefficients))), np.zeros(0))
+    model.steps.phase = "comparing surfaces with exchanged facets"
+    few = model.subset(sorted(spread_suns(model.suns, options.max_annealed)))
+
+    def fit(start: Array) -> Mode:
+        state = few.state(start)
+        near = anneal(few, state, few.jacobian(state), options.rough_minimizer, options.annealing)
+        if len(few.observations) < len(model.observations):
+            state = model.state(near.state.coefficients)
+            near = replace(near, state=state, jacobian=model.jacobian(state))
+        return find_optimum(model, replace(near, hyper=mode.hyper), options.rough_minimizer)
+
+    with ThreadPoolExecutor(2) as threads:
+        found = list(threads.map(fit, permuted_facets(model.prior, mode.state.coefficients)))
+    return OtherModes(
+        np.array([other.state.coefficients for other in found]),
+        np.array([other.cost - mode.cost for other in found]),
+    )
+
+
+def permuted_facets(prior: SurfacePrior, coefficients: Array) -> list[Array]:
+    """Coefficients (K,) with the deviations of all facets from the prior's mean permuted.
+
+    The ripples are zero.
+    """
+    rng = np.random.default_rng(0)
+    smooth, fine = np.split(coefficients, [len(prior.basis)])
+    deviation = prior.surface(smooth) - prior.mean
+    orders = [rng.permutation(len(deviation)) for _ in range(N_MODES)]
+    return [
+        np.concatenate([prior.coefficients(prior.mean + deviation[order]), np.zeros_like(fine)])
+        for order in orders
+    ]
+
+
+def between_mode_variance(prior: SurfacePrior, best: Array, others: OtherModes) -> Array:
+    """Variance (K,) of the prior's coefficients between the ``best`` (K,) mode and the others."""
+    if not len(others.excess):
+        return np.zeros(len(prior.basis))
+    squares = ((others.coefficients - best)[:, : len(prior.basis)] ** 2).mean(axis=0)
+    counts = np.diff([*prior.groups, len(squares)])
+    return np.repeat(np.add.reduceat(squares, prior.groups) / counts, counts)
