@@ -299,13 +299,13 @@ def flux_changes(
     """`Aligned.flux_images` (K + 1, B, size, size): unchanged, and after each of K height changes.
 
     ``directions`` are K changes of all mirrors, (K, F, I, J) [m] or as sums of shapes. Images are
-    linear in them. The mounts keep the spots in place. A few setups are traced at once; ``between`` is called before
-    each time.
+    linear in them. The mounts keep the spots in place. A few setups are traced at once; ``between``
+    is called before each time.
     """
     view, model = View(samples=samples), aligned.model
-    plain = isinstance(directions, Tensor)
+    is_plain = isinstance(directions, Tensor)
     heights = HeightChanges.of(directions) if isinstance(directions, Tensor) else directions
-    shapes = None if plain else heights.shapes
+    shapes = None if is_plain else heights.shapes
 
     def image_part(
         group: AlignedGroup, window: Window, there: Sequence[Effect], places: list[int]

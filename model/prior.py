@@ -267,7 +267,7 @@ def _facet_shapes(covariance: Array, half: Array, count: int) -> tuple[Array, Ar
     constant = np.full((1, tilts.shape[1]), tilts.shape[1] ** -0.5)
     rest = np.eye(tilts.shape[1]) - tilts.T @ tilts - constant.T @ constant
     values, axes = np.linalg.eigh(rest @ covariance @ rest)
-    values, axes = (part[: N_TILTS : -1] for part in (values, axes.T))
+    values, axes = (part[:N_TILTS:-1] for part in (values, axes.T))
     n_kept = max(count - N_TILTS, 1)
     fine = axes[n_kept:] * np.sqrt(values[n_kept:, None].clip(min=0))
     return np.concatenate([tilts, axes[:n_kept]]), fine
@@ -376,5 +376,7 @@ def orthogonal(directions: Array) -> Array:
     largest = np.abs(axes) > (1 - 1e-6) * np.abs(axes).max(axis=1, keepdims=True)
     signs = np.sign(axes[np.arange(len(axes)), largest.argmax(axis=1)])
     return np.asarray(
-        ((signs * singular)[:, None] * axes)[singular > MIN_LENGTH].reshape(-1, *directions.shape[1:])
+        ((signs * singular)[:, None] * axes)[singular > MIN_LENGTH].reshape(
+            -1, *directions.shape[1:]
+        )
     )

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from model.prior import SurfacePrior
 from model.refinement.image_model import ImageModel
-from model.refinement.modes import RefinementOptions, anneal, find_optimum
+from model.refinement.modes import RefinementOptions, anneal_few, find_optimum
 from model.refinement.posterior import Hyperparameters, Linearization, Mode, linearize
 from model.refinement.whitening import BANDS
 
@@ -135,8 +135,9 @@ def fit_half(
 ) -> HalfEstimate:
     """Fit some of the images from coefficients (K,), with the noise that all images have."""
     part, n_images = model.subset(half), len(model.observations)
-    state = part.state(start)
-    near = anneal(part, state, part.jacobian(state), options.rough_minimizer, options.annealing[:1])
+    near = anneal_few(
+        part, start, options.rough_minimizer, options.annealing[:1], options.max_annealed
+    )
     sigma = np.broadcast_to(hyper.sigma, (n_images, len(BANDS)))[list(half)]
     found = find_optimum(
         part, replace(near, hyper=replace(hyper, sigma=sigma)), options.rough_minimizer

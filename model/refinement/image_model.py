@@ -25,13 +25,7 @@ from numpy.typing import NDArray
 from model.forecast import Aligned, flux_changes
 from model.images import COARSE_SIZE, binned
 from model.network.inputs import STEP_HEIGHT
-from model.observation import (
-    Observation,
-    Saturation,
-    align_observations,
-    common_side,
-    spread_suns,
-)
+from model.observation import Observation, Saturation, align_observations, common_side, spread_suns
 from model.plant import Heliostat
 from model.plant_model import PlantModel
 from model.prior import SurfacePrior, ripple_shapes
@@ -177,10 +171,7 @@ class ImageModel:
         """
         shapes = _tensor(
             np.concatenate(
-                [
-                    halved(self.prior.fine),
-                    ripple_shapes(self.heliostat.facet_frames.half_sizes),
-                ]
+                [halved(self.prior.fine), ripple_shapes(self.heliostat.facet_frames.half_sizes)]
             )
         )
         smooth, _ = self.split(state.coefficients)

@@ -117,6 +117,24 @@ def anneal(
     return mode
 
 
+def anneal_few(
+    model: ImageModel,
+    start: Array,
+    minimizer: MinimizerOptions,
+    noise_levels: Sequence[float],
+    max_annealed: int,
+) -> Mode:
+    """Anneal from coefficients (K,) with a few of the images; the mode has the images of all."""
+    places = sorted(spread_suns(model.suns, max_annealed))
+    few = model if len(places) == len(model.observations) else model.subset(places)
+    state = few.state(start)
+    mode = anneal(few, state, few.jacobian(state), minimizer, noise_levels)
+    if few is model:
+        return mode
+    state = model.state(mode.state.coefficients)
+    return replace(mode, state=state, jacobian=model.jacobian(state))
+
+
 def find_mode(model: ImageModel, starts: Sequence[Array], options: RefinementOptions) -> Mode:
     """Anneal from each start, coefficients (K,), with a few images; the best mode, with the images
     of all.

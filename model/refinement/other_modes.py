@@ -19,10 +19,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from model.observation import spread_suns
 from model.prior import SurfacePrior
 from model.refinement.image_model import ImageModel
-from model.refinement.modes import RefinementOptions, anneal, find_optimum
+from model.refinement.modes import RefinementOptions, anneal_few, find_optimum
 from model.refinement.posterior import Mode
 from model.surface import FACETS
 
@@ -33,7 +32,7 @@ N_MODES = 4
 
 
 class OtherModes(NamedTuple):
-    """Coefficients (N, K) of other modes, and by how much their costs (N,) exceed the best one's."""
+    """Coefficients (N, K) of other modes, and their costs (N,) minus the best one's."""
 
     coefficients: Array
     excess: Array
@@ -49,14 +48,11 @@ def find_other_modes(model: ImageModel, mode: Mode, options: RefinementOptions) 
     if len(model.prior.mean) <= FACETS:
         return OtherModes(np.zeros((0, len(mode.state.coefficients))), np.zeros(0))
     model.steps.phase = "comparing surfaces with exchanged facets"
-    few = model.subset(sorted(spread_suns(model.suns, options.max_annealed)))
 
     def fit(start: Array) -> Mode:
-        state = few.state(start)
-        near = anneal(few, state, few.jacobian(state), options.rough_minimizer, options.annealing)
-        if len(few.observations) < len(model.observations):
-            state = model.state(near.state.coefficients)
-            near = replace(near, state=state, jacobian=model.jacobian(state))
+        near = anneal_few(
+            model, start, options.rough_minimizer, options.annealing, options.max_annealed
+        )
         return find_optimum(model, replace(near, hyper=mode.hyper), options.rough_minimizer)
 
     with ThreadPoolExecutor(2) as threads:

@@ -47,11 +47,11 @@ FACETS: dict[int, tuple[FacetDesign, ...]] = {
     25: facet_grid(5, 5, 1.22, 1.22, 0.02),
     35: facet_grid(7, 5, 1.8, 1.35, 0.02),
 }
-"""Facets of the mirrors by their number; 25 are those of the National Solar Thermal Test Facility."""
+"""Facets by their number; 25 are those of the National Solar Thermal Test Facility."""
 
 HEAD = (
-    "| facets | distance [m] | window [m] | ideal | refined | truth | error [mm] | ideal's | mean sigma |"
-    " within 90 % | processor [s] | wall [s] |\n" + "| --- " * 12 + "|"
+    "| facets | distance [m] | window [m] | ideal | refined | truth | error [mm] | ideal's |"
+    " mean sigma | within 90 % | processor [s] | wall [s] |\n" + "| --- " * 12 + "|"
 )
 
 
