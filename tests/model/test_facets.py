@@ -28,7 +28,7 @@ GRIDS = {
 }
 SUNS = np.array([sun_direction(*place) for place in ((140.0, 30.0), (180, 50), (230, 25))])
 OTHER = sun_direction(200.0, 35.0)[None]
-QUICK = RefinementOptions(annealing=(0.05,), rounds=1, max_steps=4, samples=16)
+QUICK = RefinementOptions(annealing=(0.05,), rounds=1, max_steps=4, resolution=16, samples=16)
 
 
 def mirror(count: int, distance: float = 100.0) -> Heliostat:
