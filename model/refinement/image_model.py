@@ -28,7 +28,7 @@ from model.network.inputs import STEP_HEIGHT
 from model.observation import Observation, Saturation, align_observations, common_side, spread_suns
 from model.plant import Heliostat
 from model.plant_model import PlantModel
-from model.prior import SurfacePrior, ripple_shapes
+from model.prior import SurfacePrior, ripple_shapes, ripples
 from model.progress import Steps
 from model.refinement.whitening import Whitener
 from model.surface import halved
@@ -161,34 +161,29 @@ class ImageModel:
         """The prior's directions, each as long as its step."""
         prior, steps = self.prior, self._difference_steps[:, None, None]
         if prior.shapes is None or prior.weights is None:
-            return HeightChanges.of(_tensor(prior.basis * steps[..., None]))
-        return HeightChanges(_tensor(prior.shapes), _tensor(prior.weights * steps))
+            return HeightChanges.of(_tensor(prior.basis) * _tensor(steps[..., None]))
+        return HeightChanges(_tensor(prior.shapes), _tensor(prior.weights) * _tensor(steps))
 
     def with_ripples(self, state: SurfaceState, whitener: Whitener) -> "ImageModel":
         """The model with ripples, whose images are those at a state, to first order.
 
         ``whitener`` is that of the state's images.
         """
-        shapes = _tensor(
-            np.concatenate(
-                [halved(self.prior.fine), ripple_shapes(self.heliostat.facet_frames.half_sizes)]
-            )
-        )
         smooth, _ = self.split(state.coefficients)
-        z, count = halved(self.prior.surface(smooth)), len(shapes) * len(self.prior.mean)
-        if count <= MAX_RIPPLES:
-            changes = self._trace_changes(self._align(z), HeightChanges(shapes))
-            return replace(self, ripple_images=changes)
-        few = sorted(spread_suns(self.suns, MAX_COMPARED))
-        some = self.subset(few)
-        by_shape = some._trace_changes(some._align(z), HeightChanges(shapes))
-        weights = _strongest(whitener.subset(few)(by_shape), MAX_RIPPLES)
-        if len(few) == len(self.observations):
-            changes = np.tensordot(weights, by_shape, axes=1)
-        else:
-            parts = _tensor(weights.reshape(len(weights), len(self.prior.mean), -1))
-            changes = self._trace_changes(self._align(z), HeightChanges(shapes, parts))
-        return replace(self, ripple_images=changes)
+        z, half_sizes = halved(self.prior.surface(smooth)), self.heliostat.facet_frames.half_sizes
+        if self.prior.shapes is None:
+            found = self._changes_of(z, HeightChanges.of(_tensor(ripples(half_sizes))))
+            return replace(self, ripple_images=found)
+        shapes = _tensor(np.concatenate([halved(self.prior.fine), ripple_shapes(half_sizes)]))
+        if len(shapes) * len(z) <= MAX_RIPPLES:
+            return replace(self, ripple_images=self._changes_of(z, HeightChanges(shapes)))
+        places = sorted(spread_suns(self.suns, MAX_COMPARED))
+        by_shape = self.subset(places)._changes_of(z, HeightChanges(shapes))
+        weights = _strongest(whitener.subset(places)(by_shape), MAX_RIPPLES)
+        if len(places) == len(self.observations):
+            return replace(self, ripple_images=np.tensordot(weights, by_shape, axes=1))
+        of_facets = _tensor(weights.reshape(len(weights), len(z), -1))
+        return replace(self, ripple_images=self._changes_of(z, HeightChanges(shapes, of_facets)))
 
     def dim_facets(self, state: SurfaceState, share: float) -> Array:
         """Change of the images (F, M, R, R) as each facet in turn loses a share of its light."""
@@ -209,6 +204,10 @@ class ImageModel:
             images = aligned.flux_images(size=self.resolution, side=self.side, samples=self.samples)
             images = self._saturation.apply(images)
         return np.asarray(images.double().numpy())
+
+    def _changes_of(self, z: Array, changes: HeightChanges) -> NDArray[Any]:
+        """Change of the images (K, M, R, R) of the mirror of heights (F, I, J) [m]."""
+        return self._trace_changes(self._align(z), changes)
 
     def _trace_changes(self, aligned: Aligned, directions: HeightChanges) -> NDArray[Any]:
         """Change of the images (K, M, R, R) with K changes of the heights."""

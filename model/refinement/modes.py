@@ -11,6 +11,7 @@ Notes
 The cost is that of `model.refinement.posterior`, in nats.
 """
 
+import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -82,7 +83,7 @@ class RefinementOptions:
         """Traced rays along each side of one of a mirror's facets; half as many as of four at
         least.
         """
-        return max(round(self.samples * np.sqrt(FACETS / n_facets)), self.samples // 2)
+        return max(round(self.samples * math.sqrt(FACETS / n_facets)), self.samples // 2)
 
     @property
     def minimizer(self) -> MinimizerOptions:
