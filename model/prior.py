@@ -29,6 +29,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -256,7 +257,14 @@ def generic_prior(half_sizes: Array, kind: FacetKind | None = None) -> SurfacePr
     )
 
 
-def _facet_shapes(covariance: Array, half: Array, count: int) -> tuple[Array, Array]:
+class _FacetShapes(NamedTuple):
+    """Shapes (L, 64) of a facet, and finer ones (N, 64) [m]."""
+
+    shapes: Array
+    fine: Array
+
+
+def _facet_shapes(covariance: Array, half: Array, count: int) -> _FacetShapes:
     """Shapes (L, 64) of a facet by the covariance (64, 64) of its heights, and finer ones (N, 64).
 
     The first are orthonormal: the `tilt_modes`, then principal directions, together up to
@@ -270,7 +278,7 @@ def _facet_shapes(covariance: Array, half: Array, count: int) -> tuple[Array, Ar
     values, axes = (part[:N_TILTS:-1] for part in (values, axes.T))
     n_kept = max(count - N_TILTS, 1)
     fine = axes[n_kept:] * np.sqrt(values[n_kept:, None].clip(min=0))
-    return np.concatenate([tilts, axes[:n_kept]]), fine
+    return _FacetShapes(np.concatenate([tilts, axes[:n_kept]]), fine)
 
 
 def _deviations(covariance: Array) -> Array:
@@ -285,7 +293,14 @@ def _contrasts(count: int) -> Array:
     return np.asarray(helmert / np.linalg.norm(helmert, axis=1, keepdims=True))
 
 
-def _facet_blocks(half: Array, kind: FacetKind) -> tuple[Array, Array]:
+class _FacetBlocks(NamedTuple):
+    """Covariances (64, 64) [m2] of a facet's bending, and of what it shares with no other."""
+
+    bending: Array
+    alone: Array
+
+
+def _facet_blocks(half: Array, kind: FacetKind) -> _FacetBlocks:
     """Covariances (64, 64) [m2] of a facet's bending, and of what it has in common with no other.
 
     ``half`` (2,) [m] are its half sides.
@@ -296,7 +311,7 @@ def _facet_blocks(half: Array, kind: FacetKind) -> tuple[Array, Array]:
     canting = kind.canting**2 * (np.outer(x, x) + np.outer(y, y)) + (
         kind.grain * side
     ) ** 2 * np.eye(len(x))
-    return bending, (1 - kind.alike) * bending + canting
+    return _FacetBlocks(bending, (1 - kind.alike) * bending + canting)
 
 
 def generic_covariance(half_sizes: Array, kind: FacetKind) -> Array:

@@ -172,18 +172,10 @@ class ImageModel:
         smooth, _ = self.split(state.coefficients)
         z, half_sizes = halved(self.prior.surface(smooth)), self.heliostat.facet_frames.half_sizes
         if self.prior.shapes is None:
-            found = self._changes_of(z, HeightChanges.of(_tensor(ripples(half_sizes))))
+            found = self.changes_of(z, HeightChanges.of(_tensor(ripples(half_sizes))))
             return replace(self, ripple_images=found)
         shapes = _tensor(np.concatenate([halved(self.prior.fine), ripple_shapes(half_sizes)]))
-        if len(shapes) * len(z) <= MAX_RIPPLES:
-            return replace(self, ripple_images=self._changes_of(z, HeightChanges(shapes)))
-        places = sorted(spread_suns(self.suns, MAX_COMPARED))
-        by_shape = self.subset(places)._changes_of(z, HeightChanges(shapes))
-        weights = _strongest(whitener.subset(places)(by_shape), MAX_RIPPLES)
-        if len(places) == len(self.observations):
-            return replace(self, ripple_images=np.tensordot(weights, by_shape, axes=1))
-        of_facets = _tensor(weights.reshape(len(weights), len(z), -1))
-        return replace(self, ripple_images=self._changes_of(z, HeightChanges(shapes, of_facets)))
+        return replace(self, ripple_images=_strongest_ripples(self, z, shapes, whitener))
 
     def dim_facets(self, state: SurfaceState, share: float) -> Array:
         """Change of the images (F, M, R, R) as each facet in turn loses a share of its light."""
@@ -205,7 +197,7 @@ class ImageModel:
             images = self._saturation.apply(images)
         return np.asarray(images.double().numpy())
 
-    def _changes_of(self, z: Array, changes: HeightChanges) -> NDArray[Any]:
+    def changes_of(self, z: Array, changes: HeightChanges) -> NDArray[Any]:
         """Change of the images (K, M, R, R) of the mirror of heights (F, I, J) [m]."""
         return self._trace_changes(self._align(z), changes)
 
@@ -226,6 +218,23 @@ class ImageModel:
 
 def _tensor(values: Array) -> torch.Tensor:
     return torch.as_tensor(values, dtype=torch.float32)
+
+
+def _strongest_ripples(
+    model: ImageModel, z: Array, shapes: torch.Tensor, whitener: Whitener
+) -> NDArray[Any]:
+    """Change of the images (N, M, R, R) per ripple: `MAX_RIPPLES` combinations of each facet's
+    ``shapes`` (L, I, J) [m], on the mirror of heights ``z`` (F, I, J) [m].
+    """
+    if len(shapes) * len(z) <= MAX_RIPPLES:
+        return model.changes_of(z, HeightChanges(shapes))
+    places = sorted(spread_suns(model.suns, MAX_COMPARED))
+    by_shape = model.subset(places).changes_of(z, HeightChanges(shapes))
+    weights = _strongest(whitener.subset(places)(by_shape), MAX_RIPPLES)
+    if len(places) == len(model.observations):
+        return np.asarray(np.tensordot(weights, by_shape, axes=1))
+    of_facets = _tensor(weights.reshape(len(weights), len(z), -1))
+    return model.changes_of(z, HeightChanges(shapes, of_facets))
 
 
 def _strongest(white: NDArray[Any], count: int) -> NDArray[Any]:
