@@ -216,7 +216,7 @@ class ImageModel:
             return np.asarray((images[1:] - images[:1]).numpy())
 
 
-def _tensor(values: Array) -> torch.Tensor:
+def _tensor(values: NDArray[Any]) -> torch.Tensor:
     return torch.as_tensor(values, dtype=torch.float32)
 
 
