@@ -255,7 +255,9 @@ class PlantFolder:
         with store.runtime.computing(f"predict_{method}") as operations:
             if named:
                 taken = [row for row in rows if row.identifier in named]
-                chosen = to_observations([accepted_measurement(row, twin.origin) for row in taken])
+                chosen = to_observations(
+                    [accepted_measurement(row, twin.origin) for row in taken], twin.heliostat
+                )
             else:
                 chosen, _ = choose_observations(operations, twin, rows, count)
             found = operations.predict(twin.heliostat, chosen, twin.model, method)

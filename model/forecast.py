@@ -39,7 +39,7 @@ from model.setup import Setup
 from model.site import Site
 from model.tracing import Optics, Scene, Window, trace
 from model.tracing.alignment import align_to_spots
-from model.tracing.sensitivity import sensitivity
+from model.tracing.sensitivity import HeightChanges, sensitivity
 
 Array = NDArray[np.float64]
 
@@ -289,7 +289,7 @@ class Aligned:
 
 def flux_changes(
     aligned: Aligned,
-    directions: Tensor,
+    directions: Tensor | HeightChanges,
     *,
     size: int = FLUX_SIZE,
     side: float = FLUX_WINDOW,
@@ -298,11 +298,14 @@ def flux_changes(
 ) -> Tensor:
     """`Aligned.flux_images` (K + 1, B, size, size): unchanged, and after each of K height changes.
 
-    ``directions`` are changes (K, F, I, J) [m] of all mirrors, whose images are linear in them. The
-    mounts keep the spots in place. A few setups are traced at once; ``between`` is called before
-    each time.
+    ``directions`` are K changes of all mirrors, (K, F, I, J) [m] or as sums of shapes. Images are
+    linear in them. The mounts keep the spots in place. A few setups are traced at once; ``between``
+    is called before each time.
     """
     view, model = View(samples=samples), aligned.model
+    is_plain = isinstance(directions, Tensor)
+    heights = HeightChanges.of(directions) if isinstance(directions, Tensor) else directions
+    shapes = None if is_plain else heights.shapes
 
     def image_part(
         group: AlignedGroup, window: Window, there: Sequence[Effect], places: list[int]
@@ -317,8 +320,10 @@ def flux_changes(
         between()
         scene, optics = group.scene.subset(places), apply_optics_effects(there, model.optics)
         flux = view.trace(scene, window, optics)
-        by_height = sensitivity(scene, window, optics, samples=samples, padding=view.padding)
-        changes = (directions.flatten(1) @ by_height.flatten(1)).view(-1, *flux.shape)
+        by_shape = sensitivity(
+            scene, window, optics, shapes=shapes, samples=samples, padding=view.padding
+        )
+        changes = heights.combine(by_shape)
         images = flux + torch.cat([torch.zeros_like(flux)[None], changes])
         seen = _flux_image(images.flatten(0, 1), window, there, size, side)
         return seen.view(-1, len(places), size, size).transpose(0, 1)

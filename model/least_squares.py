@@ -112,7 +112,9 @@ def minimize(
         jacobian, n_jacobians = problem.jacobian(state), n_jacobians - 1
     cost, damping, n_rejected = problem.cost(state), options.damping, 0
     for _ in range(options.max_steps):
-        change = damped_step(problem.quadratic(state, jacobian), damping, problem.bounds(state))
+        if not n_rejected:
+            quadratic = problem.quadratic(state, jacobian)
+        change = damped_step(quadratic, damping, problem.bounds(state))
         trial = problem.step(state, change)
         trial_cost = problem.cost(trial)
         gain, enough = cost - trial_cost, options.min_gain + options.min_relative_gain * cost

@@ -15,12 +15,19 @@ from numpy.typing import ArrayLike, NDArray
 from model.errors import InvalidInputError
 from model.images import FLUX_SIZE, FLUX_WINDOW
 from model.imaging.window import center_of_mass, flux_window
+from model.plant import Heliostat
 
 Array = NDArray[np.float64]
 
 
-WINDOWS = (FLUX_WINDOW, 6.0, 8.0, 12.0)
+WINDOWS = (FLUX_WINDOW, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0)
 """Sides [m] of comparison windows: a flux image's, unless a spot is larger (`accuracy_window`)."""
+
+SUN_RADIUS = 4.65e-3
+"""Half the angle [rad] of the sun's disc."""
+
+WINDOW_TOLERANCE = 0.1
+"""Share by which a spot's outer rim, which holds little light, may exceed its window."""
 
 SPILL = 0.02
 """Share of a spot's energy that may lie outside its window."""
@@ -100,6 +107,32 @@ def accuracy_window(
         if np.median(outside) <= spill:
             return window
     return windows[-1]
+
+
+def spot_window(heliostat: Heliostat, slant_range: float) -> float:
+    """Side [m] of the smallest of `WINDOWS` that holds a heliostat's spot at a slant range [m].
+
+    The spot is as wide as the light of the ideal mirror from the sun's centre, under normal
+    incidence, and the sun's disc with twice the standard deviation of the mirror's errors.
+    """
+    optics = heliostat.optics
+    error = np.hypot(2 * optics.slope_error, optics.pointing_error)
+    side = _central_spot(heliostat, slant_range) + 2 * slant_range * (SUN_RADIUS + 2 * error)
+    return min((w for w in WINDOWS if w * (1 + WINDOW_TOLERANCE) >= side), default=WINDOWS[-1])
+
+
+def _central_spot(heliostat: Heliostat, slant_range: float) -> float:
+    """Width [m] of the ideal mirror's light from a point on its axis."""
+    centers, axes, half_sizes = heliostat.facet_frames
+    corners = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
+    local = np.zeros((len(centers), len(corners), 3))
+    local[..., :2] = corners * half_sizes[:, None]
+    focus = np.array([facet.focal_length or np.inf for facet in heliostat.facets])
+    normals = -local / (2 * focus[:, None, None]) + [0.0, 0.0, 1.0]
+    points, normals = (np.einsum("fkc,fcd->fkd", part, axes) for part in (local, normals))
+    slopes = normals[..., :2] / normals[..., 2:]
+    hits = centers[:, None, :2] + points[..., :2] + 2 * slant_range * slopes
+    return float(np.ptp(hits.reshape(-1, 2), axis=0).max())
 
 
 class _Cut(NamedTuple):

@@ -90,9 +90,9 @@ class SurfacePrediction:
 
     Attributes
     ----------
-    z, z_std : (4, 8, 8) [m]
+    z, z_std : (F, 8, 8) [m]
         Control heights over the canted facets, facet mean zero, and their standard deviation.
-    control_points : (4, 8, 8, 3) [m]
+    control_points : (F, 8, 8, 3) [m]
         In mirror coordinates.
     method : str
         "network" or "refined".
@@ -167,7 +167,7 @@ def _setups(
 def observed_scene(
     heliostat: Heliostat, observations: Sequence[Observation], z: NDArray[np.float64]
 ) -> Scene:
-    """The scene of M observations of a surface ``z`` (4, 8, 8) [m], aligned by the spots."""
+    """The scene of M observations of a surface ``z`` (F, 8, 8) [m], aligned by the spots."""
     return align_to_spots(_setups(heliostat, observations, z)).scene.to(torch.float32)
 
 
@@ -178,7 +178,7 @@ def align_observations(
     model: PlantModel,
     start: Aligned | None = None,
 ) -> Aligned:
-    """Align the heliostat with surface ``z`` (4, 8, 8) [m] so that its spots are where the M were
+    """Align the heliostat with surface ``z`` (F, 8, 8) [m] so that its spots are where the M were
     observed.
 
     The mount compensates a tilt of the whole mirror. ``start`` is the result for a similar surface,
@@ -238,7 +238,7 @@ def render_observations(
     model: PlantModel,
     samples: int = 24,
 ) -> NDArray[np.float64]:
-    """Render the M images of a surface ``z`` (4, 8, 8) [m]: (M, 64, 64), sum 100."""
+    """Render the M images of a surface ``z`` (F, 8, 8) [m]: (M, 64, 64), sum 100."""
     with torch.no_grad():
         aligned = align_observations(heliostat, observations, z, model)
         images = aligned.flux_images(side=common_side(observations), samples=samples)
@@ -265,7 +265,7 @@ def misfits(
     z: NDArray[np.float64],
     model: PlantModel,
 ) -> tuple[float, ...]:
-    """One minus the accuracy with which heights ``z`` (4, 8, 8) [m] render each image."""
+    """One minus the accuracy with which heights ``z`` (F, 8, 8) [m] render each image."""
     images = render_observations(heliostat, observations, z, model).clip(min=0)
     return tuple(
         1 - flux_accuracy(o.flux, image) for o, image in zip(observations, images, strict=True)

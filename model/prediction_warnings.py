@@ -86,10 +86,13 @@ def network_warnings(heliostat: Heliostat, observations: Sequence[Observation]) 
 
 
 def canting_warnings(prior: SurfacePrior, z: Array) -> list[str]:
-    """Warnings about facets of heights (4, 8, 8) [m] whose canting is unlikely by the prior.
+    """Warnings about facets of heights (F, 8, 8) [m] whose canting is unlikely by the prior.
 
-    The canting is relative to the facets' mean: a tilt of the whole mirror is the mount's.
+    The canting is relative to the facets' mean: a tilt of the whole mirror is the mount's. A single
+    facet has none.
     """
+    if len(z) == 1:
+        return []
     mean, std = _usual_canting(prior)
     distances = np.linalg.norm((_relative_canting(z) - mean) / std, axis=-1)
     return [

@@ -22,24 +22,10 @@ from model.errors import InvalidInputError
 from model.plant import Heliostat
 
 FACETS, ROWS, COLUMNS, DEGREE = 4, 8, 8, 3
-"""heliotwin's grid: facets, control points along x and along y, and the spline's degree."""
+"""heliotwin's grid: facets of the measured type, control points along x and y, spline's degree."""
 
 Array = NDArray[np.float64]
 Values = TypeVar("Values", Array, Tensor)
-
-
-def require_own_grid(heliostat: Heliostat) -> None:
-    """Refuse a heliostat whose number of facets is not that of predicted surfaces.
-
-    Raises
-    ------
-    InvalidInputError
-    """
-    count = len(heliostat.facets)
-    if count != FACETS:
-        raise InvalidInputError(
-            f"surfaces are predicted of mirrors of {FACETS} facets, {heliostat.name} has {count}"
-        )
 
 
 def knots(count: int, degree: int) -> Array:

@@ -37,7 +37,7 @@ from model.observation import (
 from model.plant import Heliostat
 from model.plant_model import PlantModel
 from model.prior import default_prior
-from model.surface import control_points, mirrored, require_own_grid
+from model.surface import FACETS, control_points, mirrored
 
 Array = NDArray[np.float64]
 
@@ -111,7 +111,11 @@ class SurfacePredictor:
             raise InvalidInputError(
                 f"a prediction takes 1 to {MAX_IMAGES} images, got {len(observations)}"
             )
-        require_own_grid(heliostat)
+        if not has_network(heliostat):
+            raise InvalidInputError(
+                f"the network predicts mirrors of {FACETS} facets, {heliostat.name} has"
+                f" {len(heliostat.facets)}; use the method refined"
+            )
         network_inputs = _NetworkInputs(heliostat, observations, model)
         z = default_prior().mean
         inputs = network_inputs.inputs(z)
@@ -155,6 +159,11 @@ class SurfacePredictor:
                 *prediction_warnings.canting_warnings(default_prior(), z),
             ),
         )
+
+
+def has_network(heliostat: Heliostat) -> bool:
+    """Whether the shipped network predicts mirrors of a heliostat's number of facets."""
+    return len(heliostat.facets) == FACETS
 
 
 class _NetworkInputs:

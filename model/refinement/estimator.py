@@ -22,6 +22,7 @@ The stages, each of which can be called separately::
     fit = estimate_hyperparameters(fit, options)
     linearization = linearize(fit.model, fit.mode)
     covariance = half_sample_covariance(fit.model, fit.mode, linearization, options)
+    others = find_other_modes(fit.model, fit.mode, options)
 
 1. `fit_consistent_images` anneals from each start with a few images (`modes`), takes the mode of
    the lowest cost, and excludes images that the others contradict, one by one.
@@ -32,6 +33,8 @@ The stages, each of which can be called separately::
    again.
 4. `half_sample_covariance` widens the covariance by how much halves of the images disagree
    (`half_samples`).
+5. `find_other_modes` widens the covariance of mirrors of many facets by how much surfaces with
+   exchanged facets differ that explain the images too (`other_modes`).
 
 S has one variance for each band of spatial frequency, times a factor for each image. Errors that
 look like a bent mirror have more weight than S says; the overdispersion of the images' scores is
@@ -54,8 +57,13 @@ from model.progress import Progress, Steps, silent
 from model.refinement.half_samples import half_sample_covariance, n_minimizations
 from model.refinement.image_model import ImageModel
 from model.refinement.modes import RefinementOptions, find_mode, find_optimum
+from model.refinement.other_modes import (
+    between_mode_variance,
+    find_other_modes,
+    n_other_minimizations,
+)
 from model.refinement.posterior import FacetLight, Hyperparameters, Linearization, Mode, linearize
-from model.surface import control_points, require_own_grid
+from model.surface import control_points
 
 Array = NDArray[np.float64]
 
@@ -99,7 +107,7 @@ def refine(
     observations : sequence of Observation
         Any number from one.
     model : PlantModel
-    start : (4, 8, 8) [m], optional
+    start : (F, 8, 8) [m], optional
         Where to begin in addition to the prior's mean: the network's prediction, say. The better
         result counts.
     prior : SurfacePrior, optional
@@ -111,24 +119,27 @@ def refine(
     Raises
     ------
     InvalidInputError
-        Without images, or for a heliostat that does not have four facets.
+        Without images.
     """
     if not observations:
         raise InvalidInputError("a refinement takes at least one image")
-    require_own_grid(heliostat)
     prior, options, steps = (
         prior or prior_of(heliostat),
         options or RefinementOptions(),
         Steps(progress),
     )
-    steps.total = options.rounds + n_minimizations(len(observations))
+    steps.total = (
+        options.rounds
+        + n_minimizations(len(observations))
+        + n_other_minimizations(len(heliostat.facets), options)
+    )
     images = ImageModel(
         heliostat,
         observations,
         model,
         prior,
         resolution=options.resolution,
-        samples=options.samples,
+        samples=options.samples_of(len(heliostat.facets)),
         steps=steps,
     )
     mean = np.zeros(len(prior.basis))
@@ -141,6 +152,8 @@ def refine(
     fit = estimate_hyperparameters(fit, options)
     linearization = linearize(fit.model, fit.mode)
     covariance = half_sample_covariance(fit.model, fit.mode, linearization, options)
+    others = find_other_modes(fit.model, fit.mode, options)
+    covariance += np.diag(between_mode_variance(prior, fit.mode.state.coefficients, others))
     smooth, _ = fit.model.split(fit.mode.state.coefficients)
     z = prior.surface(smooth)
     against = [
@@ -182,7 +195,8 @@ def fit_consistent_images(
 
 def add_ripples(fit: SurfaceFit) -> SurfaceFit:
     """Add the coefficients of ripples, which are zero at first."""
-    model, state, hyper = fit.model.with_ripples(fit.mode.state), fit.mode.state, fit.mode.hyper
+    state, hyper = fit.mode.state, fit.mode.hyper
+    model = fit.model.with_ripples(state, fit.mode.whitener(fit.model.side))
     count = len(model.ripples)
     state = replace(state, coefficients=np.concatenate([state.coefficients, np.zeros(count)]))
     hyper = replace(hyper, precision=np.concatenate([hyper.precision, np.ones(count)]))

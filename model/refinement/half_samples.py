@@ -16,7 +16,7 @@ International Statistical Institute 37.
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from itertools import chain, combinations
+from itertools import chain, combinations, cycle
 from typing import NamedTuple
 
 import numpy as np
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from model.prior import SurfacePrior
 from model.refinement.image_model import ImageModel
-from model.refinement.modes import RefinementOptions, anneal, find_optimum
+from model.refinement.modes import RefinementOptions, anneal_few, find_optimum
 from model.refinement.posterior import Hyperparameters, Linearization, Mode, linearize
 from model.refinement.whitening import BANDS
 
@@ -112,15 +112,17 @@ def squared_difference(one: HalfEstimate, other: HalfEstimate) -> Array:
 
 def exchange_facets(prior: SurfacePrior, coefficients: Array) -> Iterator[Array]:
     """Coefficients (K,) with the deviations of two facets from the prior's mean exchanged, for each
-    pair of facets.
+    pair of facets, without end.
 
-    Four facets have six pairs, the largest number of halves. The ripples are zero.
+    Four facets have six pairs, the largest number of halves. A single facet is turned by half a
+    turn. The ripples are zero.
     """
     smooth, fine = np.split(coefficients, [len(prior.basis)])
     deviation = prior.surface(smooth) - prior.mean
-    for a, b in combinations(range(len(deviation)), 2):
-        exchanged = deviation.copy()
-        exchanged[[a, b]] = deviation[[b, a]]
+    n_facets = len(deviation)
+    for a, b in cycle([*combinations(range(n_facets), 2)] or [(0, 0)]):
+        exchanged = deviation[:, ::-1, ::-1].copy() if n_facets == 1 else deviation.copy()
+        exchanged[[a, b]] = exchanged[[b, a]]
         yield np.concatenate([prior.coefficients(prior.mean + exchanged), np.zeros_like(fine)])
 
 
@@ -133,8 +135,9 @@ def fit_half(
 ) -> HalfEstimate:
     """Fit some of the images from coefficients (K,), with the noise that all images have."""
     part, n_images = model.subset(half), len(model.observations)
-    state = part.state(start)
-    near = anneal(part, state, part.jacobian(state), options.rough_minimizer, options.annealing[:1])
+    near = anneal_few(
+        part, start, options.rough_minimizer, options.annealing[:1], options.max_annealed
+    )
     sigma = np.broadcast_to(hyper.sigma, (n_images, len(BANDS)))[list(half)]
     found = find_optimum(
         part, replace(near, hyper=replace(hyper, sigma=sigma)), options.rough_minimizer

@@ -7,7 +7,10 @@ Notes
     z(c) = mean + directions c              heights; c are coefficients of the prior
     images(c, r) = trace(z(c)) + T r        r are coefficients of the ripples, T `ripple_images`
 
-The ripples are so fine that images are linear in them, and T is traced once.
+The ripples are so fine that images are linear in them, and T is traced once. They are finer than
+the prior's directions: than 8 x 8 heights, and of many facets than the shapes of each. Those of
+many facets are reduced to the `MAX_RIPPLES` combinations that change the images most; what is left
+of them is noise.
 """
 
 from collections.abc import Sequence
@@ -22,14 +25,25 @@ from numpy.typing import NDArray
 from model.forecast import Aligned, flux_changes
 from model.images import COARSE_SIZE, binned
 from model.network.inputs import STEP_HEIGHT
-from model.observation import Observation, Saturation, align_observations, common_side
+from model.observation import Observation, Saturation, align_observations, common_side, spread_suns
 from model.plant import Heliostat
 from model.plant_model import PlantModel
-from model.prior import SurfacePrior, ripples
+from model.prior import SurfacePrior, ripple_shapes, ripples
 from model.progress import Steps
+from model.refinement.whitening import Whitener
 from model.surface import halved
+from model.tracing.sensitivity import HeightChanges
 
 Array = NDArray[np.float64]
+
+MAX_RIPPLES = 420
+"""Largest number of ripples: those of four facets."""
+
+MAX_COMPARED = 8
+"""Largest number of images by which the strongest ripples of many facets are found."""
+
+OVERSAMPLING = 20
+"""Further random combinations by which they are found."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,16 +154,28 @@ class ImageModel:
     def jacobian(self, state: SurfaceState) -> NDArray[Any]:
         """Derivatives (K, M, R, R) of the images by the prior's coefficients."""
         steps = self._difference_steps[:, None, None, None]
-        changes = torch.as_tensor(self.prior.basis, dtype=torch.float32) * torch.as_tensor(steps)
-        return np.asarray(self._trace_changes(state.aligned, changes) / steps)
+        return np.asarray(self._trace_changes(state.aligned, self._difference_changes) / steps)
 
-    def with_ripples(self, state: SurfaceState) -> "ImageModel":
-        """The model with ripples, whose images are those at a state, to first order."""
-        half_sizes = self.heliostat.facet_frames.half_sizes
-        directions = torch.as_tensor(ripples(half_sizes), dtype=torch.float32)
+    @cached_property
+    def _difference_changes(self) -> HeightChanges:
+        """The prior's directions, each as long as its step."""
+        prior, steps = self.prior, self._difference_steps[:, None, None]
+        if prior.shapes is None or prior.weights is None:
+            return HeightChanges.of(_tensor(prior.basis) * _tensor(steps[..., None]))
+        return HeightChanges(_tensor(prior.shapes), _tensor(prior.weights) * _tensor(steps))
+
+    def with_ripples(self, state: SurfaceState, whitener: Whitener) -> "ImageModel":
+        """The model with ripples, whose images are those at a state, to first order.
+
+        ``whitener`` is that of the state's images.
+        """
         smooth, _ = self.split(state.coefficients)
-        changes = self._trace_changes(self._align(halved(self.prior.surface(smooth))), directions)
-        return replace(self, ripple_images=changes)
+        z, half_sizes = halved(self.prior.surface(smooth)), self.heliostat.facet_frames.half_sizes
+        if self.prior.shapes is None:
+            found = self.changes_of(z, HeightChanges.of(_tensor(ripples(half_sizes))))
+            return replace(self, ripple_images=found)
+        shapes = _tensor(np.concatenate([halved(self.prior.fine), ripple_shapes(half_sizes)]))
+        return replace(self, ripple_images=_strongest_ripples(self, z, shapes, whitener))
 
     def dim_facets(self, state: SurfaceState, share: float) -> Array:
         """Change of the images (F, M, R, R) as each facet in turn loses a share of its light."""
@@ -171,8 +197,12 @@ class ImageModel:
             images = self._saturation.apply(images)
         return np.asarray(images.double().numpy())
 
-    def _trace_changes(self, aligned: Aligned, directions: torch.Tensor) -> NDArray[Any]:
-        """Change of the images (K, M, R, R) with directions (K, F, I, J) [m] of the heights."""
+    def changes_of(self, z: Array, changes: HeightChanges) -> NDArray[Any]:
+        """Change of the images (K, M, R, R) of the mirror of heights (F, I, J) [m]."""
+        return self._trace_changes(self._align(z), changes)
+
+    def _trace_changes(self, aligned: Aligned, directions: HeightChanges) -> NDArray[Any]:
+        """Change of the images (K, M, R, R) with K changes of the heights."""
         with torch.no_grad():
             images = flux_changes(
                 aligned,
@@ -184,3 +214,36 @@ class ImageModel:
             )
             images = self._saturation.apply(images)
             return np.asarray((images[1:] - images[:1]).numpy())
+
+
+def _tensor(values: NDArray[Any]) -> torch.Tensor:
+    return torch.as_tensor(values, dtype=torch.float32)
+
+
+def _strongest_ripples(
+    model: ImageModel, z: Array, shapes: torch.Tensor, whitener: Whitener
+) -> NDArray[Any]:
+    """Change of the images (N, M, R, R) per ripple: `MAX_RIPPLES` combinations of each facet's
+    ``shapes`` (L, I, J) [m], on the mirror of heights ``z`` (F, I, J) [m].
+    """
+    if len(shapes) * len(z) <= MAX_RIPPLES:
+        return model.changes_of(z, HeightChanges(shapes))
+    places = sorted(spread_suns(model.suns, MAX_COMPARED))
+    by_shape = model.subset(places).changes_of(z, HeightChanges(shapes))
+    weights = _strongest(whitener.subset(places)(by_shape), MAX_RIPPLES)
+    if len(places) == len(model.observations):
+        return np.asarray(np.tensordot(weights, by_shape, axes=1))
+    of_facets = _tensor(weights.reshape(len(weights), len(z), -1))
+    return model.changes_of(z, HeightChanges(shapes, of_facets))
+
+
+def _strongest(white: NDArray[Any], count: int) -> NDArray[Any]:
+    """Orthonormal combinations (count, N) of whitened changes (N, M, n) that change images most.
+
+    By a randomized range finder (Halko, Martinsson and Tropp 2011, doi:10.1137/090771806).
+    """
+    flat = white.reshape(len(white), -1)
+    guess = np.random.default_rng(0).normal(size=(count + OVERSAMPLING, len(flat)))
+    found = np.linalg.qr(flat @ (guess.astype(flat.dtype) @ flat).T)[0].T
+    _, axes = np.linalg.eigh((found @ flat) @ (found @ flat).T)
+    return np.asarray(axes[:, : -count - 1 : -1].T @ found)

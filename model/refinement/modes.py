@@ -11,6 +11,7 @@ Notes
 The cost is that of `model.refinement.posterior`, in nats.
 """
 
+import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -24,6 +25,7 @@ from model.least_squares import MinimizerOptions, minimize
 from model.observation import spread_suns
 from model.refinement.image_model import ImageModel, SurfaceState
 from model.refinement.posterior import Hyperparameters, Mode, PosteriorCost
+from model.surface import FACETS
 
 Array = NDArray[np.float64]
 
@@ -62,7 +64,8 @@ class RefinementOptions:
     resolution : int
         Pixels along a side of the compared images.
     samples : int
-        Traced rays along each side of a facet.
+        Traced rays along each side of a facet of four; others have about as many in total
+        (`samples_of`).
     max_steps : int
         Of one minimization.
     """
@@ -75,6 +78,12 @@ class RefinementOptions:
     resolution: int = COARSE_SIZE
     samples: int = 32
     max_steps: int = 12
+
+    def samples_of(self, n_facets: int) -> int:
+        """Traced rays along each side of one of a mirror's facets; half as many as of four at
+        least.
+        """
+        return max(round(self.samples * math.sqrt(FACETS / n_facets)), self.samples // 2)
 
     @property
     def minimizer(self) -> MinimizerOptions:
@@ -107,6 +116,24 @@ def anneal(
         mode = find_optimum(model, Mode(state, jacobian, hyper), minimizer)
         state, jacobian = mode.state, mode.jacobian
     return mode
+
+
+def anneal_few(
+    model: ImageModel,
+    start: Array,
+    minimizer: MinimizerOptions,
+    noise_levels: Sequence[float],
+    max_annealed: int,
+) -> Mode:
+    """Anneal from coefficients (K,) with a few of the images; the mode has the images of all."""
+    places = sorted(spread_suns(model.suns, max_annealed))
+    few = model if len(places) == len(model.observations) else model.subset(places)
+    state = few.state(start)
+    mode = anneal(few, state, few.jacobian(state), minimizer, noise_levels)
+    if few is model:
+        return mode
+    state = model.state(mode.state.coefficients)
+    return replace(mode, state=state, jacobian=model.jacobian(state))
 
 
 def find_mode(model: ImageModel, starts: Sequence[Array], options: RefinementOptions) -> Mode:

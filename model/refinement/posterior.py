@@ -262,9 +262,12 @@ class Linearization:
     def facet_light(self, jacobian: Array) -> FacetLight:
         """Estimate the light of each facet together with the surface.
 
-        ``jacobian`` (F, M, n) are the whitened derivatives of the images by the light.
+        ``jacobian`` (F, M, n) are the whitened derivatives of the images by the light. The light of
+        a single facet cannot be compared.
         """
         count = len(jacobian)
+        if count == 1:
+            return FacetLight(np.zeros(1), np.full(1, np.inf))
         flat = (
             np.concatenate([self.jacobian, jacobian])
             .reshape(len(self.jacobian) + count, -1)

@@ -15,6 +15,8 @@ value decomposition ``N' S^-1/2 = U D V``::
     W = (I - V' (I - (I + D^2)^-1/2) V) S^-1/2
 """
 
+from collections.abc import Sequence
+from copy import copy
 from typing import Any
 
 import numpy as np
@@ -65,6 +67,14 @@ class Whitener:
         )
         _, singular, self._directions = np.linalg.svd(scaled.swapaxes(0, 1), full_matrices=False)
         self._shrinkage = 1 - 1 / np.sqrt(1 + singular**2)
+
+    def subset(self, places: Sequence[int]) -> "Whitener":
+        """The whitener of some of the images."""
+        some, rows = copy(self), list(places)
+        some._scale, some._directions = self._scale[rows], self._directions[rows]
+        some._shrinkage = self._shrinkage[rows]
+        some._sigma = self._sigma[rows] if len(self._sigma) > 1 else self._sigma
+        return some
 
     def __call__(self, changes: NDArray[Any]) -> NDArray[Any]:
         """Whiten changes (..., M, R, R) to independent ones (..., M, n) of unit variance."""

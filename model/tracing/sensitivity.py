@@ -7,12 +7,14 @@ A height tilts the mirror around it, and the light of the samples there moves on
     d flux / d height = sum over samples (d flux / d hit) (d hit / d slope) (d slope / d height)
 
 A control height tilts only the adjacent spans of the spline. So all derivatives of an image cost as
-much as a few images; differences of traces would cost as many as there are heights.
+much as a few images; differences of traces would cost as many as there are heights. Heights of a
+facet touch the light of that facet only, so that the cost is linear in the number of facets.
 
 Neglected: a height also moves the origin of a ray, by a tenth of a millimetre, and changes the
 projected area, by a ten-thousandth. The mount keeps the spot's centre in place.
 """
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -28,14 +30,54 @@ TILT = 1e-4
 """Slope [rad] of the finite difference for the movement of light with the slope."""
 
 
-def sensitivity(
-    scene: Scene, window: Window, optics: Optics, *, samples: int = 12, padding: float = 0.25
-) -> Tensor:
-    """Derivatives of irradiance by control heights (F * I * J, B, rows, columns) [W/m3] of a
-    scene's B mirrors.
+@dataclass(frozen=True, eq=False)
+class HeightChanges:
+    """Changes of a mirror's heights as sums of shapes that all of its facets can have.
 
-    Heights are along the facets' normals. Windows on the plane's centre include the rotation of the
-    mount that returns the spot to its place. Other parameters are those of `model.tracing.trace`.
+    Facet f changes by ``sum weights[k, f, l] shapes[l]``. Tracing takes each facet's shapes once,
+    so that its cost grows with their number, and not with the number of heights.
+
+    Attributes
+    ----------
+    shapes : Tensor (L, I, J) [m]
+    weights : Tensor (K, F, L) or None
+        None for each shape of each facet alone: K = F * L, one facet after the other.
+    """
+
+    shapes: Tensor
+    weights: Tensor | None = None
+
+    @classmethod
+    def of(cls, directions: Tensor) -> "HeightChanges":
+        """Changes by directions (K, F, I, J) [m]: each height is a shape."""
+        rows, columns = directions.shape[-2:]
+        each = torch.eye(rows * columns, dtype=directions.dtype).view(-1, rows, columns)
+        return cls(each, directions.flatten(2))
+
+    def combine(self, by_shape: Tensor) -> Tensor:
+        """Changes (K, ...) of values whose changes by each facet's shapes are (F * L, ...)."""
+        if self.weights is None:
+            return by_shape
+        changes = self.weights.flatten(1) @ by_shape.flatten(1)
+        return changes.view(-1, *by_shape.shape[1:])
+
+
+def sensitivity(
+    scene: Scene,
+    window: Window,
+    optics: Optics,
+    *,
+    shapes: Tensor | None = None,
+    samples: int = 12,
+    padding: float = 0.25,
+) -> Tensor:
+    """Derivatives of irradiance by heights of facets (F * L, B, rows, columns) [W/m3] of a scene's
+    B mirrors.
+
+    ``shapes`` (L, I, J) are what each facet's heights change by, by default each control height
+    alone. Heights are along the facets' normals. Windows on the plane's centre include the rotation
+    of the mount that returns the spot to its place. Other parameters are those of
+    `model.tracing.trace`.
 
     Raises
     ------
@@ -52,6 +94,8 @@ def sensitivity(
         / rays_on_grid.x.new_tensor([window.pixel[0], -window.pixel[1]])[:, None, None, None]
     )
     slopes = _slopes(scene, samples)
+    if shapes is not None:
+        slopes = slopes @ shapes.to(slopes).flatten(1).T
     changes = rays_on_grid.blurred(_sharp(rays_on_grid, moved, slopes))
     weight = (rays_on_grid.weight / rays_on_grid.weight.sum(-1, keepdim=True)).view(
         scene.batch, 1, -1, samples**2, 1

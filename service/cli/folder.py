@@ -143,8 +143,9 @@ def observations_of(
     opened: FolderStore, heliostat: str
 ) -> tuple[list[Observation], dict[str, str]]:
     """Observations of a heliostat, and the reasons of rejected images by identifier."""
-    origin, (rows, refused) = opened.context(heliostat).origin, opened.photographs(heliostat)
-    return to_observations([accepted_measurement(row, origin) for row in rows]), refused
+    twin, (rows, refused) = opened.context(heliostat), opened.photographs(heliostat)
+    evidence = [accepted_measurement(row, twin.origin) for row in rows]
+    return to_observations(evidence, twin.heliostat), refused
 
 
 def predict_heliostat(
@@ -161,7 +162,7 @@ def predict_heliostat(
         chosen, apart = choose_observations(operations, twin, rows, images)
         predicted = operations.predict(twin.heliostat, chosen, twin.model, method)
     entry: dict[str, object] = {
-        "method": method,
+        "method": predicted.method,
         "weights": predicted.weights,
         "images": list(predicted.used),
         "information_share": {
@@ -178,6 +179,9 @@ def predict_heliostat(
         "z_rms_mm": round(float(np.sqrt((predicted.z**2).mean()) * 1e3), 4),
         "z_std_mean_mm": round(float(predicted.z_std.mean() * 1e3), 4),
     }
+    if predicted.method != method:
+        count = len(twin.heliostat.facets)
+        entry["note"] = f"no network predicts mirrors of {count} facets: the surface was refined"
     measured = opened.folder.measured_surface(name)
     if measured is not None:
         truth = measured_heights(twin.heliostat, measured)

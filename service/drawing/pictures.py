@@ -1,6 +1,7 @@
 """Pictures of flux maps and surfaces as PNG, without matplotlib's global state."""
 
 import io
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -138,15 +139,21 @@ def mirror_heights(z: NDArray[np.floating], samples: int = 48) -> NDArray[np.flo
 
 
 def surface_picture(z: NDArray[np.floating], title: str, bound: float) -> bytes:
-    """A surface of control heights (4, 8, 8) [m] as a map in mm.
+    """A surface of control heights (F, 8, 8) [m] as a map in mm.
 
-    The facets are seen from the front. ``bound`` [mm] is the end of the scale on both sides;
-    heights beyond it have the end colours.
+    The facets are seen from the front. Other than four have numbers, in their order. ``bound`` [mm]
+    is the end of the scale on both sides; heights beyond it have the end colours.
     """
     figure = Figure(figsize=(6.4, 5), layout="constrained")
-    panes = figure.subplots(2, 2).ravel()
     heights = mirror_heights(z)
-    for pane, facet, name in zip(panes, heights, _FACETS, strict=True):
+    columns = math.ceil(math.sqrt(len(heights)))
+    rows = math.ceil(len(heights) / columns)
+    every = figure.subplots(rows, columns, squeeze=False).ravel()
+    panes, numbers = every[: len(heights)], map(str, range(1, len(heights) + 1))
+    for pane in every[len(heights) :]:
+        pane.set_axis_off()
+    names = _FACETS if len(heights) == len(_FACETS) else tuple(numbers)
+    for pane, facet, name in zip(panes, heights, names, strict=True):
         # i runs along x and j along y, so columns are i, and rows, from below, are j.
         image = pane.imshow(
             facet.T, cmap="RdBu_r", vmin=-bound, vmax=bound, origin="lower", aspect=0.8

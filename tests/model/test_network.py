@@ -325,12 +325,27 @@ def test_runtime_of_the_network_keeps_no_id_and_has_nothing_to_send(tmp_path: Pa
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_mirror_of_other_facets_is_refused_with_its_count_and_rendered_all_the_same():
+def test_a_mirror_of_other_facets_is_refused_with_the_remedy_and_rendered_all_the_same():
     three = replace(flat_heliostat(), facets=flat_heliostat().facets[:3])
-    for ask in (default_predictor().predict, refine):
-        with pytest.raises(InvalidInputError, match="mirrors of 4 facets, flat has 3"):
-            ask(three, [observation("a")], JUELICH_MODEL)
+    with pytest.raises(
+        InvalidInputError, match="mirrors of 4 facets, flat has 3; use the method refined"
+    ):
+        default_predictor().predict(three, [observation("a")], JUELICH_MODEL)
     flux = operations.render(three, [observation("a")], None, JUELICH_MODEL)
     assert flux.shape == (1, 64, 64)
     with pytest.raises(InvalidInputError, match="for 3 facets"):
         operations.render(three, [observation("a")], np.zeros((4, 8, 8)), JUELICH_MODEL)
+
+
+@pytest.mark.parametrize("method", ["network", "refined"])
+def test_a_mirror_of_other_facets_is_refined_by_either_method(method, monkeypatch):
+    """There is no network for it, and no start by the network."""
+    three, asked = replace(flat_heliostat(), facets=flat_heliostat().facets[:3]), []
+
+    def refined(heliostat, observations, model, start=None, *, progress):
+        asked.append((heliostat, start))
+        return "refined"
+
+    monkeypatch.setattr(operations, "refine", refined)
+    assert operations.predict(three, [observation("a")], JUELICH_MODEL, method) == "refined"
+    assert asked == [(three, None)]

@@ -87,7 +87,11 @@ def predict(
     folder: Folder,
     out: Out,
     method: Annotated[
-        Method, typer.Option(help="network, or refined: the network, then MAP through the tracer.")
+        Method,
+        typer.Option(
+            help="network, or refined: the network, then MAP through the tracer. Mirrors that the"
+            " network was not trained for are refined."
+        ),
     ] = "network",
     images: Annotated[
         int, typer.Option(help="Most images used for a heliostat: 1 to 8, to 64 where refined.")

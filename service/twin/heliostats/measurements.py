@@ -15,7 +15,7 @@ from model.errors import InvalidInputError
 from model.frames import sun_direction, wgs84_to_enu
 from model.images import FLUX_WINDOW, normalized
 from model.imaging.window import flux_window, share_window
-from model.metrics import WINDOWS
+from model.metrics import WINDOWS, spot_window
 from model.observation import Observation, spread_suns
 from model.plant import Heliostat, TargetPlane
 from model.setup import Setup
@@ -154,21 +154,33 @@ class AcceptedMeasurement:
         )
 
 
-def to_observations(evidence: Sequence[AcceptedMeasurement]) -> list[Observation]:
+def to_observations(
+    evidence: Sequence[AcceptedMeasurement], heliostat: Heliostat | None = None
+) -> list[Observation]:
     """Observations of a heliostat in the smallest of `WINDOWS` that contains their spots.
 
-    No window is larger than a target. If only the part about the spot is known of any photograph,
-    all use the smallest window.
+    The first window is that of the ideal mirror's spot if the ``heliostat`` is given. No window is
+    larger than a target. If only the part about the spot is known of any photograph, all use the
+    smallest window.
     """
     observations = [one.observation() for one in evidence]
     if any(one.flux is None for one in evidence):
         return observations
     widest = min((min(one.target.width, one.target.height) for one in evidence), default=0.0)
+    expected = 0.0 if heliostat is None else _expected_window(evidence, heliostat)
     for side in WINDOWS[1:]:
-        if side > widest or not prediction_warnings.has_excess_spillage(observations):
+        if side > widest:
+            break
+        if side > expected and not prediction_warnings.has_excess_spillage(observations):
             break
         observations = [one.observation(side) for one in evidence]
     return observations
+
+
+def _expected_window(evidence: Sequence[AcceptedMeasurement], heliostat: Heliostat) -> float:
+    """Side [m] of the window that contains the ideal mirror's spots."""
+    ranges = [float(np.linalg.norm(one.target.center - heliostat.position)) for one in evidence]
+    return max((spot_window(heliostat, slant_range) for slant_range in ranges), default=0.0)
 
 
 def choose_diverse(

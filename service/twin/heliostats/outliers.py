@@ -14,6 +14,7 @@ import numpy as np
 
 from model.metrics import flux_accuracy
 from model.network.architecture import MAX_IMAGES
+from model.network.predictor import has_network
 from model.observation import Observation
 from model.plant import Heliostat
 from model.plant_model import PlantModel
@@ -40,9 +41,12 @@ def reject_outliers(
     observations: Sequence[Observation],
     model: PlantModel,
 ) -> Consistent:
-    """Remove outliers from observations."""
+    """Remove outliers from observations.
+
+    Of mirrors without a network none is removed: their refinement excludes images itself.
+    """
     observations = sorted(observations, key=_time)
-    if len(observations) < _FEWEST:
+    if len(observations) < _FEWEST or not has_network(heliostat):
         return Consistent(observations, {})
     glance = operations.predict(heliostat, choose_diverse(observations, MAX_IMAGES), model)
     images = operations.render(heliostat, observations, glance.z, model).clip(min=0)

@@ -13,7 +13,7 @@ from model.forecast import View, align
 from model.imaging import Camera, ImageKind, MeasuredFlux
 from model.imaging import measure as measure_image
 from model.network.architecture import MAX_IMAGES
-from model.network.predictor import default_predictor
+from model.network.predictor import default_predictor, has_network
 from model.observation import Observation, SurfacePrediction, render_observations, spread_suns
 from model.plant import Heliostat, TargetPlane
 from model.plant_model import PlantModel
@@ -64,7 +64,8 @@ def predict(
 ) -> SurfacePrediction:
     """Predict the mirror surface of a heliostat from its images.
 
-    The network predicts it alone, or the prediction is refined through the tracer. ``progress``
+    The network predicts it alone, or the prediction is refined through the tracer. Mirrors that
+    there is no network for are refined in either case: see `SurfacePrediction.method`. ``progress``
     receives the progress of the refinement. An exception that it raises stops the refinement.
 
     Raises
@@ -73,6 +74,8 @@ def predict(
         If there are no or too many images, or the method is unknown.
     """
     require_images(method, len(observations))
+    if not has_network(heliostat):
+        return refine(heliostat, observations, model, progress=progress)
     predictor = default_predictor()
     if method == "network":
         return predictor.predict(heliostat, observations, model)

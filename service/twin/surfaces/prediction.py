@@ -88,10 +88,12 @@ def compute_surface(
             progress("choosing photographs that are consistent", 0, 1)
             observations, _ = choose_observations(operations, twin, rows, images)
         else:
-            observations = to_observations([accepted_measurement(row, twin.origin) for row in rows])
+            observations = to_observations(
+                [accepted_measurement(row, twin.origin) for row in rows], twin.heliostat
+            )
         surface = operations.predict(twin.heliostat, observations, twin.model, method, progress)
     progress("comparing it with the active surface", 1, 1)
-    new = _new_surface(twin, method, surface, rows)
+    new = _new_surface(twin, surface, rows)
     with runtime.database.reading() as session:
         known = store.find_same_content(session, twin.row, new)
     if known is not None:
@@ -135,16 +137,15 @@ def choose_observations(
     Also return the reasons of outliers, by identifier.
     """
     arrived = sorted(rows, key=lambda row: row.id)  # the order of those of unknown time
-    observations = to_observations([accepted_measurement(row, twin.origin) for row in arrived])
+    observations = to_observations(
+        [accepted_measurement(row, twin.origin) for row in arrived], twin.heliostat
+    )
     kept, rejected = reject_outliers(operations, twin.heliostat, observations, twin.model)
     return choose_diverse(kept[::-1], images), rejected
 
 
 def _new_surface(
-    twin: HeliostatContext,
-    method: Method,
-    surface: SurfacePrediction,
-    chosen: Sequence[MeasurementRow],
+    twin: HeliostatContext, surface: SurfacePrediction, chosen: Sequence[MeasurementRow]
 ) -> store.NewSurface:
     """The surface as it will be stored.
 
@@ -152,7 +153,7 @@ def _new_surface(
     """
     used = [row for row in chosen if row.identifier in surface.used]
     return store.NewSurface(
-        source=method,
+        source=surface.method,
         z=surface.z,
         z_std=surface.z_std,
         control_points=surface.control_points,
