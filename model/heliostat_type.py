@@ -260,9 +260,18 @@ class HeliostatType:
         mount = self.mount.mount(position, goal)
         slant_range = focal_length or float(np.linalg.norm(goal - position - mount.joint))
         normals = self._normals(mount, position, goal, slant_range)
+        # The x axes of facets have no y component.
+        across = _unit(np.stack([normals[:, 2], 0 * normals[:, 1], -normals[:, 0]], axis=-1))
+        upward = np.cross(normals, across)
         facets = tuple(
-            _facet(design, normal, self._focal_length(design, slant_range))
-            for design, normal in zip(self.facets, normals, strict=True)
+            Facet(
+                design.center,
+                design.width / 2 * x,
+                design.height / 2 * y,
+                self._focal_length(design, slant_range),
+                design.outline,
+            )
+            for design, x, y in zip(self.facets, across, upward, strict=True)
         )
         width, height = self.size
         return Heliostat(name, position, mount, facets, width, height, self.optics)
@@ -295,16 +304,3 @@ class HeliostatType:
 
 def _unit(vectors: Array) -> Array:
     return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
-
-
-def _facet(design: FacetDesign, normal: Array, focal_length: float | None) -> Facet:
-    """The facet of a design, inclined to its normal (3,); its x axis has no y component."""
-    x = _unit(np.array([normal[2], 0.0, -normal[0]]))
-    y = np.cross(normal, x)
-    return Facet(
-        np.asarray(design.center, dtype=np.float64),
-        design.width / 2 * x,
-        design.height / 2 * y,
-        focal_length,
-        design.outline,
-    )
