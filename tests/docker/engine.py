@@ -209,7 +209,8 @@ class Composition:
             "HELIOTWIN_ALERTMANAGER_PORT": str(free_port()),
         }
         self._command = self._of_this_engine()
-        frequent = {"healthcheck": {"interval": "1s"}}
+        # Each check starts a Python: once a second they would take most of a core.
+        frequent = {"healthcheck": {"interval": "4s"}}
         self._override("health", dict.fromkeys(("database", "service", "worker"), frequent))
 
     def _of_this_engine(self) -> list[str]:
