@@ -3,7 +3,6 @@ import pytest
 
 from model.errors import InvalidInputError
 from model.metrics import (
-    WINDOWS,
     accuracy_window,
     compare_on_target,
     flux_accuracies,
@@ -58,7 +57,7 @@ def test_window_grows_with_the_spot():
         accuracy_window([spot((0, 0), size, sigma=sigma)], [size])
         for sigma in (0.7, 1.0, 1.4, 2.2, 4.0)
     ]
-    assert chosen == [4.0, 6.0, 8.0, 12.0, WINDOWS[-1]]
+    assert chosen == [4.0, 6.0, 8.0, 12.0, 16.0]
     wide = spot((0, 0), size, sigma=2.2)
     assert accuracy_window([wide], [size], widest=8.0) == 8.0
     assert accuracy_window([spot((0, 0), size, sigma=0.8)], [size], spill=0.001) == 6.0

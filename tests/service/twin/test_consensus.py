@@ -4,7 +4,7 @@ import numpy as np
 
 from model.images import normalized
 from model.observation import Observation
-from model.plant import TargetPlane
+from model.plant import Heliostat, TargetPlane
 from model.plant_model import JUELICH_MODEL
 from service.twin.heliostats.outliers import list_outliers, reject_outliers
 
@@ -44,8 +44,9 @@ def test_a_photograph_that_contradicts_the_others_is_left_out_with_its_reason():
     glance = Mock(
         **{"predict.return_value": Mock(z=None), "render.return_value": np.array([spot] * 7)}
     )
-    kept, apart = reject_outliers(glance, Mock(), observed, JUELICH_MODEL)
+    heliostat = Heliostat.juelich("AB12", (0.0, 100.0, 0.0))
+    kept, apart = reject_outliers(glance, heliostat, observed, JUELICH_MODEL)
     assert [o.identifier for o in kept] == ["0", "1", "3", "4", "5", "6"]
     assert set(apart) == {"2"}
     assert apart["2"].startswith("contradicts the others: it differs by 1.00 ")
-    assert reject_outliers(glance, Mock(), observed[:5], JUELICH_MODEL) == (observed[:5], {})
+    assert reject_outliers(glance, heliostat, observed[:5], JUELICH_MODEL) == (observed[:5], {})
