@@ -138,8 +138,13 @@ def every_study(real_store: Path, tmp_path_factory: pytest.TempPathFactory) -> I
 
 def links_of(text: str) -> set[str]:
     """Where a page's links lead, on this service."""
-    found = (urldefrag(link)[0] for link in Page(text).links)
-    return {link for link in found if link.startswith("/")}
+    followed = (
+        urldefrag(one[name])[0]
+        for one in Page(text).all()
+        for name in ("href", "src", "hx-get")
+        if name in one.attributes
+    )
+    return {link for link in followed if link.startswith("/")}
 
 
 def figure_of(path: str) -> str:
