@@ -191,20 +191,19 @@ def _unobstructed(
 
     ``points`` [m], ``normals`` [m2] and ``direction`` are (B, 3, S) in the plane's frame.
     """
+    obstacles, shades = (scene.in_plane_frame(some) for some in (scene.obstacles, scene.shades))
+    before_sun = [some for some in (obstacles, shades) if some is not None]
+    everything = power.sum(-1)
+    if not before_sun:
+        return _Unobstructed(power, torch.stack([everything, everything], dim=-1))
     sun = torch.einsum("bij,bj->bi", scene.plane_axes, scene.sun)[..., None]
     cell = normals.norm(dim=1).mean(dim=-1).sqrt()
-    everything = power.sum(-1)
-    obstacles, shades = (scene.in_plane_frame(some) for some in (scene.obstacles, scene.shades))
-    sees_sun = torch.ones_like(power)
-    for some in (obstacles, shades):
-        if some is not None:
-            sees_sun = torch.minimum(sees_sun, clear(some, points, sun, cell))
+    sees_sun = clear(torch.cat(before_sun, dim=1), points, sun, cell)
     free = sees_sun
     if obstacles is not None:
-        free = torch.minimum(free, clear(obstacles, points, direction, cell))
+        free = torch.minimum(sees_sun, clear(obstacles, points, direction, cell))
     lit = torch.stack([everything, (power * sees_sun).sum(-1)], dim=-1)
-    is_free = free is sees_sun and shades is None
-    return _Unobstructed(power if is_free else power * free, lit)
+    return _Unobstructed(power * free, lit)
 
 
 def _unblocked(scene: Scene, line: Tensor, samples: int) -> Tensor:
