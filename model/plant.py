@@ -632,13 +632,17 @@ class Cylinder:
         area = self.width * self.height / (rows * columns)
         return places._replace(areas=np.full((rows, columns), area))
 
+    def facing(self, points: Vector) -> Vector:
+        """Unit normals (..., 3) of the lit surface where it is nearest to points (..., 3) [m]."""
+        outward, half = points - self.axis, np.radians(self.opening_deg) / 2
+        angles = np.arctan2(outward @ self.right, outward @ self.normal).clip(-half, half)
+        return np.asarray(
+            np.cos(angles)[..., None] * self.normal + np.sin(angles)[..., None] * self.right
+        )
+
     def touching(self, mirrors: Vector) -> TouchingPlanes:
         """Planes that touch it along the line nearest to each mirror."""
-        outward = mirrors - self.axis
-        angles = np.arctan2(outward @ self.right, outward @ self.normal)
-        half = np.radians(self.opening_deg) / 2
-        angles = angles.clip(-half, half)[:, None]
-        normals = np.cos(angles) * self.normal + np.sin(angles) * self.right
+        half, normals = np.radians(self.opening_deg) / 2, self.facing(mirrors)
         axes = np.stack(
             [np.cross(self.up, normals), np.broadcast_to(self.up, normals.shape), normals], axis=1
         )

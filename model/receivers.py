@@ -3,7 +3,7 @@
 Their map has the panels from left to right, with columns by their widths.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -12,8 +12,8 @@ from model.plant import SurfaceGrid, TargetPlane, TouchingPlanes, Vector, inside
 
 
 @dataclass(frozen=True, eq=False)
-class Panels:
-    """Planes of one height side by side, lit from outside.
+class _OfPanels:
+    """What panels and cavities have in common: planes of one height side by side.
 
     Attributes
     ----------
@@ -87,6 +87,18 @@ class Panels:
             )
         return _joined(self.panels, rows, columns)
 
+    @property
+    def _screens(self) -> Vector:
+        """The panels as rectangles (K, 3, 3) [m], which may hide each other."""
+        return np.array(
+            [[p.center, p.width / 2 * p.right, p.height / 2 * p.up] for p in self.panels]
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Panels(_OfPanels):
+    """Planes of one height side by side, lit from outside."""
+
     def touching(self, mirrors: Vector) -> TouchingPlanes:
         """Upright planes before the panels, each turned to its mirror."""
         outward = mirrors - self.center
@@ -101,16 +113,9 @@ class Panels:
         origins = self.center + depth.max(axis=0)[:, None] * normals
         return replace(windows_on(edges, mirrors, origins, axes), screens=self._screens)
 
-    @property
-    def _screens(self) -> Vector:
-        """The panels as rectangles (K, 3, 3) [m], which may hide each other."""
-        return np.array(
-            [[p.center, p.width / 2 * p.right, p.height / 2 * p.up] for p in self.panels]
-        )
-
 
 @dataclass(frozen=True, eq=False)
-class Cavity(Panels):
+class Cavity(_OfPanels):
     """Panels behind a polygonal aperture; light that meets no panel is lost.
 
     Attributes
@@ -119,7 +124,7 @@ class Cavity(Panels):
         Corners of the opening in ENU, in one plane, counter-clockwise seen from outside.
     """
 
-    aperture: Vector = None  # type: ignore[assignment]  # dataclasses put defaults last
+    aperture: Vector = field(kw_only=True)
 
     def __post_init__(self) -> None:
         super().__post_init__()

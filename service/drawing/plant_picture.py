@@ -38,7 +38,7 @@ def plant_picture(
         )
     named = (("receivers", receivers, _RECEIVER), ("targets", plant.targets, _TARGET))
     for label, surfaces, colour in named:
-        for line in (line for surface in surfaces.values() for line in _lines(surface)):
+        for line in (line for surface in surfaces.values() for line in surface_lines(surface)):
             above.plot(line[:, 0], line[:, 1], color=colour, lw=1.5, label=label)
             label = f"_{label}"  # one entry in the legend
     above.set(xlabel="east [m]", ylabel="north [m]", aspect="equal", title=plant.name)
@@ -74,7 +74,7 @@ def _draw_side(
         )
     for surfaces, colour in ((receivers, _RECEIVER), (plant.targets, _TARGET)):
         for name, surface in surfaces.items():
-            lines = _lines(surface)
+            lines = surface_lines(surface)
             for line in lines:
                 axes.plot(line[:, 0], line[:, 2], color=colour, lw=1.5)
             points = np.concatenate(lines)
@@ -89,7 +89,7 @@ def _draw_side(
     axes.invert_xaxis()
 
 
-def _lines(surface: Cylinder | TargetPlane | Panels | Cavity) -> list[Array]:
+def surface_lines(surface: Cylinder | TargetPlane | Panels | Cavity) -> list[Array]:
     """Outlines (n, 3) [m] of a surface."""
     if isinstance(surface, Cylinder):
         return _cylinder_lines(surface)

@@ -1,7 +1,5 @@
 """Receivers and targets of ``plant.yaml``."""
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -91,30 +89,16 @@ def _receiver(name: str, entry: ReceiverEntry) -> AnyReceiver:
         )
         if isinstance(entry, PanelsReceiver):
             return Panels(name, panels, entry.absorptance)
-        return Cavity(name, panels, entry.absorptance, np.array(entry.aperture_m))
+        return Cavity(name, panels, entry.absorptance, aperture=np.array(entry.aperture_m))
     return _plane(name, entry, entry.absorptance)
 
 
 def aim_of(receiver: AnyReceiver, foot: Array) -> Array:
     """What a heliostat with its pylon's ``foot`` (3,) [m] is canted and focused to (3,) [m].
 
-    The middle of a plane or of panels, of a cavity's aperture, and on a cylinder the place at mid
-    height that faces the heliostat.
+    The default aim of a field forecast; on a cylinder the place at mid height that faces the
+    heliostat.
     """
     if isinstance(receiver, Cylinder):
-        return _facing(receiver, foot)
-    if isinstance(receiver, Panels):
-        return np.asarray(np.mean([panel.center for panel in receiver.panels], axis=0))
-    if isinstance(receiver, Cavity):
-        return np.asarray(receiver.aperture.mean(axis=0))
-    return receiver.center
-
-
-def _facing(cylinder: Cylinder, foot: Array) -> Array:
-    """The place (3,) [m] of a cylinder's lit surface at mid height nearest to ``foot`` (3,)."""
-    outward = foot - cylinder.axis
-    half = math.radians(cylinder.opening_deg) / 2
-    angle = math.atan2(float(outward @ cylinder.right), float(outward @ cylinder.normal))
-    angle = max(-half, min(half, angle))
-    direction = math.cos(angle) * cylinder.normal + math.sin(angle) * cylinder.right
-    return np.asarray(cylinder.axis + cylinder.radius * direction)
+        return receiver.axis + receiver.radius * receiver.facing(foot)
+    return receiver.aim

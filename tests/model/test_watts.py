@@ -56,7 +56,7 @@ CAVITY = Cavity(
     "cavity",
     (_panel(2.46, -3.0, (-0.2, 1.0)), _panel(-2.46, -3.0, (0.2, 1.0))),
     0.95,
-    np.array([[4.0, 0, 56.0], [-4.0, 0, 56.0], [-3.0, 0, 64.0], [3.0, 0, 64.0]]),
+    aperture=np.array([[4.0, 0, 56.0], [-4.0, 0, 56.0], [-3.0, 0, 64.0], [3.0, 0, 64.0]]),
 )
 RECEIVERS = (BOARD, CYLINDER, PANELS, CAVITY)
 
@@ -153,7 +153,7 @@ def test_east_and_west_exchanged(receiver: Receiver):
 
 
 def _turned(receiver: Receiver, turn: np.ndarray) -> Receiver:
-    if isinstance(receiver, Panels):
+    if isinstance(receiver, Panels | Cavity):
         panels = tuple(_turned(panel, turn) for panel in receiver.panels)
         moved = replace(receiver, panels=panels)  # type: ignore[arg-type]
         return (

@@ -10,12 +10,14 @@ from hypothesis import strategies as st
 
 from model.errors import InvalidInputError
 from model.frames import sun_angles
+from model.receivers import Cavity, Panels
+from service.drawing.plant_picture import surface_lines
 from service.sources.plant_file import read_plant
 from service.sources.plant_formats.formats import foreign_text, read_foreign
 from service.sources.plant_formats.soltrace import SolTraceInput, parse_soltrace, read_soltrace
 from service.sources.plant_receivers import aim_of
 from tests.service.command import ends, heliotwin
-from tests.service.sources.plant_files import published, round_c, write_plant
+from tests.service.sources.plant_files import ps10, published, round_c, write_plant
 
 AFTERNOON = "Power-tower-surround_singlefacet_large_afternoon.stinput"
 SURROUND = "Power-tower-surround_singlefacet.stinput"
@@ -140,6 +142,18 @@ def test_facets_of_any_type_are_written_for_soltrace(tmp_path: Path):
     np.testing.assert_allclose(
         normals @ normals.T, heliostat.facet_normals @ heliostat.facet_normals.T, atol=1e-9
     )
+
+
+def test_a_cavity_is_read_as_nothing_else(tmp_path: Path):
+    """Heliostats aim at its aperture, a picture shows that, and SolTrace does not get panels."""
+    plant = read_plant(ps10(tmp_path))
+    cavity = plant.receivers["cavity"]
+    assert isinstance(cavity, Cavity)
+    assert not isinstance(cavity, Panels)
+    np.testing.assert_allclose(aim_of(cavity, np.zeros(3)), cavity.aperture.mean(axis=0))
+    assert len(surface_lines(cavity)) == 1 + len(cavity.panels)
+    with pytest.raises(InvalidInputError, match="a cavity is not written for SolTrace"):
+        foreign_text(plant, "soltrace", (180.0, 50.0), {})
 
 
 @pytest.mark.parametrize(
