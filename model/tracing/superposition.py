@@ -44,21 +44,19 @@ class Beams:
         As of `Rays`.
     free : Tensor (B,) [m2]
         Projected mirror area whose light meets neither shade nor neighbour.
-    slant_range : Tensor (B,) [m]
     power : Tensor (B,) [W]
         Reflected, less attenuation, inside and outside of any window.
     """
 
     lit: Tensor
     free: Tensor
-    slant_range: Tensor
     power: Tensor
 
     @classmethod
     def of(cls, rays: Rays, irradiance: Tensor) -> "Beams":
         """The beams of rays whose mirrors and air leave ``irradiance`` (B,) [W/m2]."""
         free = rays.power.sum(-1)
-        return cls(rays.lit, free, rays.slant_range, free * irradiance)
+        return cls(rays.lit, free, free * irradiance)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,6 +1,5 @@
 """``heliotwin field``: the flux of all heliostats of a plant file on a receiver, watt by watt."""
 
-import csv
 import math
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
@@ -119,54 +118,6 @@ def clear_sky_dni(elevation_deg: float, altitude_m: float) -> float:
     pressure = atmosphere.alt2pres(altitude_m)
     sky = clearsky.simplified_solis(np.array([elevation_deg]), pressure=pressure)
     return float(sky["dni"][0])
-
-
-def read_aims(path: Path, plant: PlantDescription) -> dict[str, Array | None]:
-    """Read aim points from CSV: ``name,east_m,north_m,up_m,active``, the last one optional.
-
-    Raises
-    ------
-    InvalidInputError
-        It names the file and the line.
-    """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InvalidInputError(f"{path}: cannot be read ({error})") from None
-    rows = csv.DictReader(text.splitlines())
-    missing = {"name", "east_m", "north_m", "up_m"} - set(rows.fieldnames or ())
-    if missing:
-        raise InvalidInputError(
-            f"{path}, line 1: columns must be name,east_m,north_m,up_m,active;"
-            f" {', '.join(sorted(missing))} is missing"
-        )
-    aims: dict[str, Array | None] = {}
-    for row in rows:
-        where, name = f"{path}, line {rows.line_num}", row["name"]
-        if name not in plant.plant.heliostats:
-            raise InvalidInputError(f"{where}: name: {name!r} is no heliostat of the plant")
-        if name in aims:
-            raise InvalidInputError(f"{where}: name: {name} is listed twice; keep one line")
-        aims[name] = _aim(row, where)
-    return aims
-
-
-_YES, _NO = {"1", "true", "yes"}, {"0", "false", "no"}
-
-
-def _aim(row: dict[str, str], where: str) -> Array | None:
-    active = (row.get("active") or "1").strip().lower()
-    if active not in _YES | _NO:
-        raise InvalidInputError(f"{where}: active: must be 1 or 0, got {active!r}")
-    if active in _NO:
-        return None
-    try:
-        aim = np.array([float(row[key]) for key in ("east_m", "north_m", "up_m")])
-    except (TypeError, ValueError):
-        aim = np.full(3, np.nan)
-    if not (np.abs(aim) < 1e6).all():
-        raise InvalidInputError(f"{where}: east_m, north_m, up_m: must be numbers of metres")
-    return aim
 
 
 def resolution_of(receiver: Receiver) -> Resolution:

@@ -14,7 +14,7 @@ from model.ephemeris import sun_angles_at
 from model.errors import InvalidInputError, ModelError
 from model.plant import Receiver, TargetPlane
 from model.times import format_time
-from service.base.fields import Plane, Sun, parse_moment
+from service.base.fields import Plane, Sun
 from service.base.progress import Progress, no_progress
 from service.base.validation_messages import format_validation_error
 from service.cli.folder import (
@@ -26,6 +26,7 @@ from service.cli.folder import (
     surfaces_of,
 )
 from service.cli.folder_store import open_folder
+from service.cli.times import moment_of
 from service.sources.documents import read_json
 from service.sources.folder import MeasurementFolder
 from service.twin.forecasts.heliostat_forecast import ForecastRequest, trace_flux
@@ -73,10 +74,7 @@ def asked(
         raise InvalidInputError(
             "--target, --plane: give one of them, a target or receiver of the folder or a file"
         )
-    try:
-        at = None if at is None else parse_moment(at)
-    except ValueError as error:
-        raise InvalidInputError(f"--at: {error}") from None
+    at = moment_of(at)
     unknown = [name for name in heliostats if name not in folder.plant.heliostats]
     if unknown:
         raise InvalidInputError(

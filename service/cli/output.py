@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -21,6 +22,16 @@ if TYPE_CHECKING:
 console = Console(stderr=True)
 AsJson = Annotated[
     bool, typer.Option("--json", help="Print the report as JSON on standard output.")
+]
+
+
+AtTime = Annotated[
+    datetime | None,
+    typer.Option(
+        help="The sun at a time, in UTC unless it has a zone.",
+        metavar="TIME",
+        formats=["%Y-%m-%dT%H:%M", "%Y-%m-%dT%H:%M:%S", "%Y-%m-%dT%H:%M%z", "%Y-%m-%dT%H:%M:%S%z"],
+    ),
 ]
 
 

@@ -7,6 +7,7 @@ from contextvars import ContextVar
 from pathlib import Path
 
 from model.errors import InvalidInputError
+from service.base.names import escape_control_characters
 
 # The largest files of a measurement folder are deflectometry, some tens of megabytes.
 _MAX_BYTES = 2**30
@@ -68,3 +69,20 @@ def read_file(path: Path, max_bytes: int | None = None) -> bytes:
         return require_regular(path, max_bytes).read_bytes()
     except OSError as error:
         raise InvalidInputError(f"{path}: {error.strerror}") from None
+
+
+def file_name(path: Path) -> str:
+    """A path as messages show it."""
+    return escape_control_characters(str(path))
+
+
+def read_text(path: Path, max_bytes: int) -> str:
+    """Read a text file in UTF-8; InvalidInputError names the line of a byte that is none."""
+    data = read_file(path, max_bytes)
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data[: error.start].count(b"\n") + 1
+        raise InvalidInputError(
+            f"{file_name(path)}, line {line}: has a byte that is no UTF-8; save the file as UTF-8"
+        ) from None

@@ -3,7 +3,7 @@
 import csv
 import io
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,9 +14,8 @@ from model.errors import InvalidInputError
 from model.heliostat_type import FacetDesign, circle_outline
 from model.plant import Outline, outline_share
 from service.base.names import NAME, is_text, require_name
-from service.sources.files import read_file
+from service.sources.files import file_name, read_text
 from service.sources.plant_schema import MAX_FACETS, MAX_HELIOSTATS, HeliostatEntry, nearest
-from service.sources.yaml_text import file_name
 
 Array = NDArray[np.float64]
 
@@ -27,6 +26,11 @@ _NUMBER = re.compile(r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?
 
 MAX_CORNERS = 64
 """Most corners of a facet's polygon."""
+
+
+def to_number(text: str) -> float:
+    """The decimal number of a text; NaN if it is none."""
+    return float(text) if _NUMBER.fullmatch(text) else float("nan")
 
 
 @dataclass(frozen=True)
@@ -43,7 +47,7 @@ class CsvRow:
     def number(self, column: str, low: float = -1e6, high: float = 1e6) -> float:
         """The number of a cell, between ``low`` and ``high``."""
         text = self.cells[column]
-        value = float(text) if _NUMBER.fullmatch(text) else float("nan")
+        value = to_number(text)
         if not low <= value <= high:
             raise self.wrong(column, f"must be a number in [{low:g}, {high:g}], got {text[:60]!r}")
         return value
@@ -112,14 +116,7 @@ def read_rows(path: Path, columns: CsvColumns, most: int) -> list[CsvRow]:
 
 def _lines(path: Path, name: str) -> Iterator[CsvRow]:
     """Lines that are not blank, their cells by column number."""
-    data = read_file(path, MAX_CSV_BYTES)
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = data[: error.start].count(b"\n") + 1
-        raise InvalidInputError(
-            f"{name}, line {line}: has a byte that is no UTF-8; save the file as UTF-8"
-        ) from None
+    text = read_text(path, MAX_CSV_BYTES)
     reader = csv.reader(io.StringIO(text, newline=""))
     for cells in reader:
         place = f"{name}, line {reader.line_num}"
@@ -313,3 +310,32 @@ def _crosses_itself(points: Array) -> bool:
     a, b, c, d = begin[:, None], end[:, None], begin[None], end[None]
     meets = (side(a, b, c) * side(a, b, d) < 0) & (side(c, d, a) * side(c, d, b) < 0)
     return bool(meets.any())
+
+
+# --- aims
+# --------------------------------------------------------------------------------------------------
+
+_AIMS = CsvColumns(("name", "east_m", "north_m", "up_m"), ("active",))
+_YES, _NO = {"", "1", "true", "yes"}, {"0", "false", "no"}
+
+
+def read_aims(path: Path, heliostats: Container[str]) -> dict[str, Array | None]:
+    """Aim points (3,) [m] by heliostat of an aims file; None for those that are not active.
+
+    ``heliostats`` are the names of the plant's. Raises `InvalidInputError`, which names file and
+    line.
+    """
+    aims: dict[str, Array | None] = {}
+    for row in read_rows(path, _AIMS, MAX_HELIOSTATS):
+        name, active = row.cells["name"], row.cells.get("active", "").lower()
+        if name not in heliostats:
+            raise row.wrong("name", f"{name[:60]!r} is no heliostat of the plant")
+        if name in aims:
+            raise row.wrong("name", f"{name} is listed twice; keep one line")
+        if active not in _YES | _NO:
+            raise row.wrong("active", f"must be 1 or 0, got {active[:60]!r}")
+        if active in _NO:
+            aims[name] = None
+        else:
+            aims[name] = np.array([row.number(column) for column in ("east_m", "north_m", "up_m")])
+    return aims

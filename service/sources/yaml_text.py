@@ -15,8 +15,8 @@ from typing import Any
 import yaml
 
 from model.errors import InvalidInputError
-from service.base.names import escape_control_characters, is_text
-from service.sources.files import read_file
+from service.base.names import is_text
+from service.sources.files import file_name, read_text
 
 MAX_BYTES = 2**22
 """Largest YAML document [bytes]: some ten thousand heliostats in line."""
@@ -83,20 +83,7 @@ def read_yaml(path: Path) -> YamlDocument:
         If it is missing, no regular file, too large, no UTF-8, no YAML, or has what is refused. It
         names file and line.
     """
-    name, data = file_name(path), read_file(path, MAX_BYTES)
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = data[: error.start].count(b"\n") + 1
-        raise InvalidInputError(
-            f"{name}, line {line}: has a byte that is no UTF-8; save the file as UTF-8"
-        ) from None
-    return parse_yaml(text, name)
-
-
-def file_name(path: Path) -> str:
-    """A path as messages show it."""
-    return escape_control_characters(str(path))
+    return parse_yaml(read_text(path, MAX_BYTES), file_name(path))
 
 
 def parse_yaml(text: str, name: str) -> YamlDocument:

@@ -1,17 +1,14 @@
 """The verb on a whole field: flux on a receiver, and what becomes of each watt."""
 
 import json
-from datetime import datetime
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from service.cli.output import AsJson, make_table, progress, require_folder, show
+from service.cli.output import AsJson, AtTime, make_table, progress, require_folder, show
 
 app = typer.Typer()
-
-_TIMES = ["%Y-%m-%dT%H:%M", "%Y-%m-%dT%H:%M:%S", "%Y-%m-%dT%H:%M%z", "%Y-%m-%dT%H:%M:%S%z"]
 
 
 @app.command()
@@ -23,12 +20,7 @@ def field(
         tuple[float, float] | None,
         typer.Option(help="The sun: azimuth from north, elevation [deg].", metavar="AZ EL"),
     ] = None,
-    at: Annotated[
-        datetime | None,
-        typer.Option(
-            help="The sun at a time, in UTC unless it has a zone.", metavar="TIME", formats=_TIMES
-        ),
-    ] = None,
+    at: AtTime = None,
     dni: Annotated[
         float | None,
         typer.Option(
@@ -63,19 +55,20 @@ def field(
     """
     import numpy as np
 
-    from service.base.fields import parse_moment
-    from service.cli.field import FieldRequest, read_aims, sun_of, trace_field
+    from service.cli.field import FieldRequest, sun_of, trace_field
+    from service.cli.times import moment_of
     from service.sources.plant_file import read_plant
+    from service.sources.plant_tables import read_aims
 
     require_folder(out)
     source = read_plant(plant)
-    azimuth, elevation = sun_of(source, sun, None if at is None else parse_moment(at))
+    azimuth, elevation = sun_of(source, sun, moment_of(at))
     request = FieldRequest(
         receiver,
         azimuth,
         elevation,
         dni,
-        None if aims is None else read_aims(aims, source),
+        None if aims is None else read_aims(aims, source.plant.heliostats),
         surfaces,
         resolution,
     )

@@ -1,6 +1,5 @@
 """The verbs on a measurement folder: flux, predict, forecast, study."""
 
-from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,6 +9,7 @@ from rich.table import Table
 from service.base.choices import Method
 from service.cli.output import (
     AsJson,
+    AtTime,
     make_table,
     progress,
     require_file,
@@ -49,8 +49,6 @@ MountsFile = Annotated[
         metavar="MOUNTS.json",
     ),
 ]
-
-_TIMES = ["%Y-%m-%dT%H:%M", "%Y-%m-%dT%H:%M:%S", "%Y-%m-%dT%H:%M%z", "%Y-%m-%dT%H:%M:%S%z"]
 
 
 def _count(folder: "MeasurementFolder") -> int:
@@ -143,12 +141,7 @@ def forecast(
             metavar="AZ EL",
         ),
     ] = None,
-    at: Annotated[
-        datetime | None,
-        typer.Option(
-            help="The sun at a time, in UTC unless it has a zone.", metavar="TIME", formats=_TIMES
-        ),
-    ] = None,
+    at: AtTime = None,
     target: Annotated[
         str | None,
         typer.Option(help="With --sun or --at: the folder's target or receiver to aim at."),

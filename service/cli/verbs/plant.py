@@ -131,13 +131,13 @@ def export(
     as_json: AsJson = False,
 ) -> None:
     """Write a plant for another program."""
-    from service.cli.field import read_aims
     from service.sources.plant_file import read_plant
     from service.sources.plant_formats.formats import foreign_text
+    from service.sources.plant_tables import read_aims
 
     require_file(out)
     described = read_plant(file)
-    points = {} if aims is None else read_aims(aims, described)
+    points = {} if aims is None else read_aims(aims, described.plant.heliostats)
     text = foreign_text(described, to, sun, points)
     out.parent.mkdir(parents=True, exist_ok=True)
     out.write_text(text, encoding="utf-8")

@@ -1,7 +1,7 @@
 """Folders of a plant that ``plant.yaml`` describes; DESIGN.md, section 8."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,10 +17,11 @@ from service.sources.documents import (
     SUFFIXES,
     Measurement,
     optics_to_json,
+    parse_declared,
     read_json,
     sun_to_json,
 )
-from service.sources.folder import Importer, MeasurementFolder, declared_json, read_declared
+from service.sources.folder import Importer, MeasurementFolder, declared_json
 from service.sources.heliostat_document import heliostat_to_json
 from service.sources.plant_file import PlantDescription, read_plant
 from service.sources.schema import WeatherDocument, parse, parse_time
@@ -51,7 +52,7 @@ class PlantFolder(MeasurementFolder):
     description : PlantDescription
     """
 
-    description: PlantDescription = None  # type: ignore[assignment]  # the base has defaults
+    description: PlantDescription = field(kw_only=True)
 
     def declared(self) -> dict[str, object]:
         """Sun and air of ``plant.yaml``; ``twin.json`` adds effects and cameras."""
@@ -134,10 +135,8 @@ def _read(root: Path, heliostats: list[str] | None) -> PlantFolder:
         name: heliostat_to_json(heliostat, description.type_of[name])
         for name, heliostat in kept.items()
     }
-    declared = read_declared(root / "twin.json")
-    model = PlantModel(plant.site, description.optics, declared.effects, declared.cameras)
-    if "sun" in declared_json(root / "twin.json"):
-        model = replace(model, optics=replace(model.optics, sun_shape=declared.optics.sun_shape))
+    declared = _declared(description) | declared_json(root / "twin.json")
+    model = PlantModel(plant.site, *parse_declared(declared, str(root / "twin.json")))
     whole = Plant(plant.name, plant.origin, plant.targets, kept, cylinders)
     return PlantFolder(root, whole, model, skipped, properties, description=description)
 

@@ -40,11 +40,9 @@ def read_opencsp(path: Path) -> ImportedPlant:
     InvalidInputError
         It names file and line of what is not understood.
     """
-    lines = read_lines(path, ",")
+    lines = read_lines(path, ",", MAX_HELIOSTATS)
     if not lines or [cell.strip() for cell in lines[0].cells] != list(COLUMNS):
         raise InvalidInputError(f"{path}, line 1: must be {','.join(COLUMNS)}")
-    if len(lines) > MAX_HELIOSTATS + 1:
-        raise lines[-1].refuse(f"at most {MAX_HELIOSTATS} heliostats are read")
     kinds: dict[tuple[float, ...], str] = {}
     heliostats: list[HeliostatEntry] = []
     for line in lines[1:]:

@@ -45,11 +45,9 @@ def read_solarpilot(path: Path) -> ImportedPlant:
     InvalidInputError
         It names file and line of what is not understood.
     """
-    lines = read_lines(path, ",")
+    lines = read_lines(path, ",", MAX_HELIOSTATS)
     if not lines:
         raise InvalidInputError(f"{path}: is empty")
-    if len(lines) > MAX_HELIOSTATS + 1:
-        raise lines[-1].refuse(f"at most {MAX_HELIOSTATS} heliostats are read")
     return _results(lines) if "Pos-x" in lines[0].cells else _layout(lines)
 
 

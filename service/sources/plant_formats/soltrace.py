@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from model.errors import InvalidInputError
 from model.frames import sun_angles
+from service.sources.files import file_name
 from service.sources.plant_formats.imported import ImportedPlant, placed, site
 from service.sources.plant_formats.text import ForeignLine, read_lines
 from service.sources.plant_schema import MAX_HELIOSTATS, HeliostatEntry
-from service.sources.yaml_text import file_name
 
 Array = NDArray[np.float64]
 

@@ -1,18 +1,15 @@
 """Lines of foreign text files, with their places for messages."""
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from model.errors import InvalidInputError
-from service.sources.files import read_file
-from service.sources.yaml_text import file_name
+from service.sources.files import file_name, read_text
+from service.sources.plant_tables import to_number
 
 MAX_BYTES = 2**26
 """Largest file of another program [bytes]."""
-
-_NUMBER = re.compile(r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?")
 
 
 @dataclass(frozen=True)
@@ -31,7 +28,7 @@ class ForeignLine:
             If it is absent, no number, or not between ``low`` and ``high``.
         """
         text = self.cells[index].strip() if index < len(self.cells) else ""
-        value = float(text) if _NUMBER.fullmatch(text) else float("nan")
+        value = to_number(text)
         if not low <= value <= high:
             raise InvalidInputError(
                 f"{self.place}: cell {index + 1} must be a number in [{low:g}, {high:g}], got"
@@ -48,15 +45,16 @@ class ForeignLine:
         return InvalidInputError(f"{self.place}: {problem}")
 
 
-def read_lines(path: Path, separator: str) -> list[ForeignLine]:
-    """Lines of a file that are not blank, split at ``separator``."""
-    data = read_file(path, MAX_BYTES)
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise InvalidInputError(f"{file_name(path)}: is no text of UTF-8") from None
-    return [
-        ForeignLine(f"{file_name(path)}, line {number}", line.rstrip("\r").split(separator))
-        for number, line in enumerate(text.split("\n"), start=1)
+def read_lines(path: Path, separator: str, most: int | None = None) -> list[ForeignLine]:
+    """Lines of a file that are not blank, split at ``separator``; ``most`` are read below the
+    first.
+    """
+    name = file_name(path)
+    lines = [
+        ForeignLine(f"{name}, line {number}", line.rstrip("\r").split(separator))
+        for number, line in enumerate(read_text(path, MAX_BYTES).split("\n"), start=1)
         if line.strip()
     ]
+    if most is not None and len(lines) > most + 1:
+        raise lines[-1].refuse(f"at most {most} heliostats are read")
+    return lines

@@ -131,6 +131,7 @@ def test_real_layouts_are_traced(make: Any, receiver: str, tmp_path: Path):
             ("--receiver", "main", "--at", "2026-03-20T08:00"),
             "--at: the sun's elevation must lie in (0, 90] degrees",
         ),
+        (("--receiver", "main", "--at", "1950-03-20T08:00"), "--at: give a year from 1970 on"),
         (("--receiver", "main", "--sun", 180, 50, "--dni", -3), "--dni"),
     ],
 )
@@ -143,10 +144,14 @@ def test_mistakes_are_named(plant: Path, options: tuple[object, ...], said: str)
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("name,east_m,north_m\nA1,0,8\n", "line 1: columns must be"),
+        ("name,east_m,north_m\nA1,0,8\n", "line 1: column up_m is missing; add it"),
+        ("name,east_m,north_m,up_m,aktiv\nA1,0,8,150,0\n", "line 1: column 'aktiv' is not known"),
         ("name,east_m,north_m,up_m\nZZ,0,8,150\n", "line 2: name: 'ZZ' is no heliostat"),
         ("name,east_m,north_m,up_m\nA1,0,8,150\nA1,0,8,150\n", "line 3: name: A1 is listed twice"),
-        ("name,east_m,north_m,up_m\nA1,0,x,150\n", "line 2: east_m, north_m, up_m: must be"),
+        (
+            "name,east_m,north_m,up_m\nA1,0,x,150\n",
+            "line 2: north_m: must be a number in [-1e+06, 1e+06], got 'x'",
+        ),
         ("name,east_m,north_m,up_m,active\nA1,0,8,150,maybe\n", "line 2: active: must be 1 or 0"),
         ("name,east_m,north_m,up_m,active\nA1,0,8,150,0\n", "no heliostat is active"),
     ],
