@@ -127,6 +127,10 @@ def sun_direction(azimuth_deg: ArrayLike, elevation_deg: ArrayLike) -> NDArray[n
     )
 
 
+SOLAR_DISC = 4.65e-3
+"""Half angle of the solar disc [rad]."""
+
+
 class SunAngles(NamedTuple, Generic[Angle]):
     """Azimuth from north over east, and elevation, of the sun [deg]."""
 

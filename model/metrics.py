@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model.errors import InvalidInputError
+from model.frames import SOLAR_DISC
 from model.images import FLUX_SIZE, FLUX_WINDOW
 from model.imaging.window import center_of_mass, flux_window
 from model.plant import Heliostat
@@ -22,9 +23,6 @@ Array = NDArray[np.float64]
 
 WINDOWS = (FLUX_WINDOW, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0)
 """Sides [m] of comparison windows: a flux image's, unless a spot is larger (`accuracy_window`)."""
-
-SUN_RADIUS = 4.65e-3
-"""Half the angle [rad] of the sun's disc."""
 
 WINDOW_TOLERANCE = 0.1
 """Share by which a spot's outer rim, which holds little light, may exceed its window."""
@@ -117,7 +115,7 @@ def spot_window(heliostat: Heliostat, slant_range: float) -> float:
     """
     optics = heliostat.optics
     error = np.hypot(2 * optics.slope_error, optics.pointing_error)
-    side = _central_spot(heliostat, slant_range) + 2 * slant_range * (SUN_RADIUS + 2 * error)
+    side = _central_spot(heliostat, slant_range) + 2 * slant_range * (SOLAR_DISC + 2 * error)
     return min((w for w in WINDOWS if w * (1 + WINDOW_TOLERANCE) >= side), default=WINDOWS[-1])
 
 

@@ -18,9 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from model.errors import InvalidInputError
-
-SOLAR_DISC = 4.65e-3
-"""Half angle of the solar disc [rad]."""
+from model.frames import SOLAR_DISC as SOLAR_DISC
 
 FREQUENCY_STEP = 2.0
 """Spacing of tabulated transfer functions [cycles/rad]."""
