@@ -17,7 +17,7 @@ from matplotlib.colors import to_hex
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from service.drawing.pictures import map_picture, mirror_heights, series_picture
+from service.drawing.pictures import facet_columns, map_picture, mirror_heights, series_picture
 
 Array = NDArray[np.floating]
 
@@ -222,18 +222,18 @@ def difference_map(
 
 
 def mirror_image(heights: Array) -> Array:
-    """Heights (4, i, j) as one image seen from the front, rows from the top.
+    """Heights (F, i, j) as one image seen from the front, rows from the top.
 
-    i runs along x, and j along y. There are thin gaps between the facets. The facets are in PAINT's
-    order: upper left, upper right, lower left, lower right.
+    i runs along x, and j along y. There are thin gaps between the facets, which fill rows from the
+    upper left in their order: PAINT's four do so, and grids of `plant.yaml`, if they are as wide as
+    high.
     """
-    upper_left, upper_right, lower_left, lower_right = (facet.T[::-1] for facet in heights)
-    gap = np.full((upper_left.shape[0], 1), np.nan)
-    rows = [
-        np.hstack([left, gap, right])
-        for left, right in ((upper_left, upper_right), (lower_left, lower_right))
-    ]
-    return np.vstack([rows[0], np.full((1, rows[0].shape[1]), np.nan), rows[1]])
+    columns = facet_columns(len(heights))
+    facets = [np.pad(facet.T[::-1], ((0, 1), (0, 1)), constant_values=np.nan) for facet in heights]
+    blank = np.full_like(facets[0], np.nan)
+    facets += [blank] * (-len(facets) % columns)
+    rows = [np.hstack(facets[start : start + columns]) for start in range(0, len(facets), columns)]
+    return np.asarray(np.vstack(rows)[:-1, :-1])
 
 
 def surface_map(title: str, z: Array, size: tuple[float, float], bound: float) -> HeatMap:

@@ -138,6 +138,11 @@ def mirror_heights(z: NDArray[np.floating], samples: int = 48) -> NDArray[np.flo
     return across @ np.asarray(z, dtype=np.float64) @ along.T * 1e3
 
 
+def facet_columns(count: int) -> int:
+    """Columns in which so many facets are drawn."""
+    return math.ceil(math.sqrt(count))
+
+
 def surface_picture(z: NDArray[np.floating], title: str, bound: float) -> bytes:
     """A surface of control heights (F, 8, 8) [m] as a map in mm.
 
@@ -146,7 +151,7 @@ def surface_picture(z: NDArray[np.floating], title: str, bound: float) -> bytes:
     """
     figure = Figure(figsize=(6.4, 5), layout="constrained")
     heights = mirror_heights(z)
-    columns = math.ceil(math.sqrt(len(heights)))
+    columns = facet_columns(len(heights))
     rows = math.ceil(len(heights) / columns)
     every = figure.subplots(rows, columns, squeeze=False).ravel()
     panes, numbers = every[: len(heights)], map(str, range(1, len(heights) + 1))

@@ -86,8 +86,10 @@ class HeliostatRow(Base):
 
     @property
     def size_m(self) -> tuple[float, float]:
-        """Width and height of the mirror [m]."""
-        return float(self.properties["width"]), float(self.properties["height"])
+        """Width and height of the mirror [m]; PAINT's documents name them without their unit."""
+        known = self.properties
+        suffix = "_m" if "width_m" in known else ""
+        return float(known[f"width{suffix}"]), float(known[f"height{suffix}"])
 
 
 class TargetRow(Base):
