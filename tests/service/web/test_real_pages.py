@@ -9,7 +9,6 @@ from dataclasses import replace
 from datetime import date
 from pathlib import Path
 from typing import Any
-from urllib.parse import urldefrag
 
 import numpy as np
 import pytest
@@ -32,8 +31,8 @@ from service.twin.studies.study import (
     study_row,
 )
 from tests.model.scenes import photographs
-from tests.page import Page
 from tests.service import real
+from tests.service.web.crawling import crawl
 
 GAIN = Gain(0.02, 0.01, 0.03, 4.0)
 DAY = date(2024, 6, 16)
@@ -136,43 +135,11 @@ def every_study(real_store: Path, tmp_path_factory: pytest.TempPathFactory) -> I
         yield client
 
 
-def links_of(text: str) -> set[str]:
-    """Where a page's links lead, on this service."""
-    followed = (
-        urldefrag(one[name])[0]
-        for one in Page(text).all()
-        for name in ("href", "src", "hx-get")
-        if name in one.attributes
-    )
-    return {link for link in followed if link.startswith("/")}
-
-
-def figure_of(path: str) -> str:
-    """The same for the same figure of pages of one kind."""
-    page, _, query = path.partition("?")
-    shown = [part for part in query.split("&") if part.startswith(("figure=", "format="))]
-    return re.sub("[0-9]+", "", f"{page}?{'&'.join(shown)}")
-
-
 def test_every_page_and_every_file_on_it_answers(every_study: TestClient):
     """All that can be reached by links from the first page; a figure of like pages once, for it is
     drawn for each.
     """
-    waiting, seen, drawn, refused = ["/"], {"/"}, set[str](), {}
-    while waiting:
-        path = waiting.pop()
-        if "figure=" in path and figure_of(path) in drawn:
-            continue
-        drawn.add(figure_of(path))
-        answer = every_study.get(
-            path, headers={"Accept": "text/html"} if not path.startswith("/v1/") else {}
-        )
-        if answer.status_code != 200:
-            refused[path] = answer.status_code
-        elif answer.headers["Content-Type"].startswith("text/html"):
-            new = links_of(answer.text) - seen
-            seen |= new
-            waiting += sorted(new)
+    seen, refused = crawl(every_study)
     assert not refused
     pages = [path for path in seen if re.fullmatch(r"/studies/\d+", path)]
     assert len(pages) == len(FOUND) + 4 + 2 + 1
