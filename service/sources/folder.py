@@ -64,6 +64,13 @@ class MeasurementFolder(ABC):
         """
         return [m for m in self.read_measurements(heliostat) if m.images or not with_images]
 
+    def whole_field(self) -> "MeasurementFolder":
+        """The folder with every heliostat that its files describe, measured or not.
+
+        Stores take it: forecasts of a field need all its heliostats.
+        """
+        return self
+
     def declared(self) -> dict[str, object]:
         """The declared model in the form of ``twin.json``."""
         return dict(declared_json(self.root / "twin.json"))
@@ -221,8 +228,12 @@ class Importer:
     otherwise: str
 
 
-def read_folder(root: Path, heliostats: list[str] | None = None) -> MeasurementFolder:
+def read_folder(
+    root: Path, heliostats: list[str] | None = None, *, whole_field: bool = False
+) -> MeasurementFolder:
     """Read a measurement folder with the first importer that recognises it.
+
+    It has the heliostats with measurements, or those of `MeasurementFolder.whole_field`.
 
     Raises
     ------
@@ -237,7 +248,14 @@ def read_folder(root: Path, heliostats: list[str] | None = None) -> MeasurementF
     ]
     for importer in importers:
         if importer.recognises(root):
-            return importer.read(root, heliostats)
+            folder = importer.read(root, heliostats)
+            folder = folder.whole_field() if whole_field else folder
+            if not folder.plant.heliostats:
+                raise InvalidInputError(
+                    f"{root}: no heliostat of the plant has a folder of its name with Calibration"
+                    " or Deflectometry; add one"
+                )
+            return folder
     raise InvalidInputError(f"{root}: {'; '.join(importer.otherwise for importer in importers)}")
 
 

@@ -31,7 +31,7 @@ def import_(folder: Folder, as_json: AsJson = False) -> None:
     from service.twin.transfer.importing import import_folder
 
     keep_private()
-    source = read_folder(folder)
+    source = read_folder(folder, whole_field=True)
     runtime = Runtime.from_settings(Settings())
     try:
         if runtime.settings.migrates_on_start:

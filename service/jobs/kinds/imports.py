@@ -64,7 +64,7 @@ def import_allowed(context: Context, payload: ImportIn) -> Result:
     """
     root = allowed_root(context.runtime.settings)
     with confined_to(root):
-        return _import(context, read_folder(allowed_folder(root, payload.folder)))
+        return _import(context, read_folder(allowed_folder(root, payload.folder), whole_field=True))
 
 
 def _import(context: Context, folder: MeasurementFolder) -> Result:

@@ -1,7 +1,7 @@
 """Folders of a plant that ``plant.yaml`` describes; DESIGN.md, section 8."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import BeforeValidator, ConfigDict, Field
 
 from model.errors import InvalidInputError
-from model.plant import Cylinder, Plant
+from model.plant import Cylinder, Heliostat, Plant
 from model.plant_model import PlantModel
 from service.base.fields import Elevation, Number
 from service.sources.documents import (
@@ -53,6 +53,12 @@ class PlantFolder(MeasurementFolder):
     """
 
     description: PlantDescription = field(kw_only=True)
+
+    def whole_field(self) -> "PlantFolder":
+        """The folder with every heliostat of the layout."""
+        every = self.description.plant.heliostats
+        properties = _properties(self.description, every)
+        return replace(self, plant=replace(self.plant, heliostats=every), properties=properties)
 
     def declared(self) -> dict[str, object]:
         """Sun and air of ``plant.yaml``; ``twin.json`` adds effects and cameras."""
@@ -118,11 +124,6 @@ def _read(root: Path, heliostats: list[str] | None) -> PlantFolder:
         for name, heliostat in plant.heliostats.items()
         if (root / name).is_dir() and (heliostats is None or name in heliostats)
     }
-    if not kept:
-        raise InvalidInputError(
-            f"{root}: no heliostat of {PLANT} has a folder of its name with Calibration or"
-            " Deflectometry; add one"
-        )
     cylinders = {}
     for name, receiver in plant.receivers.items():
         if isinstance(receiver, Cylinder):
@@ -131,14 +132,20 @@ def _read(root: Path, heliostats: list[str] | None) -> PlantFolder:
             skipped[f"receiver {name}"] = (
                 f"the store keeps cylinders only; heliotwin field traces {name}"
             )
-    properties = {
-        name: heliostat_to_json(heliostat, description.type_of[name])
-        for name, heliostat in kept.items()
-    }
     declared = _declared(description) | declared_json(root / "twin.json")
     model = PlantModel(plant.site, *parse_declared(declared, str(root / "twin.json")))
     whole = Plant(plant.name, plant.origin, plant.targets, kept, cylinders)
+    properties = _properties(description, kept)
     return PlantFolder(root, whole, model, skipped, properties, description=description)
+
+
+def _properties(
+    description: PlantDescription, heliostats: Mapping[str, Heliostat]
+) -> dict[str, dict[str, object]]:
+    return {
+        name: heliostat_to_json(heliostat, description.type_of[name])
+        for name, heliostat in heliostats.items()
+    }
 
 
 IMPORTER = Importer(

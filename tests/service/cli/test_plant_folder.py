@@ -66,7 +66,8 @@ def test_store_gives_back_what_was_imported(folder: Path, tmp_path: Path):
     assert not any(what.endswith("new") for what in counts)
     done = heliotwin_on(tmp_path / "data", "export", tmp_path / "exported")
     assert done.returncode == 0, done.stderr
-    before, after = read_folder(folder), read_folder(tmp_path / "exported")
+    before, after = read_folder(folder, whole_field=True), read_folder(tmp_path / "exported")
+    assert list(after.plant.heliostats) == ["A1", "B1", "C1"]  # C1 has no photographs
     for name, heliostat in before.plant.heliostats.items():
         exported = after.plant.heliostats[name]
         np.testing.assert_allclose(exported.position, heliostat.position, atol=1e-9)
@@ -103,4 +104,4 @@ def test_a_wrong_measurement_is_skipped_by_name(
 def test_a_folder_without_photographs_is_refused(tmp_path: Path):
     write_plant(tmp_path, layout=LAYOUT)
     done = heliotwin("flux", tmp_path, "--out", tmp_path / "out")
-    ends(done, 2, "no heliostat of plant.yaml has a folder of its name")
+    ends(done, 2, "no heliostat of the plant has a folder of its name")
