@@ -27,7 +27,8 @@ from model.plant import Receiver, TargetPlane, require_plane_shape
 from model.study import StudyOptions, study_to_json
 from model.surface import DEGREE, control_points
 from service.base.choices import Method, require_images
-from service.cli.demo_plant import IMAGES, RAYS, write_plant
+from service.cli.demo_photographs import IMAGES, RAYS
+from service.cli.demo_plant import write_plant
 from service.cli.folder_forecast import agreement, forecast_measurement
 from service.cli.folder_store import FolderStore, open_folder
 from service.sources.documents import IMAGE_KINDS

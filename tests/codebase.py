@@ -209,13 +209,13 @@ def _is_record(annotation: ast.expr) -> bool:
 
 
 LIMITS = {
-    "lines of code": 38_850,
+    "lines of code": 39_100,
     "words that WORDS.md replaces": 0,
     "names of two or more classes": 0,
     f"functions above {MAX_PARAMETERS} parameters": 0,
     "functions that return a bare tuple": 40,
     f"classes above {MAX_CLASS_LINES} lines": 0,
-    "lines with latitude_deg": 16,
+    "lines with latitude_deg": 17,
     "names of a forecast request's fields": 21,
     "dict[str, Any] in service": 64,
 }

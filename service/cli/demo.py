@@ -3,9 +3,10 @@
 import shlex
 import shutil
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -14,9 +15,9 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from model.errors import ModelError
-from model.frames import sun_angles
-from model.images import FLUX_SIZE, FLUX_WINDOW
+from model.errors import InvalidInputError, ModelError
+from model.frames import SunAngles, sun_angles
+from model.images import FLUX_SIZE
 from model.imaging.window import center_of_mass, flux_window
 from model.metrics import flux_accuracy
 from model.network.architecture import MAX_IMAGES
@@ -28,14 +29,19 @@ from service.base.arrays import unpack
 from service.base.choices import Method
 from service.base.errors import list_reasons
 from service.base.fields import Sun
+from service.base.progress import no_progress
 from service.base.settings import Settings
+from service.cli.demo_described import Demonstrated, write_southern_plant
 from service.cli.demo_plant import write_plant
+from service.cli.field import FieldReport, FieldRequest, trace_field
 from service.cli.folder import observations_of, surface_errors, write_json
 from service.cli.folder_store import FolderStore
 from service.cli.output import make_table
-from service.drawing.pictures import comparison_picture, of_peak, surface_picture
+from service.drawing.pictures import comparison_picture, flux_picture, of_peak, surface_picture
+from service.drawing.plant_picture import plant_picture
 from service.drawing.templates import ASSETS, TEMPLATES
 from service.sources.folder import MeasurementFolder, measured_heights, read_folder
+from service.sources.plant_file import read_plant
 from service.twin.forecasts.heliostat_forecast import ForecastRequest, make_forecast
 from service.twin.heliostats.measurements import choose_diverse
 from service.twin.runtime import operations
@@ -54,7 +60,7 @@ class HeliostatResult:
     """Results for one heliostat: mean accuracies over the test images, surface errors in mm.
 
     ``held_out`` is False if the test images were also used for the prediction, because there are
-    too few images.
+    too few images. ``accuracy_network`` is None for mirrors that no network predicts.
     """
 
     heliostat: str
@@ -62,7 +68,7 @@ class HeliostatResult:
     judged: int
     held_out: bool
     accuracy_ideal: float
-    accuracy_network: float
+    accuracy_network: float | None
     accuracy_refined: float
     accuracy_measured: float | None
     error_network_mm: float | None
@@ -70,22 +76,56 @@ class HeliostatResult:
     pictures: tuple[str, ...]
 
 
-def run_demo(
-    data: Path | None, out: Path, console: Console, quiet: bool = False
+def run_demos(
+    data: Path | None, plant: Path | None, out: Path, console: Console, quiet: bool = False
 ) -> Mapping[str, object]:
-    """Run the demonstration on the embedded plant or on a folder.
+    """Run the demonstration on a folder, on photographs of a plant's file, or on two plants.
+
+    The embedded plants are one of Juelich's kind, in ``out``, and one of another, in
+    ``out/southern``. A plant of a file is demonstrated in a folder of its name.
+
+    Returns
+    -------
+    mapping
+        The report of the first plant; that of the second one is under ``other_plant``.
+    """
+    if data is not None and plant is not None:
+        raise InvalidInputError("--data, --plant: give one of them")
+    if data is not None:
+        return run_demo(data, out, console, quiet)
+    if plant is not None:
+        return _demonstrate(plant, out / read_plant(plant).plant.name, console, quiet)
+    root = out / "plant"
+    with _bars(console, quiet) as bars:
+        write_plant(root, _counting(bars, 4))
+    report = run_demo(root, out, console, quiet)
+    with TemporaryDirectory(prefix="heliotwin-") as folder:
+        file = write_southern_plant(Path(folder))
+        other = _demonstrate(file, out / "southern", console, quiet)
+    return {**report, "other_plant": other}
+
+
+def _demonstrate(plant: Path, out: Path, console: Console, quiet: bool) -> Mapping[str, object]:
+    """Photograph a plant that a file describes, and run the demonstration on it."""
+    demonstrated = Demonstrated.read(plant)
+    with _bars(console, quiet) as bars:
+        demonstrated.write(out / "plant", _counting(bars, len(demonstrated.mirrors)))
+    return run_demo(out / "plant", out, console, quiet)
+
+
+def _counting(bars: Progress, total: int) -> Callable[[str], None]:
+    """Progress of photographs of so many heliostats."""
+    task = bars.add_task("photograph a plant", total=total)
+    return lambda name: bars.update(task, description=f"photograph {name}", advance=1)
+
+
+def run_demo(root: Path, out: Path, console: Console, quiet: bool = False) -> Mapping[str, object]:
+    """Run the demonstration on a measurement folder.
 
     All files are written to ``out``. Return the report.
     """
     out.mkdir(parents=True, exist_ok=True)
     with _bars(console, quiet) as bars:
-        root = data
-        if root is None:
-            root = out / "plant"
-            task = bars.add_task("photograph a plant", total=4)
-            write_plant(
-                root, lambda name: bars.update(task, description=f"photograph {name}", advance=1)
-            )
         folder = read_folder(root)
         # A store holds one plant: each plant has a separate store, so that demonstrations on
         # different data can share one folder.
@@ -95,9 +135,10 @@ def run_demo(
             count = sum(
                 len(m.images) for name in folder.plant.heliostats for m in folder.measurements(name)
             )
-            task = bars.add_task("import", total=count + len(folder.plant.heliostats))
+            whole = read_folder(root, whole_field=True)
+            task = bars.add_task("import", total=count + len(whole.plant.heliostats))
             imported = import_folder(
-                runtime, folder, lambda name: bars.update(task, description=name, advance=1)
+                runtime, whole, lambda name: bars.update(task, description=name, advance=1)
             )
             made, skipped = _predict_all(runtime, folder, bars)
         finally:
@@ -105,11 +146,13 @@ def run_demo(
     if not made:
         reasons = list_reasons(skipped)
         raise ModelError(f"{root}: no heliostat had an image that could be used ({reasons})")
+    field = _trace_field(root, out)
     results = _drawn(out, made, runtime.settings.figure_scales)
-    report = {
+    report: dict[str, object] = {
         "data": str(root),
         "store": imported["counts"],
         "heliostats": [asdict(result) for result in results],
+        "field": field,
         "skipped": {**skipped, **imported["skipped"]},
     }
     write_json(out / "report.json", report)
@@ -117,6 +160,30 @@ def run_demo(
     if not quiet:
         _print(console, results, out, store)
     return report
+
+
+def _trace_field(root: Path, out: Path) -> FieldReport | None:
+    """Trace the field of a plant's file at noon of an equinox, if it has a receiver.
+
+    Files: ``OUT/field/field.json``, ``OUT/plant.png`` and ``OUT/field.png``.
+    """
+    file = root / "plant.yaml"
+    described = read_plant(file) if file.is_file() else None
+    if described is None or not described.receivers:
+        return None
+    (out / "plant.png").write_bytes(
+        plant_picture(described.plant, described.receivers, described.type_of, described.tower)
+    )
+    receiver = next(iter(described.receivers.values()))
+    latitude = float(described.plant.origin[0])
+    noon = SunAngles(180.0 if latitude >= 0 else 0.0, 90.0 - abs(latitude))
+    request = FieldRequest(receiver.name, noon.azimuth, noon.elevation)
+    found = trace_field(described, request, no_progress)
+    write_json(out / "field" / "field.json", found.report)
+    size = receiver.width, receiver.height
+    title = f"{described.plant.name}, {receiver.name}: noon of an equinox"
+    (out / "field.png").write_bytes(flux_picture(found.flux / 1e3, size, "kW/m2", title))
+    return found.report
 
 
 def _bars(console: Console, quiet: bool) -> Progress:
@@ -136,7 +203,7 @@ def _open_store(folder: Path) -> Runtime:
 
 @dataclass(frozen=True, eq=False)
 class _Made:
-    """A result with its surfaces (4, 8, 8) [m], test images and refined forecasts."""
+    """A result with its surfaces (F, 8, 8) [m], test images and refined forecasts."""
 
     result: HeliostatResult
     surfaces: dict[str, Array | None]
@@ -173,10 +240,15 @@ def _split(observations: list[Observation]) -> tuple[list[Observation], list[Obs
     return choose_diverse(used, MAX_IMAGES), judged
 
 
-def _stored(runtime: Runtime, name: str, method: Method, used: Sequence[Observation]) -> Array:
-    """Predict from stored measurements, store the version, and return its heights (4, 8, 8) [m]."""
+def _stored(
+    runtime: Runtime, name: str, method: Method, used: Sequence[Observation]
+) -> dict[str, Array]:
+    """Predict from stored measurements and store the version.
+
+    Return its heights (F, 8, 8) [m] by its method: mirrors that no network predicts are refined.
+    """
     row = predict_surface(runtime, name, method, [o.identifier for o in used]).row
-    return unpack(row.arrays)["z"].astype(np.float64)
+    return {row.source: unpack(row.arrays)["z"].astype(np.float64)}
 
 
 def _predict(
@@ -185,8 +257,9 @@ def _predict(
     heliostat = folder.plant.heliostats[name]
     used, judged = _split(observations)
     surfaces: dict[str, Array | None] = {"ideal": None}
-    surfaces["network"] = _stored(runtime, name, "network", used)
-    surfaces["refined"] = _stored(runtime, name, "refined", used)
+    surfaces |= _stored(runtime, name, "network", used)
+    if "refined" not in surfaces:
+        surfaces |= _stored(runtime, name, "refined", used)
     _store_forecast(runtime, name, judged[0])
     fluxes = {
         key: [_forecast(heliostat, o, folder, (z, None)) for o in judged]
@@ -209,7 +282,7 @@ def _predict(
         judged=len(judged),
         held_out=len(observations) >= HELD_OUT,
         accuracy_ideal=accuracies["ideal"],
-        accuracy_network=accuracies["network"],
+        accuracy_network=accuracies.get("network"),
         accuracy_refined=accuracies["refined"],
         accuracy_measured=accuracies.get("measured"),
         error_network_mm=errors.get("network", {}).get("mae_mm"),
@@ -242,13 +315,14 @@ def _forecast(
     from the centroid of its rays.
     """
     z, measured = surface
-    wide = 1.5 * FLUX_WINDOW
+    side = observation.side
+    wide = 1.5 * side
     points, degree = (control_points(heliostat, z), DEGREE) if measured is None else measured
     spot = observation.center_of_mass
     setup = Setup(heliostat, points, observation.sun, observation.target, spot, degree=degree)
     traced = operations.forecast(setup, folder.model, (96, 96), wide)
     center = center_of_mass(traced.camera_view, (wide, wide))
-    return flux_window(traced.camera_view, (wide, wide), center, FLUX_WINDOW, FLUX_SIZE)
+    return flux_window(traced.camera_view, (wide, wide), center, side, FLUX_SIZE)
 
 
 def _drawn(out: Path, made: Sequence[_Made], ends: Mapping[str, float]) -> list[HeliostatResult]:
@@ -281,7 +355,7 @@ def _draw(out: Path, made: _Made, top: float, ends: Mapping[str, float]) -> tupl
             f"{name}/{observation.identifier}: accuracy {flux_accuracy(observation.flux, flux):.1%}"
         )
         bounds = top, ends["flux_difference"]
-        picture = comparison_picture(observation.flux, flux, FLUX_WINDOW, title, bounds)
+        picture = comparison_picture(observation.flux, flux, observation.side, title, bounds)
         drawn[f"flux/{name}-{observation.identifier}.png"] = picture
     for path, content in drawn.items():
         (out / path).parent.mkdir(parents=True, exist_ok=True)
@@ -333,13 +407,7 @@ def _page(report: Mapping[str, object], results: list[HeliostatResult]) -> str:
     """HTML page with a conclusion, the table and links to the pictures."""
     judging = [result for result in results if result.held_out] or results
     photographs = sum(result.judged for result in judging)
-    accuracies = {
-        key: (
-            sum(getattr(result, f"accuracy_{key}") * result.judged for result in judging)
-            / photographs
-        )
-        for key in ("ideal", "network", "refined")
-    }
+    accuracies = {key: _mean_accuracy(judging, key) for key in ("ideal", "network", "refined")}
     return TEMPLATES.get_template("demo.html").render(
         style=Markup(ASSETS.joinpath("app.css").read_text(encoding="utf-8")),
         data=report["data"],
@@ -347,8 +415,20 @@ def _page(report: Mapping[str, object], results: list[HeliostatResult]) -> str:
         skipped=report["skipped"],
         accuracies=accuracies,
         photographs=photographs,
+        field=report["field"],
         is_unseen=judging[0].held_out,
         errors_mm=[
             result.error_refined_mm for result in results if result.error_refined_mm is not None
         ],
     )
+
+
+def _mean_accuracy(results: Sequence[HeliostatResult], surface: str) -> float | None:
+    """Mean accuracy with a surface over all photographs; None if no result has it."""
+    known = [
+        (accuracy, result.judged)
+        for result in results
+        if (accuracy := getattr(result, f"accuracy_{surface}")) is not None
+    ]
+    total = sum(judged for _, judged in known)
+    return sum(accuracy * judged for accuracy, judged in known) / total if total else None

@@ -1,30 +1,22 @@
 """A small plant for the demonstration: a measurement folder with four heliostats and one target.
 
-The true mirror surfaces are drawn from the surface prior. The Monte Carlo tracer traces them. It
-shares no code with the prediction and the forecast. A synthetic camera photographs the flux in
-perspective, with daylight, background and noise.
+The true mirror surfaces are drawn from the surface prior.
 """
 
 from dataclasses import asdict
 from pathlib import Path
 
-import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from model.actuator import LinearActuator
-from model.frames import sun_angles, sun_direction_at
+from model.frames import sun_angles
 from model.mount import Mount
 from model.plant import Heliostat, Plant, TargetPlane
 from model.prior import default_prior
-from model.setup import Setup
-from model.surface import control_points
-from model.tracing import Window
-from model.tracing.alignment import align_to_spots
-from model.tracing.montecarlo import trace_montecarlo
+from model.tracing import Optics
 from service.base.progress import Progress, no_progress
-from service.cli.demo_camera import CameraOptions, photograph
+from service.cli.demo_photographs import DEVIATION, IMAGES, RAYS, Camera, write_frame, write_surface
 from service.cli.folder import write_json
 from service.sources.paint_documents import azimuth_from_south
 
@@ -53,8 +45,6 @@ DRIVES = (
     ),
     LinearActuator(154166.6667, 0.0775, 0.338, 0.325, 0.944, clockwise=True, max_increment=80000.0),
 )
-IMAGES, RAYS, PIXELS = 8, 400_000, 112
-"""Photographs per heliostat, rays per photograph, and pixels along each side of the flux image."""
 
 
 def _actuator(drive: LinearActuator) -> dict[str, object]:
@@ -120,42 +110,6 @@ def tower(plant: Plant) -> dict[str, object]:
     }
 
 
-def suns(count: int, rng: np.random.Generator) -> Array:
-    """Sun directions (count, 3), unit vectors: hours of the day through the seasons."""
-    hour_angle = np.linspace(-55, 55, count) + rng.uniform(-5, 5, count)
-    return sun_direction_at(
-        rng.permutation(np.linspace(0, 22, count)), hour_angle, float(ORIGIN[0])
-    )
-
-
-def photographs(
-    mirror: Heliostat, z: Array, count: int, rays: int, rng: np.random.Generator
-) -> tuple[Array, Array, list[NDArray[np.uint8]]]:
-    """Suns (count, 3), motor positions (count, 2) [steps] and camera frames of one heliostat.
-
-    The spots lie at random positions near the target's centre.
-    """
-    directions = suns(count, rng)
-    spots = TARGET.to_enu(rng.uniform(-0.6, 0.6, (count, 2)))
-    points = control_points(mirror, z)
-    setups = [
-        Setup(mirror, points, sun, TARGET, spot)
-        for sun, spot in zip(directions, spots, strict=True)
-    ]
-    aligned = align_to_spots(setups)
-    scene = aligned.scene.to(torch.float32)
-    traced, _ = trace_montecarlo(
-        scene, Window.of(TARGET, PIXELS, PIXELS), rays=rays, seed=int(rng.integers(2**31))
-    )
-    frames = [
-        photograph(
-            flux, TARGET, rng, CameraOptions(time_stamp=f"demo {mirror.name} image {index + 1}")
-        )
-        for index, flux in enumerate(traced)
-    ]
-    return directions, mirror.mount.motors_from_angles(aligned.angles), frames
-
-
 def write_plant(
     root: Path,
     progress: Progress = no_progress,
@@ -167,6 +121,7 @@ def write_plant(
     """Write the demonstration's measurement folder, with true surfaces in ``H/Deflectometry``."""
     rng = np.random.default_rng(seed)
     plant, prior = Plant("demo", ORIGIN), default_prior()
+    camera = Camera(TARGET, float(ORIGIN[0]), Optics(), rays)
     write_json(root / "demo-tower-measurements.json", tower(plant))
     for number, (name, position) in enumerate(POSITIONS.items(), start=1):
         progress(name)
@@ -176,21 +131,17 @@ def write_plant(
             float(np.linalg.norm(position - TARGET.center)),
             mount=Mount.juelich(DRIVES),
         )
-        z = prior.surface(rng.normal(0, 0.8, len(prior.basis)))
+        z = prior.surface(rng.normal(0, DEVIATION, len(prior.basis)))
         write_json(
             root / name / "Properties" / f"{name}-heliostat-properties.json",
             properties(mirror, plant),
         )
-        (root / name / "Deflectometry").mkdir(parents=True, exist_ok=True)
-        (root / name / "Calibration").mkdir(parents=True, exist_ok=True)
-        points = control_points(mirror, z)
-        np.savez_compressed(
-            root / name / "Deflectometry" / f"{name}-nurbs-surface.npz",
-            control_points=points,
-            degrees=np.array([3, 3]),
-        )
-        taken = zip(*photographs(mirror, z, images, rays, rng), strict=True)
-        for index, (sun, motors, frame) in enumerate(taken, start=1):
+        write_surface(root, mirror, z)
+        taken = camera.photograph(mirror, z, images, rng)
+        assert taken.motors is not None  # its mounts have drives
+        for index, (sun, motors, frame) in enumerate(
+            zip(taken.suns, taken.motors, taken.frames, strict=True), start=1
+        ):
             azimuth, elevation = sun_angles(sun)
             stem = root / name / "Calibration" / f"{number}{index:02d}"
             about = {
@@ -203,6 +154,4 @@ def write_plant(
                 },
             }
             write_json(stem.with_name(f"{stem.name}-calibration-properties.json"), about)
-            cv2.imwrite(
-                str(stem.with_name(f"{stem.name}-raw.png")), cv2.cvtColor(frame, cv2.COLOR_RGB2BGR)
-            )
+            write_frame(stem.with_name(f"{stem.name}-raw.png"), frame)

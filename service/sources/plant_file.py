@@ -25,7 +25,7 @@ from service.sources.plant_receivers import (
     read_receivers,
     read_targets,
 )
-from service.sources.plant_schema import BuieSun, GaussianSun, assumed, nearest
+from service.sources.plant_schema import BuieSun, FacetFileEntry, GaussianSun, assumed, nearest
 from service.sources.plant_tables import PlacedHeliostat, read_layout
 from service.sources.plant_types import read_type
 
@@ -62,6 +62,8 @@ class PlantDescription:
     homography_of : dict
         By target with a known camera, (3, 3): pixels (column, row, 1) to metres right and up of its
         centre.
+    files : tuple of str
+        Files that it names, relative to its folder.
     assumed : tuple of str
         What the file leaves to its defaults, as lines ``key.path: value``.
     warnings : tuple of str
@@ -78,6 +80,7 @@ class PlantDescription:
     altitude: float
     marks_of: dict[str, str]
     homography_of: dict[str, Array]
+    files: tuple[str, ...] = ()
     assumed: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
 
@@ -123,12 +126,20 @@ class _PlantReader:
             altitude=header.altitude_m,
             marks_of={name: target.marks for name, target in self.entries.targets.items()},
             homography_of=read_homographies(self.text),
+            files=self._files(),
             assumed=tuple(assumed(self.entries)),
             warnings=tuple(self._warnings(layout)),
         )
 
     def _place(self, *path: str | int) -> str:
         return self.text.place(*path)
+
+    def _files(self) -> tuple[str, ...]:
+        """Files that the document names, each once."""
+        facets = [entry.facets for entry in self.entries.heliostat_types.values()]
+        named = [one.file for one in facets if isinstance(one, FacetFileEntry)]
+        layout = self.entries.layout.file
+        return tuple(dict.fromkeys([*([] if layout is None else [layout]), *named]))
 
     # --- site, sun, air
 

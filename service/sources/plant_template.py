@@ -1,5 +1,6 @@
 """A plant to begin with: a commented ``plant.yaml`` and its layout."""
 
+from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
 
@@ -23,15 +24,33 @@ def template_text() -> str:
 
 def template_layout() -> str:
     """Heliostats north of the tower in staggered rows, as CSV."""
+    radii = [_FIRST_ROW + row * _ROW_SPACING for row in range(_ROWS)]
+    return staggered_layout("standard", radii, _SPACING, 0.0, _HALF_FIELD_DEG)
+
+
+def staggered_layout(
+    of_type: str, radii: Sequence[float], spacing: float, middle_deg: float, half_width_deg: float
+) -> str:
+    """Heliostats of one type in staggered rows about the tower, as CSV.
+
+    Parameters
+    ----------
+    of_type : str
+    radii : sequence of float [m]
+        Of the rows.
+    spacing : float [m]
+        Between the heliostats of a row.
+    middle_deg, half_width_deg : float [deg]
+        The field's middle as an azimuth from north over east, and how far it reaches to each side.
+    """
     lines = ["name,type,east_m,north_m,up_m"]
-    for row in range(_ROWS):
-        radius = _FIRST_ROW + row * _ROW_SPACING
-        step = np.degrees(_SPACING / radius)
-        count = int(2 * _HALF_FIELD_DEG / step) // 2 * 2 + row % 2  # odd and even rows in turn
-        azimuths = (np.arange(count) - (count - 1) / 2) * step
+    for row, radius in enumerate(radii):
+        step = np.degrees(spacing / radius)
+        count = int(2 * half_width_deg / step) // 2 * 2 + row % 2  # odd and even rows in turn
+        azimuths = middle_deg + (np.arange(count) - (count - 1) / 2) * step
         for number, azimuth in enumerate(np.radians(azimuths), start=1):
             east, north = radius * np.sin(azimuth), radius * np.cos(azimuth)
-            lines.append(f"R{row + 1:02}-{number:02},standard,{east:.2f},{north:.2f},0")
+            lines.append(f"R{row + 1:02}-{number:02},{of_type},{east:.2f},{north:.2f},0")
     return "\n".join(lines) + "\n"
 
 

@@ -1,6 +1,6 @@
 """Accuracies of the demonstration: ``python -m tests.benchmarks.demo [--data ../shared/stj]``.
 
-Runs ``heliotwin demo`` on the embedded plant, whose mirrors are known, or on a folder of real
+Runs ``heliotwin demo`` on the embedded plants, whose mirrors are known, or on a folder of real
 photographs.
 """
 
@@ -10,18 +10,20 @@ from pathlib import Path
 
 from rich.console import Console
 
-from service.cli.demo import run_demo
+from service.cli.demo import run_demos
 from tests.benchmarks.record import log_row, recording
 
 
 def main(data: Path | None) -> None:
     """Run the demonstration, which prints its table."""
     with tempfile.TemporaryDirectory() as out:
-        report = run_demo(data, Path(out) / "demo", Console())
-    for one in report["heliostats"]:
+        report = run_demos(data, None, Path(out) / "demo", Console())
+    other = report.get("other_plant", {"heliostats": []})
+    for one in [*report["heliostats"], *other["heliostats"]]:
         methods = ("ideal", "network", "refined", "measured")
         cells = {f"accuracy, {method}": one[f"accuracy_{method}"] for method in methods}
         cells |= {f"error, {name} [mm]": one[f"error_{name}_mm"] for name in ("network", "refined")}
+        cells = {name: value for name, value in cells.items() if value is not None}
         row = f"{one['heliostat']}, judged by {one['judged']}"
         log_row(
             "The demonstration",

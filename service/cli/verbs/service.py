@@ -156,13 +156,21 @@ def migrate(
 @app.command()
 def demo(
     data: Annotated[
-        Path | None, typer.Option(help="A measurement folder instead of the embedded plant.")
+        Path | None, typer.Option(help="A measurement folder instead of the embedded plants.")
+    ] = None,
+    plant: Annotated[
+        Path | None,
+        typer.Option(
+            help="A plant's file: some of its mirrors are photographed.", metavar="PLANT.yaml"
+        ),
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder to write to.")] = Path("out/demo"),
     as_json: AsJson = False,
 ) -> None:
-    """Run the main job on an embedded plant or a measurement folder, with pictures and a report."""
-    from service.cli.demo import run_demo
+    """Run the main job, with pictures and a report, on two embedded plants, a plant's file or a
+    measurement folder.
+    """
+    from service.cli.demo import run_demos
 
     require_folder(out)
-    show(run_demo(data, out, console, quiet=as_json), as_json)
+    show(run_demos(data, plant, out, console, quiet=as_json), as_json)

@@ -1,0 +1,126 @@
+"""Photographs of a plant's mirrors, as its calibration camera would take them.
+
+The Monte Carlo tracer traces the true surfaces. It shares no code with the prediction and the
+forecast. A synthetic camera photographs the flux in perspective, with daylight, background and
+noise.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from model.frames import sun_direction_at
+from model.plant import Heliostat, TargetPlane
+from model.setup import Setup
+from model.surface import control_points
+from model.tracing import Optics, Window
+from model.tracing.alignment import align_to_spots
+from model.tracing.montecarlo import trace_montecarlo
+from service.cli.demo_camera import CameraOptions, photograph
+
+Array = NDArray[np.float64]
+
+IMAGES, RAYS, PIXELS = 8, 400_000, 112
+"""Photographs per heliostat, rays per photograph, and pixels along each side of the flux image."""
+
+DEVIATION = 0.8
+"""Standard deviation of the true surfaces' coefficients, relative to the prior's."""
+
+
+@dataclass(frozen=True, eq=False)
+class Photographs:
+    """Photographs of one mirror.
+
+    Attributes
+    ----------
+    suns : (N, 3)
+        Unit vectors towards the sun in ENU.
+    motors : (N, 2) [steps] or None
+        None for a mount without drives.
+    frames : list of N (rows, columns, 3)
+        RGB, sRGB encoded.
+    """
+
+    suns: Array
+    motors: Array | None
+    frames: list[NDArray[np.uint8]]
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """What is photographed, and how.
+
+    Attributes
+    ----------
+    target : TargetPlane
+    latitude : float [deg]
+    optics : Optics
+    rays : int
+        Of each photograph.
+    """
+
+    target: TargetPlane
+    latitude: float
+    optics: Optics
+    rays: int = RAYS
+
+    def suns(self, count: int, rng: np.random.Generator) -> Array:
+        """Sun directions (count, 3), unit vectors: hours of the day through the summer."""
+        hour_angle = np.linspace(-55, 55, count) + rng.uniform(-5, 5, count)
+        declination = np.copysign(np.linspace(0, 22, count), self.latitude)
+        return sun_direction_at(rng.permutation(declination), hour_angle, self.latitude)
+
+    def photograph(
+        self, mirror: Heliostat, z: Array, count: int, rng: np.random.Generator
+    ) -> Photographs:
+        """Photograph a mirror with heights ``z`` (F, 8, 8) [m].
+
+        The spots lie at random positions near the target's centre.
+        """
+        directions = self.suns(count, rng)
+        spots = self.target.to_enu(rng.uniform(-0.6, 0.6, (count, 2)))
+        points = control_points(mirror, z)
+        setups = [
+            Setup(mirror, points, sun, self.target, spot)
+            for sun, spot in zip(directions, spots, strict=True)
+        ]
+        aligned = align_to_spots(setups)
+        traced, _ = trace_montecarlo(
+            aligned.scene.to(torch.float32),
+            Window.of(self.target, PIXELS, PIXELS),
+            self.optics,
+            rays=self.rays,
+            seed=int(rng.integers(2**31)),
+        )
+        frames = [
+            photograph(
+                flux,
+                self.target,
+                rng,
+                CameraOptions(time_stamp=f"demo {mirror.name} image {index + 1}"),
+            )
+            for index, flux in enumerate(traced)
+        ]
+        has_drives = mirror.mount.actuators is not None
+        motors = mirror.mount.motors_from_angles(aligned.angles) if has_drives else None
+        return Photographs(directions, motors, frames)
+
+
+def write_frame(path: Path, frame: NDArray[np.uint8]) -> None:
+    """Write a photograph (rows, columns, 3), RGB, as PNG."""
+    cv2.imwrite(str(path), cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
+
+
+def write_surface(root: Path, mirror: Heliostat, z: Array) -> None:
+    """Write heights (F, 8, 8) [m] as the measured surface of a measurement folder."""
+    folder = root / mirror.name / "Deflectometry"
+    folder.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(
+        folder / f"{mirror.name}-nurbs-surface.npz",
+        control_points=control_points(mirror, z),
+        degrees=np.array([3, 3]),
+    )

@@ -1,0 +1,79 @@
+"""``heliotwin demo --plant``: photographs of any plant, and the embedded plant that is another."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from service.cli.demo_described import Demonstrated, write_southern_plant
+from service.sources.folder import read_folder
+from service.sources.plant_template import template_text
+from tests.service.command import ends, heliotwin
+
+LAYOUT = "name,type,east_m,north_m,up_m\nA1,standard,-20,90,0\n"
+
+
+def write_small(folder: Path, **changes: str) -> Path:
+    """The template with one heliostat of one facet."""
+    text = template_text().replace(
+        "rows: 4, columns: 3, width_m: 3.0", "rows: 1, columns: 1, width_m: 3.0"
+    )
+    for old, new in {"marks: none": "marks: l_brackets", **changes}.items():
+        assert old in text
+        text = text.replace(old, new)
+    path = folder / "plant.yaml"
+    path.write_text(text)
+    (folder / "layout.csv").write_text(LAYOUT)
+    return path
+
+
+def test_mirrors_of_a_plants_file_are_photographed_and_found(tmp_path: Path):
+    plant = write_small(tmp_path)
+    done = heliotwin("demo", "--plant", plant, "--out", tmp_path / "out", "--json")
+    assert done.returncode == 0, done.stderr
+    report, out = json.loads(done.stdout), tmp_path / "out" / "my-plant"
+    assert report == json.loads((out / "report.json").read_text())
+    for one in report["heliostats"]:
+        assert one["accuracy_network"] is None  # no network predicts mirrors of one facet
+        assert one["accuracy_refined"] > max(0.95, one["accuracy_ideal"])
+        assert all((out / picture).is_file() for picture in one["pictures"])
+    assert report["field"]["field"]["heliostats"] == 1
+    page = (out / "report.html").read_text()
+    for picture in ("plant.png", "field.png"):
+        assert picture in page
+        assert (out / picture).is_file()
+
+
+def test_second_embedded_plant_is_what_juelich_is_not(tmp_path: Path):
+    file = write_southern_plant(tmp_path / "southern")
+    demonstrated = Demonstrated.read(file, 1)
+    demonstrated.write(tmp_path / "plant", images=1, rays=1000)
+    (named,) = (mirror.name for mirror in demonstrated.mirrors)
+    folder = read_folder(tmp_path / "plant")
+    assert list(folder.plant.heliostats) == [named]
+    whole = read_folder(tmp_path / "plant", whole_field=True).plant
+    assert len(whole.heliostats) == 600
+    assert {len(heliostat.facets) for heliostat in whole.heliostats.values()} == {28}
+    assert whole.origin[0] < 0
+    (taken,) = folder.measurements(named)
+    assert list(taken.images) == ["raw"]
+    assert taken.motor_position is not None
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"normal: [0, 1, 0] ": "normal: [0, -1, 0]"}, "no heliostat's light meets it"),
+        ({"width_m: 8": "width: 8"}, "width"),
+    ],
+)
+def test_a_plant_that_cannot_be_photographed_says_why(
+    tmp_path: Path, changes: dict[str, str], said: str
+):
+    done = heliotwin("demo", "--plant", write_small(tmp_path, **changes), "--out", tmp_path / "out")
+    ends(done, 2, said)
+
+
+def test_data_and_plant_are_not_both_given(tmp_path: Path):
+    done = heliotwin("demo", "--plant", write_small(tmp_path), "--data", tmp_path)
+    ends(done, 2, "--data, --plant: give one of them")
