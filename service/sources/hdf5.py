@@ -113,6 +113,17 @@ class Hdf5Group:
             raise self.refuse(f"'{name}' must be finite, got {value}")
         return value
 
+    def dimensions(self, name: str) -> int:
+        """Number of a dataset's dimensions."""
+        return len(self._dataset(name).shape or ())
+
+    def truth(self, name: str) -> bool:
+        """The truth value of a dataset."""
+        found = self._dataset(name)
+        if found.shape != () or found.dtype.kind != "b":
+            raise self.refuse(f"'{name}' must be true or false, got {found.dtype} {found.shape}")
+        return bool(found[()])
+
     def text(self, name: str) -> str:
         """The text of a dataset."""
         found = self._dataset(name)
