@@ -9,6 +9,7 @@ the parameters do not cover the mirror evenly.
 Source: Piegl and Tiller, *The NURBS Book*, algorithms A2.2, A2.3 and section 9.2.
 """
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Generic, NamedTuple, TypeVar
@@ -277,17 +278,24 @@ def fit_heights(
     half_size : (2,) [m]
         Half the facet's width and height.
     """
-    value_u, slope_u = basis(shape[0], DEGREE, u)
-    value_v, slope_v = basis(shape[1], DEGREE, v)
-    by_x = np.einsum("ni,nj->nij", slope_u, value_v).reshape(len(u), -1) / (2 * half_size[0])
-    by_y = np.einsum("ni,nj->nij", value_u, slope_v).reshape(len(u), -1) / (2 * half_size[1])
-    slope_x, slope_y = -normals[:, 0] / normals[:, 2], -normals[:, 1] / normals[:, 2]
+    slopes = -normals[:, :2] / normals[:, 2:]
+    gram, right = np.zeros((math.prod(shape), math.prod(shape))), np.zeros(math.prod(shape))
+    for first in range(0, len(u), _FIT_BLOCK):
+        block = slice(first, first + _FIT_BLOCK)
+        value_u, slope_u = basis(shape[0], DEGREE, u[block])
+        value_v, slope_v = basis(shape[1], DEGREE, v[block])
+        pairs = ((slope_u, value_v), (value_u, slope_v))
+        for (along_u, along_v), size, slope in zip(pairs, half_size, slopes[block].T, strict=True):
+            design = np.einsum("ni,nj->nij", along_u, along_v).reshape(len(slope), -1) / (2 * size)
+            gram += design.T @ design
+            right += design.T @ slope
     # Slopes do not determine the constant mode; the pseudo-inverse sets it to zero.
-    gram = by_x.T @ by_x + by_y.T @ by_y
-    solution = np.linalg.pinv(gram, rcond=1e-12, hermitian=True) @ (
-        by_x.T @ slope_x + by_y.T @ slope_y
-    )
+    solution = np.linalg.pinv(gram, rcond=1e-12, hermitian=True) @ right
     return np.asarray((solution - solution.mean()).reshape(shape))
+
+
+_FIT_BLOCK = 65_536
+"""Normals that are fitted at once: their basis functions need some 100 MB."""
 
 
 @lru_cache(maxsize=4)

@@ -3,31 +3,27 @@
 `service.sources.importers` reads the folders of each source.
 """
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 
 from model.errors import InvalidInputError
 from model.plant import Heliostat, Plant
 from model.plant_model import PlantModel
-from model.surface import control_points, fit_heights, heights
+from model.surface import DEGREE, control_points, heights
 from service.base.arrays import unpack_untrusted
 from service.base.discovery import modules_of
+from service.sources.deflectometry import read_deflectometry
 from service.sources.documents import Array, Declared, Measurement, get, parse_declared, read_json
-from service.sources.files import read_file, require_regular
+from service.sources.files import read_file
 
 # PAINT's splines have 240 kB.
 _MAX_SPLINE_BYTES = 2**22
 _MAX_DEGREE = 7
-# Most deflectometry points per facet: each needs 1 kB for the fit.
-_MAX_POINTS = 500_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +85,11 @@ class MeasurementFolder(ABC):
 
 
 def read_surface(root: Path, heliostat: Heliostat) -> tuple[Array, int] | None:
-    """Control points (F, I, J, 3) [m] and spline degree from ``root/H/Deflectometry``, or None."""
+    """Control points (F, I, J, 3) [m] and spline degree from ``root/H/Deflectometry``, or None.
+
+    ``H-nurbs-surface.npz`` comes first, then PAINT's ``*deflectometry.h5``, then any ``*.h5`` of
+    PAINT or SOFAST; of several files the first by name.
+    """
     folder = root / heliostat.name / "Deflectometry"
     spline = folder / f"{heliostat.name}-nurbs-surface.npz"
     if spline.exists():
@@ -112,9 +112,10 @@ def read_surface(root: Path, heliostat: Heliostat) -> tuple[Array, int] | None:
                 f"{spline}: 'degrees' must be 1 to {_MAX_DEGREE}, and less than there are points"
             )
         return points, degree
-    for file in sorted(folder.glob("*deflectometry.h5")):
-        return control_points(heliostat, read_deflectometry(file, heliostat)), 3
-    return None
+    files = sorted(folder.glob("*deflectometry.h5")) or sorted(folder.glob("*.h5"))
+    if not files:
+        return None
+    return control_points(heliostat, read_deflectometry(files[0], heliostat)), DEGREE
 
 
 def _degree(given: Array | None) -> int:
@@ -123,84 +124,6 @@ def _degree(given: Array | None) -> int:
         return 3
     first = given.ravel()[:1]
     return int(first[0]) if first.size and np.isfinite(first[0]) else 0
-
-
-def read_deflectometry(file: Path, heliostat: Heliostat) -> Array:
-    """Fit heights z (F, 8, 8) [m] to the deflectometry of each facet.
-
-    The file has points and normals (n, 3) of each facet in mirror coordinates.
-    """
-    centers, axes, half_sizes = heliostat.facet_frames
-    facets = []
-    with _opened(file) as data:
-        for index, (center, frame, half_size) in enumerate(
-            zip(centers, axes, half_sizes, strict=True), start=1
-        ):
-            where = f"{file}, facet{index}"
-            points, normals = (
-                _vectors(data, where, f"facet{index}", name) @ frame.T
-                for name in ("surface_points", "surface_normals")
-            )
-            u, v = ((points - frame @ center)[:, :2] / (2 * half_size) + 0.5).T
-            inside = (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1) & np.isfinite(normals).all(axis=-1)
-            if inside.sum() < 256:
-                raise InvalidInputError(
-                    f"{where}: only {inside.sum()} usable points on the facet, 256 are needed"
-                )
-            facets.append(fit_heights(u[inside], v[inside], normals[inside], half_size))
-    return np.array(facets)
-
-
-@contextmanager
-def _opened(file: Path) -> Iterator[h5py.File]:
-    """Open an HDF5 file; InvalidInputError if it is none, or damaged."""
-    try:
-        with h5py.File(require_regular(file), "r") as data:
-            yield data
-    except InvalidInputError:
-        raise
-    except (OSError, KeyError, RuntimeError, ValueError) as error:
-        raise InvalidInputError(f"{file}: no readable HDF5 file ({error})") from None
-
-
-def _vectors(data: h5py.File, where: str, group: str, name: str) -> Array:
-    """Read the vectors (n, 3) of a dataset, after its size and storage are checked.
-
-    Links to other files are rejected before they are followed.
-    """
-    _require_own(data, where, group)
-    _require_own(data[group], where, name)
-    found = data[group][name]
-    if not isinstance(found, h5py.Dataset):
-        raise InvalidInputError(f"{where}: '{name}' must be a dataset")
-    if found.external or found.is_virtual:
-        raise InvalidInputError(
-            f"{where}: the numbers of '{name}' are in another file; copy them into this one"
-        )
-    if found.dtype.kind not in "fiu" or found.shape is None or found.shape[-1:] != (3,):
-        raise InvalidInputError(
-            f"{where}: '{name}' must be numbers of shape (n, 3), got {found.dtype} {found.shape}"
-        )
-    if (
-        max(math.prod(found.shape), math.prod(found.chunks or (0,))) > 3 * _MAX_POINTS
-        or found.dtype.itemsize > 8
-    ):
-        raise InvalidInputError(
-            f"{where}: '{name}' declares the shape {found.shape}; at most {_MAX_POINTS} points are"
-            " read per facet"
-        )
-    return np.asarray(found, dtype=np.float64).reshape(-1, 3)
-
-
-def _require_own(group: h5py.Group, where: str, name: str) -> None:
-    """Raise InvalidInputError if ``name`` is missing, or a link instead of an object."""
-    link = group.get(name, getlink=True) if isinstance(group, h5py.Group) else None
-    if link is None:
-        raise InvalidInputError(f"{where}: '{name}' is missing")
-    if not isinstance(link, h5py.HardLink):
-        raise InvalidInputError(
-            f"{where}: '{name}' is a link; copy what it links to into this file"
-        )
 
 
 def measured_heights(heliostat: Heliostat, surface: tuple[Array, int]) -> Array:

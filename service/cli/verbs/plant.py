@@ -15,7 +15,7 @@ app = typer.Typer(
     no_args_is_help=True,
 )
 
-ForeignFormat = Literal["solarpilot", "soltrace"]
+ForeignFormat = Literal["artist", "solarpilot", "soltrace"]
 PlantFile = Annotated[Path, typer.Argument(help="The plant's file.", metavar="PLANT.yaml")]
 
 
@@ -85,7 +85,8 @@ def import_(
     file: Annotated[
         Path,
         typer.Argument(
-            help="SolTrace's .stinput, or CSV of SolarPILOT or OpenCSP.", metavar="FILE"
+            help="SolTrace's .stinput, ARTIST's .h5, or CSV of SolarPILOT or OpenCSP.",
+            metavar="FILE",
         ),
     ],
     out: Annotated[Path, typer.Option(help="The folder for plant.yaml and its files.")],
@@ -128,20 +129,25 @@ def export(
             help="Aim points, name,east_m,north_m,up_m; without it the receivers' middles."
         ),
     ] = None,
+    surfaces: Annotated[
+        Path | None,
+        typer.Option(help="Folder of measured surfaces for ARTIST; without it nominal mirrors."),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Write a plant for another program."""
+    """Write a plant for another program; notes say what its format has no place for."""
     from service.sources.plant_file import read_plant
-    from service.sources.plant_formats.formats import foreign_text
+    from service.sources.plant_formats.formats import ExportOptions, write_foreign
     from service.sources.plant_tables import read_aims
 
     require_file(out)
     described = read_plant(file)
-    points = {} if aims is None else read_aims(aims, described.plant.heliostats)
-    text = foreign_text(described, to, sun, points)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_text(text, encoding="utf-8")
-    typer.echo(json.dumps({"written": [str(out)]}) if as_json else f"{out} is written")
+    points = None if aims is None else read_aims(aims, described.plant.heliostats)
+    notes = write_foreign(described, to, out, ExportOptions(sun, points, surfaces))
+    if as_json:
+        typer.echo(json.dumps({"written": [str(out)], "notes": notes}, indent=1))
+        return
+    typer.echo("\n".join([f"{out} is written", *notes]))
 
 
 @app.command()

@@ -1,6 +1,7 @@
 """Formats of other programs: which one a file has, and how a plant is written in one."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,8 @@ from numpy.typing import NDArray
 from model.errors import InvalidInputError
 from model.frames import sun_direction
 from service.sources.plant_file import PlantDescription
+from service.sources.plant_formats.artist import read_artist
+from service.sources.plant_formats.artist_export import write_artist
 from service.sources.plant_formats.imported import ImportedPlant
 from service.sources.plant_formats.opencsp import COLUMNS, read_opencsp
 from service.sources.plant_formats.solarpilot import read_solarpilot, solarpilot_layout
@@ -20,7 +23,8 @@ Array = NDArray[np.float64]
 
 
 def read_foreign(path: Path) -> ImportedPlant:
-    """Read a file of SolTrace (``.stinput``), OpenCSP or SolarPILOT (CSV by its first line).
+    """Read a file of SolTrace (``.stinput``), ARTIST (``.h5``), OpenCSP or SolarPILOT (CSV by its
+    first line).
 
     Raises
     ------
@@ -29,9 +33,55 @@ def read_foreign(path: Path) -> ImportedPlant:
     """
     if path.suffix.lower() == ".stinput":
         return read_soltrace(path)
+    if path.suffix.lower() in (".h5", ".hdf5"):
+        return read_artist(path)
     lines = read_lines(path, ",")
     is_opencsp = bool(lines) and [cell.strip() for cell in lines[0].cells[:5]] == list(COLUMNS[:5])
     return read_opencsp(path) if is_opencsp else read_solarpilot(path)
+
+
+@dataclass(frozen=True)
+class ExportOptions:
+    """What some formats need, and others do not have.
+
+    Attributes
+    ----------
+    sun_deg : tuple or None
+        Azimuth from north over east and elevation [deg], for SolTrace.
+    aims : mapping or None
+        Aim points (3,) [m] by heliostat, None for one that is not active; for SolTrace and
+        SolarPILOT.
+    surfaces : Path or None
+        Folder of measured surfaces, for ARTIST.
+    """
+
+    sun_deg: tuple[float, float] | None = None
+    aims: Mapping[str, Array | None] | None = None
+    surfaces: Path | None = None
+
+
+def write_foreign(
+    described: PlantDescription, to: str, out: Path, options: ExportOptions
+) -> list[str]:
+    """Write a plant for ``artist``, ``solarpilot`` or ``soltrace``; return notes.
+
+    Raises
+    ------
+    InvalidInputError
+        As of `foreign_text`; or an option is given that the format does not have.
+    """
+    if to == "artist":
+        for option, value in (("--sun", options.sun_deg), ("--aims", options.aims)):
+            if value is not None:
+                raise InvalidInputError(f"{option}: a scenario of ARTIST has none; leave it out")
+        out.parent.mkdir(parents=True, exist_ok=True)
+        return write_artist(described, out, options.surfaces)
+    if options.surfaces is not None:
+        raise InvalidInputError(f"--surfaces: {to} has no measured surfaces; leave it out")
+    text = foreign_text(described, to, options.sun_deg, options.aims or {})
+    out.parent.mkdir(parents=True, exist_ok=True)
+    out.write_text(text, encoding="utf-8")
+    return []
 
 
 def foreign_text(

@@ -1,8 +1,9 @@
 """A plant that another program's file describes, and its files."""
 
 import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,6 +20,17 @@ Array = NDArray[np.float64]
 PLANT, LAYOUT, AIMS = "plant.yaml", "layout.csv", "aims.csv"
 
 
+class MeasuredSurface(NamedTuple):
+    """Control points (F, I, J, 3) [m] of a mirror in its coordinates, and the splines' degree."""
+
+    points: Array
+    degree: int
+
+    def write(self, path: Path) -> None:
+        """Write it as ``H-nurbs-surface.npz``."""
+        np.savez_compressed(path, control_points=self.points, degrees=np.full(2, self.degree))
+
+
 @dataclass(frozen=True, eq=False)
 class ImportedPlant:
     """What a file of another program describes.
@@ -32,33 +44,49 @@ class ImportedPlant:
         Aim points (3,) [m] by heliostat; empty if the file has none.
     notes : sequence of str
         What the file does not say, and what is written in its place.
+    facets : dict
+        Lines of facets' files by their name, the column names first.
+    surfaces : dict
+        Measured surfaces by heliostat.
     """
 
     parts: Mapping[str, object]
     heliostats: Sequence[HeliostatEntry]
     aims: Mapping[str, Array] = field(default_factory=dict)
     notes: Sequence[str] = ()
+    facets: Mapping[str, Sequence[Sequence[str]]] = field(default_factory=dict)
+    surfaces: Mapping[str, MeasuredSurface] = field(default_factory=dict)
 
     def write(self, folder: Path) -> list[Path]:
-        """Write plant.yaml, layout.csv and, if there are aims, aims.csv; return their paths.
+        """Write plant.yaml, layout.csv and what else there is; return the paths.
 
         Raises
         ------
         InvalidInputError
             If one of them exists.
         """
-        names = [PLANT, LAYOUT, *([AIMS] if self.aims else [])]
-        paths = [folder / name for name in names]
+        writers: dict[str, Callable[[Path], None]] = {
+            PLANT: lambda path: _write_text(path, self._plant()),
+            LAYOUT: lambda path: _write_csv(path, *self._layout()),
+        }
+        if self.aims:
+            writers[AIMS] = lambda path: _write_csv(path, *self._aims())
+        for name, (head, *rows) in self.facets.items():
+            writers[name] = partial(_write_csv, columns=head, rows=rows)
+        for name, surface in self.surfaces.items():
+            writers[f"{name}/Deflectometry/{name}-nurbs-surface.npz"] = surface.write
+        paths = [folder / name for name in writers]
         for path in paths:
             if path.exists() or path.is_symlink():
                 raise InvalidInputError(f"{path} exists; name another folder, or move it")
-        folder.mkdir(parents=True, exist_ok=True)
-        paths[0].write_text(self._plant(), encoding="utf-8")
-        _write_csv(paths[1], *self._layout())
-        if self.aims:
-            rows = [[name, *_millimetres(aim), "true"] for name, aim in self.aims.items()]
-            _write_csv(paths[2], ["name", "east_m", "north_m", "up_m", "active"], rows)
+        for path, write in zip(paths, writers.values(), strict=True):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write(path)
         return paths
+
+    def _aims(self) -> "_Table":
+        rows = [[name, *_millimetres(aim), "true"] for name, aim in self.aims.items()]
+        return _Table(["name", "east_m", "north_m", "up_m", "active"], rows)
 
     def _plant(self) -> str:
         notes = "".join(f"# {note}\n" for note in self.notes)
@@ -89,6 +117,10 @@ def _cell(value: object) -> str:
 
 def _millimetres(point: Array) -> list[str]:
     return [f"{value:.6f}" for value in point]
+
+
+def _write_text(path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8")
 
 
 def _write_csv(path: Path, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:

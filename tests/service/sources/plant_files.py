@@ -217,3 +217,37 @@ def round_c(folder: Path) -> Path:
     rows = _rows(published() / "six-tools" / "Round3_layout.csv")
     placed = [[f"H{n}", "ideal", x, y, z, f] for n, (x, y, z, f) in enumerate(rows, start=1)]
     return _write(folder, document, placed, "focal_length_m")
+
+
+THREE_MOUNTS = """\
+plant: {name: daggett, latitude_deg: 34.86, longitude_deg: -116.83, altitude_m: 600}
+heliostat_types:
+  upright:
+    mount: {kind: azimuth_elevation, pivot_height_m: 4.0, mirror_offset_m: 0.2}
+    facets: {rows: 2, columns: 3, width_m: 1.8, height_m: 1.35, gap_m: 0.02}
+    facet_shape: slant_range
+  rolled:
+    mount: {kind: pitch_roll, pivot_height_m: 3.0, mirror_offset_m: 0.1}
+    facets: {rows: 2, columns: 3, width_m: 1.8, height_m: 1.35, gap_m: 0.02}
+    canting: {focal_length_m: 150}
+  driven:
+    mount: {kind: juelich, pivot_height_m: 2.0, mirror_offset_m: 0.175, drives: [
+      {kind: linear, increment_steps_per_m: 154166.67, initial_stroke_length_m: 0.0759, offset_m: 0.3353, pivot_radius_m: 0.3381, initial_angle_rad: -1.5466, clockwise: false, max_increment_steps: 69296},
+      {kind: linear, increment_steps_per_m: 154166.67, initial_stroke_length_m: 0.0769, offset_m: 0.3408, pivot_radius_m: 0.3191, initial_angle_rad: 0.9465, clockwise: true, max_increment_steps: 75000}]}
+    facets: {rows: 2, columns: 3, width_m: 1.8, height_m: 1.35, gap_m: 0.02}
+    canting: flat
+layout: {file: layout.csv}
+receivers:
+  main: {kind: cylinder, center_m: [0, 0, 80], radius_m: 4, height_m: 10, facing_azimuth_deg: 20, opening_deg: 180}
+targets:
+  cal: {kind: plane, center_m: [0, -3, 60], normal: [0, 1, 0], width_m: 14, height_m: 14}
+sun: {shape: gaussian, sigma_mrad: 2.35}
+"""
+"""A plant that ARTIST can say."""
+
+
+def write_three_mounts(folder: Path) -> Path:
+    """Five heliostats on mounts of three kinds; the path of plant.yaml."""
+    layout = "A1,upright,30,150,0\nA2,upright,-80,120,1\nB1,rolled,-20,130,0\nB2,rolled,60,180,2\n"
+    heads = "name,type,east_m,north_m,up_m\n"
+    return write_plant(folder, THREE_MOUNTS, heads + layout + "C1,driven,10,100,0\n")

@@ -14,6 +14,7 @@ from model.metrics import surface_error
 from model.sunshape import Buie, Gaussian, Pillbox
 from model.sunshape.buie import chi_of_csr
 from model.surface import control_points, evaluate
+from service.sources.deflectometry import read_deflectometry
 from service.sources.documents import (
     optics_to_json,
     read_heliostat,
@@ -21,7 +22,7 @@ from service.sources.documents import (
     read_measurement,
     read_targets,
 )
-from service.sources.folder import measured_heights, read_declared, read_deflectometry, read_folder
+from service.sources.folder import measured_heights, read_declared, read_folder
 from tests.conftest import flat_heliostat
 from tests.service.conftest import properties_document, tower_document
 

@@ -1,0 +1,73 @@
+"""Trace a scenario with ARTIST itself; runs in an environment that has it.
+
+    python artist_tracer.py SCENARIO.h5 TARGET SUN_EAST SUN_NORTH SUN_UP OUT.npz
+
+OUT has, for each heliostat, the irradiance (256, 256) on the target per share of the rays sent out,
+times the cosine on the target, as ARTIST has it.
+"""
+
+import sys
+import types
+from pathlib import Path
+
+try:
+    import torchvision
+except ImportError:  # ARTIST needs it for photographs only
+    torchvision = types.ModuleType("torchvision")
+    for part in ("io", "transforms"):
+        child = types.ModuleType(f"torchvision.{part}")
+        setattr(torchvision, part, child)
+        sys.modules[child.__name__] = child
+    sys.modules["torchvision"] = torchvision
+
+import h5py
+import numpy as np
+import torch
+from artist.raytracing import HeliostatRayTracer
+from artist.scenario import Scenario
+
+POINTS, RAYS = 50, 40
+
+
+def main(path: Path, target: str, sun: list[float], out: Path) -> None:
+    """Trace all heliostats, each aimed at the target's middle."""
+    torch.manual_seed(7)
+    device = torch.device("cpu")
+    with h5py.File(path) as file:
+        scenario = Scenario.load_scenario_from_hdf5(
+            file, number_of_surface_points_per_facet=torch.tensor([POINTS, POINTS]), device=device
+        )
+    scenario.set_number_of_rays(RAYS)
+    index = scenario.solar_tower.target_name_to_index[target]
+    found = {}
+    for group in scenario.heliostat_field.heliostat_groups:
+        count = group.number_of_heliostats
+        mask = torch.ones(count, dtype=torch.int32)
+        indices = torch.full((count,), index, dtype=torch.int32)
+        rays = torch.tensor([[-x for x in sun] + [0.0]] * count, dtype=torch.float32)
+        group.activate_heliostats(active_heliostats_mask=mask, device=device)
+        aims = scenario.solar_tower.get_centers_of_target_areas(
+            target_area_indices=indices, device=device
+        )
+        group.align_surfaces_with_incident_ray_directions(
+            aim_points=aims,
+            incident_ray_directions=rays,
+            active_heliostats_mask=mask,
+            device=device,
+        )
+        tracer = HeliostatRayTracer(scenario, group, blocking_active=False)
+        bitmaps = tracer.trace_rays(
+            incident_ray_directions=rays,
+            active_heliostats_mask=mask,
+            target_area_indices=indices,
+            mirror_reflectivity=1.0,
+            device=device,
+        )[0]
+        sent = group.surface_points.shape[1] * RAYS
+        found.update(zip(group.names, (bitmaps / sent).numpy(), strict=True))
+    np.savez_compressed(out, **found)
+
+
+if __name__ == "__main__":
+    _, scenario_file, target_name, *direction, output = sys.argv
+    main(Path(scenario_file), target_name, [float(x) for x in direction], Path(output))
