@@ -25,8 +25,13 @@ _LEVEL_STEP = 2  # [counts]
 _MIN_SHARE = 0.004  # of the frame: least area of a target
 _MIN_FILL = 0.9  # of the union of region and quadrilateral: least common area
 _MAX_REGIONS = 8  # of one level, the largest
-_REACHES = (0.03, 0.012, 0.006)  # search range of an edge, relative to a side, in each iteration
-_MIN_REACH = 4.0  # [px]
+_REACHES = (
+    0.03,
+    0.012,
+    0.006,
+    0.006,
+)  # search range of an edge, relative to a side, in each iteration
+_MIN_REACH = 6.0  # [px]
 _ALIKE = 0.03  # largest distance of corners of one hypothesis, relative to its side
 _SAME = 0.15  # ... and of corners of one rectangle, of which the clearest is taken
 _BAND = (0.015, 0.05)  # strips along both sides of an edge, relative to a side
