@@ -5,14 +5,15 @@ Frozen dataclasses in numpy; the tracers convert them to batched tensors (`model
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from model.errors import InvalidInputError, UnreachableError
+from model.errors import ImageRefusedError, InvalidInputError, UnreachableError
 from model.frames import enu_to_wgs84, wgs84_to_enu
+from model.locating import KNOWN_CAMERAS, Locator, corners_by_camera, locator_from_json
 from model.mount import Mount
 from model.site import Site
 
@@ -380,6 +381,8 @@ class TargetPlane:
     width, height : float [m]
     absorptance : float
         Share of the light on it that it takes up.
+    locator : Locator or None
+        How photographs show where it is; None if it declares nothing.
     """
 
     name: str
@@ -389,6 +392,7 @@ class TargetPlane:
     width: float
     height: float
     absorptance: float = 1.0
+    locator: Locator | None = None
 
     def __post_init__(self) -> None:
         if not (0 < self.width < 1e4 and 0 < self.height < 1e4):
@@ -471,6 +475,22 @@ class TargetPlane:
     def to_enu(self, coordinates: ArrayLike) -> NDArray[np.float64]:
         """ENU points (..., 3) of coordinates (..., 2) [m] right and up of the centre."""
         return np.asarray(self.center + np.asarray(coordinates, dtype=np.float64) @ self.axes[:2])
+
+    def located_by(self, declared: Mapping[str, Any]) -> "TargetPlane":
+        """The target with a locator, declared as `model.locating.locator_from_json` has it.
+
+        Raises
+        ------
+        InvalidInputError
+            If a declared camera cannot see it; it begins with the key of the mistake.
+        """
+        locator = locator_from_json(declared)
+        if isinstance(locator, KNOWN_CAMERAS):
+            try:
+                corners_by_camera(locator, self)
+            except ImageRefusedError as refusal:
+                raise InvalidInputError(f"image_size_px: {refusal.detail}") from None
+        return replace(self, locator=locator)
 
     def contains(self, point: ArrayLike) -> bool:
         """Whether a point (3,) [m] of the plane lies within the rectangle."""

@@ -242,10 +242,10 @@ def _moved(mark: Mark, first: Line | None, second: Line | None) -> Mark | None:
 
 def _edge_corner(gray: Gray, mark: Mark, reach: float) -> Mark | None:
     """The outer corner of an L: the intersection of the outer edges of its two arms."""
-    first = _edge_line(
+    first = edge_line(
         gray, mark.point + 0.15 * mark.arms[0], 0.7 * mark.arms[0], mark.arms[1], reach
     )
-    second = _edge_line(
+    second = edge_line(
         gray, mark.point + 0.15 * mark.arms[1], 0.7 * mark.arms[1], mark.arms[0], reach
     )
     return _moved(mark, first, second)
@@ -254,17 +254,17 @@ def _edge_corner(gray: Gray, mark: Mark, reach: float) -> Mark | None:
 def _edge_tee(gray: Gray, mark: Mark, reach: float) -> Mark | None:
     """Reference point of a T: the intersection of its stem's axis and its bar's outer edge."""
     half, stem = mark.arms
-    bar = _edge_line(gray, mark.point - 0.85 * half, 1.7 * half, stem, reach)
+    bar = edge_line(gray, mark.point - 0.85 * half, 1.7 * half, stem, reach)
     start, run = mark.point + 0.4 * stem, 0.5 * stem
-    left = _edge_line(gray, start - 0.2 * half, run, half, reach)
-    right = _edge_line(gray, start + 0.2 * half, run, -half, reach)
+    left = edge_line(gray, start - 0.2 * half, run, half, reach)
+    right = edge_line(gray, start + 0.2 * half, run, -half, reach)
     if left is None or right is None:
         return None
     along = (left[1] + right[1]) / np.linalg.norm(left[1] + right[1])
     return _moved(mark, bar, ((left[0] + right[0]) / 2, along))
 
 
-def _edge_line(gray: Gray, start: Points, run: Points, inward: Points, reach: float) -> Line | None:
+def edge_line(gray: Gray, start: Points, run: Points, inward: Points, reach: float) -> Line | None:
     """The edge line near ``start`` to ``start + run``, within ``reach``.
 
     Along the line, brightness falls towards ``inward``.

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from model.errors import ImageRefusedError, InvalidInputError
 from model.images import FLUX_WINDOW, normalized
+from model.imaging.finding import Frame, TargetImage, find_target
 from model.imaging.light import Camera, Power
 from model.imaging.quality import (
     SATURATED_GRAY,
@@ -24,7 +25,7 @@ from model.imaging.quality import (
     judge_flux,
     refused,
 )
-from model.imaging.rectify import BRACKETS, CROP_SIZE, Layout, check_corners, find_corners, rectify
+from model.imaging.rectify import BRACKETS, CROP_SIZE, Layout, check_corners
 from model.imaging.separate import find_spots, separate
 from model.imaging.strips import convert_by_strips
 from model.imaging.window import center_of_mass, flux_window
@@ -99,13 +100,14 @@ def measure(
         A camera frame; the rectified target; the rectified target without background; or a square
         of that, centered on the centroid.
     plane : TargetPlane
-        The target on which the image shows the spot.
+        The target on which the image shows the spot. Its locator finds it in a raw image.
     layouts : sequence of Layout
-        Possible layouts of the target's marks in a raw image, in the order to try.
+        Possible layouts of the target's marks in a raw image, in the order to try, if the target
+        declares no locator.
     side : float [m], optional
         Side of the square of a ``flux-centered`` image, which does not contain it.
     corners : array_like (4, 2) [px], optional
-        The target's corners in a raw image, used instead of its marks: upper left, upper right,
+        The target's corners in a raw image, used instead of its locator: upper left, upper right,
         lower left, lower right.
     camera : Camera, optional
         Conversion of light to counts. Without it, photographs are sRGB, or linear for 16 bits, and
@@ -135,12 +137,18 @@ def measure(
         return _measure_crop(_square(light), _square(crop), _square(brightest), plane)
     try:
         found = (
-            find_corners(crop, plane, layouts, light) if corners is None else check_corners(corners)
+            find_target(Frame(crop, light), plane, layouts)
+            if corners is None
+            else TargetImage(check_corners(corners))
         )
     except ImageRefusedError as refusal:
         return MeasuredFlux(refused(refusal.reason, refusal.detail))
     return _measure_crop(
-        rectify(light, found), rectify(crop, found), rectify(brightest, found), plane, found
+        found.rectified(light),
+        found.rectified(crop),
+        found.rectified(brightest),
+        plane,
+        found.corners,
     )
 
 

@@ -12,7 +12,7 @@ Notes
     (u, v, 1) ~ H (x, y, 1)     pixel and plane; H (3, 3) by least squares over agreeing marks
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations, product
 from typing import NamedTuple, TypeVar
@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from model.errors import ImageRefusedError, InvalidInputError
 from model.imaging.marks import Kind, Mark, Points, find_marks, intersection
+from model.locating import UNIT_CORNERS, project, smallest_turn
 from model.plant import TargetPlane
 
 CROP_SIZE = 256
@@ -64,7 +65,8 @@ BRACKETS: Layout = (
 )
 """A separate target: an L bracket at each corner."""
 
-_SQUARE = np.array([[place.x, place.y] for place in BRACKETS], dtype=np.float64)
+ToPixels = Callable[[Points], Points]
+"""Pixels (n, 2) of places (n, 2) in a target's sides, right and down from its upper left corner."""
 
 
 def find_corners(
@@ -119,7 +121,7 @@ def check_corners(corners: ArrayLike) -> Points:
         right, lower left, lower right.
     """
     points = np.asarray(corners, dtype=np.float64)
-    if points.shape != (4, 2) or not np.isfinite(points).all() or _smallest_turn(points) <= 1.0:
+    if points.shape != (4, 2) or not np.isfinite(points).all() or smallest_turn(points) <= 1.0:
         raise InvalidInputError(
             "corners must be four points (x, y) in pixels: upper left, upper right, lower left,"
             " lower right"
@@ -127,7 +129,9 @@ def check_corners(corners: ArrayLike) -> Points:
     return points
 
 
-def rectify(image: NDArray[Pixel], corners: Points, size: int = CROP_SIZE) -> NDArray[Pixel]:
+def rectify(
+    image: NDArray[Pixel], corners: Points, size: int = CROP_SIZE, to_pixels: ToPixels | None = None
+) -> NDArray[Pixel]:
     """Warp an image to the rectified target.
 
     Parameters
@@ -137,6 +141,8 @@ def rectify(image: NDArray[Pixel], corners: Points, size: int = CROP_SIZE) -> ND
         See `find_corners`.
     size : int
         Pixels per side of the result, whose outer edges are the target's.
+    to_pixels : callable, optional
+        Where places of the target are, if a lens bends its lines; else by the corners.
 
     Returns
     -------
@@ -148,9 +154,15 @@ def rectify(image: NDArray[Pixel], corners: Points, size: int = CROP_SIZE) -> ND
     )
     factor = int(np.clip(np.ceil(longest / size), 1, 8))
     fine = size * factor
-    edge = np.array([[0, 0], [fine, 0], [0, fine], [fine, fine]], dtype=np.float64) - 0.5
-    transform = cv2.getPerspectiveTransform(corners.astype(np.float32), edge.astype(np.float32))
-    warped = cv2.warpPerspective(image, transform, (fine, fine), flags=cv2.INTER_LINEAR)
+    if to_pixels is None:
+        edge = fine * UNIT_CORNERS - 0.5
+        transform = cv2.getPerspectiveTransform(corners.astype(np.float32), edge.astype(np.float32))
+        warped = cv2.warpPerspective(image, transform, (fine, fine), flags=cv2.INTER_LINEAR)
+    else:
+        middles = (np.arange(fine) + 0.5) / fine
+        places = np.stack(np.meshgrid(middles, middles), axis=-1).reshape(-1, 2)
+        x, y = to_pixels(places).astype(np.float32).T.reshape(2, fine, fine)
+        warped = cv2.remap(image, x, y, cv2.INTER_LINEAR)
     return np.asarray(
         cv2.resize(warped, (size, size), interpolation=cv2.INTER_AREA), dtype=image.dtype
     )
@@ -217,7 +229,9 @@ def _best_completed(
             if guess is None:
                 continue
             chosen = {hidden: guess, opposite: across, first: a, second: b}
-            fitted = _fit_four(_SQUARE, [chosen[i] for i in range(4)], layout, candidates, plane)
+            fitted = _fit_four(
+                UNIT_CORNERS, [chosen[i] for i in range(4)], layout, candidates, plane
+            )
             if fitted is not None and (best is None or fitted.score > best.score):
                 best = fitted
     return None if best is None else best.corners
@@ -259,7 +273,7 @@ def _fit_four(
         cv2.getPerspectiveTransform(source.astype(np.float32), points.astype(np.float32)),
         dtype=np.float64,
     )
-    corners = _project(transform, _SQUARE)
+    corners = project(transform, UNIT_CORNERS)
     if not _plausible(corners, sizes, plane) or not all(
         _arms_agree(transform, mark, place) for mark, place in zip(chosen, source, strict=True)
     ):
@@ -275,7 +289,7 @@ def _agreeing(
     """The best mark near each position that the homography predicts, by index in the layout."""
     found = {}
     for index, (place, marks) in enumerate(zip(layout, candidates, strict=True)):
-        expected = _project(transform, np.array([[place.x, place.y]]))[0]
+        expected = project(transform, np.array([[place.x, place.y]]))[0]
         near = [mark for mark in marks if np.linalg.norm(mark.point - expected) < _AGREEMENT * size]
         if near:
             found[index] = max(near, key=lambda mark: mark.score)
@@ -288,28 +302,12 @@ def _settled(corners: Points, agreeing: dict[int, Mark], layout: Layout) -> Poin
         source = np.array([[layout[i].x, layout[i].y] for i in agreeing], dtype=np.float64)
         points = np.array([mark.point for mark in agreeing.values()])
         transform, _ = cv2.findHomography(source, points)
-        corners = _project(np.asarray(transform, dtype=np.float64), _SQUARE)
+        corners = project(np.asarray(transform, dtype=np.float64), UNIT_CORNERS)
     return np.array([agreeing[i].point if i in agreeing else corners[i] for i in range(4)])
-
-
-def _project(transform: Points, points: Points) -> Points:
-    """Project points (n, 2) by a homography (3, 3)."""
-    mapped = points @ transform[:, :2].T + transform[:, 2]
-    return np.asarray(mapped[:, :2] / mapped[:, 2:], dtype=np.float64)
 
 
 def _cross(a: Points, b: Points) -> float:
     return float(a[0] * b[1] - a[1] * b[0])
-
-
-def _smallest_turn(corners: Points) -> float:
-    """Smallest cross product of successive edges.
-
-    The order is upper left, upper right, lower right, lower left.
-    """
-    ring = corners[[0, 1, 3, 2]]
-    edges = np.roll(ring, -1, axis=0) - ring
-    return min(_cross(a, b) for a, b in zip(edges, np.roll(edges, -1, axis=0), strict=True))
 
 
 def _plausible(corners: Points, sizes: Points, plane: TargetPlane) -> bool:
@@ -318,7 +316,7 @@ def _plausible(corners: Points, sizes: Points, plane: TargetPlane) -> bool:
         float(np.linalg.norm(corners[b] - corners[a])) for a, b in ((0, 1), (2, 3), (0, 2), (1, 3))
     )
     if (
-        _smallest_turn(corners) <= 0
+        smallest_turn(corners) <= 0
         or max(top / bottom, bottom / top, left / right, right / left) > 1.6
     ):
         return False
@@ -334,9 +332,9 @@ def _arms_agree(transform: Points, mark: Mark, place: Points) -> bool:
         np.array([np.cos(quarter), np.sin(quarter)]),
         np.array([-np.sin(quarter), np.cos(quarter)]),
     )
-    base = _project(transform, place[None])[0]
+    base = project(transform, place[None])[0]
     for arm, direction in zip(mark.arms, along, strict=True):
-        edge = _project(transform, (place + 0.1 * direction)[None])[0] - base
+        edge = project(transform, (place + 0.1 * direction)[None])[0] - base
         angle = np.degrees(np.arctan2(_cross(arm, edge), float(arm @ edge)))
         if abs(angle) > _ARM_TOLERANCE_DEG:
             return False

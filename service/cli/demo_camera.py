@@ -16,7 +16,6 @@ from model.imaging.light import Srgb
 from model.plant import TargetPlane
 
 _SHEET_HEIGHT = 1024  # [px] of the raster of the sheet
-_BORDER = 0.09  # white sheet beyond the marks, relative to the target's sides
 _ARM = 0.74  # [m] length of a bracket's arm, as on the Juelich tower
 _STROKE = 0.16  # [m] width of the arm
 _SURROUNDINGS = np.array([0.30, 0.36, 0.42])  # sky behind the tower, relative to full range
@@ -50,6 +49,10 @@ class CameraOptions:
         Standard deviation of the sensor noise.
     time_stamp : str
         Text in the upper left corner; empty for none.
+    border : float [1]
+        White sheet beyond the target's edges, relative to its sides.
+    marks : bool
+        Whether L brackets are at its corners.
     foreign_spot : (right [m], up [m], radius [m], peak [1]) or None
         Gaussian spot of another heliostat: its centre, its standard deviation, and its peak
         relative to ``peak``.
@@ -65,6 +68,8 @@ class CameraOptions:
     blur_px: float = 0.8
     noise: float = 1.5
     time_stamp: str = "2024-06-21 10:00:00 UTC"
+    border: float = 0.09
+    marks: bool = True
     foreign_spot: tuple[float, float, float, float] | None = None
 
 
@@ -130,11 +135,11 @@ def photograph(
     return _stamped(image, options.time_stamp)
 
 
-def _raster(plane: TargetPlane) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _raster(plane: TargetPlane, border: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Coordinates on the sheet: right (1, columns) and up (rows, 1) [m] from the
     target's centre.
     """
-    height, width = (1 + 2 * _BORDER) * plane.height, (1 + 2 * _BORDER) * plane.width
+    height, width = (1 + 2 * border) * plane.height, (1 + 2 * border) * plane.width
     columns = round(_SHEET_HEIGHT * width / height)
     right = ((np.arange(columns) + 0.5) / columns - 0.5) * width
     up = (0.5 - (np.arange(_SHEET_HEIGHT) + 0.5) / _SHEET_HEIGHT) * height
@@ -143,7 +148,7 @@ def _raster(plane: TargetPlane) -> tuple[NDArray[np.float64], NDArray[np.float64
 
 def _sheet(plane: TargetPlane, options: CameraOptions) -> NDArray[np.float64]:
     """Reflectance of the sheet (rows, columns), relative to plain white."""
-    right, up = _raster(plane)
+    right, up = _raster(plane, options.border)
     sheet = np.ones((up.shape[0], right.shape[1]))
     if options.grid_step > 0:
         pixel = float(right[0, 1] - right[0, 0])
@@ -153,6 +158,8 @@ def _sheet(plane: TargetPlane, options: CameraOptions) -> NDArray[np.float64]:
                 < 1.2 * pixel
             )
             sheet *= np.where(on_seam, 0.88, 1.0)
+    if not options.marks:
+        return sheet
     arm = min(_ARM, 0.2 * plane.width, 0.2 * plane.height)
     stroke = arm * _STROKE / _ARM
     # Inward distances from the two edges of the nearest corner.
@@ -165,7 +172,7 @@ def _light(
     flux: NDArray[np.floating], plane: TargetPlane, options: CameraOptions
 ) -> NDArray[np.float64]:
     """Daylight and flux on the sheet (rows, columns, 3), relative to the camera's range."""
-    right, up = _raster(plane)
+    right, up = _raster(plane, options.border)
     slope = options.gradient[0] * right / plane.width + options.gradient[1] * up / plane.height
     scaled = np.asarray(flux, dtype=np.float64) / max(float(flux.max()), 1e-300)
     spot = _resampled(scaled, right / plane.width, up / plane.height)
@@ -194,7 +201,8 @@ def _seen(
 ) -> NDArray[np.float64]:
     """The lit sheet (rows, columns, 3) in the camera's perspective, in front of the sky."""
     rows, columns = light.shape[:2]
-    low, high = _BORDER / (1 + 2 * _BORDER), (1 + _BORDER) / (1 + 2 * _BORDER)
+    whole = 1 + 2 * options.border
+    low, high = options.border / whole, (1 + options.border) / whole
     x, y = np.array([low, high]) * columns - 0.5, np.array([low, high]) * rows - 0.5
     source = np.array([[x[0], y[0]], [x[1], y[0]], [x[0], y[1]], [x[1], y[1]]], dtype=np.float32)
     transform = cv2.getPerspectiveTransform(

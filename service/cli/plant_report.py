@@ -5,6 +5,7 @@ from collections import Counter
 import numpy as np
 from rich.table import Table
 
+from model.locating import BracketMarks, CameraCorners, CameraHomography, CameraPose, SheetEdges
 from model.plant import Cylinder, TargetPlane
 from model.receivers import Cavity, Panels
 from model.sunshape import Buie, Gaussian, Pillbox, SunShape
@@ -16,6 +17,14 @@ from service.sources.plant_receivers import AnyReceiver
 Report = dict[str, object]
 
 _KINDS = {Cylinder: "cylinder", TargetPlane: "plane", Panels: "panels", Cavity: "cavity"}
+
+_LOCATED_BY: dict[type, str] = {
+    BracketMarks: "marks",
+    SheetEdges: "edges",
+    CameraHomography: "camera",
+    CameraCorners: "camera",
+    CameraPose: "camera",
+}
 
 
 def plant_report(described: PlantDescription) -> Report:
@@ -32,7 +41,11 @@ def plant_report(described: PlantDescription) -> Report:
             name: _surface(receiver, described) for name, receiver in described.receivers.items()
         },
         "targets": {
-            name: {**_surface(target, described), "marks": described.marks_of[name]}
+            name: {
+                **_surface(target, described),
+                "marks": described.marks_of[name],
+                "located_by": _LOCATED_BY[type(target.locator)],
+            }
             for name, target in plant.targets.items()
         },
         "tower": None

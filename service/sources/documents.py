@@ -245,12 +245,19 @@ def read_targets(tower: Any) -> tuple[Array, dict[str, TargetPlane]]:
     targets = {}
     for name, entry in tower.items():
         if isinstance(entry, dict) and entry.get("type") == "planar":
-            places = parse(PlanarTarget, entry, f"{where}, {name}").coordinates
+            document = parse(PlanarTarget, entry, f"{where}, {name}")
+            places = document.coordinates
             corners = [
                 plant.to_enu(np.array(get(places, f"{where}, {name}", corner)))
                 for corner in ("upper_left", "upper_right", "lower_left", "lower_right")
             ]
             targets[name] = TargetPlane.from_corners(name, *corners)
+            if document.locator is not None:
+                located = document.locator.model_dump(exclude_none=True)
+                try:
+                    targets[name] = targets[name].located_by(located)
+                except InvalidInputError as error:
+                    raise InvalidInputError(f"{where}, {name}, locator: {error}") from None
     if not targets:
         raise InvalidInputError(f"{where}: no target of type 'planar'")
     return origin, targets

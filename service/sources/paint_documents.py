@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from model.locating import locator_to_json
 from model.plant import Cylinder, Plant, TargetPlane
 from model.times import format_time
 from service.sources.photograph import Photograph
@@ -69,11 +70,13 @@ def _target_json(plane: TargetPlane, plant: Plant, corners: Corners | None) -> d
         name: plant.to_wgs84(plane.center + offset).tolist() for name, offset in made.items()
     }
     center = plant.to_wgs84(plane.center).tolist()
-    return {
+    document = {
         "type": "planar",
         "normal_vector": plane.normal.tolist(),
         "coordinates": {"center": center, **places},
     }
+    # PAINT has no such key, and its readers ignore it.
+    return document | ({} if plane.locator is None else {"locator": locator_to_json(plane.locator)})
 
 
 def _receiver_json(cylinder: Cylinder, plant: Plant) -> dict[str, object]:

@@ -18,13 +18,7 @@ from model.sunshape import Buie, Gaussian, Pillbox, SunShape
 from model.sunshape.buie import chi_of_csr
 from model.tracing import Optics
 from service.sources.plant_errors import PlantText, mistakes_at
-from service.sources.plant_receivers import (
-    AnyReceiver,
-    aim_of,
-    read_homographies,
-    read_receivers,
-    read_targets,
-)
+from service.sources.plant_receivers import AnyReceiver, aim_of, read_receivers, read_targets
 from service.sources.plant_schema import BuieSun, FacetFileEntry, GaussianSun, assumed, nearest
 from service.sources.plant_tables import PlacedHeliostat, read_layout
 from service.sources.plant_types import read_type
@@ -59,9 +53,6 @@ class PlantDescription:
     altitude : float [m]
     marks_of : dict
         Marks by target: ``none`` or ``l_brackets``.
-    homography_of : dict
-        By target with a known camera, (3, 3): pixels (column, row, 1) to metres right and up of its
-        centre.
     files : tuple of str
         Files that it names, relative to its folder.
     assumed : tuple of str
@@ -79,7 +70,6 @@ class PlantDescription:
     time_zone: str
     altitude: float
     marks_of: dict[str, str]
-    homography_of: dict[str, Array]
     files: tuple[str, ...] = ()
     assumed: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
@@ -125,7 +115,6 @@ class _PlantReader:
             time_zone=self._time_zone(),
             altitude=header.altitude_m,
             marks_of={name: target.marks for name, target in self.entries.targets.items()},
-            homography_of=read_homographies(self.text),
             files=self._files(),
             assumed=tuple(assumed(self.entries)),
             warnings=tuple(self._warnings(layout)),

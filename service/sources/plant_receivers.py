@@ -1,5 +1,8 @@
 """Receivers and targets of ``plant.yaml``."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,6 +19,7 @@ from service.sources.plant_schema import (
     PanelsReceiver,
     ReceiverEntry,
 )
+from service.sources.yaml_text import KeyPath
 
 Array = NDArray[np.float64]
 
@@ -32,28 +36,31 @@ def read_receivers(plant: PlantText) -> dict[str, AnyReceiver]:
 
 
 def read_targets(plant: PlantText) -> dict[str, TargetPlane]:
-    """Targets by name."""
+    """Targets by name, with how photographs show where they are."""
     targets = {}
     for name, entry in plant.entries.targets.items():
         place = plant.place("targets", name)
         if name in plant.entries.receivers:
             raise InvalidInputError(f"{place}: is a receiver's name too; rename one of them")
         with mistakes_at(place):
-            targets[name] = _plane(name, entry)
+            target = _plane(name, entry)
+        with _camera_mistakes_at(plant, name):
+            targets[name] = target.located_by(entry.locator_document)
     return targets
 
 
-def read_homographies(plant: PlantText) -> dict[str, Array]:
-    """Homographies (3, 3) of targets whose camera is known, by name."""
-    found = {}
-    for name, target in plant.entries.targets.items():
-        if target.camera is not None:
-            matrix = np.array(target.camera.homography, dtype=np.float64)
-            if abs(np.linalg.det(matrix / np.abs(matrix).max(initial=1e-300))) < 1e-15:
-                place = plant.place("targets", name, "camera", "homography")
-                raise InvalidInputError(f"{place}: must be invertible")
-            found[name] = matrix
-    return found
+@contextmanager
+def _camera_mistakes_at(plant: PlantText, target: str) -> Iterator[None]:
+    """Prefix a mistake of a target's camera with its line and key."""
+    try:
+        yield
+    except InvalidInputError as error:
+        key, _, said = str(error).partition(": ")
+        camera: KeyPath = ("targets", target, "camera")
+        known = [(*camera, "pose", key), (*camera, key), camera]
+        path = next(path for path in known if path in plant.document.lines)
+        message = said if key in (path[-1], "camera") else error
+        raise InvalidInputError(f"{plant.place(*path)}: {message}") from None
 
 
 def _plane(name: str, entry: PanelEntry, absorptance: float = 1.0) -> TargetPlane:

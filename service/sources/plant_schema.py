@@ -372,31 +372,95 @@ ReceiverEntry = Annotated[
 ]
 
 
-class CameraEntry(PlantPart):
-    """The camera that looks at a target."""
+Coordinate = Annotated[Number, Field(ge=-1e9, le=1e9)]
+PixelPair = Annotated[list[Coordinate], Field(min_length=2, max_length=2)]
+Pixels = Annotated[Whole, Field(ge=16, le=100_000)]
+MatrixRow = Annotated[list[Coordinate], Field(min_length=3, max_length=3)]
+Matrix3 = Annotated[list[MatrixRow], Field(min_length=3, max_length=3)]
 
-    homography: Annotated[
-        list[Annotated[list[Annotated[Number, Field(ge=-1e9, le=1e9)]], Field(min_length=3)]],
-        Field(min_length=3),
-    ] = Field(
-        description="3 x 3: from its pixels (column, row, 1) to metres right and up of the"
-        " target's centre."
+
+class PoseEntry(PlantPart):
+    """Where a camera is, where it looks, and its lens."""
+
+    position_m: Position
+    look_at_m: Position | None = Field(
+        None, description="The point in the direction of its optical axis; the camera is upright."
+    )
+    rotation: Matrix3 | None = Field(
+        None,
+        description="In place of look_at_m: its image's right, its image's down and its direction,"
+        " each as a row of east, north, up.",
+    )
+    focal_length_px: Annotated[Number, Field(ge=1, le=1e7)] | None = None
+    field_of_view_deg: Annotated[Number, Field(gt=0, lt=179)] | None = Field(
+        None,
+        description="In place of the focal length: from the left to the right edge of the image.",
+    )
+    principal_point_px: PixelPair | None = Field(
+        None, description="Column and row of the optical axis; the middle of the image without it."
+    )
+    distortion: Annotated[list[Coordinate], Field(min_length=1, max_length=5)] | None = Field(
+        None, description="k1, k2, p1, p2, k3 of Brown's lens, as of OpenCV; none without it."
     )
 
     @model_validator(mode="after")
-    def _three_by_three(self) -> Self:
-        if [len(row) for row in self.homography] != [3, 3, 3]:
-            raise ValueError("homography must have three rows of three numbers")
+    def _one_of_each(self) -> Self:
+        self.require_one("look_at_m", "rotation")
+        self.require_one("focal_length_px", "field_of_view_deg")
         return self
+
+
+class CameraEntry(PlantPart):
+    """The camera that looks at a target.
+
+    Pixels are (column, row); (0, 0) is the middle of the upper left one.
+    """
+
+    homography: Matrix3 | None = Field(
+        None,
+        description="3 x 3: from its pixels (column, row, 1) to metres right and up of the"
+        " target's centre.",
+    )
+    corners_px: Annotated[list[PixelPair], Field(min_length=4, max_length=4)] | None = Field(
+        None, description="The target's upper left, upper right, lower left and lower right corner."
+    )
+    pose: PoseEntry | None = None
+    image_size_px: Annotated[list[Pixels], Field(min_length=2, max_length=2)] | None = Field(
+        None, description="Columns and rows of its photographs; others are refused if it is given."
+    )
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Self:
+        self.require_one("homography", "corners_px", "pose")
+        return self
+
+
+Marks = Literal["none", "l_brackets"]
 
 
 class TargetEntry(PanelEntry):
     """A calibration target."""
 
     kind: Literal["plane"]
-    marks: Literal["none", "l_brackets"] = Field(
-        "none", description="Marks at its corners by which photographs are rectified."
+    marks: Marks = Field(
+        "none",
+        description="Marks at its corners that locate it in photographs. Without marks and camera"
+        " its edges do, of a white rectangle against darker surroundings.",
     )
+    camera: CameraEntry | None = Field(
+        None, description="A camera that does not move; for targets without marks."
+    )
+
+    @property
+    def locator_document(self) -> dict[str, object]:
+        """What it declares of its place in photographs, as of `model.locating`."""
+        return self.model_dump(include={"marks", "camera"}, exclude_none=True)
+
+
+class LocatorDocument(PlantPart):
+    """How a target is located in photographs, in exports."""
+
+    marks: Marks
     camera: CameraEntry | None = None
 
 

@@ -25,6 +25,7 @@ from model.pointing import Weather
 from service.base.fields import Direction, Elevation, Extent, Name, Number, Wgs84, parse_moment
 from service.base.names import FORMS, LINES, is_text
 from service.base.validation_messages import format_validation_error
+from service.sources.plant_schema import LocatorDocument
 
 WindSpeed = Annotated[Number, Field(ge=0, le=100)]
 WindFrom = Annotated[Number, Field(ge=0, le=360)]
@@ -139,14 +140,19 @@ class PowerPlantProperties(TowerBase):
 
 
 class PlanarTarget(DocumentPart):
-    """A target of the type ``planar``; its places are in WGS84."""
+    """A target of the type ``planar``; its places are in WGS84.
+
+    ``locator`` is heliotwin's: how photographs show where it is.
+    """
 
     coordinates: dict[str, Wgs84]
+    locator: LocatorDocument | None = None
 
 
-class CylindricalReceiver(PlanarTarget):
+class CylindricalReceiver(DocumentPart):
     """A receiver of the type ``convex_cylinder``; radius in [m], opening angle in [deg]."""
 
+    coordinates: dict[str, Wgs84]
     radius: Annotated[Number, Field(gt=0)]
     opening_angle: Number
     normal_vector: Direction

@@ -61,6 +61,7 @@ class Base(DeclarativeBase):
     type_annotation_map = {  # noqa: RUF012
         datetime: UtcDateTime,
         dict[str, Any]: _Json,
+        dict[str, object]: _Json,
         dict[str, list[float]]: _Json,
         dict[str, str]: _Json,
         list[dict[str, Any]]: _Json,

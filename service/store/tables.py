@@ -93,7 +93,11 @@ class HeliostatRow(Base):
 
 
 class TargetRow(Base):
-    """A target plane in ENU [m]; ``corners`` are its WGS84 corners, if known."""
+    """A target plane in ENU [m].
+
+    - ``corners`` are its WGS84 corners, if known.
+    - ``locator`` is how photographs show where it is (`model.locating`), if it is declared.
+    """
 
     __tablename__ = "targets"
 
@@ -105,6 +109,7 @@ class TargetRow(Base):
     width_m: Mapped[float]
     height_m: Mapped[float]
     corners: Mapped[dict[str, list[float]] | None]
+    locator: Mapped[dict[str, object] | None]
     updated_at: Mapped[datetime] = mapped_column(default=now, onupdate=now)
 
 

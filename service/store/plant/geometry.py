@@ -8,6 +8,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session, defer
 
 from model.errors import InvalidInputError
+from model.locating import locator_from_json, locator_to_json
 from model.plant import Cylinder, Receiver, TargetPlane
 from service.base import names
 from service.base.errors import ConflictError, NotFoundError
@@ -183,6 +184,8 @@ def put_target(
 ) -> Put[TargetRow]:
     """Store or update a target plane; ``corners`` are its WGS84 corners, if known.
 
+    A stored locator remains if the plane declares none.
+
     Raises
     ------
     InvalidInputError
@@ -203,12 +206,15 @@ def put_target(
         "width_m": float(plane.width),
         "height_m": float(plane.height),
     }
-    row, is_new = insert_or_find(session, TargetRow(name=plane.name, corners=corners, **values))
+    locator = None if plane.locator is None else locator_to_json(plane.locator)
+    new = TargetRow(name=plane.name, corners=corners, locator=locator, **values)
+    row, is_new = insert_or_find(session, new)
     if is_new:
         return Put(row, Change.NEW)
     moved = any(getattr(row, name) != value for name, value in values.items())
     # Known corners remain while the plane is unchanged.
     values["corners"] = corners if moved or corners is not None else row.corners
+    values["locator"] = locator or row.locator
     return Put(row, assign(row, values))
 
 
@@ -221,6 +227,7 @@ def target_plane(row: TargetRow) -> TargetPlane:
         up=np.array(row.up),
         width=row.width_m,
         height=row.height_m,
+        locator=None if row.locator is None else locator_from_json(row.locator),
     )
 
 

@@ -11,6 +11,7 @@ from model.plant import Plant, TargetPlane
 from service import store
 from service.base.fields import Model, Plane, ReceiverIn, TargetOf, Wgs84, from_row
 from service.sources.documents import parse_declared, read_receivers, read_targets
+from service.sources.plant_schema import CameraEntry, Marks
 from service.sources.schema import TowerMeasurements
 from service.store.plant.model_versions import declared_of, find_current
 from service.store.rows import Put
@@ -72,12 +73,37 @@ class TargetIn(Model):
 
     plane: Plane | None = Field(default=None, description="A rectangle [m]; or `corners`.")
     corners: Corners | None = Field(default=None, description="Four corners in WGS84.")
+    marks: Marks | None = Field(
+        default=None,
+        description=(
+            "What locates it in raw photographs: `l_brackets` at its corners; or `none`, and then"
+            " its `camera`, or without a camera its edges. If both are left out, what is stored"
+            " remains. A target that declares nothing is located by L and T marks as at the Solar"
+            " Tower Juelich."
+        ),
+    )
+    camera: CameraEntry | None = Field(
+        default=None, description="The camera that looks at it, as in plant.yaml; without marks."
+    )
 
     @model_validator(mode="after")
     def _one(self) -> Self:
         if (self.plane is None) == (self.corners is None):
             raise ValueError("give either plane or corners")
         return self
+
+    def located(self, plane: TargetPlane) -> TargetPlane:
+        """The target with what locates it, if that is given.
+
+        Raises
+        ------
+        InvalidInputError
+            If its camera cannot see it.
+        """
+        if self.marks is None and self.camera is None:
+            return plane
+        given = self.model_dump(include={"marks", "camera"}, exclude_none=True)
+        return plane.located_by({"marks": "none"} | given)
 
 
 class TargetOut(BaseModel):
@@ -92,6 +118,12 @@ class TargetOut(BaseModel):
     corners: dict[str, object] | None = Field(
         description="The WGS84 corners that it was made from, if it was."
     )
+    marks: str | None = Field(
+        description="The marks that locate it in raw photographs; null: not declared."
+    )
+    camera: dict[str, object] | None = Field(
+        description="The camera that looks at it, if that is declared."
+    )
 
 
 def plant_out(session: Session) -> PlantOut:
@@ -102,7 +134,16 @@ def plant_out(session: Session) -> PlantOut:
 
 def target_out(row: TargetRow) -> TargetOut:
     """A target plane as JSON."""
-    return from_row(TargetOut, row, center=row.center_m, width=row.width_m, height=row.height_m)
+    located = row.locator or {}
+    return from_row(
+        TargetOut,
+        row,
+        center=row.center_m,
+        width=row.width_m,
+        height=row.height_m,
+        marks=located.get("marks"),
+        camera=located.get("camera"),
+    )
 
 
 def receiver_out(row: ReceiverRow) -> ReceiverOut:
@@ -184,15 +225,20 @@ def put_target(
     identity: IdentityDep,
     response: Response,
 ) -> TargetOut:
-    """Set a target plane, by its rectangle [m] or its corners in WGS84."""
+    """Set a target plane, by its rectangle [m] or its corners in WGS84.
+
+    `marks` or `camera` say how raw photographs show where it is. They act on photographs that come
+    later, and on those that are measured again.
+    """
 
     def write(session: Session) -> Put[TargetRow]:
         if request.corners is not None:
             plane = _from_corners(session, name, request.corners)
             corners = {corner: list(getattr(request.corners, corner)) for corner in _CORNERS}
-            return setup.set_target(session, identity.name, plane, corners)
+            return setup.set_target(session, identity.name, request.located(plane), corners)
         assert request.plane is not None  # the schema requires one of the two
-        return setup.set_target(session, identity.name, request.plane.named(name))
+        plane = request.plane.named(name)
+        return setup.set_target(session, identity.name, request.located(plane))
 
     row, change = runtime.database.run_in_transaction(write)
     if change is store.Change.NEW:

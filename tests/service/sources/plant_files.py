@@ -48,7 +48,10 @@ for _old, _new in (
     ("facet_shape: flat", "facet_shape: {focal_length_m: 300}"),
     ("{shape: pillbox, half_angle_mrad: 4.65}", "{shape: buie, csr: 0.05}"),
     ("{attenuation: [0.006789, 0.1046, -0.0107, 0.002845]}", "{visibility_km: 23}"),
-    ("width_m: 12,", "width_m: 12, camera: {homography: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]},"),
+    (
+        "width_m: 12,",
+        "width_m: 12, camera: {homography: [[0.01, 0, -7], [0, -0.01, 7], [0, 0, 1]]},",
+    ),
     (
         "  board:",
         "  cave: {kind: cavity, aperture_m: [[7, -1, 94], [-7, -1, 94], [-7, 1, 106], [7, 1, 106]],"

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from model.actuator import LinearActuator
 from model.errors import InvalidInputError
+from model.locating import SheetEdges
 from model.plant import Cylinder, TargetPlane
 from model.receivers import Cavity
 from model.sunshape import Buie, Pillbox
@@ -35,6 +36,7 @@ def test_contract_is_read(tmp_path: Path):
     assert plant.tower.radius == 8
     assert plant.tower.height == 140
     assert plant.marks_of == {"cal": "none"}
+    assert plant.plant.targets["cal"].locator == SheetEdges()
     large = plant.plant.heliostats["A1"]
     assert len(large.facets) == 28
     assert large.area == pytest.approx(28 * 1.8 * 1.35)
@@ -158,6 +160,15 @@ MISTAKES = [
     ("  cal:", "  main:", 19, "targets.main", "rename"),
     ("width_m: 12,", "width_m: 12, marks: dots,", 19, "targets.cal.marks", "'dots' is none of none, l_brackets"),
     ("width_m: 12,", "width_m: 12, camera: {homography: [[1, 0, 0], [0, 1, 0], [0, 0, 0]]},", 19, "targets.cal.camera.homography", "invertible"),
+    ("width_m: 12,", "width_m: 12, camera: {homography: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]},", 19, "targets.cal.camera", "mirrored"),
+    ("width_m: 12,", "width_m: 12, camera: {homographie: []},", 19, "targets.cal.camera.homographie", "did you mean homography?"),
+    ("width_m: 12,", "width_m: 12, camera: {},", 19, "targets.cal.camera", "give one of homography, corners_px, pose"),
+    ("width_m: 12,", "width_m: 12, camera: {corners_px: [[0, 0], [9, 0], [9, 9]]},", 19, "targets.cal.camera.corners_px", "4 items"),
+    ("width_m: 12,", "width_m: 12, camera: {corners_px: [[0, 0], [9, 0], [9, 9], [0, 9]]},", 19, "targets.cal.camera.corners_px", "convex quadrilateral"),
+    ("width_m: 12,", "width_m: 12, marks: l_brackets, camera: {corners_px: [[0, 0], [9, 0], [0, 9], [9, 9]]},", 19, "targets.cal.camera", "leave one of both out"),
+    ("width_m: 12,", "width_m: 12, camera: {image_size_px: [64, 64], corners_px: [[0, 0], [90, 0], [0, 9], [90, 9]]},", 19, "targets.cal.camera.image_size_px", "outside of a photograph of 64 x 64"),
+    ("width_m: 12,", "width_m: 12, camera: {pose: {position_m: [0, 90, 2], look_at_m: [0, 5, 40]}},", 19, "targets.cal.camera.pose", "focal_length_px, field_of_view_deg"),
+    ("width_m: 12,", "width_m: 12, camera: {pose: {position_m: [0, -90, 2], look_at_m: [0, 5, 40], field_of_view_deg: 9}},", 19, "targets.cal.camera.pose.position_m", "behind the target"),
     ("tower: {radius_m: 8, height_m: 140}", "tower: 140", 20, "tower", "key: value, got 140"),
     ("tower: {radius_m: 8, height_m: 140}", "tower:", 20, "tower", "has no value"),
     ("tower:", "towers:", 20, "towers", "did you mean tower?"),

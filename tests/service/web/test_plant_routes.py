@@ -60,6 +60,33 @@ def test_target_by_plane(client: TestClient):
     assert client.get("/v1/targets/screen").json() == changed.json()
 
 
+def test_what_locates_a_target_is_stored_with_it(client: TestClient):
+    camera = {"corners_px": [[100, 80], [900, 90], [110, 700], [890, 690]]}
+    client.put("/v1/targets/screen", json={"plane": PLANE, "marks": "l_brackets"})
+    assert client.get("/v1/targets/screen").json()["marks"] == "l_brackets"
+    seen = client.put("/v1/targets/screen", json={"plane": PLANE, "camera": camera}).json()
+    assert (seen["marks"], seen["camera"]) == ("none", camera)
+    moved = client.put("/v1/targets/screen", json={"plane": PLANE | {"width": 5}}).json()
+    assert (moved["width"], moved["camera"]) == (5, camera)
+
+
+@pytest.mark.parametrize(
+    ("located", "named"),
+    [
+        ({"marks": "dots"}, "marks"),
+        ({"marks": "l_brackets", "camera": {"homography": [[1, 0, 0]] * 3}}, "leave one of both"),
+        ({"camera": {"homography": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}}, "mirrored"),
+        ({"camera": {"homographie": []}}, "did you mean homography"),
+        ({"camera": {"pose": {"position_m": [0, -50, 0], "look_at_m": [0, -3, 36]}}}, "focal"),
+    ],
+)
+def test_a_camera_that_cannot_be_is_refused(
+    refusing: TestClient, located: dict[str, Any], named: str
+):
+    answer = refusing.put("/v1/targets/screen", json={"plane": PLANE} | located)
+    assert (answer.status_code, named in answer.text) == (422, True), answer.text
+
+
 def test_target_by_corners(client: TestClient, tower: dict[str, Any]):
     names = ("upper_left", "upper_right", "lower_left", "lower_right")
     corners = {name: tower["lower"]["coordinates"][name] for name in names}
