@@ -6,8 +6,8 @@ than ours. Each heliostat is traced by both programs, alone and aimed at one tar
 - our plant, exported, with mounts of three kinds and flat, focused and canted mirrors;
 - ARTIST's example scenarios in the folder ``HELIOTWIN_ARTIST_SCENARIOS``, imported.
 
-ARTIST sends the same light to each ray and weighs it by the cosine on the target. Ours is divided by
-the light on the mirror and multiplied by that cosine.
+ARTIST sends the same light to each ray and weighs it by the cosine on the target. Ours is divided
+by the light on the mirror and multiplied by that cosine.
 """
 
 import os

@@ -17,13 +17,7 @@ from numpy.typing import NDArray
 from model.errors import InvalidInputError
 from service.base.names import NAME, require_name
 from service.sources.hdf5 import Hdf5Group, open_hdf5
-from service.sources.plant_formats.artist_axes import (
-    TILTS,
-    TRANSLATIONS,
-    RigidBody,
-    first_tilt,
-    rigid_body,
-)
+from service.sources.plant_formats.artist_axes import TILTS, TRANSLATIONS, RigidBody, rigid_body
 from service.sources.plant_formats.artist_mirrors import ArtistMirror, MirrorDesign, design_of
 from service.sources.plant_formats.imported import ImportedPlant, MeasuredSurface, placed, site
 from service.sources.plant_schema import MAX_FACETS, MAX_HELIOSTATS, HeliostatEntry
