@@ -129,7 +129,8 @@ class Demonstrated:
         """
         rng = np.random.default_rng(seed)
         latitude = float(self.description.plant.origin[0])
-        camera = Camera(self.target, latitude, self.description.optics, rays)
+        marks = self.description.marks_of[self.target.name] == "l_brackets"
+        camera = Camera(self.target, latitude, self.description.optics, rays, marks)
         _copy_plant(self.file, self.description, root)
         for mirror in self.mirrors:
             progress(mirror.name)

@@ -5,7 +5,7 @@ forecast. A synthetic camera photographs the flux in perspective, with daylight,
 noise.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -26,6 +26,9 @@ Array = NDArray[np.float64]
 
 IMAGES, RAYS, PIXELS = 8, 400_000, 112
 """Photographs per heliostat, rays per photograph, and pixels along each side of the flux image."""
+
+UNMARKED = CameraOptions(marks=False, border=0.0, daylight=0.5, peak=0.45)
+"""A white target without marks, which is brighter than what is around it."""
 
 DEVIATION = 0.8
 """Standard deviation of the true surfaces' coefficients, relative to the prior's."""
@@ -61,12 +64,15 @@ class Camera:
     optics : Optics
     rays : int
         Of each photograph.
+    marks : bool
+        Whether the target has brackets at its corners.
     """
 
     target: TargetPlane
     latitude: float
     optics: Optics
     rays: int = RAYS
+    marks: bool = True
 
     def suns(self, count: int, rng: np.random.Generator) -> Array:
         """Sun directions (count, 3), unit vectors: hours of the day through the summer."""
@@ -101,7 +107,10 @@ class Camera:
                 flux,
                 self.target,
                 rng,
-                CameraOptions(time_stamp=f"demo {mirror.name} image {index + 1}"),
+                replace(
+                    CameraOptions() if self.marks else UNMARKED,
+                    time_stamp=f"demo {mirror.name} image {index + 1}",
+                ),
             )
             for index, flux in enumerate(traced)
         ]

@@ -268,7 +268,8 @@ class _Writer:
             yield "tower, and its shadow"
         if any(described.optics.attenuation):
             yield "atmosphere"
-        if described.homography_of or "l_brackets" in described.marks_of.values():
+        targets = described.plant.targets.values()
+        if any(target.locator is not None for target in targets):
             yield "marks and cameras of targets"
         yield "what heliostats aim at, and their names of types"
 

@@ -18,7 +18,7 @@ def write_small(folder: Path, **changes: str) -> Path:
     text = template_text().replace(
         "rows: 4, columns: 3, width_m: 3.0", "rows: 1, columns: 1, width_m: 3.0"
     )
-    for old, new in {"marks: none": "marks: l_brackets", **changes}.items():
+    for old, new in changes.items():
         assert old in text
         text = text.replace(old, new)
     path = folder / "plant.yaml"
