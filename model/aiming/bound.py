@@ -11,13 +11,14 @@ parabola through the best place and its neighbours. Multipliers of a good plan m
 subgradient steps make it tighter.
 """
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from model.aiming.kernels import SIZE, Kernels
-from model.aiming.plan import AimPlan
+from model.aiming.plan import AimPlan, mirror_values
 
 _GRID = 2 * SIZE
 """Places along each side of the grid of aims: twice the image, so that nothing wraps around."""
@@ -33,10 +34,10 @@ def bound_power(plan: AimPlan, steps: int = _STEPS) -> float:
     ``steps`` are subgradient steps from the plan's multipliers; the smallest bound counts.
     """
     kernels, limit = plan.kernels, plan.limit
-    multipliers, least = plan.multipliers.clone(), float(kernels.power.double().sum())
+    multipliers, least = plan.multipliers.clone(), math.inf
     with torch.no_grad():
         for number in range(steps + 1):
-            best = _best_aims(kernels, multipliers)
+            best = _best_aims(plan, multipliers)
             priced = (multipliers.double() * limit * kernels.areas).sum()
             least = min(least, float(best.values.double().clamp(min=0).sum() + priced))
             if number < steps:
@@ -56,13 +57,20 @@ class _Best:
     values: Tensor
 
 
-def _best_aims(kernels: Kernels, multipliers: Tensor) -> _Best:
+def _best_aims(plan: AimPlan, multipliers: Tensor) -> _Best:
+    """Best aims of the grid, or the plan's own where they are better."""
+    kernels = plan.kernels
     weights = (1 - multipliers) * kernels.areas
     parts = [
         _best_of(kernels.subset(range(start, min(start + _CHUNK, len(kernels)))), weights)
         for start in range(0, len(kernels), _CHUNK)
     ]
-    return _Best(torch.cat([p.moved for p in parts]), torch.cat([p.values for p in parts]))
+    moved, values = (torch.cat([getattr(p, name) for p in parts]) for name in ("moved", "values"))
+    own = mirror_values(replace(plan, multipliers=multipliers))
+    is_better = own > values
+    return _Best(
+        torch.where(is_better[:, None], plan.moved, moved), torch.where(is_better, own, values)
+    )
 
 
 def _best_of(kernels: Kernels, weights: Tensor) -> _Best:

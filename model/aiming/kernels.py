@@ -204,7 +204,7 @@ class KernelTracer:
         )
         optics = optics_of(scene, optics)
         rays = central_rays(scene, self.field.samples)
-        images = _images(rays, torch.tensor(middles).to(scene.sun), scene, optics)
+        images = _images(rays, torch.tensor(middles).to(scene.sun), scene, optics, max(planes.size))
         aims = planes.centers + np.einsum("bi,bij->bj", middles, planes.axes[:, :2])
         lit = _lit(receiver, self.field.resolution, mirrors, planes, aims)
         single = torch.float32
@@ -249,8 +249,10 @@ def _through(points: Array, mirrors: Array, origins: Array, axes: Array) -> Arra
     return np.asarray(start[:, :2] - (start[:, 2] / way[:, 2])[:, None] * way[:, :2])
 
 
-def _images(rays: Rays, middles: Tensor, scene: Scene, optics: Optics) -> _Images:
-    """Images in windows about ``middles`` (B, 2) [m] that hold nearly all light."""
+def _images(rays: Rays, middles: Tensor, scene: Scene, optics: Optics, size: float) -> _Images:
+    """Images in windows about ``middles`` (B, 2) [m] that hold nearly all light which a receiver of
+    this ``size`` [m] can get.
+    """
     errors = math.hypot(
         2 * float(torch.as_tensor(optics.slope_error).max()),
         float(torch.as_tensor(optics.pointing_error).max()),
@@ -259,7 +261,8 @@ def _images(rays: Rays, middles: Tensor, scene: Scene, optics: Optics) -> _Image
     cone = half_angle(optics.sun_shape, _CONE_SHARE) + _DEVIATIONS * errors
     blur = float((rays.slant_range * cone / -rays.direction[:, 2].clamp(max=-0.25)).max())
     mirror = float((rays.hits - middles[:, :, None]).abs().max())
-    side = 2 * (blur + mirror)
+    # Light further from an aim than the receiver's size is lost, wherever the aim is on it.
+    side = 2 * min(blur + mirror, size)
     window = Window(side, side, SIZE, SIZE)
     irradiance = irradiance_of(scene, optics, rays.slant_range)
     expected, sharp = (

@@ -38,6 +38,7 @@ _N_ANEW, _N_AGAIN = 100, 20
 """Steps of a plan from the beginning, and from aims that were good."""
 
 _RHO = 10.0
+_MAX_PRESSURE = 3.0
 _UPDATE = 10
 """Steps between updates of multipliers and margins."""
 
@@ -108,12 +109,10 @@ class AimPlan:
 
     def draws(self, count: int = DRAWS, seed: int = 0) -> Draws:
         """Trace draws of the pointing errors: each moves the image without errors."""
-        generator = torch.Generator().manual_seed(seed)
         active = self.is_active.to(self.moved)
         peaks, ratios = [], []
         with torch.no_grad():
-            for _ in range(count):
-                errors = torch.randn(len(self.kernels), 2, generator=generator)
+            for errors in _errors(self.kernels, count, seed):
                 moved = self.moved + torch.einsum("nij,nj->ni", self.kernels.spread, errors)
                 flux = self.kernels.flux(moved, active, is_sharp=True)
                 peaks.append(float(flux.max()))
@@ -155,7 +154,7 @@ def plan_aims(
     if not (torch.isfinite(limit).all() and float(limit.min()) > 0):
         raise InvalidInputError("limit: must be positive everywhere; give the pixels a small one")
     if start is None:
-        found = replace(single_aim(kernels, limit), moved=_spread_out(kernels))
+        found = _within_budget(replace(single_aim(kernels, limit), moved=_spread_out(kernels)))
         ascent = _Ascent(found, _STEP, between)
         ascent.run(_N_ANEW)
     else:
@@ -164,7 +163,7 @@ def plan_aims(
         ascent.run(_N_AGAIN)
     for _ in range(_CORRECTIONS):
         plan = ascent.plan
-        excess = linear_draws(plan).ratio - 1
+        excess = _judged_ratio(plan) - 1
         if excess <= _TOLERANCE:
             break
         if excess > _DEFOCUS_ABOVE:
@@ -172,6 +171,26 @@ def plan_aims(
         ascent = _Ascent(plan, _STEP_AGAIN, between, ascent.deviations + _DEEPER)
         ascent.run(_N_AGAIN)
     return ascent.plan
+
+
+def _judged_ratio(plan: AimPlan) -> float:
+    """The quantile of `Draws.ratio`: by draws to first order, with what some full ones differ."""
+    linear, full = linear_draws(plan), plan.draws(_FULL_DRAWS)
+    return linear.ratio + float((full.ratios - linear.ratios[:_FULL_DRAWS]).mean())
+
+
+_FULL_DRAWS = 40
+
+
+def _within_budget(plan: AimPlan) -> AimPlan:
+    """A plan without the mirrors of the least power, if the limit allows less than all have."""
+    order = torch.argsort(plan.kernels.power, descending=True)
+    allowed = float((plan.limit * plan.kernels.areas).sum())
+    is_active = torch.zeros_like(plan.is_active)
+    is_active[order] = plan.kernels.power[order].cumsum(0) <= max(
+        allowed, float(plan.kernels.power.max())
+    )
+    return replace(plan, is_active=is_active)
 
 
 _DEEPER = 0.3
@@ -239,7 +258,9 @@ class _Ascent:
             adam.zero_grad()
             flux = self.kernels.flux(self.places * self.unit, self.active)
             pressure = (self.multipliers + _RHO * self._excess(flux)).clamp(min=0)
-            penalty = (areas * self.limit * pressure**2).sum() / (2 * _RHO)
+            # Linear above `_MAX_PRESSURE`: far too much light must not be thrown off the receiver.
+            soft = pressure.clamp(max=_MAX_PRESSURE)
+            penalty = (areas * self.limit * soft * (2 * pressure - soft)).sum() / (2 * _RHO)
             ((penalty - (areas * flux).sum()) / total).backward()  # type: ignore[no-untyped-call]
             adam.step()
 
@@ -250,13 +271,15 @@ class _Ascent:
         """Set margin and multipliers by the present aims."""
         with torch.no_grad():
             flux = self.kernels.flux(self.moved, self.active)
-            sigma, ratio = linear_draws(self.plan)
+            drawn = linear_draws(self.plan)
             if has_settled:
-                full = (sigma / self.limit)[(flux + self.margin) > 0.98 * self.limit]
+                full = (drawn.sigma / self.limit)[(flux + self.margin) > 0.98 * self.limit]
                 if len(full):
-                    self.deviations += (ratio - 1 + _TOLERANCE) / max(float(full.mean()), 1e-4)
+                    self.deviations += (drawn.ratio - 1 + _TOLERANCE) / max(
+                        float(full.mean()), 1e-4
+                    )
                     self.deviations = min(max(self.deviations, 0.5), 6.0)
-            self.margin = self.deviations * sigma
+            self.margin = self.deviations * drawn.sigma
             if has_settled:
                 self.multipliers = (self.multipliers + _RHO * self._excess(flux)).clamp(min=0)
 
@@ -268,18 +291,23 @@ class LinearDraws(NamedTuple):
     ----------
     sigma : Tensor (P,) [W/m2]
         Standard deviation of the flux.
-    ratio : float
-        Quantile `WITHIN` of the largest ratio of flux and limit; 1 is just within it.
+    ratios : (D,)
+        Largest ratio of flux and limit of each draw.
     """
 
     sigma: Tensor
-    ratio: float
+    ratios: Array
+
+    @property
+    def ratio(self) -> float:
+        """Quantile `WITHIN` of the ratios; 1 is just within the limit."""
+        return float(np.quantile(self.ratios, WITHIN))
 
 
 def linear_draws(plan: AimPlan, count: int = DRAWS) -> LinearDraws:
-    """Draw pointing errors that move the flux in proportion: no image is moved for them."""
+    """Draw the errors of `AimPlan.draws`, with flux that changes in proportion to them."""
     kernels, flux = plan.kernels, plan.flux
-    generator = torch.Generator().manual_seed(1)
+    errors = _errors(kernels, count, 0)
     drawn, variance = torch.zeros(count, len(flux)), torch.zeros_like(flux)
     with torch.no_grad():
         for axis in range(2):
@@ -288,9 +316,15 @@ def linear_draws(plan: AimPlan, count: int = DRAWS) -> LinearDraws:
             change = change * plan.is_active[:, None]
             variance.index_add_(0, kernels.pixels.flatten(), (change**2).flatten())
             dense = torch.zeros(len(kernels), len(flux)).scatter_add_(1, kernels.pixels, change)
-            drawn += torch.randn(count, len(kernels), generator=generator) @ dense
+            drawn += errors[:, :, axis] @ dense
     ratios = ((flux + drawn) / plan.limit).max(dim=1).values
-    return LinearDraws(variance.sqrt(), float(torch.quantile(ratios, WITHIN)))
+    return LinearDraws(variance.sqrt(), ratios.double().numpy())
+
+
+def _errors(kernels: Kernels, count: int, seed: int) -> Tensor:
+    """Standard normal draws (count, N, 2); the first ones are the same for any count."""
+    generator = torch.Generator().manual_seed(seed)
+    return torch.stack([torch.randn(len(kernels), 2, generator=generator) for _ in range(count)])
 
 
 def _defocused(plan: AimPlan, excess: float) -> AimPlan:
