@@ -46,6 +46,8 @@ _STEP, _STEP_AGAIN, _LAST_STEP = 0.35, 0.08, 0.05
 """First step of the aims, relative to the images' spread, and the last relative to the first."""
 
 _TOLERANCE = 0.002
+"""Share of the limit by which steps aim below it."""
+
 _DEFOCUS_ABOVE = 0.01
 """Excess above which mirrors are defocused; less is left to their aims."""
 
@@ -164,7 +166,7 @@ def plan_aims(
     for _ in range(_CORRECTIONS):
         plan = ascent.plan
         excess = _judged_ratio(plan) - 1
-        if excess <= _TOLERANCE:
+        if excess <= 0:
             break
         if excess > _DEFOCUS_ABOVE:
             plan = _defocused(plan, excess)

@@ -76,7 +76,7 @@ def test_aims_give_what_their_report_says(
     report = aimed(plant, tmp_path, receiver, f"{limit:.3f}")
     assert report["single_aim_power_w"] == pytest.approx(single["intercepted_w"], rel=1e-3)
     assert report["limit_w_m2"] == pytest.approx(1e3 * limit, rel=1e-5)
-    assert report["peak_w_m2"] < report["peak_p95_w_m2"] <= 1.004e3 * limit
+    assert report["peak_w_m2"] < report["peak_p95_w_m2"] <= 1.002e3 * limit
     assert report["power_w"] > 0.98 * report["single_aim_power_w"]
     assert report["power_w"] > 0.995 * report["baseline"]["power_w"]
     assert report["power_w"] < report["bound_w"] < 1.02 * report["power_w"]
@@ -93,7 +93,7 @@ def test_light_enters_a_cavity_and_its_panels_stay_under_the_limit(plant: Path, 
     single = field(plant, tmp_path, "cave", "--resolution", 24, 30)
     limit = 0.8 * single["peak_w_m2"] / 1e3
     report = aimed(plant, tmp_path, "cave", limit, "--resolution", 24, 30)
-    assert report["peak_p95_w_m2"] <= 1.004e3 * limit
+    assert report["peak_p95_w_m2"] <= 1.002e3 * limit
     assert report["power_w"] > 0.97 * report["single_aim_power_w"]
     assert report["power_w"] < report["bound_w"]
     # Those behind the opening are left out, and the report says so.
@@ -104,13 +104,13 @@ def test_plans_begin_with_aims_of_a_moment_before(plant: Path, tmp_path: Path):
     first = aimed(plant, tmp_path, "board", 900)
     again = aimed(plant, tmp_path, "board", 900, "--start", tmp_path / "aims.csv")
     assert again["power_w"] > 0.995 * first["power_w"]
-    assert again["peak_p95_w_m2"] <= 1.004 * 900e3
+    assert again["peak_p95_w_m2"] <= 1.002 * 900e3
 
 
 def test_mirrors_are_defocused_where_no_aims_help(plant: Path, tmp_path: Path):
     report = aimed(plant, tmp_path, "strip", 200)  # 1.8 MW at most, of 2.6 MW
     assert report["inactive"]
-    assert report["peak_p95_w_m2"] <= 1.004 * 200e3
+    assert report["peak_p95_w_m2"] <= 1.002 * 200e3
     assert report["power_w"] > report["baseline"]["power_w"]
     with (tmp_path / "aims.csv").open() as file:
         rows = list(csv.DictReader(file))
