@@ -213,14 +213,18 @@ class Superposition:
     def _trace(self, tile: Tile) -> FleetFlux:
         total = FleetFlux(np.zeros(self.resolution))
         with torch.no_grad():
-            for there, part in self._alike(tile):
-                optics = apply_optics_effects(there, self.model.optics)
-                for group in align(part.setups, replace(self.model, effects=there)).groups:
-                    scene = self._obstructed(group.scene, part, group.rows)
-                    heliostats = [setup.heliostat for setup in group.setups]
-                    for rows, light in self._lights(scene, optics):
-                        total = total + self._flux([heliostats[row] for row in rows], light, optics)
+            for setups, scene, optics in self.scenes(tile):
+                heliostats = [setup.heliostat for setup in setups]
+                for rows, light in self._lights(scene, optics):
+                    total = total + self._flux([heliostats[row] for row in rows], light, optics)
         return total
+
+    def scenes(self, tile: Tile) -> Iterator[tuple[list[Setup], Scene, Optics]]:
+        """Aligned mirrors of a tile with what hides them, and the optics that act on them."""
+        for there, part in self._alike(tile):
+            optics = apply_optics_effects(there, self.model.optics)
+            for group in align(part.setups, replace(self.model, effects=there)).groups:
+                yield group.setups, self._obstructed(group.scene, part, group.rows), optics
 
     def _obstructed(self, scene: Scene, part: Tile, rows: list[int]) -> Scene:
         """The scene of a part's mirrors in some rows, with neighbours and tower."""

@@ -314,6 +314,8 @@ class TouchingPlanes:
         Of windows that show the whole receiver from each mirror.
     opening : callable or None
         Share of light that passes each cell of a window of (rows, columns).
+    outline : (V, 2) [m] or None
+        Corners of the opening, right and up of the windows' middles.
     screens : (K, 3, 3) [m] or None
         Rectangles, centre and half sides, behind which the receiver gets no light.
     """
@@ -322,6 +324,7 @@ class TouchingPlanes:
     axes: Vector
     size: tuple[float, float]
     opening: Callable[[int, int], Vector] | None = None
+    outline: Vector | None = None
     screens: Vector | None = None
 
 

@@ -166,7 +166,7 @@ class Cavity(_OfPanels):
             inside = inside_outline(places[..., 0], places[..., 1], outline)
             return np.asarray(inside.reshape(rows, _FINE, columns, _FINE).mean(axis=(1, 3)))
 
-        return replace(same, opening=opening, screens=self._screens)
+        return replace(same, opening=opening, outline=outline, screens=self._screens)
 
 
 _FINE = 8

@@ -148,7 +148,7 @@ def project(
         part = slice(start, start + step)
         seen = _projected(kernels[part], scene, part, window, grid)
         if touching.screens is not None:
-            seen = seen * _in_sight(touching.screens, scene.center[part], grid)
+            seen = seen * in_sight(touching.screens, scene.center[part], grid)
         image = image + seen.sum(0)
         intercepted.append((seen * areas).sum(dim=(-2, -1)))
     return SuperposedFlux(image, Beams.of(rays, irradiance), torch.cat(intercepted))
@@ -191,7 +191,7 @@ def _projected(
     return seen
 
 
-def _in_sight(screens: NDArray[np.float64], mirrors: Tensor, grid: SurfaceGrid) -> Tensor:
+def in_sight(screens: NDArray[np.float64], mirrors: Tensor, grid: SurfaceGrid) -> Tensor:
     """Share (b, rows, columns) of places that no screen (K, 3, 3) hides from mirrors (b, 3)."""
     count = len(mirrors)
     points = torch.tensor(grid.points).to(mirrors).flatten(0, 1).T.expand(count, -1, -1)

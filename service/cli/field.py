@@ -10,11 +10,21 @@ from typing import TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
+from model.aiming.kernels import aims_in_front
 from model.ephemeris import sun_angles_at
 from model.errors import InvalidInputError
-from model.fleet import LOSSES, FleetFlux, Losses, aligned_field, field_losses, superpose, tiles
-from model.fleet import Superposition as Task
+from model.fleet import (
+    LOSSES,
+    FleetFlux,
+    Losses,
+    Superposition,
+    aligned_field,
+    field_losses,
+    superpose,
+    tiles,
+)
 from model.frames import SunAngles, sun_direction
+from model.neighbours import Neighbours
 from model.plant import Heliostat, Receiver
 from model.plant_model import PlantModel
 from model.setup import Setup
@@ -120,14 +130,14 @@ def clear_sky_dni(elevation_deg: float, altitude_m: float) -> float:
     return float(sky["dni"][0])
 
 
-def resolution_of(receiver: Receiver) -> Resolution:
+def resolution_of(receiver: Receiver, rows: int = ROWS) -> Resolution:
     """Rows and columns of a map with square pixels."""
-    columns = round(ROWS * receiver.width / receiver.height)
-    return ROWS, min(max(columns, ROWS // 4), _MAX_COLUMNS)
+    columns = round(rows * receiver.width / receiver.height)
+    return rows, min(max(columns, rows // 4), _MAX_COLUMNS)
 
 
 @dataclass
-class _Aimed:
+class Aimed:
     """Heliostats with their aims: those whose light is asked for, and those that stand around."""
 
     setups: list[Setup] = field(default_factory=list)
@@ -145,29 +155,53 @@ def trace_field(plant: PlantDescription, request: FieldRequest, step: Progress) 
     InvalidInputError
         If the plant has no such receiver, or no heliostat sends light to it.
     """
+    lit = light_field(plant, request)
+    total = superpose(
+        lit.task,
+        tiles(lit.aimed.setups, lit.neighbours),
+        done=lambda flux: step(f"{flux.heliostats}"),
+    )
+    receiver, dni = lit.task.receiver, lit.task.model.optics.dni
+    if not total.heliostats:
+        reason = next(iter(total.skipped.values()), "no heliostat is active")
+        raise InvalidInputError(f"no heliostat sends light to {receiver.name}: {reason}")
+    return FieldFlux(total.irradiance, _report(request, receiver, dni, total, lit.aimed))
+
+
+@dataclass(frozen=True, eq=False)
+class LitField:
+    """Heliostats that send light to a receiver, what stands around them, and how it is traced."""
+
+    task: Superposition
+    aimed: Aimed
+    neighbours: Neighbours
+
+
+def light_field(
+    plant: PlantDescription, request: FieldRequest, rows: int = ROWS, *, in_front: bool = False
+) -> LitField:
+    """Aim a plant's heliostats; errors as of `trace_field`.
+
+    ``rows`` are those of the map if the request says nothing. ``in_front`` aims at the surface
+    toward each mirror by default, where a beam to a point inside of the receiver would meet it
+    elsewhere.
+    """
     receiver = _receiver(plant, request.receiver)
     sun = sun_direction(request.azimuth_deg, request.elevation_deg)
     dni = request.dni_w_m2
     if dni is None:
         dni = clear_sky_dni(request.elevation_deg, plant.altitude)
     model = PlantModel(plant.plant.site, plant.optics).with_dni(dni)
-    aimed = _aimed(plant, receiver, request, sun)
+    aimed = _aimed(plant, receiver, request, sun, in_front)
     field_around = [(one.heliostat, one.goal) for one in aimed.setups] + aimed.others
-    neighbours = aligned_field(field_around, sun, model)
-    task = Task(
+    task = Superposition(
         receiver,
         model,
-        request.resolution or resolution_of(receiver),
+        request.resolution or resolution_of(receiver, rows),
         samples=_samples(aimed.setups),
         tower=None if plant.tower is None else plant.tower.outline(sun),
     )
-    total = superpose(
-        task, tiles(aimed.setups, neighbours), done=lambda flux: step(f"{flux.heliostats}")
-    )
-    if not total.heliostats:
-        reason = next(iter(total.skipped.values()), "no heliostat is active")
-        raise InvalidInputError(f"no heliostat sends light to {receiver.name}: {reason}")
-    return FieldFlux(total.irradiance, _report(request, receiver, dni, total, aimed))
+    return LitField(task, aimed, aligned_field(field_around, sun, model))
 
 
 def _receiver(plant: PlantDescription, name: str) -> Receiver:
@@ -178,10 +212,10 @@ def _receiver(plant: PlantDescription, name: str) -> Receiver:
 
 
 def _aimed(
-    plant: PlantDescription, receiver: Receiver, request: FieldRequest, sun: Array
-) -> _Aimed:
+    plant: PlantDescription, receiver: Receiver, request: FieldRequest, sun: Array, in_front: bool
+) -> Aimed:
     """Heliostats with aims and surfaces."""
-    found = _Aimed()
+    found = Aimed()
     for name, heliostat in plant.plant.heliostats.items():
         own = plant.receiver_of.get(name, receiver.name)
         if request.aims is not None:
@@ -191,6 +225,8 @@ def _aimed(
         elif own != receiver.name and own in plant.receivers and _is_shared(plant):
             found.others.append((heliostat, plant.receivers[own].aim))
             continue
+        elif in_front:
+            (aim,) = aims_in_front(receiver, heliostat.position[None])
         else:
             aim = receiver.aim
         surface = None if request.surfaces is None else read_surface(request.surfaces, heliostat)
@@ -214,7 +250,7 @@ def _samples(setups: Iterable[Setup]) -> int:
 
 
 def _report(
-    request: FieldRequest, receiver: Receiver, dni: float, total: FleetFlux, aimed: _Aimed
+    request: FieldRequest, receiver: Receiver, dni: float, total: FleetFlux, aimed: Aimed
 ) -> FieldReport:
     whole = field_losses(total.losses.values())
     warnings = []

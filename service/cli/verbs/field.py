@@ -1,4 +1,4 @@
-"""The verb on a whole field: flux on a receiver, and what becomes of each watt."""
+"""Verbs on a whole field: flux on a receiver, what becomes of each watt, and aims under a limit."""
 
 import json
 from pathlib import Path
@@ -6,29 +6,48 @@ from typing import Annotated
 
 import typer
 
-from service.cli.output import AsJson, AtTime, make_table, progress, require_folder, show
+from service.cli.output import (
+    AsJson,
+    AtTime,
+    make_table,
+    progress,
+    require_file,
+    require_folder,
+    show,
+)
 
 app = typer.Typer()
+
+PlantFile = Annotated[Path, typer.Argument(help="The plant's file.", metavar="PLANT.yaml")]
+ReceiverName = Annotated[str, typer.Option(help="Receiver of the plant.", metavar="NAME")]
+SunAt = Annotated[
+    tuple[float, float] | None,
+    typer.Option(help="The sun: azimuth from north, elevation [deg].", metavar="AZ EL"),
+]
+Dni = Annotated[
+    float | None,
+    typer.Option(
+        min=1, max=2000, help="Direct normal irradiance [W/m2]; that of a clear sky if not given."
+    ),
+]
+SurfacesOf = Annotated[
+    Path | None,
+    typer.Option(help="Folder that predict wrote; nominal mirrors if not given.", metavar="DIR"),
+]
+MapResolution = Annotated[
+    tuple[int, int] | None,
+    typer.Option(min=2, max=1024, help="Rows and columns of the map.", metavar="ROWS COLUMNS"),
+]
 
 
 @app.command()
 def field(
-    plant: Annotated[Path, typer.Argument(help="The plant's file.", metavar="PLANT.yaml")],
-    receiver: Annotated[str, typer.Option(help="Receiver of the plant.", metavar="NAME")],
+    plant: PlantFile,
+    receiver: ReceiverName,
     out: Annotated[Path, typer.Option("--out", help="Folder to write to.", metavar="OUT")],
-    sun: Annotated[
-        tuple[float, float] | None,
-        typer.Option(help="The sun: azimuth from north, elevation [deg].", metavar="AZ EL"),
-    ] = None,
+    sun: SunAt = None,
     at: AtTime = None,
-    dni: Annotated[
-        float | None,
-        typer.Option(
-            min=1,
-            max=2000,
-            help="Direct normal irradiance [W/m2]; that of a clear sky if not given.",
-        ),
-    ] = None,
+    dni: Dni = None,
     aims: Annotated[
         Path | None,
         typer.Option(
@@ -36,16 +55,8 @@ def field(
             metavar="AIMS.csv",
         ),
     ] = None,
-    surfaces: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder that predict wrote; nominal mirrors if not given.", metavar="DIR"
-        ),
-    ] = None,
-    resolution: Annotated[
-        tuple[int, int] | None,
-        typer.Option(min=2, max=1024, help="Rows and columns of the map.", metavar="ROWS COLUMNS"),
-    ] = None,
+    surfaces: SurfacesOf = None,
+    resolution: MapResolution = None,
     as_json: AsJson = False,
 ) -> None:
     """Trace the flux of a whole field on a receiver: OUT/flux.npz [W/m2] and OUT/field.json.
@@ -81,4 +92,66 @@ def field(
     table = make_table("Field", "quantity", "value")
     for name, value in found.report["field"].items():
         table.add_row(name, f"{value:.6g}")
+    show(found.report, as_json, table)
+
+
+@app.command()
+def aim(
+    plant: PlantFile,
+    receiver: ReceiverName,
+    limit: Annotated[
+        str,
+        typer.Option(
+            help="Flux that the receiver stands [kW/m2], or a CSV of it over the unrolled map.",
+            metavar="KW_M2 or FILE.csv",
+        ),
+    ],
+    out: Annotated[Path, typer.Option("--out", help="The aims, a CSV file.", metavar="AIMS.csv")],
+    report: Annotated[Path, typer.Option(help="What the aims are worth.", metavar="REPORT.json")],
+    sun: SunAt = None,
+    at: AtTime = None,
+    dni: Dni = None,
+    start: Annotated[
+        Path | None, typer.Option(help="Aims that were good a moment before.", metavar="AIMS.csv")
+    ] = None,
+    flow_path: Annotated[
+        Path | None,
+        typer.Option(
+            help="CSV of positions along the flow path, 0 to 1, and shares of the limit.",
+            metavar="FILE.csv",
+        ),
+    ] = None,
+    surfaces: SurfacesOf = None,
+    resolution: MapResolution = None,
+    as_json: AsJson = False,
+) -> None:
+    """Find the aim points of the most power under the flux that a receiver stands.
+
+    In 95 % of draws of the pointing errors the whole map is within the limit. The report has an
+    upper bound on the power of any aims, and what aiming by k-factors reaches.
+    """
+    from service.cli.aim import find_aims, write_aims
+    from service.cli.field import FieldRequest, sun_of
+    from service.cli.folder import write_json
+    from service.cli.times import moment_of
+    from service.sources.limits import read_limit
+    from service.sources.plant_file import read_plant
+    from service.sources.plant_tables import read_aims
+
+    require_file(out)
+    require_file(report)
+    stands = read_limit(limit, flow_path)
+    source = read_plant(plant)
+    azimuth, elevation = sun_of(source, sun, moment_of(at))
+    request = FieldRequest(
+        receiver, azimuth, elevation, dni, surfaces=surfaces, resolution=resolution
+    )
+    begin = None if start is None else read_aims(start, source.plant.heliostats)
+    with progress(None, "aim") as step:
+        found = find_aims(source, request, stands, begin, step)
+    write_aims(out, found.plan)
+    write_json(report, found.report)
+    table = make_table("Aims", "quantity", "value")
+    for name in ("power_w", "bound_w", "single_aim_power_w", "peak_p95_w_m2", "limit_w_m2"):
+        table.add_row(name, f"{found.report[name]:.6g}")
     show(found.report, as_json, table)

@@ -1,0 +1,1 @@
+"""Aim points: the most power on a receiver under the flux that it stands."""

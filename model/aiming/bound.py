@@ -1,0 +1,132 @@
+"""An upper bound on the power of any aims under a limit.
+
+For any multipliers l >= 0, areas A and limit L, no plan whose expected map is within the limit has
+more power than::
+
+    sum over mirrors of max(0, best aim's sum of K A (1 - l)) + sum of l L A
+
+Source: Lagrangian duality, Boyd and Vandenberghe, *Convex Optimization*, section 5.1. The best aim
+of each mirror is sought on a grid as fine as its image's pixels, by Fourier transform, with a
+parabola through the best place and its neighbours. Multipliers of a good plan make the bound tight;
+subgradient steps make it tighter.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from model.aiming.kernels import SIZE, Kernels
+from model.aiming.plan import AimPlan, mirror_values
+
+_GRID = 2 * SIZE
+"""Places along each side of the grid of aims: twice the image, so that nothing wraps around."""
+
+_CHUNK = 256
+_STEPS = 6
+_STEP = 0.05
+
+
+def bound_power(plan: AimPlan, steps: int = _STEPS) -> float:
+    """Upper bound [W] on the power of any aims of the plan's mirrors under its limit.
+
+    ``steps`` are subgradient steps from the plan's multipliers; the smallest bound counts.
+    """
+    kernels, limit = plan.kernels, plan.limit
+    multipliers, least = plan.multipliers.clone(), math.inf
+    with torch.no_grad():
+        for number in range(steps + 1):
+            best = _best_aims(plan, multipliers)
+            priced = (multipliers.double() * limit * kernels.areas).sum()
+            least = min(least, float(best.values.double().clamp(min=0).sum() + priced))
+            if number < steps:
+                flux = kernels.flux(best.moved, (best.values > 0).to(best.moved))
+                # The subgradient is the room that is left; half of the way keeps what the plan
+                # knows.
+                room = 1 - (flux + plan.flux) / (2 * limit)
+                multipliers = (multipliers - _STEP / (number + 1) * room).clamp(min=0)
+    return least
+
+
+@dataclass(frozen=True, eq=False)
+class _Best:
+    """Best aims (N, 2) [m] and what they are worth (N,) [W]."""
+
+    moved: Tensor
+    values: Tensor
+
+
+def _best_aims(plan: AimPlan, multipliers: Tensor) -> _Best:
+    """Best aims of the grid, or the plan's own where they are better."""
+    kernels = plan.kernels
+    weights = (1 - multipliers) * kernels.areas
+    parts = [
+        _best_of(kernels.subset(range(start, min(start + _CHUNK, len(kernels)))), weights)
+        for start in range(0, len(kernels), _CHUNK)
+    ]
+    moved, values = (torch.cat([getattr(p, name) for p in parts]) for name in ("moved", "values"))
+    own = mirror_values(replace(plan, multipliers=multipliers))
+    is_better = own > values
+    return _Best(
+        torch.where(is_better[:, None], plan.moved, moved), torch.where(is_better, own, values)
+    )
+
+
+def _best_of(kernels: Kernels, weights: Tensor) -> _Best:
+    """Best aims of some mirrors for what light is worth in each pixel (P,) [m2]."""
+    pixel = kernels.sides / SIZE
+    worth = _on_planes(kernels, weights, pixel)
+    images = torch.zeros_like(worth)
+    images[:, :SIZE, :SIZE] = kernels.expected
+    spectrum = torch.fft.rfft2(worth) * torch.fft.rfft2(images).conj()
+    values = torch.fft.irfft2(spectrum, s=(_GRID, _GRID))
+    flat = values.flatten(1).argmax(dim=1)
+    row, column = flat // _GRID, flat % _GRID
+    best = values[torch.arange(len(flat)), row, column]
+    best = best + _beyond(values, row, column)
+    # Places of the image's first pixel; those of the second half are before the grid's beginning.
+    down, right = (
+        torch.where(place > _GRID - SIZE // 2, place - _GRID, place) for place in (row, column)
+    )
+    middle = _GRID / 2 - SIZE / 2 + 0.5
+    moved = torch.stack([(right - middle) * pixel, (middle - down) * pixel], dim=-1)
+    return _Best(moved, best)
+
+
+def _beyond(values: Tensor, row: Tensor, column: Tensor) -> Tensor:
+    """What the tops of parabolas through the best places are above them (N,)."""
+    here = torch.arange(len(values))
+    top = values[here, row, column]
+    above = torch.zeros_like(top)
+    for down, right in ((1, 0), (0, 1)):
+        before = values[here, (row - down) % _GRID, (column - right) % _GRID]
+        after = values[here, (row + down) % _GRID, (column + right) % _GRID]
+        bend = (2 * top - before - after).clamp(min=1e-12)
+        above = above + (after - before) ** 2 / (8 * bend)
+    return above
+
+
+def _on_planes(kernels: Kernels, weights: Tensor, pixel: Tensor) -> Tensor:
+    """What light is worth (N, _GRID, _GRID) on the pixels of the mirrors' planes.
+
+    It is the adjoint of `Kernels.light`: bilinear shares of each place.
+    """
+    worth = kernels.factors * weights[kernels.pixels]
+    x = kernels.places[..., 0] / pixel[:, None] + _GRID / 2
+    y = _GRID / 2 - kernels.places[..., 1] / pixel[:, None]
+    is_inside = (x >= 0) & (x < _GRID - 1) & (y >= 0) & (y < _GRID - 1)
+    worth = worth * is_inside
+    left, top = (place.floor().clamp(0, _GRID - 2) for place in (x, y))
+    right, down = x - left, y - top
+    index = (top * _GRID + left).long()
+    planes = torch.zeros(len(kernels), _GRID**2)
+    shares = (
+        (0, (1 - right) * (1 - down)),
+        (1, right * (1 - down)),
+        (_GRID, (1 - right) * down),
+        (_GRID + 1, right * down),
+    )
+    for offset, share in shares:
+        planes.scatter_add_(1, index + offset, worth * share)
+    return planes.view(-1, _GRID, _GRID)

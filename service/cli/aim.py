@@ -1,0 +1,162 @@
+"""``heliotwin aim``: aim points of the most power under what a receiver stands."""
+
+import csv
+import math
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TypedDict
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from model.aiming.bound import bound_power
+from model.aiming.k_factor import k_factor_aims
+from model.aiming.kernels import Kernels, KernelTracer, join
+from model.aiming.plan import AimPlan, plan_aims, single_aim
+from model.errors import InvalidInputError
+from model.fleet import tiles
+from model.setup import Setup
+from service.base.progress import Progress
+from service.cli.field import FieldRequest, LitField, light_field, trace_field
+from service.sources.limits import Limit
+from service.sources.plant_file import PlantDescription
+
+Array = NDArray[np.float64]
+
+
+ROWS = 32
+"""Rows of a map if none are asked for: its pixels are smaller than any image of a mirror."""
+
+
+class Baseline(TypedDict):
+    """What another way of aiming reaches under the same limit and draws."""
+
+    name: str
+    power_w: float
+    peak_p95_w_m2: float
+
+
+class AimReport(TypedDict):
+    """``REPORT.json`` of `aim`; DESIGN.md, section 8."""
+
+    receiver: str
+    sun: dict[str, float]
+    dni_w_m2: float
+    power_w: float
+    single_aim_power_w: float
+    peak_w_m2: float
+    peak_p95_w_m2: float
+    limit_w_m2: float
+    largest_share_of_limit: float
+    bound_w: float
+    baseline: Baseline
+    seconds: dict[str, float]
+    inactive: list[str]
+    skipped: dict[str, str]
+
+
+@dataclass(frozen=True, eq=False)
+class Aims:
+    """A plan of aims and its report.
+
+    Attributes
+    ----------
+    plan : AimPlan
+    report : AimReport
+    """
+
+    plan: AimPlan
+    report: AimReport
+
+
+def find_aims(
+    plant: PlantDescription,
+    request: FieldRequest,
+    limit: Limit,
+    start: dict[str, Array | None] | None,
+    step: Progress,
+) -> Aims:
+    """Find the aims of a plant's heliostats on one receiver.
+
+    ``start`` are good aims of a moment before (3,) [m] by heliostat, None for one that was not
+    active.
+
+    Raises
+    ------
+    InvalidInputError
+        If the plant has no such receiver, no heliostat reaches it, or the limit is invalid.
+    """
+    begun = time.perf_counter()
+    lit = light_field(plant, request, ROWS, in_front=True)
+    tracer, skipped, parts = KernelTracer(lit.task), dict[str, str](), list[Kernels]()
+    for tile in tiles(_from_near_to_far(lit), lit.neighbours):
+        found = tracer(tile)
+        skipped |= found.skipped
+        if found.kernels is not None:
+            parts.append(found.kernels)
+            step(f"images of {len(tile)} heliostats")
+    if not parts:
+        reason = next(iter(skipped.values()), "the layout gives it none")
+        raise InvalidInputError(f"no heliostat sends light to {request.receiver}: {reason}")
+    kernels = join(parts)
+    traced = time.perf_counter()
+    on_map = torch.tensor(limit.on_map(*kernels.resolution), dtype=torch.float32).flatten()
+    begin = None if start is None else _started(kernels, on_map, start)
+    plan = plan_aims(kernels, on_map, begin, lambda: step("aims"))
+    aimed = time.perf_counter()
+    single = trace_field(plant, replace(request, resolution=kernels.resolution), step)
+    other = k_factor_aims(kernels, on_map, lit.task.receiver)
+    draws, seen = plan.draws(), plan.flux
+    report = AimReport(
+        receiver=request.receiver,
+        sun={"azimuth_deg": request.azimuth_deg, "elevation_deg": request.elevation_deg},
+        dni_w_m2=lit.task.model.optics.dni,
+        power_w=plan.power,
+        single_aim_power_w=single.report["field"]["intercepted_w"],
+        peak_w_m2=float(seen.max()),
+        peak_p95_w_m2=draws.peak,
+        limit_w_m2=float(on_map.max()),
+        largest_share_of_limit=draws.ratio,
+        bound_w=bound_power(plan),
+        baseline=Baseline(name="k-factor", power_w=other.power, peak_p95_w_m2=other.draws().peak),
+        seconds={"kernels": traced - begun, "aims": aimed - traced},
+        inactive=sorted(np.array(kernels.names)[~plan.is_active.numpy()].tolist()),
+        skipped=skipped,
+    )
+    return Aims(plan, report)
+
+
+def _from_near_to_far(lit: LitField) -> list[Setup]:
+    """Setups by distance, since images of one tile have one size."""
+    return sorted(
+        lit.aimed.setups, key=lambda one: math.dist(one.heliostat.position, lit.task.receiver.aim)
+    )
+
+
+def _started(kernels: Kernels, limit: Tensor, start: dict[str, Array | None]) -> AimPlan:
+    """A plan that begins with aims of a file; heliostats that it leaves out begin at the middle."""
+    plan = single_aim(kernels, limit)
+    points, active = plan.points, plan.is_active
+    for row, name in enumerate(kernels.names):
+        aim = start.get(name)
+        if aim is not None:
+            points[row] = aim
+        elif name in start:
+            active[row] = False
+    return AimPlan(kernels, limit, kernels.moved(points), active, plan.multipliers)
+
+
+def write_aims(path: Path, plan: AimPlan) -> None:
+    """Write ``name,east_m,north_m,up_m,active``, in the order of names."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    rows = sorted(
+        zip(plan.kernels.names, plan.points.tolist(), plan.is_active.tolist(), strict=True)
+    )
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["name", "east_m", "north_m", "up_m", "active"])
+        for name, point, is_on in rows:
+            writer.writerow([name, *(f"{value:.4f}" for value in point), int(is_on)])

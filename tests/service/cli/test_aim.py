@@ -1,0 +1,158 @@
+"""``heliotwin aim``: the most power under the flux that a receiver stands."""
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from service.sources.limits import read_limit
+from service.sources.plant_template import staggered_layout
+from tests.service.command import ends, heliotwin
+
+PLANT = """\
+plant: {name: small, latitude_deg: 37, longitude_deg: -5, altitude_m: 100, time_zone: Europe/Madrid}
+heliostat_types:
+  large:
+    mount: {kind: azimuth_elevation, pivot_height_m: 5}
+    facets: {rows: 1, columns: 1, width_m: 9, height_m: 8}
+    facet_shape: slant_range
+    reflectance: 0.93
+    slope_error_mrad: 1.3
+    pointing_error_mrad: 0.8
+layout: {file: layout.csv}
+receivers:
+  main: {kind: cylinder, center_m: [0, 0, 80], radius_m: 4, height_m: 10}
+  board: {kind: plane, center_m: [0, 3, 80], normal: [0, 1, 0], width_m: 10, height_m: 10}
+  strip: {kind: plane, center_m: [0, 3, 90], normal: [0, 1, 0], width_m: 3, height_m: 3}
+  cave:
+    kind: cavity
+    aperture_m: [[4, 3, 76], [-4, 3, 76], [-4, 3, 84], [4, 3, 84]]
+    panels:
+      - {center_m: [2.4, 0, 80], normal: [-0.3, 1, 0], width_m: 5, height_m: 9}
+      - {center_m: [-2.4, 0, 80], normal: [0.3, 1, 0], width_m: 5, height_m: 9}
+sun: {shape: pillbox, half_angle_mrad: 4.65}
+"""
+SUN = ("--sun", 180, 55, "--dni", 900)
+
+
+@pytest.fixture(scope="module")
+def plant(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Fifty heliostats north of three receivers."""
+    folder = tmp_path_factory.mktemp("aims")
+    layout = staggered_layout("large", [140, 170, 200, 230], 32, 0.0, 75.0)
+    (folder / "layout.csv").write_text(layout)
+    (folder / "plant.yaml").write_text(PLANT)
+    return folder / "plant.yaml"
+
+
+def aimed(plant: Path, out: Path, receiver: str, limit: object, *options: object) -> dict[str, Any]:
+    """The report of aims in ``out``."""
+    done = heliotwin(
+        "aim", plant, "--receiver", receiver, "--limit", limit, "--out", out / "aims.csv",
+        "--report", out / "report.json", *SUN, *options,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    report: dict[str, Any] = json.loads((out / "report.json").read_text())
+    return report
+
+
+def field(plant: Path, out: Path, receiver: str, *options: object) -> dict[str, Any]:
+    """The field's figures by `heliotwin field`, on a map of as many pixels as aims are found on."""
+    done = heliotwin("field", plant, "--receiver", receiver, "--out", out / "field", *SUN, *options)
+    assert done.returncode == 0, done.stderr
+    figures: dict[str, Any] = json.loads((out / "field" / "field.json").read_text())["field"]
+    return figures
+
+
+@pytest.mark.parametrize(("receiver", "resolution"), [("main", (32, 80)), ("board", (32, 32))])
+def test_aims_give_what_their_report_says(
+    plant: Path, tmp_path: Path, receiver: str, resolution: tuple[int, int]
+):
+    single = field(plant, tmp_path, receiver, "--resolution", *resolution)
+    limit = 0.4 * single["peak_w_m2"] / 1e3
+    report = aimed(plant, tmp_path, receiver, f"{limit:.3f}")
+    assert report["single_aim_power_w"] == pytest.approx(single["intercepted_w"], rel=1e-3)
+    assert report["limit_w_m2"] == pytest.approx(1e3 * limit, rel=1e-5)
+    assert report["peak_w_m2"] < report["peak_p95_w_m2"] <= 1.002e3 * limit
+    assert report["power_w"] > 0.98 * report["single_aim_power_w"]
+    assert report["power_w"] > 0.995 * report["baseline"]["power_w"]
+    assert report["power_w"] < report["bound_w"] < 1.02 * report["power_w"]
+    assert report["inactive"] == []
+    assert set(report["seconds"]) == {"kernels", "aims"}
+    traced = field(
+        plant, tmp_path, receiver, "--resolution", *resolution, "--aims", tmp_path / "aims.csv"
+    )
+    assert traced["intercepted_w"] == pytest.approx(report["power_w"], rel=0.005)
+    assert traced["peak_w_m2"] == pytest.approx(report["peak_w_m2"], rel=0.02)
+
+
+def test_light_enters_a_cavity_and_its_panels_stay_under_the_limit(plant: Path, tmp_path: Path):
+    single = field(plant, tmp_path, "cave", "--resolution", 24, 30)
+    limit = 0.8 * single["peak_w_m2"] / 1e3
+    report = aimed(plant, tmp_path, "cave", limit, "--resolution", 24, 30)
+    assert report["peak_p95_w_m2"] <= 1.002e3 * limit
+    assert report["power_w"] > 0.97 * report["single_aim_power_w"]
+    assert report["power_w"] < report["bound_w"]
+    # Those behind the opening are left out, and the report says so.
+    assert all("behind" in why or "faces away" in why for why in report["skipped"].values())
+
+
+def test_plans_begin_with_aims_of_a_moment_before(plant: Path, tmp_path: Path):
+    first = aimed(plant, tmp_path, "board", 900)
+    again = aimed(plant, tmp_path, "board", 900, "--start", tmp_path / "aims.csv")
+    assert again["power_w"] > 0.995 * first["power_w"]
+    assert again["peak_p95_w_m2"] <= 1.002 * 900e3
+
+
+def test_mirrors_are_defocused_where_no_aims_help(plant: Path, tmp_path: Path):
+    report = aimed(plant, tmp_path, "strip", 200)  # 1.8 MW at most, of 2.6 MW
+    assert report["inactive"]
+    assert report["peak_p95_w_m2"] <= 1.002 * 200e3
+    assert report["power_w"] > report["baseline"]["power_w"]
+    with (tmp_path / "aims.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["name"] for row in rows if row["active"] == "0"] == report["inactive"]
+    assert report["power_w"] < report["bound_w"]
+
+
+def test_limits_over_the_map_and_along_the_flow_path(tmp_path: Path):
+    table = tmp_path / "limit.csv"
+    table.write_text("800,900\n700,600\n")
+    np.testing.assert_allclose(
+        read_limit(str(table)).on_map(4, 4)[[0, 0, 3, 3], [0, 3, 0, 3]], [8e5, 9e5, 7e5, 6e5]
+    )
+    path = tmp_path / "path.csv"
+    path.write_text("position,share\n0,1\n0.5,0.8\n1,0.4\n")
+    along = read_limit("1000", path).on_map(1, 5)[0]
+    np.testing.assert_allclose(along, [0.56e6, 0.84e6, 1e6, 0.84e6, 0.56e6])
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("800,900\n700\n", "limit.csv, line 2: has 1 limits, and the first 2"),
+        ("800,0\n", "limit.csv, line 1: cell 2 must be a number"),
+        ("800,high\n", "limit.csv, line 1: cell 2 must be a number"),
+        ("", "has no limits"),
+    ],
+)
+def test_a_wrong_limit_is_refused_by_its_line(plant: Path, tmp_path: Path, text: str, said: str):
+    (tmp_path / "limit.csv").write_text(text)
+    done = heliotwin(
+        "aim", plant, "--receiver", "main", "--limit", tmp_path / "limit.csv", "--out",
+        tmp_path / "aims.csv", "--report", tmp_path / "report.json", *SUN,
+    )  # fmt: skip
+    ends(done, 2, said)
+    assert not (tmp_path / "aims.csv").exists()
+
+
+@pytest.mark.parametrize("limit", ["0", "-3", "nan", "no-such-file.csv", "1e9"])
+def test_a_limit_is_a_positive_number_or_a_file(plant: Path, tmp_path: Path, limit: str):
+    done = heliotwin(
+        "aim", plant, "--receiver", "main", "--limit", limit, "--out", tmp_path / "aims.csv",
+        "--report", tmp_path / "report.json", *SUN,
+    )  # fmt: skip
+    ends(done, 2, "--limit")
