@@ -1,1 +1,1 @@
-"""Aim points: the most power on a receiver under the flux that it stands."""
+"""Aim points: the most power on a receiver under the flux that it can take."""

@@ -42,10 +42,10 @@ def bound_power(plan: AimPlan, steps: int = _STEPS) -> float:
             least = min(least, float(best.values.double().clamp(min=0).sum() + priced))
             if number < steps:
                 flux = kernels.flux(best.moved, (best.values > 0).to(best.moved))
-                # The subgradient is the room that is left; half of the way keeps what the plan
+                # The subgradient is the flux that is left; half of the way keeps what the plan
                 # knows.
-                room = 1 - (flux + plan.flux) / (2 * limit)
-                multipliers = (multipliers - _STEP / (number + 1) * room).clamp(min=0)
+                left = 1 - (flux + plan.flux) / (2 * limit)
+                multipliers = (multipliers - _STEP / (number + 1) * left).clamp(min=0)
     return least
 
 

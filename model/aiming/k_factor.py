@@ -1,7 +1,7 @@
 """Aims by the aiming factor k, to compare with.
 
 Each mirror aims above or below the receiver's middle, neighbours in turn, as far as k times its
-beam's spread leaves room to the edge. All k begin at 3, where every beam is within the receiver.
+beam's spread leaves space to the edge. All k begin at 3, where every beam is within the receiver.
 In sectors that see pixels above the limit, k falls until none is, or the aims are at the edge.
 
 Source: Sanchez-Gonzalez, Rodriguez-Sanchez and Santana 2017, *Aiming strategy model based on
@@ -36,8 +36,8 @@ def k_factor_aims(kernels: Kernels, limit: Tensor, receiver: Receiver) -> AimPla
     plan, least = single_aim(kernels, limit), float("inf")
     nearest = plan
     while least > 1 and bool((k > 0).any()):
-        room = (receiver.height / 2 - k[sector] * spread).clamp(min=0)
-        up = middle_up + room * turn
+        space = (receiver.height / 2 - k[sector] * spread).clamp(min=0)
+        up = middle_up + space * turn
         plan = replace(plan, moved=torch.stack([torch.zeros_like(up), up], dim=-1))
         ratio = linear_draws(plan).ratio
         if ratio < least:

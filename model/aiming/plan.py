@@ -1,4 +1,4 @@
-"""Aims that put the most power on a receiver under the flux that it stands.
+"""Aims that put the most power on a receiver under the flux that it can take.
 
 The light of all mirrors is a differentiable function of their aims (`model.aiming.kernels`). Power
 is maximised under the limit with an augmented Lagrangian and Adam::

@@ -1,4 +1,4 @@
-"""``heliotwin aim``: aim points of the most power under what a receiver stands."""
+"""``heliotwin aim``: aim points of the most power under what a receiver can take."""
 
 import csv
 import math

@@ -1,4 +1,4 @@
-"""The flux that a receiver stands, as a number, a map or along its flow path."""
+"""The flux that a receiver can take, as a number, a map or along its flow path."""
 
 import math
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ _LEAST = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Limit:
-    """The flux that a receiver stands.
+    """The flux that a receiver can take.
 
     Attributes
     ----------

@@ -5,7 +5,7 @@
   seconds, and a plan that begins with the aims of two minutes before.
 - Another field of 10,000 heliostats: seconds and memory.
 - A Monte Carlo simulation of a plan, which shares no code with the tracer: rays from uniform points
-  of paraboloids, with slope and pointing errors of their own, shaded and blocked by the nearest
+  of paraboloids, with own slope and pointing errors, shaded and blocked by the nearest
   heliostats.
 
 Reads Gemasolar's layout from ``HELIOTWIN_PLANTS``, by default ``../shared/plants``.

@@ -102,7 +102,7 @@ def aim(
     limit: Annotated[
         str,
         typer.Option(
-            help="Flux that the receiver stands [kW/m2], or a CSV of it over the unrolled map.",
+            help="Flux that the receiver can take [kW/m2], or a CSV of it over the unrolled map.",
             metavar="KW_M2 or FILE.csv",
         ),
     ],
@@ -125,7 +125,7 @@ def aim(
     resolution: MapResolution = None,
     as_json: AsJson = False,
 ) -> None:
-    """Find the aim points of the most power under the flux that a receiver stands.
+    """Find the aim points of the most power under the flux that a receiver can take.
 
     In 95 % of draws of the pointing errors the whole map is within the limit. The report has an
     upper bound on the power of any aims, and what aiming by k-factors reaches.
@@ -140,7 +140,7 @@ def aim(
 
     require_file(out)
     require_file(report)
-    stands = read_limit(limit, flow_path)
+    flux_limit = read_limit(limit, flow_path)
     source = read_plant(plant)
     azimuth, elevation = sun_of(source, sun, moment_of(at))
     request = FieldRequest(
@@ -148,7 +148,7 @@ def aim(
     )
     begin = None if start is None else read_aims(start, source.plant.heliostats)
     with progress(None, "aim") as step:
-        found = find_aims(source, request, stands, begin, step)
+        found = find_aims(source, request, flux_limit, begin, step)
     write_aims(out, found.plan)
     write_json(report, found.report)
     table = make_table("Aims", "quantity", "value")

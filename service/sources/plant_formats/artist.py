@@ -1,6 +1,6 @@
 """Scenarios of ARTIST (HDF5): site, target areas, sun, and heliostats with their surfaces.
 
-Heliostats without a surface, kinematics or actuators of their own have those of the prototypes.
+Heliostats without a surface, own kinematics or actuators have those of the prototypes.
 What plant.yaml cannot say is named in the notes, or refused.
 
 Source: ARTIST 2.0, ``docs/scenario.rst`` and ``artist.io.h5_scenario_parser``.

@@ -1,4 +1,4 @@
-"""``heliotwin aim``: the most power under the flux that a receiver stands."""
+"""``heliotwin aim``: the most power under the flux that a receiver can take."""
 
 import csv
 import json
