@@ -170,7 +170,7 @@ def trace_field(plant: PlantDescription, request: FieldRequest, step: Progress) 
 
 @dataclass(frozen=True, eq=False)
 class LitField:
-    """Heliostats that send light to a receiver, what stands around them, and how it is traced."""
+    """Heliostats that send light to a receiver, what is around them, and how it is traced."""
 
     task: Superposition
     aimed: Aimed
