@@ -23,10 +23,10 @@ from service.base.fields import (
     Name,
     Plane,
     Position,
-    ReceiverIn,
     Resolution,
     Sun,
 )
+from service.base.receivers import ReceiverIn
 from service.jobs.common import Heliostats, chosen_names, require_some
 from service.jobs.kind import Context, Kind, Result
 from service.store.jobs import queue
@@ -52,10 +52,14 @@ class FleetIn(Model):
         default=None, description="Any plane; either this, `target` or `receiver`."
     )
     receiver: ReceiverIn | None = Field(
-        default=None, description="Any cylinder; either this, `target` or `plane`."
+        default=None, description="Any receiver; either this, `target` or `plane`."
     )
     aim_point_m: Position | None = Field(
-        default=None, description="Where all heliostats aim [m]; by default the receiver's middle."
+        default=None,
+        description=(
+            "Where all heliostats aim [m]; by default the receiver's middle, which is the axis of a"
+            " whole cylinder and the middle of a cavity's opening."
+        ),
     )
     aim_points_m: dict[Name, Position] = Field(
         default_factory=dict,
@@ -64,7 +68,10 @@ class FleetIn(Model):
     )
     neighbours: Flag = Field(
         default=True,
-        description="Whether the mirrors of these heliostats shade and block each other.",
+        description=(
+            "Whether the mirrors of these heliostats shade and block each other, and the tower"
+            " shades them."
+        ),
     )
     dni_w_m2: Irradiance = 1000.0
     resolution: Resolution = (256, 256)
@@ -91,14 +98,16 @@ class FleetIn(Model):
         with runtime.database.reading() as session:
             receiver = self.on(session)
             model = model_versions.get_model(session, self.model_version)
+            tower = store.stored_tower(session)
         return HeliostatGroup(
             names=names,
             receiver=receiver,
             sun=sun_direction(sun.azimuth_deg, sun.elevation_deg),
             model=model.with_dni(self.dni_w_m2),
-            aim=np.array(receiver.center if self.aim_point_m is None else self.aim_point_m),
+            aim=np.array(receiver.aim if self.aim_point_m is None else self.aim_point_m),
             aims=self.aim_points_m,
             ideal=ideal,
+            tower=tower,
         )
 
 

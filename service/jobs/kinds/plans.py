@@ -12,6 +12,7 @@ from pydantic import Field, StringConstraints, model_validator
 from model.ephemeris import sun_positions
 from model.fleet import FleetFlux
 from model.plant import Cylinder, Receiver
+from model.receivers import Cavity, Panels
 from model.times import format_time
 from service import store
 from service.base.fields import Metres, Moment, Name, Number, Resolution, Sun, Text
@@ -87,11 +88,16 @@ class PlanIn(FleetIn):
 def aim_on(receiver: Receiver, right: float, up: float) -> tuple[float, float, float]:
     """Convert map coordinates [m] on a receiver to a point (3,) [m] in ENU.
 
-    On a cylinder, ``right`` is along the arc.
+    On a cylinder, ``right`` is along the arc. On panels and in a cavity it is along the panels.
     """
     plane, across = receiver.middle, right
     if isinstance(receiver, Cylinder):
         plane, across = receiver.tangent(right / receiver.radius, 1.0, 1.0), 0.0
+    elif isinstance(receiver, Panels | Cavity):
+        ends = np.cumsum([panel.width for panel in receiver.panels]) - receiver.width / 2
+        number = min(int(np.searchsorted(ends, right)), len(ends) - 1)
+        plane = receiver.panels[number]
+        across = right - float(ends[number]) + plane.width / 2
     east, north, height = plane.to_enu((across, up)).tolist()
     return east, north, height
 

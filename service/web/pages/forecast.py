@@ -122,7 +122,9 @@ def _choices(session: Session) -> dict[str, object]:
     return {
         "heliostats": store.list_heliostats(session, _OFFERED),
         "targets": session.scalars(select(TargetRow.name).order_by(TargetRow.name)).all(),
-        "receivers": session.scalars(select(ReceiverRow.name).order_by(ReceiverRow.name)).all(),
+        "receivers": session.execute(
+            select(ReceiverRow.name, ReceiverRow.kind).order_by(ReceiverRow.name)
+        ).all(),
         "recent": _recent(session),
     }
 

@@ -25,6 +25,7 @@ def test_plant_brings_its_targets(client: TestClient, tower: dict[str, Any]):
         "name": "WRI1030197",
         "origin_wgs84": tower["power_plant_properties"]["coordinates"],
         "declared": None,
+        "tower_size": None,
     }
     listed = client.get("/v1/targets").json()
     assert [target["name"] for target in listed["items"]] == ["lower", "upper"]
