@@ -18,7 +18,6 @@ from service.base.fields import (
     Flag,
     HeliostatOf,
     Id,
-    Irradiance,
     Model,
     ModelNumber,
     ModelVersion,
@@ -46,6 +45,7 @@ from service.twin.forecasts.heliostat_forecast import (
     make_forecast,
     position_of,
 )
+from service.twin.forecasts.watts import Sunlight, dni_of
 from service.twin.runtime.runtime import Runtime
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,
@@ -108,7 +108,7 @@ class ForecastIn(Model):
             " surface is forecast by its ideal mirror; the first of `warnings` says so."
         ),
     )
-    dni_w_m2: Irradiance = 1000.0
+    dni_w_m2: Sunlight = 1000.0
     resolution: Resolution = (256, 256)
     window_m: Number | None = Field(
         default=None,
@@ -259,9 +259,10 @@ def _given(body: ForecastIn) -> Receiver | None:
 
 def _request(runtime: Runtime, body: ForecastIn) -> ForecastRequest:
     with runtime.database.reading() as session:
-        sun = position_of(session, body.sun)
+        sun, altitude = position_of(session, body.sun), store.get_plant(session).altitude_m
     names = {field.name for field in fields(ForecastRequest)} & set(ForecastIn.model_fields)
     same = {name: getattr(body, name) for name in names - {"sun", "receiver"}}
+    same["dni_w_m2"] = dni_of(body.dni_w_m2, sun.elevation_deg, altitude)
     sun_at = body.sun.at if isinstance(body.sun, SunAt) else None
     return ForecastRequest(sun=sun, sun_at=sun_at, receiver=_given(body), **same)
 
