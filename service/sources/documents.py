@@ -22,7 +22,7 @@ from model.mount import Mount
 from model.plant import Cylinder, Facet, Heliostat, Plant, TargetPlane, require_cylinder_shape
 from model.pointing import Weather
 from model.sunshape import SHAPES, Buie, SunShape
-from model.sunshape.buie import chi_of_csr
+from model.sunshape.buie import chi_of_csr, csr_of_chi
 from model.tracing import Optics
 from service.base.fields import JsonObject, Sun
 from service.base.names import require_text
@@ -416,6 +416,17 @@ def sun_to_json(sun: SunShape) -> dict[str, object]:
     values = (getattr(sun, field.name) for field in fields(sun))  # type: ignore[arg-type]
     given = zip(sun.units.items(), values, strict=True)
     return {"shape": name, **{key: float(value) / unit for (key, unit), value in given}}
+
+
+def describe_sun(sun: SunShape) -> dict[str, object]:
+    """A sun shape by the names of plant.yaml; Buie's by the chi of the formula and by ``csr``, the
+    true circumsolar share.
+    """
+    known = sun_to_json(sun)
+    if not isinstance(sun, Buie):
+        return known
+    chi = float(sun.circumsolar_ratio)
+    return {"shape": "buie", "chi": round(chi, 6), "csr": round(csr_of_chi(chi), 6)}
 
 
 def optics_to_json(optics: Optics) -> dict[str, object]:

@@ -187,7 +187,8 @@ class TowerMeasurements(Document, ReceiversPart):
     declared: dict[str, object] | None = Field(
         default=None,
         description=(
-            "What twin.json declares of the plant's model: `sun`, `effects`, and `optics` with"
+            "What twin.json declares of the plant's model: `sun` (Buie's with `chi`, or with `csr`,"
+            " the true circumsolar share), `effects`, and `optics` with"
             " `reflectivity` (0 to 1, by default 1) and `attenuation`, the share of light lost"
             " between mirror and target as coefficients of a polynomial in the slant range in"
             " kilometres, the constant first (by default none: clear air)."

@@ -14,6 +14,7 @@ from service.base.fields import Model, Plane, TargetOf, Wgs84, from_row
 from service.base.plant_facts import TowerSize
 from service.base.receivers import ReceiverIn
 from service.sources.documents import (
+    describe_sun,
     parse_declared,
     read_facts,
     read_receivers,
@@ -26,6 +27,7 @@ from service.store.plant.model_versions import declared_of, find_current
 from service.store.rows import Put
 from service.store.tables import ReceiverRow, TargetRow
 from service.twin.plant import setup
+from service.twin.plant.model_versions import get_model
 from service.web.auth.dependencies import (
     OPERATE,
     READ,
@@ -54,6 +56,12 @@ class PlantOut(BaseModel):
         description=(
             "What is declared of its model, as in twin.json; null: Buie's sun with a ratio of 0.02,"
             " no effects, and optics of reflectivity 1 without attenuation."
+        )
+    )
+    sun: dict[str, object] = Field(
+        description=(
+            "The sun shape of the current model, and its numbers. Buie's has `chi` of the formula,"
+            " and `csr`, the true circumsolar share."
         )
     )
     tower_size: TowerSize | None = Field(
@@ -190,8 +198,13 @@ class TargetOut(BaseModel):
 def plant_out(session: Session) -> PlantOut:
     """The plant as JSON."""
     row, declared = store.get_plant(session), declared_of(session, find_current(session))
-    size = None if row.tower is None else TowerSize(**row.tower)
-    return PlantOut(name=row.name, origin_wgs84=row.origin, declared=declared, tower_size=size)
+    return PlantOut(
+        name=row.name,
+        origin_wgs84=row.origin,
+        declared=declared,
+        sun=describe_sun(get_model(session).optics.sun_shape),
+        tower_size=None if row.tower is None else TowerSize(**row.tower),
+    )
 
 
 def target_out(row: TargetRow) -> TargetOut:

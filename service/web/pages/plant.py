@@ -14,6 +14,7 @@ from model.receivers import Cavity
 from service import store
 from service.base.fields import Version
 from service.drawing.templates import figure
+from service.sources.documents import describe_sun
 from service.store import audit, keys
 from service.store.tables import MeasurementRow, PlantRow, ReceiverRow, TargetRow
 from service.twin.plant import model_versions
@@ -73,7 +74,7 @@ def get_plant_page(request: Request, runtime: RuntimeDep) -> HTMLResponse:
         targets = _targets(session)
         receivers = [_receiver_line(row) for row in store.list_receivers(session)]
         model = None if plant is None else model_versions.get_model(session)
-    shape = None if model is None else model.optics.sun_shape
+    sun = None if model is None else describe_sun(model.optics.sun_shape)
     return render(
         request,
         "plant.html",
@@ -82,7 +83,7 @@ def get_plant_page(request: Request, runtime: RuntimeDep) -> HTMLResponse:
         receivers=receivers,
         model=model,
         place=_place,
-        sun_shape=None if shape is None else (type(shape).__name__, vars(shape)),
+        sun=sun,
     )
 
 
