@@ -23,6 +23,7 @@ RECEIVER_KINDS = ("plane", "cylinder", "panels", "cavity")
 MAX_PANELS = 64
 """Most panels of a receiver, and most corners of an aperture."""
 
+KIND = Field(description="Its kind.")
 ABSORPTANCE = Field(default=1.0, gt=0, le=1, description="Share of the light that it absorbs [1].")
 _PANELS = Field(
     min_length=1,
@@ -34,7 +35,7 @@ _PANELS = Field(
 class PlaneReceiverIn(Plane):
     """A flat receiver, such as a billboard."""
 
-    kind: Literal["plane"]
+    kind: Literal["plane"] = KIND
     absorptance: Number = ABSORPTANCE
 
     def named(self, name: str) -> TargetPlane:
@@ -45,7 +46,7 @@ class PlaneReceiverIn(Plane):
 class CylinderIn(Model):
     """A cylinder or a part of one, lit from outside; the default kind."""
 
-    kind: Literal["cylinder"] = "cylinder"
+    kind: Literal["cylinder"] = Field(default="cylinder", description="Its kind.")
     center: Position = Field(
         description="The middle of the lit surface: east, north, up of the tower base [m]."
     )
@@ -78,7 +79,7 @@ class CylinderIn(Model):
 class PanelsIn(Model):
     """Panels side by side, lit from outside."""
 
-    kind: Literal["panels"]
+    kind: Literal["panels"] = KIND
     panels: list[Plane] = _PANELS
     absorptance: Number = ABSORPTANCE
 
@@ -95,7 +96,7 @@ class PanelsIn(Model):
 class CavityIn(Model):
     """Panels behind a polygonal opening."""
 
-    kind: Literal["cavity"]
+    kind: Literal["cavity"] = KIND
     aperture: list[Position] = Field(
         min_length=3,
         max_length=MAX_PANELS,

@@ -12,7 +12,7 @@ from model.plant import Plant, TargetPlane
 from service import store
 from service.base.fields import Model, Plane, TargetOf, Wgs84, from_row
 from service.base.plant_facts import TowerSize
-from service.base.receivers import ReceiverIn
+from service.base.receivers import KIND, ReceiverIn
 from service.sources.documents import (
     describe_sun,
     parse_declared,
@@ -58,7 +58,7 @@ class PlantOut(BaseModel):
             " no effects, and optics of reflectivity 1 without attenuation."
         )
     )
-    sun: dict[str, object] = Field(
+    sun_shape: dict[str, object] = Field(
         description=(
             "The sun shape of the current model, and its numbers. Buie's has `chi` of the formula,"
             " and `csr`, the true circumsolar share."
@@ -83,7 +83,7 @@ class PlaneReceiverOut(PanelOut):
     """A flat receiver."""
 
     name: TargetOf
-    kind: Literal["plane"]
+    kind: Literal["plane"] = KIND
     absorptance: float = _ABSORPTANCE
 
 
@@ -91,7 +91,7 @@ class CylinderOut(BaseModel):
     """A cylindrical receiver."""
 
     name: TargetOf
-    kind: Literal["cylinder"]
+    kind: Literal["cylinder"] = KIND
     center: Place = Field(description="The middle of the lit surface [m].")
     normal: Place = Field(description="Unit normal there, away from the axis.")
     up: Place = Field(description="Unit vector along the axis.")
@@ -105,7 +105,7 @@ class PanelsOut(BaseModel):
     """A receiver of panels side by side."""
 
     name: TargetOf
-    kind: Literal["panels"]
+    kind: Literal["panels"] = KIND
     panels: list[PanelOut] = Field(description="From left to right.")
     absorptance: float = _ABSORPTANCE
 
@@ -114,7 +114,7 @@ class CavityOut(BaseModel):
     """Panels behind an opening."""
 
     name: TargetOf
-    kind: Literal["cavity"]
+    kind: Literal["cavity"] = KIND
     aperture: list[Place] = Field(description="Corners of the opening [m].")
     panels: list[PanelOut] = Field(description="From left to right.")
     absorptance: float = _ABSORPTANCE
@@ -202,7 +202,7 @@ def plant_out(session: Session) -> PlantOut:
         name=row.name,
         origin_wgs84=row.origin,
         declared=declared,
-        sun=describe_sun(get_model(session).optics.sun_shape),
+        sun_shape=describe_sun(get_model(session).optics.sun_shape),
         tower_size=None if row.tower is None else TowerSize(**row.tower),
     )
 

@@ -27,7 +27,7 @@ def test_plant_brings_its_targets(client: TestClient, tower: dict[str, Any]):
         "name": "WRI1030197",
         "origin_wgs84": tower["power_plant_properties"]["coordinates"],
         "declared": None,
-        "sun": {"shape": "buie", "chi": 0.02, "csr": pytest.approx(0.0058, abs=1e-4)},
+        "sun_shape": {"shape": "buie", "chi": 0.02, "csr": pytest.approx(0.0058, abs=1e-4)},
         "tower_size": None,
     }
     listed = client.get("/v1/targets").json()
@@ -44,7 +44,7 @@ def test_sun_is_declared_by_its_true_circumsolar_share(client: TestClient, tower
     sun = {"shape": "buie", "csr": 0.05}
     answer = client.put("/v1/plant", json=tower | {"declared": {"sun": sun}})
     assert answer.status_code == 200, answer.text
-    found = answer.json()["sun"]
+    found = answer.json()["sun_shape"]
     assert (found["shape"], found["csr"]) == ("buie", pytest.approx(0.05, abs=1e-4))
     assert found["chi"] != found["csr"]
     words = Page(client.get("/plant", headers={"Accept": "text/html"}).text).words
@@ -52,7 +52,7 @@ def test_sun_is_declared_by_its_true_circumsolar_share(client: TestClient, tower
     wrong = {"declared": {"sun": sun | {"chi": 0.02}}}
     assert client.put("/v1/plant", json=tower | wrong).status_code == 422
     flat = {"declared": {"sun": {"shape": "pillbox", "half_angle_mrad": 4.65}}}
-    assert client.put("/v1/plant", json=tower | flat).json()["sun"] == flat["declared"]["sun"]
+    assert client.put("/v1/plant", json=tower | flat).json()["sun_shape"] == flat["declared"]["sun"]
     words = Page(client.get("/plant", headers={"Accept": "text/html"}).text).words
     assert "half angle mrad 4.65" in words
 
