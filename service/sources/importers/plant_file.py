@@ -131,9 +131,7 @@ def _read(root: Path, heliostats: list[str] | None) -> PlantFolder:
     whole = Plant(plant.name, plant.origin, plant.targets, kept, plant.receivers)
     properties = _properties(description, kept)
     facts = PlantFacts(description.tower, description.time_zone, types_to_json(root / PLANT))
-    return PlantFolder(
-        root, whole, model, {}, properties, facts=facts, description=description
-    )
+    return PlantFolder(root, whole, model, {}, properties, facts=facts, description=description)
 
 
 def _properties(
