@@ -26,13 +26,7 @@ from pydantic import (
     model_validator,
 )
 
-from model.plant import (
-    MIN_OPENING_DEG,
-    Cylinder,
-    TargetPlane,
-    require_cylinder_shape,
-    require_plane_shape,
-)
+from model.plant import TargetPlane, require_plane_shape
 from service.base.choices import Method as Method  # also used by the command line
 from service.base.names import IDENTIFIER, LINE, LINES, MEASUREMENT, NAME
 
@@ -260,45 +254,6 @@ class Plane(Model):
         )
 
 
-class ReceiverIn(Model):
-    """A receiver: a cylinder or a part of one, irradiated from outside."""
-
-    center: Position = Field(
-        description="The middle of the lit surface: east, north, up of the tower base [m]."
-    )
-    normal: Direction = Field(
-        description="Normal there, away from the axis, east-north-up; of any length."
-    )
-    up: Direction = Field(
-        default=(0.0, 0.0, 1.0), description="Along the axis, upwards in the map."
-    )
-    radius: Annotated[Number, Field(ge=0.01, lt=1e3)] = Field(description="[m]")
-    height: Extent = Field(description="Along the axis [m].")
-    opening_deg: Number = Field(
-        default=360.0,
-        ge=MIN_OPENING_DEG,
-        le=360,
-        description="Angle of the lit surface about its middle [deg].",
-    )
-
-    @model_validator(mode="after")
-    def _shape(self) -> Self:
-        require_cylinder_shape(self.radius, self.height, self.opening_deg)
-        return self
-
-    def named(self, name: str) -> Cylinder:
-        """Convert to the model's cylinder with this name."""
-        return Cylinder(
-            name=name,
-            center=np.array(self.center),
-            normal=np.array(self.normal),
-            up=np.array(self.up),
-            radius=self.radius,
-            height=self.height,
-            opening_deg=self.opening_deg,
-        )
-
-
 class Sun(Model):
     """A sun position."""
 
@@ -340,6 +295,9 @@ Resolution = Annotated[
     Field(description="Rows and columns of the map [px], or one number for both."),
 ]
 
+
+JsonObject = dict[str, Any]
+"""An object of JSON."""
 
 Rows = list[list[float]]
 """A map as JSON: rows from the top."""

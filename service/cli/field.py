@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import TypedDict
@@ -13,16 +13,7 @@ from numpy.typing import NDArray
 from model.aiming.kernels import aims_in_front
 from model.ephemeris import sun_angles_at
 from model.errors import InvalidInputError
-from model.fleet import (
-    LOSSES,
-    FleetFlux,
-    Losses,
-    Superposition,
-    aligned_field,
-    field_losses,
-    superpose,
-    tiles,
-)
+from model.fleet import FleetFlux, Superposition, aligned_field, superpose, tiles
 from model.frames import SunAngles, sun_direction
 from model.neighbours import Neighbours
 from model.plant import Heliostat, Receiver
@@ -32,6 +23,7 @@ from model.surface import DEGREE, control_points
 from service.base.progress import Progress
 from service.sources.folder import read_surface
 from service.sources.plant_file import PlantDescription
+from service.twin.forecasts.watts import FieldWatts, clear_sky_dni, field_watts, heliostat_watts
 
 Array = NDArray[np.float64]
 
@@ -82,7 +74,7 @@ class FieldReport(TypedDict):
     sun: dict[str, float]
     dni_w_m2: float
     receiver: str
-    field: dict[str, float]
+    field: FieldWatts
     by_heliostat: dict[str, dict[str, float]]
     skipped: dict[str, str]
     warnings: list[str]
@@ -115,19 +107,6 @@ def sun_of(
         given = "--sun: elevation" if at is None else "--at: the sun's elevation"
         raise InvalidInputError(f"{given} must lie in (0, 90] degrees, got {elevation:g}")
     return SunAngles(float(azimuth) % 360, float(elevation))
-
-
-def clear_sky_dni(elevation_deg: float, altitude_m: float) -> float:
-    """Direct normal irradiance [W/m2] of a clear sky.
-
-    Source: Ineichen 2008, *A broadband simplified version of the Solis clear sky model*, as pvlib
-    has it, with its default aerosol and water.
-    """
-    from pvlib import atmosphere, clearsky
-
-    pressure = atmosphere.alt2pres(altitude_m)
-    sky = clearsky.simplified_solis(np.array([elevation_deg]), pressure=pressure)
-    return float(sky["dni"][0])
 
 
 def resolution_of(receiver: Receiver, rows: int = ROWS) -> Resolution:
@@ -252,41 +231,18 @@ def _samples(setups: Iterable[Setup]) -> int:
 def _report(
     request: FieldRequest, receiver: Receiver, dni: float, total: FleetFlux, aimed: Aimed
 ) -> FieldReport:
-    whole = field_losses(total.losses.values())
     warnings = []
     if aimed.without_surface:
         warnings.append(
             f"{aimed.without_surface} of {len(aimed.setups)} heliostats have no surface in"
             f" {request.surfaces} and are traced as nominal mirrors"
         )
-    incident = dni * whole.area
     return FieldReport(
         sun={"azimuth_deg": request.azimuth_deg, "elevation_deg": request.elevation_deg},
         dni_w_m2=dni,
         receiver=receiver.name,
-        field={
-            "heliostats": total.heliostats,
-            "mirror_area_m2": whole.area,
-            "incident_w": incident,
-            **_factors(whole),
-            "optical_efficiency": whole.efficiency,
-            "intercepted_w": incident * whole.intercepted,
-            "absorbed_w": incident * whole.efficiency,
-            "peak_w_m2": float(total.irradiance.max()),
-        },
-        by_heliostat={
-            name: {
-                **_factors(one),
-                "optical_efficiency": one.efficiency,
-                "intercepted_w": dni * one.area * one.intercepted,
-            }
-            for name, one in total.losses.items()
-        },
+        field=field_watts(total, dni),
+        by_heliostat=heliostat_watts(total.losses, dni),
         skipped=total.skipped,
         warnings=warnings,
     )
-
-
-def _factors(losses: Losses) -> dict[str, float]:
-    factors = asdict(losses)
-    return {name: factors[name] for name in LOSSES}

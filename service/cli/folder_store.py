@@ -172,7 +172,7 @@ def _store_plant(
     every = [effect_to_json(effect) for effect in (*folder.model.effects, *effects)]
     declared = declared | ({"effects": every} if every else {})
     with runtime.database.writing() as session:
-        setup.set_plant(session, RESERVED, plant, declared)
+        setup.set_plant(session, RESERVED, plant, declared, facts=folder.facts)
         for name in plant.heliostats:
             try:
                 row, _ = setup.set_heliostat(session, RESERVED, name, folder.properties[name])

@@ -8,9 +8,8 @@ from rich.table import Table
 from model.locating import BracketMarks, CameraCorners, CameraHomography, CameraPose, SheetEdges
 from model.plant import Cylinder, TargetPlane
 from model.receivers import Cavity, Panels
-from model.sunshape import Buie, Gaussian, Pillbox, SunShape
-from model.sunshape.buie import csr_of_chi
 from service.cli.output import make_table
+from service.sources.documents import describe_sun
 from service.sources.plant_file import PlantDescription
 from service.sources.plant_receivers import AnyReceiver
 
@@ -51,7 +50,7 @@ def plant_report(described: PlantDescription) -> Report:
         "tower": None
         if described.tower is None
         else {"radius_m": described.tower.radius, "height_m": described.tower.height},
-        "sun": _sun(described.optics.sun_shape),
+        "sun": describe_sun(described.optics.sun_shape),
         "attenuation": list(described.optics.attenuation),
         "assumed": list(described.assumed),
         "warnings": list(described.warnings),
@@ -94,22 +93,11 @@ def lit_area(surface: AnyReceiver) -> float:
     return float(surface.width * surface.height)
 
 
-def _sun(shape: SunShape) -> Report:
-    """The sun shape by the names of plant.yaml; Buie's by both of its ratios."""
-    if isinstance(shape, Buie):
-        chi = float(shape.circumsolar_ratio)
-        return {"shape": "buie", "chi": round(chi, 6), "csr": round(csr_of_chi(chi), 6)}
-    if isinstance(shape, Gaussian):
-        return {"shape": "gaussian", "sigma_mrad": float(shape.sigma) * 1e3}
-    assert isinstance(shape, Pillbox)
-    return {"shape": "pillbox", "half_angle_mrad": float(shape.half_angle) * 1e3}
-
-
 def plant_lines(described: PlantDescription) -> list[str]:
     """The report in sentences for a person, without the table of types."""
     report, air = plant_report(described), described.optics.attenuation
     sun = ", ".join(
-        f"{key} {_figure(value)}" for key, value in _sun(described.optics.sun_shape).items()
+        f"{key} {_figure(value)}" for key, value in describe_sun(described.optics.sun_shape).items()
     )
     lost = np.polynomial.polynomial.polyval([0.5, 1.0], air or [0.0])
     lines = [

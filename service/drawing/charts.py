@@ -17,7 +17,8 @@ from matplotlib.colors import to_hex
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from service.drawing.pictures import facet_columns, map_picture, mirror_heights, series_picture
+from service.drawing.facets import FacetPlaces
+from service.drawing.pictures import map_picture, mirror_heights, series_picture
 
 Array = NDArray[np.floating]
 
@@ -118,12 +119,14 @@ class HeatMap:
     picture : str
         The map as a data URL.
     width, height : float [m]
-        Size of the rectangle; the origin is its centre.
+        Size of the rectangle.
     scale : Scale
     values : (rows, columns)
         Data of the map, rows from the top.
     outline : str
         Outline of a region of the map as a data URL; empty if there is none.
+    facets : FacetPlaces or None
+        Of the map of a mirror: their edges are drawn, and the rectangle is the one around them.
     """
 
     formats: ClassVar[tuple[str, ...]] = ("npz", "png")
@@ -135,6 +138,22 @@ class HeatMap:
     scale: Scale
     values: Array = field(repr=False)
     outline: str = ""
+    facets: FacetPlaces | None = None
+
+    @property
+    def edges(self) -> list[list[list[float]]]:
+        """Edges of facets: corners from 0 to 1, rightwards and upwards."""
+        if self.facets is None:
+            return []
+        low, size = self.facets.box[0], np.array([self.width, self.height])
+        return [np.round((edge - low) / size, 4).tolist() for edge in self.facets.edges()]
+
+    @property
+    def _low(self) -> Array:
+        """The lower left corner (2,) [m]; without facets, the origin is the rectangle's centre."""
+        if self.facets is None:
+            return np.array([-self.width, -self.height]) / 2
+        return np.asarray(self.facets.box[0])
 
     @property
     def beyond(self) -> tuple[float, float] | None:
@@ -157,17 +176,19 @@ class HeatMap:
         """The map as PNG, with axes and a colour bar."""
         scale = self.scale
         size, bounds = (self.width, self.height), (scale.low, scale.high)
-        return map_picture(self.values, size, self.title, scale.colours, bounds, scale.label)
+        return map_picture(
+            self.values, size, self.title, scale.colours, bounds, scale.label, self.facets
+        )
 
     @property
     def x_ticks(self) -> tuple[Tick, ...]:
-        """Ticks to the right of the centre [m]."""
-        return ticks(-self.width / 2, self.width / 2)
+        """Ticks to the right [m]."""
+        return ticks(float(self._low[0]), float(self._low[0]) + self.width)
 
     @property
     def y_ticks(self) -> tuple[Tick, ...]:
-        """Ticks up from the centre [m]."""
-        return ticks(-self.height / 2, self.height / 2)
+        """Ticks upwards [m]."""
+        return ticks(float(self._low[1]), float(self._low[1]) + self.height)
 
 
 def _data_url(pixels: NDArray[np.uint8]) -> str:
@@ -221,39 +242,27 @@ def difference_map(
     return heat_map(title, difference, size, difference_scale(bound, unit))
 
 
-def mirror_image(heights: Array) -> Array:
-    """Heights (F, i, j) as one image seen from the front, rows from the top.
-
-    i runs along x, and j along y. There are thin gaps between the facets, which fill rows from the
-    upper left in their order: PAINT's four do so, and grids of `plant.yaml`, if they are as wide as
-    high.
-    """
-    columns = facet_columns(len(heights))
-    facets = [np.pad(facet.T[::-1], ((0, 1), (0, 1)), constant_values=np.nan) for facet in heights]
-    blank = np.full_like(facets[0], np.nan)
-    facets += [blank] * (-len(facets) % columns)
-    rows = [np.hstack(facets[start : start + columns]) for start in range(0, len(facets), columns)]
-    return np.asarray(np.vstack(rows)[:-1, :-1])
+def _mirror_map(title: str, control: Array, places: FacetPlaces, scale: Scale) -> HeatMap:
+    """Control heights (F, 8, 8) [m] in mm on the facets of a mirror, seen from the front."""
+    image, (low, high) = places.image(mirror_heights(control)), places.box
+    width, height = (high - low).tolist()
+    return replace(heat_map(title, image, (width, height), scale), facets=places)
 
 
-def surface_map(title: str, z: Array, size: tuple[float, float], bound: float) -> HeatMap:
-    """A surface of control heights (4, 8, 8) [m] in mm, red if higher.
+def surface_map(title: str, z: Array, places: FacetPlaces, bound: float) -> HeatMap:
+    """A surface of control heights (F, 8, 8) [m] in mm, red if higher.
 
     ``bound`` [mm] is the end of the scale on both sides.
     """
-    return heat_map(
-        title, mirror_image(mirror_heights(z)), size, Scale("RdBu_r", -bound, bound, "mm")
-    )
+    return _mirror_map(title, z, places, Scale("RdBu_r", -bound, bound, "mm"))
 
 
-def uncertainty_map(title: str, z_std: Array, size: tuple[float, float], top: float) -> HeatMap:
-    """Standard deviations (4, 8, 8) [m] in mm.
+def uncertainty_map(title: str, z_std: Array, places: FacetPlaces, top: float) -> HeatMap:
+    """Standard deviations (F, 8, 8) [m] in mm.
 
     ``top`` [mm] is the end of the scale.
     """
-    return heat_map(
-        title, mirror_image(mirror_heights(z_std)), size, Scale("viridis_r", 0.0, top, "mm")
-    )
+    return _mirror_map(title, z_std, places, Scale("viridis_r", 0.0, top, "mm"))
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from model.surface import DEGREE, basis
+from service.drawing.facets import FacetPlaces
 
 _FACETS = ("upper left", "upper right", "lower left", "lower right")
 
@@ -47,14 +48,22 @@ def map_picture(
     colours: str,
     bounds: tuple[float, float | None],
     label: str,
+    facets: FacetPlaces | None = None,
 ) -> bytes:
     """A map (rows from the top, columns) in a colour map of matplotlib.
 
     ``bounds`` are the ends of the colour scale; an upper end of None is the largest value.
+    The map of a mirror is of the rectangle around its ``facets``, whose edges are drawn.
     """
-    figure = Figure(figsize=(6, 5), layout="constrained")
+    ratio = np.shape(values)[0] / np.shape(values)[1] if size is None else size[1] / size[0]
+    figure = Figure(figsize=(6, float(np.clip(4.4 * ratio + 0.8, 2.6, 5))), layout="constrained")
     axes = figure.subplots()
     extent = None if size is None else (-size[0] / 2, size[0] / 2, -size[1] / 2, size[1] / 2)
+    if facets is not None:
+        (left, bottom), (right, top) = facets.box.tolist()
+        extent = (left, right, bottom, top)
+        for edge in facets.edges():
+            axes.plot(*np.concatenate([edge, edge[:1]]).T, color="gray", linewidth=0.5)
     low, high = bounds[0], float(np.nanmax(values)) if bounds[1] is None else bounds[1]
     image = axes.imshow(values, cmap=colours, vmin=low, vmax=high, extent=extent, aspect="equal")
     axes.set(xlabel="right [m]" if size else "column", ylabel="up [m]" if size else "row")
@@ -143,12 +152,21 @@ def facet_columns(count: int) -> int:
     return math.ceil(math.sqrt(count))
 
 
-def surface_picture(z: NDArray[np.floating], title: str, bound: float) -> bytes:
+def surface_picture(
+    z: NDArray[np.floating], title: str, bound: float, places: FacetPlaces | None = None
+) -> bytes:
     """A surface of control heights (F, 8, 8) [m] as a map in mm.
 
-    The facets are seen from the front. Other than four have numbers, in their order. ``bound`` [mm]
-    is the end of the scale on both sides; heights beyond it have the end colours.
+    The facets are seen from the front, at their ``places``. Without those they are in rows; other
+    than four have numbers, in their order. ``bound`` [mm] is the end of the scale on both sides;
+    heights beyond it have the end colours.
     """
+    label = "deviation from the ideal facet [mm]"
+    if places is not None:
+        width, height = np.ptp(places.box, axis=0).tolist()
+        image = places.image(mirror_heights(z))
+        limits = (-bound, bound)
+        return map_picture(image, (width, height), title, "RdBu_r", limits, label, places)
     figure = Figure(figsize=(6.4, 5), layout="constrained")
     heights = mirror_heights(z)
     columns = facet_columns(len(heights))
@@ -160,15 +178,13 @@ def surface_picture(z: NDArray[np.floating], title: str, bound: float) -> bytes:
     names = _FACETS if len(heights) == len(_FACETS) else tuple(numbers)
     for pane, facet, name in zip(panes, heights, names, strict=True):
         # i runs along x and j along y, so columns are i, and rows, from below, are j.
-        image = pane.imshow(
+        shown = pane.imshow(
             facet.T, cmap="RdBu_r", vmin=-bound, vmax=bound, origin="lower", aspect=0.8
         )
         pane.set(xticks=[], yticks=[], title=name)
     figure.suptitle(title)
     extend = _extend(heights, -bound, bound)
-    figure.colorbar(
-        image, ax=panes.tolist(), label="deviation from the ideal facet [mm]", extend=extend
-    )
+    figure.colorbar(shown, ax=panes.tolist(), label=label, extend=extend)
     return png(figure)
 
 

@@ -194,6 +194,7 @@ class Kind(Generic[Payload]):
     - ``due``: workers call it every hour. It returns None, or the Idempotency-Key of a due job.
       Such a job starts once, with an empty payload.
     - ``so_far`` makes a result of the completed steps, for a job that did not finish.
+    - ``details`` names the step with the part of the result that only the whole job shows.
     - ``require`` checks the settings before a job is queued.
     - ``expected_s`` estimates the duration [s] from the payload and the number of stored
       heliostats. A kind without it counts as long.
@@ -205,6 +206,7 @@ class Kind(Generic[Payload]):
     summary: str
     due: Callable[[Session, Settings], str | None] | None = None
     so_far: Callable[[Mapping[str, Mapping[str, Any]]], Mapping[str, object]] | None = None
+    details: str | None = None
     require: Callable[[Settings], object] | None = None
     expected_s: Callable[[Payload, int], float] | None = None
 
@@ -215,6 +217,8 @@ Kinds = Mapping[str, Kind[Any]]
 def result_of(kinds: Kinds, session: Session, job: JobRow) -> Mapping[str, Any] | None:
     """The result of a job. For a cancelled or failed one, what it changed until then."""
     kind = kinds.get(job.kind)
+    if kind is not None and kind.details is not None and job.result is not None:
+        return {**job.result, **queue.load_checkpoints(session, job.id).get(kind.details, {})}
     if (
         job.result is not None
         or kind is None

@@ -22,10 +22,12 @@ from model.mount import Mount
 from model.plant import Cylinder, Facet, Heliostat, Plant, TargetPlane, require_cylinder_shape
 from model.pointing import Weather
 from model.sunshape import SHAPES, Buie, SunShape
-from model.sunshape.buie import chi_of_csr
+from model.sunshape.buie import chi_of_csr, csr_of_chi
 from model.tracing import Optics
-from service.base.fields import Sun
+from service.base.fields import JsonObject, Sun
 from service.base.names import require_text
+from service.base.plant_facts import PlantFacts
+from service.base.receivers import AnyReceiver
 from service.base.validation_messages import not_json, place_of
 from service.sources.files import MAX_JSON_BYTES, MAX_JSON_VALUES, read_file
 from service.sources.heliostat_document import heliostat_from_json, is_heliostat_document
@@ -40,6 +42,7 @@ from service.sources.schema import (
     KinematicsProperties,
     LinearAxis,
     PlanarTarget,
+    ReceiversPart,
     Spots,
     TowerBase,
     parse,
@@ -237,14 +240,14 @@ def read_heliostat(
 def read_targets(tower: Any) -> tuple[Array, dict[str, TargetPlane]]:
     """Tower base (3,) in WGS84, and planar targets, of PAINT's ``tower-measurements.json``.
 
-    `read_receivers` reads the cylinders.
+    `read_receivers` reads the receivers.
     """
     where = "tower measurements"
     origin = _tower_base(tower, where)
     plant = Plant("", origin)
     targets = {}
-    for name, entry in tower.items():
-        if isinstance(entry, dict) and entry.get("type") == "planar":
+    for name, entry in _typed(tower).items():
+        if entry["type"] == "planar":
             document = parse(PlanarTarget, entry, f"{where}, {name}")
             places = document.coordinates
             corners = [
@@ -269,24 +272,60 @@ def _tower_base(tower: Any, where: str) -> Array:
     return np.array(parse(TowerBase, properties, f"{where}, power_plant_properties").coordinates)
 
 
-def read_receivers(tower: Any) -> dict[str, Cylinder]:
-    """The convex cylindrical receivers of PAINT's ``tower-measurements.json`` that have
-    coordinates.
+def read_receivers(tower: Any) -> dict[str, AnyReceiver]:
+    """The receivers of ``tower-measurements.json``, by name.
 
-    Their inner corners are on the edges of the irradiated surface, one chord apart.
+    PAINT describes convex cylinders; those with coordinates are read. Their inner corners are on
+    the edges of the irradiated surface, one chord apart. Receivers of every kind, in REST's form,
+    are in the object ``receivers``, which exports have; they take the place of PAINT's.
     """
     where = "tower measurements"
     plant = Plant("", _tower_base(tower, where))
     surveyed = {
         name: entry
-        for name, entry in tower.items()
-        if isinstance(entry, dict)
-        and entry.get("type") == "convex_cylinder"
-        and "coordinates" in entry
+        for name, entry in _typed(tower).items()
+        if entry["type"] == "convex_cylinder" and "coordinates" in entry
     }
+    others = parse(ReceiversPart, tower, where).receivers
     return {
-        name: _receiver(name, entry, f"{where}, {name}", plant) for name, entry in surveyed.items()
+        **{
+            name: _receiver(name, entry, f"{where}, {name}", plant)
+            for name, entry in surveyed.items()
+            if name not in others
+        },
+        **{name: receiver.named(name) for name, receiver in others.items()},
     }
+
+
+def read_facts(tower: Any) -> PlantFacts:
+    """What ``tower-measurements.json`` has of a plant in addition to PAINT."""
+    size = parse(ReceiversPart, tower, "tower measurements").tower_size
+    return PlantFacts(None if size is None else size.tower())
+
+
+def unknown_parts(tower: Any) -> dict[str, str]:
+    """Parts of ``tower-measurements.json`` of a type that is not understood, with the remedy."""
+    return {
+        name: (
+            f"type: {str(entry['type'])[:60]!r} is not understood; known are planar and"
+            " convex_cylinder. Give receivers of other kinds in `receivers`, or in plant.yaml"
+        )
+        for name, entry in _typed(tower).items()
+        if entry["type"] not in ("planar", "convex_cylinder")
+    }
+
+
+def _typed(tower: Any) -> dict[str, JsonObject]:
+    """The parts that have a type."""
+    return {
+        name: entry
+        for name, entry in tower.items()
+        if isinstance(entry, dict) and "type" in entry and name not in _PARTS
+    }
+
+
+_PARTS = ("power_plant_properties", "declared", *ReceiversPart.model_fields)
+"""Parts that are neither targets nor receivers of PAINT."""
 
 
 def _receiver(name: str, entry: Any, where: str, plant: Plant) -> Cylinder:
@@ -377,6 +416,17 @@ def sun_to_json(sun: SunShape) -> dict[str, object]:
     values = (getattr(sun, field.name) for field in fields(sun))  # type: ignore[arg-type]
     given = zip(sun.units.items(), values, strict=True)
     return {"shape": name, **{key: float(value) / unit for (key, unit), value in given}}
+
+
+def describe_sun(sun: SunShape) -> dict[str, object]:
+    """A sun shape by the names of plant.yaml; Buie's by the chi of the formula and by ``csr``, the
+    true circumsolar share.
+    """
+    known = sun_to_json(sun)
+    if not isinstance(sun, Buie):
+        return known
+    chi = float(sun.circumsolar_ratio)
+    return {"shape": "buie", "chi": round(chi, 6), "csr": round(csr_of_chi(chi), 6)}
 
 
 def optics_to_json(optics: Optics) -> dict[str, object]:

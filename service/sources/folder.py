@@ -17,6 +17,7 @@ from model.plant_model import PlantModel
 from model.surface import DEGREE, control_points, heights
 from service.base.arrays import unpack_untrusted
 from service.base.discovery import modules_of
+from service.base.plant_facts import NO_FACTS, PlantFacts
 from service.sources.deflectometry import read_deflectometry
 from service.sources.documents import Array, Declared, Measurement, get, parse_declared, read_json
 from service.sources.files import read_file
@@ -44,6 +45,7 @@ class MeasurementFolder(ABC):
         heliostat.
     properties : dict
         The heliostats' property documents in PAINT's form, by name; the store keeps them.
+    facts : PlantFacts
     """
 
     root: Path
@@ -52,6 +54,7 @@ class MeasurementFolder(ABC):
     skipped: dict[str, str]
     properties: dict[str, dict[str, object]] = field(default_factory=dict)
     broken: dict[str, str] = field(default_factory=dict)
+    facts: PlantFacts = NO_FACTS
 
     def measurements(self, heliostat: str, with_images: bool = True) -> list[Measurement]:
         """All measurements of a heliostat by identifier, or only those with an image.

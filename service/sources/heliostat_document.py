@@ -13,6 +13,7 @@ from model.actuator import Actuator, LinearActuator, RotaryActuator
 from model.mount import Mount
 from model.plant import Facet, Heliostat, MirrorOptics
 from service.base.fields import Number
+from service.sources.plant_schema import HeliostatEntry
 from service.sources.schema import parse
 
 FORMAT = "heliotwin heliostat 1"
@@ -81,7 +82,10 @@ class OpticsDocument(_Part):
 
 
 class HeliostatDocument(_Part):
-    """A heliostat of any type."""
+    """A heliostat of any type.
+
+    ``type``, ``receiver`` and ``focal_length_m`` are those of the layout of its ``plant.yaml``.
+    """
 
     format: Literal["heliotwin heliostat 1"]
     type: str = ""
@@ -91,6 +95,8 @@ class HeliostatDocument(_Part):
     mount: MountDocument
     facets: tuple[MirrorFacet, ...] = Field(min_length=1, max_length=256)
     optics: OpticsDocument = OpticsDocument()
+    receiver: str | None = None
+    focal_length_m: Number | None = None
 
 
 def is_heliostat_document(properties: Any) -> bool:
@@ -98,14 +104,18 @@ def is_heliostat_document(properties: Any) -> bool:
     return isinstance(properties, dict) and properties.get("format") == FORMAT
 
 
-def heliostat_to_json(heliostat: Heliostat, kind: str = "") -> dict[str, object]:
-    """The document of a heliostat of a type ``kind``."""
+def heliostat_to_json(
+    heliostat: Heliostat, placed: HeliostatEntry | None = None
+) -> dict[str, object]:
+    """The document of a heliostat, and of its place in the layout of a plant."""
     mount = heliostat.mount
     first, second = mount.actuators or (None, None)
     drives = first and second and (_drive_document(first), _drive_document(second))
     document = HeliostatDocument(
         format=FORMAT,
-        type=kind,
+        type="" if placed is None else placed.type,
+        receiver=None if placed is None else placed.receiver,
+        focal_length_m=None if placed is None else placed.focal_length_m,
         position_m=_point(heliostat.position),
         width_m=heliostat.width,
         height_m=heliostat.height,

@@ -9,6 +9,8 @@ import numpy as np
 from model.locating import locator_to_json
 from model.plant import Cylinder, Plant, TargetPlane
 from model.times import format_time
+from service.base.plant_facts import NO_FACTS, PlantFacts
+from service.base.receivers import receiver_to_json
 from service.sources.photograph import Photograph
 
 STAC_VERSION = "1.1.0"
@@ -39,11 +41,16 @@ When = datetime | tuple[datetime, datetime]
 """A time, or the first and the last possible time."""
 
 
-def tower_json(plant: Plant, corners: Mapping[str, Corners | None]) -> dict[str, object]:
+def tower_json(
+    plant: Plant, corners: Mapping[str, Corners | None], facts: PlantFacts = NO_FACTS
+) -> dict[str, object]:
     """``tower-measurements.json`` of a plant.
 
-    ``corners`` are the WGS84 corners of targets as they were received, or None.
+    ``corners`` are the WGS84 corners of targets as they were received, or None. PAINT knows convex
+    cylinders; ``receivers`` has all of them, and ``tower_size`` the tower.
     """
+    receivers = {name: receiver_to_json(one) for name, one in plant.receivers.items()}
+    tower = facts.columns()["tower"]
     return {
         "power_plant_properties": {"ID": plant.name, "coordinates": plant.origin.tolist()},
         **{
@@ -55,6 +62,8 @@ def tower_json(plant: Plant, corners: Mapping[str, Corners | None]) -> dict[str,
             for name, receiver in plant.receivers.items()
             if isinstance(receiver, Cylinder)  # PAINT has no others
         },
+        **({"receivers": receivers} if receivers else {}),
+        **({"tower_size": tower} if tower else {}),
     }
 
 

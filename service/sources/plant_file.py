@@ -19,7 +19,14 @@ from model.sunshape.buie import chi_of_csr
 from model.tracing import Optics
 from service.sources.plant_errors import PlantText, mistakes_at
 from service.sources.plant_receivers import AnyReceiver, aim_of, read_receivers, read_targets
-from service.sources.plant_schema import BuieSun, FacetFileEntry, GaussianSun, assumed, nearest
+from service.sources.plant_schema import (
+    BuieSun,
+    FacetFileEntry,
+    GaussianSun,
+    HeliostatEntry,
+    assumed,
+    nearest,
+)
 from service.sources.plant_tables import PlacedHeliostat, read_layout
 from service.sources.plant_types import read_type
 
@@ -43,6 +50,8 @@ class PlantDescription:
         All receivers by name.
     type_of : dict
         Names of types by heliostat.
+    layout : dict
+        What the layout says of each heliostat, with the receiver that it is made for.
     receiver_of : dict
         What each heliostat is canted and focused to: a receiver, or a target.
     optics : Optics
@@ -64,6 +73,7 @@ class PlantDescription:
     types: dict[str, HeliostatType]
     receivers: dict[str, AnyReceiver]
     type_of: dict[str, str]
+    layout: dict[str, HeliostatEntry]
     receiver_of: dict[str, str]
     optics: Optics
     tower: Tower | None
@@ -109,6 +119,11 @@ class _PlantReader:
             types=types,
             receivers=receivers,
             type_of={placed.entry.name: placed.entry.type for placed in layout},
+            layout={
+                name: placed.entry.model_copy(update={"receiver": receiver_of[name]})
+                for placed in layout
+                for name in [placed.entry.name]
+            },
             receiver_of=receiver_of,
             optics=Optics(sun_shape=self._sun(), attenuation=self._attenuation()),
             tower=self._tower(),

@@ -10,6 +10,7 @@ from model.errors import InvalidInputError
 from model.frames import sun_direction
 from model.plant import Cylinder, TargetPlane
 from model.receivers import Cavity, Panels
+from service.base.receivers import AnyReceiver as AnyReceiver
 from service.sources.plant_errors import PlantText, mistakes_at
 from service.sources.plant_schema import (
     UP,
@@ -22,8 +23,6 @@ from service.sources.plant_schema import (
 from service.sources.yaml_text import KeyPath
 
 Array = NDArray[np.float64]
-
-AnyReceiver = Cylinder | TargetPlane | Panels | Cavity
 
 
 def read_receivers(plant: PlantText) -> dict[str, AnyReceiver]:

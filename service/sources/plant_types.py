@@ -1,11 +1,14 @@
 """Heliostat types of ``plant.yaml``."""
 
 import math
+from pathlib import Path
 
 from model.actuator import Actuator, LinearActuator, RotaryActuator
 from model.errors import InvalidInputError
 from model.heliostat_type import Canting, FacetDesign, Focus, HeliostatType, MountDesign, facet_grid
 from model.plant import MirrorOptics
+from service.base.fields import JsonObject
+from service.sources.files import read_text
 from service.sources.plant_errors import PlantText, mistakes_at
 from service.sources.plant_schema import (
     CantingEntry,
@@ -18,7 +21,7 @@ from service.sources.plant_schema import (
     MountEntry,
     RotaryDrive,
 )
-from service.sources.plant_tables import read_facets
+from service.sources.plant_tables import MAX_CSV_BYTES, read_facets
 from service.sources.yaml_text import KeyPath
 
 
@@ -33,6 +36,20 @@ def read_type(plant: PlantText, name: str) -> HeliostatType:
     canting = _canting(plant, entry.canting, facets, path)
     with mistakes_at(plant.place(*path)):
         return HeliostatType(name, facets, _mount(entry.mount), _focus(entry), canting, optics)
+
+
+def types_to_json(path: Path) -> JsonObject:
+    """Heliostat types of a plant's file: the entries as ``types``, and the text of the ``files``
+    that they name.
+    """
+    text = PlantText.read(path)
+    types, files = text.entries.heliostat_types, {}
+    for name, entry in types.items():
+        if isinstance(entry.facets, FacetFileEntry):
+            file = text.file(entry.facets.file, "heliostat_types", name, "facets", "file")
+            files[entry.facets.file] = read_text(file, MAX_CSV_BYTES)
+    entries = {name: one.model_dump(mode="json", exclude_unset=True) for name, one in types.items()}
+    return {"types": entries, "files": files}
 
 
 def _facets(

@@ -24,6 +24,8 @@ from model.errors import InvalidInputError
 from model.pointing import Weather
 from service.base.fields import Direction, Elevation, Extent, Name, Number, Wgs84, parse_moment
 from service.base.names import FORMS, LINES, is_text
+from service.base.plant_facts import TowerSize
+from service.base.receivers import ReceiverIn
 from service.base.validation_messages import format_validation_error
 from service.sources.plant_schema import LocatorDocument
 
@@ -167,14 +169,26 @@ class DeclaredOptics(BaseModel):
     attenuation: list[Annotated[Number, Field(ge=-1e6, le=1e6)]] = Field([], max_length=8)
 
 
-class TowerMeasurements(Document):
+class ReceiversPart(BaseModel):
+    """What ``tower-measurements.json`` may have in addition to PAINT."""
+
+    receivers: dict[Name, ReceiverIn] = Field(
+        default={}, max_length=64, description="Receivers of every kind by name, as PUT sets them."
+    )
+    tower_size: TowerSize | None = Field(
+        default=None, description="The tower, which casts a shadow; null: as it was."
+    )
+
+
+class TowerMeasurements(Document, ReceiversPart):
     """PAINT's ``tower-measurements.json``: the tower base, and planar targets by WGS84 corners."""
 
     power_plant_properties: PowerPlantProperties = Field(description="Name and tower base.")
     declared: dict[str, object] | None = Field(
         default=None,
         description=(
-            "What twin.json declares of the plant's model: `sun`, `effects`, and `optics` with"
+            "What twin.json declares of the plant's model: `sun` (Buie's with `chi`, or with `csr`,"
+            " the true circumsolar share), `effects`, and `optics` with"
             " `reflectivity` (0 to 1, by default 1) and `attenuation`, the share of light lost"
             " between mirror and target as coefficients of a polynomial in the slant range in"
             " kilometres, the constant first (by default none: clear air)."

@@ -62,10 +62,12 @@ class Base(DeclarativeBase):
         datetime: UtcDateTime,
         dict[str, Any]: _Json,
         dict[str, object]: _Json,
+        dict[str, float]: _Json,
         dict[str, list[float]]: _Json,
         dict[str, str]: _Json,
         list[dict[str, Any]]: _Json,
         list[float]: _Json,
+        list[list[float]]: _Json,
         list[int]: _Json,
         list[str]: _Json,
     }

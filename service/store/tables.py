@@ -23,7 +23,7 @@ from sqlalchemy import (
 )
 from sqlalchemy.orm import Mapped, mapped_column, relationship
 
-from service.base.fields import Sun
+from service.base.fields import JsonObject, Sun
 from service.store.columns import Base, now, one_of
 
 NO_IMAGE = "none"
@@ -46,8 +46,11 @@ MODEL_VERSION = 256
 class PlantRow(Base):
     """The plant: a single row, written before anything that needs its origin.
 
-    ``declared`` is what ``twin.json`` declares for the first version of the plant's model
-    (DESIGN.md, section 6). None means the defaults.
+    - ``declared`` is what ``twin.json`` declares for the first version of the plant's model
+      (DESIGN.md, section 6). None means the defaults.
+    - ``tower`` has ``radius_m`` and ``height_m`` of the tower, which casts a shadow.
+    - ``time_zone`` and ``heliostat_types`` are those of its ``plant.yaml``, if it had one: the
+      entries, and the text of the files that they name.
     """
 
     __tablename__ = "plant"
@@ -58,7 +61,10 @@ class PlantRow(Base):
     latitude_deg: Mapped[float]
     longitude_deg: Mapped[float]
     altitude_m: Mapped[float]
-    declared: Mapped[dict[str, Any] | None]
+    declared: Mapped[JsonObject | None]
+    tower: Mapped[dict[str, float] | None]
+    time_zone: Mapped[str | None] = mapped_column(String(64))
+    heliostat_types: Mapped[JsonObject | None]
 
     @property
     def origin(self) -> tuple[float, float, float]:
@@ -114,7 +120,11 @@ class TargetRow(Base):
 
 
 class ReceiverRow(Base):
-    """A cylindrical receiver in ENU [m]; see `model.plant.Cylinder`."""
+    """A receiver in ENU [m], of a ``kind`` of `service.base.receivers`.
+
+    ``center_m``, ``normal``, ``up`` and ``height_m`` are those of its middle. ``width_m`` is a
+    plane's, ``radius_m`` and ``opening_deg`` a cylinder's. ``panels`` are as in REST.
+    """
 
     __tablename__ = "receivers"
 
@@ -123,9 +133,14 @@ class ReceiverRow(Base):
     center_m: Mapped[list[float]]
     normal: Mapped[list[float]]
     up: Mapped[list[float]]
-    radius_m: Mapped[float]
     height_m: Mapped[float]
-    opening_deg: Mapped[float]
+    width_m: Mapped[float | None]
+    radius_m: Mapped[float | None]
+    opening_deg: Mapped[float | None]
+    panels: Mapped[list[JsonObject] | None]
+    aperture_m: Mapped[list[list[float]] | None]
+    kind: Mapped[str] = mapped_column(String(16), server_default="cylinder")
+    absorptance: Mapped[float] = mapped_column(server_default="1")
     updated_at: Mapped[datetime] = mapped_column(default=now, onupdate=now)
 
 

@@ -26,7 +26,7 @@ from sqlalchemy import URL, make_url
 from starlette.routing import BaseRoute
 
 from model.errors import UnreachableError
-from model.fleet import FleetFlux, Superposition
+from model.fleet import FleetFlux, Losses, Superposition
 from model.frames import wgs84_to_enu
 from model.imaging import MeasuredFlux, Quality
 from model.mount import Mount
@@ -337,7 +337,12 @@ class FakeOperations:
         for tile in parts:
             asked.append(tile)
             count = len(tile)
-            made += FleetFlux(np.full(task.resolution, 2.0 * count), 60.0 * count, count)
+            losses = {
+                setup.heliostat.name: Losses(8.0, 0.75, *[1.0] * 5, task.receiver.absorptance)
+                for setup in tile.setups
+            }
+            light = np.full(task.resolution, 2.0 * count)
+            made += FleetFlux(light, 60.0 * count, count, losses=losses)
             done(made)
         return made
 

@@ -2,24 +2,27 @@
 "use strict";
 (() => {
   const view = (canvas) => {
-    const { size, bound, facets, colours } = JSON.parse(canvas.dataset.surface);
+    const { size, middle, bound, facets, colours } = JSON.parse(canvas.dataset.surface);
     const context = canvas.getContext("2d"), said = document.querySelector("[data-exaggeration]");
-    const highest = Math.max(...facets.flat(2).map(Math.abs), 1e-3);
+    const highest = Math.max(...facets.flatMap((facet) => facet.heights).flat().map(Math.abs), 1e-3);
     let azimuth = -0.6, tilt = 0.9, factor = 0.12 * size[0] * 1000 / highest; // mm are drawn as metres; the highest point is a tenth of the width
 
-    // Facets in PAINT's order: upper left, upper right, lower left, lower right; i runs along x, j along y.
-    const quads = facets.flatMap((heights, facet) => {
-      const n = heights.length, gap = 0.01 * size[0], w = (size[0] - gap) / 2, h = (size[1] - gap) / 2;
-      const x0 = facet % 2 ? gap / 2 : -size[0] / 2, y0 = facet < 2 ? gap / 2 : -size[1] / 2;
-      const point = (i, j) => [x0 + w * i / (n - 1), y0 + h * j / (n - 1), heights[i][j]];
-      const found = [];
-      for (let i = 0; i + 1 < n; i++) for (let j = 0; j + 1 < n; j++)
-        found.push([point(i, j), point(i + 1, j), point(i + 1, j + 1), point(i, j + 1)]);
+    // Each facet has its centre and half sides; i runs along x, j along y. Heights are null beside its outline.
+    const quads = facets.flatMap(({ center, x, y, heights }) => {
+      const n = heights.length, found = [];
+      const point = (i, j) => {
+        const u = 2 * i / (n - 1) - 1, v = 2 * j / (n - 1) - 1;
+        return [center[0] - middle[0] + u * x[0] + v * y[0], center[1] - middle[1] + u * x[1] + v * y[1], heights[i][j]];
+      };
+      for (let i = 0; i + 1 < n; i++) for (let j = 0; j + 1 < n; j++) {
+        const quad = [point(i, j), point(i + 1, j), point(i + 1, j + 1), point(i, j + 1)].filter((corner) => corner[2] !== null);
+        if (quad.length > 2) found.push(quad);
+      }
       return found;
     });
 
     const draw = () => {
-      const scale = 0.66 * canvas.width / size[0];
+      const scale = 0.66 * Math.min(canvas.width / size[0], 1.2 * canvas.height / size[1]);
       const [ca, sa, ct, st] = [Math.cos(azimuth), Math.sin(azimuth), Math.cos(tilt), Math.sin(tilt)];
       const turned = ([x, y, z]) => {
         const up = z * factor / 1000, a = ca * x - sa * y, b = sa * x + ca * y;
@@ -27,8 +30,8 @@
       };
       context.clearRect(0, 0, canvas.width, canvas.height);
       const drawn = quads.map((quad) => {
-        const corners = quad.map(turned), mean = quad.reduce((sum, p) => sum + p[2], 0) / 4;
-        return { corners, mean, depth: corners.reduce((sum, p) => sum + p[2], 0) };
+        const corners = quad.map(turned), mean = quad.reduce((sum, p) => sum + p[2], 0) / quad.length;
+        return { corners, mean, depth: corners.reduce((sum, p) => sum + p[2], 0) / corners.length };
       }).sort((a, b) => b.depth - a.depth);
       for (const { corners, mean } of drawn) {
         context.beginPath();

@@ -2,7 +2,7 @@
 
 import json
 import time
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from hashlib import sha256
 from typing import Any, Literal, Self
 
@@ -10,23 +10,22 @@ import numpy as np
 from pydantic import Field, model_validator
 from sqlalchemy.orm import Session
 
-from model.fleet import FleetFlux
+from model.fleet import LOSSES, FleetFlux, Losses
 from model.frames import sun_direction
 from model.plant import Receiver
 from service import store
 from service.base.fields import (
     AnySun,
     Flag,
-    Irradiance,
     Model,
     ModelVersion,
     Name,
     Plane,
     Position,
-    ReceiverIn,
     Resolution,
     Sun,
 )
+from service.base.receivers import ReceiverIn
 from service.jobs.common import Heliostats, chosen_names, require_some
 from service.jobs.kind import Context, Kind, Result
 from service.store.jobs import queue
@@ -37,6 +36,7 @@ from service.twin.forecasts.field_forecast import (
     group_warnings,
 )
 from service.twin.forecasts.heliostat_forecast import position_of, receiver_as_json
+from service.twin.forecasts.watts import Sunlight, dni_of, field_watts, heliostat_watts
 from service.twin.plant import model_versions
 from service.twin.runtime.runtime import Runtime
 
@@ -52,10 +52,14 @@ class FleetIn(Model):
         default=None, description="Any plane; either this, `target` or `receiver`."
     )
     receiver: ReceiverIn | None = Field(
-        default=None, description="Any cylinder; either this, `target` or `plane`."
+        default=None, description="Any receiver; either this, `target` or `plane`."
     )
     aim_point_m: Position | None = Field(
-        default=None, description="Where all heliostats aim [m]; by default the receiver's middle."
+        default=None,
+        description=(
+            "Where all heliostats aim [m]; by default the receiver's middle, which is the axis of a"
+            " whole cylinder and the middle of a cavity's opening."
+        ),
     )
     aim_points_m: dict[Name, Position] = Field(
         default_factory=dict,
@@ -64,9 +68,12 @@ class FleetIn(Model):
     )
     neighbours: Flag = Field(
         default=True,
-        description="Whether the mirrors of these heliostats shade and block each other.",
+        description=(
+            "Whether the mirrors of these heliostats shade and block each other, and the tower"
+            " shades them."
+        ),
     )
-    dni_w_m2: Irradiance = 1000.0
+    dni_w_m2: Sunlight = 1000.0
     resolution: Resolution = (256, 256)
     model_version: ModelVersion = None
 
@@ -91,14 +98,17 @@ class FleetIn(Model):
         with runtime.database.reading() as session:
             receiver = self.on(session)
             model = model_versions.get_model(session, self.model_version)
+            tower = store.stored_tower(session)
+            altitude = store.get_plant(session).altitude_m
         return HeliostatGroup(
             names=names,
             receiver=receiver,
             sun=sun_direction(sun.azimuth_deg, sun.elevation_deg),
-            model=model.with_dni(self.dni_w_m2),
-            aim=np.array(receiver.center if self.aim_point_m is None else self.aim_point_m),
+            model=model.with_dni(dni_of(self.dni_w_m2, sun.elevation_deg, altitude)),
+            aim=np.array(receiver.aim if self.aim_point_m is None else self.aim_point_m),
             aims=self.aim_points_m,
             ideal=ideal,
+            tower=tower,
         )
 
 
@@ -122,6 +132,9 @@ class FleetForecastIn(FleetIn):
 _CHECKPOINT_EVERY_S = 15.0
 _CHECKPOINT = "light"
 
+# Step with what becomes of each heliostat's light.
+_DETAILS = "heliostats"
+
 
 def forecast_field(context: Context, payload: FleetForecastIn) -> Result:
     """Sum the heliostats' flux maps [W/m2]. A restarted job continues from its checkpoint."""
@@ -144,10 +157,14 @@ def forecast_field(context: Context, payload: FleetForecastIn) -> Result:
         total.irradiance, fleet.receiver
     )
     figures |= {"model_version": fleet.model.number, "reflected_w": total.power}
-    figures |= {"sun": sun.model_dump(), "dni_w_m2": payload.dni_w_m2}
+    dni = fleet.model.optics.dni
+    figures |= {"sun": sun.model_dump(), "dni_w_m2": dni, "field": field_watts(total, dni)}
     figures |= {"heliostats": total.heliostats, "skipped": total.skipped}
     figures |= {"ideal_surfaces": ideal}
     saved.drop()
+    details = {"by_heliostat": heliostat_watts(total.losses, dni)}
+    with context.runtime.database.writing() as session:
+        context.replace(session, _DETAILS, details)
     return Result(figures, {"flux": total.irradiance.astype(np.float32)})
 
 
@@ -170,13 +187,17 @@ class _Checkpoints:
             self.context.steps().get(_CHECKPOINT),
             self.context.kept_arrays(_CHECKPOINT),
         )
-        if figures is None or arrays is None or figures["of"] != self.of:
+        if figures is None or arrays is None or figures["of"] != self.of or "names" not in figures:
             return None
         light = FleetFlux(
             arrays["irradiance"].astype(np.float64),
             figures["power"],
             figures["heliostats"],
             figures["skipped"],
+            {
+                name: Losses(*factors)
+                for name, factors in zip(figures["names"], arrays["losses"].tolist(), strict=True)
+            },
         )
         return Checkpoint(figures["tiles"], light)
 
@@ -187,8 +208,11 @@ class _Checkpoints:
         light = checkpoint.light
         figures = {"of": self.of, "tiles": checkpoint.tiles, "power": light.power}
         figures |= {"heliostats": light.heliostats, "skipped": light.skipped}
+        figures |= {"names": list(light.losses)}
+        losses = np.array([astuple(one) for one in light.losses.values()])
+        arrays = {"irradiance": light.irradiance, "losses": losses.reshape(-1, 1 + len(LOSSES))}
         with self.context.runtime.database.writing() as session:
-            self.context.replace(session, _CHECKPOINT, figures, {"irradiance": light.irradiance})
+            self.context.replace(session, _CHECKPOINT, figures, arrays)
         self.saved_s = time.monotonic()
 
     def drop(self) -> None:
@@ -222,5 +246,6 @@ KIND = Kind(
     FleetForecastIn,
     forecast_field,
     "Superpose the flux of many heliostats on one receiver.",
+    details=_DETAILS,
     expected_s=expected_s,
 )

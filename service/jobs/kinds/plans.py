@@ -12,6 +12,7 @@ from pydantic import Field, StringConstraints, model_validator
 from model.ephemeris import sun_positions
 from model.fleet import FleetFlux
 from model.plant import Cylinder, Receiver
+from model.receivers import Cavity, Panels
 from model.times import format_time
 from service import store
 from service.base.fields import Metres, Moment, Name, Number, Resolution, Sun, Text
@@ -20,6 +21,7 @@ from service.jobs.kind import Context, Kind, Result
 from service.jobs.kinds.field_forecasts import FleetIn, expected_s
 from service.twin.forecasts.field_forecast import HeliostatGroup, forecast_group, group_warnings
 from service.twin.forecasts.heliostat_forecast import receiver_as_json
+from service.twin.forecasts.watts import FieldWatts, field_watts
 from service.twin.plant import model_versions
 
 MAX_TIMES = 100
@@ -87,11 +89,16 @@ class PlanIn(FleetIn):
 def aim_on(receiver: Receiver, right: float, up: float) -> tuple[float, float, float]:
     """Convert map coordinates [m] on a receiver to a point (3,) [m] in ENU.
 
-    On a cylinder, ``right`` is along the arc.
+    On a cylinder, ``right`` is along the arc. On panels and in a cavity it is along the panels.
     """
     plane, across = receiver.middle, right
     if isinstance(receiver, Cylinder):
         plane, across = receiver.tangent(right / receiver.radius, 1.0, 1.0), 0.0
+    elif isinstance(receiver, Panels | Cavity):
+        ends = np.cumsum([panel.width for panel in receiver.panels]) - receiver.width / 2
+        number = min(int(np.searchsorted(ends, right)), len(ends) - 1)
+        plane = receiver.panels[number]
+        across = right - float(ends[number]) + plane.width / 2
     east, north, height = plane.to_enu((across, up)).tolist()
     return east, north, height
 
@@ -111,7 +118,8 @@ class ReceiverLoad(TypedDict):
     """Key figures of the flux on a receiver.
 
     ``intercept`` is the share of the reflected power that hits it, and ``spillage`` the rest.
-    ``exceeded_m2`` is the area above the allowed flux.
+    ``exceeded_m2`` is the area above the allowed flux. ``field`` is the chain of losses, or None
+    without any light.
     """
 
     peak_w_m2: float
@@ -120,13 +128,17 @@ class ReceiverLoad(TypedDict):
     intercept: float | None
     spillage: float | None
     exceeded_m2: float | None
+    field: FieldWatts | None
 
 
-def load_of(flux: FleetFlux, receiver: Receiver, allowed_w_m2: float | None) -> ReceiverLoad:
+def load_of(
+    flux: FleetFlux, receiver: Receiver, allowed_w_m2: float | None, dni_w_m2: float
+) -> ReceiverLoad:
     """Key figures of a fleet's flux on a receiver."""
     pixel_m2 = receiver.width * receiver.height / flux.irradiance.size
     power = float(flux.irradiance.sum() * pixel_m2)
-    intercept = min(power / flux.power, 1.0) if flux.power > 0 else None
+    field = field_watts(flux, dni_w_m2) if flux.losses else None
+    intercept = field["intercept"] if field is not None and flux.power > 0 else None
     return {
         "peak_w_m2": float(flux.irradiance.max()),
         "power_w": power,
@@ -138,6 +150,7 @@ def load_of(flux: FleetFlux, receiver: Receiver, allowed_w_m2: float | None) -> 
             if allowed_w_m2 is None
             else float((flux.irradiance > allowed_w_m2).sum() * pixel_m2)
         ),
+        "field": field,
     }
 
 
@@ -227,12 +240,15 @@ def _plan_time(time: _Time) -> None:
         replace(fleet, names=[name for name in fleet.names if name not in twin.skipped]), 0.5
     )
     fluxes = {"twin": twin, "ideal": ideal}
+    dni = fleet.model.optics.dni
     loads = {
-        name: load_of(flux, time.receiver, request.allowed_w_m2) for name, flux in fluxes.items()
+        name: load_of(flux, time.receiver, request.allowed_w_m2, dni)
+        for name, flux in fluxes.items()
     }
     step = {
         "at": format_time(time.at),
         "sun": time.sun.model_dump(),
+        "dni_w_m2": dni,
         "heliostats": twin.heliostats,
         **loads,
     }

@@ -9,18 +9,24 @@ from model.errors import InvalidInputError
 from model.plant import Heliostat, Plant
 from model.plant_model import PlantModel
 from model.pointing import Weather
+from service.base.plant_facts import PlantFacts
 from service.sources.documents import (
     IMAGE_KINDS,
     SUFFIXES,
     Measurement,
+    read_facts,
     read_heliostat,
     read_item,
     read_json,
     read_measurement,
     read_receivers,
     read_targets,
+    unknown_parts,
 )
 from service.sources.folder import Importer, MeasurementFolder, read_declared
+from service.sources.plant_errors import PlantText
+from service.sources.plant_formats.imported import PLANT
+from service.sources.plant_types import types_to_json
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +74,7 @@ def _read(root: Path, heliostats: list[str] | None) -> PaintFolder:
     tower = read_json(file)
     origin, targets = read_targets(tower)
     found: dict[str, Heliostat] = {}
-    skipped: dict[str, str] = {}
+    skipped = unknown_parts(tower)
     broken: dict[str, str] = {}
     properties: dict[str, dict[str, object]] = {}
     for own in sorted(filter(Path.is_dir, root.iterdir())):
@@ -102,7 +108,21 @@ def _read(root: Path, heliostats: list[str] | None) -> PaintFolder:
         )
     plant = Plant(_plant_name(tower, file), origin, targets, found, read_receivers(tower))
     model = PlantModel(plant.site, *read_declared(root / "twin.json"))
-    return PaintFolder(root, plant, model, skipped, properties, broken)
+    facts = _with_types(read_facts(tower), root, skipped)
+    return PaintFolder(root, plant, model, skipped, properties, broken, facts)
+
+
+def _with_types(facts: PlantFacts, root: Path, skipped: dict[str, str]) -> PlantFacts:
+    """Add time zone and heliostat types of ``plant.yaml``, which exports have."""
+    path = root / PLANT
+    if not path.is_file():
+        return facts
+    try:
+        zone, types = PlantText.read(path).entries.plant.time_zone, types_to_json(path)
+    except InvalidInputError as error:
+        skipped[PLANT] = str(error)
+        return facts
+    return replace(facts, time_zone=zone, heliostat_types=types)
 
 
 def _plant_name(tower: Any, file: Path) -> str:

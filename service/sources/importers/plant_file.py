@@ -9,9 +9,10 @@ import numpy as np
 from pydantic import BeforeValidator, ConfigDict, Field
 
 from model.errors import InvalidInputError
-from model.plant import Cylinder, Heliostat, Plant
+from model.plant import Heliostat, Plant
 from model.plant_model import PlantModel
 from service.base.fields import Elevation, Number
+from service.base.plant_facts import PlantFacts
 from service.sources.documents import (
     IMAGE_KINDS,
     SUFFIXES,
@@ -24,6 +25,7 @@ from service.sources.documents import (
 from service.sources.folder import Importer, MeasurementFolder, declared_json
 from service.sources.heliostat_document import heliostat_to_json
 from service.sources.plant_file import PlantDescription, read_plant
+from service.sources.plant_types import types_to_json
 from service.sources.schema import WeatherDocument, parse, parse_time
 
 PLANT = "plant.yaml"
@@ -118,32 +120,25 @@ def _declared(description: PlantDescription) -> dict[str, object]:
 
 def _read(root: Path, heliostats: list[str] | None) -> PlantFolder:
     description = read_plant(root / PLANT)
-    plant, skipped = description.plant, {}
+    plant = description.plant
     kept = {
         name: heliostat
         for name, heliostat in plant.heliostats.items()
         if (root / name).is_dir() and (heliostats is None or name in heliostats)
     }
-    cylinders = {}
-    for name, receiver in plant.receivers.items():
-        if isinstance(receiver, Cylinder):
-            cylinders[name] = receiver
-        else:
-            skipped[f"receiver {name}"] = (
-                f"the store keeps cylinders only; heliotwin field traces {name}"
-            )
     declared = _declared(description) | declared_json(root / "twin.json")
     model = PlantModel(plant.site, *parse_declared(declared, str(root / "twin.json")))
-    whole = Plant(plant.name, plant.origin, plant.targets, kept, cylinders)
+    whole = Plant(plant.name, plant.origin, plant.targets, kept, plant.receivers)
     properties = _properties(description, kept)
-    return PlantFolder(root, whole, model, skipped, properties, description=description)
+    facts = PlantFacts(description.tower, description.time_zone, types_to_json(root / PLANT))
+    return PlantFolder(root, whole, model, {}, properties, facts=facts, description=description)
 
 
 def _properties(
     description: PlantDescription, heliostats: Mapping[str, Heliostat]
 ) -> dict[str, dict[str, object]]:
     return {
-        name: heliostat_to_json(heliostat, description.type_of[name])
+        name: heliostat_to_json(heliostat, description.layout[name])
         for name, heliostat in heliostats.items()
     }
 

@@ -7,11 +7,13 @@ from numpy.typing import ArrayLike
 from sqlalchemy import select
 from sqlalchemy.orm import Session, defer
 
-from model.errors import InvalidInputError
 from model.locating import locator_from_json, locator_to_json
-from model.plant import Cylinder, Receiver, TargetPlane
+from model.plant import Receiver, TargetPlane, Tower
 from service.base import names
 from service.base.errors import ConflictError, NotFoundError
+from service.base.fields import JsonObject
+from service.base.plant_facts import PlantFacts
+from service.base.receivers import AnyReceiver, receiver_from_json, receiver_to_json
 from service.store.rows import (
     Change,
     Put,
@@ -249,52 +251,78 @@ def get_receiver(session: Session, name: str) -> ReceiverRow:
     return row
 
 
-def put_receiver(session: Session, cylinder: Receiver) -> Put[ReceiverRow]:
+def put_receiver(session: Session, receiver: Receiver) -> Put[ReceiverRow]:
     """Store or update a receiver.
 
     Raises
     ------
     InvalidInputError
-        For an invalid name, or a receiver that is no cylinder.
+        For an invalid name, or a kind that cannot be stored.
     ConflictError
         If a target has this name.
     """
-    names.require_name(names.NAME, cylinder.name, "receiver")
-    if not isinstance(cylinder, Cylinder):
-        raise InvalidInputError(
-            f"receiver {cylinder.name}: the store keeps cylinders only; give it to heliotwin field"
-        )
+    names.require_name(names.NAME, receiver.name, "receiver")
+    document = receiver_to_json(receiver)
     serialize_writers(session)
-    if find_target(session, cylinder.name) is not None:
+    if find_target(session, receiver.name) is not None:
         raise ConflictError(
-            f"name: {cylinder.name} is a target plane; choose another name for the receiver"
+            f"name: {receiver.name} is a target plane; choose another name for the receiver"
         )
     values: dict[str, object] = {
-        "center_m": floats(cylinder.center),
-        "normal": floats(cylinder.normal),
-        "up": floats(cylinder.up),
-        "radius_m": float(cylinder.radius),
-        "height_m": float(cylinder.height),
-        "opening_deg": float(cylinder.opening_deg),
+        "kind": document["kind"],
+        "center_m": floats(receiver.center),
+        "normal": floats(receiver.normal),
+        "up": floats(receiver.up),
+        "height_m": float(receiver.height),
+        "width_m": document.get("width"),
+        "radius_m": document.get("radius"),
+        "opening_deg": document.get("opening_deg"),
+        "panels": document.get("panels"),
+        "aperture_m": document.get("aperture"),
+        "absorptance": document["absorptance"],
     }
-    row, is_new = insert_or_find(session, ReceiverRow(name=cylinder.name, **values))
+    row, is_new = insert_or_find(session, ReceiverRow(name=receiver.name, **values))
     return Put(row, Change.NEW if is_new else assign(row, values))
 
 
-def receiver_cylinder(row: ReceiverRow) -> Cylinder:
-    """Convert a stored receiver to the model's cylinder."""
-    return Cylinder(
-        name=row.name,
-        center=np.array(row.center_m),
-        normal=np.array(row.normal),
-        up=np.array(row.up),
-        radius=row.radius_m,
-        height=row.height_m,
-        opening_deg=row.opening_deg,
+_FIELDS = {
+    "plane": ("center", "normal", "up", "width", "height"),
+    "cylinder": ("center", "normal", "up", "radius", "height", "opening_deg"),
+    "panels": ("panels",),
+    "cavity": ("aperture", "panels"),
+}
+"""Fields of a receiver's document by its kind."""
+
+_COLUMNS = {name: f"{name}_m" for name in ("center", "width", "radius", "height", "aperture")}
+"""Columns by field, where the names differ."""
+
+
+def receiver_document(row: ReceiverRow) -> JsonObject:
+    """A stored receiver as REST and exports have it, without its name."""
+    known = {name: getattr(row, _COLUMNS.get(name, name)) for name in _FIELDS[row.kind]}
+    return {"kind": row.kind, **known, "absorptance": row.absorptance}
+
+
+def stored_receiver(row: ReceiverRow) -> AnyReceiver:
+    """Convert a stored receiver to the model's."""
+    return receiver_from_json(row.name, receiver_document(row))
+
+
+def get_target_or_receiver(session: Session, name: str) -> AnyReceiver:
+    """The target plane or the receiver of this name; NotFoundError if there is neither."""
+    row = find_receiver(session, name)
+    return target_plane(get_target(session, name)) if row is None else stored_receiver(row)
+
+
+def put_plant_facts(session: Session, facts: PlantFacts) -> Change:
+    """Set what is known of the plant besides its geometry; what is None stays as it is."""
+    return assign(
+        get_plant(session),
+        {name: value for name, value in facts.columns().items() if value is not None},
     )
 
 
-def get_target_or_receiver(session: Session, name: str) -> Receiver:
-    """The target plane or the cylinder of this name; NotFoundError if there is neither."""
-    row = find_receiver(session, name)
-    return target_plane(get_target(session, name)) if row is None else receiver_cylinder(row)
+def stored_tower(session: Session) -> Tower | None:
+    """The plant's tower, if it is known."""
+    known = get_plant(session).tower
+    return None if known is None else Tower(known["radius_m"], known["height_m"])

@@ -75,14 +75,13 @@ class SurfaceErrors:
     canting_mrad: float
 
 
-def surface_errors(z: NDArray[np.floating], size: tuple[float, float]) -> SurfaceErrors:
+def surface_errors(z: NDArray[np.floating], sizes: NDArray[np.floating]) -> SurfaceErrors:
     """Split surface deviation into canting and waviness.
 
-    ``z`` are heights (4, 8, 8) [m]. ``size`` is the mirror's width and height [m], with two facets
-    in each direction.
+    ``z`` are heights (F, 8, 8) [m]. ``sizes`` (F, 2) [m] are width and height of each facet.
     """
     _, waviness = split_canting(z)
-    tilts = (canting_rises(z) / (np.array(size) / 2)) ** 2
+    tilts = (canting_rises(z) / sizes) ** 2
     deviation, wavy = (float(np.sqrt(np.mean(heights**2)) * 1e3) for heights in (z, waviness))
     return SurfaceErrors(deviation, wavy, 1e3 * math.sqrt(tilts.mean(axis=0).sum()))
 

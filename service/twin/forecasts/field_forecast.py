@@ -20,7 +20,7 @@ from model.fleet import (
     tile_size,
 )
 from model.neighbours import Neighbours
-from model.plant import Heliostat, Receiver
+from model.plant import Heliostat, Receiver, Tower
 from model.progress import nothing_between
 from model.setup import Setup
 from model.surface import control_points
@@ -56,6 +56,8 @@ class HeliostatGroup:
     aims : mapping of heliostat names to (3,) [m]
     ideal : bool
         Trace ideal surfaces instead of the active ones.
+    tower : Tower or None
+        It shades mirrors.
     skipped : dict
         Heliostats that could not be read, with the reason. The forecast fills it.
     without_surface : set of str
@@ -69,6 +71,7 @@ class HeliostatGroup:
     aim: Array
     aims: Mapping[str, Sequence[float]]
     ideal: bool
+    tower: Tower | None = None
     skipped: dict[str, str] = field(default_factory=dict)
     without_surface: set[str] = field(default_factory=set)
 
@@ -110,7 +113,8 @@ def forecast_group(
 ) -> FleetFlux:
     """Forecast the flux of a heliostat group.
 
-    With ``neighbours``, heliostats block and shade each other, also those without a surface.
+    With ``neighbours``, heliostats block and shade each other, also those without a surface, and
+    the tower shades them.
     ``report`` receives the progress from 0 to 1. An exception that it raises stops the work.
     ``save`` receives a checkpoint after each tile. ``begun`` is a checkpoint to continue from.
     """
@@ -132,7 +136,8 @@ def forecast_group(
     engine: Engine = engine_of(runtime)
     # Work on other machines cannot check whether it shall stop.
     between = (lambda: traced(number)) if isinstance(engine, Threads) else nothing_between
-    task = Superposition(fleet.receiver, fleet.model, resolution, between=between)
+    tower = None if fleet.tower is None or not neighbours else fleet.tower.outline(fleet.sun)
+    task = Superposition(fleet.receiver, fleet.model, resolution, tower=tower, between=between)
     total = runtime.operations.superpose(
         task,
         _tiles(runtime, fleet, field, size, number),

@@ -40,7 +40,7 @@ class ForecastRequest:
 
     Names are those of `POST /v1/forecasts`. ``receiver`` is the geometry to light. Without it
     ``target`` names a stored target or receiver. ``sun_at`` is the time that was requested, if any.
-    ``aim_point_m`` (3,) is by default the plane's centre.
+    ``aim_point_m`` (3,) is by default the receiver's `model.plant.Receiver.aim`.
 
     ``motor_position`` [steps] may replace ``aim_point_m``. It turns the mirror by its calibrated
     mount at ``sun_at``, by default as newly measured.
@@ -103,7 +103,7 @@ def _receiver(session: Session, request: ForecastRequest) -> Receiver:
     receiver = store.get_target_or_receiver(session, request.target)
     if request.window_m is not None and not isinstance(receiver, TargetPlane):
         raise InvalidInputError(
-            f"window_m: the map of {request.target}, a cylinder, is all of it; leave it out"
+            f"window_m: the map of {request.target}, which is no plane, is all of it; leave it out"
         )
     return receiver
 
@@ -151,13 +151,13 @@ def trace_request(runtime: Runtime, request: ForecastRequest) -> Traced:
 def receiver_as_json(receiver: Receiver) -> dict[str, object]:
     """A receiver's geometry [m], as stored with forecasts.
 
-    A cylinder's width is the length of its arc.
+    A cylinder's width is the length of its arc, and that of panels is their sum.
     """
     outline = {
         name: to_json_value(getattr(receiver, name))
         for name in ("center", "normal", "up", "width", "height")
     }
-    return outline | receiver.shape
+    return outline | {"absorptance": receiver.absorptance} | receiver.shape
 
 
 def _forecast_row(request: ForecastRequest, traced: Traced) -> ForecastRow:
@@ -226,7 +226,7 @@ def trace_flux(
         sun_direction(request.sun.azimuth_deg, request.sun.elevation_deg),
         receiver.middle,
         angles=angles,
-        aim=None if request.aim_point_m is None else np.asarray(request.aim_point_m),
+        aim=receiver.aim if request.aim_point_m is None else np.asarray(request.aim_point_m),
         degree=degree,
         identifier=twin.heliostat.name,
         taken_at=request.sun_at,
@@ -289,9 +289,9 @@ def camera_view(session: Session, row: ForecastRow) -> NDArray[np.float32]:
     ConflictError
         If the forecast is not for a stored target; cameras look only at these.
     """
-    if row.target_name is None or "radius" in row.plane:
+    if row.target_name is None or store.find_target(session, row.target_name) is None:
         raise ConflictError(
-            "view: a camera looks at stored targets; of any other plane there is only the light"
+            "view: a camera looks at stored targets; of any other surface there is only the light"
         )
     light = torch.as_tensor(unpack(row.flux)["flux"])
     size = row.window_m or row.plane["width"], row.window_m or row.plane["height"]

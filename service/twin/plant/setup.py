@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy.orm import Session
 
-from model.plant import Cylinder, Plant, TargetPlane
+from model.plant import Plant, Receiver, TargetPlane
 from service import store
+from service.base.plant_facts import NO_FACTS, PlantFacts
 from service.sources.documents import read_heliostat
 from service.sources.paint_documents import Corners
 from service.store import Change, audit
@@ -37,24 +38,27 @@ def set_plant(
     plant: Plant,
     declared: dict[str, object] | None = None,
     corners: Mapping[str, Corners] | None = None,
+    facts: PlantFacts = NO_FACTS,
 ) -> PlantChange:
-    """Set tower base, targets, receivers and declared model together.
+    """Set tower base, targets, receivers, declared model and other facts together.
 
     Raises
     ------
     ConflictError
         If stored data forbid it: see the functions of `service.store`.
     """
+    placed = store.put_plant(session, plant.name, plant.origin)
+    known = store.put_plant_facts(session, facts)
     change = PlantChange(
-        store.put_plant(session, plant.name, plant.origin),
+        known if placed is Change.UNCHANGED else placed,
         put_declared(session, declared, actor) if declared else None,
         {
             name: store.put_target(session, plane, (corners or {}).get(name)).change
             for name, plane in plant.targets.items()
         },
         {
-            name: store.put_receiver(session, cylinder).change
-            for name, cylinder in plant.receivers.items()
+            name: store.put_receiver(session, receiver).change
+            for name, receiver in plant.receivers.items()
         },
     )
     parts = {
@@ -80,10 +84,10 @@ def set_target(
     return put
 
 
-def set_receiver(session: Session, actor: str, cylinder: Cylinder) -> Put[ReceiverRow]:
-    """Set a cylindrical receiver; raises what `store.put_receiver` raises."""
-    put = store.put_receiver(session, cylinder)
-    _note(session, actor, "receiver", cylinder.name, put.change)
+def set_receiver(session: Session, actor: str, receiver: Receiver) -> Put[ReceiverRow]:
+    """Set a receiver; raises what `store.put_receiver` raises."""
+    put = store.put_receiver(session, receiver)
+    _note(session, actor, "receiver", receiver.name, put.change)
     return put
 
 

@@ -21,8 +21,10 @@ from model.surface import DEGREE
 from service import store
 from service.base.arrays import unpack
 from service.base.errors import StoreDamagedError
+from service.base.fields import JsonObject
+from service.base.plant_facts import PlantFacts
 from service.base.progress import Progress, no_progress
-from service.sources.documents import SUFFIXES
+from service.sources.documents import SUFFIXES, parse_declared
 from service.sources.paint_documents import (
     CATALOGUE,
     When,
@@ -32,9 +34,9 @@ from service.sources.paint_documents import (
     tower_json,
 )
 from service.sources.photograph import Photograph
+from service.sources.plant_export import export_plant
 from service.store.columns import EPOCH
 from service.store.photographs.measurements import EXCLUDED
-from service.store.plant.geometry import receiver_cylinder
 from service.store.plant.model_versions import declared_of, find_current
 from service.store.tables import HeliostatRow, MeasurementRow, SurfaceRow
 from service.twin.heliostats.metadata import photograph_from_row
@@ -105,19 +107,25 @@ def _write_plant(runtime: Runtime, writer: _Writer) -> tuple[Plant, Sequence[str
         )
         version = find_current(session)
         declared = declared_of(session, version) or {}
-        names = session.scalars(select(HeliostatRow.name).order_by(HeliostatRow.name)).all()
+        heliostats = select(HeliostatRow.name, HeliostatRow.properties).order_by(HeliostatRow.name)
+        properties: dict[str, JsonObject] = dict(session.execute(heliostats).all())
         document = history.plant_history(session)
+        facts = PlantFacts(store.stored_tower(session), row.time_zone, row.heliostat_types)
     if version is not None and version.effects:  # adopted effects are part of the model, too
         declared = declared | {"effects": [*declared.get("effects", []), *version.effects]}
     planes = {target.name: store.target_plane(target) for target in targets}
-    cylinders = {receiver.name: receiver_cylinder(receiver) for receiver in receivers}
-    plant = Plant(row.name, np.array(row.origin), planes, {}, cylinders)
-    tower = tower_json(plant, {target.name: target.corners for target in targets})
+    surfaces = {receiver.name: store.stored_receiver(receiver) for receiver in receivers}
+    plant = Plant(row.name, np.array(row.origin), planes, {}, surfaces)
+    tower = tower_json(plant, {target.name: target.corners for target in targets}, facts)
     writer.json(f"{row.name}-tower-measurements.json", tower, "plants")
     writer.model(history.PLANT, document, "histories")
     if declared:
         writer.json("twin.json", {"declared": declared}, "declared models")
-    return plant, names
+    exported = export_plant(plant, facts, parse_declared(declared, "declared").optics, properties)
+    for path, text in exported.files.items():
+        writer.bytes(path, text.encode(), "files of plant.yaml")
+    writer.skipped.update(exported.skipped)
+    return plant, list(properties)
 
 
 def _write_heliostat(runtime: Runtime, writer: _Writer, plant: Plant, name: str) -> None:

@@ -191,7 +191,7 @@ def _put_plant(runtime: Runtime, folder: MeasurementFolder, actor: str) -> Count
     plant, has_history = folder.plant, (folder.root / history.PLANT).exists()
     declared = None if has_history else folder.declared()
     changes = runtime.database.run_in_transaction(
-        lambda session: setup.set_plant(session, actor, plant, declared)
+        lambda session: setup.set_plant(session, actor, plant, declared, facts=folder.facts)
     )
     counts = Counter([f"plants {changes.plant}"])
     counts.update(f"targets {change}" for change in changes.targets.values())

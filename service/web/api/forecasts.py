@@ -18,7 +18,6 @@ from service.base.fields import (
     Flag,
     HeliostatOf,
     Id,
-    Irradiance,
     Model,
     ModelNumber,
     ModelVersion,
@@ -27,7 +26,6 @@ from service.base.fields import (
     Number,
     Plane,
     Position,
-    ReceiverIn,
     Resolution,
     Rows,
     SunAt,
@@ -36,6 +34,7 @@ from service.base.fields import (
     VersionIn,
     from_row,
 )
+from service.base.receivers import PlaneReceiverIn, ReceiverIn
 from service.drawing.pictures import flux_picture
 from service.store.listing import Order, Period
 from service.store.tables import ForecastRow
@@ -46,6 +45,7 @@ from service.twin.forecasts.heliostat_forecast import (
     make_forecast,
     position_of,
 )
+from service.twin.forecasts.watts import Sunlight, dni_of
 from service.twin.runtime.runtime import Runtime
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,
@@ -85,11 +85,13 @@ class ForecastIn(Model):
     )
     receiver: ReceiverIn | None = Field(
         default=None,
-        description="Any cylinder; either this, `target` or `plane`. Its map is unrolled.",
+        description=(
+            "Any receiver; either this, `target` or `plane`. The map of a cylinder is unrolled."
+        ),
     )
     sun: AnySun
     aim_point_m: Position | None = Field(
-        default=None, description="Where the heliostat aims [m]; by default the plane's centre."
+        default=None, description="Where the heliostat aims [m]; by default the receiver's middle."
     )
     motor_position: MotorPosition | None = Field(
         default=None,
@@ -106,15 +108,14 @@ class ForecastIn(Model):
             " surface is forecast by its ideal mirror; the first of `warnings` says so."
         ),
     )
-    dni_w_m2: Irradiance = 1000.0
+    dni_w_m2: Sunlight = 1000.0
     resolution: Resolution = (256, 256)
     window_m: Number | None = Field(
         default=None,
         ge=0.01,
         le=1e3,
         description=(
-            "Side of a square about the centre of mass to map [m]; else the plane. Not on a"
-            " cylinder."
+            "Side of a square about the centre of mass to map [m]; else the plane. Planes only."
         ),
     )
     normalised: Flag = Field(
@@ -126,17 +127,19 @@ class ForecastIn(Model):
     def _one(self) -> Self:
         if sum(value is not None for value in (self.target, self.plane, self.receiver)) != 1:
             raise ValueError("give either target or plane, or receiver")
-        if self.receiver is not None and self.window_m is not None:
-            raise ValueError("window_m: the map of a cylinder is all of it; leave it out")
+        is_whole = not isinstance(self.receiver, PlaneReceiverIn | None)
+        if self.window_m is not None and is_whole:
+            raise ValueError("window_m: the map of such a receiver is all of it; leave it out")
         if self.aim_point_m is not None and self.motor_position is not None:
             raise ValueError("give either aim_point_m or motor_position")
         return self
 
 
 class ForecastReceiverOut(BaseModel):
-    """The receiver of a forecast: a plane, or a cylinder.
+    """The receiver of a forecast.
 
-    The axis of a cylinder is behind its middle. The map of a cylinder is unrolled.
+    The axis of a cylinder is behind its middle. The map of a cylinder is unrolled. That of panels
+    has them side by side.
     """
 
     center: tuple[float, float, float] = Field(
@@ -144,11 +147,19 @@ class ForecastReceiverOut(BaseModel):
     )
     normal: tuple[float, float, float] = Field(description="Of the lit side, there.")
     up: tuple[float, float, float] = Field(description="Unit vector up the map.")
-    width: float = Field(description="[m]; of a cylinder the length of its arc.")
+    width: float = Field(
+        description="[m]; of a cylinder the length of its arc, of panels their sum."
+    )
     height: float = Field(description="[m]")
     radius: float | None = Field(default=None, description="Of a cylinder [m]; null: a plane.")
     opening_deg: float | None = Field(
         default=None, description="Angle of a cylinder's lit surface [deg]."
+    )
+    panels: int | None = Field(
+        default=None, description="Number of panels side by side; null: it is one surface."
+    )
+    absorptance: float = Field(
+        default=1.0, description="Share of the light on the map that it absorbs [1]."
     )
 
 
@@ -165,9 +176,7 @@ class ForecastSummary(BaseModel):
     )
     surface_version: int | None = Field(description="null: the ideal surface.")
     target: str | None = Field(description="Name of the target; null: another plane.")
-    plane: ForecastReceiverOut = Field(
-        description="The plane, or the cylinder, that the light falls on [m]."
-    )
+    plane: ForecastReceiverOut = Field(description="The surface that the light falls on [m].")
     sun: SunPosition
     at: datetime | None = Field(
         description="The time that was asked for; null: the sun's position was."
@@ -242,7 +251,7 @@ router = APIRouter(prefix="/forecasts", tags=["forecasts"])
 
 
 def _given(body: ForecastIn) -> Receiver | None:
-    """The plane or cylinder of the request, or None if it names a stored one."""
+    """The receiver of the request, or None if it names a stored one."""
     if body.plane is not None:
         return body.plane.named("plane")
     return None if body.receiver is None else body.receiver.named("receiver")
@@ -250,9 +259,10 @@ def _given(body: ForecastIn) -> Receiver | None:
 
 def _request(runtime: Runtime, body: ForecastIn) -> ForecastRequest:
     with runtime.database.reading() as session:
-        sun = position_of(session, body.sun)
+        sun, altitude = position_of(session, body.sun), store.get_plant(session).altitude_m
     names = {field.name for field in fields(ForecastRequest)} & set(ForecastIn.model_fields)
     same = {name: getattr(body, name) for name in names - {"sun", "receiver"}}
+    same["dni_w_m2"] = dni_of(body.dni_w_m2, sun.elevation_deg, altitude)
     sun_at = body.sun.at if isinstance(body.sun, SunAt) else None
     return ForecastRequest(sun=sun, sun_at=sun_at, receiver=_given(body), **same)
 

@@ -1,22 +1,33 @@
 """The plant, its target planes and its receivers."""
 
-from typing import Self
+from typing import Annotated, Literal, Self
 
 from fastapi import APIRouter, Depends, Response, status
-from pydantic import BaseModel, Field, model_validator
+from pydantic import BaseModel, Field, TypeAdapter, model_validator
 from sqlalchemy.orm import Session
 
+from model.errors import InvalidInputError
 from model.frames import wgs84_to_enu
 from model.plant import Plant, TargetPlane
 from service import store
-from service.base.fields import Model, Plane, ReceiverIn, TargetOf, Wgs84, from_row
-from service.sources.documents import parse_declared, read_receivers, read_targets
+from service.base.fields import Model, Plane, TargetOf, Wgs84, from_row
+from service.base.plant_facts import TowerSize
+from service.base.receivers import KIND, ReceiverIn
+from service.sources.documents import (
+    describe_sun,
+    parse_declared,
+    read_facts,
+    read_receivers,
+    read_targets,
+    unknown_parts,
+)
 from service.sources.plant_schema import CameraEntry, Marks
 from service.sources.schema import TowerMeasurements
 from service.store.plant.model_versions import declared_of, find_current
 from service.store.rows import Put
 from service.store.tables import ReceiverRow, TargetRow
 from service.twin.plant import setup
+from service.twin.plant.model_versions import get_model
 from service.web.auth.dependencies import (
     OPERATE,
     READ,
@@ -27,6 +38,11 @@ from service.web.auth.dependencies import (
 )
 from service.web.responses.openapi import problems
 from service.web.responses.paging import Page
+
+Place = tuple[float, float, float]
+"""East, north and up."""
+
+_ABSORPTANCE = Field(description="Share of the light that it absorbs [1].")
 
 
 class PlantOut(BaseModel):
@@ -42,18 +58,71 @@ class PlantOut(BaseModel):
             " no effects, and optics of reflectivity 1 without attenuation."
         )
     )
+    sun_shape: dict[str, object] = Field(
+        description=(
+            "The sun shape of the current model, and its numbers. Buie's has `chi` of the formula,"
+            " and `csr`, the true circumsolar share."
+        )
+    )
+    tower_size: TowerSize | None = Field(
+        description="The tower, which casts a shadow; null: no shadow is known."
+    )
 
 
-class ReceiverOut(BaseModel):
+class PanelOut(BaseModel):
+    """A rectangle."""
+
+    center: Place = Field(description="[m]")
+    normal: Place = Field(description="Unit normal of the lit side.")
+    up: Place = Field(description="Unit vector up its map.")
+    width: float = Field(description="[m]")
+    height: float = Field(description="[m]")
+
+
+class PlaneReceiverOut(PanelOut):
+    """A flat receiver."""
+
+    name: TargetOf
+    kind: Literal["plane"] = KIND
+    absorptance: float = _ABSORPTANCE
+
+
+class CylinderOut(BaseModel):
     """A cylindrical receiver."""
 
     name: TargetOf
-    center: tuple[float, float, float] = Field(description="The middle of the lit surface [m].")
-    normal: tuple[float, float, float] = Field(description="Unit normal there, away from the axis.")
-    up: tuple[float, float, float] = Field(description="Unit vector along the axis.")
+    kind: Literal["cylinder"] = KIND
+    center: Place = Field(description="The middle of the lit surface [m].")
+    normal: Place = Field(description="Unit normal there, away from the axis.")
+    up: Place = Field(description="Unit vector along the axis.")
     radius: float = Field(description="[m]")
     height: float = Field(description="[m]")
     opening_deg: float = Field(description="Angle of the lit surface [deg].")
+    absorptance: float = _ABSORPTANCE
+
+
+class PanelsOut(BaseModel):
+    """A receiver of panels side by side."""
+
+    name: TargetOf
+    kind: Literal["panels"] = KIND
+    panels: list[PanelOut] = Field(description="From left to right.")
+    absorptance: float = _ABSORPTANCE
+
+
+class CavityOut(BaseModel):
+    """Panels behind an opening."""
+
+    name: TargetOf
+    kind: Literal["cavity"] = KIND
+    aperture: list[Place] = Field(description="Corners of the opening [m].")
+    panels: list[PanelOut] = Field(description="From left to right.")
+    absorptance: float = _ABSORPTANCE
+
+
+ReceiverOut = Annotated[
+    PlaneReceiverOut | CylinderOut | PanelsOut | CavityOut, Field(discriminator="kind")
+]
 
 
 class Corners(Model):
@@ -129,7 +198,13 @@ class TargetOut(BaseModel):
 def plant_out(session: Session) -> PlantOut:
     """The plant as JSON."""
     row, declared = store.get_plant(session), declared_of(session, find_current(session))
-    return PlantOut(name=row.name, origin_wgs84=row.origin, declared=declared)
+    return PlantOut(
+        name=row.name,
+        origin_wgs84=row.origin,
+        declared=declared,
+        sun_shape=describe_sun(get_model(session).optics.sun_shape),
+        tower_size=None if row.tower is None else TowerSize(**row.tower),
+    )
 
 
 def target_out(row: TargetRow) -> TargetOut:
@@ -147,9 +222,11 @@ def target_out(row: TargetRow) -> TargetOut:
 
 
 def receiver_out(row: ReceiverRow) -> ReceiverOut:
-    """A cylindrical receiver as JSON."""
-    return from_row(ReceiverOut, row, center=row.center_m, radius=row.radius_m, height=row.height_m)
+    """A receiver as JSON."""
+    return _RECEIVER.validate_python({"name": row.name, **store.receiver_document(row)})
 
+
+_RECEIVER: TypeAdapter[ReceiverOut] = TypeAdapter(ReceiverOut)
 
 router = APIRouter(tags=["plant"])
 _CORNERS = ("upper_left", "upper_right", "lower_left", "lower_right")
@@ -176,14 +253,17 @@ def get_plant(runtime: RuntimeDep) -> PlantOut:
 def put_plant(document: TowerMeasurements, runtime: RuntimeDep, identity: IdentityDep) -> PlantOut:
     """Set the plant: tower base, targets and receivers.
 
-    The body is PAINT's tower measurements. Repeating the request changes nothing. `declared` sets
-    what is declared of the plant model, if it is given. An effect's `scope` says when it acts and
-    at which `heliostats`. Without a scope, it acts at all of them.
+    The body is PAINT's tower measurements. Repeating the request changes nothing. `receivers` are
+    of any kind, and `tower_size` casts a shadow. A part of a type that is not understood is
+    refused. `declared` sets what is declared of the plant model, if it is given. An effect's
+    `scope` says when it acts and at which `heliostats`. Without a scope, it acts at all of them.
 
     A scope of one mirror: `{"kind": "set", "heliostats": ["AB12"]}`.
     """
+    for name, reason in unknown_parts(document.raw).items():
+        raise InvalidInputError(f"{name}.{reason}")
     origin, targets = read_targets(document.raw)
-    receivers = read_receivers(document.raw)
+    receivers, facts = read_receivers(document.raw), read_facts(document.raw)
     parse_declared(document.declared or {}, "declared")  # refuse models that cannot be computed
     places = {name: document.raw[name]["coordinates"] for name in targets}
     corners = {
@@ -193,7 +273,7 @@ def put_plant(document: TowerMeasurements, runtime: RuntimeDep, identity: Identi
 
     def write(session: Session) -> PlantOut:
         plant = Plant(document.power_plant_properties.ID, origin, targets, receivers=receivers)
-        setup.set_plant(session, identity.name, plant, document.declared, corners)
+        setup.set_plant(session, identity.name, plant, document.declared, corners, facts)
         return plant_out(session)
 
     return runtime.database.run_in_transaction(write)
@@ -265,14 +345,14 @@ def delete_target(name: NamePath, runtime: RuntimeDep, identity: IdentityDep) ->
 
 @router.get("/receivers", responses=problems(), dependencies=[READ])
 def list_receivers(runtime: RuntimeDep) -> Page[ReceiverOut]:
-    """List cylindrical receivers."""
+    """List receivers of all kinds."""
     with runtime.database.reading() as session:
         return Page(items=[receiver_out(row) for row in store.list_receivers(session)], next=None)
 
 
 @router.get("/receivers/{name}", responses=problems(404), dependencies=[READ])
 def get_receiver(name: NamePath, runtime: RuntimeDep) -> ReceiverOut:
-    """Get a cylindrical receiver."""
+    """Get a receiver."""
     with runtime.database.reading() as session:
         return receiver_out(store.get_receiver(session, name))
 
@@ -289,7 +369,10 @@ def put_receiver(
     identity: IdentityDep,
     response: Response,
 ) -> ReceiverOut:
-    """Set a cylindrical receiver."""
+    """Set a receiver: a plane, a cylinder, panels side by side, or a cavity.
+
+    `kind` says which. Without it, the receiver is a cylinder.
+    """
     row, change = runtime.database.run_in_transaction(
         lambda session: setup.set_receiver(session, identity.name, request.named(name))
     )

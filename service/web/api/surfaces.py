@@ -30,13 +30,13 @@ from service.base.fields import (
     Why,
     from_row,
 )
-from service.base.settings import Settings
 from service.drawing.pictures import surface_picture
 from service.store.listing import Order, Period
 from service.store.surfaces import decisions
 from service.store.surfaces.decisions import Justification
 from service.store.surfaces.surface_versions import SurfaceFilter
-from service.store.tables import DecisionRow, SurfaceRow
+from service.store.tables import DecisionRow, HeliostatRow, SurfaceRow
+from service.twin.heliostats.facets import facet_places
 from service.twin.runtime.runtime import Runtime
 from service.twin.surfaces.prediction import predict_surface
 from service.web.auth.dependencies import (
@@ -201,17 +201,20 @@ def surface_out(heliostat_name: str, row: SurfaceRow) -> SurfaceOut:
 
 
 def surface_answer(
-    heliostat_name: str, row: SurfaceRow, media_type: str, settings: Settings
+    runtime: Runtime, heliostat: HeliostatRow, row: SurfaceRow, media_type: str
 ) -> Response:
     """A surface in the requested media type."""
     arrays = unpack(row.arrays)
     if media_type == formats.JSON:
-        return json_answer(surface_summary(heliostat_name, row), **arrays)
+        return json_answer(surface_summary(heliostat.name, row), **arrays)
     name, title = (
-        f"{heliostat_name}-surface-{row.version}",
-        f"{heliostat_name}, surface {row.version} ({row.source})",
+        f"{heliostat.name}-surface-{row.version}",
+        f"{heliostat.name}, surface {row.version} ({row.source})",
     )
-    picture = partial(surface_picture, arrays["z"], bound=settings.figure_scales["heights"])
+    with runtime.database.reading() as session:
+        places = facet_places(heliostat, store.get_plant(session).origin, len(arrays["z"]))
+    bound = runtime.settings.figure_scales["heights"]
+    picture = partial(surface_picture, arrays["z"], bound=bound, places=places)
     return maps_answer(Maps(name, title, arrays, picture, row.arrays), media_type)
 
 
@@ -318,8 +321,9 @@ def list_surfaces(
 
 def _at(runtime: Runtime, name: str, moment: datetime | None, media_type: str) -> Response:
     with runtime.database.reading() as session:
-        row = store.get_surface_at(session, store.get_heliostat(session, name), moment)
-    return surface_answer(name, row, media_type, runtime.settings)
+        heliostat = store.get_heliostat(session, name)
+        row = store.get_surface_at(session, heliostat, moment)
+    return surface_answer(runtime, heliostat, row, media_type)
 
 
 @router.get(
@@ -396,8 +400,9 @@ def get_surface(
 ) -> Response:
     """Get a version of the surface."""
     with runtime.database.reading() as session:
-        row = store.get_surface(session, store.get_heliostat(session, name), version)
-    return surface_answer(name, row, media_type, runtime.settings)
+        heliostat = store.get_heliostat(session, name)
+        row = store.get_surface(session, heliostat, version)
+    return surface_answer(runtime, heliostat, row, media_type)
 
 
 @router.post("/{version}/acknowledge", responses=problems(404, 409), dependencies=[OPERATE])

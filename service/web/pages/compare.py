@@ -17,7 +17,7 @@ from pydantic import model_validator
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
-from model.errors import ModelError
+from model.errors import InvalidInputError, ModelError
 from model.metrics import flux_accuracy
 from service import store
 from service.base.arrays import unpack
@@ -25,11 +25,13 @@ from service.base.errors import NotFoundError
 from service.base.fields import AZIMUTH, ELEVATION, Model, Name, Sun, Version, drop_empty_fields
 from service.drawing import charts
 from service.drawing.charts import HeatMap, Timeline, Value
+from service.drawing.facets import FacetPlaces
 from service.store.listing import Period
 from service.store.pointing import mounts
 from service.store.tables import HeliostatRow, MountRow, PlantRow, SurfaceRow, TargetRow
 from service.twin.alerts.field_overview import SurfaceErrors, field_totals, surface_errors
 from service.twin.forecasts.heliostat_forecast import ForecastRequest, trace_request
+from service.twin.heliostats.facets import facet_places
 from service.twin.runtime.operations import Forecast
 from service.twin.runtime.runtime import Runtime
 from service.twin.surfaces.accuracy import Comparison, ComparisonResult
@@ -86,6 +88,7 @@ class Side:
     versions: Sequence[SurfaceRow]
     mounts: Sequence[MountRow]
     z: charts.Array
+    places: FacetPlaces
 
     @property
     def name(self) -> str:
@@ -100,7 +103,14 @@ class Side:
     @property
     def shape(self) -> SurfaceErrors:
         """Deviation of the surface from the ideal mirror, by kind."""
-        return surface_errors(self.z, self.size)
+        return surface_errors(self.z, self.places.sizes)
+
+    def shape_of(self, surface: SurfaceRow) -> SurfaceErrors:
+        """The same of one of its versions, which may have other facets."""
+        z = unpack(surface.arrays)["z"]
+        is_same = len(z) == len(self.z)
+        places = self.places if is_same else FacetPlaces.in_rows(len(z), self.size)
+        return surface_errors(z, places.sizes)
 
     @property
     def uncertainty_mm(self) -> float | None:
@@ -125,9 +135,18 @@ def _side(session: Session, name: str, version: int | None) -> Side:
     else:
         surface = store.get_surface(session, heliostat, version)
     made = mounts.list_mounts(session, heliostat, _MAX_MOUNTS)
-    return Side(
-        heliostat, surface, versions[::-1], made, unpack(surface.arrays)["z"].astype(np.float64)
-    )
+    z = unpack(surface.arrays)["z"].astype(np.float64)
+    places = facet_places(heliostat, store.get_plant(session).origin, len(z))
+    return Side(heliostat, surface, versions[::-1], made, z, places)
+
+
+def _require_as_many_facets(first: Side, second: Side) -> None:
+    """Raise InvalidInputError if the numbers of facets differ."""
+    if len(first.z) != len(second.z):
+        raise InvalidInputError(
+            f"other: {first.name} has {len(first.z)} facets, and {second.name} has"
+            f" {len(second.z)}; choose mirrors with as many facets"
+        )
 
 
 def _sides(session: Session, query: CompareQuery) -> tuple[Side, Side]:
@@ -165,14 +184,14 @@ class Trio:
 
 def _surfaces(first: Side, second: Side, ends: Mapping[str, float]) -> Trio:
     one, other = (
-        charts.surface_map(f"Deviation of {side.name}", side.z, side.size, ends["heights"])
+        charts.surface_map(f"Deviation of {side.name}", side.z, side.places, ends["heights"])
         for side in (first, second)
     )
     title = f"{second.name} minus {first.name}"
     return Trio(
         one,
         other,
-        charts.surface_map(title, second.z - first.z, second.size, ends["height_change"]),
+        charts.surface_map(title, second.z - first.z, second.places, ends["height_change"]),
     )
 
 
@@ -272,7 +291,7 @@ def _timelines(
         side.name: _judged(one.comparisons) for side, one in zip(sides, compared, strict=True)
     }
     shapes = {
-        name: [(row, surface_errors(unpack(row.arrays)["z"], side.size)) for row in side.versions]
+        name: [(row, side.shape_of(row)) for row in side.versions]
         for name, side in heliostats.items()
     }
 
@@ -345,6 +364,8 @@ def _read(
         targets = session.scalars(select(TargetRow.name).order_by(TargetRow.name)).all()
         azimuth, elevation = sun_now(session.get(PlantRow, 1))
         sides = None if query.heliostat is None else _sides(session, query)
+        if sides is not None:
+            _require_as_many_facets(*sides)
         shown = [
             cache.read(session, side.heliostat, side.surface, query.span) for side in sides or ()
         ]

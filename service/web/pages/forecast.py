@@ -41,6 +41,7 @@ from service.twin.forecasts.heliostat_forecast import (
     make_forecast,
     position_of,
 )
+from service.twin.forecasts.watts import dni_of
 from service.twin.runtime.runtime import Runtime
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,
@@ -84,6 +85,7 @@ class ForecastForm(Model):
     elevation_deg: Annotated[float, ELEVATION] | None = None
     moment: FormMoment | None = None
     surface: Literal["current", "ideal"] = "current"
+    sunlight: Literal["given", "clear_sky"] = "given"
     dni_w_m2: float = Field(default=1000.0, gt=0, le=2000)
 
     @model_validator(mode="after")
@@ -98,6 +100,11 @@ class ForecastForm(Model):
         if self.sun_by == "position" and (self.azimuth_deg is None or self.elevation_deg is None):
             raise ValueError("azimuth_deg, elevation_deg: give the position of the sun")
         return self
+
+    @property
+    def given_dni(self) -> float | Literal["clear_sky"]:
+        """The irradiance [W/m2], or that it is that of a clear sky."""
+        return "clear_sky" if self.sunlight == "clear_sky" else self.dni_w_m2
 
     @property
     def sun(self) -> Sun | SunAt:
@@ -122,7 +129,9 @@ def _choices(session: Session) -> dict[str, object]:
     return {
         "heliostats": store.list_heliostats(session, _OFFERED),
         "targets": session.scalars(select(TargetRow.name).order_by(TargetRow.name)).all(),
-        "receivers": session.scalars(select(ReceiverRow.name).order_by(ReceiverRow.name)).all(),
+        "receivers": session.execute(
+            select(ReceiverRow.name, ReceiverRow.kind).order_by(ReceiverRow.name)
+        ).all(),
         "recent": _recent(session),
     }
 
@@ -208,7 +217,8 @@ def _filled_as(session: Session, job: JobRow) -> ForecastForm:
         azimuth_deg=round(sun.azimuth_deg, 3) % 360,
         elevation_deg=round(sun.elevation_deg, 3),
         surface=asked.surface,
-        dni_w_m2=asked.dni_w_m2,
+        sunlight="clear_sky" if asked.dni_w_m2 == "clear_sky" else "given",
+        dni_w_m2=1000.0 if asked.dni_w_m2 == "clear_sky" else asked.dni_w_m2,
         sun_by="position" if moment is None else "time",
         moment=moment,
     )
@@ -232,7 +242,7 @@ def _ask_for_all(runtime: Runtime, form: ForecastForm, identity: Identity) -> st
     It takes longer than a request may.
     """
     payload = FleetForecastIn(
-        target=form.target, sun=form.sun, surface=form.surface, dni_w_m2=form.dni_w_m2
+        target=form.target, sun=form.sun, surface=form.surface, dni_w_m2=form.given_dni
     )
     row = enqueue(runtime, field_forecasts.KIND, payload, identity.name)
     return f"/jobs/{row.id}"
@@ -247,7 +257,7 @@ def post_forecast_form(
 ) -> Response:
     """Compute and store a forecast, and go to its page."""
     with runtime.database.reading() as session:
-        sun = position_of(session, form.sun)
+        sun, altitude = position_of(session, form.sun), store.get_plant(session).altitude_m
     if form.heliostat is None:
         return leave_for(request, _ask_for_all(runtime, form, identity))
     asked = ForecastRequest(
@@ -256,7 +266,7 @@ def post_forecast_form(
         sun=sun,
         sun_at=form.moment if form.sun_by == "time" else None,
         surface=form.surface,
-        dni_w_m2=form.dni_w_m2,
+        dni_w_m2=dni_of(form.given_dni, sun.elevation_deg, altitude),
     )
     return go_to(f"/forecasts/{make_forecast(runtime, asked).id}")
 

@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
@@ -15,11 +16,13 @@ from numpy.typing import NDArray
 from sqlalchemy import select
 from sqlalchemy.orm import Session, undefer
 
+from model.plant import inside_outline
 from service import store
 from service.base.arrays import unpack
 from service.base.fields import Version
 from service.drawing import charts
 from service.drawing.charts import HeatMap, History, Scale
+from service.drawing.facets import FacetPlaces
 from service.drawing.pictures import comparison_picture, mirror_heights
 from service.store.photographs.groups import (
     PhotographFilter,
@@ -36,6 +39,7 @@ from service.twin.alerts.field_overview import (
     field_totals,
     read_summaries,
 )
+from service.twin.heliostats.facets import facet_places
 from service.twin.pointing.calibration import CalibrationSlot, best_slot
 from service.twin.surfaces.accuracy import Comparison, ComparisonCache, ComparisonResult, rank_of
 from service.web.auth.dependencies import READ, FieldCacheDep, NamePath, RenderSlotDep, RuntimeDep
@@ -51,6 +55,8 @@ MAX_PHOTOGRAPHS = 60
 _MAX_DECISIONS = 5
 # Points along each side of a facet in the 3D view.
 _SPACE_SAMPLES = 14
+# The least, and the most on all facets together, which a browser can turn.
+_LEAST_SPACE, _MOST_SPACE = 4, 8000
 _OF_PEAK = "of the measured peak"
 # Size of the window of measured fluxes [m].
 _WINDOW = (4.0, 4.0)
@@ -112,7 +118,10 @@ def _rms_mm(heights: NDArray[Any]) -> float:
 def versions(rows: Sequence[SurfaceRow]) -> list[Revision]:
     """Surfaces, newest first, each with its change from the next older one [mm RMS]."""
     heights = [unpack(row.arrays)["z"] for row in rows]
-    changes = [_rms_mm(new - old) for new, old in itertools.pairwise(heights)]
+    changes = [
+        _rms_mm(new - old) if new.shape == old.shape else None
+        for new, old in itertools.pairwise(heights)
+    ]
     return [
         Revision(row, field_totals(row.arrays), change)
         for row, change in zip(rows, [*changes, None], strict=False)
@@ -133,16 +142,31 @@ def _histories(listed: Sequence[Revision]) -> list[History]:
     )
 
 
-def space_view(z: NDArray[Any], size: tuple[float, float], bound: float) -> str:
+def space_view(z: NDArray[Any], places: FacetPlaces, bound: float) -> str:
     """JSON for `surface3d.js`.
 
-    It holds the heights of each facet on a regular grid [mm], and the size of the mirror [m]. Its
-    colours end at ``bound`` [mm], as on the map.
+    It holds the place of each facet [m] and its heights on a regular grid [mm], with null beside
+    its outline. The colours end at ``bound`` [mm], as on the map.
     """
-    heights = mirror_heights(z, _SPACE_SAMPLES)
+    samples = max(_LEAST_SPACE, min(_SPACE_SAMPLES, math.isqrt(_MOST_SPACE // len(z))))
+    heights, low = mirror_heights(z, samples), places.box[0]
+    side = np.linspace(-1, 1, samples)
+    u, v = np.meshgrid(side, side, indexing="ij")
+    facets = []
+    for facet, outline in enumerate(places.outlines):
+        # A sample on the edge is inside.
+        inside = inside_outline(0.999 * u, 0.999 * v, outline)
+        known = [
+            [round(height, 4) if kept else None for height, kept in zip(*row, strict=True)]
+            for row in zip(heights[facet].tolist(), inside.tolist(), strict=True)
+        ]
+        vectors = np.round([places.centers[facet], *places.halves[facet]], 5).tolist()
+        facets.append(dict(zip(("center", "x", "y"), vectors, strict=True)) | {"heights": known})
+    size = np.round(places.box[1] - low, 5).tolist()
+    middle = np.round(places.box.mean(axis=0), 5).tolist()
     colours = Scale("RdBu_r", 0, 1, "").names(np.linspace(0, 1, 33).tolist())
     return json.dumps(
-        {"size": size, "bound": bound, "facets": np.round(heights, 4).tolist(), "colours": colours}
+        {"size": size, "middle": middle, "bound": bound, "facets": facets, "colours": colours}
     )
 
 
@@ -199,19 +223,23 @@ _UNDER_WAY = ComparisonResult(
 
 
 def _surface_context(
-    surface: SurfaceRow, size: tuple[float, float], ends: Mapping[str, float]
+    heliostat: HeliostatRow,
+    surface: SurfaceRow,
+    origin: tuple[float, float, float],
+    ends: Mapping[str, float],
 ) -> dict[str, object]:
     arrays = unpack(surface.arrays)
+    places = facet_places(heliostat, origin, len(arrays["z"]))
     shown = field_totals(surface.arrays)
     title = f"Surface {surface.version}: deviation from the ideal mirror, seen from the front"
-    deviation = charts.surface_map(title, arrays["z"], size, ends["heights"])
+    deviation = charts.surface_map(title, arrays["z"], places, ends["heights"])
     std = "Standard deviation of the surface"
-    uncertainty = charts.uncertainty_map(std, arrays["z_std"], size, ends["height_std"])
+    uncertainty = charts.uncertainty_map(std, arrays["z_std"], places, ends["height_std"])
     return {
         "figures": shown,
         "surface_map": deviation,
         "uncertainty_map": uncertainty if shown.uncertainty_mm else None,
-        "space": space_view(arrays["z"], size, ends["heights"]),
+        "space": space_view(arrays["z"], places, ends["heights"]),
     }
 
 
@@ -239,6 +267,7 @@ class _HeliostatData:
     """Data of the page, read before the slot for drawing is taken."""
 
     row: HeliostatRow
+    origin: tuple[float, float, float]
     today: SurfaceRow | None
     surface: SurfaceRow | None
     surfaces: list[SurfaceRow]
@@ -265,7 +294,7 @@ def _read(
     It waits for comparisons that are computed in the background.
     """
     with runtime.database.reading() as session:
-        row = store.get_heliostat(session, name)
+        row, origin = store.get_heliostat(session, name), store.get_plant(session).origin
         today = store.find_surface_at(session, row)
         surface = today if version is None else store.get_surface(session, row, version)
         surfaces = newest_surfaces(session, row)
@@ -282,6 +311,7 @@ def _read(
     best = None if line.pointing is None else best_slot(runtime, name)
     return _HeliostatData(
         row,
+        origin,
         today,
         surface,
         surfaces,
@@ -334,7 +364,7 @@ def get_heliostat_page(
         best=read.best,
         pointing=None if read.mount is None else _mount_context(read.mount),
         **(
-            _surface_context(read.surface, read.row.size_m, ends)
+            _surface_context(read.row, read.surface, read.origin, ends)
             if read.surface is not None
             else {}
         ),

@@ -2,12 +2,14 @@
 
 from collections.abc import Mapping
 from datetime import datetime
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Form, Path, Query, Request, Response
 from fastapi.responses import HTMLResponse
 
+from model.fleet import LOSSES
 from service.base.arrays import unpack
+from service.base.errors import NotFoundError
 from service.base.fields import Method, Model, Name, Version
 from service.drawing import charts
 from service.drawing.charts import HeatMap
@@ -19,6 +21,7 @@ from service.jobs.kinds.predictions import PredictionsIn
 from service.store.job_tables import JobRow
 from service.store.jobs import queue
 from service.store.sizes import sizes
+from service.twin.forecasts.watts import loss_chain
 from service.web.auth.dependencies import (
     OPERATE,
     READ,
@@ -27,6 +30,7 @@ from service.web.auth.dependencies import (
     KindsDep,
     RuntimeDep,
 )
+from service.web.responses.csv_tables import sheet_answer
 from service.web.responses.pages import go_to, render
 
 router = APIRouter(include_in_schema=False)
@@ -126,12 +130,41 @@ def _asked(payload: Mapping[str, object]) -> dict[str, str]:
     )
 
 
+_FACTORS = ("name", *LOSSES, "optical_efficiency", "intercepted_w")
+
+By = Annotated[
+    Literal[_FACTORS],  # type: ignore[valid-type]
+    Query(description="What the heliostats of a field forecast are sorted by."),
+]
+
+
+@router.get("/jobs/{number}/heliostats.csv", dependencies=[READ])
+def get_job_heliostats_table(number: Number, runtime: RuntimeDep, kinds: KindsDep) -> Response:
+    """What becomes of the light of each heliostat of a field forecast."""
+    with runtime.database.reading() as session:
+        result = result_of(kinds, session, queue.get_job(session, number)) or {}
+    if "by_heliostat" not in result:
+        raise NotFoundError(f"job {number} has no losses by heliostat")
+    lines = result["by_heliostat"].items()
+    columns = _FACTORS[1:]
+    rows = ([name, *(one[column] for column in columns)] for name, one in lines)
+    return sheet_answer(f"job-{number}-heliostats", ("heliostat", *columns), rows)
+
+
+def _mirrors(result: Mapping[str, Any], by: str) -> list[tuple[str, dict[str, float]]]:
+    """The first heliostats of a field forecast, sorted by a factor or their name."""
+    lines = list(result.get("by_heliostat", {}).items())
+    lines.sort(key=(lambda line: line[0]) if by == "name" else (lambda line: line[1][by]))
+    return lines[:_SHOWN]
+
+
 @router.get("/jobs/{number}", dependencies=[READ, RENDER_SLOT])
 def get_job_page(
-    number: Number, request: Request, runtime: RuntimeDep, kinds: KindsDep
+    number: Number, request: Request, runtime: RuntimeDep, kinds: KindsDep, by: By = "name"
 ) -> HTMLResponse:
     """A job, which the page follows until it ends.
 
+    The heliostats of a field forecast are sorted ``by`` their name or a factor, the least first.
     While it runs, each update reads only what changes, but neither the payload nor the result.
     """
     with runtime.database.reading() as session:
@@ -154,6 +187,11 @@ def get_job_page(
         asked=asked,
         flux=flux,
         has_changed=any(result.values()),
+        chain=loss_chain(result["field"]) if result.get("field") else [],
+        mirrors=_mirrors(result, by),
+        n_mirrors=len(result.get("by_heliostat", ())),
+        factors=_FACTORS,
+        by=by,
         light=result if row.kind == "forecasts" and "peak_w_m2" in result else None,
         target=row.payload.get("target") if asked else None,
         facts={name: value for name, value in result.items() if _plain(value)},

@@ -5,7 +5,7 @@ A plan compares the twin with ideal mirrors, and with the flux that the receiver
 
 from dataclasses import dataclass
 from datetime import datetime, timedelta
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from fastapi import APIRouter, Form, Path, Query, Request, Response
@@ -28,6 +28,8 @@ from service.jobs.kinds.plans import PlanIn, PlanName, ReceiverLoad, map_name
 from service.store.columns import now
 from service.store.job_tables import JobRow
 from service.store.jobs import queue
+from service.twin.forecasts.watts import LossStage
+from service.twin.forecasts.watts import loss_chain as chain
 from service.twin.runtime.runtime import Runtime
 from service.web.auth.dependencies import OPERATE, READ, RENDER_SLOT, IdentityDep, RuntimeDep
 from service.web.responses.pages import go_to, leave_for, render
@@ -51,6 +53,7 @@ class PlanForm(Model):
     step_minutes: float = Field(default=60.0, ge=1, le=1440)
     heliostats: Lines = ""
     allowed_kw_m2: float | None = Field(default=None, gt=0, le=1e5)
+    sunlight: Literal["given", "clear_sky"] = "given"
     dni_w_m2: float = Field(default=1000.0, gt=0, le=2000)
 
     def chosen(self) -> dict[str, tuple[float, float] | None]:
@@ -89,7 +92,7 @@ class PlanForm(Model):
                 heliostats=list(chosen) or None,
                 aim_offsets_m={name: aim for name, aim in chosen.items() if aim is not None},
                 allowed_w_m2=None if self.allowed_kw_m2 is None else 1e3 * self.allowed_kw_m2,
-                dni_w_m2=self.dni_w_m2,
+                dni_w_m2="clear_sky" if self.sunlight == "clear_sky" else self.dni_w_m2,
             )
         except ValidationError as error:
             raise RequestValidationError(error.errors()) from error
@@ -112,8 +115,11 @@ def _filled(asked: PlanIn) -> PlanForm:
     lines = [aims.get(name, name) for name in asked.heliostats or ()]
     given = {
         name: getattr(asked, name)
-        for name in ("name", "target", "first_at", "last_at", "step_minutes", "dni_w_m2")
+        for name in ("name", "target", "first_at", "last_at", "step_minutes")
     }
+    is_clear = asked.dni_w_m2 == "clear_sky"
+    given |= {"sunlight": "clear_sky" if is_clear else "given"}
+    given |= {"dni_w_m2": 1000.0 if is_clear else asked.dni_w_m2}
     allowed = None if asked.allowed_w_m2 is None else asked.allowed_w_m2 / 1e3
     return PlanForm.model_construct(**given, heliostats="\n".join(lines), allowed_kw_m2=allowed)
 
@@ -128,8 +134,15 @@ class Step:
 
     at: datetime
     sun: dict[str, float]
+    dni_w_m2: float | None
     twin: ReceiverLoad
     ideal: ReceiverLoad
+
+    @property
+    def chains(self) -> list[tuple[LossStage, LossStage]]:
+        """Losses of the twin and of ideal mirrors, stage by stage; older plans have none."""
+        twin, ideal = self.twin.get("field"), self.ideal.get("field")
+        return [] if not twin or not ideal else [*zip(chain(twin), chain(ideal), strict=True)]
 
 
 @dataclass(frozen=True)
@@ -214,7 +227,13 @@ def _day(session: Session, row: JobRow, at: int | None) -> Day:
     """A finished plan with the maps of one time. Other maps are not loaded."""
     assert row.result is not None
     steps = [
-        Step(datetime.fromisoformat(step["at"]), step["sun"], step["twin"], step["ideal"])
+        Step(
+            datetime.fromisoformat(step["at"]),
+            step["sun"],
+            step.get("dni_w_m2"),
+            step["twin"],
+            step["ideal"],
+        )
         for step in row.result["steps"]
     ]
     hottest = max(range(len(steps)), key=lambda index: steps[index].twin["peak_w_m2"])

@@ -1,18 +1,22 @@
 """Pages of the plant: targets, receivers and model, and settings, keys and audit trail."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Annotated
 
+import numpy as np
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import HTMLResponse
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
+from model.receivers import Cavity
 from service import store
 from service.base.fields import Version
 from service.drawing.templates import figure
+from service.sources.documents import describe_sun
 from service.store import audit, keys
-from service.store.tables import MeasurementRow, PlantRow, TargetRow
+from service.store.tables import MeasurementRow, PlantRow, ReceiverRow, TargetRow
 from service.twin.plant import model_versions
 from service.web.auth.dependencies import ADMIN, READ, RuntimeDep
 from service.web.responses.pages import render
@@ -32,6 +36,30 @@ def _targets(session: Session) -> Sequence[tuple[TargetRow, int]]:
     return [(row, count) for row, count in session.execute(counted.order_by(TargetRow.name))]
 
 
+@dataclass(frozen=True)
+class ReceiverLine:
+    """A receiver in the table: its row, and sizes [m, m2] of the surface and of a cavity's
+    opening.
+    """
+
+    row: ReceiverRow
+    width: float
+    panels: int | None
+    opening: float | None
+
+
+def _receiver_line(row: ReceiverRow) -> ReceiverLine:
+    receiver = store.stored_receiver(row)
+    opening = None
+    if isinstance(receiver, Cavity):
+        corners = receiver.aperture
+        parts = np.cross(corners, np.roll(corners, -1, axis=0))
+        opening = float(np.linalg.norm(parts.sum(axis=0)) / 2)
+    return ReceiverLine(
+        row, receiver.width, None if row.panels is None else len(row.panels), opening
+    )
+
+
 def _place(metres: Sequence[float]) -> list[str]:
     """East, north and up as parts of a table's cell."""
     east, north, up = (figure(value, 2) for value in metres)
@@ -43,9 +71,10 @@ def get_plant_page(request: Request, runtime: RuntimeDep) -> HTMLResponse:
     """Targets and receivers on the tower, and the optical model."""
     with runtime.database.reading() as session:
         plant = session.get(PlantRow, 1)
-        targets, receivers = _targets(session), store.list_receivers(session)
+        targets = _targets(session)
+        receivers = [_receiver_line(row) for row in store.list_receivers(session)]
         model = None if plant is None else model_versions.get_model(session)
-    shape = None if model is None else model.optics.sun_shape
+    sun = None if model is None else describe_sun(model.optics.sun_shape)
     return render(
         request,
         "plant.html",
@@ -54,7 +83,7 @@ def get_plant_page(request: Request, runtime: RuntimeDep) -> HTMLResponse:
         receivers=receivers,
         model=model,
         place=_place,
-        sun_shape=None if shape is None else (type(shape).__name__, vars(shape)),
+        sun=sun,
     )
 
 

@@ -7,9 +7,12 @@ import numpy as np
 import pytest
 
 from model.surface import control_points
+from service.base.receivers import receiver_to_json
 from service.sources.folder import read_folder
+from service.sources.heliostat_document import heliostat_to_json
+from service.sources.plant_file import read_plant
 from tests.service.command import ends, heliotwin, heliotwin_on
-from tests.service.sources.plant_files import write_plant
+from tests.service.sources.plant_files import RICH, write_plant
 from tests.service.sources.plant_folder import LAYOUT, write_plant_folder
 
 
@@ -24,9 +27,8 @@ def test_folder_is_read_as_its_file_describes_it(folder: Path):
     assert [one.identifier for one in read.measurements("A1")] == ["1", "2", "3", "4", "5"]
     first = read.measurements("A1")[0]
     assert (first.azimuth_deg, first.elevation_deg, first.taken_at) == (140.0, 40.0, None)
-    assert read.skipped == {
-        "receiver board": "the store keeps cylinders only; heliotwin field traces board"
-    }
+    assert read.skipped == {}
+    assert list(read.plant.receivers) == ["main", "board"]
 
 
 def test_flux_and_forecast_work_on_it(folder: Path, tmp_path: Path):
@@ -76,6 +78,56 @@ def test_store_gives_back_what_was_imported(folder: Path, tmp_path: Path):
         assert [f.outline for f in exported.facets] == [f.outline for f in heliostat.facets]
         spots = [[one.spot for one in read.measurements(name)] for read in (before, after)]
         np.testing.assert_allclose(spots[0], spots[1], atol=1e-3)
+
+
+def test_exported_plant_file_equals_the_imported_one(tmp_path: Path):
+    """Receivers of every kind, tower, sun, air and types, also after a second store."""
+    folder = write_plant_folder(tmp_path / "plant", RICH)
+    given, place = read_plant(folder / "plant.yaml"), folder
+    for number in ("1", "2"):
+        done = heliotwin_on(tmp_path / number, "import", place)
+        assert done.returncode == 0, done.stderr
+        place = tmp_path / f"exported-{number}"
+        done = heliotwin_on(tmp_path / number, "export", place)
+        assert done.returncode == 0, done.stderr
+        exported = read_plant(place / "plant.yaml")
+        assert set(exported.receivers) == set(given.receivers) == {"main", "board", "cave", "walls"}
+        for name, receiver in given.receivers.items():
+            _is_same(receiver_to_json(exported.receivers[name]), receiver_to_json(receiver))
+        for name, target in given.plant.targets.items():
+            there = receiver_to_json(exported.plant.targets[name])
+            _is_same(there, receiver_to_json(target), 1e-8)
+        assert exported.tower == given.tower
+        assert exported.optics.attenuation == given.optics.attenuation
+        assert vars(exported.optics.sun_shape) == vars(given.optics.sun_shape)
+        assert (exported.time_zone, exported.plant.name) == (given.time_zone, given.plant.name)
+        assert exported.plant.origin.tolist() == given.plant.origin.tolist()
+        assert list(exported.types) == list(given.types)
+        assert list(exported.plant.heliostats) == ["A1", "B1"]
+        for name, heliostat in exported.plant.heliostats.items():
+            other = given.plant.heliostats[name]
+            np.testing.assert_allclose(control_points(heliostat), control_points(other), atol=1e-9)
+            assert heliostat.optics == other.optics
+            assert exported.receiver_of[name] == given.receiver_of[name]
+            assert heliostat_to_json(heliostat)["mount"] == heliostat_to_json(other)["mount"]
+
+
+def _is_same(found: object, expected: object, atol: float = 1e-12) -> None:
+    """The same JSON, with numbers to ``atol``."""
+    if isinstance(expected, dict):
+        assert isinstance(found, dict)
+        assert found.keys() == expected.keys()
+        for key, value in expected.items():
+            _is_same(found[key], value, atol)
+    elif isinstance(expected, list):
+        assert isinstance(found, list)
+        assert len(found) == len(expected)
+        for one, other in zip(found, expected, strict=True):
+            _is_same(one, other, atol)
+    elif isinstance(expected, float):
+        assert found == pytest.approx(expected, abs=atol)
+    else:
+        assert found == expected
 
 
 @pytest.mark.parametrize(

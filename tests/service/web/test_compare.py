@@ -123,7 +123,7 @@ def test_bad_links_are_refused_by_name(pages: TestClient, query: str):
 def test_tilted_facets_are_canting_and_no_waviness():
     """One mrad about each axis of every facet of a 4 m x 2 m mirror."""
     x, y = np.meshgrid(2 * (greville(8) - 0.5), 1 * (greville(8) - 0.5), indexing="ij")
-    shape = surface_errors(np.stack([1e-3 * (x + y)] * 4), (4.0, 2.0))
+    shape = surface_errors(np.stack([1e-3 * (x + y)] * 4), np.array([[2.0, 1.0]] * 4))
     assert shape.canting_mrad == pytest.approx(2**0.5, rel=1e-9)
     assert shape.waviness_mm == pytest.approx(0.0, abs=1e-9)
 

@@ -65,6 +65,8 @@ WITHOUT_UNIT = {
     # Steps of drives.
     "motor_position",
     # Planes and receivers [m], and corners [px] or in WGS84.
+    "absorptance",
+    "aperture",
     "center",
     "corners",
     "height",

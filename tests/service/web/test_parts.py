@@ -192,8 +192,9 @@ def test_plan_as_tables_maps_and_timelines(app: FastAPI, two_heliostats: TestCli
         "npz": 3,
         "png": 6,
         "csv": 3,
+        "losses": 1,
         "series": 1,
         "plans": 1,
-    }  # three maps, three timelines, two tables
+    }  # three maps, three timelines, three tables
     for link in links:
         check(two_heliostats.get(link))

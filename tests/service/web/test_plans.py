@@ -12,7 +12,7 @@ from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from sqlalchemy import select, update
 
-from model.fleet import FleetFlux
+from model.fleet import FleetFlux, Losses
 from model.plant import Cylinder, TargetPlane
 from service.jobs.kinds.plans import PlanIn, aim_on, load_of
 from service.store.columns import now
@@ -291,16 +291,21 @@ def test_load_is_what_lands_and_what_is_too_much():
     reflect.
     """
     plane = TargetPlane("wall", np.zeros(3), np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), 2.0, 2.0)
-    load = load_of(
-        FleetFlux(np.array([[3.0, 1.0], [0.0, 0.0]]), power=8.0, heliostats=1), plane, 2.0
-    )
+    losses = {"AA39": Losses(10.0, 0.8, 1.0, 1.0, 1.0, 1.0, 0.5, 0.9)}
+    image = np.array([[3.0, 1.0], [0.0, 0.0]])
+    load = load_of(FleetFlux(image, power=8.0, heliostats=1, losses=losses), plane, 2.0, 1.0)
     assert (load["power_w"], load["intercept"], load["spillage"], load["exceeded_m2"]) == (
         4.0,
         0.5,
         0.5,
         1.0,
     )
-    assert load_of(FleetFlux(np.zeros((2, 2))), plane, None)["intercept"] is None
+    field = load["field"]
+    assert field is not None
+    assert (field["incident_w"], field["intercepted_w"]) == (10.0, 4.0)
+    assert (field["optical_efficiency"], field["absorbed_w"]) == pytest.approx((0.36, 3.6))
+    dark = load_of(FleetFlux(np.zeros((2, 2))), plane, None, 1.0)
+    assert (dark["intercept"], dark["field"]) == (None, None)
 
 
 def aged(app: FastAPI) -> None:

@@ -7,6 +7,8 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
+from tests.page import Page
+
 PLANE = {"center": [0, -3, 36], "normal": [0, 2, 0], "width": 8.6, "height": 7.2}
 
 
@@ -25,6 +27,8 @@ def test_plant_brings_its_targets(client: TestClient, tower: dict[str, Any]):
         "name": "WRI1030197",
         "origin_wgs84": tower["power_plant_properties"]["coordinates"],
         "declared": None,
+        "sun_shape": {"shape": "buie", "chi": 0.02, "csr": pytest.approx(0.0058, abs=1e-4)},
+        "tower_size": None,
     }
     listed = client.get("/v1/targets").json()
     assert [target["name"] for target in listed["items"]] == ["lower", "upper"]
@@ -33,6 +37,24 @@ def test_plant_brings_its_targets(client: TestClient, tower: dict[str, Any]):
     assert lower["normal"] == pytest.approx([0, 1, 0], abs=1e-3)
     assert lower["corners"]["upper_left"] == tower["lower"]["coordinates"]["upper_left"]
     assert client.put("/v1/plant", json=tower).status_code == 200
+
+
+def test_sun_is_declared_by_its_true_circumsolar_share(client: TestClient, tower: dict[str, Any]):
+    """And stated by both numbers, over REST and on its page."""
+    sun = {"shape": "buie", "csr": 0.05}
+    answer = client.put("/v1/plant", json=tower | {"declared": {"sun": sun}})
+    assert answer.status_code == 200, answer.text
+    found = answer.json()["sun_shape"]
+    assert (found["shape"], found["csr"]) == ("buie", pytest.approx(0.05, abs=1e-4))
+    assert found["chi"] != found["csr"]
+    words = Page(client.get("/plant", headers={"Accept": "text/html"}).text).words
+    assert "circumsolar share 5.0" in words
+    wrong = {"declared": {"sun": sun | {"chi": 0.02}}}
+    assert client.put("/v1/plant", json=tower | wrong).status_code == 422
+    flat = {"declared": {"sun": {"shape": "pillbox", "half_angle_mrad": 4.65}}}
+    assert client.put("/v1/plant", json=tower | flat).json()["sun_shape"] == flat["declared"]["sun"]
+    words = Page(client.get("/plant", headers={"Accept": "text/html"}).text).words
+    assert "half angle mrad 4.65" in words
 
 
 def test_plant_does_not_move_under_its_heliostats(client: TestClient, tower: dict[str, Any]):

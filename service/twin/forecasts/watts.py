@@ -1,0 +1,127 @@
+"""What becomes of each watt of a field's light, by the names of ``field.json``."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, TypedDict
+
+import numpy as np
+from pydantic import Discriminator, Field, Tag
+
+from model.fleet import LOSSES, FleetFlux, Losses, field_losses
+from service.base.fields import Irradiance
+
+
+def _way_to_give(value: Any) -> str:
+    return "(word)" if isinstance(value, str) else "(number)"
+
+
+Sunlight = Annotated[
+    Annotated[Irradiance, Tag("(number)")] | Annotated[Literal["clear_sky"], Tag("(word)")],
+    Discriminator(_way_to_give),
+    Field(
+        description=(
+            "Direct normal irradiance [W/m2], or `clear_sky` for that of a clear sky at the plant's"
+            " altitude under this sun."
+        )
+    ),
+]
+"""The light of the sun, given or that of a clear sky."""
+
+
+def clear_sky_dni(elevation_deg: float, altitude_m: float) -> float:
+    """Direct normal irradiance [W/m2] of a clear sky.
+
+    Source: Ineichen 2008, *A broadband simplified version of the Solis clear sky model*, as pvlib
+    has it, with its default aerosol and water.
+    """
+    from pvlib import atmosphere, clearsky
+
+    pressure = atmosphere.alt2pres(altitude_m)
+    sky = clearsky.simplified_solis(np.array([elevation_deg]), pressure=pressure)
+    return float(sky["dni"][0])
+
+
+def dni_of(
+    sunlight: float | Literal["clear_sky"], elevation_deg: float, altitude_m: float
+) -> float:
+    """The irradiance [W/m2] that is given, or that of a clear sky."""
+    if sunlight == "clear_sky":
+        return clear_sky_dni(elevation_deg, altitude_m)
+    return sunlight
+
+
+class FieldWatts(TypedDict):
+    """The light of a field [W, W/m2, m2]; the others are factors in the order of the light."""
+
+    heliostats: int
+    mirror_area_m2: float
+    incident_w: float
+    cosine: float
+    shading: float
+    blocking: float
+    reflectance: float
+    attenuation: float
+    intercept: float
+    absorptance: float
+    optical_efficiency: float
+    intercepted_w: float
+    absorbed_w: float
+    peak_w_m2: float
+
+
+def field_watts(flux: FleetFlux, dni_w_m2: float) -> FieldWatts:
+    """The light of heliostats together; at least one must have reached the receiver."""
+    whole = field_losses(flux.losses.values())
+    incident = dni_w_m2 * whole.area
+    return FieldWatts(
+        heliostats=flux.heliostats,
+        mirror_area_m2=whole.area,
+        incident_w=incident,
+        cosine=whole.cosine,
+        shading=whole.shading,
+        blocking=whole.blocking,
+        reflectance=whole.reflectance,
+        attenuation=whole.attenuation,
+        intercept=whole.intercept,
+        absorptance=whole.absorptance,
+        optical_efficiency=whole.efficiency,
+        intercepted_w=incident * whole.intercepted,
+        absorbed_w=incident * whole.efficiency,
+        peak_w_m2=float(flux.irradiance.max()),
+    )
+
+
+def heliostat_watts(losses: Mapping[str, Losses], dni_w_m2: float) -> dict[str, dict[str, float]]:
+    """Factors, optical efficiency and intercepted power [W] of each heliostat by name."""
+    return {
+        name: {
+            **{factor: getattr(one, factor) for factor in LOSSES},
+            "optical_efficiency": one.efficiency,
+            "intercepted_w": dni_w_m2 * one.area * one.intercepted,
+        }
+        for name, one in losses.items()
+    }
+
+
+@dataclass(frozen=True)
+class LossStage:
+    """A step of the light's way: its factor, what it takes and what is left [W].
+
+    ``share`` is what is left of the light on the mirrors' area.
+    """
+
+    name: str
+    factor: float | None
+    lost_w: float | None
+    left_w: float
+    share: float
+
+
+def loss_chain(field: Mapping[str, Any]) -> list[LossStage]:
+    """The chain of losses from the light on the mirrors' area to what is absorbed."""
+    incident = field["incident_w"]
+    stages, left = [LossStage("on the mirrors' area", None, None, incident, 1.0)], incident
+    for name in LOSSES:
+        before, left = left, left * field[name]
+        stages.append(LossStage(name, field[name], before - left, left, left / incident))
+    return stages

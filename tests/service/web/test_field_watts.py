@@ -1,0 +1,157 @@
+"""Watts of field forecasts and plans, on receivers of every kind of an imported plant."""
+
+import csv
+import io
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from fastapi.testclient import TestClient
+
+from model.fleet import LOSSES
+from service.cli.field import FieldRequest, trace_field
+from service.jobs.kinds import KINDS
+from service.jobs.worker import Worker
+from service.sources.folder import read_folder
+from service.sources.plant_file import PlantDescription, read_plant
+from service.twin.transfer.importing import import_folder
+from tests.page import Page
+from tests.service import real
+from tests.service.sources.plant_files import RICH
+from tests.service.sources.plant_folder import write_plant_folder
+
+pytestmark = [pytest.mark.slow]
+
+SUN = {"azimuth_deg": 150.0, "elevation_deg": 35.0}
+RECEIVERS = ("main", "board", "cave", "walls")
+HTML = {"Accept": "text/html"}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_plant_folder(tmp_path_factory.mktemp("rich"), RICH)
+
+
+@pytest.fixture(scope="module")
+def plant(folder: Path) -> PlantDescription:
+    return read_plant(folder / "plant.yaml")
+
+
+@pytest.fixture(scope="module")
+def rich(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
+    with real.client_on(tmp_path_factory.mktemp("store")) as client:
+        report = import_folder(real.runtime_of(client), read_folder(folder))
+        assert (report["counts"]["receivers new"], report["skipped"]) == (4, {})
+        yield client
+
+
+def done(client: TestClient, kind: str, body: dict[str, Any]) -> dict[str, Any]:
+    """The job of a request, when it has ended."""
+    answer = client.post(f"/v1/jobs/{kind}", json=body)
+    assert answer.status_code == 202, answer.text
+    path = answer.headers["Location"]
+    assert Worker(real.runtime_of(client), KINDS, "tester", threading.Event()).work()
+    job: dict[str, Any] = client.get(path).json()
+    assert job["state"] == "done", job["reason"]
+    return job
+
+
+@pytest.mark.parametrize("name", RECEIVERS)
+def test_field_forecast_has_the_watts_of_the_plant_file(
+    rich: TestClient, plant: PlantDescription, name: str
+):
+    """By the same names, and the same to a tenth of a percent, as ``heliotwin field``."""
+    body = {"target": name, "sun": SUN, "surface": "ideal", "resolution": [48, 96]}
+    result = done(rich, "forecasts", body | {"dni_w_m2": "clear_sky"})["result"]
+    receiver = plant.receivers[name]
+    aims = dict.fromkeys(("A1", "B1"), receiver.aim)
+    request = FieldRequest(name, 150.0, 35.0, aims=aims, resolution=(48, 96))
+    report = trace_field(plant, request, lambda _: None).report
+    assert result["dni_w_m2"] == pytest.approx(report["dni_w_m2"])
+    field = result["field"]
+    assert set(field) == set(report["field"])
+    for key, value in report["field"].items():
+        if key != "peak_w_m2":
+            assert field[key] == pytest.approx(value, rel=2e-3), key
+    product = np.prod([field[factor] for factor in LOSSES])
+    assert product == pytest.approx(field["optical_efficiency"], rel=1e-9)
+    assert field["intercepted_w"] == pytest.approx(result["power_w"], rel=2e-3)
+    assert field["absorptance"] == pytest.approx(receiver.absorptance)
+    assert field["shading"] <= 1
+    assert set(result["by_heliostat"]) == {"A1", "B1"}
+    parts = sum(one["intercepted_w"] for one in result["by_heliostat"].values())
+    assert parts == pytest.approx(field["intercepted_w"], rel=1e-9)
+
+
+def test_one_heliostat_is_forecast_on_receivers_of_every_kind(rich: TestClient):
+    for name in RECEIVERS:
+        body = {"heliostat": "A1", "target": name, "sun": SUN, "resolution": [32, 64]}
+        made = rich.post("/v1/forecasts", json=body)
+        assert made.status_code == 201, made.text
+        assert made.json()["power_w"] > 1e3
+        page = rich.get(f"/forecasts/{made.json()['id']}", headers=HTML)
+        assert page.status_code == 200
+        camera = rich.get(f"/v1/forecasts/{made.json()['id']}?view=camera")
+        assert camera.status_code == 409  # no camera looks at receivers
+
+
+def test_tower_shades_the_field(rich: TestClient):
+    """The sun in the south is low, and A1 is behind the tower."""
+    sun = {"azimuth_deg": 180.0, "elevation_deg": 30.0}
+    body = {"target": "main", "sun": sun, "heliostats": ["A1"], "resolution": 32}
+    shaded = done(rich, "forecasts", body)["result"]["field"]["shading"]
+    free = done(rich, "forecasts", body | {"neighbours": False})["result"]["field"]["shading"]
+    assert free == 1
+    assert shaded < 0.9
+
+
+def test_page_shows_the_chain_of_losses_and_each_heliostat(rich: TestClient):
+    job = done(rich, "forecasts", {"target": "cave", "sun": SUN, "resolution": 48})
+    number, field = job["id"], job["result"]["field"]
+    page = Page(rich.get(f"/jobs/{number}", headers=HTML).text)
+    for words in ("What becomes of the light", "cosine", "absorptance", "By heliostat"):
+        assert words in page.words
+    table = rich.get(f"/jobs/{number}?table=losses", headers=HTML)
+    lines = list(csv.DictReader(io.StringIO(table.text)))
+    assert [line["Stage"] for line in lines] == ["on the mirrors' area", *LOSSES]
+    assert float(lines[-1]["Left [kW]"]) == pytest.approx(field["absorbed_w"] / 1e3)
+    by_factor = job["result"]["by_heliostat"]
+    for factor in ("cosine", "intercept"):
+        sorted_page = rich.get(f"/jobs/{number}?by={factor}", headers=HTML).text
+        mirrors = sorted_page[sorted_page.index("mirrors-title") :]
+        first = min(by_factor, key=lambda name, factor=factor: by_factor[name][factor])
+        other = next(name for name in by_factor if name != first)
+        assert mirrors.index(f"/heliostats/{first}") < mirrors.index(f"/heliostats/{other}")
+    assert rich.get(f"/jobs/{number}?by=size", headers=HTML).status_code == 422
+    every = rich.get(f"/jobs/{number}/heliostats.csv")
+    rows = {row["heliostat"]: row for row in csv.DictReader(io.StringIO(every.text))}
+    assert set(rows) == {"A1", "B1"}
+    assert float(rows["A1"]["intercepted_w"]) == by_factor["A1"]["intercepted_w"]
+
+
+def test_plan_states_the_losses_of_each_time(rich: TestClient):
+    day = {"first_at": "2026-06-21T15:00:00Z", "last_at": "2026-06-21T21:00:00Z"}
+    body = {"name": "June", "target": "main", "step_minutes": 180, "resolution": 32}
+    job = done(rich, "plans", body | day | {"dni_w_m2": "clear_sky"})
+    steps = job["result"]["steps"]
+    suns = [step["dni_w_m2"] for step in steps]
+    assert min(suns) > 600
+    assert len(set(suns)) == len(suns) == 3
+    for step in steps:
+        for mirrors in ("twin", "ideal"):
+            field = step[mirrors]["field"]
+            assert field["incident_w"] == pytest.approx(step["dni_w_m2"] * field["mirror_area_m2"])
+            assert field["intercepted_w"] == pytest.approx(step[mirrors]["power_w"], rel=1e-2)
+    page = Page(rich.get(f"/plans/{job['id']}", headers=HTML).text)
+    for words in ("Losses at", "of a clear sky", "efficiency", "Absorbed"):
+        assert words in page.words
+
+
+def test_plant_page_lists_receivers_of_every_kind(rich: TestClient):
+    words = Page(rich.get("/plant", headers=HTML).text).words
+    for name, kind in zip(RECEIVERS, ("cylinder", "plane", "cavity", "panels"), strict=True):
+        assert f"{name} {kind}" in words
+    assert "casts a shadow" in words
