@@ -1,11 +1,15 @@
 """Draw the pictures of README and the site from a demonstration: ``python -m docs.pictures OUT``.
 
-``OUT`` is the folder of ``heliotwin demo``, ``out/demo`` by default.
+``OUT`` is the folder of ``heliotwin demo``, ``out/demo`` by default. Chromium takes the page of a
+heliostat.
 """
 
 import json
+import os
+import shutil
 import sys
 from pathlib import Path
+from subprocess import PIPE, Popen, run
 
 import cv2
 import numpy as np
@@ -99,5 +103,34 @@ def _draw_field(axes: Axes, positions: dict[str, np.ndarray], accuracies: dict[s
     _name(axes, "4. Field: flux accuracy")
 
 
+def draw_second_plant(out: Path) -> None:
+    """Copy the pictures of a plant and its flux, and take the page of a photographed heliostat."""
+    for name in ("plant", "field"):
+        shutil.copyfile(out / f"{name}.png", PICTURE.with_name(f"second-{name}.png"))
+    report = json.loads((out / "report.json").read_text(encoding="utf-8"))
+    address = f"http://127.0.0.1:{PORT}"
+    serve = [sys.executable, "-m", "service", "serve", "--port", str(PORT), "--json"]
+    environment = os.environ | {"HELIOTWIN_DATA_DIR": str(out / "store-southern")}
+    with Popen(serve, env=environment, stdout=PIPE) as service:
+        try:
+            assert service.stdout is not None
+            service.stdout.readline()  # it is written once the service listens
+            page = f"{address}/heliostats/{report['heliostats'][0]['heliostat']}"
+            picture = out / "heliostat.png"
+            run(
+                ["chromium", "--headless", "--no-sandbox", "--hide-scrollbars",
+                 "--window-size=1280,1560", f"--screenshot={picture}", page],
+                check=True, capture_output=True,
+            )  # fmt: skip
+        finally:
+            service.terminate()
+    page_picture = PICTURE.with_name("second-heliostat.jpg")
+    cv2.imwrite(str(page_picture), cv2.imread(str(picture)), [cv2.IMWRITE_JPEG_QUALITY, 85])
+
+
+PORT = 8123
+
 if __name__ == "__main__":
-    draw(Path(sys.argv[1] if len(sys.argv) > 1 else "out/demo"))
+    folder = Path(sys.argv[1] if len(sys.argv) > 1 else "out/demo")
+    draw(folder)
+    draw_second_plant(folder / "southern")
