@@ -19,7 +19,7 @@ batch has a separate mount in `Mount.stack`.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import date
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -34,6 +34,9 @@ Array = NDArray[np.float64]
 _UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 _EAST, _, _UP = np.eye(3)
+
+AxisName = Literal["first", "second"]
+"""One of a mount's two axes."""
 
 # Lever below which a mirror faces the zenith, so that its pylon does not lean.
 _MIN_LEVER = 1e-9
@@ -90,6 +93,8 @@ class Mount:
         Whether the axes are as measured, not as surveyed: they include all tilts.
     calibrated_until : date or None
         Day of the newest photograph of its calibration, if known.
+    jitter_axis : "first" or "second"
+        The less stiff axis, about which the mirror oscillates in wind.
     lean : (...) [rad]
         Inclination of the pylon towards the side that the mirror faces, for an upright mirror. It
         is proportional to the lever of the mirror's weight, the horizontal part of its normal.
@@ -105,6 +110,7 @@ class Mount:
     is_calibrated: bool = False
     calibrated_until: date | None = None
     lean: float | Array = 0.0
+    jitter_axis: AxisName = "first"
 
     @classmethod
     def juelich(
@@ -150,6 +156,12 @@ class Mount:
             @ self.zero_attitude
         )
         return lean_attitude(turned, self.lean) if np.any(self.lean) else np.asarray(turned)
+
+    def jitter_direction(self, angles: Array) -> Array:
+        """Unit vector (3,) in ENU of the axis that oscillates, at axis angles (2,) [rad]."""
+        if self.jitter_axis == "first":
+            return self.first_axis
+        return np.asarray(rotation(self.first_axis, angles[0]) @ self.second_axis)
 
     def require_within(self, motors: Array) -> None:
         """Raise `UnreachableError` unless motors (2,) [steps] are within the drives' travel."""

@@ -183,6 +183,9 @@ class MountEntry(PlantPart):
     drives: Annotated[list[Drive], Field(min_length=2, max_length=2)] | None = Field(
         None, description="Drives of the first and the second axis; ideal ones without it."
     )
+    jitter_axis: Literal["first", "second"] = Field(
+        "first", description="The less stiff axis, about which the mirror oscillates in wind."
+    )
 
 
 class FacetGridEntry(PlantPart):
@@ -263,6 +266,11 @@ class HeliostatTypeEntry(PlantPart):
     )
     pointing_error_mrad: ErrorMrad = Field(
         0.0, description="Of the reflected beam, standard deviation per axis."
+    )
+    reference_elevation_deg: Annotated[Number, Field(ge=0, le=90)] = Field(
+        30.0,
+        description="Elevation of the mirror's normal at which its facets were canted. At others"
+        " the mirror sags by the effect gravity_bending.",
     )
 
 
