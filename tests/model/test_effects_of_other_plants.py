@@ -24,6 +24,7 @@ from model.study import FluxImage, Study, StudyOptions, study
 from model.sunshape import Gaussian
 from model.surface import control_points
 from model.tracing import Optics, Window, trace
+from model.tracing.convolution import central_rays
 from model.tracing.montecarlo import trace_montecarlo
 from model.tracing.scene import Scene
 
@@ -41,12 +42,12 @@ PLACES = {"B01": (-60.0, -120.0, 0.0), "B02": (20.0, -180.0, 0.0), "B03": (110.0
 FIRST = datetime(2024, 3, 1, 15, tzinfo=UTC)
 
 
-def large(jitter_axis="first", reference_sine=0.5) -> HeliostatType:
+def large(jitter_axis="first", reference_sine=0.5, canting="on_axis") -> HeliostatType:
     """28 facets of 1.8 x 1.35 m."""
     mount = MountDesign(pivot_height=6.0, mirror_offset=0.2, jitter_axis=jitter_axis)
     facets = facet_grid(4, 7, 1.8, 1.35, 0.02)
     return HeliostatType(
-        "large", facets, mount, canting=Canting("on_axis"), reference_sine=reference_sine
+        "large", facets, mount, canting=Canting(canting), reference_sine=reference_sine
     )
 
 
@@ -142,7 +143,9 @@ def study_of(effect: Effect) -> Study:
         fit_view=View(24, 24, samples=4, padding=0.125),
         view=View(48, 48, samples=6),
     )
-    kind = large("second", reference_sine=0.9)
+    # On a canted mirror all facets' images are alike, and round: part of them says nothing.
+    canting = "flat" if effect.name in ("axis_tilt", "blocking") else "on_axis"
+    kind = large("second", 0.9, canting)
     return study(photographs([effect], kind), MODEL, options)
 
 
@@ -198,33 +201,22 @@ def test_gravity_counts_from_the_attitude_at_which_the_type_was_canted():
 
 @pytest.mark.parametrize("axis", ["first", "second"])
 def test_jitter_is_about_the_axis_that_the_type_declares(axis):
-    """Two turned mirrors have their spots where the smear has its ends; both tracers agree."""
+    """It moves the spot as a turn about that axis does, and both tracers show it alike."""
     (one,) = setups(large(axis), 1)[:1]
-    angles, step = align([one], MODEL).angles[0], 2e-4
+    angles, step = align([one], MODEL).angles[0], 1e-5
     turn = np.eye(2)[0 if axis == "first" else 1] * step
     scenes = [Scene.from_setups([one], [angles + s * turn], torch.float64) for s in (-1, 0, 1)]
-    window, optics = Window(36.0, 36.0, 128, 128), Optics(sun_shape=Gaussian(1e-3))
-    ends = [trace(scene, window, optics, samples=6).spot[0].numpy() for scene in scenes]
-    moved = (ends[2] - ends[0]) / (2 * step)
-    jitter = TrackingJitter(3.0).on_optics(optics)
-    smooth = trace(scenes[1], window, jitter, samples=12).irradiance[0].clamp(min=0).numpy()
-    still = trace(scenes[1], window, optics, samples=12).irradiance[0].clamp(min=0).numpy()
-    spread = _covariance(smooth, window) - _covariance(still, window)
+    before, still, after = (central_rays(scene, 4) for scene in scenes)
+    moved = ((after.spot - before.spot) / (2 * step))[0].numpy()
     np.testing.assert_allclose(
-        spread, 9e-6 * np.outer(moved, moved), atol=0.05 * 9e-6 * float(moved @ moved)
+        still.spot_per_angle[0], moved, atol=0.01 * float(np.linalg.norm(moved))
     )
-    rays = 300_000
+    window, rays = Window(30.0, 30.0, 48, 48), 200_000
+    jitter = TrackingJitter(3.0).on_optics(Optics(sun_shape=Gaussian(3e-3)))
+    smooth = trace(scenes[1], window, jitter, samples=8).irradiance[0].clamp(min=0).numpy()
     thrown = trace_montecarlo(scenes[1], window, jitter, rays=rays)[0][0]
     noise = np.sqrt(4 / np.pi) * np.sqrt(smooth / smooth.sum() / rays).sum()
     assert np.abs(thrown - smooth).sum() / smooth.sum() < 1.3 * noise
-
-
-def _covariance(image: np.ndarray, window: Window) -> np.ndarray:
-    """Second central moments (2, 2) [m2], right and up."""
-    x = (np.arange(window.columns) + 0.5) * window.pixel[0] - window.width / 2
-    y = window.height / 2 - (np.arange(window.rows) + 0.5) * window.pixel[1]
-    places = np.stack([a.ravel() for a in np.meshgrid(x, y)])
-    return np.cov(places, aweights=image.ravel(), ddof=0)
 
 
 def test_a_mirror_of_the_default_type_is_juelichs():
