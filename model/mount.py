@@ -92,12 +92,11 @@ class Mount:
     is_calibrated : bool
         Whether the axes are as measured, not as surveyed: they include all tilts.
     calibrated_until : date or None
-        Day of the newest photograph of its calibration, if known.
+        Day of its calibration's newest photograph, if known.
+    lean : (...) [rad]
+        Of the pylon towards an upright mirror's front, proportional to the normal's level part.
     jitter_axis : "first" or "second"
         The less stiff axis, about which the mirror oscillates in wind.
-    lean : (...) [rad]
-        Inclination of the pylon towards the side that the mirror faces, for an upright mirror. It
-        is proportional to the lever of the mirror's weight, the horizontal part of its normal.
     """
 
     first_axis: Array
@@ -156,12 +155,6 @@ class Mount:
             @ self.zero_attitude
         )
         return lean_attitude(turned, self.lean) if np.any(self.lean) else np.asarray(turned)
-
-    def jitter_direction(self, angles: Array) -> Array:
-        """Unit vector (3,) in ENU of the axis that oscillates, at axis angles (2,) [rad]."""
-        if self.jitter_axis == "first":
-            return self.first_axis
-        return np.asarray(rotation(self.first_axis, angles[0]) @ self.second_axis)
 
     def require_within(self, motors: Array) -> None:
         """Raise `UnreachableError` unless motors (2,) [steps] are within the drives' travel."""
@@ -230,6 +223,13 @@ class Mount:
             angles = self.angles_from_normal(bisector(source, point - center))
             center = self.mirror_center(position, self.attitude(angles))
         return angles
+
+
+def jitter_direction(mount: Mount, angles: Array) -> Array:
+    """Unit vector (3,) in ENU of a mount's axis that oscillates, at axis angles (2,) [rad]."""
+    if mount.jitter_axis == "first":
+        return mount.first_axis
+    return np.asarray(rotation(mount.first_axis, angles[0]) @ mount.second_axis)
 
 
 def bisector(sun: Array, outgoing: Array) -> Array:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from model.errors import InvalidInputError
 from model.images import FLUX_SIZE, FLUX_WINDOW
-from model.mount import Mount
+from model.mount import Mount, jitter_direction
 from model.plant import PERFECT, Outline, TargetPlane, inside_outline, outline_share
 from model.setup import Setup
 from model.sunshape import Buie, SunShape
@@ -211,7 +211,7 @@ class Scene:
             degree=setups[0].degree,
             jitter_axis=tensor(
                 [
-                    setup.heliostat.mount.jitter_direction(turned)
+                    jitter_direction(setup.heliostat.mount, turned)
                     for setup, turned in zip(setups, np.asarray(angles), strict=True)
                 ]
             ),
