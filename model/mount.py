@@ -82,11 +82,10 @@ class Mount:
     zero_attitude : (..., 3, 3)
         Mirror coordinates to ENU at zero angles.
     joint : (..., 3) [m]
-        From the heliostat's position to the pivot of both axes, in ENU.
+        The pivot of both axes, from the heliostat's position in ENU.
     mirror_offset : (..., 3) [m]
         From the pivot to the mirror's centre, in mirror coordinates.
-    actuators : pair of Actuator, or None
-        None if an axis is driven directly, or its drive is not known.
+    actuators : pair of Actuator, or None if they are not known
     axis_zero : (2,) [rad]
         Added to the actuators' angles to give the axis angles.
     is_calibrated : bool
