@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from model.actuator import Actuators
 from model.errors import InvalidInputError
 from model.frames import sun_direction
-from model.mount import Mount, bisector
-from model.plant import PERFECT, Facet, Heliostat, MirrorOptics, Outline
+from model.mount import AxisName, Mount, bisector
+from model.plant import PERFECT, REFERENCE_SINE, Facet, Heliostat, MirrorOptics, Outline
 
 Array = NDArray[np.float64]
 
@@ -47,6 +47,8 @@ class MountDesign:
         None for axes whose drives are not known.
     axis_zero : (2,) [rad]
         Axis angles at which the drives' angles are zero.
+    jitter_axis : "first" or "second"
+        As of `model.mount.Mount`.
     """
 
     kind: str = "azimuth_elevation"
@@ -54,6 +56,7 @@ class MountDesign:
     mirror_offset: float = 0.0
     drives: Actuators | None = None
     axis_zero: tuple[float, float] = (0.0, 0.0)
+    jitter_axis: AxisName = "first"
 
     def __post_init__(self) -> None:
         if self.kind not in MOUNT_KINDS:
@@ -75,6 +78,7 @@ class MountDesign:
             np.array([0.0, 0.0, self.mirror_offset]),
             self.drives,
             axis_zero=self.axis_zero,
+            jitter_axis=self.jitter_axis,
         )
 
 
@@ -219,6 +223,8 @@ class HeliostatType:
     focus : float [m], "flat" or "slant_range"
     canting : Canting
     optics : MirrorOptics
+    reference_sine : float
+        As of `model.plant.Heliostat`.
     """
 
     name: str
@@ -227,6 +233,7 @@ class HeliostatType:
     focus: Focus = "flat"
     canting: Canting = Canting()
     optics: MirrorOptics = PERFECT
+    reference_sine: float = REFERENCE_SINE
 
     def __post_init__(self) -> None:
         if not self.facets:
@@ -274,7 +281,9 @@ class HeliostatType:
             for design, x, y in zip(self.facets, across, upward, strict=True)
         )
         width, height = self.size
-        return Heliostat(name, position, mount, facets, width, height, self.optics)
+        return Heliostat(
+            name, position, mount, facets, width, height, self.optics, self.reference_sine
+        )
 
     def _focal_length(self, design: FacetDesign, slant_range: float) -> float | None:
         if design.focal_length is not None:

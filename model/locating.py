@@ -339,7 +339,8 @@ def corners_by_camera(
             f" pixels, and this one has {size}; correct the target's camera",
         )
     frame = size or camera.image_size or ImageSize(1000, 1000)
-    corners = camera.to_pixels(plane, corner_places(plane), frame)
+    with np.errstate(all="ignore"):  # what is not finite is refused below
+        corners = camera.to_pixels(plane, corner_places(plane), frame)
     if not np.isfinite(corners).all() or smallest_turn(corners) <= 1.0:
         raise InvalidInputError(
             f"camera: shows {plane.name} mirrored, or of no area; pixels are (column, row) with row"

@@ -19,7 +19,7 @@ batch has a separate mount in `Mount.stack`.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import date
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -34,6 +34,9 @@ Array = NDArray[np.float64]
 _UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 _EAST, _, _UP = np.eye(3)
+
+AxisName = Literal["first", "second"]
+"""One of a mount's two axes."""
 
 # Lever below which a mirror faces the zenith, so that its pylon does not lean.
 _MIN_LEVER = 1e-9
@@ -79,20 +82,20 @@ class Mount:
     zero_attitude : (..., 3, 3)
         Mirror coordinates to ENU at zero angles.
     joint : (..., 3) [m]
-        From the heliostat's position to the pivot of both axes, in ENU.
+        The pivot of both axes, from the heliostat's position in ENU.
     mirror_offset : (..., 3) [m]
         From the pivot to the mirror's centre, in mirror coordinates.
-    actuators : pair of Actuator, or None
-        None if an axis is driven directly, or its drive is not known.
+    actuators : pair of Actuator, or None if they are not known
     axis_zero : (2,) [rad]
         Added to the actuators' angles to give the axis angles.
     is_calibrated : bool
         Whether the axes are as measured, not as surveyed: they include all tilts.
     calibrated_until : date or None
-        Day of the newest photograph of its calibration, if known.
+        Day of its calibration's newest photograph, if known.
     lean : (...) [rad]
-        Inclination of the pylon towards the side that the mirror faces, for an upright mirror. It
-        is proportional to the lever of the mirror's weight, the horizontal part of its normal.
+        Of the pylon towards an upright mirror's front, proportional to the normal's level part.
+    jitter_axis : "first" or "second"
+        The less stiff axis, about which the mirror oscillates in wind.
     """
 
     first_axis: Array
@@ -105,6 +108,7 @@ class Mount:
     is_calibrated: bool = False
     calibrated_until: date | None = None
     lean: float | Array = 0.0
+    jitter_axis: AxisName = "first"
 
     @classmethod
     def juelich(
@@ -218,6 +222,13 @@ class Mount:
             angles = self.angles_from_normal(bisector(source, point - center))
             center = self.mirror_center(position, self.attitude(angles))
         return angles
+
+
+def jitter_direction(mount: Mount, angles: Array) -> Array:
+    """Unit vector (3,) in ENU of a mount's axis that oscillates, at axis angles (2,) [rad]."""
+    if mount.jitter_axis == "first":
+        return mount.first_axis
+    return np.asarray(rotation(mount.first_axis, angles[0]) @ mount.second_axis)
 
 
 def bisector(sun: Array, outgoing: Array) -> Array:

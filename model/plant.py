@@ -161,6 +161,9 @@ class MirrorOptics:
                 )
 
 
+REFERENCE_SINE = 0.5
+"""Sine of 30 degrees, the mean elevation of normals in Juelich's field north of its tower."""
+
 PERFECT = MirrorOptics()
 """A mirror that reflects all light where it should."""
 
@@ -191,6 +194,9 @@ class Heliostat:
     width, height : float [m]
         Of the whole mirror.
     optics : MirrorOptics
+    reference_sine : float
+        Sine of the elevation of the mirror's normal at which its surface is the known one: where it
+        was canted or measured. Elsewhere it sags (`model.effects.gravity_bending`).
     """
 
     name: str
@@ -200,6 +206,7 @@ class Heliostat:
     width: float = 3.22
     height: float = 2.56
     optics: MirrorOptics = PERFECT
+    reference_sine: float = REFERENCE_SINE
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "position", _vector(f"position of {self.name}", self.position))

@@ -11,10 +11,11 @@ What it is
 
     with x along the torque tube, which supports the mirror and keeps it straighter in this
     direction. A positive amplitude lowers the upper and lower edges. This makes the mirror convex
-    and its focus longer. A surface that was measured, or learnt from images, includes the sag of
-    its attitude, so only the deviation from there counts. Normals of a field north of its tower
-    have a mean elevation of some 30 degrees, hence `REFERENCE`. `REFERENCE`, `ALONG` and the power
-    of two were chosen by the images of undeclared set 3.
+    and its focus longer. A surface that was measured or canted, or learnt from images, includes the
+    sag of its attitude, so only the deviation from there counts. That reference is a property of
+    the heliostat's type (`Heliostat.reference_sine`). Normals of a field north of its tower have a
+    mean elevation of some 30 degrees, hence its default. The default, `ALONG` and the power of two
+    were chosen by the images of undeclared set 3, which are of Juelich's type.
 
 Source
     Moya and Ho, *Modeling and validation of heliostat deformation due to static loading*, ASME
@@ -45,12 +46,12 @@ import torch
 from torch import Tensor
 
 from model.effects.base import Effect, Factor, Scalar, Stage, parameter
-from model.plant import Heliostat
+from model.plant import REFERENCE_SINE, Heliostat
 from model.surface import basis, greville
 from model.tracing.scene import Scene
 
-REFERENCE = 0.5
-"""Sine of the normal's elevation at which mirrors have their known surfaces."""
+REFERENCE = REFERENCE_SINE
+"""Sine of the normal's elevation at which mirrors have their known surfaces, by default."""
 
 ALONG = 0.4
 """Sag of the left and right edges, relative to that of the upper and lower edges."""
@@ -76,7 +77,8 @@ class GravityBending(Effect):
         edges = points.new_tensor(
             [(heliostat.width / 2, heliostat.height / 2) for heliostat in heliostats]
         )
-        depth = 1e-3 * self.amplitude_mm * (scene.attitude[:, 2, 2] - REFERENCE)
+        known = points.new_tensor([heliostat.reference_sine for heliostat in heliostats])
+        depth = 1e-3 * self.amplitude_mm * (scene.attitude[:, 2, 2] - known)
         sag = depth[:, None, None, None] * _paraboloid(points, edges, scene.degree)
         x, y, z = points.unbind(2)
         x, y = x.expand_as(sag), y.expand_as(sag)

@@ -11,8 +11,8 @@ Source
 
 In an image
     The light of one facet is dimmer. If the facets' images overlap, only the spot's peak changes.
-    If they do not, as for a heliostat that is near or out of focus, a quarter of the image is
-    darker, and the centroid moves away from it.
+    If they do not, as for a heliostat that is near or out of focus, the facet's part of the image
+    is darker, and the centroid moves away from it.
 
 What it scales with
     Nothing, neither distance nor sun. The darker part is fixed in the mirror's frame, and has the

@@ -1,8 +1,9 @@
-"""Tracking jitter: the mount oscillates about its first axis during the exposure.
+"""Tracking jitter: the mount oscillates about its less stiff axis during the exposure.
 
 What it is
-    Wind, backlash and the steps of the drive let a mirror oscillate about its least stiff axis. At
-    the Solar Tower Juelich this is the first axis, which points east. The spot is smeared if the
+    Wind, backlash and the steps of the drive let a mirror oscillate about its less stiff axis. At
+    the Solar Tower Juelich this is the first axis, which points east. A heliostat type may declare
+    the second one (`Mount.jitter_axis`). The spot is smeared if the
     exposure is longer than an oscillation, or if several images are averaged. The angle is Gaussian
     with ``sigma_mrad``.
 
@@ -13,7 +14,7 @@ Source
     evaluation and monitoring of heliostats*, J. Solar Energy Engineering 137 (2015).
 
 In an image
-    A smear along one line, which is nearly vertical on the target if the first axis points east.
+    A smear along one line, which is nearly vertical on the target if the axis points east.
     Nothing changes across the line, and contours along it stay sharp.
 
 What it scales with
@@ -27,7 +28,7 @@ What it is confused with
     - Camera blur: also blurs all directions, and is constant in metres.
     - A wrong registered height of the target (``scale_y``): scales the whole image with its edges,
       instead of convolving it, and is the same for near and far heliostats.
-    - Oscillation about the second axis: the same in another direction.
+    - Oscillation about the other axis: the same in another direction.
 """
 
 from dataclasses import dataclass, replace
@@ -39,7 +40,7 @@ from model.tracing.scene import Optics
 
 @dataclass(frozen=True, eq=False)
 class TrackingJitter(Effect):
-    """The mirror turns about the first mount axis with standard deviation ``sigma_mrad`` [mrad]."""
+    """The mirror turns about one mount axis with standard deviation ``sigma_mrad`` [mrad]."""
 
     name: ClassVar[str] = "tracking_jitter"
     about: ClassVar[str] = (

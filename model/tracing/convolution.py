@@ -162,8 +162,8 @@ def central_rays(scene: Scene, samples: int) -> Rays:
     slant_range = mean_point[:, 2] / -beam[:, 2]
     spot_per_angle = (
         None
-        if scene.first_axis is None
-        else _spot_per_angle(scene, scene.first_axis, mean_normal, sun, beam, slant_range)
+        if scene.jitter_axis is None
+        else _spot_per_angle(scene, scene.jitter_axis, mean_normal, sun, beam, slant_range)
     )
     return Rays(
         hits, power, lit, beam, slant_range, mean_normal, _footprint(hits, samples), spot_per_angle
@@ -348,7 +348,7 @@ def _cone_transfer(rays: Rays, optics: Optics, right: Tensor, up: Tensor, table:
     variance = variance * rays.slant_range[:, None] ** 2
     if _is_given(optics.tracking_jitter):
         if rays.spot_per_angle is None:
-            raise InvalidInputError("tracking jitter needs a scene with 'first_axis'")
+            raise InvalidInputError("tracking jitter needs a scene with 'jitter_axis'")
         moved = _square(rays.spot_per_angle)
         variance = variance + _variance(optics.tracking_jitter, rays) * moved
     if any(map(_is_given, (optics.slope_error, optics.pointing_error, optics.tracking_jitter))):

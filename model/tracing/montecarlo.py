@@ -97,7 +97,7 @@ def _rays(
         visible = _visible_share(scene, index, facet, place, spots)
         if jitter > 0:
             angle = rng.normal(0, jitter, share)
-            place, area = _rotate_about_first_axis(scene, index, place, area, angle)
+            place, area = _rotate_about_jitter_axis(scene, index, place, area, angle)
         normal = _unit(area)
         toward_sun = _sun_rays(sun, optics, share, rng)
         # The light that a patch collects counts its own area, not that of the tilted micro-facets
@@ -168,14 +168,14 @@ class _Turned(NamedTuple):
     areas: Array
 
 
-def _rotate_about_first_axis(
+def _rotate_about_jitter_axis(
     scene: Scene, index: int, place: Array, area: Array, angle: Array
 ) -> _Turned:
-    """Rotate a mirror's points and area vectors about its first axis by angles (n,) [rad]."""
-    if scene.first_axis is None:
-        raise InvalidInputError("tracking jitter needs a scene with 'first_axis'")
+    """Rotate a mirror's points and area vectors about its jitter axis by angles (n,) [rad]."""
+    if scene.jitter_axis is None:
+        raise InvalidInputError("tracking jitter needs a scene with 'jitter_axis'")
     center, turn = _plane_frame(scene, index)
-    jitter = rotation(turn @ scene.first_axis[index].double().numpy(), angle)
+    jitter = rotation(turn @ scene.jitter_axis[index].double().numpy(), angle)
     points = center + np.einsum("nij,nj->ni", jitter, place - center)
     return _Turned(points, np.einsum("nij,nj->ni", jitter, area))
 

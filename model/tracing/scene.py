@@ -12,7 +12,7 @@ from torch import Tensor
 
 from model.errors import InvalidInputError
 from model.images import FLUX_SIZE, FLUX_WINDOW
-from model.mount import Mount
+from model.mount import Mount, jitter_direction
 from model.plant import PERFECT, Outline, TargetPlane, inside_outline, outline_share
 from model.setup import Setup
 from model.sunshape import Buie, SunShape
@@ -34,7 +34,7 @@ class Optics:
     slope_error : float or Tensor (B,) [rad]
         Standard deviation of the mirror's normals per axis, below the resolution of the surface.
     tracking_jitter : float or Tensor (B,) [rad]
-        Standard deviation of the mirror's rotation about the first mount axis during an exposure.
+        Standard deviation of the mirror's rotation about `Mount.jitter_axis` during an exposure.
     pointing_error : float or Tensor (B,) [rad]
         Standard deviation of the reflected beam's direction per axis.
     dni : float [W/m2]
@@ -148,8 +148,8 @@ class Scene:
     degree : int
     facet_reflectivity : Tensor (B, F) or None
         Relative to `Optics.reflectivity`; None for equal facets.
-    first_axis : Tensor (B, 3) or None
-        The mount's first axis in ENU, about which tracking jitter rotates the mirror.
+    jitter_axis : Tensor (B, 3) or None
+        The mount's axis in ENU about which tracking jitter rotates the mirror.
     blocked_below : Tensor (B,) or None [m]
         Mirror y below which a neighbour blocks the light; None for free mirrors.
     obstacles : Tensor (B, K, 3, 3) or None [m]
@@ -171,7 +171,7 @@ class Scene:
     plane_axes: Tensor
     degree: int = DEGREE
     facet_reflectivity: Tensor | None = None
-    first_axis: Tensor | None = None
+    jitter_axis: Tensor | None = None
     blocked_below: Tensor | None = None
     obstacles: Tensor | None = None
     shades: Tensor | None = None
@@ -209,7 +209,12 @@ class Scene:
             plane_center=tensor([plane.center for plane in planes]),
             plane_axes=tensor([axes[id(plane)] for plane in planes]),
             degree=setups[0].degree,
-            first_axis=tensor(mount.first_axis),
+            jitter_axis=tensor(
+                [
+                    jitter_direction(setup.heliostat.mount, turned)
+                    for setup, turned in zip(setups, np.asarray(angles), strict=True)
+                ]
+            ),
             **_mirror_tensors(setups, tensor),
         )
 

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from model.actuator import Actuator, LinearActuator, RotaryActuator
 from model.mount import Mount
-from model.plant import Facet, Heliostat, MirrorOptics
+from model.plant import REFERENCE_SINE, Facet, Heliostat, MirrorOptics
 from service.base.fields import Number
 from service.sources.plant_schema import HeliostatEntry
 from service.sources.schema import parse
@@ -61,6 +61,7 @@ class MountDocument(_Part):
     mirror_offset_m: Point
     axis_zero_rad: tuple[Number, Number] = (0.0, 0.0)
     drives: tuple[DriveDocument, DriveDocument] | None = None
+    jitter_axis: Literal["first", "second"] | None = None
 
 
 class MirrorFacet(_Part):
@@ -97,6 +98,7 @@ class HeliostatDocument(_Part):
     optics: OpticsDocument = OpticsDocument()
     receiver: str | None = None
     focal_length_m: Number | None = None
+    reference_sine: Annotated[Number, Field(ge=0, le=1)] | None = None
 
 
 def is_heliostat_document(properties: Any) -> bool:
@@ -131,6 +133,7 @@ def heliostat_to_json(
             mirror_offset_m=_point(mount.mirror_offset),
             axis_zero_rad=mount.axis_zero,
             drives=drives,
+            jitter_axis=mount.jitter_axis,
         ),
         facets=tuple(map(_facet_part, heliostat.facets)),
         optics=OpticsDocument(
@@ -138,8 +141,15 @@ def heliostat_to_json(
             slope_error_mrad=heliostat.optics.slope_error * 1e3,
             pointing_error_mrad=heliostat.optics.pointing_error * 1e3,
         ),
+        reference_sine=heliostat.reference_sine,
     )
-    return document.model_dump(mode="json")
+    content = document.model_dump(mode="json")
+    # Documents of types with the defaults are as they were before these keys existed.
+    if heliostat.reference_sine == REFERENCE_SINE:
+        del content["reference_sine"]
+    if mount.jitter_axis == "first":
+        del content["mount"]["jitter_axis"]
+    return content
 
 
 def _point(vector: Any) -> Point:
@@ -184,6 +194,7 @@ def heliostat_from_json(name: str, properties: Any) -> Heliostat:
             np.array(mount.mirror_offset_m),
             drives,
             axis_zero=mount.axis_zero_rad,
+            jitter_axis=mount.jitter_axis or "first",
         ),
         tuple(
             Facet(
@@ -200,4 +211,5 @@ def heliostat_from_json(name: str, properties: Any) -> Heliostat:
         MirrorOptics(
             optics.reflectance, optics.slope_error_mrad / 1e3, optics.pointing_error_mrad / 1e3
         ),
+        REFERENCE_SINE if document.reference_sine is None else document.reference_sine,
     )

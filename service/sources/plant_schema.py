@@ -183,6 +183,9 @@ class MountEntry(PlantPart):
     drives: Annotated[list[Drive], Field(min_length=2, max_length=2)] | None = Field(
         None, description="Drives of the first and the second axis; ideal ones without it."
     )
+    jitter_axis: Literal["first", "second"] = Field(
+        "first", description="The less stiff axis, about which the mirror oscillates in wind."
+    )
 
 
 class FacetGridEntry(PlantPart):
@@ -263,6 +266,11 @@ class HeliostatTypeEntry(PlantPart):
     )
     pointing_error_mrad: ErrorMrad = Field(
         0.0, description="Of the reflected beam, standard deviation per axis."
+    )
+    reference_elevation_deg: Annotated[Number, Field(ge=0, le=90)] = Field(
+        30.0,
+        description="Elevation of the mirror's normal at which its facets were canted. At others"
+        " the mirror sags by the effect gravity_bending.",
     )
 
 
@@ -382,22 +390,23 @@ Matrix3 = Annotated[list[MatrixRow], Field(min_length=3, max_length=3)]
 class PoseEntry(PlantPart):
     """Where a camera is, where it looks, and its lens."""
 
-    position_m: Position
+    position_m: Position = Field(description="Its place: east, north, up of the tower base [m].")
     look_at_m: Position | None = Field(
-        None, description="The point in the direction of its optical axis; the camera is upright."
+        None, description="The point [m] that its optical axis leads to; the camera is upright."
     )
     rotation: Matrix3 | None = Field(
         None,
         description="In place of look_at_m: its image's right, its image's down and its direction,"
         " each as a row of east, north, up.",
     )
-    focal_length_px: Annotated[Number, Field(ge=1, le=1e7)] | None = None
+    focal_length_px: Annotated[Number, Field(ge=1, le=1e7)] | None = Field(
+        None, description="Focal length divided by the size of a pixel [px]."
+    )
     field_of_view_deg: Annotated[Number, Field(gt=0, lt=179)] | None = Field(
-        None,
-        description="In place of the focal length: from the left to the right edge of the image.",
+        None, description="In place of the focal length: from the left to the right edge [deg]."
     )
     principal_point_px: PixelPair | None = Field(
-        None, description="Column and row of the optical axis; the middle of the image without it."
+        None, description="Column and row [px] of the optical axis; the image's middle without it."
     )
     distortion: Annotated[list[Coordinate], Field(min_length=1, max_length=5)] | None = Field(
         None, description="k1, k2, p1, p2, k3 of Brown's lens, as of OpenCV; none without it."
@@ -422,11 +431,13 @@ class CameraEntry(PlantPart):
         " target's centre.",
     )
     corners_px: Annotated[list[PixelPair], Field(min_length=4, max_length=4)] | None = Field(
-        None, description="The target's upper left, upper right, lower left and lower right corner."
+        None,
+        description="The target's upper left, upper right, lower left and lower right corner [px].",
     )
-    pose: PoseEntry | None = None
+    pose: PoseEntry | None = Field(None, description="Its place, direction and lens.")
     image_size_px: Annotated[list[Pixels], Field(min_length=2, max_length=2)] | None = Field(
-        None, description="Columns and rows of its photographs; others are refused if it is given."
+        None,
+        description="Columns and rows [px] of its photographs; others are refused if it is given.",
     )
 
     @model_validator(mode="after")

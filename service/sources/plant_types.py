@@ -6,7 +6,7 @@ from pathlib import Path
 from model.actuator import Actuator, LinearActuator, RotaryActuator
 from model.errors import InvalidInputError
 from model.heliostat_type import Canting, FacetDesign, Focus, HeliostatType, MountDesign, facet_grid
-from model.plant import MirrorOptics
+from model.plant import REFERENCE_SINE, MirrorOptics
 from service.base.fields import JsonObject
 from service.sources.files import read_text
 from service.sources.plant_errors import PlantText, mistakes_at
@@ -35,7 +35,20 @@ def read_type(plant: PlantText, name: str) -> HeliostatType:
     )
     canting = _canting(plant, entry.canting, facets, path)
     with mistakes_at(plant.place(*path)):
-        return HeliostatType(name, facets, _mount(entry.mount), _focus(entry), canting, optics)
+        return HeliostatType(
+            name,
+            facets,
+            _mount(entry.mount),
+            _focus(entry),
+            canting,
+            optics,
+            _sine(entry.reference_elevation_deg),
+        )
+
+
+def _sine(elevation_deg: float) -> float:
+    """Sine of an elevation [deg]; that of 30 degrees is exact."""
+    return REFERENCE_SINE if elevation_deg == 30 else math.sin(math.radians(elevation_deg))
 
 
 def types_to_json(path: Path) -> JsonObject:
@@ -90,6 +103,7 @@ def _mount(entry: MountEntry) -> MountDesign:
         entry.pivot_height_m,
         entry.mirror_offset_m,
         (drives[0], drives[1]) if len(drives) == 2 else None,
+        jitter_axis=entry.jitter_axis,
     )
 
 

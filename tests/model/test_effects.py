@@ -434,9 +434,9 @@ def _covariance(flux, window: Window) -> np.ndarray:
 
 
 def test_jitter_needs_to_know_the_axis():
-    scene = scene_of(setup()).with_(first_axis=None)
+    scene = scene_of(setup()).with_(jitter_axis=None)
     for tracer in (trace, trace_montecarlo):
-        with pytest.raises(InvalidInputError, match="first_axis"):
+        with pytest.raises(InvalidInputError, match="jitter_axis"):
             tracer(scene, Window(), Optics(tracking_jitter=1e-3))
 
 

@@ -239,7 +239,7 @@ def test_cones_of_facets_add_up_to_that_of_the_mirror_far_away(slope_error):
                 "sun",
                 "plane_center",
                 "plane_axes",
-                "first_axis",
+                "jitter_axis",
             )
         }
     )

@@ -17,6 +17,7 @@ from model.plant import Cylinder, TargetPlane
 from model.receivers import Cavity
 from model.sunshape import Buie, Pillbox
 from model.sunshape.buie import csr_of_chi
+from service.sources.heliostat_document import heliostat_from_json, heliostat_to_json
 from service.sources.plant_file import read_plant
 from tests.service.sources import plant_files
 from tests.service.sources.plant_files import FACETS, LAYOUT, PLANT, RICH, write_plant
@@ -125,6 +126,18 @@ def test_older_name_of_chi_warns(tmp_path: Path):
     assert warning.startswith(f"{tmp_path / 'plant.yaml'}, line 21: sun.circumsolar_ratio: ")
 
 
+def test_what_effects_need_of_a_type_is_read_and_stored(tmp_path: Path):
+    text = PLANT.replace("mirror_offset_m: 0.2}", "mirror_offset_m: 0.2, jitter_axis: second}")
+    text = text.replace("canting: on_axis", "canting: on_axis\n    reference_elevation_deg: 90")
+    plants = [read_plant(write_plant(tmp_path, one)).plant for one in (text, PLANT)]
+    changed, default = (plant.heliostats["A1"] for plant in plants)
+    assert (changed.mount.jitter_axis, changed.reference_sine) == ("second", 1.0)
+    assert (default.mount.jitter_axis, default.reference_sine) == ("first", 0.5)
+    again = heliostat_from_json("A1", heliostat_to_json(changed))
+    assert (again.mount.jitter_axis, again.reference_sine) == ("second", 1.0)
+    assert "reference_sine" not in heliostat_to_json(default)
+
+
 MISTAKES = [
     # what is written, in place of what; the line, the key, and a part of the remedy
     ("kind: azimuth_elevation", "kind: az-el", 4, "heliostat_types.large.mount.kind", "'az-el' is none of azimuth_elevation, juelich, pitch_roll, target_aligned"),
@@ -137,6 +150,8 @@ MISTAKES = [
     ("canting: on_axis", "canting: {off_axis: {azimuth_deg: 180, elevation_deg: -5}}", 7, "heliostat_types.large.canting.off_axis.elevation_deg", "greater than 0"),
     ("canting: on_axis", "canting: {}", 7, "heliostat_types.large.canting", "give one of focal_length_m, off_axis"),
     ("canting: on_axis", "canting: individual", 7, "heliostat_types.large.canting", "facets file"),
+    ("mirror_offset_m: 0.2", "mirror_offset_m: 0.2, jitter_axis: third", 4, "heliostat_types.large.mount.jitter_axis", "'third' is none of first, second"),
+    ("reflectance: 0.95", "reference_elevation_deg: 91", 8, "heliostat_types.large.reference_elevation_deg", "less than or equal to 90"),
     ("facets: {file: facets.csv}", "facets: {file: facets.csv}\n    canting: on_axis", 14, "heliostat_types.small.canting", "individual"),
     ("facet_shape: flat", "facet_shape: {focal_length: 3}", 6, "heliostat_types.large.facet_shape.focal_length", "did you mean focal_length_m?"),
     ("facet_shape: flat", "facet_shape: 320", 6, "heliostat_types.large.facet_shape", "{focal_length_m: ..}"),
