@@ -66,6 +66,9 @@ def test_the_declaration_is_stored_and_exported(folder: Path, tmp_path: Path):
     before, after = (read_folder(path).plant.targets for path in (folder, tmp_path / "exported"))
     for name, target in before.items():
         assert locator_to_json(after[name].locator) == locator_to_json(target.locator)
+    written = read_plant(tmp_path / "exported" / "plant.yaml").plant.targets
+    for name, target in before.items():
+        assert locator_to_json(written[name].locator) == locator_to_json(target.locator)
 
 
 def test_check_says_how_targets_are_located(folder: Path):
