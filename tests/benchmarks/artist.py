@@ -6,8 +6,8 @@ than ours. Each heliostat is traced by both programs, alone and aimed at one tar
 - our plant, exported, with mounts of three kinds and flat, focused and canted mirrors;
 - ARTIST's example scenarios in the folder ``HELIOTWIN_ARTIST_SCENARIOS``, imported.
 
-ARTIST sends the same light to each ray and weighs it by the cosine on the target. Ours is divided
-by the light on the mirror and multiplied by that cosine.
+ARTIST gives each ray the same light and weighs it by the cosine on the target. Ours is divided by
+the light on the mirror and multiplied by that cosine.
 """
 
 import os
@@ -94,6 +94,9 @@ def compared(
         sun = sun_direction(*angles)
         theirs = by_artist(scenario, target.name, sun)
         for name, heliostat in plant.plant.heliostats.items():
+            if name not in theirs:
+                print(f"{scenario.stem}: {name} is left out, whose motors do not reach the aim")
+                continue
             ours = by_us(plant, heliostat, target, sun, folder)
             yield name, spot_of(ours, target), spot_of(theirs[name], target)
 
@@ -148,7 +151,7 @@ def imported() -> None:
         with tempfile.TemporaryDirectory() as name:
             folder = Path(name)
             plant = read_plant(read_artist(scenario).write(folder)[0])
-            copy = folder / "scenario.h5"
+            copy = folder / scenario.name
             copy.write_bytes(scenario.read_bytes())
             target = max(plant.plant.targets.values(), key=lambda one: one.center[2])
             report(f"imported: {scenario.stem}", list(compared(plant, copy, target, folder)))
