@@ -1,4 +1,4 @@
-"""Slopes of a mirror that SOFAST measured, and of its surface: ``python -m tests.benchmarks.sofast``.
+"""Slopes of a mirror by SOFAST, and of its surface: ``python -m tests.benchmarks.sofast``.
 
 The mirror is OpenCSP's example, one facet of the NSTTF.
 """
