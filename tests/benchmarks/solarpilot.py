@@ -187,7 +187,7 @@ def our_efficiency(plant: PlantDescription, azimuth_deg: float, elevation_deg: f
     return trace_field(plant, request, no_progress).report["field"]["optical_efficiency"]
 
 
-def main(power_mw: float = 20.0) -> None:
+def main(power_mw: float = 10.0) -> None:
     """Print efficiencies of both, and record their differences."""
     torch.set_num_threads(2)
     theirs = laid_out(power_mw)
