@@ -84,6 +84,5 @@ def main(path: Path, target: str, sun: list[float], out: Path) -> None:
     np.savez_compressed(out, **found)
 
 
-if __name__ == "__main__":
-    _, scenario_file, target_name, *direction, output = sys.argv
-    main(Path(scenario_file), target_name, [float(x) for x in direction], Path(output))
+_, scenario_file, target_name, *direction, output = sys.argv
+main(Path(scenario_file), target_name, [float(x) for x in direction], Path(output))
