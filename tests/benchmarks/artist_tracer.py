@@ -2,7 +2,8 @@
 
     python artist_tracer.py SCENARIO.h5 TARGET SUN_EAST SUN_NORTH SUN_UP OUT.npz
 
-OUT has, for each heliostat, the irradiance (256, 256) on the target per share of the rays sent out,
+OUT has, for each heliostat whose motors reach the aim, the irradiance (256, 256) on the target per
+share of the rays sent out,
 times the cosine on the target, as ARTIST has it.
 """
 
@@ -27,6 +28,19 @@ from artist.raytracing import HeliostatRayTracer
 from artist.scenario import Scenario
 
 POINTS, RAYS = 50, 40
+
+
+def within_limits(group) -> dict[str, bool]:
+    """Whether heliostats reach the aim; ARTIST turns others, with the same normal, on their heads.
+
+    Ideal motors have angles; those that begin at zero, as steps do, reach no usual angle.
+    """
+    motors = group.kinematics.active_motor_positions
+    low, high = (group.kinematics.actuators.active_non_optimizable_parameters[:, i] for i in (2, 3))
+    inside = ((motors >= low) & (motors <= high)).all(dim=1)
+    if "ideal" in type(group.kinematics.actuators).__name__.lower():
+        inside &= (low < -3).all(dim=1)
+    return dict(zip(group.names, inside.tolist(), strict=True))
 
 
 def main(path: Path, target: str, sun: list[float], out: Path) -> None:
@@ -63,11 +77,12 @@ def main(path: Path, target: str, sun: list[float], out: Path) -> None:
             mirror_reflectivity=1.0,
             device=device,
         )[0]
+        reached = within_limits(group)
         sent = group.surface_points.shape[1] * RAYS
-        found.update(zip(group.names, (bitmaps / sent).numpy(), strict=True))
+        images = dict(zip(group.names, (bitmaps / sent).numpy(), strict=True))
+        found.update({name: images[name] for name, is_there in reached.items() if is_there})
     np.savez_compressed(out, **found)
 
 
-if __name__ == "__main__":
-    _, scenario_file, target_name, *direction, output = sys.argv
-    main(Path(scenario_file), target_name, [float(x) for x in direction], Path(output))
+_, scenario_file, target_name, *direction, output = sys.argv
+main(Path(scenario_file), target_name, [float(x) for x in direction], Path(output))

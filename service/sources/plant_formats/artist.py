@@ -1,6 +1,6 @@
 """Scenarios of ARTIST (HDF5): site, target areas, sun, and heliostats with their surfaces.
 
-Heliostats without a surface, own kinematics or actuators have those of the prototypes.
+Prototypes replace the surface, kinematics or actuators that a heliostat has not.
 What plant.yaml cannot say is named in the notes, or refused.
 
 Source: ARTIST 2.0, ``docs/scenario.rst`` and ``artist.io.h5_scenario_parser``.
@@ -78,7 +78,7 @@ class _Scenario:
     def plant(self) -> ImportedPlant:
         """The plant with its heliostats and their surfaces."""
         areas = _TargetAreas(self.data, self.notes)
-        sun = self._sun()
+        sun = _sun(self.data)
         types: dict[_TypeKey, str] = {}
         heliostats: list[HeliostatEntry] = []
         surfaces: dict[str, MeasuredSurface] = {}
@@ -154,24 +154,6 @@ class _Scenario:
             " named receiver, are receivers; heliostats aim at the first.",
         ]
 
-    def _sun(self) -> dict[str, object]:
-        sources = self.data.group("lightsources").groups()
-        if len(sources) != 1:
-            raise self.data.group("lightsources").refuse(
-                f"has {len(sources)} light sources; one is read"
-            )
-        (source,) = sources.values()
-        law = source.group("distribution_parameters")
-        kind, shape = source.text("type"), law.text("distribution_type")
-        if (kind, shape) != (_SUN, "normal"):
-            raise source.refuse(f"is a {kind} of distribution {shape}; a normal sun is read")
-        if "mean" in law and law.number("mean") != 0:
-            raise law.refuse("'mean' must be 0: a sun beside its place is not read")
-        variance = law.number("covariance")
-        if not 0 < variance < 1e-2:
-            raise law.refuse(f"'covariance' must lie in (0, 0.01) rad2, got {variance:g}")
-        return {"shape": "gaussian", "sigma_mrad": float(f"{1e3 * np.sqrt(variance):.9g}")}
-
     def _kinematics(self, one: Hdf5Group, prototypes: Hdf5Group) -> _Kinematics:
         body = _part("kinematics", one, prototypes)
         kind = body.text("type")
@@ -213,22 +195,25 @@ class _Scenario:
         if mount == "azimuth_elevation":
             self._note("actuators: linear ones of an upright first axis are left out.")
             return None
-        return tuple(tuple(self._linear(drive).items()) for drive in drives)
-
-    def _linear(self, drive: Hdf5Group) -> dict[str, object]:
-        parameters = drive.group("parameters")
-        low, high = drive.numbers("min_max_motor_positions", (2,), 2)
-        if low != 0:
-            self._note("actuators: motor positions begin at 0; a smallest one is left out.")
-        entry: dict[str, object] = {"kind": "linear"}
-        for name, key in _LINEAR.items():
-            entry[key] = _exact(parameters.number(name))
-        clockwise = drive.truth("clockwise_axis_movement")
-        return {**entry, "clockwise": clockwise, "max_increment_steps": _exact(high)}
+        for drive in drives:
+            if drive.numbers("min_max_motor_positions", (2,), 2)[0] != 0:
+                self._note("actuators: motor positions begin at 0; a smallest one is left out.")
+        return tuple(tuple(_linear(drive).items()) for drive in drives)
 
     def _note(self, text: str) -> None:
         if text not in self.notes:
             self.notes.append(text)
+
+
+def _linear(drive: Hdf5Group) -> dict[str, object]:
+    """The entry of a linear drive."""
+    parameters = drive.group("parameters")
+    entry: dict[str, object] = {"kind": "linear"}
+    for name, key in _LINEAR.items():
+        entry[key] = _exact(parameters.number(name))
+    entry["clockwise"] = drive.truth("clockwise_axis_movement")
+    most = drive.numbers("min_max_motor_positions", (2,), 2)[1]
+    return {**entry, "max_increment_steps": _exact(most)}
 
 
 _LINEAR = {
@@ -286,8 +271,25 @@ def _entry(key: _TypeKey, name: str) -> dict[str, object]:
     }
 
 
-# --- target areas
+# --- sun and target areas
 # --------------------------------------------------------------------------------------------------
+
+
+def _sun(data: Hdf5Group) -> dict[str, object]:
+    sources = data.group("lightsources").groups()
+    if len(sources) != 1:
+        raise data.group("lightsources").refuse(f"has {len(sources)} light sources; one is read")
+    (source,) = sources.values()
+    distribution = source.group("distribution_parameters")
+    kind, shape = source.text("type"), distribution.text("distribution_type")
+    if (kind, shape) != (_SUN, "normal"):
+        raise source.refuse(f"is a {kind} of distribution {shape}; a normal sun is read")
+    if "mean" in distribution and distribution.number("mean") != 0:
+        raise distribution.refuse("'mean' must be 0: a sun beside its place is not read")
+    variance = distribution.number("covariance")
+    if not 0 < variance < 1e-2:
+        raise distribution.refuse(f"'covariance' must lie in (0, 0.01) rad2, got {variance:g}")
+    return {"shape": "gaussian", "sigma_mrad": float(f"{1e3 * np.sqrt(variance):.9g}")}
 
 
 class _TargetAreas:

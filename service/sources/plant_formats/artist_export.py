@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from model.actuator import LinearActuator
 from model.errors import InvalidInputError
 from model.plant import Cylinder, Heliostat, TargetPlane
-from model.sunshape import Gaussian
+from model.sunshape import Gaussian, SunShape
 from model.surface import COLUMNS, DEGREE, ROWS, control_points
 from service.sources.files import file_name
 from service.sources.folder import read_surface
@@ -51,7 +51,7 @@ def write_artist(described: PlantDescription, out: Path, surfaces: Path | None) 
         It names the heliostat, receiver or sun that ARTIST cannot have; or the file cannot be
         written.
     """
-    writer = _Writer(described, surfaces)
+    writer = _ScenarioWriter(described, surfaces)
     members = writer.scenario()
     try:
         with h5py.File(out, "w") as file:
@@ -59,7 +59,8 @@ def write_artist(described: PlantDescription, out: Path, surfaces: Path | None) 
             _write(file, members)
     except OSError as error:
         raise InvalidInputError(f"{file_name(out)}: cannot be written ({error})") from None
-    return writer.notes()
+    types = {described.type_of[name] for name in described.type_of if writer.has_steps(name)}
+    return [f"not written: {text}" for text in _left_out(described, types)]
 
 
 def _write(group: h5py.Group, members: _Members) -> None:
@@ -70,7 +71,7 @@ def _write(group: h5py.Group, members: _Members) -> None:
             group[name] = value
 
 
-class _Writer:
+class _ScenarioWriter:
     """Groups and datasets of a scenario."""
 
     def __init__(self, described: PlantDescription, surfaces: Path | None) -> None:
@@ -81,17 +82,14 @@ class _Writer:
     def scenario(self) -> _Members:
         """The whole file."""
         self._require_equal_mirrors()
-        site = self.described.plant.site
         heliostats = {name: self._heliostat(one) for name, one in self.heliostats.items()}
         prototype = next(iter(heliostats.values()))
         parts = ("surface", "kinematics", "actuator")
-        drives = {self._has_steps(name) for name in self.heliostats}
+        drives = {self.has_steps(name) for name in self.heliostats}
         return {
-            "power_plant": {
-                "position": np.array([site.latitude_deg, site.longitude_deg, site.altitude_m])
-            },
-            **self._target_areas(),
-            "lightsources": {"sun_1": self._sun()},
+            "power_plant": {"position": np.array(self.described.plant.site.origin)},
+            **_target_areas(self.described),
+            "lightsources": {"sun_1": _sun(self.described.optics.sun_shape)},
             "prototypes": {part: prototype[part] for part in parts},
             "number_of_heliostat_groups": len(drives),
             "heliostats": {
@@ -99,39 +97,6 @@ class _Writer:
                 for number, (name, one) in enumerate(heliostats.items(), start=1)
             },
         }
-
-    # --- sun and targets
-
-    def _sun(self) -> _Members:
-        shape = self.described.optics.sun_shape
-        if not isinstance(shape, Gaussian):
-            raise InvalidInputError(
-                "sun: ARTIST's sun is a normal distribution; write sun: {shape: gaussian,"
-                " sigma_mrad: ..} into plant.yaml"
-            )
-        return {
-            "type": "sun",
-            "number_of_rays": _RAYS,
-            "distribution_parameters": {
-                "distribution_type": "normal",
-                "mean": 0.0,
-                "covariance": float(shape.sigma) ** 2,
-            },
-        }
-
-    def _target_areas(self) -> _Members:
-        planes: dict[str, _Members] = {}
-        cylinders: dict[str, _Members] = {}
-        for name, area in {**self.described.receivers, **self.described.plant.targets}.items():
-            if isinstance(area, TargetPlane):
-                planes[name] = _plane(area)
-            elif isinstance(area, Cylinder):
-                cylinders[name] = _cylinder(area)
-            else:
-                raise InvalidInputError(
-                    f"receiver {name}: ARTIST has planes and cylinders only; write it as one"
-                )
-        return {"target_areas_planar": planes, "target_areas_cylindrical": cylinders}
 
     # --- heliostats
 
@@ -217,7 +182,7 @@ class _Writer:
                 },
             )
 
-    def _has_steps(self, name: str) -> bool:
+    def has_steps(self, name: str) -> bool:
         """Whether a heliostat's drives are written as they are."""
         design = self.described.types[self.described.type_of[name]].mount
         return design.kind != "azimuth_elevation" and all(
@@ -226,7 +191,7 @@ class _Writer:
 
     def _drives(self, name: str) -> list[_Members]:
         design = self.described.types[self.described.type_of[name]].mount
-        if not self._has_steps(name):
+        if not self.has_steps(name):
             ideal: _Members = {
                 "type": "ideal",
                 "clockwise_axis_movement": False,
@@ -239,39 +204,41 @@ class _Writer:
         linear = [drive for drive in design.drives or () if isinstance(drive, LinearActuator)]
         return [_linear(drive, zero) for drive, zero in zip(linear, (upright, 0.0), strict=True)]
 
-    # --- notes
 
-    def notes(self) -> list[str]:
-        """What the plant has and ARTIST's scenario has not."""
-        return [f"not written: {text}" for text in self._left_out()]
+# --- sun and target areas
+# --------------------------------------------------------------------------------------------------
 
-    def _left_out(self) -> Iterator[str]:
-        described = self.described
-        for name, kind in described.types.items():
-            optics, where = kind.optics, f"heliostat_types.{name}"
-            if optics.reflectance < 1:
-                yield f"{where}.reflectance {optics.reflectance:g}; give it to ARTIST's tracer"
-            if optics.slope_error:
-                yield f"{where}.slope_error_mrad {1e3 * optics.slope_error:g}"
-            if optics.pointing_error:
-                yield f"{where}.pointing_error_mrad {1e3 * optics.pointing_error:g}"
-            if kind.mount.drives is not None and not all(
-                self._has_steps(one) for one, of in described.type_of.items() if of == name
-            ):
-                yield f"{where}.mount.drives; they are ideal"
-        for name, receiver in described.receivers.items():
-            if receiver.absorptance < 1:
-                yield f"receivers.{name}.absorptance {receiver.absorptance:g}"
-        if described.receivers:
-            yield f"that {', '.join(described.receivers)} are receivers; all are target areas"
-        if described.tower is not None:
-            yield "tower, and its shadow"
-        if any(described.optics.attenuation):
-            yield "atmosphere"
-        targets = described.plant.targets.values()
-        if any(target.locator is not None for target in targets):
-            yield "marks and cameras of targets"
-        yield "what heliostats aim at, and their names of types"
+
+def _sun(shape: SunShape) -> _Members:
+    if not isinstance(shape, Gaussian):
+        raise InvalidInputError(
+            "sun: ARTIST's sun is a normal distribution; write sun: {shape: gaussian,"
+            " sigma_mrad: ..} into plant.yaml"
+        )
+    return {
+        "type": "sun",
+        "number_of_rays": _RAYS,
+        "distribution_parameters": {
+            "distribution_type": "normal",
+            "mean": 0.0,
+            "covariance": float(shape.sigma) ** 2,
+        },
+    }
+
+
+def _target_areas(described: PlantDescription) -> _Members:
+    planes: dict[str, _Members] = {}
+    cylinders: dict[str, _Members] = {}
+    for name, area in {**described.receivers, **described.plant.targets}.items():
+        if isinstance(area, TargetPlane):
+            planes[name] = _plane(area)
+        elif isinstance(area, Cylinder):
+            cylinders[name] = _cylinder(area)
+        else:
+            raise InvalidInputError(
+                f"receiver {name}: ARTIST has planes and cylinders only; write it as one"
+            )
+    return {"target_areas_planar": planes, "target_areas_cylindrical": cylinders}
 
 
 def _plane(area: TargetPlane) -> _Members:
@@ -313,3 +280,31 @@ def _linear(drive: LinearActuator, zero: float) -> _Members:
             "initial_angle": drive.initial_angle + zero,
         },
     }
+
+
+# --- notes
+# --------------------------------------------------------------------------------------------------
+
+
+def _left_out(described: PlantDescription, with_steps: set[str]) -> Iterator[str]:
+    """What a plant has and a scenario has not; drives of types in ``with_steps`` are written."""
+    for name, kind in described.types.items():
+        optics, where = kind.optics, f"heliostat_types.{name}"
+        if optics.reflectance < 1:
+            yield f"{where}.reflectance {optics.reflectance:g}; give it to ARTIST's tracer"
+        if optics.slope_error:
+            yield f"{where}.slope_error_mrad {1e3 * optics.slope_error:g}"
+        if optics.pointing_error:
+            yield f"{where}.pointing_error_mrad {1e3 * optics.pointing_error:g}"
+        if kind.mount.drives is not None and name not in with_steps:
+            yield f"{where}.mount.drives; ideal ones are in their place"
+    for name, receiver in described.receivers.items():
+        if receiver.absorptance < 1:
+            yield f"receivers.{name}.absorptance {receiver.absorptance:g}"
+    if described.tower is not None:
+        yield "tower, and its shadow"
+    if any(described.optics.attenuation):
+        yield "atmosphere"
+    if any(target.locator is not None for target in described.plant.targets.values()):
+        yield "marks and cameras of targets"
+    yield "time zone, names of types, which areas are receivers, and where heliostats aim"

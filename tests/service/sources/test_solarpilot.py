@@ -1,0 +1,19 @@
+"""SolarPILOT's efficiency of a field that it laid out, and ours of the imported layout."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.benchmarks import solarpilot
+
+pytest.importorskip("PySAM", reason="NREL-PySAM is not installed; see the extra 'peers'")
+
+
+@pytest.mark.slow
+def test_efficiency_is_solarpilots(tmp_path: Path):
+    theirs = solarpilot.laid_out(20.0)
+    plant = solarpilot.our_plant(theirs.places, tmp_path)
+    assert len(plant.plant.heliostats) == len(theirs.places) > 100
+    azimuth, zenith, efficiency = min(theirs.efficiencies, key=lambda row: row[1])
+    ours = solarpilot.our_efficiency(plant, azimuth + 180, 90 - zenith)
+    assert ours == pytest.approx(efficiency, abs=0.01)
