@@ -28,10 +28,10 @@ C1,large,200,400,0
 SUNS = [(140.0, 40.0), (200.0, 55.0), (110.0, 30.0), (230.0, 35.0), (170.0, 60.0)]
 
 
-def write_plant_folder(root: Path) -> Path:
+def write_plant_folder(root: Path, text: str = PLANT) -> Path:
     """The folder in ``root``: A1 has motors, B1 has none, C1 has no photographs."""
     drives = "[{kind: rotary, steps_per_rad: 9000}, {kind: rotary, steps_per_rad: 7000}]"
-    text = PLANT.replace("mirror_offset_m: 0.2}", f"mirror_offset_m: 0.2, drives: {drives}}}")
+    text = text.replace("mirror_offset_m: 0.2}", f"mirror_offset_m: 0.2, drives: {drives}}}")
     plant = read_plant(write_plant(root, text, layout=LAYOUT))
     target = plant.plant.targets["cal"]
     model = PlantModel(plant.plant.site, plant.optics)
