@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from model.observation import spread_suns
 from model.prior import SurfacePrior
 from model.refinement.image_model import ImageModel
-from model.refinement.modes import RefinementOptions, anneal_few, find_optimum
+from model.refinement.modes import N_THREADS, RefinementOptions, anneal_few, find_optimum
 from model.refinement.posterior import Hyperparameters, Linearization, Mode, linearize
 from model.refinement.whitening import BANDS
 
@@ -91,9 +91,7 @@ def half_sample_covariance(
     if len(model.suns) < 2:
         return shared
     model.steps.phase = "comparing half-samples of the images"
-    # NumPy and torch release the interpreter's lock: two threads take little more than half the
-    # time.
-    with ThreadPoolExecutor(2) as threads:
+    with ThreadPoolExecutor(N_THREADS) as threads:
         halves = chain.from_iterable(half_samples(model.suns, options.max_annealed))
         starts = exchange_facets(model.prior, mode.state.coefficients)
         found = list(
@@ -144,7 +142,7 @@ def fit_half(
     options: RefinementOptions,
 ) -> HalfEstimate:
     """Fit some of the images from coefficients (K,), with the noise that all images have."""
-    part, n_images = model.subset(half), len(model.observations)
+    part, n_images = replace(model.subset(half), threads=1), len(model.observations)
     near = anneal_few(
         part, start, options.rough_minimizer, options.annealing[:1], options.max_annealed
     )
