@@ -91,21 +91,18 @@ class Batch(NamedTuple):
     photographs: Photographs
     truth: Tensor
 
+    @classmethod
+    def of(cls, seen: Photographs, z: Array) -> "Batch":
+        """Photographs of heights ``z`` (B, F, 8, 8) [m]."""
+        truth = torch.as_tensor(z * 1e3, dtype=torch.float32, device=seen.flux.device)
+        return cls(seen, truth - truth.mean(dim=(2, 3), keepdim=True))
+
 
 class Trainer(ABC):
     """A training run in its folder; each derived class has a kind of mirrors.
 
-    Parameters
-    ----------
-    config : TrainConfig
-    folder : Path
-    device : torch.device
-    prior : SurfacePrior
-        Its mean is the first guess.
-    usual : float [mm]
-        Usual mean absolute height over the prior's mean.
-    scale : float [mm]
-        Unit of heights inside the network.
+    The mean of the ``prior`` is the first guess. ``usual`` [mm] is the usual mean absolute height
+    over it, and ``scale`` [mm] the unit of heights inside the network.
     """
 
     def __init__(
@@ -188,19 +185,6 @@ class Trainer(ABC):
     def validate(self) -> list[float]:
         """Mean absolute height error [mm] on validation mirrors after each iteration."""
 
-    def as_batch(self, seen: Photographs, z: Array) -> Batch:
-        """Photographs and heights ``z`` (B, F, 8, 8) [m] as a batch."""
-        truth = torch.as_tensor(z * 1e3, dtype=torch.float32, device=self.device)
-        return Batch(seen, truth - truth.mean(dim=(2, 3), keepdim=True))
-
-    def errors(self, batch: Batch) -> list[float]:
-        """Mean absolute height error [mm] on a batch after each iteration."""
-        guesses = (
-            self.predict(batch.photographs, count)
-            for count in range(1, self.config.n_iterations + 1)
-        )
-        return [round(float((1e3 * guess - batch.truth).abs().mean()), 4) for guess in guesses]
-
     def train_step(self) -> float:
         """Render a batch and learn from each iteration on it; return the last height error [mm]."""
         photographs, truth = self.batch()
@@ -263,6 +247,13 @@ class Trainer(ABC):
         print(json.dumps(line), flush=True)
 
 
+def height_errors(run: Trainer, batch: Batch) -> list[float]:
+    """Mean absolute height error [mm] on a batch after each iteration."""
+    counts = range(1, run.config.n_iterations + 1)
+    guesses = (run.predict(batch.photographs, count) for count in counts)
+    return [round(float((1e3 * guess - batch.truth).abs().mean()), 4) for guess in guesses]
+
+
 class Run(Trainer):
     """A training run on the measured mirrors of Juelich."""
 
@@ -291,7 +282,7 @@ class Run(Trainer):
             seen = render(
                 z, images, self.field, c.scenes, c.camera, self.device, int(rng.integers(2**31))
             )
-        return self.as_batch(seen, z)
+        return Batch.of(seen, z)
 
     def validate(self, repeats: int = 8) -> list[float]:
         """Mean absolute height error [mm] on validation mirrors after each iteration.
@@ -302,7 +293,7 @@ class Run(Trainer):
             return []
         z = self.validation.repeat(repeats, axis=0)
         seen = render(z, MAX_IMAGES, self.field, self.config.scenes, None, self.device, seed=0)
-        return self.errors(self.as_batch(seen, z))
+        return height_errors(self, Batch.of(seen, z))
 
 
 def main() -> None:

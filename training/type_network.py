@@ -31,7 +31,7 @@ from model.tracing import Optics
 from training.config import TrainConfig
 from training.export import export_checked
 from training.render import Camera, Setups, draw_suns, take
-from training.train import Batch, Trainer
+from training.train import Batch, Trainer, height_errors
 from training.type_prior import type_prior
 
 Array = NDArray[np.float64]
@@ -157,7 +157,7 @@ class TypeRun(Trainer):
 
     def validate(self) -> list[float]:
         """Mean absolute height error [mm] on `validation` after each iteration."""
-        return self.errors(self.validation)
+        return height_errors(self, self.validation)
 
     @cached_property
     def validation(self) -> Batch:
@@ -171,7 +171,7 @@ class TypeRun(Trainer):
         z = draw_surfaces(self.scenes.prior, count, rng)
         with torch.no_grad():
             setups = self.scenes.draw(count, images, rng)
-            return self.as_batch(take(setups, z, camera, rng), z)
+            return Batch.of(take(setups, z, camera, rng), z)
 
 
 def write_network(run: TypeRun, out: Path) -> dict[str, Any]:

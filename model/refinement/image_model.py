@@ -146,13 +146,11 @@ class ImageModel:
         return tuple(np.split(coefficients, [len(self.prior.basis)]))
 
     def state(self, coefficients: Array, near: SurfaceState | None = None) -> SurfaceState:
-        """Align the mirror of coefficients (K,) under each sun, and trace its images.
-
-        A state of similar coefficients saves rounds of the alignment.
-        """
+        """Align the mirror of coefficients (K,), faster from a state near by; trace its images."""
         self.steps.alive()
         smooth, fine = self.split(coefficients)
-        aligned = self._align(self.prior.surface(smooth), None if near is None else near.aligned)
+        z, start = self.prior.surface(smooth), None if near is None else near.aligned
+        aligned = align_observations(self.heliostat, self.observations, z, self.model, start)
         # In the ripples' precision: a copy of them in double precision takes longer than the trace.
         rippled = np.tensordot(fine.astype(self.ripples.dtype), self.ripples, axes=1)
         return SurfaceState(coefficients, aligned, self._trace(aligned) + rippled)
@@ -192,10 +190,6 @@ class ImageModel:
         ]
         return np.asarray(state.images - np.stack(images))
 
-    def _align(self, z: Array, start: Aligned | None = None) -> Aligned:
-        """Align the mirror of heights (F, I, J) [m] under each sun."""
-        return align_observations(self.heliostat, self.observations, z, self.model, start)
-
     def _trace(self, aligned: Aligned) -> Array:
         """Images (M, R, R) as the cameras show them."""
         with torch.no_grad():
@@ -205,7 +199,8 @@ class ImageModel:
 
     def changes_of(self, z: Array, changes: HeightChanges) -> NDArray[Any]:
         """Change of the images (K, M, R, R) of the mirror of heights (F, I, J) [m]."""
-        return self._trace_changes(self._align(z), changes)
+        aligned = align_observations(self.heliostat, self.observations, z, self.model)
+        return self._trace_changes(aligned, changes)
 
     def _trace_changes(self, aligned: Aligned, directions: HeightChanges) -> NDArray[Any]:
         """Change of the images (K, M, R, R) with K changes of the heights."""
