@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test serve lint lock docs bench train clean
+.PHONY: help install demo test serve lint lock docs bench train network clean
 
 help: ## list the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -49,6 +49,9 @@ train: install ## the shipped weights from scratch: network, prior, export, eval
 	$(BIN)/python -m training.prior --run $(RUN)
 	$(BIN)/python -m training.export --run $(RUN)
 	$(BIN)/python -m training.evaluate
+
+network: install ## the network of a heliostat type: make network PLANT=plant.yaml TYPE=standard
+	$(BIN)/python -m heliotwin.networks $(PLANT) --type $(TYPE) $(ARGS)
 
 clean: ## remove the virtual environment and everything that was made
 	rm -rf $(VENV) out build service/web/root/guide docs/reference/generated *.egg-info

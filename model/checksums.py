@@ -7,16 +7,17 @@ from pathlib import Path
 from model.errors import WeightsError
 
 
-def read_verified(path: Path) -> bytes:
-    """Read a shipped file, and compare its SHA-256 with its model card, the JSON file of the same
+def read_verified(path: Path, remedy: str = "install heliotwin again") -> bytes:
+    """Read weights, and compare their SHA-256 with their model card, the JSON file of the same
     name.
+
+    The ``remedy`` is part of the error's message.
 
     Raises
     ------
     WeightsError
         If the file or its card cannot be read, or they differ.
     """
-    remedy = "install heliotwin again"
     try:
         content = path.read_bytes()
         expected = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))["sha256"]

@@ -12,8 +12,10 @@ Gradients with respect to an effect's parameters hold the alignment fixed.
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from datetime import datetime
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -295,12 +297,13 @@ def flux_changes(
     side: float = FLUX_WINDOW,
     samples: int = 20,
     between: Callable[[], None] = lambda: None,
+    threads: int = 1,
 ) -> Tensor:
     """`Aligned.flux_images` (K + 1, B, size, size): unchanged, and after each of K height changes.
 
     ``directions`` are K changes of all mirrors, (K, F, I, J) [m] or as sums of shapes. Images are
-    linear in them. The mounts keep the spots in place. A few setups are traced at once; ``between``
-    is called before each time.
+    linear in them. The mounts keep the spots in place. A few setups are traced at once, by each of
+    ``threads``; ``between`` is called before each time. There are no gradients.
     """
     view, model = View(samples=samples), aligned.model
     is_plain = isinstance(directions, Tensor)
@@ -310,10 +313,15 @@ def flux_changes(
     def image_part(
         group: AlignedGroup, window: Window, there: Sequence[Effect], places: list[int]
     ) -> Tensor:
-        starts = range(0, len(places), _N_DIFFERENTIATED)
-        parts = [places[start : start + _N_DIFFERENTIATED] for start in starts]
-        return torch.cat([differentiate(group, window, there, some) for some in parts])
+        count = min(_N_DIFFERENTIATED, math.ceil(len(places) / threads))
+        parts = [places[start : start + count] for start in range(0, len(places), count)]
+        work = partial(differentiate, group, window, there)
+        if threads == 1 or len(parts) == 1:
+            return torch.cat(list(map(work, parts)))
+        with ThreadPoolExecutor(threads) as pool:
+            return torch.cat(list(pool.map(work, parts)))
 
+    @torch.no_grad()  # it is a thread's
     def differentiate(
         group: AlignedGroup, window: Window, there: Sequence[Effect], places: list[int]
     ) -> Tensor:

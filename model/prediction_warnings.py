@@ -12,10 +12,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from model.images import FLUX_SIZE, FLUX_WINDOW
+from model.images import FLUX_SIZE
+from model.mirror_kind import MirrorKind
 from model.observation import Observation, common_side
 from model.plant import Heliostat
-from model.prior import MEASURED_FACET, SurfacePrior, of_measured_kind
+from model.prior import SurfacePrior
 from model.surface import canting_rises
 
 Array = NDArray[np.float64]
@@ -63,24 +64,26 @@ def geometry_warnings(heliostat: Heliostat, observations: Sequence[Observation])
     return warnings
 
 
-def network_warnings(heliostat: Heliostat, observations: Sequence[Observation]) -> list[str]:
-    """Warnings about facets and images of other sizes than those of the training.
+def network_warnings(
+    heliostat: Heliostat, observations: Sequence[Observation], kind: MirrorKind
+) -> list[str]:
+    """Warnings about facets and images of other sizes than those of the network's training.
 
     Refinement accepts all sizes.
     """
     warnings = []
-    half_sizes = heliostat.facet_frames.half_sizes
-    if not of_measured_kind(half_sizes):
-        width, height = 2 * half_sizes.mean(axis=0)
-        trained = " m x ".join(str(2 * half) for half in MEASURED_FACET)
+    if not kind.has_facets_of(heliostat):
+        width, height = 2 * heliostat.facet_frames.half_sizes.mean(axis=0)
+        trained = " m x ".join(f"{2 * half:.4g}" for half in kind.half_sizes.mean(axis=0))
         warnings.append(
             f"the facets of {width:.2f} m x {height:.2f} m differ in size from those that"
             f" the network was trained on ({trained} m)"
         )
     side = common_side(observations)
-    if side != FLUX_WINDOW:
+    if side not in kind.windows:
+        trained = ", ".join(f"{window:g}" for window in kind.windows)
         warnings.append(
-            f"the spots fill a window of {side:g} m; the network was trained on {FLUX_WINDOW:g} m"
+            f"the spots fill a window of {side:g} m; the network was trained on {trained} m"
         )
     return warnings
 

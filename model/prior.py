@@ -49,6 +49,9 @@ GROUPS = (0, 4, 8, 24, 64, 128)
 FREEDOM = 3.0
 """Degrees of freedom of the scales: their prior has the weight of this number of coefficients."""
 
+MAX_SCALE = 4.0
+"""Largest scale of a group of drawn surfaces."""
+
 MAX_DIRECTIONS = 480
 """Largest number of directions of a generic prior, which many facets share out among them."""
 
@@ -111,6 +114,28 @@ class FacetKind:
             bending=1e-3 * slope_mrad * usual.reach / np.sqrt(5 / 3),
         )
 
+    @classmethod
+    def of_declared(cls, slope_error: float) -> "FacetKind":
+        """The usual kind with all slopes in proportion to a declared slope error [rad].
+
+        Zero is no declaration: the kind is the usual one.
+        """
+        usual = cls()
+        if not slope_error:
+            return usual
+        factor = slope_error / usual.slope
+        return replace(
+            usual,
+            canting=factor * usual.canting,
+            bending=factor * usual.bending,
+            grain=factor * usual.grain,
+        )
+
+    @property
+    def slope(self) -> float:
+        """Standard deviation of a facet's slopes along each side [rad]: canting and bending."""
+        return float(np.hypot(self.canting, self.bending * np.sqrt(5 / 3) / self.reach))
+
 
 @dataclass(frozen=True, eq=False)
 class SurfacePrior:
@@ -157,14 +182,12 @@ class SurfacePrior:
     def load(
         cls, path: Path = PRIOR, read: Callable[[Path], bytes] = Path.read_bytes
     ) -> "SurfacePrior":
-        """Read a prior of `training.prior`."""
+        """Read a prior of `training.prior` or `training.type_network`."""
         content = read(path)
         with np.load(io.BytesIO(content)) as data:
             name = f"{path.stem}-{hashlib.sha256(content).hexdigest()[:12]}"
-            mean, basis, hidden = (
-                data[key].astype(np.float64) for key in ("mean", "basis", "hidden")
-            )
-            return cls(mean, basis, hidden, name)
+            known = {key: values.astype(np.float64) for key, values in data.items()}
+            return cls(name=name, **known)
 
     def coefficients(self, z: Array) -> Array:
         """Coefficients (K,) of the surface of the prior's span nearest to ``z`` (F, 8, 8) [m]."""
@@ -203,6 +226,19 @@ class SurfacePrior:
         return np.asarray(np.sqrt(visible + unseen))
 
 
+def draw_surfaces(prior: SurfacePrior, count: int, rng: np.random.Generator) -> Array:
+    """Draw surfaces (count, F, 8, 8) [m] of a prior, each group with a scale of Student's t."""
+    sizes = np.diff([*prior.groups, len(prior.basis)])
+    scales = np.sqrt(FREEDOM / rng.chisquare(FREEDOM, (count, len(sizes)))).clip(max=MAX_SCALE)
+    coarse = scales.repeat(sizes, axis=1) * rng.standard_normal((count, len(prior.basis)))
+    fine = rng.standard_normal((count, len(prior.mean), len(prior.fine)))
+    return np.asarray(
+        prior.mean
+        + np.tensordot(coarse, prior.basis, axes=1)
+        + np.tensordot(fine, prior.fine, axes=1)
+    )
+
+
 @lru_cache(maxsize=1)
 def default_prior() -> SurfacePrior:
     """The shipped prior, loaded once; `WeightsError` if it is not that of its model card."""
@@ -210,9 +246,14 @@ def default_prior() -> SurfacePrior:
 
 
 def prior_of(heliostat: Heliostat) -> SurfacePrior:
-    """The shipped prior for mirrors of the measured type, the generic one for all others."""
+    """The shipped prior for mirrors of the measured type, the generic one for all others.
+
+    The latter has the slopes that the heliostat's type declares.
+    """
     half_sizes = heliostat.facet_frames.half_sizes
-    return default_prior() if of_measured_kind(half_sizes) else generic_prior(half_sizes)
+    if of_measured_kind(half_sizes):
+        return default_prior()
+    return generic_prior(half_sizes, FacetKind.of_declared(heliostat.optics.slope_error))
 
 
 def of_measured_kind(half_sizes: Array) -> bool:

@@ -10,6 +10,7 @@ Source: Piegl and Tiller, *The NURBS Book*, algorithms A2.2, A2.3 and section 9.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Generic, NamedTuple, TypeVar
@@ -311,9 +312,12 @@ def halved(z: ArrayLike) -> Array:
     return np.asarray(halving(ROWS) @ np.asarray(z, dtype=np.float64) @ halving(COLUMNS).T)
 
 
-def mirrored(z: Array) -> Array:
-    """Mirrors (..., 4, 8, 8) with left and right exchanged."""
-    return np.asarray(z[..., [1, 0, 3, 2], ::-1, :])
+def mirrored(z: Array, order: Sequence[int] = (1, 0, 3, 2)) -> Array:
+    """Mirrors (..., F, 8, 8) with left and right exchanged; ``order`` are the facets' new places.
+
+    By default mirrors have four facets.
+    """
+    return np.asarray(z[..., list(order), ::-1, :])
 
 
 class SurfaceParts(NamedTuple):

@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 import onnx
 import torch
-from torch import nn
 
 from model.checksums import digests
 from model.images import FLUX_SIZE, normalized
-from model.network.architecture import CONDITIONS, MAX_IMAGES
+from model.network.architecture import CONDITIONS, MAX_IMAGES, SurfaceNetwork
 from model.network.predictor import INPUTS, WEIGHTS, SurfacePredictor
 from model.surface import COLUMNS, FACETS, ROWS
 from training.cases import make_cases
@@ -31,8 +30,8 @@ PARITY_MM = 1e-4
 """Largest allowed difference between torch and onnxruntime [mm]."""
 
 
-def example(batch: int, images: int) -> tuple[torch.Tensor, ...]:
-    """Random inputs of the network in the order of `INPUTS`.
+def example(batch: int, images: int, facets: int = FACETS) -> tuple[torch.Tensor, ...]:
+    """Random inputs of the network in the order of `INPUTS`, for mirrors of so many facets.
 
     The first ``images`` of the eight images are present.
     """
@@ -42,17 +41,17 @@ def example(batch: int, images: int) -> tuple[torch.Tensor, ...]:
     conditions = torch.randn(batch, MAX_IMAGES, CONDITIONS, generator=generator)
     mask = torch.zeros(batch, MAX_IMAGES)
     mask[:, :images] = 1
-    guess = 0.3 * torch.randn(batch, FACETS, ROWS, COLUMNS, generator=generator)
-    descent = 0.05 * torch.randn(batch, MAX_IMAGES, FACETS, ROWS, COLUMNS, generator=generator)
+    guess = 0.3 * torch.randn(batch, facets, ROWS, COLUMNS, generator=generator)
+    descent = 0.05 * torch.randn(batch, MAX_IMAGES, facets, ROWS, COLUMNS, generator=generator)
     return flux, conditions, mask, guess_flux, guess, descent * mask[:, :, None, None, None]
 
 
-def export(network: nn.Module, path: Path) -> None:
+def export(network: SurfaceNetwork, path: Path) -> None:
     """Write a `rounded` network as ONNX with a free batch size."""
     batch = torch.export.Dim("batch", min=1, max=4096)
     torch.onnx.export(
         network.eval(),
-        example(2, 5),
+        example(2, 5, network.facets),
         str(path),
         input_names=list(INPUTS),
         output_names=["heights", "spread"],
@@ -64,7 +63,7 @@ def export(network: nn.Module, path: Path) -> None:
     store_in_half(path)
 
 
-def rounded(network: nn.Module) -> nn.Module:
+def rounded(network: SurfaceNetwork) -> SurfaceNetwork:
     """Round the network's parameters in place to 16-bit floats."""
     with torch.no_grad():
         for parameter in network.parameters():
@@ -95,7 +94,7 @@ def store_in_half(path: Path) -> None:
     onnx.save(model, path)
 
 
-def parity(network: nn.Module, path: Path) -> float:
+def parity(network: SurfaceNetwork, path: Path) -> float:
     """Largest difference [mm] between torch and onnxruntime.
 
     Batches of 1, 2 and 7 are compared, each with one to eight images.
@@ -104,7 +103,7 @@ def parity(network: nn.Module, path: Path) -> float:
     worst = 0.0
     for batch in (1, 2, 7):
         for images in range(1, MAX_IMAGES + 1):
-            inputs = example(batch, images)
+            inputs = example(batch, images, network.facets)
             with torch.no_grad():
                 expected = network(*inputs)[0].numpy()
             z, _ = session.iterate(
@@ -112,6 +111,24 @@ def parity(network: nn.Module, path: Path) -> float:
             )
             worst = max(worst, float(np.abs(z * 1e3 - expected).max()))
     return worst
+
+
+def export_checked(average: SurfaceNetwork, path: Path) -> float:
+    """Export a run's averaged network, rounded; return its difference from torch [mm].
+
+    Raises
+    ------
+    SystemExit
+        If ONNX and torch differ by more than `PARITY_MM`.
+    """
+    network = rounded(average.to(memory_format=torch.contiguous_format))  # type: ignore[call-overload]
+    export(network, path)
+    difference = parity(network, path)
+    if not math.isfinite(difference) or difference > PARITY_MM:
+        raise SystemExit(
+            f"ONNX differs from torch by {difference:.2e} mm, more than {PARITY_MM:.0e}"
+        )
+    return difference
 
 
 def evaluation(run: Run, path: Path, count: int = 128) -> dict[str, Any]:
@@ -177,13 +194,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=WEIGHTS)
     arguments = parser.parse_args()
     run = Run.open(arguments.run)
-    network = rounded(run.average.to(memory_format=torch.contiguous_format))
-    export(network, arguments.out)
-    difference = parity(network, arguments.out)
-    if not math.isfinite(difference) or difference > PARITY_MM:
-        raise SystemExit(
-            f"ONNX differs from torch by {difference:.2e} mm, more than {PARITY_MM:.0e}"
-        )
+    difference = export_checked(run.average, arguments.out)
     card = model_card(run, arguments.out, difference)
     arguments.out.with_suffix(".json").write_text(
         json.dumps(card, indent=1) + "\n", encoding="utf-8"

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,13 +20,23 @@ from model.effects.slope_error import SlopeError
 from model.effects.sun_shape import SunShapeEffect
 from model.effects.target_registration import TargetRegistration
 from model.frames import sun_direction_at
-from model.images import COARSE_SIZE, FLUX_SHAPE, FLUX_SIZE, binned, clipped_alike, normalized
+from model.images import (
+    COARSE_SIZE,
+    FLUX_SHAPE,
+    FLUX_SIZE,
+    FLUX_WINDOW,
+    binned,
+    clipped_alike,
+    normalized,
+)
 from model.imaging.light import Srgb
+from model.mount import Mount
 from model.network.architecture import CONDITIONS
 from model.network.inputs import GUESS_SAMPLES, STEP_SAMPLES, conditions, conjugate_gradient_steps
 from model.observation import Observation, observed_scene
 from model.plant import Heliostat, TargetPlane
-from model.site import JUELICH
+from model.setup import Setup
+from model.site import JUELICH, Site
 from model.surface import control_points
 from model.tracing import Optics, Scene, Window, trace
 
@@ -41,14 +51,25 @@ CLEAREST_SKY, CLEAR_SKY = 1e-3, 0.02
 RESPONSE = Srgb()
 """Response curve of the drawn cameras."""
 
-TENSORS = ("control_points", "attitude", "center", "sun", "plane_center", "plane_axes")
-"""A scene's tensors with one entry for each mirror."""
-
 
 def load_field(root: Path) -> Array:
     """Heliostat positions (N, 3) [m] in ENU from ``root/field-positions.json``."""
     field = json.loads((root / "field-positions.json").read_text(encoding="utf-8"))
     return np.array([entry["position_enu"] for entry in field.values()], dtype=np.float64)
+
+
+def draw_suns(count: int, site: Site, min_elevation_deg: float, rng: np.random.Generator) -> Array:
+    """Draw sun directions, unit vectors (count, 3), of the year and the day at a site."""
+    found = np.empty((0, 3))
+    while len(found) < count:
+        declination = 23.45 * np.sin(rng.uniform(0, 2 * np.pi, 4 * count))
+        directions = sun_direction_at(
+            declination, rng.uniform(-105, 105, 4 * count), site.latitude_deg
+        )
+        found = np.concatenate(
+            [found, directions[directions[:, 2] > np.sin(np.radians(min_elevation_deg))]]
+        )
+    return found[:count]
 
 
 @dataclass(frozen=True)
@@ -68,16 +89,7 @@ class SceneSampler:
 
     def suns(self, count: int, rng: np.random.Generator) -> Array:
         """Draw sun directions, unit vectors (count, 3)."""
-        found = np.empty((0, 3))
-        while len(found) < count:
-            declination = 23.45 * np.sin(rng.uniform(0, 2 * np.pi, 4 * count))
-            directions = sun_direction_at(
-                declination, rng.uniform(-105, 105, 4 * count), JUELICH.latitude_deg
-            )
-            found = np.concatenate(
-                [found, directions[directions[:, 2] > np.sin(np.radians(self.min_elevation_deg))]]
-            )
-        return found[:count]
+        return draw_suns(count, JUELICH, self.min_elevation_deg, rng)
 
     def heliostats(self, positions: Array, rng: np.random.Generator) -> list[Heliostat]:
         """Heliostats at positions (N, 3) [m], each canted to a random focus."""
@@ -111,14 +123,35 @@ class Setups:
     ----------
     ideal : Scene
         The B * images mirrors with ideal surfaces; the images of one heliostat are consecutive.
-    lift : Tensor (B, 4, 3)
+    lift : Tensor (B, F, 3)
         Derivative of each facet's control points by its heights: the normal.
     images : int
+    side : float [m]
+        Width of the images.
+    optics : Optics
     """
 
     ideal: Scene
     lift: Tensor
     images: int
+    side: float = FLUX_WINDOW
+    optics: Optics = field(default_factory=Optics)
+
+    @classmethod
+    def placed(cls, setups: Sequence[Setup], images: int, side: float, optics: Optics) -> "Setups":
+        """Geometry of B * images `Setup` that aim at their targets' centres, on the CPU.
+
+        The images of one heliostat are consecutive, and all have the same facets.
+        """
+        mount = Mount.stack([setup.heliostat.mount for setup in setups])
+        positions = np.array([setup.heliostat.position for setup in setups])
+        suns, aims = (
+            np.array(points)
+            for points in ([s.sun for s in setups], [s.plane.center for s in setups])
+        )
+        ideal = Scene.from_setups(setups, mount.align(positions, suns, aims))
+        normals = np.array([setup.heliostat.facet_normals for setup in setups[::images]])
+        return cls(ideal, torch.as_tensor(normals, dtype=torch.float32), images, side, optics)
 
     @classmethod
     def of(
@@ -149,9 +182,9 @@ class Setups:
         return cls(ideal, tensor(normals), images)
 
     def scene(self, z: Tensor) -> Scene:
-        """The scene of surfaces ``z`` (B, 4, 8, 8) [m].
+        """The scene of surfaces ``z`` (B, F, 8, 8) [m].
 
-        Each sun may have a different surface: (B, images, 4, 8, 8).
+        Each sun may have a different surface: (B, images, F, 8, 8).
         """
         if z.ndim == 4:
             z = z[:, None].expand(-1, self.images, -1, -1, -1)
@@ -160,20 +193,19 @@ class Setups:
 
     def trace(self, z: Tensor, samples: int = GUESS_SAMPLES, size: int = FLUX_SIZE) -> Tensor:
         """Flux (B, images, size, size), sum 100, of surfaces as in `scene`, without a camera."""
-        window = Window(rows=size, columns=size, on_spot=True)
-        flux = trace(self.scene(z), window, samples=samples, padding=0.25).irradiance
+        window = Window(self.side, self.side, size, size, on_spot=True)
+        flux = trace(self.scene(z), window, self.optics, samples=samples, padding=0.25).irradiance
         return normalized(flux.clamp(min=0)).view(-1, self.images, size, size)
 
     def conditions(self) -> Tensor:
         """Return the geometry of each image (B, images, 12) for the network."""
-        return conditions(self.ideal).view(-1, self.images, CONDITIONS)
+        return conditions(self.ideal, self.side).view(-1, self.images, CONDITIONS)
 
     def __getitem__(self, rows: slice) -> "Setups":
         """Select some heliostats."""
         start, stop, _ = rows.indices(len(self.lift))
-        setups = slice(start * self.images, stop * self.images)
-        parts = {name: getattr(self.ideal, name)[setups] for name in TENSORS}
-        return Setups(self.ideal.with_(**parts), self.lift[rows], self.images)
+        ideal = self.ideal.subset(range(start * self.images, stop * self.images))
+        return replace(self, ideal=ideal, lift=self.lift[rows])
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,15 +233,15 @@ class Photographs:
         )
 
     def conjugate_gradient_steps(self, z: Tensor, basis: Tensor) -> Tensor:
-        """Return steps (B, images, 4, 8, 8) [m] from surfaces ``z`` towards the measured images.
+        """Return steps (B, images, F, 8, 8) [m] from surfaces ``z`` towards the measured images.
 
-        ``z`` is (B, 4, 8, 8) [m].
+        ``z`` is (B, F, 8, 8) [m].
         """
 
         def traced(dz: Tensor) -> Tensor:
             return self.trace(z[:, None] + dz, STEP_SAMPLES, COARSE_SIZE)
 
-        return conjugate_gradient_steps(traced, self.flux, basis)
+        return conjugate_gradient_steps(traced, self.flux, basis, self.setups.side)
 
     def __getitem__(self, rows: slice) -> "Photographs":
         """Select some heliostats."""
@@ -219,7 +251,7 @@ class Photographs:
 class CameraImages(NamedTuple):
     """Flux images (B, 64, 64) of sum 100 and the saturated share of each pixel.
 
-    The images are 4 m wide and centered on the spot.
+    The images are centered on the spot.
     """
 
     flux: Tensor
@@ -255,15 +287,19 @@ class Camera:
     exposure: tuple[float, float] = (0.5, 1.2)
 
     def photograph(
-        self, scene: Scene, device: torch.device, rng: np.random.Generator
+        self,
+        scene: Scene,
+        device: torch.device,
+        rng: np.random.Generator,
+        side: float = FLUX_WINDOW,
     ) -> CameraImages:
-        """Photograph a scene under several conditions."""
+        """Photograph a scene under several conditions, in squares of ``side`` [m]."""
         images = torch.empty(2, scene.batch, FLUX_SIZE, FLUX_SIZE, device=device)
         for rows in np.array_split(
             rng.permutation(scene.batch), min(self.n_conditions, scene.batch)
         ):
             share = rng.uniform() ** self.ease
-            seen = self._seen(scene.subset(rows.tolist()), self.effects(share, rng))
+            seen = self._seen(scene.subset(rows.tolist()), self.effects(share, rng), side)
             images[:, rows] = self._developed(seen, share, rng)
         return CameraImages(normalized(images[0]), images[1])
 
@@ -286,9 +322,9 @@ class Camera:
         ]
 
     @staticmethod
-    def _seen(scene: Scene, effects: Sequence[Effect]) -> Tensor:
+    def _seen(scene: Scene, effects: Sequence[Effect], side: float) -> Tensor:
         """Trace the images (B, 64, 64) of a scene with effects on light and camera."""
-        window = Window(on_spot=True)
+        window = Window(side, side, on_spot=True)
         flux = trace(
             scene, window, apply_optics_effects(effects, Optics()), samples=16, padding=0.25
         ).irradiance
@@ -392,10 +428,16 @@ def render(
     Without a camera, the flux is traced for the default sun without further effects.
     """
     rng = np.random.default_rng(seed)
-    setups = scenes.setups(field, len(z), images, rng, device)
+    return take(scenes.setups(field, len(z), images, rng, device), z, camera, rng)
+
+
+def take(setups: Setups, z: Array, camera: Camera | None, rng: np.random.Generator) -> Photographs:
+    """Photographs of surfaces ``z`` (B, F, 8, 8) [m] with given geometry; see `render`."""
+    device = setups.lift.device
     surfaces = torch.as_tensor(z, dtype=torch.float32, device=device)
     if camera is None:
         flux = setups.trace(surfaces, samples=24)
         return Photographs(setups, flux, torch.zeros_like(flux))
-    seen = camera.photograph(setups.scene(surfaces), device, rng)
-    return Photographs(setups, *(values.view(len(z), images, *values.shape[1:]) for values in seen))
+    seen = camera.photograph(setups.scene(surfaces), device, rng, setups.side)
+    shape = (len(z), setups.images, FLUX_SIZE, FLUX_SIZE)
+    return Photographs(setups, *(values.view(shape) for values in seen))

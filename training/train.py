@@ -13,19 +13,24 @@ import math
 import shutil
 import subprocess
 import time
+from abc import ABC, abstractmethod
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from model.network.architecture import MAX_IMAGES, SurfaceNetwork
+from model.prior import SurfacePrior
 from training.config import TrainConfig
 from training.prior import estimate
 from training.render import Photographs, load_field, render
 from training.surfaces import load_surfaces
+
+Array = NDArray[np.float64]
 
 
 class LossTerms(NamedTuple):
@@ -81,30 +86,41 @@ def commit_of(folder: Path) -> str:
 
 
 class Batch(NamedTuple):
-    """Photographs of mirrors, and their true heights (B, 4, 8, 8) [mm]."""
+    """Photographs of mirrors, and their true heights (B, F, 8, 8) [mm]."""
 
     photographs: Photographs
     truth: Tensor
 
+    @classmethod
+    def of(cls, seen: Photographs, z: Array) -> "Batch":
+        """Photographs of heights ``z`` (B, F, 8, 8) [m]."""
+        truth = torch.as_tensor(z * 1e3, dtype=torch.float32, device=seen.flux.device)
+        return cls(seen, truth - truth.mean(dim=(2, 3), keepdim=True))
 
-class Run:
-    """One training run in its folder."""
 
-    def __init__(self, config: TrainConfig, folder: Path, device: torch.device) -> None:
-        self.config, self.folder, self.device = config, folder, device
-        surfaces, self.names = load_surfaces(Path(config.data))
-        parts = config.parts(self.names)
-        self.surfaces, self.validation = surfaces[parts.training], surfaces[parts.held_out]
-        self.learnt = [self.names[i] for i in parts.training]
-        self.field = load_field(Path(config.data))
-        prior = estimate(self.surfaces)
+class Trainer(ABC):
+    """A training run in its folder; each derived class has a kind of mirrors.
+
+    The mean of the ``prior`` is the first guess. ``usual`` [mm] is the usual mean absolute height
+    over it, and ``scale`` [mm] the unit of heights inside the network.
+    """
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        folder: Path,
+        device: torch.device,
+        prior: SurfacePrior,
+        usual: float,
+        scale: float = 0.35,
+    ) -> None:
+        self.config, self.folder, self.device, self.usual = config, folder, device, usual
         self.mean, self.basis = (
             torch.as_tensor(values, dtype=torch.float32, device=device)
             for values in (prior.mean, prior.basis)
         )
-        self.usual = float(np.abs(self.surfaces - prior.mean).mean()) * 1e3
         torch.manual_seed(config.seed)
-        network = SurfaceNetwork(config.network).to(device)
+        network = SurfaceNetwork(config.network, scale, len(prior.mean)).to(device)
         self.network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.average = copy.deepcopy(self.network).requires_grad_(False)
         self.optimizer = torch.optim.AdamW(
@@ -117,13 +133,9 @@ class Run:
         able = device.type != "cpu" or torch.backends.cpu.get_cpu_capability().startswith("AVX512")
         self.short_floats = config.bfloat16 and able
         self.step, self.commit = 0, ""
+        self.validation_errors: list[float] = []
         if (folder / "checkpoint.pt").is_file():
             self._resume()
-
-    @classmethod
-    def open(cls, folder: Path) -> "Run":
-        """Open a run from its folder, on the CPU."""
-        return cls(TrainConfig.read(folder / "config.json"), folder, torch.device("cpu"))
 
     @property
     def _stateful(self) -> dict[str, Any]:
@@ -149,7 +161,7 @@ class Run:
         (self.folder / "checkpoint.tmp").replace(self.folder / "checkpoint.pt")
 
     def inputs(self, photographs: Photographs, guess: Tensor) -> tuple[Tensor, ...]:
-        """Return the network's inputs for photographs of B mirrors and guesses (B, 4, 8, 8) [m]."""
+        """Return the network's inputs for photographs of B mirrors and guesses (B, F, 8, 8) [m]."""
         # Geometry needs more than sixteen bits: all of it is outside of autocast.
         with torch.no_grad():
             guess_flux, conditions = photographs.trace(guess), photographs.setups.conditions()
@@ -159,24 +171,19 @@ class Run:
 
     @torch.no_grad()
     def predict(self, photographs: Photographs, n_iterations: int | None = None) -> Tensor:
-        """Return the surfaces (B, 4, 8, 8) [m] of the averaged network after all iterations."""
+        """Return the surfaces (B, F, 8, 8) [m] of the averaged network after all iterations."""
         guess = self.mean.expand(len(photographs.flux), -1, -1, -1)
         for _ in range(self.config.n_iterations if n_iterations is None else n_iterations):
             guess = self.average.eval()(*self.inputs(photographs, guess))[0] * 1e-3
         return guess
 
+    @abstractmethod
     def batch(self) -> Batch:
         """Render photographs of the step's mirrors."""
-        c = self.config
-        rng = np.random.default_rng((c.seed, self.step, 0))
-        z = c.augmentation.sample(self.surfaces, c.batch, rng)
-        images = int(rng.integers(1, MAX_IMAGES + 1))
-        with torch.no_grad():
-            seen = render(
-                z, images, self.field, c.scenes, c.camera, self.device, int(rng.integers(2**31))
-            )
-        truth = torch.as_tensor(z * 1e3, dtype=torch.float32, device=self.device)
-        return Batch(seen, truth - truth.mean(dim=(2, 3), keepdim=True))
+
+    @abstractmethod
+    def validate(self) -> list[float]:
+        """Mean absolute height error [mm] on validation mirrors after each iteration."""
 
     def train_step(self) -> float:
         """Render a batch and learn from each iteration on it; return the last height error [mm]."""
@@ -229,29 +236,64 @@ class Run:
     def _report(self, error: float) -> None:
         """Append one line to the learning curve, and write a checkpoint."""
         self.save()
+        self.validation_errors = self.validate()
         line = {
             "step": self.step,
             "train_mae_mm": round(error, 4),
-            "validation_mae_mm": validate(self),
+            "validation_mae_mm": self.validation_errors,
         }
         with (self.folder / "curve.jsonl").open("a", encoding="utf-8") as file:
             file.write(json.dumps(line) + "\n")
         print(json.dumps(line), flush=True)
 
 
-def validate(run: Run, repeats: int = 8) -> list[float]:
-    """Mean absolute height error [mm] on validation mirrors after each iteration.
+def height_errors(run: Trainer, batch: Batch) -> list[float]:
+    """Mean absolute height error [mm] on a batch after each iteration."""
+    counts = range(1, run.config.n_iterations + 1)
+    guesses = (run.predict(batch.photographs, count) for count in counts)
+    return [round(float((1e3 * guess - batch.truth).abs().mean()), 4) for guess in guesses]
 
-    Each mirror has eight clean images.
-    """
-    if not len(run.validation):
-        return []
-    z = run.validation.repeat(repeats, axis=0)
-    seen = render(z, MAX_IMAGES, run.field, run.config.scenes, None, run.device, seed=0)
-    truth = torch.as_tensor(z, dtype=torch.float32, device=run.device)
-    truth = truth - truth.mean(dim=(2, 3), keepdim=True)
-    guesses = [run.predict(seen, count) for count in range(1, run.config.n_iterations + 1)]
-    return [round(float((guess - truth).abs().mean()) * 1e3, 4) for guess in guesses]
+
+class Run(Trainer):
+    """A training run on the measured mirrors of Juelich."""
+
+    def __init__(self, config: TrainConfig, folder: Path, device: torch.device) -> None:
+        surfaces, self.names = load_surfaces(Path(config.data))
+        parts = config.parts(self.names)
+        self.surfaces, self.validation = surfaces[parts.training], surfaces[parts.held_out]
+        self.learnt = [self.names[i] for i in parts.training]
+        self.field = load_field(Path(config.data))
+        prior = estimate(self.surfaces)
+        usual = float(np.abs(self.surfaces - prior.mean).mean()) * 1e3
+        super().__init__(config, folder, device, prior, usual)
+
+    @classmethod
+    def open(cls, folder: Path) -> "Run":
+        """Open a run from its folder, on the CPU."""
+        return cls(TrainConfig.read(folder / "config.json"), folder, torch.device("cpu"))
+
+    def batch(self) -> Batch:
+        """Render photographs of the step's mirrors."""
+        c = self.config
+        rng = np.random.default_rng((c.seed, self.step, 0))
+        z = c.augmentation.sample(self.surfaces, c.batch, rng)
+        images = int(rng.integers(1, MAX_IMAGES + 1))
+        with torch.no_grad():
+            seen = render(
+                z, images, self.field, c.scenes, c.camera, self.device, int(rng.integers(2**31))
+            )
+        return Batch.of(seen, z)
+
+    def validate(self, repeats: int = 8) -> list[float]:
+        """Mean absolute height error [mm] on validation mirrors after each iteration.
+
+        Each mirror has eight clean images.
+        """
+        if not len(self.validation):
+            return []
+        z = self.validation.repeat(repeats, axis=0)
+        seen = render(z, MAX_IMAGES, self.field, self.config.scenes, None, self.device, seed=0)
+        return height_errors(self, Batch.of(seen, z))
 
 
 def main() -> None:

@@ -28,9 +28,6 @@ MAX_IMAGES = 8
 CONDITIONS = 12
 """Numbers that describe the geometry of one image (`model.network.inputs.conditions`)."""
 
-POINTS = FACETS * ROWS * COLUMNS
-"""Control heights of a mirror."""
-
 
 @dataclass(frozen=True)
 class NetworkConfig:
@@ -126,23 +123,24 @@ class Pooling(nn.Module):
 class SurfaceNetwork(nn.Module):
     """Flux images and a guess to control heights [mm] and the spread of their error [mm].
 
-    ``scale`` [mm] is the unit of heights inside the network.
+    ``scale`` [mm] is the unit of heights inside the network; mirrors have F ``facets``.
     """
 
-    def __init__(self, config: NetworkConfig, scale: float = 0.35) -> None:
+    def __init__(self, config: NetworkConfig, scale: float = 0.35, facets: int = FACETS) -> None:
         super().__init__()
-        self.config, self.scale = config, scale
+        self.config, self.scale, self.facets = config, scale, facets
+        points = facets * ROWS * COLUMNS
         self.encoder = Encoder(config)
-        self.from_geometry = nn.Linear(CONDITIONS + POINTS, config.features)
+        self.from_geometry = nn.Linear(CONDITIONS + points, config.features)
         self.blocks = nn.Sequential(*[Perceptron(config.features) for _ in range(config.depth)])
         self.pooling = Pooling(config)
         self.norm = nn.LayerNorm(config.features)
-        to_heights = nn.Linear(config.hidden, 2 * POINTS)
+        to_heights = nn.Linear(config.hidden, 2 * points)
         self.decoder = nn.Sequential(
-            nn.Linear(config.features + 2 * POINTS, config.hidden), nn.GELU(), to_heights
+            nn.Linear(config.features + 2 * points, config.hidden), nn.GELU(), to_heights
         )
         # A linear path for the part that is nearly linear in the images.
-        self.bypass = nn.Linear(config.features + POINTS, POINTS)
+        self.bypass = nn.Linear(config.features + points, points)
         for last in (to_heights, self.bypass):  # the initial prediction is the guess
             nn.init.zeros_(last.weight)
             nn.init.zeros_(last.bias)
@@ -167,14 +165,14 @@ class SurfaceNetwork(nn.Module):
             One with an image, zero without.
         guess_flux : Tensor (B, M, 64, 64)
             Traced from the guess, likewise.
-        guess : Tensor (B, 4, 8, 8) [mm]
-        descent : Tensor (B, M, 4, 8, 8) [mm]
+        guess : Tensor (B, F, 8, 8) [mm]
+        descent : Tensor (B, M, F, 8, 8) [mm]
             Each image's share of a step from the guess
             (`model.network.inputs.conjugate_gradient_steps`), zero without an image.
 
         Returns
         -------
-        heights, spread : Tensor (B, 4, 8, 8) [mm]
+        heights, spread : Tensor (B, F, 8, 8) [mm]
             Facet mean zero; the spread is the scale of a Laplace distribution of the error.
         """
         shares = descent.flatten(2) / self.scale  # (B, M, points)
@@ -191,9 +189,9 @@ class SurfaceNetwork(nn.Module):
         )  # (B, features + 2 points)
         heights, log_spread = (
             self.decoder(known).view(-1, 2, *guess.shape[1:]).unbind(1)
-        )  # (B, 4, 8, 8) each
+        )  # (B, F, 8, 8) each
         heights = heights + self.bypass(torch.cat([pooled, step], dim=1)).view_as(
             heights
-        )  # (B, 4, 8, 8)
+        )  # (B, F, 8, 8)
         heights = heights - heights.mean(dim=(2, 3), keepdim=True)
         return guess + self.scale * heights, self.scale * torch.exp(log_spread.clamp(-6, 2))

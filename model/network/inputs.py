@@ -39,7 +39,7 @@ STEP_HEIGHT = 3e-5
 def conjugate_gradient_steps(
     trace: Callable[[Tensor], Tensor], flux: Tensor, basis: Tensor, side: float = FLUX_WINDOW
 ) -> Tensor:
-    """Step towards the maximum a posteriori surface, as one share per image: heights (B, M, 4, 8,
+    """Step towards the maximum a posteriori surface, as one share per image: heights (B, M, F, 8,
     8) [m].
 
     The images are linearised in the surface, and a few conjugate gradient iterations are made.
@@ -49,11 +49,11 @@ def conjugate_gradient_steps(
     Parameters
     ----------
     trace : callable
-        Differentiable; images (B, M, R, R), sum 100, of the surface changed by heights (B, M, 4, 8,
+        Differentiable; images (B, M, R, R), sum 100, of the surface changed by heights (B, M, F, 8,
         8) [m], which are separate for each image.
     flux : Tensor (B, M, n R, n R)
         The measured images, sum 100.
-    basis : Tensor (K, 4, 8, 8) [m]
+    basis : Tensor (K, F, 8, 8) [m]
         Principal directions of the prior, each scaled by its standard deviation.
     side : float [m]
         Width of the images.
@@ -139,16 +139,26 @@ def conditions(scene: Scene, side: float = FLUX_WINDOW) -> Tensor:
         turned = -(axis * sun).sum(-1, keepdim=True) * normal - cosine * axis
         slopes.append(_project(turned, beam))
         shifts.append(_project(axis, beam) * scale)
-    return torch.cat(
-        [*slopes, *shifts, distance[:, None], cosine, _canting(mirror.area_vectors, axes) / 5e-3],
-        dim=1,
-    )
+    places = torch.einsum("bij,bjf->bif", axes[:, :2], mirror.points)
+    canting = _canting(mirror.area_vectors, axes, places)
+    return torch.cat([*slopes, *shifts, distance[:, None], cosine, canting / 5e-3], dim=1)
 
 
-def _canting(area_vectors: Tensor, axes: Tensor) -> Tensor:
-    """Slope (B, 2) between facets on either side, across x and y; in PAINT's facet order."""
+def _canting(area_vectors: Tensor, axes: Tensor, places: Tensor) -> Tensor:
+    """Slope (B, 2) between facets on either side of the mirror's middle, across x and y.
+
+    ``places`` (B, 2, F) [m] are the facets' along x and y; all mirrors have their facets on the
+    same sides. Zero for mirrors whose facets are all on one line.
+    """
     normals = torch.einsum("bij,bjf->bif", axes, area_vectors)
     slope = -normals[:, :2] / normals[:, 2:]
-    right_left = slope[:, 0, [1, 3]].mean(-1) - slope[:, 0, [0, 2]].mean(-1)
-    upper_lower = slope[:, 1, [0, 1]].mean(-1) - slope[:, 1, [2, 3]].mean(-1)
-    return torch.stack([right_left, upper_lower], dim=-1) / 2
+    middle = places.mean(dim=-1, keepdim=True)
+    away = 0.05 * (places - middle).abs().amax(dim=(1, 2))[0]
+    sides = (places - middle)[0]
+    across = [
+        slope[:, axis, sides[axis] > away].mean(-1) - slope[:, axis, sides[axis] < -away].mean(-1)
+        if bool((sides[axis].abs() > away).any())
+        else torch.zeros_like(slope[:, axis, 0])
+        for axis in range(2)
+    ]
+    return torch.stack(across, dim=-1) / 2

@@ -1,4 +1,4 @@
-"""Surface prediction by the shipped network, through onnxruntime."""
+"""Surface prediction by a network, through onnxruntime: the shipped one or that of a type."""
 
 import hashlib
 import json
@@ -18,6 +18,7 @@ from model.checksums import read_verified
 from model.errors import InvalidInputError
 from model.forecast import Aligned
 from model.images import COARSE_SIZE, FLUX_SIZE
+from model.mirror_kind import MirrorKind, mirror_order
 from model.network.architecture import MAX_IMAGES
 from model.network.inputs import (
     GUESS_SAMPLES,
@@ -36,8 +37,8 @@ from model.observation import (
 )
 from model.plant import Heliostat
 from model.plant_model import PlantModel
-from model.prior import default_prior
-from model.surface import FACETS, control_points, mirrored
+from model.prior import SurfacePrior, default_prior
+from model.surface import control_points, mirrored
 
 Array = NDArray[np.float64]
 
@@ -55,7 +56,7 @@ WEIGHTS = Path(__file__).parents[1] / "weights" / "surface-network.onnx"
 
 
 class HeightEstimate(NamedTuple):
-    """Heights (..., 4, 8, 8) [m] and their standard deviation."""
+    """Heights (..., F, 8, 8) [m] and their standard deviation."""
 
     z: Array
     z_std: Array
@@ -68,6 +69,10 @@ class SurfacePredictor:
     ----------
     name : str
         File name and the first twelve digits of its SHA-256: which weights made a prediction.
+    kind : MirrorKind
+        The mirrors that it was trained for; by default those of Juelich.
+    prior : SurfacePrior
+        Its mean is the first guess.
     """
 
     def __init__(
@@ -75,7 +80,11 @@ class SurfacePredictor:
         path: Path = WEIGHTS,
         threads: int = 1,
         read: Callable[[Path], bytes] = Path.read_bytes,
+        *,
+        kind: MirrorKind | None = None,
+        prior: SurfacePrior | None = None,
     ) -> None:
+        self.kind, self.prior = kind or juelich_kind(), prior or default_prior()
         # onnxruntime reads this when it is loaded. Its disable_telemetry_events() is too late: by
         # then it has written an id into the home folder and looked up the maker's host.
         os.environ["ORT_DISABLE_TELEMETRY"] = "1"
@@ -90,7 +99,7 @@ class SurfacePredictor:
         self.name = f"{path.stem}-{hashlib.sha256(content).hexdigest()[:12]}"
 
     def iterate(self, inputs: Mapping[str, NDArray[Any]]) -> HeightEstimate:
-        """Heights (B, 4, 8, 8) after one iteration."""
+        """Heights (B, F, 8, 8) after one iteration."""
         heights, spread = self.session.run(
             None, {name: inputs[name].astype(np.float32) for name in INPUTS}
         )
@@ -106,27 +115,31 @@ class SurfacePredictor:
         *,
         n_iterations: int = N_ITERATIONS,
     ) -> HeightEstimate:
-        """Heights (4, 8, 8) from one to eight images; see `predict`."""
+        """Heights (F, 8, 8) from one to eight images; see `predict`."""
         if not 1 <= len(observations) <= MAX_IMAGES:
             raise InvalidInputError(
                 f"a prediction takes 1 to {MAX_IMAGES} images, got {len(observations)}"
             )
-        if not has_network(heliostat):
+        n_facets = len(self.kind.centers)
+        if len(heliostat.facets) != n_facets:
             raise InvalidInputError(
-                f"the network predicts mirrors of {FACETS} facets, {heliostat.name} has"
+                f"the network predicts mirrors of {n_facets} facets, {heliostat.name} has"
                 f" {len(heliostat.facets)}; use the method refined"
             )
-        network_inputs = _NetworkInputs(heliostat, observations, model)
-        z = default_prior().mean
+        network_inputs = _NetworkInputs(heliostat, observations, model, self.prior)
+        z = self.prior.mean
         inputs = network_inputs.inputs(z)
         for _ in range(n_iterations - 1):
             z = self.iterate(inputs).z[0]
             inputs = network_inputs.inputs(z)
-        swapped = mirrored_inputs(inputs)
+        order = mirror_order(heliostat)
+        if order is None:
+            return HeightEstimate(*(values[0] for values in self.iterate(inputs)))
+        swapped = mirrored_inputs(inputs, order)
         both = self.iterate(
             {name: np.concatenate([inputs[name], swapped[name]]) for name in INPUTS}
         )
-        return HeightEstimate(*((values[0] + mirrored(values[1])) / 2 for values in both))
+        return HeightEstimate(*((values[0] + mirrored(values[1], order)) / 2 for values in both))
 
     def predict(
         self,
@@ -141,7 +154,7 @@ class SurfacePredictor:
         Raises
         ------
         InvalidInputError
-            Without images, with more than eight, or for a heliostat that does not have four facets.
+            Without images, with more than eight, or for a heliostat with another number of facets.
         """
         z, z_std = self.heights(heliostat, observations, model, n_iterations=n_iterations)
         return SurfacePrediction(
@@ -152,31 +165,36 @@ class SurfacePredictor:
             weights=self.name,
             misfits=misfits(heliostat, observations, z, model),
             used=tuple(o.identifier for o in observations),
-            mahalanobis_distance=default_prior().mahalanobis(z),
+            mahalanobis_distance=self.prior.mahalanobis(z),
             warnings=(
                 *prediction_warnings.geometry_warnings(heliostat, observations),
-                *prediction_warnings.network_warnings(heliostat, observations),
-                *prediction_warnings.canting_warnings(default_prior(), z),
+                *prediction_warnings.network_warnings(heliostat, observations, self.kind),
+                *prediction_warnings.canting_warnings(self.prior, z),
             ),
         )
 
 
-def has_network(heliostat: Heliostat) -> bool:
-    """Whether the shipped network predicts mirrors of a heliostat's number of facets."""
-    return len(heliostat.facets) == FACETS
+@lru_cache(maxsize=1)
+def juelich_kind() -> MirrorKind:
+    """The mirrors of Juelich, which the shipped network was trained for."""
+    return MirrorKind.of(Heliostat.juelich("juelich", (0.0, 100.0, 0.0), 100.0), name="juelich")
 
 
 class _NetworkInputs:
     """Computes the inputs of each iteration for M observations of a heliostat."""
 
     def __init__(
-        self, heliostat: Heliostat, observations: Sequence[Observation], model: PlantModel
+        self,
+        heliostat: Heliostat,
+        observations: Sequence[Observation],
+        model: PlantModel,
+        prior: SurfacePrior,
     ) -> None:
         self.heliostat, self.observations, self.model = heliostat, observations, model
         self.flux = torch.as_tensor(np.array([o.flux for o in observations]), dtype=torch.float32)
         self.ideal = torch.as_tensor(control_points(heliostat), dtype=torch.float32).movedim(-1, -3)
         self.normals = torch.as_tensor(heliostat.facet_normals, dtype=torch.float32)
-        self.basis = torch.as_tensor(default_prior().basis, dtype=torch.float32)
+        self.basis = torch.as_tensor(prior.basis, dtype=torch.float32)
         self.saturation = {
             size: Saturation(observations, size) for size in (FLUX_SIZE, COARSE_SIZE)
         }
@@ -184,7 +202,7 @@ class _NetworkInputs:
         self.aligned: Aligned | None = None
 
     def inputs(self, z: Array) -> dict[str, NDArray[Any]]:
-        """Return `INPUTS` for the current surface (4, 8, 8) [m]."""
+        """Return `INPUTS` for the current surface (F, 8, 8) [m]."""
         # The previous surface is similar, so that its alignment is a good start.
         aligned = align_observations(self.heliostat, self.observations, z, self.model, self.aligned)
         self.aligned = aligned
@@ -208,7 +226,7 @@ class _NetworkInputs:
         return self.saturation[size].apply(images)
 
     def _changed(self, aligned: Aligned, changes: Tensor) -> Tensor:
-        """Images (1, M, R, R), sum 100, of mirrors deformed by heights (1, M, 4, 8, 8) [m]."""
+        """Images (1, M, R, R), sum 100, of mirrors deformed by heights (1, M, F, 8, 8) [m]."""
         deformed = aligned.deformed(torch.einsum("mfij,fk->mfkij", changes[0], self.normals))
         return self._images(deformed, COARSE_SIZE, STEP_SAMPLES)[None]
 
@@ -220,8 +238,10 @@ class _NetworkInputs:
         )
 
 
-def mirrored_inputs(inputs: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """`INPUTS` with left and right exchanged.
+def mirrored_inputs(
+    inputs: Mapping[str, NDArray[Any]], order: Sequence[int]
+) -> dict[str, NDArray[Any]]:
+    """`INPUTS` with left and right exchanged, and facets in the ``order`` of `mirror_order`.
 
     Physics is symmetric, the network not quite: the mean of both predictions has smaller errors.
     """
@@ -230,8 +250,8 @@ def mirrored_inputs(inputs: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any
         "conditions": inputs["conditions"] * np.array(MIRRORED_CONDITIONS, dtype=np.float32),
         "mask": inputs["mask"],
         "guess_flux": inputs["guess_flux"][..., ::-1],
-        "guess": mirrored(inputs["guess"]),
-        "descent": mirrored(inputs["descent"]),
+        "guess": mirrored(inputs["guess"], order),
+        "descent": mirrored(inputs["descent"], order),
     }
 
 

@@ -56,7 +56,7 @@ from model.prior import SurfacePrior, prior_of
 from model.progress import Progress, Steps, silent
 from model.refinement.half_samples import half_sample_covariance, n_minimizations
 from model.refinement.image_model import ImageModel
-from model.refinement.modes import RefinementOptions, find_mode, find_optimum
+from model.refinement.modes import N_THREADS, RefinementOptions, find_mode, find_optimum
 from model.refinement.other_modes import (
     between_mode_variance,
     find_other_modes,
@@ -141,6 +141,7 @@ def refine(
         resolution=options.resolution,
         samples=options.samples_of(len(heliostat.facets)),
         steps=steps,
+        threads=N_THREADS,
     )
     mean = np.zeros(len(prior.basis))
     fit = fit_consistent_images(

@@ -22,9 +22,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from model.observation import spread_suns
 from model.prior import SurfacePrior
 from model.refinement.image_model import ImageModel
-from model.refinement.modes import RefinementOptions, anneal_few, find_optimum
+from model.refinement.modes import N_THREADS, RefinementOptions, anneal_few, find_optimum
 from model.refinement.posterior import Hyperparameters, Linearization, Mode, linearize
 from model.refinement.whitening import BANDS
 
@@ -48,19 +49,28 @@ class HalfEstimate(NamedTuple):
     variance: Array
 
 
-def half_samples(suns: Array) -> list[HalfSplit]:
+def half_samples(suns: Array, max_images: int) -> list[HalfSplit]:
     """Split M images by their suns (M, 3) into halves: fewer than four in one way, others in three
     balanced ways.
 
     Four groups of similar suns, along the direction of the largest scatter, are combined to halves
-    in all ways.
+    in all ways. Of a half with more than ``max_images`` those are taken whose suns are far apart:
+    the squared differences are relative to their variance, whatever the number of images is.
     """
+
+    def some(half: list[int]) -> list[int]:
+        if len(half) <= max_images:
+            return half
+        return [half[i] for i in spread_suns(suns[half], max_images)]
+
     around = suns - suns.mean(axis=0)
     order = np.argsort(around @ np.linalg.svd(around)[2][0], kind="stable").tolist()
     if len(order) < N_GROUPS:
         return [HalfSplit(order[: len(order) // 2], order[len(order) // 2 :])]
     first, *others = (part.tolist() for part in np.array_split(order, N_GROUPS))
-    return [HalfSplit(first + others[i], others[i - 2] + others[i - 1]) for i in range(3)]
+    return [
+        HalfSplit(some(first + others[i]), some(others[i - 2] + others[i - 1])) for i in range(3)
+    ]
 
 
 def n_minimizations(n_images: int) -> int:
@@ -81,10 +91,8 @@ def half_sample_covariance(
     if len(model.suns) < 2:
         return shared
     model.steps.phase = "comparing half-samples of the images"
-    # NumPy and torch release the interpreter's lock: two threads take little more than half the
-    # time.
-    with ThreadPoolExecutor(2) as threads:
-        halves = chain.from_iterable(half_samples(model.suns))
+    with ThreadPoolExecutor(N_THREADS) as threads:
+        halves = chain.from_iterable(half_samples(model.suns, options.max_annealed))
         starts = exchange_facets(model.prior, mode.state.coefficients)
         found = list(
             threads.map(
@@ -134,7 +142,7 @@ def fit_half(
     options: RefinementOptions,
 ) -> HalfEstimate:
     """Fit some of the images from coefficients (K,), with the noise that all images have."""
-    part, n_images = model.subset(half), len(model.observations)
+    part, n_images = replace(model.subset(half), threads=1), len(model.observations)
     near = anneal_few(
         part, start, options.rough_minimizer, options.annealing[:1], options.max_annealed
     )

@@ -83,6 +83,8 @@ class ImageModel:
         Traced rays along each side of a facet.
     steps : Steps
         Counts minimizations; the work may be ended before each trace.
+    threads : int
+        That differentiate the images; one where several fits run in parallel.
     """
 
     heliostat: Heliostat
@@ -93,6 +95,7 @@ class ImageModel:
     resolution: int = COARSE_SIZE
     samples: int = 32
     steps: Steps = field(default_factory=Steps)
+    threads: int = 1
 
     @cached_property
     def measured(self) -> Array:
@@ -142,14 +145,15 @@ class ImageModel:
         """Coefficients (K,) of the prior and those of the ripples."""
         return tuple(np.split(coefficients, [len(self.prior.basis)]))
 
-    def state(self, coefficients: Array) -> SurfaceState:
-        """Align the mirror of coefficients (K,) under each sun, and trace its images."""
+    def state(self, coefficients: Array, near: SurfaceState | None = None) -> SurfaceState:
+        """Align the mirror of coefficients (K,), faster from a state near by; trace its images."""
         self.steps.alive()
         smooth, fine = self.split(coefficients)
-        aligned = self._align(self.prior.surface(smooth))
-        return SurfaceState(
-            coefficients, aligned, self._trace(aligned) + np.tensordot(fine, self.ripples, axes=1)
-        )
+        z, start = self.prior.surface(smooth), None if near is None else near.aligned
+        aligned = align_observations(self.heliostat, self.observations, z, self.model, start)
+        # In the ripples' precision: a copy of them in double precision takes longer than the trace.
+        rippled = np.tensordot(fine.astype(self.ripples.dtype), self.ripples, axes=1)
+        return SurfaceState(coefficients, aligned, self._trace(aligned) + rippled)
 
     def jacobian(self, state: SurfaceState) -> NDArray[Any]:
         """Derivatives (K, M, R, R) of the images by the prior's coefficients."""
@@ -186,10 +190,6 @@ class ImageModel:
         ]
         return np.asarray(state.images - np.stack(images))
 
-    def _align(self, z: Array) -> Aligned:
-        """Align the mirror of heights (F, I, J) [m] under each sun."""
-        return align_observations(self.heliostat, self.observations, z, self.model)
-
     def _trace(self, aligned: Aligned) -> Array:
         """Images (M, R, R) as the cameras show them."""
         with torch.no_grad():
@@ -199,7 +199,8 @@ class ImageModel:
 
     def changes_of(self, z: Array, changes: HeightChanges) -> NDArray[Any]:
         """Change of the images (K, M, R, R) of the mirror of heights (F, I, J) [m]."""
-        return self._trace_changes(self._align(z), changes)
+        aligned = align_observations(self.heliostat, self.observations, z, self.model)
+        return self._trace_changes(aligned, changes)
 
     def _trace_changes(self, aligned: Aligned, directions: HeightChanges) -> NDArray[Any]:
         """Change of the images (K, M, R, R) with K changes of the heights."""
@@ -211,6 +212,7 @@ class ImageModel:
                 side=self.side,
                 samples=self.samples,
                 between=self.steps.alive,
+                threads=self.threads,
             )
             images = self._saturation.apply(images)
             return np.asarray((images[1:] - images[:1]).numpy())

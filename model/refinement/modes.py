@@ -43,6 +43,10 @@ MINIMIZER = MinimizerOptions(
 """Minimization of the negative log posterior, whose unit is the nat."""
 
 
+N_THREADS = 2
+"""Threads of a refinement. NumPy and torch release the interpreter's lock."""
+
+
 @dataclass(frozen=True)
 class RefinementOptions:
     """Options of a refinement.
@@ -146,11 +150,14 @@ def find_mode(model: ImageModel, starts: Sequence[Array], options: RefinementOpt
     model.steps.phase = f"fitting the surface to {len(few.observations)} images"
     model.steps.total += len(starts) * len(options.annealing)
 
+    if len(starts) > 1:
+        few = replace(few, threads=1)
+
     def anneal_from(start: Array) -> Mode:
         state = few.state(start)
         return anneal(few, state, few.jacobian(state), options.minimizer, options.annealing)
 
-    with ThreadPoolExecutor(2) as threads:
+    with ThreadPoolExecutor(N_THREADS) as threads:
         mode = min(threads.map(anneal_from, starts), key=lambda mode: mode.cost)
     if len(few.observations) == len(model.observations):
         return mode

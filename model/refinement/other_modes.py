@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from model.prior import SurfacePrior
 from model.refinement.image_model import ImageModel
-from model.refinement.modes import RefinementOptions, anneal_few, find_optimum
+from model.refinement.modes import N_THREADS, RefinementOptions, anneal_few, find_optimum
 from model.refinement.posterior import Mode
 from model.surface import FACETS
 
@@ -49,6 +49,7 @@ def find_other_modes(model: ImageModel, mode: Mode, options: RefinementOptions) 
     if len(model.prior.mean) == FACETS:
         return OtherModes(np.zeros((0, len(mode.state.coefficients))), np.zeros(0))
     model.steps.phase = "comparing surfaces with exchanged facets"
+    model = replace(model, threads=1)
 
     def fit(start: Array) -> Mode:
         near = anneal_few(
@@ -56,7 +57,7 @@ def find_other_modes(model: ImageModel, mode: Mode, options: RefinementOptions) 
         )
         return find_optimum(model, replace(near, hyper=mode.hyper), options.rough_minimizer)
 
-    with ThreadPoolExecutor(2) as threads:
+    with ThreadPoolExecutor(N_THREADS) as threads:
         found = list(threads.map(fit, changed_facets(model.prior, mode.state.coefficients)))
     return OtherModes(
         np.array([other.state.coefficients for other in found]),

@@ -133,7 +133,7 @@ class PosteriorCost:
 
     def step(self, state: SurfaceState, change: Array) -> SurfaceState:
         """The state after a change (K,) of the coefficients."""
-        return self.model.state(state.coefficients + change)
+        return self.model.state(state.coefficients + change, state)
 
     def _flat(self, changes: NDArray[Any]) -> NDArray[Any]:
         """Whitened changes (K, M n) of changes (K, M, R, R)."""

@@ -142,6 +142,8 @@ class StorageSettings(_SettingsGroup):
     """Most connections of this process, at least 8 and 2 for each of its job_workers and
     short_job_workers; without it 48 and 2 for each. PostgreSQL's max_connections must hold those of
     all processes."""
+    networks_dir: Path | None = None
+    """Folder of the networks of heliostat types; without it networks inside data_dir."""
     migrate_on_start: bool | None = None
     """Bring the schema to its newest version at start; without it only SQLite is migrated."""
 
@@ -166,6 +168,11 @@ class StorageSettings(_SettingsGroup):
         if self.database_password_file is None:
             return None
         return SecretStr(self.database_password_file.read_text(encoding="utf-8").strip())
+
+    @property
+    def networks(self) -> Path:
+        """The folder of the networks of heliostat types."""
+        return self.networks_dir or self.data_dir / "networks"
 
     @property
     def database(self) -> URL:

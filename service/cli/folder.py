@@ -180,13 +180,20 @@ def predict_heliostat(
         "z_std_mean_mm": round(float(predicted.z_std.mean() * 1e3), 4),
     }
     if predicted.method != method:
-        count = len(twin.heliostat.facets)
-        entry["note"] = f"no network predicts mirrors of {count} facets: the surface was refined"
+        entry["note"] = _refined_note(twin.heliostat)
     measured = opened.folder.measured_surface(name)
     if measured is not None:
         truth = measured_heights(twin.heliostat, measured)
         entry["against_measured"] = surface_errors(predicted.z, truth)
     return predicted, entry
+
+
+def _refined_note(heliostat: Heliostat) -> str:
+    width, height = 2 * heliostat.facet_frames.half_sizes.mean(axis=0)
+    return (
+        f"no network was trained for mirrors of {len(heliostat.facets)} facets of {width:.2f} m x"
+        f" {height:.2f} m on this mount: the surface was refined"
+    )
 
 
 def surface_errors(z: Array, truth: Array) -> dict[str, float]:

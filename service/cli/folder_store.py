@@ -125,7 +125,11 @@ def open_folder(
     with TemporaryDirectory(prefix="heliotwin-") as directory:
         # Without validation: the environment configures the service's store, not this one.
         runtime = Runtime.from_settings(
-            Settings.model_construct(data_dir=Path(directory), max_image_bytes=2**30)
+            Settings.model_construct(
+                data_dir=Path(directory),
+                networks_dir=folder.root / "networks",
+                max_image_bytes=2**30,
+            )
         )
         try:
             Base.metadata.create_all(runtime.database.engine)

@@ -9,6 +9,7 @@ import torch
 from model.effects.soiling import Soiling
 from model.forecast import align
 from model.metrics import flux_accuracy
+from model.network.predictor import juelich_kind
 from model.observation import Observation, render_observations
 from model.plant import Facet, Heliostat
 from model.plant_model import JUELICH_MODEL
@@ -56,9 +57,9 @@ def test_far_mirrors_are_named_with_their_spots():
 
 def test_facets_of_another_size_and_clipped_photographs_are_named():
     large = [Facet(f.position, 1.5 * f.canting_x, f.canting_y) for f in near().facets]
-    (said,) = network_warnings(replace(near(), facets=tuple(large)), seen(near()))
+    (said,) = network_warnings(replace(near(), facets=tuple(large)), seen(near()), juelich_kind())
     assert "2.41 m x 1.28 m" in said
-    assert network_warnings(near(), seen(near())) == []
+    assert network_warnings(near(), seen(near()), juelich_kind()) == []
     (said,) = geometry_warnings(near(), seen(near(), clipped=np.ones((64, 64), np.float32)))
     assert "are saturated" in said
 

@@ -1,6 +1,7 @@
 """Refinement on rendered images of mirrors it knows only by their light."""
 
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 import pytest
@@ -145,11 +146,19 @@ def test_half_samples_are_balanced(count):
     of three.
     """
     suns = sun_direction_at(np.full(count, 10.0), np.linspace(-60, 60, count), 50.9)
-    pairs = half_samples(suns)
+    pairs = half_samples(suns, 8)
     assert all(sorted(a + b) == list(range(count)) and a and b for a, b in pairs)
     if count == 4:
         apart = [sum((i in a) != (j in a) for a, _ in pairs) for i in range(4) for j in range(i)]
         assert apart == [2] * 6
+
+
+def test_half_samples_of_many_images_are_of_a_few_with_suns_far_apart():
+    suns = sun_direction_at(np.full(64, 10.0), np.linspace(-60, 60, 64), 50.9)
+    for half in chain.from_iterable(half_samples(suns, 8)):
+        assert len(set(half)) == 8
+        around = np.arccos(np.clip(suns[half] @ suns[half].T, -1, 1))
+        assert np.degrees(around.max()) > 40
 
 
 def test_no_image_narrows_the_tilt_of_the_whole_mirror(refined):

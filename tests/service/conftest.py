@@ -257,6 +257,9 @@ class FakeOperations:
             return MeasuredFlux(Quality(accepted=True), centered=centered)
         return MeasuredFlux(Quality(accepted=True), flux, centered, np.array([0.5, -0.25]))
 
+    def has_network(self, heliostat: Heliostat) -> bool:
+        return len(heliostat.facets) == 4
+
     def predict(
         self,
         heliostat: Heliostat,

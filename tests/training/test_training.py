@@ -24,7 +24,7 @@ from training.surfaces import (
     untilted,
     with_symmetries,
 )
-from training.train import Run, commit_of, loss_terms, validate
+from training.train import Run, commit_of, loss_terms
 
 SMALL = NetworkConfig(channels=(8, 16, 16), features=32, hidden=32)
 
@@ -201,7 +201,7 @@ def test_a_run_learns_saves_and_resumes(stj, tmp_path):
     for a, b in zip(whole.network.parameters(), resumed.network.parameters(), strict=True):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-6)
     assert TrainConfig.read(tmp_path / "half" / "config.json") == config
-    assert np.isfinite(validate(resumed, repeats=1)).all()
+    assert np.isfinite(resumed.validate(repeats=1)).all()
 
 
 def test_rough_mirrors_weigh_less_and_their_spread_all_the_same():

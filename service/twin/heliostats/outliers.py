@@ -14,7 +14,6 @@ import numpy as np
 
 from model.metrics import flux_accuracy
 from model.network.architecture import MAX_IMAGES
-from model.network.predictor import has_network
 from model.observation import Observation
 from model.plant import Heliostat
 from model.plant_model import PlantModel
@@ -46,7 +45,7 @@ def reject_outliers(
     Of mirrors without a network none is removed: their refinement excludes images itself.
     """
     observations = sorted(observations, key=_time)
-    if len(observations) < _FEWEST or not has_network(heliostat):
+    if len(observations) < _FEWEST or not operations.has_network(heliostat):
         return Consistent(observations, {})
     glance = operations.predict(heliostat, choose_diverse(observations, MAX_IMAGES), model)
     images = operations.render(heliostat, observations, glance.z, model).clip(min=0)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -13,7 +14,7 @@ from model.forecast import View, align
 from model.imaging import Camera, ImageKind, MeasuredFlux
 from model.imaging import measure as measure_image
 from model.network.architecture import MAX_IMAGES
-from model.network.predictor import default_predictor, has_network
+from model.network.networks import SHIPPED, Networks
 from model.observation import Observation, SurfacePrediction, render_observations, spread_suns
 from model.plant import Heliostat, TargetPlane
 from model.plant_model import PlantModel
@@ -26,7 +27,17 @@ from model.tracing.convolution import central_rays
 from service.base.choices import Method, require_images
 from service.sources.juelich import CENTERED_WINDOW, mark_layouts
 
-__all__ = ["Forecast", "forecast", "measure", "predict", "render", "study", "superpose"]
+__all__ = [
+    "Forecast",
+    "ModelOperations",
+    "forecast",
+    "has_network",
+    "measure",
+    "predict",
+    "render",
+    "study",
+    "superpose",
+]
 
 Array = NDArray[np.float64]
 
@@ -61,12 +72,15 @@ def predict(
     model: PlantModel,
     method: Method = "network",
     progress: Progress = silent,
+    *,
+    networks: Networks = SHIPPED,
 ) -> SurfacePrediction:
     """Predict the mirror surface of a heliostat from its images.
 
     The network predicts it alone, or the prediction is refined through the tracer. Mirrors that
-    there is no network for are refined in either case: see `SurfacePrediction.method`. ``progress``
-    receives the progress of the refinement. An exception that it raises stops the refinement.
+    none of the ``networks`` was trained for are refined in either case: see
+    `SurfacePrediction.method`. ``progress`` receives the progress of the refinement. An exception
+    that it raises stops the refinement.
 
     Raises
     ------
@@ -74,16 +88,23 @@ def predict(
         If there are no or too many images, or the method is unknown.
     """
     require_images(method, len(observations))
-    if not has_network(heliostat):
+    predictor = networks.of(heliostat)
+    if predictor is None:
         return refine(heliostat, observations, model, progress=progress)
-    predictor = default_predictor()
     if method == "network":
         return predictor.predict(heliostat, observations, model)
     far_apart = spread_suns(np.array([o.sun for o in observations]), MAX_IMAGES)
     few = [observations[place] for place in far_apart]
     start, _ = predictor.heights(heliostat, few, model)
-    refined = refine(heliostat, observations, model, start, progress=progress)
+    refined = refine(
+        heliostat, observations, model, start, prior=predictor.prior, progress=progress
+    )
     return replace(refined, weights=f"{predictor.name}+{refined.weights}")
+
+
+def has_network(heliostat: Heliostat, networks: Networks = SHIPPED) -> bool:
+    """Whether a network was trained for a heliostat's kind of mirror."""
+    return networks.of(heliostat) is not None
 
 
 def render(
@@ -176,3 +197,36 @@ def _smooth(image: torch.Tensor) -> NDArray[np.float32]:
     total = positive.sum()
     kept = positive * (image.sum().clamp(min=0) / total) if total > 0 else positive
     return np.asarray(kept.float().numpy())
+
+
+class ModelOperations:
+    """These operations, with the networks of a folder.
+
+    Attributes
+    ----------
+    networks : Networks
+    """
+
+    measure = staticmethod(measure)
+    render = staticmethod(render)
+    forecast = staticmethod(forecast)
+    superpose = staticmethod(superpose)
+    study = staticmethod(study)
+
+    def __init__(self, folder: Path) -> None:
+        self.networks = Networks(folder)
+
+    def predict(
+        self,
+        heliostat: Heliostat,
+        observations: Sequence[Observation],
+        model: PlantModel,
+        method: Method = "network",
+        progress: Progress = silent,
+    ) -> SurfacePrediction:
+        """`predict` with the networks of the folder."""
+        return predict(heliostat, observations, model, method, progress, networks=self.networks)
+
+    def has_network(self, heliostat: Heliostat) -> bool:
+        """`has_network` with the networks of the folder."""
+        return has_network(heliostat, self.networks)

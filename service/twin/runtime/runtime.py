@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from importlib import import_module
+from pathlib import Path
 from typing import Any, Protocol, cast
 
 from numpy.typing import NDArray
@@ -35,7 +36,7 @@ LARGE_PIXELS = 12_500_000
 
 
 class Operations(Protocol):
-    """Interface of the module `service.twin.runtime.operations`: the service's use of the model."""
+    """Interface of `service.twin.runtime.operations`: the service's use of the model."""
 
     def measure(
         self,
@@ -57,6 +58,9 @@ class Operations(Protocol):
         progress: Progress = ...,
     ) -> SurfacePrediction:
         """Predict a surface from observations."""
+
+    def has_network(self, heliostat: Heliostat) -> bool:
+        """Whether a network was trained for a heliostat's kind of mirror."""
 
     def render(
         self,
@@ -96,12 +100,13 @@ class Operations(Protocol):
         """Find effects that photographs require and the declared model lacks."""
 
 
-def load_operations() -> Operations:
-    """Import the module `service.twin.runtime.operations`.
+def load_operations(networks: Path) -> Operations:
+    """Import the module `service.twin.runtime.operations`, with the networks of a folder.
 
     It is imported late because it loads the tracer's libraries.
     """
-    return cast(Operations, import_module("service.twin.runtime.operations"))
+    module = import_module("service.twin.runtime.operations")
+    return cast(Operations, module.ModelOperations(networks))
 
 
 @dataclass(frozen=True)
@@ -136,7 +141,7 @@ class Runtime:
             settings=settings,
             database=Database(settings.database, settings.connections),
             images=ImageStore(settings.data_dir / "images"),
-            operations=operations or load_operations(),
+            operations=operations or load_operations(settings.networks),
             compute_slots=ComputeSlots(settings.parallel_computations),
             decoding_slots=ComputeSlots(settings.parallel_computations + 1),
         )

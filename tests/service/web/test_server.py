@@ -91,7 +91,7 @@ class Telling(slots.ComputeSlots):
         super().enter(timeout_s, check)
 
 runtime.ComputeSlots = Telling
-runtime.load_operations = Slow
+runtime.load_operations = lambda networks: Slow()
 serve(Settings())
 """
 
