@@ -11,6 +11,7 @@ import numpy as np
 import yaml
 
 from model.errors import InvalidInputError
+from model.locating import locator_to_json
 from model.plant import Cylinder, Plant, TargetPlane
 from model.receivers import Cavity, Panels
 from model.sunshape import Buie
@@ -60,10 +61,7 @@ def export_plant(
         "heliostat_types": types,
         "layout": {"file": LAYOUT},
         "receivers": _entries(plant.receivers, made),
-        "targets": {
-            name: {key: value for key, value in _plane(target).items() if key != "absorptance"}
-            for name, target in plant.targets.items()
-        },
+        "targets": {name: _target(target) for name, target in plant.targets.items()},
         "sun": _sun(optics),
     }
     if facts.tower is not None:
@@ -138,6 +136,11 @@ def receiver_entry(receiver: AnyReceiver) -> dict[str, object]:
         return {"kind": "panels", **shared}
     assert isinstance(receiver, Cavity)
     return {"kind": "cavity", "aperture_m": receiver.aperture.tolist(), **shared}
+
+
+def _target(target: TargetPlane) -> dict[str, object]:
+    entry = {key: value for key, value in _plane(target).items() if key != "absorptance"}
+    return entry | ({} if target.locator is None else locator_to_json(target.locator))
 
 
 def _plane(plane: TargetPlane) -> dict[str, object]:
