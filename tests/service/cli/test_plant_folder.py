@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from model.locating import locator_to_json
 from model.surface import control_points
 from service.base.receivers import receiver_to_json
 from service.sources.folder import read_folder
@@ -97,13 +98,17 @@ def test_exported_plant_file_equals_the_imported_one(tmp_path: Path):
         for name, target in given.plant.targets.items():
             there = receiver_to_json(exported.plant.targets[name])
             _is_same(there, receiver_to_json(target), 1e-8)
+            located, expected = exported.plant.targets[name].locator, target.locator
+            assert located is not None
+            assert expected is not None
+            assert locator_to_json(located) == locator_to_json(expected)
         assert exported.tower == given.tower
         assert exported.optics.attenuation == given.optics.attenuation
         assert vars(exported.optics.sun_shape) == vars(given.optics.sun_shape)
         assert (exported.time_zone, exported.plant.name) == (given.time_zone, given.plant.name)
         assert exported.plant.origin.tolist() == given.plant.origin.tolist()
         assert list(exported.types) == list(given.types)
-        assert list(exported.plant.heliostats) == ["A1", "B1"]
+        assert list(exported.plant.heliostats) == list(given.plant.heliostats)
         for name, heliostat in exported.plant.heliostats.items():
             other = given.plant.heliostats[name]
             np.testing.assert_allclose(control_points(heliostat), control_points(other), atol=1e-9)

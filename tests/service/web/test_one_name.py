@@ -59,6 +59,10 @@ WITHOUT_UNIT = {
     "per_image",
     "progress",
     "unexplained_share",
+    # Of cameras: matrices, and coefficients of a lens.
+    "distortion",
+    "homography",
+    "rotation",
     # Directions.
     "normal",
     "up",
