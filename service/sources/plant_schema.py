@@ -384,20 +384,19 @@ class PoseEntry(PlantPart):
 
     position_m: Position
     look_at_m: Position | None = Field(
-        None, description="The point in the direction of its optical axis; the camera is upright."
+        None, description="A point on its optical axis [m]; the camera is upright."
     )
     rotation: Matrix3 | None = Field(
         None,
         description="In place of look_at_m: its image's right, its image's down and its direction,"
         " each as a row of east, north, up.",
     )
-    focal_length_px: Annotated[Number, Field(ge=1, le=1e7)] | None = None
+    focal_length_px: Annotated[Number, Field(ge=1, le=1e7)] | None = Field(None, description="[px]")
     field_of_view_deg: Annotated[Number, Field(gt=0, lt=179)] | None = Field(
-        None,
-        description="In place of the focal length: from the left to the right edge of the image.",
+        None, description="In place of the focal length: from the left to the right edge [deg]."
     )
     principal_point_px: PixelPair | None = Field(
-        None, description="Column and row of the optical axis; the middle of the image without it."
+        None, description="Column and row of the optical axis [px]; the image's middle without it."
     )
     distortion: Annotated[list[Coordinate], Field(min_length=1, max_length=5)] | None = Field(
         None, description="k1, k2, p1, p2, k3 of Brown's lens, as of OpenCV; none without it."
@@ -422,11 +421,11 @@ class CameraEntry(PlantPart):
         " target's centre.",
     )
     corners_px: Annotated[list[PixelPair], Field(min_length=4, max_length=4)] | None = Field(
-        None, description="The target's upper left, upper right, lower left and lower right corner."
+        None, description="The target's upper left and right, lower left and right corner [px]."
     )
-    pose: PoseEntry | None = None
+    pose: PoseEntry | None = Field(None, description="Where the camera is, and its lens.")
     image_size_px: Annotated[list[Pixels], Field(min_length=2, max_length=2)] | None = Field(
-        None, description="Columns and rows of its photographs; others are refused if it is given."
+        None, description="Columns and rows of its photographs [px]; others are refused."
     )
 
     @model_validator(mode="after")
