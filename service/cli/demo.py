@@ -37,6 +37,7 @@ from service.cli.field import FieldReport, FieldRequest, trace_field
 from service.cli.folder import observations_of, surface_errors, write_json
 from service.cli.folder_store import FolderStore
 from service.cli.output import make_table
+from service.drawing.facets import FacetPlaces
 from service.drawing.pictures import comparison_picture, flux_picture, of_peak, surface_picture
 from service.drawing.plant_picture import plant_picture
 from service.drawing.templates import ASSETS, TEMPLATES
@@ -203,9 +204,10 @@ def _open_store(folder: Path) -> Runtime:
 
 @dataclass(frozen=True, eq=False)
 class _Made:
-    """A result with its surfaces (F, 8, 8) [m], test images and refined forecasts."""
+    """A result with its mirror, surfaces (F, 8, 8) [m], test images and refined forecasts."""
 
     result: HeliostatResult
+    heliostat: Heliostat
     surfaces: dict[str, Array | None]
     judged: list[Observation]
     forecasts: list[Array]
@@ -289,7 +291,7 @@ def _predict(
         error_refined_mm=errors.get("refined", {}).get("mae_mm"),
         pictures=(),
     )
-    return _Made(result, surfaces, judged, fluxes["refined"])
+    return _Made(result, heliostat, surfaces, judged, fluxes["refined"])
 
 
 def _store_forecast(runtime: Runtime, name: str, observation: Observation) -> None:
@@ -346,7 +348,9 @@ def _draw(out: Path, made: _Made, top: float, ends: Mapping[str, float]) -> tupl
     """
     name = made.result.heliostat
     drawn = {
-        f"surfaces/{name}-{key}.png": surface_picture(z, f"{name}, {key}", ends["heights"])
+        f"surfaces/{name}-{key}.png": surface_picture(
+            z, f"{name}, {key}", ends["heights"], FacetPlaces.of(made.heliostat)
+        )
         for key, z in made.surfaces.items()
         if z is not None
     }
