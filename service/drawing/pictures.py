@@ -1,7 +1,6 @@
 """Pictures of flux maps and surfaces as PNG, without matplotlib's global state."""
 
 import io
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -12,8 +11,6 @@ from numpy.typing import NDArray
 
 from model.surface import DEGREE, basis
 from service.drawing.facets import FacetPlaces
-
-_FACETS = ("upper left", "upper right", "lower left", "lower right")
 
 
 def png(figure: Figure) -> bytes:
@@ -147,45 +144,17 @@ def mirror_heights(z: NDArray[np.floating], samples: int = 48) -> NDArray[np.flo
     return across @ np.asarray(z, dtype=np.float64) @ along.T * 1e3
 
 
-def facet_columns(count: int) -> int:
-    """Columns in which so many facets are drawn."""
-    return math.ceil(math.sqrt(count))
-
-
 def surface_picture(
-    z: NDArray[np.floating], title: str, bound: float, places: FacetPlaces | None = None
+    z: NDArray[np.floating], title: str, bound: float, places: FacetPlaces
 ) -> bytes:
-    """A surface of control heights (F, 8, 8) [m] as a map in mm.
+    """A surface of control heights (F, 8, 8) [m] as a map in mm, seen from the front.
 
-    The facets are seen from the front, at their ``places``. Without those they are in rows; other
-    than four have numbers, in their order. ``bound`` [mm] is the end of the scale on both sides;
-    heights beyond it have the end colours.
+    ``bound`` [mm] is the end of the scale on both sides; heights beyond it have the end colours.
     """
+    width, height = np.ptp(places.box, axis=0).tolist()
     label = "deviation from the ideal facet [mm]"
-    if places is not None:
-        width, height = np.ptp(places.box, axis=0).tolist()
-        image = places.image(mirror_heights(z))
-        limits = (-bound, bound)
-        return map_picture(image, (width, height), title, "RdBu_r", limits, label, places)
-    figure = Figure(figsize=(6.4, 5), layout="constrained")
-    heights = mirror_heights(z)
-    columns = facet_columns(len(heights))
-    rows = math.ceil(len(heights) / columns)
-    every = figure.subplots(rows, columns, squeeze=False).ravel()
-    panes, numbers = every[: len(heights)], map(str, range(1, len(heights) + 1))
-    for pane in every[len(heights) :]:
-        pane.set_axis_off()
-    names = _FACETS if len(heights) == len(_FACETS) else tuple(numbers)
-    for pane, facet, name in zip(panes, heights, names, strict=True):
-        # i runs along x and j along y, so columns are i, and rows, from below, are j.
-        shown = pane.imshow(
-            facet.T, cmap="RdBu_r", vmin=-bound, vmax=bound, origin="lower", aspect=0.8
-        )
-        pane.set(xticks=[], yticks=[], title=name)
-    figure.suptitle(title)
-    extend = _extend(heights, -bound, bound)
-    figure.colorbar(shown, ax=panes.tolist(), label=label, extend=extend)
-    return png(figure)
+    image = places.image(mirror_heights(z))
+    return map_picture(image, (width, height), title, "RdBu_r", (-bound, bound), label, places)
 
 
 Array = NDArray[np.floating]
