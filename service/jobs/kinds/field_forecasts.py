@@ -44,7 +44,13 @@ from service.twin.runtime.runtime import Runtime
 class FleetIn(Model):
     """Heliostats, their common receiver, and their aim points."""
 
-    heliostats: Heliostats = None
+    heliostats: Heliostats = Field(
+        default=None,
+        description=(
+            "Names; all of the plant if not given, or those that its layout gives to the receiver."
+            " The others cast shadows."
+        ),
+    )
     target: Name | None = Field(
         default=None, description="A stored target or receiver; either this, `plane` or `receiver`."
     )
@@ -100,8 +106,9 @@ class FleetIn(Model):
             model = model_versions.get_model(session, self.model_version)
             tower = store.stored_tower(session)
             altitude = store.get_plant(session).altitude_m
+            around = self._around(session)
         return HeliostatGroup(
-            names=names,
+            names=[name for name in names if name not in around],
             receiver=receiver,
             sun=sun_direction(sun.azimuth_deg, sun.elevation_deg),
             model=model.with_dni(dni_of(self.dni_w_m2, sun.elevation_deg, altitude)),
@@ -109,7 +116,21 @@ class FleetIn(Model):
             aims=self.aim_points_m,
             ideal=ideal,
             tower=tower,
+            around=around,
         )
+
+    def _around(self, session: Session) -> dict[str, np.ndarray[Any, Any]]:
+        """Where heliostats aim (3,) [m] that the layout gives to another receiver, by name.
+
+        There are none if heliostats are named, or what they light is not of the layout.
+        """
+        given = {} if self.heliostats is not None else store.receivers_of_heliostats(session)
+        if self.target not in given.values():
+            return {}
+        aims = {
+            goal: store.get_target_or_receiver(session, goal).aim for goal in set(given.values())
+        }
+        return {name: aims[goal] for name, goal in given.items() if goal != self.target}
 
 
 class FleetForecastIn(FleetIn):

@@ -238,6 +238,22 @@ def list_receivers(session: Session) -> Sequence[ReceiverRow]:
     return session.scalars(select(ReceiverRow).order_by(ReceiverRow.name)).all()
 
 
+def receivers_of_heliostats(session: Session) -> dict[str, str]:
+    """Receivers that the layout gives heliostats to, by heliostat; by default the first one.
+
+    Empty if all have one receiver, or there is none.
+    """
+    every = list(session.scalars(select(ReceiverRow.name).order_by(ReceiverRow.id)))
+    own = HeliostatRow.properties["receiver"].as_string()
+    given = {
+        name: goal or next(iter(every), "")
+        for name, goal in session.execute(
+            select(HeliostatRow.name, own).order_by(HeliostatRow.name)
+        )
+    }
+    return given if len(set(given.values()) & set(every)) > 1 else {}
+
+
 def find_receiver(session: Session, name: str) -> ReceiverRow | None:
     """The receiver of this name, or None."""
     return session.scalar(select(ReceiverRow).where(ReceiverRow.name == name))

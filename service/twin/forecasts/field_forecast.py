@@ -54,6 +54,8 @@ class HeliostatGroup:
     aim : (3,) [m]
         Aim point of all heliostats that are not in ``aims``.
     aims : mapping of heliostat names to (3,) [m]
+    around : mapping of heliostat names to (3,) [m]
+        Heliostats that light another receiver, and where they aim: they block and shade.
     ideal : bool
         Trace ideal surfaces instead of the active ones.
     tower : Tower or None
@@ -72,12 +74,14 @@ class HeliostatGroup:
     aims: Mapping[str, Sequence[float]]
     ideal: bool
     tower: Tower | None = None
+    around: Mapping[str, Array] = field(default_factory=dict)
     skipped: dict[str, str] = field(default_factory=dict)
     without_surface: set[str] = field(default_factory=set)
 
     def aim_of(self, name: str) -> Array:
         """Aim point of a heliostat (3,) [m]."""
-        return np.asarray(self.aims.get(name, self.aim), dtype=np.float64)
+        aim = self.around[name] if name in self.around else self.aims.get(name, self.aim)
+        return np.asarray(aim, dtype=np.float64)
 
 
 def group_warnings(ideal: int, heliostats: int) -> list[str]:
@@ -168,8 +172,8 @@ class _Counted:
         )
 
 
-def _batches(fleet: HeliostatGroup, size: int) -> Iterator[Sequence[str]]:
-    return (fleet.names[start : start + size] for start in range(0, len(fleet.names), size))
+def _batches(names: Sequence[str], size: int) -> Iterator[Sequence[str]]:
+    return (names[start : start + size] for start in range(0, len(names), size))
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,13 +205,14 @@ def _heliostats(fleet: HeliostatGroup, batch: _Batch) -> Iterator[Heliostat]:
 def _neighbours(
     runtime: Runtime, fleet: HeliostatGroup, report: Callable[[int], None]
 ) -> Neighbours:
-    """All mirrors of the group as they are aligned, whatever their surfaces.
+    """All mirrors of the group and around it as they are aligned, whatever their surfaces.
 
     Each takes a fraction of a kilobyte.
     """
 
     def all_of_them() -> Iterator[tuple[Heliostat, Array]]:
-        for number, names in enumerate(_batches(fleet, TILE)):
+        every = [*fleet.names, *fleet.around]
+        for number, names in enumerate(_batches(every, TILE)):
             report(number * TILE)
             with runtime.database.reading() as session:
                 batch = _Batch.read(session, names)
@@ -224,7 +229,7 @@ def _tiles(
 
     The heliostats of those are read again, so ``skipped`` and ``without_surface`` are complete.
     """
-    for names in _batches(fleet, size):
+    for names in _batches(fleet.names, size):
         with runtime.database.reading() as session:
             batch = _Batch.read(session, names)
             heights = {} if fleet.ideal else _heights(session, batch.rows)

@@ -20,7 +20,7 @@ from service.sources.plant_file import PlantDescription, read_plant
 from service.twin.transfer.importing import import_folder
 from tests.page import Page
 from tests.service import real
-from tests.service.sources.plant_files import RICH
+from tests.service.sources.plant_files import RICH, write_plant
 from tests.service.sources.plant_folder import write_plant_folder
 
 pytestmark = [pytest.mark.slow]
@@ -86,6 +86,23 @@ def test_field_forecast_has_the_watts_of_the_plant_file(
     assert result["skipped"] == report["skipped"]
     parts = sum(one["intercepted_w"] for one in result["by_heliostat"].values())
     assert parts == pytest.approx(field["intercepted_w"], rel=1e-9)
+
+
+def test_heliostats_of_another_receiver_cast_shadows_only(tmp_path: Path):
+    """As the layout says, and as ``heliotwin field`` has it: B1 lights the board."""
+    described = read_plant(write_plant(tmp_path / "plant", RICH))
+    with real.client_on(tmp_path / "store") as client:
+        import_folder(real.runtime_of(client), read_folder(tmp_path / "plant", whole_field=True))
+        for name, lit in (("main", {"A1", "A2"}), ("board", {"B1"}), ("walls", {"A1", "A2", "B1"})):
+            body = {"target": name, "sun": SUN, "surface": "ideal", "resolution": [48, 96]}
+            result = done(client, "forecasts", body)["result"]
+            assert set(result["by_heliostat"]) | set(result["skipped"]) == lit
+            if name == "walls":  # no heliostat is the walls' own
+                continue
+            request = FieldRequest(name, 150.0, 35.0, 1000.0, resolution=(48, 96))
+            field = trace_field(described, request, lambda _: None).report["field"]
+            for key in ("shading", "blocking", "intercepted_w"):
+                assert result["field"][key] == pytest.approx(field[key], rel=2e-3), key
 
 
 def test_one_heliostat_is_forecast_on_receivers_of_every_kind(rich: TestClient):
