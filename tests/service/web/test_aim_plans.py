@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -10,7 +11,9 @@ from fastapi.testclient import TestClient
 from service.jobs.kinds import KINDS
 from service.jobs.worker import Worker
 from service.sources.folder import read_folder
+from service.sources.plant_tables import read_aims
 from service.twin.transfer.importing import import_folder
+from tests.page import Page
 from tests.service import real
 from tests.service.sources.aim_plant import write_aim_plant
 
@@ -58,8 +61,18 @@ def test_plan_keeps_the_limit_and_its_aims_do_what_it_says(plant: TestClient):
     forecast = plant.get(path).json()["result"]
     assert forecast["field"]["intercepted_w"] == pytest.approx(result["power_w"], rel=0.005)
     assert forecast["peak_w_m2"] == pytest.approx(result["peak_w_m2"], rel=0.03)
-    page = plant.get(f"/jobs/{job['id']}", headers={"Accept": "text/html"})
-    assert page.status_code == 200
+
+
+def test_page_shows_the_plan_and_gives_its_aims(plant: TestClient, tmp_path: Path):
+    job = planned(plant)
+    page = Page(plant.get(f"/jobs/{job['id']}", headers={"Accept": "text/html"}).text)
+    for words in ("Most that any aims can give", "Peak in 95 % of draws", "not active", "Flux"):
+        assert words in page.words
+    (tmp_path / "aims.csv").write_text(plant.get(f"/jobs/{job['id']}/aims.csv").text)
+    aims = read_aims(tmp_path / "aims.csv", job["result"]["aim_points_m"])
+    assert {name: list(aim) for name, aim in aims.items() if aim is not None} == job["result"][
+        "aim_points_m"
+    ]
 
 
 def test_plan_begins_with_aims_of_a_moment_before(plant: TestClient):
