@@ -1,6 +1,7 @@
 """The job `aim-plans`: aim points of the most power under the flux that a receiver can take."""
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Annotated, Any, Literal
 
@@ -27,7 +28,7 @@ from service.twin.forecasts.field_forecast import (
 from service.twin.forecasts.heliostat_forecast import position_of, receiver_as_json
 from service.twin.runtime.runtime import Runtime
 
-FluxLimit = Annotated[Number, Field(gt=0, le=6e4)]
+FluxLimit = Annotated[Number, Field(gt=0, le=6e7)]
 
 LimitRow = Annotated[list[FluxLimit], Field(min_length=1, max_length=1024)]
 
@@ -50,9 +51,9 @@ class AimPlanIn(FleetIn):
             " ideal ones."
         ),
     )
-    limit_kw_m2: FluxLimit | list[LimitRow] = Field(
+    limit_w_m2: FluxLimit | list[LimitRow] = Field(
         description=(
-            "Flux that the receiver can take [kW/m2]: one number, or rows of numbers over the"
+            "Flux that the receiver can take [W/m2]: one number, or rows of numbers over the"
             " unrolled map, from its upper left."
         )
     )
@@ -66,7 +67,7 @@ class AimPlanIn(FleetIn):
         description="Rows and columns of the map; 32 rows of square pixels if not given.",
     )
 
-    @field_validator("limit_kw_m2")
+    @field_validator("limit_w_m2")
     @classmethod
     def _is_a_map(cls, limit: float | list[list[float]]) -> float | list[list[float]]:
         if isinstance(limit, list) and len({len(row) for row in limit}) != 1:
@@ -75,8 +76,8 @@ class AimPlanIn(FleetIn):
 
     def limit(self) -> Limit:
         """The limit over the map."""
-        rows = self.limit_kw_m2 if isinstance(self.limit_kw_m2, list) else [[self.limit_kw_m2]]
-        return Limit(1e3 * np.array(rows, dtype=np.float64))
+        rows = self.limit_w_m2 if isinstance(self.limit_w_m2, list) else [[self.limit_w_m2]]
+        return Limit(np.array(rows, dtype=np.float64))
 
 
 def plan_field(context: Context, payload: AimPlanIn) -> Result:
@@ -88,7 +89,7 @@ def plan_field(context: Context, payload: AimPlanIn) -> Result:
     receiver = fleet.receiver
     columns = max(8, min(1024, round(ROWS * receiver.width / receiver.height)))
     resolution = payload.resolution or (ROWS, columns)
-    start = dict(fleet.aims)
+    start = fleet.aims
     group = _in_front(runtime, fleet)
     kernels = trace_kernels(runtime, group, resolution, payload.neighbours, context.report)
     limit = torch.tensor(payload.limit().on_map(*resolution), dtype=torch.float32).flatten()
@@ -148,12 +149,12 @@ def _in_front(runtime: Runtime, fleet: HeliostatGroup) -> HeliostatGroup:
     return replace(fleet, names=[*known, *unknown], aims=aims)
 
 
-def _begin(kernels: Kernels, limit: torch.Tensor, start: dict[str, Any]) -> AimPlan:
+def _begin(kernels: Kernels, limit: torch.Tensor, start: Mapping[str, Sequence[float]]) -> AimPlan:
     """A plan that begins with given aims; heliostats without one begin at the middle."""
     plan = single_aim(kernels, limit)
     points = plan.points
     for row, name in enumerate(kernels.names):
-        points[row] = start.get(name, points[row])
+        points[row] = start.get(name, points[row].tolist())
     return replace(plan, moved=kernels.moved(points))
 
 
@@ -166,7 +167,7 @@ KIND = Kind(
     "aim-plans",
     AimPlanIn,
     plan_field,
-    "Find aim points of the most power under the flux that a receiver can take.",
+    "Find the aim points of the most power under a limit of flux.",
     details=_AIMS,
     expected_s=expected_plan_s,
 )

@@ -21,7 +21,7 @@ BODY = {
     "target": "main",
     "sun": {"azimuth_deg": 180, "elevation_deg": 55},
     "dni_w_m2": 900,
-    "limit_kw_m2": 80,
+    "limit_w_m2": 80e3,
 }
 
 
@@ -83,13 +83,13 @@ def test_plan_begins_with_aims_of_a_moment_before(plant: TestClient):
 
 
 def test_limit_over_the_map(plant: TestClient):
-    result = planned(plant, limit_kw_m2=[[200, 200], [70, 70]])["result"]
+    result = planned(plant, limit_w_m2=[[200e3, 200e3], [70e3, 70e3]])["result"]
     assert result["limit_w_m2"] == pytest.approx(200e3)
     assert result["largest_share_of_limit"] <= 1.002
 
 
 @pytest.mark.parametrize("limit", [0, -1, [], [[100, 100], [100]], [[100, 0]], "high", 1e9])
 def test_a_wrong_limit_is_refused_by_its_name(plant: TestClient, limit: object):
-    answer = plant.post("/v1/jobs/aim-plans", json=BODY | {"limit_kw_m2": limit})
+    answer = plant.post("/v1/jobs/aim-plans", json=BODY | {"limit_w_m2": limit})
     assert answer.status_code == 422
-    assert any("limit_kw_m2" in error["field"] for error in answer.json()["errors"])
+    assert any("limit_w_m2" in error["field"] for error in answer.json()["errors"])
