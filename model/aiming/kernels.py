@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from model.errors import InvalidInputError, ModelError
+from model.errors import InvalidInputError, ModelError, UnreachableError
 from model.fleet import Superposition, Tile, in_parts
 from model.plant import Receiver, SurfaceGrid, TouchingPlanes, inside_outline
 from model.setup import Setup
@@ -226,16 +226,19 @@ class KernelTracer:
         )
 
 
-def aims_in_front(receiver: Receiver, mirrors: Array) -> Array:
-    """Points (B, 3) [m] in front of a receiver's default aim, on the planes that touch it toward
-    mirrors (B, 3) [m].
+def aim_in_front(receiver: Receiver, mirror: Array) -> Array:
+    """The point (3,) [m] in front of a receiver's default aim, on the plane that touches it toward
+    a mirror (3,) [m].
 
-    Beams to a point inside of a receiver meet its surface elsewhere.
+    Beams to a point inside of a receiver meet its surface elsewhere. For a mirror that sees nothing
+    of the receiver it is the default aim.
     """
-    planes = receiver.touching(mirrors)
-    normals = planes.axes[:, 2]
-    gap = ((planes.centers - receiver.aim) * normals).sum(axis=1, keepdims=True)
-    return np.asarray(receiver.aim + gap * normals)
+    try:
+        plane = receiver.touching(mirror[None])
+    except UnreachableError:
+        return receiver.aim
+    normal = plane.axes[0, 2]
+    return np.asarray(receiver.aim + ((plane.centers[0] - receiver.aim) @ normal) * normal)
 
 
 def _through(points: Array, mirrors: Array, origins: Array, axes: Array) -> Array:

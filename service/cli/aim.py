@@ -5,15 +5,12 @@ import math
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypedDict
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from model.aiming.bound import bound_power
-from model.aiming.k_factor import k_factor_aims
 from model.aiming.kernels import Kernels, KernelTracer, join
 from model.aiming.plan import AimPlan, plan_aims, single_aim
 from model.errors import InvalidInputError
@@ -23,6 +20,7 @@ from service.base.progress import Progress
 from service.cli.field import FieldRequest, LitField, light_field, trace_field
 from service.sources.limits import Limit
 from service.sources.plant_file import PlantDescription
+from service.twin.forecasts.aims import AimFigures, aim_figures
 
 Array = NDArray[np.float64]
 
@@ -31,30 +29,13 @@ ROWS = 32
 """Rows of a map if none are asked for: its pixels are smaller than any image of a mirror."""
 
 
-class Baseline(TypedDict):
-    """What another way of aiming reaches under the same limit and draws."""
-
-    name: str
-    power_w: float
-    peak_p95_w_m2: float
-
-
-class AimReport(TypedDict):
+class AimReport(AimFigures):
     """``REPORT.json`` of `aim`; DESIGN.md, section 8."""
 
     receiver: str
     sun: dict[str, float]
     dni_w_m2: float
-    power_w: float
-    single_aim_power_w: float
-    peak_w_m2: float
-    peak_p95_w_m2: float
-    limit_w_m2: float
-    largest_share_of_limit: float
-    bound_w: float
-    baseline: Baseline
     seconds: dict[str, float]
-    inactive: list[str]
     skipped: dict[str, str]
 
 
@@ -108,22 +89,13 @@ def find_aims(
     plan = plan_aims(kernels, on_map, begin, lambda: step("aims"))
     aimed = time.perf_counter()
     single = trace_field(plant, replace(request, resolution=kernels.resolution), step)
-    other = k_factor_aims(kernels, on_map, lit.task.receiver)
-    draws, seen = plan.draws(), plan.flux
+    power = single.report["field"]["intercepted_w"]
     report = AimReport(
+        **aim_figures(plan, lit.task.receiver, power),
         receiver=request.receiver,
         sun={"azimuth_deg": request.azimuth_deg, "elevation_deg": request.elevation_deg},
         dni_w_m2=lit.task.model.optics.dni,
-        power_w=plan.power,
-        single_aim_power_w=single.report["field"]["intercepted_w"],
-        peak_w_m2=float(seen.max()),
-        peak_p95_w_m2=draws.peak,
-        limit_w_m2=float(on_map.max()),
-        largest_share_of_limit=draws.ratio,
-        bound_w=bound_power(plan),
-        baseline=Baseline(name="k-factor", power_w=other.power, peak_p95_w_m2=other.draws().peak),
         seconds={"kernels": traced - begun, "aims": aimed - traced},
-        inactive=sorted(np.array(kernels.names)[~plan.is_active.numpy()].tolist()),
         skipped=skipped,
     )
     return Aims(plan, report)

@@ -10,7 +10,7 @@ from typing import TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from model.aiming.kernels import aims_in_front
+from model.aiming.kernels import aim_in_front
 from model.ephemeris import sun_angles_at
 from model.errors import InvalidInputError
 from model.fleet import FleetFlux, Superposition, aligned_field, superpose, tiles
@@ -205,7 +205,7 @@ def _aimed(
             found.others.append((heliostat, plant.receivers[own].aim))
             continue
         elif in_front:
-            (aim,) = aims_in_front(receiver, heliostat.position[None])
+            aim = aim_in_front(receiver, heliostat.position)
         else:
             aim = receiver.aim
         surface = None if request.surfaces is None else read_surface(request.surfaces, heliostat)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy.orm import Session
 
+from model.aiming.kernels import Kernels, KernelTracer, join
 from model.errors import ModelError
 from model.fleet import (
     TILE,
@@ -26,6 +27,7 @@ from model.setup import Setup
 from model.surface import control_points
 from service import store
 from service.base.arrays import unpack
+from service.base.errors import ConflictError
 from service.base.progress import Report
 from service.store.pointing import mounts
 from service.store.tables import HeliostatRow, MountRow
@@ -124,10 +126,7 @@ def forecast_group(
     """
     size = tile_size(resolution)
     share = _NEIGHBOURS_SHARE if neighbours else 0.0
-    seen = _Counted(
-        report, "mirrors that may stand in each other's way", len(fleet.names), 0.0, share
-    )
-    field = _neighbours(runtime, fleet, seen) if neighbours else None
+    field = _seen_neighbours(runtime, fleet, report, share) if neighbours else None
     number = 0 if begun is None else begun.tiles
     traced = _Counted(report, "tiles of the field", math.ceil(len(fleet.names) / size), share, 1.0)
 
@@ -138,18 +137,59 @@ def forecast_group(
         traced(number)
 
     engine: Engine = engine_of(runtime)
-    # Work on other machines cannot check whether it shall stop.
-    between = (lambda: traced(number)) if isinstance(engine, Threads) else nothing_between
-    tower = None if fleet.tower is None or not neighbours else fleet.tower.outline(fleet.sun)
-    task = Superposition(fleet.receiver, fleet.model, resolution, tower=tower, between=between)
     total = runtime.operations.superpose(
-        task,
+        _task(fleet, resolution, neighbours, engine, lambda: traced(number)),
         _tiles(runtime, fleet, field, size, number),
         engine,
         before=None if begun is None else begun.light,
         done=done,
     )
     return replace(total, skipped=fleet.skipped | total.skipped)
+
+
+def _task(
+    fleet: HeliostatGroup,
+    resolution: tuple[int, int],
+    neighbours: bool,
+    engine: Engine,
+    check: Callable[[], None],
+) -> Superposition:
+    """What is traced of each tile; ``check`` is called between its parts."""
+    # Work on other machines cannot check whether it shall stop.
+    between = check if isinstance(engine, Threads) else nothing_between
+    tower = None if fleet.tower is None or not neighbours else fleet.tower.outline(fleet.sun)
+    return Superposition(fleet.receiver, fleet.model, resolution, tower=tower, between=between)
+
+
+def trace_kernels(
+    runtime: Runtime,
+    fleet: HeliostatGroup,
+    resolution: tuple[int, int],
+    neighbours: bool,
+    report: Report,
+) -> Kernels:
+    """Trace an image of each heliostat of a group about its aim; see `model.aiming.kernels`.
+
+    Parameters are those of `forecast_group`. ``fleet.skipped`` receives heliostats without one.
+
+    Raises
+    ------
+    ConflictError
+        If no heliostat reaches the receiver.
+    """
+    field = _seen_neighbours(runtime, fleet, report, _NEIGHBOURS_SHARE) if neighbours else None
+    count = math.ceil(len(fleet.names) / TILE)
+    traced = _Counted(report, "images of mirrors", count, _NEIGHBOURS_SHARE, 0.5)
+    engine, found = engine_of(runtime), list[Kernels]()
+    task = _task(fleet, resolution, neighbours, engine, lambda: traced(len(found)))
+    for tile in engine.map(KernelTracer(task), _tiles(runtime, fleet, field, TILE, 0)):
+        fleet.skipped.update(tile.skipped)
+        found += [] if tile.kernels is None else [tile.kernels]
+        traced(len(found))
+    if not found:
+        name, reason = next(iter(fleet.skipped.items()), ("the store", "it holds no heliostat"))
+        raise ConflictError(f"no heliostat reaches {fleet.receiver.name}; {name}: {reason}")
+    return join(found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,6 +240,14 @@ def _heliostats(fleet: HeliostatGroup, batch: _Batch) -> Iterator[Heliostat]:
             yield as_calibrated(batch.rows[name], batch.mounts.get(name), fleet.model)
         except ModelError as error:
             fleet.skipped[name] = str(error)
+
+
+def _seen_neighbours(
+    runtime: Runtime, fleet: HeliostatGroup, report: Report, share: float
+) -> Neighbours:
+    """The group's mirrors as obstacles, which are the first ``share`` of the work."""
+    phase = "mirrors that may stand in each other's way"
+    return _neighbours(runtime, fleet, _Counted(report, phase, len(fleet.names), 0.0, share))
 
 
 def _neighbours(

@@ -134,7 +134,7 @@ IdempotencyKey = Annotated[
 ]
 
 KindName = Annotated[
-    str | None, Query(pattern=r"^[a-z]{1,32}$", description="Only jobs of this kind.")
+    str | None, Query(pattern=r"^[a-z-]{1,32}$", description="Only jobs of this kind.")
 ]
 
 
@@ -142,7 +142,8 @@ def creators(kinds: Kinds) -> APIRouter:
     """Routes that enqueue a job, one for each of ``kinds``."""
     asking = APIRouter(prefix="/jobs", tags=["jobs"])
     for kind in kinds.values():
-        add_creator(asking, kind, f"/{kind.name}", f"post_{kind.name}_job")
+        name = kind.name.replace("-", "_")
+        add_creator(asking, kind, f"/{kind.name}", f"post_{name}_job")
         for other, role in ((asking.get, READ), (asking.delete, OPERATE)):
             other(f"/{kind.name}", include_in_schema=False, dependencies=[role])(_only_post)
     return asking

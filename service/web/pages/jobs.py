@@ -151,6 +151,21 @@ def get_job_heliostats_table(number: Number, runtime: RuntimeDep, kinds: KindsDe
     return sheet_answer(f"job-{number}-heliostats", ("heliostat", *columns), rows)
 
 
+@router.get("/jobs/{number}/aims.csv", dependencies=[READ])
+def get_job_aims_table(number: Number, runtime: RuntimeDep, kinds: KindsDep) -> Response:
+    """The aims of a plan, as ``heliotwin field --aims`` reads them."""
+    with runtime.database.reading() as session:
+        result = result_of(kinds, session, queue.get_job(session, number)) or {}
+    if "aim_points_m" not in result:
+        raise NotFoundError(f"job {number} has no aims")
+    inactive = set(result["inactive"])
+    rows = (
+        [name, *point, int(name not in inactive)] for name, point in result["aim_points_m"].items()
+    )
+    columns = ("name", "east_m", "north_m", "up_m", "active")
+    return sheet_answer(f"job-{number}-aims", columns, rows)
+
+
 def _mirrors(result: Mapping[str, Any], by: str) -> list[tuple[str, dict[str, float]]]:
     """The first heliostats of a field forecast, sorted by a factor or their name."""
     lines = list(result.get("by_heliostat", {}).items())
@@ -193,6 +208,7 @@ def get_job_page(
         factors=_FACTORS,
         by=by,
         light=result if row.kind == "forecasts" and "peak_w_m2" in result else None,
+        aims=result if row.kind == "aim-plans" and "bound_w" in result else None,
         target=row.payload.get("target") if asked else None,
         facts={name: value for name, value in result.items() if _plain(value)},
         counts=result.get("counts", {}),

@@ -9,43 +9,16 @@ import numpy as np
 import pytest
 
 from service.sources.limits import read_limit
-from service.sources.plant_template import staggered_layout
 from tests.service.command import ends, heliotwin
+from tests.service.sources.aim_plant import write_aim_plant
 
-PLANT = """\
-plant: {name: small, latitude_deg: 37, longitude_deg: -5, altitude_m: 100, time_zone: Europe/Madrid}
-heliostat_types:
-  large:
-    mount: {kind: azimuth_elevation, pivot_height_m: 5}
-    facets: {rows: 1, columns: 1, width_m: 9, height_m: 8}
-    facet_shape: slant_range
-    reflectance: 0.93
-    slope_error_mrad: 1.3
-    pointing_error_mrad: 0.8
-layout: {file: layout.csv}
-receivers:
-  main: {kind: cylinder, center_m: [0, 0, 80], radius_m: 4, height_m: 10}
-  board: {kind: plane, center_m: [0, 3, 80], normal: [0, 1, 0], width_m: 10, height_m: 10}
-  strip: {kind: plane, center_m: [0, 3, 90], normal: [0, 1, 0], width_m: 3, height_m: 3}
-  cave:
-    kind: cavity
-    aperture_m: [[4, 3, 76], [-4, 3, 76], [-4, 3, 84], [4, 3, 84]]
-    panels:
-      - {center_m: [2.4, 0, 80], normal: [-0.3, 1, 0], width_m: 5, height_m: 9}
-      - {center_m: [-2.4, 0, 80], normal: [0.3, 1, 0], width_m: 5, height_m: 9}
-sun: {shape: pillbox, half_angle_mrad: 4.65}
-"""
 SUN = ("--sun", 180, 55, "--dni", 900)
 
 
 @pytest.fixture(scope="module")
 def plant(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Fifty heliostats north of three receivers."""
-    folder = tmp_path_factory.mktemp("aims")
-    layout = staggered_layout("large", [140, 170, 200, 230], 32, 0.0, 75.0)
-    (folder / "layout.csv").write_text(layout)
-    (folder / "plant.yaml").write_text(PLANT)
-    return folder / "plant.yaml"
+    return write_aim_plant(tmp_path_factory.mktemp("aims"))
 
 
 def aimed(plant: Path, out: Path, receiver: str, limit: object, *options: object) -> dict[str, Any]:
