@@ -108,7 +108,8 @@ class Worker:
     """A worker that takes jobs one by one until it is stopped or hangs. It then calls ``on_stuck``.
 
     With ``only_short`` it takes only jobs that are expected to take seconds, so that they need not
-    wait for long ones.
+    wait for long ones. With ``ends_if_stuck`` all that share ``stopping`` take no more jobs once it
+    hangs, since the process ends.
     """
 
     def __init__(
@@ -119,6 +120,8 @@ class Worker:
         stopping: threading.Event,
         on_stuck: Callable[[], None] = lambda: None,
         only_short: bool = False,
+        *,
+        ends_if_stuck: bool = False,
     ) -> None:
         self.runtime = runtime
         self.kinds = kinds
@@ -126,6 +129,7 @@ class Worker:
         self.stopping = stopping
         self.only_short = only_short
         self._on_stuck = on_stuck
+        self._ends_if_stuck = ends_if_stuck
         self._stuck = threading.Event()
         self._random = random.Random(name)
         self._purged_s = -math.inf
@@ -184,7 +188,11 @@ class Worker:
             if not queue.has_claimable(session, self.kinds, lease_s, self.only_short):
                 return None
         with database.writing() as session:
-            return queue.claim(session, self.kinds, self.name, lease_s, attempts, self.only_short)
+            job = queue.claim(session, self.kinds, self.name, lease_s, attempts, self.only_short)
+            if self.stopping.is_set():  # a job that came back since is for another process
+                session.rollback()
+                return None
+            return job
 
     def _return_stuck(self, context: Context, job: JobRow) -> None:
         """End a stuck attempt, and return its job to the queue.
@@ -193,6 +201,8 @@ class Worker:
         continues.
         """
         context.lost.set()
+        if self._ends_if_stuck:  # before the job is back: no thread of this process takes it again
+            self.stopping.set()
         reason = f"no sign of life for {self.runtime.settings.job_silence_s:g} s"
         logger.error("job %d (%s) hangs, %s in attempt %d", job.id, job.kind, reason, job.attempts)
         try:
@@ -283,7 +293,15 @@ class Workers:
         number = next(self._numbers)
         name = f"{socket.gethostname()[:48]}-{os.getpid()}-{number}"
         on_stuck = self._on_stuck or partial(self._replace, number, only_short)
-        worker = Worker(self._runtime, self._kinds, name, self.stopping, on_stuck, only_short)
+        worker = Worker(
+            self._runtime,
+            self._kinds,
+            name,
+            self.stopping,
+            on_stuck,
+            only_short,
+            ends_if_stuck=self._on_stuck is not None,
+        )
         thread = threading.Thread(target=worker.run, name=f"job-{number}", daemon=True)
         with self._changing:
             if not self.stopping.is_set():
