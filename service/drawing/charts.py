@@ -127,6 +127,8 @@ class HeatMap:
         Outline of a region of the map as a data URL; empty if there is none.
     facets : FacetPlaces or None
         Of the map of a mirror: their edges are drawn, and the rectangle is the one around them.
+    extremes : (least, most) or None
+        Of what is drawn; None for those of ``values``, whose pixels may lie beside them.
     """
 
     formats: ClassVar[tuple[str, ...]] = ("npz", "png")
@@ -139,6 +141,7 @@ class HeatMap:
     values: Array = field(repr=False)
     outline: str = ""
     facets: FacetPlaces | None = None
+    extremes: tuple[float, float] | None = None
 
     @property
     def edges(self) -> list[list[list[float]]]:
@@ -158,7 +161,8 @@ class HeatMap:
     @property
     def beyond(self) -> tuple[float, float] | None:
         """The smallest and the largest value if any lies beyond the scale, otherwise None."""
-        least, most = float(np.nanmin(self.values)), float(np.nanmax(self.values))
+        ends = float(np.nanmin(self.values)), float(np.nanmax(self.values))
+        least, most = self.extremes or ends
         slack = 1e-6 * (self.scale.high - self.scale.low)
         return (
             (least, most)
@@ -244,9 +248,10 @@ def difference_map(
 
 def _mirror_map(title: str, control: Array, places: FacetPlaces, scale: Scale) -> HeatMap:
     """Control heights (F, 8, 8) [m] in mm on the facets of a mirror, seen from the front."""
-    image, (low, high) = places.image(mirror_heights(control)), places.box
+    heights, (low, high) = mirror_heights(control), places.box
     width, height = (high - low).tolist()
-    return replace(heat_map(title, image, (width, height), scale), facets=places)
+    drawn = heat_map(title, places.image(heights), (width, height), scale)
+    return replace(drawn, facets=places, extremes=(float(heights.min()), float(heights.max())))
 
 
 def surface_map(title: str, z: Array, places: FacetPlaces, bound: float) -> HeatMap:

@@ -397,7 +397,7 @@ class PoseEntry(PlantPart):
     rotation: Matrix3 | None = Field(
         None,
         description="In place of look_at_m: its image's right, its image's down and its direction,"
-        " each as a row of east, north, up.",
+        " each as a row of east, north, up [1].",
     )
     focal_length_px: Annotated[Number, Field(ge=1, le=1e7)] | None = Field(
         None, description="Focal length divided by the size of a pixel [px]."
@@ -409,7 +409,7 @@ class PoseEntry(PlantPart):
         None, description="Column and row [px] of the optical axis; the image's middle without it."
     )
     distortion: Annotated[list[Coordinate], Field(min_length=1, max_length=5)] | None = Field(
-        None, description="k1, k2, p1, p2, k3 of Brown's lens, as of OpenCV; none without it."
+        None, description="k1, k2, p1, p2, k3 [1] of Brown's lens, as of OpenCV; none without it."
     )
 
     @model_validator(mode="after")
@@ -427,8 +427,8 @@ class CameraEntry(PlantPart):
 
     homography: Matrix3 | None = Field(
         None,
-        description="3 x 3: from its pixels (column, row, 1) to metres right and up of the"
-        " target's centre.",
+        description="3 x 3: from its pixels (column, row, 1) to places right and up of the"
+        " target's centre [m].",
     )
     corners_px: Annotated[list[PixelPair], Field(min_length=4, max_length=4)] | None = Field(
         None,

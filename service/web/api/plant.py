@@ -221,6 +221,10 @@ def target_out(row: TargetRow) -> TargetOut:
     )
 
 
+class ReceiverPage(Page[ReceiverOut]):
+    """All receivers, under a name that generated clients accept."""
+
+
 def receiver_out(row: ReceiverRow) -> ReceiverOut:
     """A receiver as JSON."""
     return _RECEIVER.validate_python({"name": row.name, **store.receiver_document(row)})
@@ -344,10 +348,11 @@ def delete_target(name: NamePath, runtime: RuntimeDep, identity: IdentityDep) ->
 
 
 @router.get("/receivers", responses=problems(), dependencies=[READ])
-def list_receivers(runtime: RuntimeDep) -> Page[ReceiverOut]:
+def list_receivers(runtime: RuntimeDep) -> ReceiverPage:
     """List receivers of all kinds."""
     with runtime.database.reading() as session:
-        return Page(items=[receiver_out(row) for row in store.list_receivers(session)], next=None)
+        every = [receiver_out(row) for row in store.list_receivers(session)]
+    return ReceiverPage(items=every, next=None)
 
 
 @router.get("/receivers/{name}", responses=problems(404), dependencies=[READ])
