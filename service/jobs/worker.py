@@ -107,9 +107,8 @@ def _store(context: Context, write: Callable[[Session], None]) -> None:
 class Worker:
     """A worker that takes jobs one by one until it is stopped or hangs. It then calls ``on_stuck``.
 
-    With ``only_short`` it takes only jobs that are expected to take seconds, so that they need not
-    wait for long ones. With ``ends_if_stuck`` all that share ``stopping`` take no more jobs once it
-    hangs, since the process ends.
+    With ``only_short`` it takes only jobs that are expected to take seconds, which need not wait
+    for long ones. With ``ends_if_stuck`` a hang ends all that share ``stopping``.
     """
 
     def __init__(
@@ -247,15 +246,11 @@ class Worker:
         Attempts count from the last one that completed a step.
         """
         settings, lease = self.runtime.settings, context.lease
-        attempts = (
-            1 if context.has_progressed.is_set() else job.attempts - job.attempts_before_progress
-        )
+        since = job.attempts - job.attempts_before_progress
+        attempts = 1 if context.has_progressed.is_set() else since
         if attempts >= settings.job_attempts:
-            return _failed(
-                lease,
-                f"failed {attempts} times, the last time by {fault}; the worker's log has more of"
-                f" job {lease.job_id}",
-            )
+            often = f"failed {attempts} times, the last time by {fault}"
+            return _failed(lease, f"{often}; the worker's log has more of job {lease.job_id}")
         delay = pause_s(attempts, settings.job_retry_s, self._random)
         reason = f"attempt {job.attempts} failed by {fault}; tried again in {delay:.0f} s"
         return _Ending("retried", lambda session: queue.retry(session, lease, reason, delay))
