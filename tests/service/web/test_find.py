@@ -275,6 +275,7 @@ def now(cache: FieldOverviewCache, database: Database) -> tuple[list[str], bool]
 def test_changed_part_of_the_field_is_read_again(
     cache: FieldOverviewCache, database: Database, monkeypatch: pytest.MonkeyPatch
 ):
+    monkeypatch.setattr(field_overview, "_QUICK_S", WAIT_LIMIT_S)  # no field is large
     reads, read = [], field_overview.read_summaries
     monkeypatch.setattr(
         field_overview, "read_summaries", lambda session: reads.append(1) or read(session)
