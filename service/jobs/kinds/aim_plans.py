@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
-from pydantic import Field, field_validator
+from pydantic import Discriminator, Field, Tag, field_validator
 from sqlalchemy import select
 
 from model.aiming.kernels import Kernels, aim_in_front
@@ -32,6 +32,16 @@ FluxLimit = Annotated[Number, Field(gt=0, le=6e7)]
 
 LimitRow = Annotated[list[FluxLimit], Field(min_length=1, max_length=1024)]
 
+
+def _way_to_give(value: Any) -> str:
+    return "(map)" if isinstance(value, list) else "(number)"
+
+
+LimitOfMap = Annotated[
+    Annotated[FluxLimit, Tag("(number)")] | Annotated[list[LimitRow], Tag("(map)")],
+    Discriminator(_way_to_give),
+]
+
 ROWS = 32
 """Rows of a map if none are asked for."""
 
@@ -51,7 +61,7 @@ class AimPlanIn(FleetIn):
             " ideal ones."
         ),
     )
-    limit_w_m2: FluxLimit | list[LimitRow] = Field(
+    limit_w_m2: LimitOfMap = Field(
         description=(
             "Flux that the receiver can take [W/m2]: one number, or rows of numbers over the"
             " unrolled map, from its upper left."
