@@ -53,7 +53,8 @@ def delete_photograph(
     session.execute(select(HeliostatRow.id).where(HeliostatRow.id == owner.id).with_for_update())
     row = get_measurement(session, owner, identifier)
     derived = made_from(session, row)
-    rows = [row] if only_this else list(images_of_photograph(session, row).values())
+    every = [row] if only_this else images_of_photograph(session, row).values()
+    rows = sorted(every, key=lambda image: image.id)  # in the order in which they came
     _name_in_surfaces(session, rows)
     for image in rows:
         delete_drift(session, image)
