@@ -27,7 +27,7 @@ from model.sunshape import half_angle
 from model.tracing import Optics, Scene, Window
 from model.tracing.convolution import Rays, central_rays, raster, splat
 from model.tracing.scene import irradiance_of, optics_of
-from model.tracing.superposition import in_sight
+from model.tracing.superposition import in_sight, passages
 
 Array = NDArray[np.float64]
 
@@ -309,15 +309,11 @@ def _lit(
 ) -> _Lit:
     """Pixels that mirrors (B, 3) can light through planes, relative to ``aims`` (B, 3) [m]."""
     grid = receiver.grid(*resolution)
-    points, normals = (a.reshape(-1, 3) for a in (grid.points, grid.normals))
-    ways = points - mirrors[:, None]
-    turned = np.einsum("bij,bpj->bpi", planes.axes, ways)
-    source = np.einsum("bij,bj->bi", planes.axes, mirrors - aims)
-    ahead = np.minimum(turned[..., 2], -1e-6)
-    scale = -source[:, None, 2] / ahead
-    places = source[:, None, :2] + scale[..., None] * turned[..., :2]
-    toward = np.einsum("bpj,pj->bp", ways, normals)
-    factors = np.where(turned[..., 2] < 0, scale**2 * np.minimum(toward, 0) / ahead, 0.0)
+    passed = passages(
+        *(torch.tensor(a) for a in (mirrors, aims, planes.axes, grid.points, grid.normals))
+    )
+    places = torch.stack([passed.right, passed.up], dim=-1).flatten(1, 2).numpy()
+    factors = passed.gain.flatten(1).numpy()
     factors = factors * _open(planes, places, aims, mirrors, grid)
     count = max(1, int((factors > 0).sum(axis=1).max()))
     # The pixels that a mirror lights, before those that it does not.

@@ -12,6 +12,7 @@ centimetres, which is little beside the sun's image.
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -169,26 +170,52 @@ def _window(touching: TouchingPlanes, grid: SurfaceGrid) -> Window:
 def _projected(
     kernels: Tensor, scene: Scene, part: slice, window: Window, grid: SurfaceGrid
 ) -> Tensor:
-    """Irradiance (b, rows, columns) [W/m2] on the receiver of mirrors' images (b, r, c).
+    """Irradiance (b, rows, columns) [W/m2] on the receiver of mirrors' images (b, r, c)."""
+    points, normals = (torch.tensor(a).to(kernels) for a in (grid.points, grid.normals))
+    passed = passages(
+        scene.center[part], scene.plane_center[part], scene.plane_axes[part], points, normals
+    )
+    x, y = passed.right * (2 / window.width), passed.up * (-2 / window.height)
+    places = torch.stack([x, y], dim=-1)
+    light = grid_sample(kernels[:, None], places, padding_mode="border", align_corners=False)[:, 0]
+    return light * passed.gain
+
+
+class Passages(NamedTuple):
+    """Where light from mirrors to places passes the mirrors' planes, each (b, rows, columns).
+
+    Attributes
+    ----------
+    right, up : Tensor [m]
+        Of the planes' origins.
+    gain : Tensor
+        Irradiance at a place, relative to that on the plane; 0 where the place faces away.
+    """
+
+    right: Tensor
+    up: Tensor
+    gain: Tensor
+
+
+def passages(
+    mirrors: Tensor, origins: Tensor, axes: Tensor, points: Tensor, normals: Tensor
+) -> Passages:
+    """Follow light from the middles of mirrors (b, 3) [m] to places (rows, columns, 3) [m].
 
     A place P of normal N is lit through the point q = c + t (P - c) of the mirror's plane, whose
-    normal is n, from the mirror's middle c, so that E_P = E_q t**2 (P - c).N / (P - c).n.
+    normal is n, from the mirror's middle c, so that E_P = E_q t**2 (P - c).N / (P - c).n. Planes
+    have origins (b, 3) [m] and axes (b, 3, 3).
     """
-    points, normals = (torch.tensor(a).to(kernels) for a in (grid.points, grid.normals))
-    axes = scene.plane_axes[part]
-    source = torch.einsum("bij,bj->bi", axes, scene.center[part] - scene.plane_center[part])
+    source = torch.einsum("bij,bj->bi", axes, mirrors - origins)
     turned = torch.einsum("bij,rcj->ircb", axes, points).permute(0, 3, 1, 2)
-    origin = torch.einsum("bij,bj->ib", axes, scene.plane_center[part])[..., None, None]
+    origin = torch.einsum("bij,bj->ib", axes, origins)[..., None, None]
     ahead = [turned[i] - origin[i] - source[:, i, None, None] for i in range(3)]
     scale = -source[:, 2, None, None] / ahead[2].clamp(max=-1e-6)
-    x, y = (source[:, i, None, None] + scale * ahead[i] for i in (0, 1))
+    right, up = (source[:, i, None, None] + scale * ahead[i] for i in (0, 1))
     toward = torch.einsum("rcj,rcj->rc", points, normals) - torch.einsum(
-        "bj,rcj->brc", scene.center[part], normals
+        "bj,rcj->brc", mirrors, normals
     )
-    places = torch.stack([x * (2 / window.width), y * (-2 / window.height)], dim=-1)
-    light = grid_sample(kernels[:, None], places, padding_mode="border", align_corners=False)[:, 0]
-    seen: Tensor = light * scale**2 * toward.clamp(max=0) / ahead[2].clamp(max=-1e-6)
-    return seen
+    return Passages(right, up, scale**2 * toward.clamp(max=0) / ahead[2].clamp(max=-1e-6))
 
 
 def in_sight(screens: NDArray[np.float64], mirrors: Tensor, grid: SurfaceGrid) -> Tensor:
