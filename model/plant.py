@@ -563,6 +563,15 @@ class Receiver(Protocol):
         """
 
 
+_MOST_COLUMNS = 1024
+
+
+def square_pixels(receiver: Receiver, rows: int) -> tuple[int, int]:
+    """Rows and columns of a receiver's map whose pixels are about square."""
+    columns = round(rows * receiver.width / receiver.height)
+    return rows, min(max(columns, rows // 4), _MOST_COLUMNS)
+
+
 @dataclass(frozen=True, eq=False)
 class Cylinder:
     """A receiver that is a cylinder or a part of one, lit from outside.

@@ -9,6 +9,7 @@ allowable flux densities for molten salt central receivers*, Solar Energy 157.
 """
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -66,14 +67,20 @@ def _without_hottest(plan: AimPlan) -> AimPlan:
     return replace(plan, is_active=active)
 
 
-def _sectors(kernels: Kernels) -> tuple[Tensor, Tensor]:
+class _Sectors(NamedTuple):
     """Sector (N,) of each mirror by its azimuth, and 1 or -1 (N,) in turn with the distance."""
+
+    sector: Tensor
+    turn: Tensor
+
+
+def _sectors(kernels: Kernels) -> _Sectors:
     east, north, _ = kernels.mirrors.double().numpy().T
     sector = (np.arctan2(east, north) / (2 * np.pi) * SECTORS).astype(int) % SECTORS
     order = np.lexsort((np.hypot(east, north), sector))
     turn = np.empty(len(order))
     turn[order] = np.where(np.arange(len(order)) % 2 == 0, 1.0, -1.0)
-    return torch.tensor(sector), torch.tensor(turn, dtype=torch.float32)
+    return _Sectors(torch.tensor(sector), torch.tensor(turn, dtype=torch.float32))
 
 
 def _sectors_that_light(kernels: Kernels, sector: Tensor, pixels: Tensor) -> Tensor:

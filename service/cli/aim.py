@@ -9,24 +9,18 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from model.aiming.kernels import Kernels, KernelTracer, join
-from model.aiming.plan import AimPlan, plan_aims, single_aim
+from model.aiming.plan import AimPlan, plan_aims
 from model.errors import InvalidInputError
-from model.fleet import tiles
-from model.setup import Setup
+from model.fleet import Superposition, tiles
 from service.base.progress import Progress
-from service.cli.field import FieldRequest, LitField, light_field, trace_field
+from service.cli.field import FieldRequest, light_field, trace_field
 from service.sources.limits import Limit
 from service.sources.plant_file import PlantDescription
-from service.twin.forecasts.aims import AimFigures, aim_figures
+from service.twin.forecasts.aims import ROWS, AimFigures, aim_figures, begin_at
 
 Array = NDArray[np.float64]
-
-
-ROWS = 32
-"""Rows of a map if none are asked for: its pixels are smaller than any image of a mirror."""
 
 
 class AimReport(AimFigures):
@@ -71,10 +65,45 @@ def find_aims(
         If the plant has no such receiver, no heliostat reaches it, or the limit is invalid.
     """
     begun = time.perf_counter()
+    found = trace_kernels(plant, request, step)
+    kernels = found.kernels
+    traced = time.perf_counter()
+    on_map = torch.tensor(limit.on_map(*kernels.resolution), dtype=torch.float32).flatten()
+    begin = None if start is None else begin_at(kernels, on_map, start)
+    plan = plan_aims(kernels, on_map, begin, lambda: step("aims"))
+    aimed = time.perf_counter()
+    single = trace_field(plant, replace(request, resolution=kernels.resolution), step)
+    power = single.report["field"]["intercepted_w"]
+    report = AimReport(
+        **aim_figures(plan, found.task.receiver, power),
+        receiver=request.receiver,
+        sun={"azimuth_deg": request.azimuth_deg, "elevation_deg": request.elevation_deg},
+        dni_w_m2=found.task.model.optics.dni,
+        seconds={"kernels": traced - begun, "aims": aimed - traced},
+        skipped=found.skipped,
+    )
+    return Aims(plan, report)
+
+
+@dataclass(frozen=True, eq=False)
+class TracedKernels:
+    """Images of a field's mirrors, how they were traced, and why some mirrors have none."""
+
+    kernels: Kernels
+    task: Superposition
+    skipped: dict[str, str]
+
+
+def trace_kernels(plant: PlantDescription, request: FieldRequest, step: Progress) -> TracedKernels:
+    """Trace the images of a plant's mirrors; errors as of `find_aims`.
+
+    They are traced from near to far, since images of one tile have one size.
+    """
     lit = light_field(plant, request, ROWS, in_front=True)
-    tracer, skipped, parts = KernelTracer(lit.task), dict[str, str](), list[Kernels]()
-    for tile in tiles(_from_near_to_far(lit), lit.neighbours):
-        found = tracer(tile)
+    goal, skipped, parts = lit.task.receiver.aim, dict[str, str](), list[Kernels]()
+    setups = sorted(lit.aimed.setups, key=lambda one: math.dist(one.heliostat.position, goal))
+    for tile in tiles(setups, lit.neighbours):
+        found = KernelTracer(lit.task)(tile)
         skipped |= found.skipped
         if found.kernels is not None:
             parts.append(found.kernels)
@@ -82,43 +111,7 @@ def find_aims(
     if not parts:
         reason = next(iter(skipped.values()), "the layout gives it none")
         raise InvalidInputError(f"no heliostat sends light to {request.receiver}: {reason}")
-    kernels = join(parts)
-    traced = time.perf_counter()
-    on_map = torch.tensor(limit.on_map(*kernels.resolution), dtype=torch.float32).flatten()
-    begin = None if start is None else _started(kernels, on_map, start)
-    plan = plan_aims(kernels, on_map, begin, lambda: step("aims"))
-    aimed = time.perf_counter()
-    single = trace_field(plant, replace(request, resolution=kernels.resolution), step)
-    power = single.report["field"]["intercepted_w"]
-    report = AimReport(
-        **aim_figures(plan, lit.task.receiver, power),
-        receiver=request.receiver,
-        sun={"azimuth_deg": request.azimuth_deg, "elevation_deg": request.elevation_deg},
-        dni_w_m2=lit.task.model.optics.dni,
-        seconds={"kernels": traced - begun, "aims": aimed - traced},
-        skipped=skipped,
-    )
-    return Aims(plan, report)
-
-
-def _from_near_to_far(lit: LitField) -> list[Setup]:
-    """Setups by distance, since images of one tile have one size."""
-    return sorted(
-        lit.aimed.setups, key=lambda one: math.dist(one.heliostat.position, lit.task.receiver.aim)
-    )
-
-
-def _started(kernels: Kernels, limit: Tensor, start: dict[str, Array | None]) -> AimPlan:
-    """A plan that begins with aims of a file; heliostats that it leaves out begin at the middle."""
-    plan = single_aim(kernels, limit)
-    points, active = plan.points, plan.is_active
-    for row, name in enumerate(kernels.names):
-        aim = start.get(name)
-        if aim is not None:
-            points[row] = aim
-        elif name in start:
-            active[row] = False
-    return AimPlan(kernels, limit, kernels.moved(points), active, plan.multipliers)
+    return TracedKernels(join(parts), lit.task, skipped)
 
 
 def write_aims(path: Path, plan: AimPlan) -> None:

@@ -16,7 +16,7 @@ from model.errors import InvalidInputError
 from model.fleet import FleetFlux, Superposition, aligned_field, superpose, tiles
 from model.frames import SunAngles, sun_direction
 from model.neighbours import Neighbours
-from model.plant import Heliostat, Receiver
+from model.plant import Heliostat, Receiver, square_pixels
 from model.plant_model import PlantModel
 from model.setup import Setup
 from model.surface import DEGREE, control_points
@@ -29,8 +29,6 @@ Array = NDArray[np.float64]
 
 ROWS = 64
 """Rows of a map if none are asked for; columns follow from the receiver's shape."""
-
-_MAX_COLUMNS = 1024
 
 _RAYS = 24
 """Rays along each side of a mirror, at least; each facet has `_LEAST_RAYS` or more."""
@@ -109,12 +107,6 @@ def sun_of(
     return SunAngles(float(azimuth) % 360, float(elevation))
 
 
-def resolution_of(receiver: Receiver, rows: int = ROWS) -> Resolution:
-    """Rows and columns of a map with square pixels."""
-    columns = round(rows * receiver.width / receiver.height)
-    return rows, min(max(columns, rows // 4), _MAX_COLUMNS)
-
-
 @dataclass
 class Aimed:
     """Heliostats with their aims: those whose light is asked for, and those that stand around."""
@@ -176,7 +168,7 @@ def light_field(
     task = Superposition(
         receiver,
         model,
-        request.resolution or resolution_of(receiver, rows),
+        request.resolution or square_pixels(receiver, rows),
         samples=_samples(aimed.setups),
         tower=None if plant.tower is None else plant.tower.outline(sun),
     )

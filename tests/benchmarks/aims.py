@@ -25,13 +25,12 @@ from scipy.spatial import cKDTree
 
 from model.aiming.bound import bound_power
 from model.aiming.k_factor import k_factor_aims
-from model.aiming.kernels import Kernels, KernelTracer, join
+from model.aiming.kernels import Kernels
 from model.aiming.plan import AimPlan, plan_aims, single_aim
-from model.fleet import tiles
 from model.frames import sun_direction
 from service.base.progress import no_progress
-from service.cli.aim import ROWS
-from service.cli.field import FieldRequest, light_field, trace_field
+from service.cli.aim import trace_kernels
+from service.cli.field import FieldRequest, trace_field
 from service.sources.plant_file import PlantDescription, read_plant
 from service.sources.plant_template import staggered_layout
 from tests.benchmarks.record import Estimate, log_row, recording
@@ -56,12 +55,7 @@ class Traced:
 def trace(plant: PlantDescription, sun: tuple[float, float]) -> Traced:
     """Trace the images of a plant's mirrors."""
     begun = time.perf_counter()
-    lit = light_field(plant, FieldRequest("main", *sun, DNI), ROWS, in_front=True)
-    by_distance = sorted(
-        lit.aimed.setups, key=lambda one: float(np.linalg.norm(one.heliostat.position))
-    )
-    parts = [KernelTracer(lit.task)(tile).kernels for tile in tiles(by_distance, lit.neighbours)]
-    kernels = join(part for part in parts if part is not None)
+    kernels = trace_kernels(plant, FieldRequest("main", *sun, DNI), no_progress).kernels
     return Traced(kernels, time.perf_counter() - begun)
 
 

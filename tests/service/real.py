@@ -66,12 +66,17 @@ def runtime_of(client: TestClient) -> Runtime:
 
 def run_job(client: TestClient, path: str, **payload: Any) -> dict[str, Any]:
     """Post a job, run it here, and return its result."""
+    return cast(dict[str, Any], done_job(client, path, **payload)["result"])
+
+
+def done_job(client: TestClient, path: str, **payload: Any) -> dict[str, Any]:
+    """Post a job, run it here, and return it when it is done."""
     answer = client.post(path, json=payload)
     assert answer.status_code == 202, answer.text
     assert Worker(runtime_of(client), KINDS, "tester", threading.Event()).work()
-    job = client.get(answer.headers["Location"]).json()
+    job: dict[str, Any] = client.get(answer.headers["Location"]).json()
     assert job["state"] == "done", job["reason"]
-    return cast(dict[str, Any], job["result"])
+    return job
 
 
 def fill(stj: Path, folder: Path) -> None:

@@ -1,24 +1,24 @@
 """The job `aim-plans`: aim points of the most power under the flux that a receiver can take."""
 
 import math
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 import torch
 from pydantic import Discriminator, Field, Tag, field_validator
 from sqlalchemy import select
 
-from model.aiming.kernels import Kernels, aim_in_front
-from model.aiming.plan import AimPlan, plan_aims, single_aim
-from service.base.fields import AnySun, Name, Number, Position, Resolution
+from model.aiming.kernels import aim_in_front
+from model.aiming.plan import plan_aims
+from model.plant import square_pixels
+from service.base.fields import Name, Number, Position, Resolution
 from service.jobs.common import require_some
 from service.jobs.kind import Context, Kind, Result
-from service.jobs.kinds.field_forecasts import FleetIn, expected_s
+from service.jobs.kinds.field_forecasts import FleetForecastIn, expected_s
 from service.sources.limits import Limit
 from service.store.tables import HeliostatRow
-from service.twin.forecasts.aims import aim_figures
+from service.twin.forecasts.aims import ROWS, aim_figures, begin_at
 from service.twin.forecasts.field_forecast import (
     HeliostatGroup,
     forecast_group,
@@ -42,25 +42,14 @@ LimitOfMap = Annotated[
     Discriminator(_way_to_give),
 ]
 
-ROWS = 32
-"""Rows of a map if none are asked for."""
 
-
-class AimPlanIn(FleetIn):
+class AimPlanIn(FleetForecastIn):
     """Find the aim points of the most power on a receiver under the flux that it can take.
 
     In 95 % of draws of the pointing errors the whole map is within the limit. Heliostats are left
     inactive only where no aims keep it.
     """
 
-    sun: AnySun
-    surface: Literal["current", "ideal"] = Field(
-        default="current",
-        description=(
-            "The heliostats' current surfaces, and the ideal mirror of those that have none; or"
-            " ideal ones."
-        ),
-    )
     limit_w_m2: LimitOfMap = Field(
         description=(
             "Flux that the receiver can take [W/m2]: one number, or rows of numbers over the"
@@ -97,13 +86,12 @@ def plan_field(context: Context, payload: AimPlanIn) -> Result:
         sun = position_of(session, payload.sun)
     fleet = payload.fleet(runtime, sun, payload.surface == "ideal")
     receiver = fleet.receiver
-    columns = max(8, min(1024, round(ROWS * receiver.width / receiver.height)))
-    resolution = payload.resolution or (ROWS, columns)
+    resolution = payload.resolution or square_pixels(receiver, ROWS)
     start = fleet.aims
     group = _in_front(runtime, fleet)
     kernels = trace_kernels(runtime, group, resolution, payload.neighbours, context.report)
     limit = torch.tensor(payload.limit().on_map(*resolution), dtype=torch.float32).flatten()
-    begin = _begin(kernels, limit, start) if start else None
+    begin = begin_at(kernels, limit, start) if start else None
     context.report(0.55, "aims", phase="aims")
     plan = plan_aims(kernels, limit, begin, context.check)
     context.report(0.85, "what the plan is worth", phase="aims")
@@ -157,15 +145,6 @@ def _in_front(runtime: Runtime, fleet: HeliostatGroup) -> HeliostatGroup:
     aims = {name: aim_in_front(fleet.receiver, places[name]).tolist() for name in known}
     unknown = [name for name in fleet.names if name not in places]
     return replace(fleet, names=[*known, *unknown], aims=aims)
-
-
-def _begin(kernels: Kernels, limit: torch.Tensor, start: Mapping[str, Sequence[float]]) -> AimPlan:
-    """A plan that begins with given aims; heliostats without one begin at the middle."""
-    plan = single_aim(kernels, limit)
-    points = plan.points
-    for row, name in enumerate(kernels.names):
-        points[row] = start.get(name, points[row].tolist())
-    return replace(plan, moved=kernels.moved(points))
 
 
 def expected_plan_s(payload: AimPlanIn, stored: int) -> float:

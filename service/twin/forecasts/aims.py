@@ -1,11 +1,35 @@
 """What a plan of aim points is worth, by the names of ``REPORT.json`` of ``heliotwin aim``."""
 
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import TypedDict
+
+from numpy.typing import ArrayLike
+from torch import Tensor
 
 from model.aiming.bound import bound_power
 from model.aiming.k_factor import k_factor_aims
-from model.aiming.plan import AimPlan
+from model.aiming.kernels import Kernels
+from model.aiming.plan import AimPlan, single_aim
 from model.plant import Receiver
+
+ROWS = 32
+"""Rows of a map if none are asked for: its pixels are smaller than any image of a mirror."""
+
+
+def begin_at(kernels: Kernels, limit: Tensor, aims: Mapping[str, ArrayLike | None]) -> AimPlan:
+    """A plan that begins with aims (3,) [m] by heliostat, None for one that is not active.
+
+    Heliostats without an aim begin where their images were traced.
+    """
+    plan = single_aim(kernels, limit)
+    points, active = plan.points, plan.is_active
+    for row, name in enumerate(kernels.names):
+        if name in aims:
+            aim = aims[name]
+            active[row] = aim is not None
+            points[row] = points[row] if aim is None else aim
+    return replace(plan, moved=kernels.moved(points), is_active=active)
 
 
 class Baseline(TypedDict):

@@ -15,13 +15,14 @@ from service.drawing import charts
 from service.drawing.charts import HeatMap
 from service.drawing.templates import in_words
 from service.jobs.enqueuing import cancel_for, enqueue
-from service.jobs.kind import result_of
+from service.jobs.kind import Kinds, result_of
 from service.jobs.kinds import predictions
 from service.jobs.kinds.predictions import PredictionsIn
 from service.store.job_tables import JobRow
 from service.store.jobs import queue
 from service.store.sizes import sizes
 from service.twin.forecasts.watts import loss_chain
+from service.twin.runtime.runtime import Runtime
 from service.web.auth.dependencies import (
     OPERATE,
     READ,
@@ -138,14 +139,19 @@ By = Annotated[
 ]
 
 
+def _result_with(runtime: Runtime, kinds: Kinds, number: int, part: str) -> Mapping[str, Any]:
+    """The result of a job that has this part; NotFoundError if it has not."""
+    with runtime.database.reading() as session:
+        result = result_of(kinds, session, queue.get_job(session, number)) or {}
+    if part not in result:
+        raise NotFoundError(f"the result of job {number} has no {part}")
+    return result
+
+
 @router.get("/jobs/{number}/heliostats.csv", dependencies=[READ])
 def get_job_heliostats_table(number: Number, runtime: RuntimeDep, kinds: KindsDep) -> Response:
     """What becomes of the light of each heliostat of a field forecast."""
-    with runtime.database.reading() as session:
-        result = result_of(kinds, session, queue.get_job(session, number)) or {}
-    if "by_heliostat" not in result:
-        raise NotFoundError(f"job {number} has no losses by heliostat")
-    lines = result["by_heliostat"].items()
+    lines = _result_with(runtime, kinds, number, "by_heliostat")["by_heliostat"].items()
     columns = _FACTORS[1:]
     rows = ([name, *(one[column] for column in columns)] for name, one in lines)
     return sheet_answer(f"job-{number}-heliostats", ("heliostat", *columns), rows)
@@ -154,10 +160,7 @@ def get_job_heliostats_table(number: Number, runtime: RuntimeDep, kinds: KindsDe
 @router.get("/jobs/{number}/aims.csv", dependencies=[READ])
 def get_job_aims_table(number: Number, runtime: RuntimeDep, kinds: KindsDep) -> Response:
     """The aims of a plan, as ``heliotwin field --aims`` reads them."""
-    with runtime.database.reading() as session:
-        result = result_of(kinds, session, queue.get_job(session, number)) or {}
-    if "aim_points_m" not in result:
-        raise NotFoundError(f"job {number} has no aims")
+    result = _result_with(runtime, kinds, number, "aim_points_m")
     inactive = set(result["inactive"])
     rows = (
         [name, *point, int(name not in inactive)] for name, point in result["aim_points_m"].items()

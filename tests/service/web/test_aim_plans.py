@@ -1,6 +1,5 @@
 """The job `aim-plans` on an imported plant, and its page."""
 
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -8,8 +7,6 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
-from service.jobs.kinds import KINDS
-from service.jobs.worker import Worker
 from service.sources.folder import read_folder
 from service.sources.plant_tables import read_aims
 from service.twin.transfer.importing import import_folder
@@ -34,15 +31,9 @@ def plant(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
         yield client
 
 
-def planned(client: TestClient, **changes: object) -> dict[str, Any]:
+def planned(client: TestClient, **changes: Any) -> dict[str, Any]:
     """The job of a plan, when it has ended."""
-    answer = client.post("/v1/jobs/aim-plans", json=BODY | changes)
-    assert answer.status_code == 202, answer.text
-    path = answer.headers["Location"]
-    assert Worker(real.runtime_of(client), KINDS, "tester", threading.Event()).work()
-    job: dict[str, Any] = client.get(path).json()
-    assert job["state"] == "done", job["reason"]
-    return job
+    return real.done_job(client, "/v1/jobs/aim-plans", **BODY | changes)
 
 
 def test_plan_keeps_the_limit_and_its_aims_do_what_it_says(plant: TestClient):
@@ -56,9 +47,7 @@ def test_plan_keeps_the_limit_and_its_aims_do_what_it_says(plant: TestClient):
     assert len(aims) == result["heliostats"] > 40
     body = {key: BODY[key] for key in ("target", "sun", "dni_w_m2")}
     body |= {"aim_points_m": aims, "resolution": [32, 80]}
-    path = plant.post("/v1/jobs/forecasts", json=body).headers["Location"]
-    assert Worker(real.runtime_of(plant), KINDS, "tester", threading.Event()).work()
-    forecast = plant.get(path).json()["result"]
+    forecast = real.run_job(plant, "/v1/jobs/forecasts", **body)
     assert forecast["field"]["intercepted_w"] == pytest.approx(result["power_w"], rel=0.005)
     assert forecast["peak_w_m2"] == pytest.approx(result["peak_w_m2"], rel=0.03)
 

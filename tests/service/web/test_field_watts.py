@@ -2,7 +2,6 @@
 
 import csv
 import io
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,8 +12,6 @@ from fastapi.testclient import TestClient
 
 from model.fleet import LOSSES
 from service.cli.field import FieldRequest, trace_field
-from service.jobs.kinds import KINDS
-from service.jobs.worker import Worker
 from service.sources.folder import read_folder
 from service.sources.plant_file import PlantDescription, read_plant
 from service.twin.transfer.importing import import_folder
@@ -50,13 +47,7 @@ def rich(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tes
 
 def done(client: TestClient, kind: str, body: dict[str, Any]) -> dict[str, Any]:
     """The job of a request, when it has ended."""
-    answer = client.post(f"/v1/jobs/{kind}", json=body)
-    assert answer.status_code == 202, answer.text
-    path = answer.headers["Location"]
-    assert Worker(real.runtime_of(client), KINDS, "tester", threading.Event()).work()
-    job: dict[str, Any] = client.get(path).json()
-    assert job["state"] == "done", job["reason"]
-    return job
+    return real.done_job(client, f"/v1/jobs/{kind}", **body)
 
 
 @pytest.mark.parametrize("name", RECEIVERS)
