@@ -43,7 +43,17 @@ class PlaneReceiverIn(Plane):
         return _plane(name, self.model_dump(), self.absorptance)
 
 
-class CylinderIn(Model):
+class _ReceiverPart(Model):
+    """What receivers other than planes have in common."""
+
+    absorptance: Number = ABSORPTANCE
+
+    def named(self, name: str) -> AnyReceiver:
+        """Convert to the model's receiver with this name."""
+        return receiver_from_json(name, self.model_dump())
+
+
+class CylinderIn(_ReceiverPart):
     """A cylinder or a part of one, lit from outside; the default kind."""
 
     kind: Literal["cylinder"] = Field(default="cylinder", description="Its kind.")
@@ -64,36 +74,31 @@ class CylinderIn(Model):
         le=360,
         description="Angle of the lit surface about its middle [deg].",
     )
-    absorptance: Number = ABSORPTANCE
 
     @model_validator(mode="after")
     def _shape(self) -> Self:
         require_cylinder_shape(self.radius, self.height, self.opening_deg)
         return self
 
-    def named(self, name: str) -> Cylinder:
-        """Convert to the model's cylinder with this name."""
-        return _cylinder(name, self.model_dump())
 
+class _PanelledIn(_ReceiverPart):
+    """Panels of one height."""
 
-class PanelsIn(Model):
-    """Panels side by side, lit from outside."""
-
-    kind: Literal["panels"] = KIND
     panels: list[Plane] = _PANELS
-    absorptance: Number = ABSORPTANCE
 
     @model_validator(mode="after")
     def _one_height(self) -> Self:
         self.named("as given")
         return self
 
-    def named(self, name: str) -> Panels:
-        """Convert to the model's panels with this name."""
-        return _panels(name, self.model_dump())
+
+class PanelsIn(_PanelledIn):
+    """Panels side by side, lit from outside."""
+
+    kind: Literal["panels"] = KIND
 
 
-class CavityIn(Model):
+class CavityIn(_PanelledIn):
     """Panels behind a polygonal opening."""
 
     kind: Literal["cavity"] = KIND
@@ -102,17 +107,6 @@ class CavityIn(Model):
         max_length=MAX_PANELS,
         description="Corners of the opening in one plane, counter-clockwise seen from outside [m].",
     )
-    panels: list[Plane] = _PANELS
-    absorptance: Number = ABSORPTANCE
-
-    @model_validator(mode="after")
-    def _one_height(self) -> Self:
-        self.named("as given")
-        return self
-
-    def named(self, name: str) -> Cavity:
-        """Convert to the model's cavity with this name."""
-        return _cavity(name, self.model_dump())
 
 
 def _kind_of(receiver: Any) -> str:
