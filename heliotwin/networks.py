@@ -15,6 +15,7 @@ import torch
 
 from model.errors import InvalidInputError, ModelError
 from model.plant import Heliostat
+from model.surface import COLUMNS, ROWS
 from service.sources.folder import measured_heights, read_surface
 from service.sources.plant_file import read_plant
 from training.config import TrainConfig
@@ -107,7 +108,7 @@ def _measured(root: Path, heliostats: list[Heliostat]) -> np.ndarray[Any, np.dty
         surface = read_surface(root, heliostat)
         if surface is not None:
             found.append(measured_heights(heliostat, surface))
-    shape = (0, len(heliostats[0].facets), 8, 8)
+    shape = (0, len(heliostats[0].facets), ROWS, COLUMNS)
     return np.array(found) if found else np.zeros(shape)
 
 

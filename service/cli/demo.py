@@ -43,6 +43,7 @@ from service.drawing.plant_picture import plant_picture
 from service.drawing.templates import ASSETS, TEMPLATES
 from service.sources.folder import MeasurementFolder, measured_heights, read_folder
 from service.sources.plant_file import read_plant
+from service.sources.plant_formats.imported import PLANT
 from service.twin.forecasts.heliostat_forecast import ForecastRequest, make_forecast
 from service.twin.heliostats.measurements import choose_diverse
 from service.twin.runtime import operations
@@ -95,20 +96,23 @@ def run_demos(
     if data is not None:
         return run_demo(data, out, console, quiet)
     if plant is not None:
-        return _demonstrate(plant, out / read_plant(plant).plant.name, console, quiet)
+        return _demonstrate(plant, out, console, quiet)
     root = out / "plant"
     with _bars(console, quiet) as bars:
         write_plant(root, _counting(bars, 4))
     report = run_demo(root, out, console, quiet)
     with TemporaryDirectory(prefix="heliotwin-") as folder:
         file = write_southern_plant(Path(folder))
-        other = _demonstrate(file, out / "southern", console, quiet)
+        other = _demonstrate(file, out, console, quiet)
     return {**report, "other_plant": other}
 
 
 def _demonstrate(plant: Path, out: Path, console: Console, quiet: bool) -> Mapping[str, object]:
-    """Photograph a plant that a file describes, and run the demonstration on it."""
+    """Photograph a plant that a file describes, and run the demonstration on it, in a folder of its
+    name.
+    """
     demonstrated = Demonstrated.read(plant)
+    out = out / demonstrated.description.plant.name
     with _bars(console, quiet) as bars:
         demonstrated.write(out / "plant", _counting(bars, len(demonstrated.mirrors)))
     return run_demo(out / "plant", out, console, quiet)
@@ -168,7 +172,7 @@ def _trace_field(root: Path, out: Path) -> FieldReport | None:
 
     Files: ``OUT/field/field.json``, ``OUT/plant.png`` and ``OUT/field.png``.
     """
-    file = root / "plant.yaml"
+    file = root / PLANT
     described = read_plant(file) if file.is_file() else None
     if described is None or not described.receivers:
         return None

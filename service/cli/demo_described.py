@@ -19,11 +19,10 @@ from service.base.progress import Progress, no_progress
 from service.cli.demo_photographs import DEVIATION, IMAGES, RAYS, Camera, write_frame, write_surface
 from service.cli.folder import write_json
 from service.sources.plant_file import PlantDescription, read_plant
-from service.sources.plant_template import LAYOUT, staggered_layout
+from service.sources.plant_formats.imported import LAYOUT, PLANT
+from service.sources.plant_template import staggered_layout
 
 Array = NDArray[np.float64]
-
-PLANT = "plant.yaml"
 
 MIRRORS = 2
 """Photographed heliostats of a plant."""
