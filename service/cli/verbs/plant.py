@@ -43,14 +43,20 @@ def check(file: PlantFile, as_json: AsJson = False) -> None:
 
 @app.command()
 def new(
-    file: Annotated[Path, typer.Argument(help="Where to write it.", metavar="[PLANT.yaml]")] = Path(
-        "plant.yaml"
-    ),
+    file: Annotated[
+        Path, typer.Argument(help="Where to write it, or a folder.", metavar="[PLANT.yaml]")
+    ] = Path("plant.yaml"),
     as_json: AsJson = False,
 ) -> None:
-    """Write a commented plant to begin with, and its layout.csv beside it."""
+    """Write a commented plant to begin with, and its layout.csv beside it.
+
+    A path without .yaml is a folder for them.
+    """
+    from service.sources.plant_formats.imported import PLANT
     from service.sources.plant_template import LAYOUT, write_template
 
+    if file.suffix.lower() not in (".yaml", ".yml"):
+        file /= PLANT
     require_file(file)
     write_template(file)
     written = [str(file), str(file.with_name(LAYOUT))]
@@ -85,7 +91,7 @@ def import_(
     file: Annotated[
         Path,
         typer.Argument(
-            help="SolTrace's .stinput, ARTIST's .h5, or CSV of SolarPILOT or OpenCSP.",
+            help="SolTrace's .stinput, ARTIST's .h5, or CSV of SolarPILOT, OpenCSP or positions.",
             metavar="FILE",
         ),
     ],

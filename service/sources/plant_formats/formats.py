@@ -14,6 +14,7 @@ from service.sources.plant_formats.artist import read_artist
 from service.sources.plant_formats.artist_export import write_artist
 from service.sources.plant_formats.imported import ImportedPlant
 from service.sources.plant_formats.opencsp import COLUMNS, read_opencsp
+from service.sources.plant_formats.positions import has_positions, read_positions
 from service.sources.plant_formats.solarpilot import read_solarpilot, solarpilot_layout
 from service.sources.plant_formats.soltrace import read_soltrace
 from service.sources.plant_formats.soltrace_export import soltrace_text
@@ -23,8 +24,8 @@ Array = NDArray[np.float64]
 
 
 def read_foreign(path: Path) -> ImportedPlant:
-    """Read a file of SolTrace (``.stinput``), ARTIST (``.h5``), OpenCSP or SolarPILOT (CSV by its
-    first line).
+    """Read a file of SolTrace (``.stinput``), ARTIST (``.h5``), or a CSV by its first line:
+    OpenCSP, SolarPILOT, or positions.
 
     Raises
     ------
@@ -36,8 +37,9 @@ def read_foreign(path: Path) -> ImportedPlant:
     if path.suffix.lower() in (".h5", ".hdf5"):
         return read_artist(path)
     lines = read_lines(path, ",")
-    is_opencsp = bool(lines) and [cell.strip() for cell in lines[0].cells[:5]] == list(COLUMNS[:5])
-    return read_opencsp(path) if is_opencsp else read_solarpilot(path)
+    if lines and [cell.strip() for cell in lines[0].cells[:5]] == list(COLUMNS[:5]):
+        return read_opencsp(path)
+    return read_positions(path) if lines and has_positions(lines[0]) else read_solarpilot(path)
 
 
 @dataclass(frozen=True)

@@ -62,7 +62,7 @@ def _results(lines: Sequence[ForeignLine]) -> ImportedPlant:
         name = f"H{int(line.number(head.index('Heliostat ID'), 0, 1e9))}"
         heliostats.append(placed(name, "T0", line.numbers(head.index(_POSITION[0]), 3)))
         aims[name] = np.array(line.numbers(head.index(_AIM[0]), 3))
-    return _plant(heliostats, aims, {"T0"})
+    return default_plant(heliostats, aims, {"T0"})
 
 
 def _layout(lines: Sequence[ForeignLine]) -> ImportedPlant:
@@ -84,13 +84,16 @@ def _layout(lines: Sequence[ForeignLine]) -> ImportedPlant:
         heliostats.append(placed(f"H{number}", kind, line.numbers(1, 3), focal_length))
         if len(cells) == 12 and cells[9] != _NULL:
             aims[f"H{number}"] = np.array(line.numbers(9, 3))
-    return _plant(heliostats, aims, {entry.type for entry in heliostats})
+    return default_plant(heliostats, aims, {entry.type for entry in heliostats})
 
 
-def _plant(
+def default_plant(
     heliostats: Sequence[HeliostatEntry], aims: Mapping[str, Array], kinds: set[str]
 ) -> ImportedPlant:
-    """The plant of a layout, with SolarPILOT's default case for what it does not say."""
+    """The plant of a layout, with SolarPILOT's default case for what it does not say.
+
+    ``aims`` are points (3,) [m] by heliostat.
+    """
     guess = _receiver(list(aims.values()))
     mirror = {
         "mount": {"kind": "azimuth_elevation"},

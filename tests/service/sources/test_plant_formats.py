@@ -23,6 +23,10 @@ AFTERNOON = "Power-tower-surround_singlefacet_large_afternoon.stinput"
 SURROUND = "Power-tower-surround_singlefacet.stinput"
 
 
+def solar_two() -> Path:
+    return published() / "layouts" / "SolarTwo_layout.csv"
+
+
 def pose_error_mrad(first: SolTraceInput, second: SolTraceInput) -> float:
     """The largest angle between axes of heliostats; half a turn leaves a rectangle as it is."""
     axes = [np.array([e.axes for e in given.stages[0]]) for given in (first, second)]
@@ -74,6 +78,8 @@ def test_aim_points_of_soltrace_are_on_its_receiver(tmp_path: Path):
         ("halos/flat-daggett-50.csv", 656, 656),
         ("halos/radial-daggett-50.csv", 904, 904),
         ("opencsp/NSTTF_Heliostats_origin_at_torque_tube.csv", 218, 0),
+        ("layouts/Gemasolar_layout.csv", 2650, 0),
+        ("layouts/SolarTwo_layout.csv", 1926, 0),
     ],
 )
 def test_layouts_are_imported(tmp_path: Path, name: str, count: int, aims: int):
@@ -102,6 +108,29 @@ def test_mirrors_of_opencsp(tmp_path: Path):
     assert len(heliostat.facets) == 25
     assert heliostat.area == pytest.approx(25 * 1.2192**2)
     np.testing.assert_allclose(heliostat.position + heliostat.mount.joint, [92.61, 57.92, 5.45])
+
+
+def test_positions_keep_their_names_and_types(tmp_path: Path):
+    plant = read_plant(read_foreign(solar_two()).write(tmp_path)[0])
+    assert {plant.type_of[name] for name in plant.type_of} == {"MM", "LUGO"}
+    np.testing.assert_allclose(plant.plant.heliostats["H2"].position, [-179.2, -183.6, 0])
+
+
+@pytest.mark.parametrize(
+    ("text", "error"),
+    [
+        ("id,x,y\n", "line 1: no heliostat follows"),
+        ("id,x,y,height\n1,2,3,4\n", "line 1: column 'height' is not understood"),
+        ("x,y\n1,2\n3,north\n", "line 3: cell 2 must be a number"),
+        ("x,y,type\n1,2\n", "line 2: has no cell for type"),
+        ("x,y,name\n1,2,a b\n", "line 2: name 'a b'"),
+        ("x,y,name\n1,2,a\n3,4,a\n", "a"),
+    ],
+)
+def test_positions_that_are_refused(tmp_path: Path, text: str, error: str):
+    file = tmp_path / "field.csv"
+    file.write_text(text)
+    ends(heliotwin("plant", "import", file, "--out", tmp_path / "out"), 2, error)
 
 
 def test_solarpilot_returns_as_it_came(tmp_path: Path):
