@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import yaml
 
 from model.errors import InvalidInputError
 from model.locating import BracketMarks, locator_to_json
@@ -20,7 +19,7 @@ from service.base.fields import JsonObject
 from service.base.plant_facts import PlantFacts
 from service.base.receivers import AnyReceiver
 from service.sources.documents import sun_to_json
-from service.sources.plant_formats.imported import LAYOUT, PLANT, site
+from service.sources.plant_formats.imported import LAYOUT, PLANT, plant_text, site
 
 _LAYOUT = ("name", "type", "east_m", "north_m", "up_m", "receiver", "focal_length_m")
 
@@ -68,9 +67,7 @@ def export_plant(
         parts["tower"] = {"radius_m": facts.tower.radius, "height_m": facts.tower.height}
     if optics.attenuation:
         parts["atmosphere"] = {"attenuation": list(optics.attenuation)}
-    made.files[PLANT] = yaml.safe_dump(
-        parts, sort_keys=False, width=100, default_flow_style=None, allow_unicode=True
-    )
+    made.files[PLANT] = plant_text(parts)
     made.files[LAYOUT] = _csv([_LAYOUT, *rows])
     made.files.update(facts.heliostat_types["files"])
     return made

@@ -91,7 +91,7 @@ class ImportedPlant:
     def _plant(self) -> str:
         notes = "".join(f"# {note}\n" for note in self.notes)
         parts = {**self.parts, "layout": {"file": LAYOUT}}
-        return notes + yaml.safe_dump(parts, sort_keys=False, width=100, default_flow_style=None)
+        return notes + plant_text(parts)
 
     def _layout(self) -> "_Table":
         optional = [
@@ -102,6 +102,13 @@ class ImportedPlant:
         columns = ["name", "type", "east_m", "north_m", "up_m", *optional]
         rows = [[_cell(getattr(entry, name)) for name in columns] for entry in self.heliostats]
         return _Table(columns, rows)
+
+
+class _PlainDumper(yaml.SafeDumper):
+    """Repeats what occurs twice: plant.yaml has no anchors."""
+
+    def ignore_aliases(self, data: object) -> bool:
+        return True
 
 
 class _Table(NamedTuple):
@@ -126,6 +133,18 @@ def _write_text(path: Path, text: str) -> None:
 def _write_csv(path: Path, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     with path.open("w", encoding="utf-8", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows([columns, *rows])
+
+
+def plant_text(parts: Mapping[str, object]) -> str:
+    """plant.yaml of its parts."""
+    return yaml.dump(
+        parts,
+        Dumper=_PlainDumper,
+        sort_keys=False,
+        width=100,
+        default_flow_style=None,
+        allow_unicode=True,
+    )
 
 
 def placed(
