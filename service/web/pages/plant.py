@@ -15,6 +15,7 @@ from service import store
 from service.base.fields import Version
 from service.drawing.templates import figure
 from service.sources.documents import describe_sun
+from service.sources.plant_schema import FacetGridEntry, HeliostatTypeEntry
 from service.store import audit, keys
 from service.store.tables import MeasurementRow, PlantRow, ReceiverRow, TargetRow
 from service.twin.plant import model_versions
@@ -60,6 +61,32 @@ def _receiver_line(row: ReceiverRow) -> ReceiverLine:
     )
 
 
+@dataclass(frozen=True)
+class TypeLine:
+    """A heliostat type of ``plant.yaml`` in the table, with its facets in words."""
+
+    name: str
+    entry: HeliostatTypeEntry
+    facets: str
+
+
+def _type_lines(plant: PlantRow | None) -> list[TypeLine]:
+    """Heliostat types that the plant's file declares."""
+    if plant is None or plant.heliostat_types is None:
+        return []
+    lines = []
+    for name, declared in plant.heliostat_types["types"].items():
+        entry = HeliostatTypeEntry.model_validate(declared)
+        facets = entry.facets
+        if isinstance(facets, FacetGridEntry):
+            size = f"{facets.width_m:g} × {facets.height_m:g} m"
+            text = f"{facets.rows * facets.columns} of {size}"
+        else:
+            text = f"as in {facets.file}"
+        lines.append(TypeLine(name, entry, text))
+    return lines
+
+
 def _place(metres: Sequence[float]) -> list[str]:
     """East, north and up as parts of a table's cell."""
     east, north, up = (figure(value, 2) for value in metres)
@@ -81,6 +108,7 @@ def get_plant_page(request: Request, runtime: RuntimeDep) -> HTMLResponse:
         plant=plant,
         targets=targets,
         receivers=receivers,
+        types=_type_lines(plant),
         model=model,
         place=_place,
         sun=sun,

@@ -50,3 +50,9 @@ def test_page_has_the_mirrors_size_and_all_facets(other_plant: TestClient):
     assert "12.72" in page.words  # 7 facets of 1.8 m and the gaps between them
     table = other_plant.get("/heliostats/A1?figure=deviation&format=npz")
     assert table.status_code == 200
+
+
+def test_page_of_the_plant_has_the_heliostat_types(other_plant: TestClient):
+    page = Page(other_plant.get("/plant", headers={"Accept": "text/html"}).text)
+    assert "28 of 1.8 × 1.35 m" in page.words
+    assert "as in facets.csv" in page.words
