@@ -13,7 +13,7 @@ import cv2
 import matplotlib
 import matplotlib.dates
 import numpy as np
-from matplotlib.colors import to_hex
+from matplotlib.colors import LinearSegmentedColormap, to_hex
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
@@ -69,6 +69,18 @@ def ticks(low: float, high: float, most: int = 5) -> tuple[Tick, ...]:
     return tuple(
         Tick((value - low) / (high - low), f"{round(value, 12) + 0.0:g}") for value in inside
     )
+
+
+CONDITION = "heliotwin.condition"
+"""Colour map from poor, red, to fine, a quiet blue. Each colour has a contrast of 3 to light and to
+dark cards.
+"""
+matplotlib.colormaps.register(
+    LinearSegmentedColormap.from_list(
+        CONDITION, ["#d62020", "#d9541e", "#b98244", "#8a929a", "#5b95b8"]
+    )
+)
+matplotlib.colormaps.register(matplotlib.colormaps[CONDITION].reversed(f"{CONDITION}_r"))
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from service.base.settings import Settings
-from service.drawing.charts import Scale
+from service.drawing.charts import CONDITION, Scale
 from service.drawing.pictures import places_picture
 from service.store.job_tables import JobRow
 from service.store.tables import PlantRow, TargetRow
@@ -140,10 +140,11 @@ def _text(line: HeliostatOverview, metric: Metric) -> str:
 
 
 def scale_for(metric: Metric, settings: Settings) -> Scale:
-    """Colours of a metric, from bright (good) to dark (poor), the same for every field."""
+    """Colours of a metric, from blue (fine) to red (poor), the same for every field."""
     fine, poor = settings.map_scales[metric.name]
     label = f"{metric.label} [{metric.unit}]"
-    return Scale("viridis" if poor < fine else "viridis_r", min(fine, poor), max(fine, poor), label)
+    colours = CONDITION if poor < fine else f"{CONDITION}_r"
+    return Scale(colours, min(fine, poor), max(fine, poor), label)
 
 
 _WIDTH = 720.0

@@ -263,7 +263,7 @@ def test_operator_sees_what_needs_attention(page: Any, served: Served, size: dic
     page.set_viewport_size(size)
     page.goto("/")
     expect(page.locator("nav .count")).to_have_text("1 not acknowledged")
-    follow(page, "text=Needs attention")
+    follow(page, "text=Alarms")
     expect(page.locator(".attention li")).to_contain_text("None was ever accepted.")
     follow(page, ".attention li button")
     expect(page.locator("#attention")).to_contain_text("Nothing.")
