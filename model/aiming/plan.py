@@ -55,10 +55,11 @@ _CORRECTIONS = 12
 
 
 class Draws(NamedTuple):
-    """Peaks [W/m2] of the map, and largest ratios of flux and limit, by draw (D,)."""
+    """Peaks [W/m2] of the map, largest ratios of flux and limit, and powers [W], by draw (D,)."""
 
     peaks: Array
     ratios: Array
+    powers: Array
 
     @property
     def peak(self) -> float:
@@ -115,7 +116,7 @@ class AimPlan:
         ``rows`` are those of the ``count`` draws that are traced, if not all.
         """
         active = self.is_active.to(self.moved)
-        peaks, ratios = [], []
+        peaks, ratios, powers = [], [], []
         with torch.no_grad():
             every = _errors(self.kernels, count, seed)
             for errors in every if rows is None else every[list(rows)]:
@@ -123,7 +124,8 @@ class AimPlan:
                 flux = self.kernels.flux(moved, active, is_sharp=True)
                 peaks.append(float(flux.max()))
                 ratios.append(float((flux / self.limit).max()))
-        return Draws(np.array(peaks), np.array(ratios))
+                powers.append(float(flux @ self.kernels.areas))
+        return Draws(np.array(peaks), np.array(ratios), np.array(powers))
 
 
 def single_aim(kernels: Kernels, limit: Tensor) -> AimPlan:
@@ -169,12 +171,14 @@ def plan_aims(
     rough.run(count, _UPDATE, count // 4 if start is None else 0)
     plan = replace(plan, moved=rough.moved, multipliers=rough.multipliers[thin.block])
     deviations, before = rough.deviations, math.inf
+    second_order = _second_order(_on_blocks(plan, thin))
     for _ in range(_CORRECTIONS):
-        second_order = _second_order(_on_blocks(plan, thin))
         ascent = _Ascent(plan, _STEP_FINE, between, deviations, second_order)
         ascent.run(_N_FINE, _UPDATE_FINE)
         plan, deviations = ascent.plan, ascent.deviations
-        excess = linear_draws(plan).ratio + second_order - 1
+        linear = linear_draws(plan)
+        second_order = _second_order(plan, linear)
+        excess = linear.ratio + second_order - 1
         if excess <= 0:
             break
         if excess > max(_DEFOCUS_ABOVE, before / 2):
@@ -193,12 +197,13 @@ def _on_blocks(plan: AimPlan, thin: Thinned) -> AimPlan:
     return replace(plan, kernels=thin.kernels, limit=limit, multipliers=multipliers)
 
 
-def _second_order(plan: AimPlan) -> float:
-    """What `Draws.ratio` is above that of `linear_draws`, by some draws of about that rank."""
-    linear = linear_draws(plan)
-    middle = round((1 - WITHIN) * DRAWS)
-    rows = np.argsort(-linear.ratios)[max(0, middle - _FULL_DRAWS // 2) :][:_FULL_DRAWS].tolist()
-    return float((plan.draws(rows=rows).ratios - linear.ratios[rows]).mean())
+def _second_order(plan: AimPlan, linear: "LinearDraws | None" = None) -> float:
+    """What `Draws.ratio` is above that of `linear_draws`, by tracing the draws of the largest."""
+    linear = linear or linear_draws(plan)
+    rows = np.argsort(-linear.ratios)[:_FULL_DRAWS].tolist()
+    ratios = linear.ratios.copy()
+    ratios[rows] = plan.draws(rows=rows).ratios
+    return float(np.quantile(ratios, WITHIN)) - linear.ratio
 
 
 _FULL_DRAWS = 16
