@@ -11,6 +11,7 @@ two aims, some hundredths of a radian, which changes the image far less than its
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -111,14 +112,28 @@ class Kernels:
     def light(self, moved: Tensor, *, is_sharp: bool = False) -> Tensor:
         """Irradiance (N, M) [W/m2] of each mirror in the pixels that it can light."""
         images = self.sharp if is_sharp else self.expected
-        scale = 2 / self.sides
-        scale = torch.stack([scale, -scale], dim=-1)
-        places = (self.places - moved[:, None]) * scale[:, None]
+        grid = self._grid - (moved * self._scale)[:, :, None]
         seen = grid_sample(
-            images[:, None], places[:, None], padding_mode="zeros", align_corners=False
+            images[:, None],
+            grid.transpose(1, 2)[:, None],
+            padding_mode="zeros",
+            align_corners=False,
         )
         light: Tensor = seen[:, 0, 0] * self.factors
         return light
+
+    @property
+    def _scale(self) -> Tensor:
+        """What right and up [m] are relative to half of the images, which begin at the top."""
+        scale = 2 / self.sides
+        return torch.stack([scale, -scale], dim=-1)
+
+    @cached_property
+    def _grid(self) -> Tensor:
+        """The places (N, 2, M) in halves of the images; all x of a mirror are in one row, which is
+        twice as fast as pairs.
+        """
+        return (self.places * self._scale[:, None]).transpose(1, 2).contiguous()
 
     def points(self, moved: Tensor) -> Array:
         """Aim points (N, 3) [m] in ENU of ``moved`` (N, 2) [m]."""
@@ -139,6 +154,50 @@ class Kernels:
         index = torch.as_tensor(rows, dtype=torch.long)
         kept: dict[str, Any] = {name: getattr(self, name)[index] for name in _OF_MIRRORS}
         return replace(self, names=tuple(self.names[row] for row in index.tolist()), **kept)
+
+    def thinned(self) -> "Thinned":
+        """The same images with one pixel of each two by two, in turn each of the four."""
+        rows, columns = self.resolution
+        row, column = torch.arange(rows)[:, None], torch.arange(columns)[None]
+        down, right = row // 2, column // 2
+        kept_row = (2 * down + (down + right) % 2).clamp(max=rows - 1)
+        kept_column = (2 * right + down % 2).clamp(max=columns - 1)
+        kept, block = torch.unique(kept_row * columns + kept_column, return_inverse=True)
+        block = block.flatten()
+        areas = torch.zeros(len(kept)).index_add(0, block, self.areas)
+        number = torch.full((rows * columns,), -1)
+        number[kept] = torch.arange(len(kept))
+        # Of each mirror the pixels that remain and that it lights, one after another.
+        pixels = number[self.pixels]
+        mirror, source = ((pixels >= 0) & (self.factors > 0)).nonzero(as_tuple=True)
+        counts = torch.bincount(mirror, minlength=len(self))
+        place = torch.arange(len(mirror)) - (counts.cumsum(0) - counts)[mirror]
+        count = max(1, int(counts.max()))
+
+        def chosen(values: Tensor) -> Tensor:
+            some = values.new_zeros(len(self), count, *values.shape[2:])
+            some[mirror, place] = values[mirror, source]
+            return some
+
+        kernels = replace(
+            self,
+            places=chosen(self.places),
+            factors=chosen(self.factors),
+            pixels=chosen(pixels),
+            areas=areas,
+        )
+        return Thinned(kernels, block)
+
+
+@dataclass(frozen=True, eq=False)
+class Thinned:
+    """Kernels on fewer pixels, and by which of them (P,) each pixel of the whole map is replaced.
+
+    The resolution is still that of the whole map.
+    """
+
+    kernels: Kernels
+    block: Tensor
 
 
 _OF_PIXELS = ("places", "factors", "pixels")

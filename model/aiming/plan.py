@@ -13,7 +13,7 @@ Source: Nocedal and Wright, *Numerical Optimization*, section 17.4, for inequali
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -22,7 +22,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from model.aiming.kernels import Kernels
+from model.aiming.kernels import Kernels, Thinned
 from model.errors import InvalidInputError
 from model.progress import nothing_between
 
@@ -34,31 +34,32 @@ DRAWS = 200
 WITHIN = 0.95
 """Share of draws that must be within the limit."""
 
-_N_ANEW, _N_AGAIN = 100, 20
-"""Steps of a plan from the beginning, and from aims that were good."""
+_N_ANEW, _N_AGAIN, _N_FINE = 100, 20, 8
+"""Steps on a quarter of the pixels, from the beginning or from aims that were good, and on all."""
 
 _RHO = 10.0
 _MAX_PRESSURE = 3.0
-_UPDATE = 10
+_UPDATE, _UPDATE_FINE = 10, 4
 """Steps between updates of multipliers and margins."""
 
-_STEP, _STEP_AGAIN, _LAST_STEP = 0.35, 0.08, 0.05
+_STEP, _STEP_AGAIN, _STEP_FINE, _LAST_STEP = 0.35, 0.06, 0.03, 0.05
 """First step of the aims, relative to the images' spread, and the last relative to the first."""
 
-_TOLERANCE = 0.002
+_TOLERANCE = 0.003
 """Share of the limit by which steps aim below it."""
 
 _DEFOCUS_ABOVE = 0.01
-"""Excess above which mirrors are defocused; less is left to their aims."""
+"""Excess above which mirrors are defocused if aims do not halve it; less is left to their aims."""
 
 _CORRECTIONS = 12
 
 
 class Draws(NamedTuple):
-    """Peaks [W/m2] of the map, and largest ratios of flux and limit, by draw (D,)."""
+    """Peaks [W/m2] of the map, largest ratios of flux and limit, and powers [W], by draw (D,)."""
 
     peaks: Array
     ratios: Array
+    powers: Array
 
     @property
     def peak(self) -> float:
@@ -109,17 +110,22 @@ class AimPlan:
         """Aim points (N, 3) [m] in ENU."""
         return self.kernels.points(self.moved)
 
-    def draws(self, count: int = DRAWS, seed: int = 0) -> Draws:
-        """Trace draws of the pointing errors: each moves the image without errors."""
+    def draws(self, count: int = DRAWS, seed: int = 0, rows: Sequence[int] | None = None) -> Draws:
+        """Trace draws of the pointing errors: each moves the image without errors.
+
+        ``rows`` are those of the ``count`` draws that are traced, if not all.
+        """
         active = self.is_active.to(self.moved)
-        peaks, ratios = [], []
+        peaks, ratios, powers = [], [], []
         with torch.no_grad():
-            for errors in _errors(self.kernels, count, seed):
+            every = _errors(self.kernels, count, seed)
+            for errors in every if rows is None else every[list(rows)]:
                 moved = self.moved + torch.einsum("nij,nj->ni", self.kernels.spread, errors)
                 flux = self.kernels.flux(moved, active, is_sharp=True)
                 peaks.append(float(flux.max()))
                 ratios.append(float((flux / self.limit).max()))
-        return Draws(np.array(peaks), np.array(ratios))
+                powers.append(float(flux @ self.kernels.areas))
+        return Draws(np.array(peaks), np.array(ratios), np.array(powers))
 
 
 def single_aim(kernels: Kernels, limit: Tensor) -> AimPlan:
@@ -156,32 +162,51 @@ def plan_aims(
     if not (torch.isfinite(limit).all() and float(limit.min()) > 0):
         raise InvalidInputError("limit: must be positive everywhere; give the pixels a small one")
     if start is None:
-        found = _within_budget(replace(single_aim(kernels, limit), moved=_spread_out(kernels)))
-        ascent = _Ascent(found, _STEP, between)
-        ascent.run(_N_ANEW)
+        plan = _within_budget(replace(single_aim(kernels, limit), moved=_spread_out(kernels)))
+        step, count = _STEP, _N_ANEW
     else:
-        found = replace(start, kernels=kernels, limit=limit)
-        ascent = _Ascent(found, _STEP_AGAIN, between)
-        ascent.run(_N_AGAIN)
+        plan, step, count = replace(start, kernels=kernels, limit=limit), _STEP_AGAIN, _N_AGAIN
+    thin = kernels.thinned()
+    rough = _Ascent(_on_blocks(plan, thin), step, between)
+    rough.run(count, _UPDATE, count // 4 if start is None else 0)
+    plan = replace(plan, moved=rough.moved, multipliers=rough.multipliers[thin.block])
+    deviations, before = rough.deviations, math.inf
+    second_order = _second_order(_on_blocks(plan, thin))
     for _ in range(_CORRECTIONS):
-        plan = ascent.plan
-        excess = _judged_ratio(plan) - 1
+        ascent = _Ascent(plan, _STEP_FINE, between, deviations, second_order)
+        ascent.run(_N_FINE, _UPDATE_FINE)
+        plan, deviations = ascent.plan, ascent.deviations
+        linear = linear_draws(plan)
+        second_order = _second_order(plan, linear)
+        excess = linear.ratio + second_order - 1
         if excess <= 0:
             break
-        if excess > _DEFOCUS_ABOVE:
+        if excess > max(_DEFOCUS_ABOVE, before / 2):
             plan = _defocused(plan, excess)
-        ascent = _Ascent(plan, _STEP_AGAIN, between, ascent.deviations + _DEEPER)
-        ascent.run(_N_AGAIN)
+        before = excess
     return ascent.plan
 
 
-def _judged_ratio(plan: AimPlan) -> float:
-    """The quantile of `Draws.ratio`: by draws to first order, with what some full ones differ."""
-    linear, full = linear_draws(plan), plan.draws(_FULL_DRAWS)
-    return linear.ratio + float((full.ratios - linear.ratios[:_FULL_DRAWS]).mean())
+def _on_blocks(plan: AimPlan, thin: Thinned) -> AimPlan:
+    """A plan on a quarter of the pixels, each with the least limit of its block."""
+    count = len(thin.kernels.areas)
+    limit = torch.full((count,), math.inf).scatter_reduce(0, thin.block, plan.limit, "amin")
+    multipliers = torch.zeros(count).scatter_reduce(
+        0, thin.block, plan.multipliers, "mean", include_self=False
+    )
+    return replace(plan, kernels=thin.kernels, limit=limit, multipliers=multipliers)
 
 
-_FULL_DRAWS = 40
+def _second_order(plan: AimPlan, linear: "LinearDraws | None" = None) -> float:
+    """What `Draws.ratio` is above that of `linear_draws`, by tracing the draws of the largest."""
+    linear = linear or linear_draws(plan)
+    rows = np.argsort(-linear.ratios)[:_FULL_DRAWS].tolist()
+    ratios = linear.ratios.copy()
+    ratios[rows] = plan.draws(rows=rows).ratios
+    return float(np.quantile(ratios, WITHIN)) - linear.ratio
+
+
+_FULL_DRAWS = 16
 
 
 def _within_budget(plan: AimPlan) -> AimPlan:
@@ -193,10 +218,6 @@ def _within_budget(plan: AimPlan) -> AimPlan:
         allowed, float(plan.kernels.power.max())
     )
     return replace(plan, is_active=is_active)
-
-
-_DEEPER = 0.3
-"""Standard deviations that are added to the margin if draws exceed the limit."""
 
 
 def _spread_out(kernels: Kernels) -> Tensor:
@@ -224,7 +245,12 @@ class _Ascent:
     """Steps of the augmented Lagrangian from a plan."""
 
     def __init__(
-        self, plan: AimPlan, step: float, between: Callable[[], None], deviations: float = 2.5
+        self,
+        plan: AimPlan,
+        step: float,
+        between: Callable[[], None],
+        deviations: float = 3.5,
+        second_order: float = 0.0,
     ) -> None:
         self.begun, self.between, self.deviations = plan, between, deviations
         self.kernels, self.limit = plan.kernels, plan.limit
@@ -235,7 +261,9 @@ class _Ascent:
         self.places = (plan.moved / self.unit).requires_grad_()
         self.multipliers = plan.multipliers.clone()
         self.step = step
-        self.margin = torch.zeros_like(self.limit)
+        self.drawn = linear_draws(plan)
+        self.margin = deviations * self.drawn.sigma
+        self.second_order = second_order
 
     @property
     def moved(self) -> Tensor:
@@ -245,15 +273,19 @@ class _Ascent:
     def plan(self) -> AimPlan:
         return replace(self.begun, moved=self.moved, multipliers=self.multipliers)
 
-    def run(self, count: int) -> None:
-        """Take ``count`` steps; they shrink as a cosine."""
+    def run(self, count: int, update: int, settled: int = 0) -> None:
+        """Take ``count`` steps, which shrink as a cosine.
+
+        Margins are updated after each ``update`` of them, multipliers once ``settled`` are taken.
+        """
         areas = self.kernels.areas
         total = float(self.kernels.power.sum())
         adam = torch.optim.Adam([self.places], lr=self.step, betas=(0.8, 0.98))
         for number in range(count):
             self.between()
-            if number % _UPDATE == 0:
-                self._update(number > count // 4)
+            if number % update == 0:
+                self.drawn = linear_draws(self.plan) if number else self.drawn
+                self._update(number >= settled)
             fall = (1 + math.cos(math.pi * number / count)) / 2
             for group in adam.param_groups:
                 group["lr"] = self.step * (_LAST_STEP + (1 - _LAST_STEP) * fall)
@@ -273,17 +305,19 @@ class _Ascent:
         """Set margin and multipliers by the present aims."""
         with torch.no_grad():
             flux = self.kernels.flux(self.moved, self.active)
-            drawn = linear_draws(self.plan)
+            drawn, ratio = self.drawn, self.drawn.ratio + self.second_order
             if has_settled:
+                # By the margin for which the aims were found.
+                self.multipliers = (self.multipliers + _RHO * self._excess(flux)).clamp(min=0)
                 full = (drawn.sigma / self.limit)[(flux + self.margin) > 0.98 * self.limit]
                 if len(full):
-                    self.deviations += (drawn.ratio - 1 + _TOLERANCE) / max(
-                        float(full.mean()), 1e-4
-                    )
-                    self.deviations = min(max(self.deviations, 0.5), 6.0)
+                    wanted = (ratio - 1 + _TOLERANCE) / max(float(full.mean()), 1e-4)
+                    self.deviations = min(max(self.deviations + _SHARE * wanted, 0.5), 6.0)
             self.margin = self.deviations * drawn.sigma
-            if has_settled:
-                self.multipliers = (self.multipliers + _RHO * self._excess(flux)).clamp(min=0)
+
+
+_SHARE = 0.5
+"""Share of a wanted change of the margin that is made at once."""
 
 
 class LinearDraws(NamedTuple):

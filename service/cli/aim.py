@@ -9,13 +9,17 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from model.aiming.kernels import Kernels, KernelTracer, join
 from model.aiming.plan import AimPlan, plan_aims
+from model.aiming.uncertainty import plan_uncertainty
 from model.errors import InvalidInputError
 from model.fleet import Superposition, tiles
+from model.setup import Setup
 from service.base.progress import Progress
 from service.cli.field import FieldRequest, light_field, trace_field
+from service.sources.folder import read_height_std
 from service.sources.limits import Limit
 from service.sources.plant_file import PlantDescription
 from service.twin.forecasts.aims import ROWS, AimFigures, aim_figures, begin_at
@@ -30,6 +34,9 @@ class AimReport(AimFigures):
     sun: dict[str, float]
     dni_w_m2: float
     seconds: dict[str, float]
+    power_interval_w: list[float]
+    peak_interval_w_m2: list[float]
+    surface_draws: int
     skipped: dict[str, str]
 
 
@@ -74,12 +81,17 @@ def find_aims(
     aimed = time.perf_counter()
     single = trace_field(plant, replace(request, resolution=kernels.resolution), step)
     power = single.report["field"]["intercepted_w"]
+    worlds = _drawn_worlds(plant, request, step)
+    moment = plan_uncertainty(plan, worlds)
     report = AimReport(
         **aim_figures(plan, found.task.receiver, power),
         receiver=request.receiver,
         sun={"azimuth_deg": request.azimuth_deg, "elevation_deg": request.elevation_deg},
         dni_w_m2=found.task.model.optics.dni,
         seconds={"kernels": traced - begun, "aims": aimed - traced},
+        power_interval_w=[moment.power.low, moment.power.high],
+        peak_interval_w_m2=[moment.peak.low, moment.peak.high],
+        surface_draws=len(worlds),
         skipped=found.skipped,
     )
     return Aims(plan, report)
@@ -94,14 +106,55 @@ class TracedKernels:
     skipped: dict[str, str]
 
 
-def trace_kernels(plant: PlantDescription, request: FieldRequest, step: Progress) -> TracedKernels:
+_WORLDS = 4
+"""Draws of the surfaces: each traces the whole field again."""
+
+_ALIKE = 1.5
+"""Distance, in control points, over which errors of a surface are alike."""
+
+
+def _drawn_worlds(plant: PlantDescription, request: FieldRequest, step: Progress) -> list[Kernels]:
+    """Kernels of drawn surfaces, none if no surface of the request has standard deviations."""
+    if request.surfaces is None or not any(
+        read_height_std(request.surfaces, one) is not None
+        for one in plant.plant.heliostats.values()
+    ):
+        return []
+    return [
+        trace_kernels(plant, request, step, np.random.default_rng(seed)).kernels
+        for seed in range(_WORLDS)
+    ]
+
+
+def _drawn(setup: Setup, surfaces: Path, rng: np.random.Generator) -> Setup:
+    """A setup whose surface has errors of its standard deviations."""
+    std = read_height_std(surfaces, setup.heliostat)
+    if std is None:
+        return setup
+    noise = gaussian_filter(rng.normal(size=std.shape), (0, _ALIKE, _ALIKE), mode="reflect")
+    heights = std * noise / np.sqrt(np.mean(noise**2))
+    normals = setup.heliostat.facet_frames[1][:, 2]
+    return replace(
+        setup, control_points=setup.control_points + heights[..., None] * normals[:, None, None]
+    )
+
+
+def trace_kernels(
+    plant: PlantDescription,
+    request: FieldRequest,
+    step: Progress,
+    rng: np.random.Generator | None = None,
+) -> TracedKernels:
     """Trace the images of a plant's mirrors; errors as of `find_aims`.
 
-    They are traced from near to far, since images of one tile have one size.
+    They are traced from near to far, since images of one tile have one size. ``rng`` draws errors
+    of the surfaces that have standard deviations.
     """
     lit = light_field(plant, request, ROWS, in_front=True)
     goal, skipped, parts = lit.task.receiver.aim, dict[str, str](), list[Kernels]()
     setups = sorted(lit.aimed.setups, key=lambda one: math.dist(one.heliostat.position, goal))
+    if rng is not None and request.surfaces is not None:
+        setups = [_drawn(setup, request.surfaces, rng) for setup in setups]
     for tile in tiles(setups, lit.neighbours):
         found = KernelTracer(lit.task)(tile)
         skipped |= found.skipped

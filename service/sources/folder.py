@@ -87,6 +87,25 @@ class MeasurementFolder(ABC):
         return read_surface(self.root, self.plant.heliostats[heliostat])
 
 
+def read_height_std(root: Path, heliostat: Heliostat) -> Array | None:
+    """Standard deviations (F, I, J) [m] of a predicted surface's heights, or None.
+
+    They are ``z_std`` of the file that `read_surface` prefers.
+    """
+    spline = root / heliostat.name / "Deflectometry" / f"{heliostat.name}-nurbs-surface.npz"
+    if not spline.exists():
+        return None
+    data = unpack_untrusted(read_file(spline, _MAX_SPLINE_BYTES), _MAX_SPLINE_BYTES, str(spline))
+    if "z_std" not in data:
+        return None
+    std, shape = np.asarray(data["z_std"], dtype=np.float64), data["control_points"].shape[:3]
+    if std.shape != shape or not np.isfinite(std).all() or (std < 0).any():
+        raise InvalidInputError(
+            f"{spline}: 'z_std' must be finite, not negative and {shape}, got {std.shape}"
+        )
+    return std
+
+
 def read_surface(root: Path, heliostat: Heliostat) -> tuple[Array, int] | None:
     """Control points (F, I, J, 3) [m] and spline degree from ``root/H/Deflectometry``, or None.
 

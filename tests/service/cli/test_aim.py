@@ -7,8 +7,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
+from model.errors import InvalidInputError
+from model.surface import control_points
+from service.base.progress import no_progress
+from service.cli.aim import trace_kernels
+from service.cli.field import FieldRequest
+from service.sources.folder import read_height_std
 from service.sources.limits import read_limit
+from service.sources.plant_file import read_plant
 from tests.service.command import ends, heliotwin
 from tests.service.sources.aim_plant import write_aim_plant
 
@@ -54,6 +62,11 @@ def test_aims_give_what_their_report_says(
     assert report["power_w"] > 0.995 * report["baseline"]["power_w"]
     assert report["power_w"] < report["bound_w"] < 1.02 * report["power_w"]
     assert report["inactive"] == []
+    low, high = report["peak_interval_w_m2"]
+    assert low < report["peak_p95_w_m2"] <= high
+    low, high = report["power_interval_w"]
+    assert 0.999 * low < report["power_w"] < 1.001 * high < 1.02 * low
+    assert report["surface_draws"] == 0
     assert set(report["seconds"]) == {"kernels", "aims"}
     traced = field(
         plant, tmp_path, receiver, "--resolution", *resolution, "--aims", tmp_path / "aims.csv"
@@ -129,3 +142,42 @@ def test_a_limit_is_a_positive_number_or_a_file(plant: Path, tmp_path: Path, lim
         "--report", tmp_path / "report.json", *SUN,
     )  # fmt: skip
     ends(done, 2, "--limit")
+
+
+def test_a_quarter_of_the_pixels_has_the_same_light(plant: Path):
+    request = FieldRequest("board", 180.0, 55.0, 900.0, resolution=(31, 33))
+    kernels = trace_kernels(read_plant(plant), request, no_progress).kernels
+    thin = kernels.thinned()
+    moved = torch.zeros(len(kernels), 2)
+    whole, some = kernels.flux(moved), thin.kernels.flux(moved)
+    assert float(thin.kernels.areas.sum()) == pytest.approx(float(kernels.areas.sum()), rel=1e-5)
+    assert len(some) == 16 * 17
+    assert np.isin(some.numpy(), whole.numpy()).all()
+    power = float(whole @ kernels.areas)
+    assert float(some @ thin.kernels.areas) == pytest.approx(power, rel=0.01)
+
+
+def test_uncertain_surfaces_widen_the_interval_of_the_peak(plant: Path, tmp_path: Path):
+    known, uncertain = tmp_path / "known", tmp_path / "uncertain"
+    for name, heliostat in read_plant(plant).plant.heliostats.items():
+        points = control_points(heliostat)
+        for folder, std in ((known, 0.0), (uncertain, 3e-3)):
+            path = folder / name / "Deflectometry" / f"{name}-nurbs-surface.npz"
+            path.parent.mkdir(parents=True)
+            np.savez(path, control_points=points, z_std=np.full(points.shape[:3], std))
+    reports = [
+        aimed(plant, tmp_path, "board", 45, "--surfaces", folder) for folder in (known, uncertain)
+    ]
+    assert [report["surface_draws"] for report in reports] == [4, 4]
+    assert reports[0]["power_w"] == pytest.approx(reports[1]["power_w"], rel=1e-6)
+    (low, high), (least, most) = (report["peak_interval_w_m2"] for report in reports)
+    assert most - least > 1.1 * (high - low)
+
+
+def test_deviations_of_another_shape_are_refused(plant: Path, tmp_path: Path):
+    heliostat = next(iter(read_plant(plant).plant.heliostats.values()))
+    path = tmp_path / heliostat.name / "Deflectometry" / f"{heliostat.name}-nurbs-surface.npz"
+    path.parent.mkdir(parents=True)
+    np.savez(path, control_points=control_points(heliostat), z_std=np.zeros((1, 3, 3)))
+    with pytest.raises(InvalidInputError, match="'z_std' must be finite"):
+        read_height_std(tmp_path, heliostat)

@@ -12,7 +12,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
+from model.aiming.kernels import KernelTracer, join
 from model.fleet import FleetFlux, Superposition, Tile, aligned_field, superpose, tiles
 from model.frames import sun_direction
 from model.plant import Heliostat
@@ -62,6 +64,19 @@ def test_threads_give_the_same_light_whatever_their_number(count: int):
     expected, made = superpose(task, parts), superpose(task, parts, Threads(count))
     assert (made.heliostats, made.power) == (expected.heliostats, expected.power)
     np.testing.assert_array_equal(made.irradiance, expected.irradiance)
+
+
+@pytest.mark.slow
+def test_cluster_traces_the_same_images_of_mirrors(cluster: Any):
+    task = KernelTracer(Superposition(target(10.0), JUELICH_MODEL, (32, 32)))
+    kernels, expected = (
+        join(made.kernels for made in engine.map(task, some_tiles()) if made.kernels is not None)
+        for engine in (Ray("local"), Threads(1))
+    )
+    assert kernels.names == expected.names
+    assert len(kernels) == 32
+    for name in ("expected", "sharp", "sides", "spread", "places", "factors"):
+        assert torch.equal(getattr(kernels, name), getattr(expected, name))
 
 
 @pytest.mark.slow
