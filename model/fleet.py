@@ -35,7 +35,7 @@ from model.plant_model import PlantModel
 from model.progress import nothing_between
 from model.setup import Setup
 from model.tracing import Optics, Scene, Window
-from model.tracing.superposition import SuperposedFlux, project
+from model.tracing.superposition import Beams, SuperposedFlux, project
 from model.tracing.superposition import superpose as superpose_scene
 
 Array = NDArray[np.float64]
@@ -126,6 +126,33 @@ class Losses:
 
 LOSSES = tuple(f.name for f in fields(Losses) if f.name != "area")
 """The factors, in the order of the light."""
+
+
+def losses_of(
+    heliostats: Sequence[Heliostat],
+    beams: Beams,
+    intercepted: torch.Tensor,
+    optics: Optics,
+    absorptance: float,
+) -> dict[str, Losses]:
+    """Losses by name of heliostats whose power on the receiver is ``intercepted`` (B,) [W]."""
+    areas = np.array([heliostat.area for heliostat in heliostats])
+    reflectance = optics.reflectivity * np.array([h.optics.reflectance for h in heliostats])
+    lit, free, power, reached = (
+        values.double().numpy() for values in (beams.lit, beams.free, beams.power, intercepted)
+    )
+    stages = [areas, *lit.T, free, free * reflectance, power / max(optics.dni, 1e-300)]
+    stages.append(reached.clip(min=0, max=power) / max(optics.dni, 1e-300))
+    shares = [
+        np.where(before > 0, after / np.where(before > 0, before, 1.0), 1.0)
+        for before, after in pairwise(stages)
+    ]
+    shares.append(np.full(len(areas), absorptance))
+    factors = [dict(zip(LOSSES, row, strict=True)) for row in np.stack(shares, axis=1).tolist()]
+    return {
+        heliostat.name: Losses(area=heliostat.area, **some)
+        for heliostat, some in zip(heliostats, factors, strict=True)
+    }
 
 
 def field_losses(losses: Iterable[Losses]) -> Losses:
@@ -240,27 +267,11 @@ class Superposition:
         self, heliostats: Sequence[Heliostat], light: SuperposedFlux, optics: Optics
     ) -> FleetFlux:
         """The light of mirrors with their losses."""
-        areas = np.array([heliostat.area for heliostat in heliostats])
-        reflectance = optics.reflectivity * np.array([h.optics.reflectance for h in heliostats])
-        beams = light.beams
-        lit, free, power, intercepted = (
-            values.double().numpy()
-            for values in (beams.lit, beams.free, beams.power, light.intercepted)
-        )
-        stages = [areas, *lit.T, free, free * reflectance, power / max(optics.dni, 1e-300)]
-        stages.append(intercepted.clip(min=0, max=power) / max(optics.dni, 1e-300))
-        shares = [
-            np.where(before > 0, after / np.where(before > 0, before, 1.0), 1.0)
-            for before, after in pairwise(stages)
-        ]
-        shares.append(np.full(len(areas), self.receiver.absorptance))
-        factors = [dict(zip(LOSSES, row, strict=True)) for row in np.stack(shares, axis=1).tolist()]
-        losses = {
-            heliostat.name: Losses(area=heliostat.area, **some)
-            for heliostat, some in zip(heliostats, factors, strict=True)
-        }
+        absorptance = self.receiver.absorptance
+        losses = losses_of(heliostats, light.beams, light.intercepted, optics, absorptance)
         image = light.irradiance.double().numpy()
-        return FleetFlux(image, float(power.sum()), len(heliostats), losses=losses)
+        power = float(light.beams.power.double().sum())
+        return FleetFlux(image, power, len(heliostats), losses=losses)
 
     def _alike(self, tile: Tile) -> Iterator[tuple[tuple[Effect, ...], Tile]]:
         """Group the heliostats of a tile by the effects on light that act on them at present."""

@@ -431,8 +431,9 @@ class DriftRow(Base):
 class ForecastRow(Base):
     """A computed flux map: its inputs, npz ``flux`` (rows, columns) float32 [W/m2] and key figures.
 
-    ``sun_at`` is the requested time, or None if the request gave a sun position. ``warnings`` are
-    notes for readers of the forecast.
+    ``sun_at`` is the requested time, or None if the request gave a sun position. ``losses`` are
+    those of `service.twin.forecasts.watts.LightWatts`, or None if they were not computed.
+    ``warnings`` are notes for readers of the forecast.
     """
 
     __tablename__ = "forecasts"
@@ -456,6 +457,7 @@ class ForecastRow(Base):
     power_w: Mapped[float]
     center_right_m: Mapped[float | None]
     center_up_m: Mapped[float | None]
+    losses: Mapped[dict[str, Any] | None]
     model_version: Mapped[str] = mapped_column(String(MODEL_VERSION))
     warnings: Mapped[list[str] | None]
     flux: Mapped[bytes] = mapped_column(LargeBinary, deferred=True)

@@ -320,6 +320,7 @@ class FakeOperations:
             center_of_mass=center,
             peak=2.0,
             power=50.0,
+            losses=Losses(30.0, 0.9, 1.0, 1.0, 0.9, 0.95, 0.8, 1.0),
             camera_view=flux,
             model_version="fake",
         )

@@ -23,6 +23,7 @@ from service.base.arrays import pack, to_json_value, unpack
 from service.base.errors import ConflictError
 from service.base.fields import Sun, SunAt
 from service.store.tables import ForecastRow, HeliostatRow, SurfaceRow
+from service.twin.forecasts.watts import light_watts
 from service.twin.heliostats.measurements import (
     HeliostatContext,
     heights_of,
@@ -184,6 +185,7 @@ def _forecast_row(request: ForecastRequest, traced: Traced) -> ForecastRow:
         power_w=float(forecast.power),
         center_right_m=right,
         center_up_m=up,
+        losses=dict(light_watts(forecast.losses, request.dni_w_m2)),
         model_version=traced.model.version,
         warnings=(
             [
@@ -264,6 +266,7 @@ def _trace_unrolled(
         center_of_mass=_center(total.irradiance, receiver),
         peak=float(flux.max()),
         power=float(total.irradiance.sum() * pixel_m2),
+        losses=total.losses[twin.heliostat.name],
         camera_view=flux,
         model_version=twin.model.version,
     )

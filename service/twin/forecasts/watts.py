@@ -1,4 +1,4 @@
-"""What becomes of each watt of a field's light, by the names of ``field.json``."""
+"""What becomes of each watt of mirrors' light, by the names of ``field.json``."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -50,10 +50,9 @@ def dni_of(
     return sunlight
 
 
-class FieldWatts(TypedDict):
-    """The light of a field [W, W/m2, m2]; the others are factors in the order of the light."""
+class LightWatts(TypedDict):
+    """Light of mirrors [W, m2]; the others are factors in the order of the light."""
 
-    heliostats: int
     mirror_area_m2: float
     incident_w: float
     cosine: float
@@ -66,29 +65,41 @@ class FieldWatts(TypedDict):
     optical_efficiency: float
     intercepted_w: float
     absorbed_w: float
+
+
+class FieldWatts(LightWatts):
+    """The light of a field, and its peak [W/m2]."""
+
+    heliostats: int
     peak_w_m2: float
+
+
+def light_watts(losses: Losses, dni_w_m2: float) -> LightWatts:
+    """The light of mirrors with these losses, of one heliostat or of many."""
+    incident = dni_w_m2 * losses.area
+    return LightWatts(
+        mirror_area_m2=losses.area,
+        incident_w=incident,
+        cosine=losses.cosine,
+        shading=losses.shading,
+        blocking=losses.blocking,
+        reflectance=losses.reflectance,
+        attenuation=losses.attenuation,
+        intercept=losses.intercept,
+        absorptance=losses.absorptance,
+        optical_efficiency=losses.efficiency,
+        intercepted_w=incident * losses.intercepted,
+        absorbed_w=incident * losses.efficiency,
+    )
 
 
 def field_watts(flux: FleetFlux, dni_w_m2: float) -> FieldWatts:
     """The light of heliostats together; at least one must have reached the receiver."""
-    whole = field_losses(flux.losses.values())
-    incident = dni_w_m2 * whole.area
-    return FieldWatts(
-        heliostats=flux.heliostats,
-        mirror_area_m2=whole.area,
-        incident_w=incident,
-        cosine=whole.cosine,
-        shading=whole.shading,
-        blocking=whole.blocking,
-        reflectance=whole.reflectance,
-        attenuation=whole.attenuation,
-        intercept=whole.intercept,
-        absorptance=whole.absorptance,
-        optical_efficiency=whole.efficiency,
-        intercepted_w=incident * whole.intercepted,
-        absorbed_w=incident * whole.efficiency,
-        peak_w_m2=float(flux.irradiance.max()),
-    )
+    return {
+        "heliostats": flux.heliostats,
+        **light_watts(field_losses(flux.losses.values()), dni_w_m2),
+        "peak_w_m2": float(flux.irradiance.max()),
+    }
 
 
 def heliostat_watts(losses: Mapping[str, Losses], dni_w_m2: float) -> dict[str, dict[str, float]]:
@@ -117,11 +128,11 @@ class LossStage:
     share: float
 
 
-def loss_chain(field: Mapping[str, Any]) -> list[LossStage]:
+def loss_chain(watts: Mapping[str, Any]) -> list[LossStage]:
     """The chain of losses from the light on the mirrors' area to what is absorbed."""
-    incident = field["incident_w"]
+    incident = watts["incident_w"]
     stages, left = [LossStage("on the mirrors' area", None, None, incident, 1.0)], incident
     for name in LOSSES:
-        before, left = left, left * field[name]
-        stages.append(LossStage(name, field[name], before - left, left, left / incident))
+        before, left = left, left * watts[name]
+        stages.append(LossStage(name, watts[name], before - left, left, left / incident))
     return stages

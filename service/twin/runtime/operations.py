@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from model.effects import model_version
-from model.fleet import superpose
-from model.forecast import View, align
+from model.effects import acting, apply_optics_effects, effects_of_stage, model_version
+from model.fleet import Losses, losses_of, superpose
+from model.forecast import Aligned, View, align
 from model.imaging import Camera, ImageKind, MeasuredFlux
 from model.imaging import measure as measure_image
 from model.network.architecture import MAX_IMAGES
@@ -23,7 +23,9 @@ from model.refinement import refine
 from model.setup import Setup
 from model.study import study
 from model.surface import heights_or_ideal
-from model.tracing.convolution import central_rays
+from model.tracing.convolution import Rays, central_rays
+from model.tracing.scene import irradiance_of
+from model.tracing.superposition import Beams
 from service.base.choices import Method, require_images
 from service.sources.juelich import CENTERED_WINDOW, mark_layouts
 
@@ -135,6 +137,8 @@ class Forecast:
     peak : float [W/m2]
     power : float [W]
         On the mapped part of the plane.
+    losses : Losses
+        What becomes of the light, up to the whole plane.
     camera_view : (rows, columns) float32
         What the camera shows of this flux, by the model's effects. It equals the flux if the model
         has no camera effects. Photographs are compared with it.
@@ -146,6 +150,7 @@ class Forecast:
     center_of_mass: Array
     peak: float
     power: float
+    losses: Losses
     camera_view: NDArray[np.float32]
     model_version: str = MODEL_VERSION
 
@@ -176,15 +181,31 @@ def forecast(
     with torch.no_grad():
         light = aligned.flux(view)
         flux, shown = (_smooth(image[0]) for image in (light, aligned.camera_images(light, view)))
-        center = central_rays(aligned.groups[0].scene, SAMPLES).spot
+        whole = view if window is None else replace(view, window=None)
+        onto_plane = light if window is None else aligned.flux(whole)
+        rays = central_rays(aligned.groups[0].scene, SAMPLES)
+    intercepted = onto_plane.sum(dim=(-2, -1)) * float(np.prod(whole.window_on(setup.plane).pixel))
     return Forecast(
         flux=flux,
-        center_of_mass=center[0].numpy(),
+        center_of_mass=rays.spot[0].numpy(),
         peak=float(flux.max()),
         power=float(flux.sum(dtype=np.float64) * np.prod(view.window_on(setup.plane).pixel)),
+        losses=_losses(aligned, rays, intercepted),
         camera_view=shown,
         model_version=model_version(model.effects),
     )
+
+
+def _losses(aligned: Aligned, rays: Rays, intercepted: torch.Tensor) -> Losses:
+    """Losses of the light of one setup, of which ``intercepted`` (1,) [W] reaches its plane."""
+    (group,), model = aligned.groups, aligned.model
+    (setup,) = group.setups
+    optics_effects = effects_of_stage(model.effects, "optics")
+    there = acting(optics_effects, setup.taken_at, setup.heliostat.name)
+    optics = apply_optics_effects(there, model.optics)
+    beams = Beams.of(rays, irradiance_of(group.scene, optics, rays.slant_range))
+    found = losses_of([setup.heliostat], beams, intercepted, optics, setup.plane.absorptance)
+    return found[setup.heliostat.name]
 
 
 def _smooth(image: torch.Tensor) -> NDArray[np.float32]:

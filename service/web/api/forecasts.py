@@ -163,6 +163,34 @@ class ForecastReceiverOut(BaseModel):
     )
 
 
+def _factor(description: str) -> Any:
+    """A factor of the losses."""
+    return Field(description=f"{description} [1].")
+
+
+class ForecastLosses(BaseModel):
+    """What becomes of the light on a heliostat, in watts.
+
+    The factors are in the order of the light, and each is the share that is left. Neighbours and
+    tower are not traced, so that shading and blocking are 1.
+    """
+
+    mirror_area_m2: float = Field(description="Area of the facets [m2].")
+    incident_w: float = Field(description="Direct normal irradiance times that area [W].")
+    cosine: float = _factor(
+        "Projection of the mirror towards the sun, less what the effects soiling and blocking take"
+    )
+    shading: float = _factor("Share that is not shaded")
+    blocking: float = _factor("Share that is not blocked")
+    reflectance: float = _factor("Reflectance of mirrors and of the model's optics")
+    attenuation: float = _factor("Share that the air leaves")
+    intercept: float = _factor("Share that hits the whole target or receiver, mapped or not")
+    absorptance: float = _factor("Share that it absorbs")
+    optical_efficiency: float = Field(description="Product of the factors [1].")
+    intercepted_w: float = Field(description="Power on the whole target or receiver [W].")
+    absorbed_w: float = Field(description="Power that it absorbs [W].")
+
+
 class ForecastSummary(BaseModel):
     """A computed flux map without its pixels."""
 
@@ -200,6 +228,9 @@ class ForecastSummary(BaseModel):
     power_w: float = Field(description="Power on the mapped area [W].")
     center_of_mass_m: tuple[float, float] | None = Field(
         description="Right and up of the plane's centre [m]."
+    )
+    losses: ForecastLosses | None = Field(
+        description="What becomes of the light; null: not computed, as the forecast is older."
     )
     model_version: ModelNumber = Field(description="Version of the plant's model, see /v1/models.")
     created_at: CreatedAt

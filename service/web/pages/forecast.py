@@ -41,7 +41,7 @@ from service.twin.forecasts.heliostat_forecast import (
     make_forecast,
     position_of,
 )
-from service.twin.forecasts.watts import dni_of
+from service.twin.forecasts.watts import dni_of, loss_chain
 from service.twin.runtime.runtime import Runtime
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,
@@ -298,4 +298,5 @@ def get_forecast_page(
         dni_w_m2=row.dni_w_m2,
     )
     flux = charts.flux_map(title, flux_of(row), size, unit)
-    return _page(request, runtime, choices, filled, forecast=row, flux=flux)
+    chain = loss_chain(row.losses) if row.losses else []
+    return _page(request, runtime, choices, filled, forecast=row, flux=flux, chain=chain)

@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 from fastapi.testclient import TestClient
+from sqlalchemy import update
 
 from model.fleet import LOSSES
 from service.cli.field import FieldRequest, trace_field
 from service.sources.folder import read_folder
 from service.sources.plant_file import PlantDescription, read_plant
+from service.store.tables import ForecastRow
 from service.twin.transfer.importing import import_folder
 from tests.page import Page
 from tests.service import real
@@ -102,10 +104,56 @@ def test_one_heliostat_is_forecast_on_receivers_of_every_kind(rich: TestClient):
         made = rich.post("/v1/forecasts", json=body)
         assert made.status_code == 201, made.text
         assert made.json()["power_w"] > 1e3
-        page = rich.get(f"/forecasts/{made.json()['id']}", headers=HTML)
-        assert page.status_code == 200
         camera = rich.get(f"/v1/forecasts/{made.json()['id']}?view=camera")
         assert camera.status_code == 409  # no camera looks at receivers
+
+
+@pytest.mark.parametrize("name", RECEIVERS)
+def test_single_forecast_has_the_losses_of_the_same_field_forecast(rich: TestClient, name: str):
+    """By the names of ``field.json``: its factors multiply to its watts."""
+    body = {"target": name, "sun": SUN, "resolution": [48, 96], "dni_w_m2": "clear_sky"}
+    posted = rich.post("/v1/forecasts", json=body | {"heliostat": "A1"})
+    assert posted.status_code == 201, posted.text
+    made = rich.get(posted.headers["Location"]).json()
+    losses = made["losses"]
+    field = done(rich, "forecasts", body | {"heliostats": ["A1"], "neighbours": False})
+    expected = field["result"]["field"]
+    assert losses.keys() == expected.keys() - {"heliostats", "peak_w_m2"}
+    # The field's tower, which hides nothing of A1 under this sun, is all that is traced besides.
+    for key, value in losses.items():
+        assert value == pytest.approx(expected[key], rel=5e-3), key
+    product = np.prod([losses[factor] for factor in LOSSES])
+    assert product == pytest.approx(losses["optical_efficiency"], rel=1e-9)
+    assert losses["incident_w"] == pytest.approx(made["dni_w_m2"] * losses["mirror_area_m2"])
+    assert losses["absorbed_w"] == pytest.approx(product * losses["incident_w"])
+    assert losses["intercepted_w"] == pytest.approx(made["power_w"], rel=1e-3)
+    page = rich.get(f"/forecasts/{made['id']}", headers=HTML).text
+    assert "What becomes of the light" in Page(page).words
+    table = rich.get(f"/forecasts/{made['id']}?table=losses", headers=HTML)
+    lines = list(csv.DictReader(io.StringIO(table.text)))
+    assert [line["Stage"] for line in lines] == ["on the mirrors' area", *LOSSES]
+    assert float(lines[-1]["Left [kW]"]) == pytest.approx(losses["absorbed_w"] / 1e3)
+
+
+def test_losses_are_those_of_the_whole_plane_whatever_is_mapped(rich: TestClient):
+    body = {"heliostat": "B1", "target": "board", "sun": SUN, "resolution": 64}
+    whole, window = (
+        rich.post("/v1/forecasts", json=body | some).json() for some in ({}, {"window_m": 0.5})
+    )
+    assert window["power_w"] < 0.9 * whole["power_w"]
+    assert window["losses"] == pytest.approx(whole["losses"])
+
+
+def test_older_forecast_without_losses_says_so(rich: TestClient):
+    body = {"heliostat": "A1", "target": "board", "sun": SUN, "resolution": 32}
+    number = rich.post("/v1/forecasts", json=body).json()["id"]
+    with real.runtime_of(rich).database.writing() as session:
+        session.execute(
+            update(ForecastRow).where(ForecastRow.id == number).values(losses=None)
+        )  # as the migration leaves rows
+    assert rich.get(f"/v1/forecasts/{number}").json()["losses"] is None
+    words = Page(rich.get(f"/forecasts/{number}", headers=HTML).text).words
+    assert "Not computed: this forecast is older" in words
 
 
 def test_tower_shades_the_field(rich: TestClient):
