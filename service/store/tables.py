@@ -457,7 +457,7 @@ class ForecastRow(Base):
     power_w: Mapped[float]
     center_right_m: Mapped[float | None]
     center_up_m: Mapped[float | None]
-    losses: Mapped[dict[str, Any] | None]
+    losses: Mapped[JsonObject | None]
     model_version: Mapped[str] = mapped_column(String(MODEL_VERSION))
     warnings: Mapped[list[str] | None]
     flux: Mapped[bytes] = mapped_column(LargeBinary, deferred=True)
