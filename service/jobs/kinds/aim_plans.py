@@ -79,10 +79,13 @@ LimitOfMap = Annotated[
 Minute = Annotated[clock, Field(description="Time of day at the plant, such as 09:30.")]
 
 
+_Date = date
+
+
 class DayIn(Model):
     """The steps of a day by the clocks of the plant."""
 
-    date: date
+    date: _Date
     first: Minute = clock(0, 0)
     last: Minute = clock(23, 59)
     step_minutes: Number = Field(
@@ -91,7 +94,7 @@ class DayIn(Model):
 
     @field_validator("date")
     @classmethod
-    def _is_near(cls, day: date) -> date:
+    def _is_near(cls, day: _Date) -> _Date:
         parse_moment(datetime.combine(day, clock(), UTC))
         return day
 

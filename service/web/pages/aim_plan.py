@@ -69,9 +69,8 @@ def _timed(step: Mapping[str, Any]) -> Mapping[str, Any]:
 def _maps(arrays: dict[str, NDArray[Any]], size: tuple[float, float]) -> dict[str, HeatMap]:
     limit = arrays["limit"]
     fluxes = {"single": arrays["single_aim_flux"], "plan": arrays["flux"]}
-    # A limit that is nowhere reached must not make the flux dark.
-    peak = max(float(flux.max()) for flux in fluxes.values())
-    top = min(max(peak, float(limit.min())), max(peak, float(limit.max()))) / 1e3
+    # The flux sets the scale: a limit that is nowhere reached must not make it dark.
+    top = max(float(limit.min()), *(float(flux.max()) for flux in fluxes.values())) / 1e3
     titles = {"single": "Flux if all aim at one point", "plan": "Flux by the plan"}
     maps = {"limit": charts.limit_map("Limit of flux, and the aims", limit / 1e3, size, top)}
     if "places" in arrays:
