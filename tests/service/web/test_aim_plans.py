@@ -15,6 +15,7 @@ from service.sources.folder import read_folder
 from service.sources.plant_tables import read_aims
 from service.sources.schema import STORED
 from service.store.columns import now
+from service.twin.plant import setup
 from service.twin.transfer.importing import import_folder
 from tests.page import Page
 from tests.service import real
@@ -206,8 +207,9 @@ def test_a_change_since_todays_plan_raises_an_alert_until_a_new_plan(plant: Test
     name = today["heliostats"][0]
     path = f"/v1/heliostats/{name}"
     properties = plant.get(path).json()["properties"]
-    properties["heliostat_position"][2] += 0.01
-    assert plant.put(path, json=properties).status_code == 200
+    properties["position_m"][2] += 0.01
+    with real.runtime_of(plant).database.writing() as session:
+        setup.set_heliostat(session, "tester", name, properties)
     (alert,) = outdated(plant)
     assert f"plan {job['id']} of today's aims on main" in alert["message"]
     assert f"properties of 1: {name}" in alert["message"]
