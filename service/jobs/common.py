@@ -75,6 +75,6 @@ def _require_aim_plan(session: Session, number: int, target: object) -> None:
         raise ConflictError(f"aim_plan: job {number} is {row.state}; wait until it is done")
     if row.payload.get("target") != target:
         raise ConflictError(
-            f"aim_plan: job {number} aims at {row.payload.get('target') or 'a receiver of its own'}"
+            f"aim_plan: job {number} aims at {row.payload.get('target') or 'a separate receiver'}"
             f", not at {target}; give a plan of the same target"
         )

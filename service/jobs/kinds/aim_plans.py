@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, date, datetime, timedelta
 from datetime import time as clock
@@ -282,7 +282,7 @@ class StepAims:
     multipliers: NDArray[np.float32]
 
     @classmethod
-    def of(cls, arrays: dict[str, NDArray[Any]]) -> "StepAims":
+    def of(cls, arrays: Mapping[str, NDArray[Any]]) -> "StepAims":
         """The aims of a step's kept arrays."""
         kept = (arrays[name] for name in ("names", "points", "active", "multipliers"))
         return cls(*kept)

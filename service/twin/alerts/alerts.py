@@ -419,7 +419,7 @@ def _outdated_aims(session: Session, settings: Settings) -> Iterator[Alert]:
             "aims_outdated",
             None,
             plan.made_at,
-            f"since plan {plan.job} of today's aims{on} was made, changed: {'; '.join(said)}",
+            f"since plan {plan.job} of aims for today{on} was made, changed: {'; '.join(said)}",
             f"plan the aims of today again (POST /v1/jobs/aim-plans), see /jobs/{plan.job}",
             f"{plan.job} {plan.models} {_fingerprint(plan.made_at, len(names))}",
         )

@@ -81,7 +81,7 @@ def get_jobs_page(
 
 
 def _flux(row: JobRow) -> HeatMap | None:
-    """The flux map of a job, if it has one; plans of aims have maps of their own."""
+    """The flux map of a job, if it has one; plans of aims have separate maps."""
     if (
         row.kind == "aim-plans"
         or row.arrays is None

@@ -211,7 +211,7 @@ def test_a_change_since_todays_plan_raises_an_alert_until_a_new_plan(plant: Test
     with real.runtime_of(plant).database.writing() as session:
         setup.set_heliostat(session, "tester", name, properties)
     (alert,) = outdated(plant)
-    assert f"plan {job['id']} of today's aims on main" in alert["message"]
+    assert f"plan {job['id']} of aims for today on main" in alert["message"]
     assert f"properties of 1: {name}" in alert["message"]
     metrics = plant.get("/metrics").text
     assert 'heliotwin_attention{acknowledged="no",reason="aims_outdated"} 1.0' in metrics
