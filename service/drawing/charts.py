@@ -258,7 +258,8 @@ def marked(drawn: HeatMap, mask: NDArray[np.bool_]) -> HeatMap:
         return drawn
     pixels = np.zeros((*mask.shape, 4), np.uint8)
     pixels[mask] = _RED
-    return replace(drawn, outline=_data_url(np.kron(pixels, np.ones((_FINE, _FINE, 1), np.uint8))))
+    fine = pixels.repeat(_FINE, axis=0).repeat(_FINE, axis=1)
+    return replace(drawn, outline=_data_url(fine))
 
 
 def dotted(drawn: HeatMap, places: Array) -> HeatMap:

@@ -108,7 +108,6 @@ def places_on(receiver: Receiver, points: Array) -> Array:
         away = [np.linalg.norm(panel.to_enu(place) - points, axis=-1) for panel, place in near]
         nearest = np.argmin(away, axis=0)
         place = inside[nearest, np.arange(len(points))]
-        return place + np.stack(
-            [begins[nearest] + sizes[nearest, 0], np.zeros(len(points))], axis=-1
-        )
+        beside = np.stack([begins[nearest] + sizes[nearest, 0], np.zeros(len(points))], axis=-1)
+        return np.asarray(place + beside)
     return receiver.middle.to_plane(points)
