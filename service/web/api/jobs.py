@@ -251,7 +251,8 @@ def get_job_flux(
             f"step: job {number} ({row.kind}, {row.state}) has no map of a step {step}"
         )
     found = unpack(maps)
-    return job_flux(row, pack({"flux": found.get(mirrors, found.get("flux"))}), media_type)
+    flux = found[mirrors] if mirrors in found else found["flux"]
+    return job_flux(row, pack({"flux": flux}), media_type)
 
 
 @router.get(
