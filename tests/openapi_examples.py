@@ -251,7 +251,8 @@ def forecast(record: Recorder) -> None:
     field = {"target": "upper-receiver", "resolution": [64, 64]}
     job = record.run("post_forecasts_job", "/v1/jobs/forecasts", sun=sun, **field)
     record.call("get_job_flux", f"GET /v1/jobs/{job['id']}/flux")
-    record.run("post_aim_plans_job", "/v1/jobs/aim-plans", sun=sun, limit_w_m2=40e3, **field)
+    day = {"date": "2026-06-21", "first": "11:00", "last": "13:00", "step_minutes": 120}
+    record.run("post_aim_plans_job", "/v1/jobs/aim-plans", day=day, limit_w_m2=40e3, **field)
     times = {"first_at": "2026-06-21T08:00:00Z", "last_at": "2026-06-21T16:00:00Z"}
     plan = record.run(
         "post_plans_job", "/v1/jobs/plans", name="a day in June", step_minutes=240, **times, **field

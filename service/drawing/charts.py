@@ -251,6 +251,41 @@ def outlined(drawn: HeatMap, mask: NDArray[np.bool_]) -> HeatMap:
     return replace(drawn, outline=_data_url(pixels))
 
 
+# Pixels of an overlay for each pixel of its map.
+_FINE = 8
+
+_RED, _WHITE, _BLACK = (230, 0, 0, 255), (255, 255, 255, 255), (0, 0, 0, 255)
+
+
+def limit_map(title: str, flux: Array, size: tuple[float, float], top: float) -> HeatMap:
+    """A map [kW/m2] in colours without red, for `marked`; its scale ends at ``top``."""
+    return heat_map(
+        title, flux, size, Scale("viridis", 0.0, max(top, 1e-9), "kW/m\N{SUPERSCRIPT TWO}")
+    )
+
+
+def marked(drawn: HeatMap, mask: NDArray[np.bool_]) -> HeatMap:
+    """A map with a region in red, if it is not empty; ``mask`` is (rows, columns)."""
+    if not mask.any():
+        return drawn
+    pixels = np.zeros((*mask.shape, 4), np.uint8)
+    pixels[mask] = _RED
+    fine = pixels.repeat(_FINE, axis=0).repeat(_FINE, axis=1)
+    return replace(drawn, outline=_data_url(fine))
+
+
+def dotted(drawn: HeatMap, places: Array) -> HeatMap:
+    """A map with dots at places (N, 2) [m], right and up of its middle; those beside it are not."""
+    rows, columns = (_FINE * count for count in drawn.values.shape)
+    pixels = np.zeros((rows, columns, 4), np.uint8)
+    right = (places[:, 0] / drawn.width + 0.5) * columns
+    down = (0.5 - places[:, 1] / drawn.height) * rows
+    for radius, colour in ((4, _BLACK), (2, _WHITE)):
+        for x, y in np.round([right, down]).astype(int).T.tolist():
+            cv2.circle(pixels, (x, y), radius, colour, -1)
+    return replace(drawn, outline=_data_url(pixels))
+
+
 def difference_map(
     title: str, difference: Array, size: tuple[float, float], unit: str, bound: float
 ) -> HeatMap:

@@ -10,6 +10,7 @@ from sqlalchemy.orm import Session
 from service import store
 from service.base.errors import ConflictError, NotFoundError
 from service.base.fields import Name
+from service.store.job_tables import JobRow
 from service.store.tables import HeliostatRow
 from service.twin.runtime.runtime import Runtime
 
@@ -48,7 +49,9 @@ def require_stored(session: Session, payload: Mapping[str, Any]) -> None:
     Raises
     ------
     NotFoundError
-        With the field and the first unknown names.
+        With the field and the first unknown names, or the job that is no plan of aims.
+    ConflictError
+        If the plan of aims is not done, or aims at another target.
     """
     for field in _HELIOSTATS:
         names = dict.fromkeys(payload.get(field) or ())
@@ -59,3 +62,19 @@ def require_stored(session: Session, payload: Mapping[str, Any]) -> None:
             raise NotFoundError(f"{field}: {listed} not found; GET /v1/heliostats lists the names")
     if (target := payload.get("target")) is not None:
         store.get_target_or_receiver(session, target)
+    if (number := payload.get("aim_plan")) is not None:
+        _require_aim_plan(session, number, target)
+
+
+def _require_aim_plan(session: Session, number: int, target: object) -> None:
+    """Check that a job is a finished plan of aims on the same target."""
+    row = session.get(JobRow, number)
+    if row is None or row.kind != "aim-plans":
+        raise NotFoundError(f"aim_plan: job {number} is no plan of aims; GET /v1/jobs lists them")
+    if row.state != "done":
+        raise ConflictError(f"aim_plan: job {number} is {row.state}; wait until it is done")
+    if row.payload.get("target") != target:
+        raise ConflictError(
+            f"aim_plan: job {number} aims at {row.payload.get('target') or 'a separate receiver'}"
+            f", not at {target}; give a plan of the same target"
+        )

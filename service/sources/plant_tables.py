@@ -315,7 +315,10 @@ def _crosses_itself(points: Array) -> bool:
 # --- aims
 # --------------------------------------------------------------------------------------------------
 
-_AIMS = CsvColumns(("name", "east_m", "north_m", "up_m"), ("active",))
+AIM_COLUMNS = ("name", "east_m", "north_m", "up_m", "active")
+DRIVE_COLUMNS = ("motor_1_steps", "motor_2_steps", "axis_1_deg", "axis_2_deg", "drive_reason")
+"""Columns of an aims file that the service adds; they are not read."""
+_AIMS = CsvColumns(AIM_COLUMNS[:4], (AIM_COLUMNS[4], *DRIVE_COLUMNS))
 _YES, _NO = {"", "1", "true", "yes"}, {"0", "false", "no"}
 
 

@@ -15,9 +15,10 @@ from model.plant import Cylinder, Receiver
 from model.receivers import Cavity, Panels
 from model.times import format_time
 from service import store
-from service.base.fields import Metres, Moment, Name, Number, Resolution, Sun, Text
+from service.base.fields import Metres, Moment, Name, Number, Resolution, Sun, Text, VersionIn
 from service.jobs.common import require_some
 from service.jobs.kind import Context, Kind, Result
+from service.jobs.kinds.aim_plans import PlannedAims
 from service.jobs.kinds.field_forecasts import FleetIn, expected_s
 from service.twin.forecasts.field_forecast import HeliostatGroup, forecast_group, group_warnings
 from service.twin.forecasts.heliostat_forecast import receiver_as_json
@@ -57,6 +58,14 @@ class PlanIn(FleetIn):
         description=(
             "Where single heliostats aim instead, by name: right and up of the receiver's middle,"
             " on it [m]."
+        ),
+    )
+    aim_plan: VersionIn | None = Field(
+        default=None,
+        description=(
+            "Number of a job `aim-plans` on the same target, whose aims are used: at each time"
+            " those of its nearest step. Its inactive heliostats send no light. `aim_points_m` and"
+            " `aim_offsets_m` come first."
         ),
     )
     resolution: Resolution = (64, 64)
@@ -173,6 +182,7 @@ def plan_day(context: Context, payload: PlanIn) -> Result:
     with context.runtime.database.reading() as session:
         receiver = payload.on(session)
         model = model_versions.get_model(session, payload.model_version)
+        planned = None if payload.aim_plan is None else PlannedAims.read(session, payload.aim_plan)
     aims = {name: aim_on(receiver, *offset) for name, offset in payload.aim_offsets_m.items()}
     request = payload.model_copy(
         update={"model_version": model.number, "aim_points_m": payload.aim_points_m | aims}
@@ -181,12 +191,12 @@ def plan_day(context: Context, payload: PlanIn) -> Result:
     require_some(len(suns), {"the sun": "it is night from first_at to last_at"})
     for index, (at, sun) in enumerate(suns):
         if map_name(index) not in done:
-            _plan_time(_Time(context, request, receiver, index, len(suns), at, sun))
+            _plan_time(_Time(context, request, receiver, planned, index, len(suns), at, sun))
     steps = context.steps()
     fleet = steps.pop(_FLEET)
     peak = _peak(context, len(suns))
     heliostats = max(step["heliostats"] for step in steps.values())
-    figures = {
+    figures: dict[str, object] = {
         "warnings": group_warnings(len(fleet["ideal_surfaces"]), heliostats),
         "name": payload.name,
         "peak_w_m2": float(peak.max()),
@@ -194,6 +204,7 @@ def plan_day(context: Context, payload: PlanIn) -> Result:
         "times": len(suns),
         "left_out": payload.count() - len(suns),
         "model_version": model.number,
+        "aim_plan": payload.aim_plan,
         "plane": receiver_as_json(receiver),
         "steps": [steps[map_name(index)] for index in range(len(suns))],
         **fleet,
@@ -208,10 +219,16 @@ class _Time:
     context: Context
     asked: PlanIn
     receiver: Receiver
+    planned: PlannedAims | None
     index: int
     total: int
     at: datetime
     sun: Sun
+
+    def fleet(self, ideal: bool) -> HeliostatGroup:
+        """The heliostats at this time, with the aims of the aim plan if there is one."""
+        fleet = self.asked.fleet(self.context.runtime, self.sun, ideal)
+        return fleet if self.planned is None else self.planned.aimed(fleet, self.at)
 
     def light(self, fleet: HeliostatGroup, begun: float) -> FleetFlux:
         """Compute a fleet's flux, half of the work at this time, from share ``begun`` on."""
@@ -231,11 +248,11 @@ class _Time:
 def _plan_time(time: _Time) -> None:
     """Compute and store the flux maps of the twin and of ideal mirrors at one time."""
     context, request = time.context, time.asked
-    fleet = request.fleet(context.runtime, time.sun, ideal=False)
+    fleet = time.fleet(ideal=False)
     twin = time.light(fleet, 0.0)
     require_some(twin.heliostats, twin.skipped)
     without = fleet.without_surface - set(twin.skipped)
-    fleet = request.fleet(context.runtime, time.sun, ideal=True)
+    fleet = time.fleet(ideal=True)
     ideal = time.light(
         replace(fleet, names=[name for name in fleet.names if name not in twin.skipped]), 0.5
     )
@@ -250,6 +267,7 @@ def _plan_time(time: _Time) -> None:
         "sun": time.sun.model_dump(),
         "dni_w_m2": dni,
         "heliostats": twin.heliostats,
+        "aims_of_step": None if time.planned is None else time.planned.nearest(time.at),
         **loads,
     }
     maps = {name: flux.irradiance.astype(np.float32) for name, flux in fluxes.items()}

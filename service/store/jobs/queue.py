@@ -425,6 +425,13 @@ def load_checkpoints(session: Session, number: int) -> dict[str, dict[str, Any]]
     return {row.name: row.result for row in rows}
 
 
+def load_checkpoint(session: Session, number: int, name: str) -> Mapping[str, Any] | None:
+    """The result of one completed step of a job; None if there is none."""
+    return session.scalar(
+        select(JobStepRow.result).where(JobStepRow.job_id == number, JobStepRow.name == name)
+    )
+
+
 def _end(session: Session, row: JobRow, state: str, at: datetime) -> None:
     row.state, row.finished_at = state, at
     if state != "done":  # Nobody reads these megabytes any more.

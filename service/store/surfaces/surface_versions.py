@@ -275,6 +275,15 @@ def current_surfaces(session: Session, heliostats: Sequence[int]) -> dict[int, b
     return {row.heliostat_id: row.arrays for row in rows}
 
 
+def active_versions(session: Session) -> dict[int, int]:
+    """Versions of all active surfaces by heliostat id."""
+    place = func.row_number().over(partition_by=SurfaceRow.heliostat_id, order_by=newest_first())
+    ranked = select(SurfaceRow.heliostat_id, SurfaceRow.version, place.label("place"))
+    found = ranked.where(~SurfaceRow.is_candidate).subquery()
+    query = select(found.c.heliostat_id, found.c.version).where(found.c.place == 1)
+    return {row.heliostat_id: row.version for row in session.execute(query)}
+
+
 @dataclass(frozen=True)
 class Outdated:
     """An active surface whose prediction used another version of the plant's model.

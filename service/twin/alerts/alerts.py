@@ -48,6 +48,7 @@ from service.twin.alerts.field_overview import (
     FieldOverviewCache,
     HeliostatOverview,
 )
+from service.twin.forecasts.aim_sources import outdated_plans
 from service.twin.plant import model_versions
 from service.twin.pointing.errors import DriveStep, PointingState
 from service.twin.runtime.runtime import Runtime
@@ -55,6 +56,7 @@ from service.twin.studies.camera_watch import FIGURES, CameraChange
 
 Reason = Literal[
     "queue",
+    "aims_outdated",
     "camera",
     "clock",
     "moved",
@@ -71,6 +73,7 @@ Reason = Literal[
 
 REASONS: dict[Reason, str] = {
     "queue": "Queue stuck",
+    "aims_outdated": "Aims outdated",
     "camera": "Camera changed",
     "clock": "Clock wrong",
     "moved": "Moved",
@@ -146,6 +149,7 @@ def alerts_of_heliostats(
     at = now()
     found = [
         *_queue(session, settings),
+        *_outdated_aims(session, settings),
         *_camera(session),
         *_watch_cameras(session, cameras),
         *_clock(session),
@@ -394,6 +398,31 @@ def _queue(session: Session, settings: Settings) -> Iterator[Alert]:
     message = f"job {oldest.id} has waited since then"
     action = "see whether a worker is alive, and what its log says"
     yield Alert("queue", None, oldest.created_at, message, action, str(oldest.id))
+
+
+# Most heliostats that the alert of a plan names.
+_NAMED = 10
+
+
+def _outdated_aims(session: Session, settings: Settings) -> Iterator[Alert]:
+    """Find plans of aims for the current day whose heliostats or model changed since."""
+    for plan in outdated_plans(session, settings.time_zone):
+        names = plan.heliostats
+        more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+        parts = [f"{part} of {len(of)}" for part, of in plan.changes.items()]
+        said = [f"{', '.join(parts)}: {', '.join(names[:_NAMED])}{more}"] if names else []
+        if plan.models is not None:
+            before, current = plan.models
+            said.insert(0, f"model version {current} instead of {before}, for all heliostats")
+        on = "" if plan.target is None else f" on {plan.target}"
+        yield Alert(
+            "aims_outdated",
+            None,
+            plan.made_at,
+            f"since plan {plan.job} of aims for today{on} was made, changed: {'; '.join(said)}",
+            f"plan the aims of today again (POST /v1/jobs/aim-plans), see /jobs/{plan.job}",
+            f"{plan.job} {plan.models} {_fingerprint(plan.made_at, len(names))}",
+        )
 
 
 def _camera(session: Session) -> Iterator[Alert]:

@@ -2,16 +2,20 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TypedDict
+from typing import Any, TypedDict
 
-from numpy.typing import ArrayLike
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from model.aiming.bound import bound_power
 from model.aiming.k_factor import k_factor_aims
 from model.aiming.kernels import Kernels
 from model.aiming.plan import AimPlan, single_aim
-from model.plant import Receiver
+from model.plant import Cylinder, Receiver
+from model.receivers import Cavity, Panels
+
+Array = NDArray[np.float64]
 
 ROWS = 32
 """Rows of a map if none are asked for: its pixels are smaller than any image of a mirror."""
@@ -71,3 +75,39 @@ def aim_figures(plan: AimPlan, receiver: Receiver, single_aim_power_w: float) ->
             name for name, is_on in zip(names, plan.is_active.tolist(), strict=True) if not is_on
         ),
     )
+
+
+class Excess(TypedDict):
+    """Where a map exceeds its limit: pixels, area [m2] and the worst excess [1] over the limit."""
+
+    places: int
+    area_m2: float
+    worst: float
+
+
+def excess_of(flux: NDArray[Any], limit: NDArray[Any], receiver: Receiver) -> Excess:
+    """Where a map (rows, columns) [W/m2] exceeds its limit; ``worst`` is 0 if nowhere."""
+    places = int((flux > limit).sum())
+    pixel_m2 = receiver.width * receiver.height / flux.size
+    worst = max(0.0, float((flux / limit).max()) - 1)
+    return {"places": places, "area_m2": places * pixel_m2, "worst": worst}
+
+
+def places_on(receiver: Receiver, points: Array) -> Array:
+    """Map coordinates (N, 2) [m] of points (N, 3) [m], right and up of the map's middle."""
+    if isinstance(receiver, Cylinder):
+        outwards = points - receiver.axis
+        angle = np.arctan2(outwards @ receiver.right, outwards @ receiver.normal)
+        return np.stack([angle * receiver.radius, outwards @ receiver.up], axis=-1)
+    if isinstance(receiver, Panels | Cavity):
+        begins = np.cumsum([0.0, *(panel.width for panel in receiver.panels)]) - receiver.width / 2
+        flat = np.stack([panel.to_plane(points) for panel in receiver.panels])
+        sizes = np.array([[panel.width, panel.height] for panel in receiver.panels]) / 2
+        inside = np.clip(flat, -sizes[:, None], sizes[:, None])
+        near = zip(receiver.panels, inside, strict=True)
+        away = [np.linalg.norm(panel.to_enu(place) - points, axis=-1) for panel, place in near]
+        nearest = np.argmin(away, axis=0)
+        place = inside[nearest, np.arange(len(points))]
+        beside = np.stack([begins[nearest] + sizes[nearest, 0], np.zeros(len(points))], axis=-1)
+        return np.asarray(place + beside)
+    return receiver.middle.to_plane(points)

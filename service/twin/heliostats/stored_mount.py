@@ -58,10 +58,19 @@ class StoredMount:
 
         Raises `UnreachableError` if no attitude does, or a drive would exceed its travel.
         """
+        angles = self.axis_angles(recorded, aim, moment)
+        return self._standing(moment).mount.motors_from_angles(angles)
+
+    def axis_angles(self, recorded: Array, aim: Array, moment: datetime | None = None) -> Array:
+        """Axis angles (2,) [rad] for what `motors` gives the positions of."""
+        standing = self._standing(moment)
+        return standing.mount.align(standing.position, self.sun(recorded, moment), aim)
+
+    def _standing(self, moment: datetime | None) -> Heliostat:
+        """The heliostat as calibrated, with the mount effects of the model."""
         effects = acting(self.model.effects, moment, self.heliostat.name)
         (standing,) = apply_mount_effects([self.turned(moment)], effects)
-        angles = standing.mount.align(standing.position, self.sun(recorded, moment), aim)
-        return standing.mount.motors_from_angles(angles)
+        return standing
 
 
 def true_sun(model: PlantModel, recorded: Array, moment: datetime | None) -> Array:

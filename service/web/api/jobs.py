@@ -230,12 +230,14 @@ def get_job_flux(
     step: Annotated[
         int | None,
         Query(
-            ge=0, lt=MAX_TIMES, description="Of a plan: which of its `steps`; else the most of all."
+            ge=0,
+            lt=MAX_TIMES,
+            description="Of a plan or aim plan: which of its `steps`; else the most of all.",
         ),
     ] = None,
     mirrors: Annotated[
         Literal["twin", "ideal"],
-        Query(description="Of a plan's step: by the twin, or by ideal mirrors."),
+        Query(description="Of a plan's step (not of aims): by the twin, or by ideal mirrors."),
     ] = "twin",
 ) -> Response:
     """Get the flux map of a job, if its kind computes one."""
@@ -248,7 +250,9 @@ def get_job_flux(
         raise NotFoundError(
             f"step: job {number} ({row.kind}, {row.state}) has no map of a step {step}"
         )
-    return job_flux(row, pack({"flux": unpack(maps)[mirrors]}), media_type)
+    found = unpack(maps)
+    flux = found[mirrors] if mirrors in found else found["flux"]
+    return job_flux(row, pack({"flux": flux}), media_type)
 
 
 @router.get(

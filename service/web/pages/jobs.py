@@ -13,7 +13,7 @@ from service.base.errors import NotFoundError
 from service.base.fields import Method, Model, Name, Version
 from service.drawing import charts
 from service.drawing.charts import HeatMap
-from service.drawing.templates import in_words
+from service.drawing.templates import in_words, in_zone
 from service.jobs.enqueuing import cancel_for, enqueue
 from service.jobs.kind import Kinds, result_of
 from service.jobs.kinds import predictions
@@ -31,6 +31,7 @@ from service.web.auth.dependencies import (
     KindsDep,
     RuntimeDep,
 )
+from service.web.pages.aim_plan import StepNumber, aim_view
 from service.web.responses.csv_tables import sheet_answer
 from service.web.responses.pages import go_to, render
 
@@ -80,8 +81,13 @@ def get_jobs_page(
 
 
 def _flux(row: JobRow) -> HeatMap | None:
-    """The flux map of a job, if it has one."""
-    if row.arrays is None or row.result is None or "plane" not in row.result:
+    """The flux map of a job, if it has one; plans of aims have separate maps."""
+    if (
+        row.kind == "aim-plans"
+        or row.arrays is None
+        or row.result is None
+        or "plane" not in row.result
+    ):
         return None
     plane = row.result["plane"]
     flux = unpack(row.arrays)["flux"]
@@ -157,18 +163,6 @@ def get_job_heliostats_table(number: Number, runtime: RuntimeDep, kinds: KindsDe
     return sheet_answer(f"job-{number}-heliostats", ("heliostat", *columns), rows)
 
 
-@router.get("/jobs/{number}/aims.csv", dependencies=[READ])
-def get_job_aims_table(number: Number, runtime: RuntimeDep, kinds: KindsDep) -> Response:
-    """The aims of a plan, as ``heliotwin field --aims`` reads them."""
-    result = _result_with(runtime, kinds, number, "aim_points_m")
-    inactive = set(result["inactive"])
-    rows = (
-        [name, *point, int(name not in inactive)] for name, point in result["aim_points_m"].items()
-    )
-    columns = ("name", "east_m", "north_m", "up_m", "active")
-    return sheet_answer(f"job-{number}-aims", columns, rows)
-
-
 def _mirrors(result: Mapping[str, Any], by: str) -> list[tuple[str, dict[str, float]]]:
     """The first heliostats of a field forecast, sorted by a factor or their name."""
     lines = list(result.get("by_heliostat", {}).items())
@@ -178,16 +172,22 @@ def _mirrors(result: Mapping[str, Any], by: str) -> list[tuple[str, dict[str, fl
 
 @router.get("/jobs/{number}", dependencies=[READ, RENDER_SLOT])
 def get_job_page(
-    number: Number, request: Request, runtime: RuntimeDep, kinds: KindsDep, by: By = "name"
+    number: Number,
+    request: Request,
+    runtime: RuntimeDep,
+    kinds: KindsDep,
+    by: By = "name",
+    step: StepNumber = 0,
 ) -> HTMLResponse:
     """A job, which the page follows until it ends.
 
     The heliostats of a field forecast are sorted ``by`` their name or a factor, the least first.
+    Of a plan of aims the maps of one ``step`` are shown.
     While it runs, each update reads only what changes, but neither the payload nor the result.
     """
     with runtime.database.reading() as session:
         row = queue.get_summary(session, number)
-        is_live, asked, flux = row.state not in queue.ENDED, None, None
+        is_live, asked, flux, aims = row.state not in queue.ENDED, None, None, None
         result: Mapping[str, Any] = {}
         if not is_live or "hx-request" not in request.headers:
             session.expunge(row)
@@ -197,6 +197,7 @@ def get_job_page(
                 result_of(kinds, session, row) or {},
                 _flux(row),
             )
+            aims = aim_view(runtime, row, step)
     return render(
         request,
         "job.html",
@@ -211,7 +212,8 @@ def get_job_page(
         factors=_FACTORS,
         by=by,
         light=result if row.kind == "forecasts" and "peak_w_m2" in result else None,
-        aims=result if row.kind == "aim-plans" and "bound_w" in result else None,
+        aims=aims,
+        in_zone=in_zone(result.get("time_zone") or runtime.settings.time_zone),
         target=row.payload.get("target") if asked else None,
         facts={name: value for name, value in result.items() if _plain(value)},
         counts=result.get("counts", {}),

@@ -43,7 +43,8 @@ LISTED = 20
 class PlanForm(Model):
     """The form. ``heliostats`` has one name a line.
 
-    An optional aim follows the name: right and up of the middle [m].
+    An optional aim follows the name: right and up of the middle [m]. ``aim_plan`` is the number of
+    a job `aim-plans`.
     """
 
     name: PlanName
@@ -53,6 +54,7 @@ class PlanForm(Model):
     step_minutes: float = Field(default=60.0, ge=1, le=1440)
     heliostats: Lines = ""
     allowed_kw_m2: float | None = Field(default=None, gt=0, le=1e5)
+    aim_plan: Version | None = None
     sunlight: Literal["given", "clear_sky"] = "given"
     dni_w_m2: float = Field(default=1000.0, gt=0, le=2000)
 
@@ -93,6 +95,7 @@ class PlanForm(Model):
                 aim_offsets_m={name: aim for name, aim in chosen.items() if aim is not None},
                 allowed_w_m2=None if self.allowed_kw_m2 is None else 1e3 * self.allowed_kw_m2,
                 dni_w_m2="clear_sky" if self.sunlight == "clear_sky" else self.dni_w_m2,
+                aim_plan=self.aim_plan,
             )
         except ValidationError as error:
             raise RequestValidationError(error.errors()) from error
@@ -115,7 +118,7 @@ def _filled(asked: PlanIn) -> PlanForm:
     lines = [aims.get(name, name) for name in asked.heliostats or ()]
     given = {
         name: getattr(asked, name)
-        for name in ("name", "target", "first_at", "last_at", "step_minutes")
+        for name in ("name", "target", "first_at", "last_at", "step_minutes", "aim_plan")
     }
     is_clear = asked.dni_w_m2 == "clear_sky"
     given |= {"sunlight": "clear_sky" if is_clear else "given"}

@@ -4,11 +4,18 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
+from model.frames import sun_direction
+from service import store
+from service.sources.documents import read_heliostat
 from service.sources.folder import read_folder
 from service.sources.plant_tables import read_aims
+from service.sources.schema import STORED
+from service.store.columns import now
+from service.twin.plant import setup
 from service.twin.transfer.importing import import_folder
 from tests.page import Page
 from tests.service import real
@@ -82,3 +89,135 @@ def test_a_wrong_limit_is_refused_by_its_name(plant: TestClient, limit: object):
     answer = plant.post("/v1/jobs/aim-plans", json=BODY | {"limit_w_m2": limit})
     assert answer.status_code == 422
     assert any("limit_w_m2" in error["field"] for error in answer.json()["errors"])
+
+
+DAY = {
+    "target": "main",
+    "dni_w_m2": 900,
+    "limit_w_m2": 80e3,
+    "day": {"date": "2026-06-21", "first": "05:00", "last": "15:00", "step_minutes": 240},
+}
+
+
+def test_day_is_planned_step_by_step(plant: TestClient):
+    """At 5 o'clock in Madrid the sun is below the horizon; each step keeps the limit."""
+    job = real.done_job(plant, "/v1/jobs/aim-plans", **DAY)
+    result = job["result"]
+    assert (result["time_zone"], result["date"]) == ("Europe/Madrid", "2026-06-21")
+    assert result["below_horizon"] == ["2026-06-21T03:00:00Z"]
+    assert [step["at"] for step in result["steps"]] == [
+        "2026-06-21T07:00:00Z",
+        "2026-06-21T11:00:00Z",
+    ]
+    for step in result["steps"]:
+        assert step["peak_p95_w_m2"] <= 1.002 * 80e3
+        assert step["power_w"] <= step["bound_w"] < 1.03 * step["power_w"]
+        assert step["seconds"]["all"] > 0
+        assert step["single_aim_exceeded"]["places"] > 0
+        assert step["single_aim_exceeded"]["worst"] > step["exceeded"]["worst"]
+        assert step["drives"].keys() == step["aim_points_m"].keys()
+    last = result["steps"][1]
+    name, aim = next(iter(last["aim_points_m"].items()))
+    drive = last["drives"][name]
+    assert drive["motor_position"] is None
+    assert drive["reason"] is None
+    assert reflects(plant, name, drive["axis_angles_deg"], aim, last["sun"])
+    page = Page(plant.get(f"/jobs/{job['id']}?step=1", headers={"Accept": "text/html"}).text)
+    for words in ("Step 2: 2026-06-21 13:00 CEST", "exceed the limit, the worst by", "1 more"):
+        assert words in page.words
+    flux = plant.get(f"/v1/jobs/{job['id']}/flux?step=1", headers={"Accept": "application/json"})
+    assert np.max(flux.json()["flux"]) == pytest.approx(last["peak_w_m2"])
+    table = plant.get(f"/jobs/{job['id']}/aims.csv?step=1").text.splitlines()
+    assert table[0].endswith(
+        "active,motor_1_steps,motor_2_steps,axis_1_deg,axis_2_deg,drive_reason"
+    )
+    assert plant.get(f"/jobs/{job['id']}/aims.csv?step=2").status_code == 404
+    assert day_plan_takes_the_aims(plant, job)
+
+
+def reflects(
+    client: TestClient, name: str, angles_deg: list[float], aim: list[float], sun: dict[str, float]
+) -> bool:
+    """Whether a mirror of the imported plant at these axis angles sends the sun to an aim."""
+    with real.runtime_of(client).database.reading() as session:
+        row = store.get_heliostat(session, name)
+        origin = store.get_plant(session).origin
+    heliostat = read_heliostat(name, row.properties, np.array(origin), STORED)
+    attitude = heliostat.mount.attitude(np.radians(angles_deg))
+    center = heliostat.mount.mirror_center(heliostat.position, attitude)
+    ray = -sun_direction(sun["azimuth_deg"], sun["elevation_deg"])
+    normal = attitude[:, 2]
+    sent = ray - 2 * (ray @ normal) * normal
+    toward = (np.array(aim) - center) / np.linalg.norm(np.array(aim) - center)
+    return bool(np.linalg.norm(sent - toward) < 1e-4)
+
+
+def day_plan_takes_the_aims(client: TestClient, job: dict[str, Any]) -> bool:
+    """Its flux is that of the aim plan's step, and its page links to the aim plan."""
+    body = {
+        "name": "June",
+        "target": "main",
+        "dni_w_m2": 900,
+        "first_at": "2026-06-21T11:00:00Z",
+        "last_at": "2026-06-21T11:00:00Z",
+        "resolution": [32, 80],
+        "aim_plan": job["id"],
+    }
+    plan = real.done_job(client, "/v1/jobs/plans", **body)
+    step, aimed = plan["result"]["steps"][0], job["result"]["steps"][1]
+    assert (plan["result"]["aim_plan"], step["aims_of_step"]) == (job["id"], 1)
+    assert step["twin"]["power_w"] == pytest.approx(aimed["power_w"], rel=0.005)
+    page = Page(client.get(f"/plans/{plan['id']}", headers={"Accept": "text/html"}).text)
+    assert f"of aim plan {job['id']}" in page.words
+    for changes, status in (({"aim_plan": plan["id"]}, 404), ({"target": "board"}, 409)):
+        answer = client.post("/v1/jobs/plans", json=body | changes)
+        assert (answer.status_code, "aim_plan" in answer.json()["detail"]) == (status, True)
+    return True
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"sun": {"azimuth_deg": 180, "elevation_deg": 55}}, "either sun or day"),
+        ({"day": None}, "either sun or day"),
+        ({"day": {"date": "2026-06-21", "step_minutes": 1}}, "at most 100"),
+        ({"day": {"date": "2026-06-21", "first": "12:00", "last": "11:00"}}, "after first"),
+        ({"day": {"date": "2026-06-21", "first": "12:00Z"}}, "without a zone"),
+        ({"day": {"date": "1969-06-21"}}, "1970"),
+    ],
+)
+def test_a_wrong_day_is_refused_by_its_name(plant: TestClient, changes: dict[str, Any], said: str):
+    answer = plant.post("/v1/jobs/aim-plans", json=DAY | changes)
+    assert answer.status_code == 422
+    assert said in str(answer.json())
+
+
+def outdated(client: TestClient) -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = client.get(
+        "/v1/attention", params={"reason": "aims_outdated"}
+    ).json()["items"]
+    return found
+
+
+def test_a_change_since_todays_plan_raises_an_alert_until_a_new_plan(plant: TestClient):
+    noon = now().replace(hour=11, minute=0, second=0, microsecond=0)
+    today = BODY | {"sun": {"at": noon.isoformat()}, "heliostats": some_names(plant)}
+    job = real.done_job(plant, "/v1/jobs/aim-plans", **today)
+    assert outdated(plant) == []
+    name = today["heliostats"][0]
+    path = f"/v1/heliostats/{name}"
+    properties = plant.get(path).json()["properties"]
+    properties["position_m"][2] += 0.01
+    with real.runtime_of(plant).database.writing() as session:
+        setup.set_heliostat(session, "tester", name, properties)
+    (alert,) = outdated(plant)
+    assert f"plan {job['id']} of aims for today on main" in alert["message"]
+    assert f"properties of 1: {name}" in alert["message"]
+    metrics = plant.get("/metrics").text
+    assert 'heliotwin_attention{acknowledged="no",reason="aims_outdated"} 1.0' in metrics
+    real.done_job(plant, "/v1/jobs/aim-plans", **today)
+    assert outdated(plant) == []
+
+
+def some_names(client: TestClient) -> list[str]:
+    return [row["name"] for row in client.get("/v1/heliostats").json()["items"][:20]]

@@ -1,0 +1,106 @@
+"""A plan of aims on the page of its job: maps, aims, steps, and the aims as CSV."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Path, Query, Response
+from numpy.typing import NDArray
+
+from service.base.arrays import unpack
+from service.base.errors import NotFoundError
+from service.base.fields import Version
+from service.drawing import charts
+from service.drawing.charts import HeatMap
+from service.jobs.kind import result_of
+from service.jobs.kinds.aim_plans import MAX_STEPS, step_name
+from service.sources.plant_tables import AIM_COLUMNS, DRIVE_COLUMNS
+from service.store.job_tables import JobRow
+from service.store.jobs import queue
+from service.twin.runtime.runtime import Runtime
+from service.web.auth.dependencies import READ, KindsDep, RuntimeDep
+from service.web.responses.csv_tables import sheet_answer
+
+router = APIRouter(include_in_schema=False)
+
+Number = Annotated[Version, Path(description="Id of the job.")]
+
+StepNumber = Annotated[
+    int, Query(ge=0, lt=MAX_STEPS, description="Which step of a day, from 0; the first without it.")
+]
+
+
+@dataclass(frozen=True)
+class AimView:
+    """What the page shows of one step: its figures, its maps, and all steps of a day.
+
+    ``maps`` are on one scale: the limit with the aims, a single aim, and the plan.
+    """
+
+    figures: Mapping[str, Any]
+    chosen: int
+    steps: list[Mapping[str, Any]]
+    maps: dict[str, HeatMap]
+
+
+def aim_view(runtime: Runtime, row: JobRow, step: int) -> AimView | None:
+    """A finished plan of aims; None for other jobs."""
+    result = row.result
+    if row.kind != "aim-plans" or result is None or row.arrays is None:
+        return None
+    steps = [_timed(one) for one in result.get("steps", [result])]
+    chosen = min(step, len(steps) - 1)
+    with runtime.database.reading() as session:
+        packed = queue.checkpoint_arrays(session, row.id, step_name(chosen))
+    # Plans of older versions kept no steps.
+    arrays = unpack(row.arrays if packed is None else packed)
+    size = result["plane"]["width"], result["plane"]["height"]
+    listed = steps if "steps" in result else []
+    return AimView({**result, **steps[chosen]}, chosen, listed, _maps(arrays, size))
+
+
+def _timed(step: Mapping[str, Any]) -> Mapping[str, Any]:
+    """A step with its time as such; None for a sun without one."""
+    at = step.get("at")
+    return {**step, "at": None if at is None else datetime.fromisoformat(at)}
+
+
+def _maps(arrays: dict[str, NDArray[Any]], size: tuple[float, float]) -> dict[str, HeatMap]:
+    limit = arrays["limit"]
+    fluxes = {"single": arrays["single_aim_flux"], "plan": arrays["flux"]}
+    # The flux sets the scale: a limit that is nowhere reached must not make it dark.
+    top = max(float(limit.min()), *(float(flux.max()) for flux in fluxes.values())) / 1e3
+    titles = {"single": "Flux if all aim at one point", "plan": "Flux by the plan"}
+    maps = {"limit": charts.limit_map("Limit of flux, and the aims", limit / 1e3, size, top)}
+    if "places" in arrays:
+        maps["limit"] = charts.dotted(maps["limit"], arrays["places"][arrays["active"]])
+    for name, flux in fluxes.items():
+        drawn = charts.limit_map(titles[name], flux / 1e3, size, top)
+        maps[name] = charts.marked(drawn, flux > limit)
+    return maps
+
+
+@router.get("/jobs/{number}/aims.csv", dependencies=[READ])
+def get_job_aims_table(
+    number: Number, runtime: RuntimeDep, kinds: KindsDep, step: StepNumber = 0
+) -> Response:
+    """The aims of a plan's step, as ``heliotwin field --aims`` reads them, and its drives."""
+    with runtime.database.reading() as session:
+        result = result_of(kinds, session, queue.get_job(session, number)) or {}
+    steps = result.get("steps", [result])
+    if step >= len(steps) or "aim_points_m" not in steps[step]:
+        raise NotFoundError(f"the result of job {number} has no aims of a step {step}")
+    found = steps[step]
+    inactive, drives = set(found["inactive"]), found.get("drives", {})
+    rows = (
+        [name, *point, int(name not in inactive), *_drive_cells(drives.get(name, {}))]
+        for name, point in found["aim_points_m"].items()
+    )
+    suffix = f"-step-{step}" if "steps" in result else ""
+    return sheet_answer(f"job-{number}-aims{suffix}", (*AIM_COLUMNS, *DRIVE_COLUMNS), rows)
+
+
+def _drive_cells(drive: Mapping[str, Any]) -> list[Any]:
+    motors, angles = drive.get("motor_position"), drive.get("axis_angles_deg")
+    return [*(motors or (None, None)), *(angles or (None, None)), drive.get("reason")]
