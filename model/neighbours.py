@@ -131,7 +131,7 @@ class Neighbours:
 
 
 def stacked_rectangles(rectangles: Sequence[Array]) -> Array:
-    """Rectangles (B, K, 3, 3) [m] of B mirrors with up to K of them; others are out of all light."""
+    """Rectangles (B, K, 3, 3) [m] of B mirrors; those that a mirror lacks are out of all light."""
     padded = np.tile(_NOWHERE, (len(rectangles), max([1, *map(len, rectangles)]), 1, 1))
     for row, some in zip(padded, rectangles, strict=True):
         row[: len(some)] = some

@@ -266,8 +266,7 @@ class ParameterVector:
     def for_heliostats(self, heliostats: Sequence[str]) -> "ParameterVector":
         """Return the same terms for some of the heliostats."""
         return replace(
-            self,
-            facets=tuple((name, count) for name, count in self.facets if name in heliostats),
+            self, facets=tuple((name, count) for name, count in self.facets if name in heliostats)
         )
 
 
