@@ -24,7 +24,8 @@ C1,large,200,400,0
 
 def test_neighbours_are_those_of_the_layout_and_aim_at_the_receiver(tmp_path: Path):
     write_plant(tmp_path, PLANT, layout=LAYOUT)
-    with open_folder(read_folder(tmp_path), kinds=None) as opened:
+    (tmp_path / "A1" / "Calibration").mkdir(parents=True)
+    with open_folder(read_folder(tmp_path, whole_field=True), kinds=None) as opened:
         twin = opened.context("A1")
         found = load_neighbours(opened.session, twin)
         assert [one.heliostat.name for one in found] == ["A2", "B1"]
