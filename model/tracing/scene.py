@@ -156,10 +156,10 @@ class Scene:
     obstacles : Tensor (B, K, 3, 3) or None [m]
         Rectangles in ENU, centre and half sides, that shade and block the mirrors
         (`model.neighbours`).
-    obstacle_share : Tensor (B,) or None [1]
-        Share of the light on obstacles that they take; None for all of it.
+    obstacle_share : Tensor (B,) or None
+        Share of the light on obstacles that they take; None for all.
     neighbours : Tensor (B, K, 3, 3) or None [m]
-        Rectangles like obstacles that hide nothing unless an effect says so.
+        What an effect may make obstacles.
     shades : Tensor (B, K, 3, 3) or None [m]
         Rectangles that shade the mirrors only, such as the tower's outline.
     coverage : Tensor (B, F, n, n) or None
@@ -236,11 +236,8 @@ class Scene:
 
     def subset(self, rows: Sequence[int]) -> "Scene":
         """Select some mirrors, in the given order."""
-        return (
-            self
-            if list(rows) == list(range(self.batch))
-            else self._each(lambda tensor: tensor[list(rows)])
-        )
+        is_whole = list(rows) == list(range(self.batch))
+        return self if is_whole else self._each(lambda tensor: tensor[list(rows)])
 
     def to(self, dtype: torch.dtype) -> "Scene":
         """Convert to another precision."""
@@ -249,9 +246,7 @@ class Scene:
     def _each(self, change: Callable[[Tensor], Tensor]) -> "Scene":
         """Change every tensor."""
         tensors = {f.name: getattr(self, f.name) for f in fields(self)}
-        return self.with_(
-            **{name: change(value) for name, value in tensors.items() if isinstance(value, Tensor)}
-        )
+        return self.with_(**{k: change(v) for k, v in tensors.items() if isinstance(v, Tensor)})
 
     def by_facet(self) -> "Scene":
         """Make each facet a separate mirror (B * F mirrors); those of one mirror are adjacent."""
