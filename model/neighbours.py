@@ -105,11 +105,9 @@ class Neighbours:
         """
         radii = self.radii
         top = float((self.rectangles[:, 0, 2] + radii).max(initial=-np.inf))
-        found = [self.rectangles[list(self._before(name, radii, top))] for name in names]
-        padded = np.tile(_NOWHERE, (len(found), max(1, *map(len, found)), 1, 1))
-        for row, some in zip(padded, found, strict=True):
-            row[: len(some)] = some
-        return padded
+        return stacked_rectangles(
+            [self.rectangles[list(self._before(name, radii, top))] for name in names]
+        )
 
     def _before(self, name: str, radii: Array, top: float) -> Iterator[int]:
         """Rows of mirrors whose spheres intersect the beams from this mirror's sphere."""
@@ -130,6 +128,14 @@ class Neighbours:
             near = radii[first:last] + radii[row]
             in_the_way = (along > -near) & (along < end) & (aside < near**2)
             yield from (other for other in first + np.flatnonzero(in_the_way) if other != row)
+
+
+def stacked_rectangles(rectangles: Sequence[Array]) -> Array:
+    """Rectangles (B, K, 3, 3) [m] of B mirrors; those that a mirror lacks are out of all light."""
+    padded = np.tile(_NOWHERE, (len(rectangles), max([1, *map(len, rectangles)]), 1, 1))
+    for row, some in zip(padded, rectangles, strict=True):
+        row[: len(some)] = some
+    return padded
 
 
 def clear(obstacles: Tensor, points: Tensor, direction: Tensor, cell: Tensor) -> Tensor:

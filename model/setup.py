@@ -38,6 +38,9 @@ class Setup:
     identifier : str
     taken_at : datetime or None
         With time zone; effects may begin and end. None if it is not known.
+    neighbours : (K, 3, 3) [m] or None
+        Rectangles in ENU of mirrors that may hide parts of this one, by the plant's layout
+        (`model.neighbours`). They act by the effect `known_neighbours` only.
     """
 
     heliostat: Heliostat
@@ -50,6 +53,7 @@ class Setup:
     degree: int = DEGREE
     identifier: str = ""
     taken_at: datetime | None = None
+    neighbours: Array | None = None
 
     @property
     def goal(self) -> Array:

@@ -216,7 +216,7 @@ LIMITS = {
     "functions that return a bare tuple": 40,
     f"classes above {MAX_CLASS_LINES} lines": 0,
     "lines with latitude_deg": 18,
-    "names of a forecast request's fields": 21,
+    "names of a forecast request's fields": 22,
     "dict[str, Any] in service": 64,
 }
 """The most of each count. A limit is lowered when its count falls; it rises with a feature only."""

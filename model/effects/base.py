@@ -130,6 +130,8 @@ class Effect:
     of_heliostats : bool
         True if the effect belongs to mirror, mount or drive, so that a single heliostat may have
         it. False if it belongs to the sun or a camera.
+    needs_neighbours : bool
+        True if only setups with ``neighbours`` show the effect.
     scope : Scope
         When and where this effect acts.
     """
@@ -144,6 +146,7 @@ class Effect:
     only_moves: ClassVar[bool] = False
     comes: ClassVar[frozenset[Arrival]] = frozenset({"since"})
     of_heliostats: ClassVar[bool] = False
+    needs_neighbours: ClassVar[bool] = False
 
     scope: Scope = field(default=Always(), kw_only=True)
 
@@ -174,6 +177,11 @@ class Effect:
     def parameters(cls) -> tuple[Parameter, ...]:
         """The effect's parameters in their order."""
         return tuple(Parameter(name=f.name, **f.metadata) for f in fields(cls) if f.metadata)
+
+    @classmethod
+    def unseen(cls, mounts: Sequence[Mount]) -> frozenset[str]:
+        """Names of the parameters that studies of heliostats on these ``mounts`` do not fit."""
+        return frozenset()
 
     @property
     def heliostats(self) -> list[str] | None:

@@ -24,6 +24,7 @@ ORDER = (
     "gravity_bending",
     "soiling",
     "blocking",
+    "known_neighbours",
     "sun_shape",
     "slope_error",
     "tracking_jitter",

@@ -49,7 +49,13 @@ def study(
     found: dict[Term, Found] = {}
     candidates: list[Candidate] = []
     has_motors = any(p.setup.angles is not None for p in flux_images)
-    left = _candidate_terms(scopes, model.effects, options, has_motors)
+    has_neighbours = any(p.setup.neighbours is not None for p in flux_images)
+    left = [
+        term
+        for term in _candidate_terms(scopes, model.effects, options)
+        if (has_motors or not term.kind.only_moves)
+        and (has_neighbours or not term.kind.needs_neighbours)
+    ]
     for _ in range(options.most):
         if found and not selection.can_improve(current):
             break
@@ -90,7 +96,7 @@ def _check(flux_images: Sequence[FluxImage]) -> None:
 
 
 def _candidate_terms(
-    scopes: ScopeSearch, effects: Sequence[Effect], options: StudyOptions, has_motors: bool
+    scopes: ScopeSearch, effects: Sequence[Effect], options: StudyOptions
 ) -> list[Term]:
     """Return the effects that the declared model does not have in full scope.
 
@@ -102,7 +108,7 @@ def _candidate_terms(
         if effect.scope == Always() or isinstance(effect.scope, ByDay)
     }
     kinds = [CATALOGUE[name] for name in options.candidates if name not in declared]
-    return [scopes.full_scope(kind) for kind in kinds if has_motors or not kind.only_moves]
+    return [scopes.full_scope(kind) for kind in kinds]
 
 
 def _candidates(

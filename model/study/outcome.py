@@ -94,6 +94,7 @@ class Found:
         parameters = {
             p.name: _fitted(value[p.name], ci95[p.name], p.unit, term)
             for p in term.kind.parameters()
+            if p.name in value
         }
         away = dict.fromkeys(term.days, 0.0)
         for place, unknown in enumerate(unknowns.all):

@@ -131,16 +131,23 @@ class ParameterVector:
     terms : tuple of Term
     facets : tuple of (str, int)
         Heliostats with their number of facets.
+    unseen : frozenset of (str, str)
+        Effects and their parameters that the heliostats' mounts do not show (`Effect.unseen`).
     """
 
     terms: tuple[Term, ...]
     facets: tuple[tuple[str, int], ...]
+    unseen: frozenset[tuple[str, str]] = frozenset()
 
     @cached_property
     def all(self) -> tuple[Unknown, ...]:
         """All unknowns, in the order of the vector."""
         return tuple(
-            u for term in self.terms for p in term.kind.parameters() for u in self._of(term, p)
+            u
+            for term in self.terms
+            for p in term.kind.parameters()
+            if (term.kind.name, p.name) not in self.unseen
+            for u in self._of(term, p)
         )
 
     def _of(self, term: Term, parameter: Parameter) -> list[Unknown]:
@@ -245,20 +252,21 @@ class ParameterVector:
     @property
     def per_heliostat(self) -> "ParameterVector":
         """Those of effects per heliostat."""
-        return ParameterVector(
-            tuple(term for term in self.terms if term.is_per_heliostat), self.facets
-        )
+        return self.of_terms(term for term in self.terms if term.is_per_heliostat)
 
     def without(self, terms: Iterable[Term]) -> "ParameterVector":
         """Return the unknowns of all other terms."""
-        return ParameterVector(
-            tuple(term for term in self.terms if term not in set(terms)), self.facets
-        )
+        left_out = set(terms)
+        return self.of_terms(term for term in self.terms if term not in left_out)
+
+    def of_terms(self, terms: Iterable[Term]) -> "ParameterVector":
+        """Return the unknowns of other terms at the same heliostats."""
+        return replace(self, terms=tuple(terms))
 
     def for_heliostats(self, heliostats: Sequence[str]) -> "ParameterVector":
         """Return the same terms for some of the heliostats."""
-        return ParameterVector(
-            self.terms, tuple((name, count) for name, count in self.facets if name in heliostats)
+        return replace(
+            self, facets=tuple((name, count) for name, count in self.facets if name in heliostats)
         )
 
 
@@ -290,6 +298,7 @@ def copy_vector(unknowns: ParameterVector, trials: Array) -> VectorCopies:
     copies = ParameterVector(
         tuple(_copied_term(term, count) for term in unknowns.terms),
         tuple((copy_name(h, m), n) for m in range(count) for h, n in unknowns.facets),
+        unknowns.unseen,
     )
     known = {
         replace(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from model.effects import Effect
 from model.study.flux_images import FluxImage
 from model.study.judging import Rows
-from model.study.parameters import ParameterVector, Term
+from model.study.parameters import Term
 from model.study.scopes import (
     MAX_SCREENED,
     MIN_SHARE_OF_BEST,
@@ -97,7 +97,7 @@ class ScopeSearch:
             self._from_the_first(term) if other == term else other
             for other in trial.parameters.terms
         )
-        parameters = ParameterVector(terms, self.fitter.facets)
+        parameters = self.fitter.unknowns.of_terms(terms)
         is_moved = np.array([u.term == term for u in trial.parameters.all])
         away = np.where(is_moved, trial.values - trial.parameters.neutral, 0.0)
         values = [np.clip(trial.values + (s - 1) * away, *parameters.bounds) for s in strengths]

@@ -20,7 +20,7 @@ from model.images import FLUX_SIZE
 from model.metrics import flux_accuracies
 from model.study.flux_images import noise_floor
 from model.study.judging import Gain, few_gain, paired_gain
-from model.study.parameters import ParameterVector, Term
+from model.study.parameters import Term
 from model.study.position import EXPECTED, NAT, loss
 from model.study.scope_search import ScopeSearch
 from model.study.scopes import MAX_SCREENED
@@ -112,7 +112,7 @@ class ForwardSelection:
         """Changes of score (n,) of the fitted images, by a fit to the held-out ones."""
         fitter = self.fitter
         crossed = replace(after, values=before.parameters.transfer(before.values, after.parameters))
-        moving = ParameterVector((term,), fitter.facets)
+        moving = fitter.unknowns.of_terms([term])
         crossed = fitter.fit_rows(
             crossed, fitter.touched(fitter.split.held_out, [term]), moving, set()
         )

@@ -89,7 +89,7 @@ class Trial:
         """Return the trial with another start day of one effect."""
         later = replace(term, since=since)
         terms = tuple(later if other == term else other for other in self.parameters.terms)
-        return replace(self, parameters=ParameterVector(terms, self.parameters.facets))
+        return replace(self, parameters=self.parameters.of_terms(terms))
 
 
 class Forecasters(NamedTuple):
@@ -108,9 +108,10 @@ class TrialFitter:
         self.flux_images, self.model, self.options = flux_images, model, options
         self.window = options.window or spot_window(flux_images)
         self.split: Split = split(flux_images)
-        self.facets = tuple(
-            sorted({(p.heliostat, len(p.setup.control_points)) for p in flux_images})
-        )
+        facets = sorted({(p.heliostat, len(p.setup.control_points)) for p in flux_images})
+        mounts = [p.setup.heliostat.mount for p in flux_images]
+        unseen = {(name, p) for name, kind in CATALOGUE.items() for p in kind.unseen(mounts)}
+        self.unknowns = ParameterVector((), tuple(facets), frozenset(unseen))
         self.days = days_of(flux_images)
         self.heliostats = np.array([p.heliostat for p in flux_images])
         self.judge = self._forecaster(self.split.held_out, options.view)
@@ -144,7 +145,7 @@ class TrialFitter:
         The fit begins at the values of ``start``. Unless ``joint``, the effects of ``start`` are
         kept as they are.
         """
-        full = ParameterVector(tuple(terms), self.facets)
+        full = self.unknowns.of_terms(terms)
         trial = Trial(full, full.neutral, np.zeros(len(full.all)), *(np.empty(0) for _ in range(3)))
         known: set[Term] = set()
         if start is not None:

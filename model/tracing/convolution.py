@@ -202,6 +202,9 @@ def _unobstructed(
     free = sees_sun
     if obstacles is not None:
         free = torch.minimum(sees_sun, clear(obstacles, points, direction, cell))
+    if scene.obstacle_share is not None:
+        share = scene.obstacle_share[:, None]
+        sees_sun, free = (1 - share * (1 - some) for some in (sees_sun, free))
     lit = torch.stack([everything, (power * sees_sun).sum(-1)], dim=-1)
     return _Unobstructed(power * free, lit)
 

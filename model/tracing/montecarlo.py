@@ -89,6 +89,7 @@ def _rays(
         np.zeros((0, 3, 3)) if some is None else some[index].double().numpy()
         for some in map(scene.in_plane_frame, (scene.obstacles, scene.shades))
     )
+    taken = 1.0 if scene.obstacle_share is None else float(scene.obstacle_share[index])
     shares = rng.multinomial(count, np.full(len(facets), 1 / len(facets)))
     for facet, share in enumerate(shares):
         place, area, spots = _facet_points(
@@ -108,7 +109,8 @@ def _rays(
             tilt = rng.normal(0, slope_error, (2, share, 1))
             normal = _unit(normal + tilt[0] * first + tilt[1] * second)
         out = 2 * (normal * toward_sun).sum(axis=-1, keepdims=True) * normal - toward_sun
-        weight = weight * _is_free(obstacles, place, toward_sun) * _is_free(obstacles, place, out)
+        free = _is_free(obstacles, place, toward_sun) & _is_free(obstacles, place, out)
+        weight = weight * (1 - taken * ~free)
         weight = weight * _is_free(shades, place, toward_sun)
         if pointing_error > 0:
             first, second = _across(out)

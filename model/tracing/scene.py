@@ -13,6 +13,7 @@ from torch import Tensor
 from model.errors import InvalidInputError
 from model.images import FLUX_SIZE, FLUX_WINDOW
 from model.mount import Mount, jitter_direction
+from model.neighbours import stacked_rectangles
 from model.plant import PERFECT, Outline, TargetPlane, inside_outline, outline_share
 from model.setup import Setup
 from model.sunshape import Buie, SunShape
@@ -155,6 +156,10 @@ class Scene:
     obstacles : Tensor (B, K, 3, 3) or None [m]
         Rectangles in ENU, centre and half sides, that shade and block the mirrors
         (`model.neighbours`).
+    obstacle_share : Tensor (B,) or None
+        Share of the light on obstacles that they take; None for all.
+    neighbours : Tensor (B, K, 3, 3) or None [m]
+        What an effect may make obstacles.
     shades : Tensor (B, K, 3, 3) or None [m]
         Rectangles that shade the mirrors only, such as the tower's outline.
     coverage : Tensor (B, F, n, n) or None
@@ -174,6 +179,8 @@ class Scene:
     jitter_axis: Tensor | None = None
     blocked_below: Tensor | None = None
     obstacles: Tensor | None = None
+    obstacle_share: Tensor | None = None
+    neighbours: Tensor | None = None
     shades: Tensor | None = None
     coverage: Tensor | None = None
     reflectance: Tensor | None = None
@@ -229,11 +236,8 @@ class Scene:
 
     def subset(self, rows: Sequence[int]) -> "Scene":
         """Select some mirrors, in the given order."""
-        return (
-            self
-            if list(rows) == list(range(self.batch))
-            else self._each(lambda tensor: tensor[list(rows)])
-        )
+        is_whole = list(rows) == list(range(self.batch))
+        return self if is_whole else self._each(lambda tensor: tensor[list(rows)])
 
     def to(self, dtype: torch.dtype) -> "Scene":
         """Convert to another precision."""
@@ -242,9 +246,7 @@ class Scene:
     def _each(self, change: Callable[[Tensor], Tensor]) -> "Scene":
         """Change every tensor."""
         tensors = {f.name: getattr(self, f.name) for f in fields(self)}
-        return self.with_(
-            **{name: change(value) for name, value in tensors.items() if isinstance(value, Tensor)}
-        )
+        return self.with_(**{k: change(v) for k, v in tensors.items() if isinstance(v, Tensor)})
 
     def by_facet(self) -> "Scene":
         """Make each facet a separate mirror (B * F mirrors); those of one mirror are adjacent."""
@@ -303,9 +305,16 @@ def irradiance_of(scene: Scene, optics: Optics, slant_range: Tensor) -> Tensor:
 def _mirror_tensors(
     setups: Sequence[Setup], tensor: Callable[[object], Tensor]
 ) -> dict[str, Tensor]:
-    """Coverage and mirror optics of setups, where any is not that of a perfect rectangle."""
+    """Neighbours, coverage and mirror optics of setups, where any is not that of a perfect
+    rectangle that is alone.
+    """
     heliostats = [setup.heliostat for setup in setups]
     tensors = {}
+    if any(setup.neighbours is not None for setup in setups):
+        none = np.zeros((0, 3, 3))
+        tensors["neighbours"] = tensor(
+            stacked_rectangles([none if s.neighbours is None else s.neighbours for s in setups])
+        )
     if any(heliostat.optics != PERFECT for heliostat in heliostats):
         for name in ("reflectance", "slope_error", "pointing_error"):
             tensors[name] = tensor([getattr(h.optics, name) for h in heliostats])

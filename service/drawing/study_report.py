@@ -58,7 +58,10 @@ class Finding:
         kind = CATALOGUE[found.name]
         of = ", ".join(found.scope.get("heliostats") or ["all images"])
         parameters = [
-            row for p in kind.parameters() for row in _rows(p, found.parameters[p.name], of)
+            row
+            for p in kind.parameters()
+            if p.name in found.parameters
+            for row in _rows(p, found.parameters[p.name], of)
         ]
         return cls(
             found,

@@ -78,14 +78,17 @@ def test_the_catalogue_is_the_contract():
         name: {p.name: (p.low, p.high, p.unit, p.owner) for p in effect.parameters()}
         for name, effect in CATALOGUE.items()
     }
-    assert len(bounds) == 17
+    assert len(bounds) == 18
     assert bounds["sun_shape"] == {"circumsolar_ratio": (0, 0.5, "1", "set")}
     assert (
         bounds["slope_error"] == bounds["tracking_jitter"] == {"sigma_mrad": (0, 4, "mrad", "set")}
     )
     assert bounds["facet_canting"] == dict.fromkeys(("x_mrad", "y_mrad"), (-5, 5, "mrad", "facet"))
     assert bounds["gravity_bending"] == {"amplitude_mm": (-8, 8, "mm", "set")}
-    assert bounds["axis_tilt"] == dict.fromkeys(("north_deg", "up_deg"), (-3, 3, "deg", "set"))
+    assert bounds["axis_tilt"] == dict.fromkeys(
+        ("north_deg", "up_deg", "east_deg"), (-3, 3, "deg", "set")
+    )
+    assert bounds["known_neighbours"] == {"share": (0, 1, "1", "set")}
     assert bounds["pylon_bending"] == {"amplitude_mrad": (-20, 20, "mrad", "set")}
     assert bounds["encoder_offset"] == dict.fromkeys(
         ("first_deg", "second_deg"), (-6, 6, "deg", "heliostat")

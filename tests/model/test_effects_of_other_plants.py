@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from model.effects import CATALOGUE, Effect, effect_from_json
+from model.effects.axis_tilt import AxisTilt
 from model.effects.gravity_bending import GravityBending
 from model.effects.tracking_jitter import TrackingJitter
 from model.forecast import View, align
@@ -110,7 +111,11 @@ PARAMETERS = {
 }
 """A strong effect of each kind that changes shapes."""
 
-SHAPED = [name for name, kind in CATALOGUE.items() if not kind.only_moves]
+SHAPED = [
+    name
+    for name, kind in CATALOGUE.items()
+    if not (kind.only_moves or kind.needs_neighbours)  # see test_known_neighbours.py
+]
 
 
 def made(name: str) -> Effect:
@@ -136,9 +141,9 @@ def test_each_effect_changes_the_images_of_any_type(name):
     assert moved.max() > 0.004
 
 
-def study_of(effect: Effect) -> Study:
+def study_of(effect: Effect, candidates: tuple[str, ...] | None = None) -> Study:
     options = StudyOptions(
-        candidates=tuple(RIVALS),
+        candidates=candidates or tuple(RIVALS),
         most=1,
         fit_view=View(24, 24, samples=4, padding=0.125),
         view=View(48, 48, samples=6),
@@ -172,6 +177,14 @@ def test_an_effect_is_found_before_its_rivals(name):
     if isinstance(truth, dict):
         value, truth = [float(value[name]) for name in truth], list(truth.values())
     assert value == pytest.approx(truth, rel=0.15)
+
+
+def test_a_tilt_about_east_is_found():
+    """A vertical axis may lean to either side."""
+    found = study_of(AxisTilt(east_deg=2.8), ("axis_tilt", "target_registration"))
+    assert [one.name for one in found.found] == ["axis_tilt"]
+    assert found.effects[0].east_deg == pytest.approx(2.8, rel=0.15)
+    assert abs(found.effects[0].north_deg) < 0.4
 
 
 # --- properties of a type

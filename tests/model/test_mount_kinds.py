@@ -3,12 +3,15 @@
 Readings are made by `Mount`, which shares nothing with the calibration's kinematic chain.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from model.actuator import LinearActuator, RotaryActuator
 from model.frames import sun_direction
 from model.heliostat_type import MOUNT_KINDS, HeliostatType, MountDesign, facet_grid
+from model.mount import rotation
 from model.plant import Heliostat, TargetPlane
 from model.pointing import CalibratedMount, Reading, calibrate_field, pointing_error
 from model.pointing.kinematics import NAMES, KinematicChain, apply_parameters, residuals
@@ -91,6 +94,19 @@ def test_ten_spots_point_at_unseen_suns(kind: str, drives: tuple[object, object]
         after += list(pointing_error(one, done.mounts[name], unseen))
     assert np.median(before) > 3e-3
     assert np.mean(after) < 3e-4
+
+
+@pytest.mark.parametrize("axis", [(1.0, 0, 0), (0, 1.0, 0)], ids=["east", "north"])
+def test_a_vertical_axis_that_leans_is_calibrated_from_ten_spots(axis: tuple[float, ...]):
+    """The lean is that of `Mount.tilted`, about either level direction."""
+    one = heliostat("H", "azimuth_elevation", ROTARY, (-40.0, 90.0, 0.0))
+    lean = replace(one, mount=one.mount.tilted(rotation(axis, 8e-3)))
+    parameters = true_parameters(5, lengths=False) * [name.endswith("_zero") for name in NAMES]
+    shown = {"H": readings(lean, parameters, SHOWN, 2e-4)}
+    done = calibrate_field({"H": one}, shown, {"target": TARGET}, JUELICH)
+    unseen = readings(lean, parameters, UNSEEN, 0.0)
+    assert np.median(pointing_error(one, CalibratedMount.uncalibrated(), unseen)) > 3e-3
+    assert np.mean(pointing_error(one, done.mounts["H"], unseen)) <= 3e-4
 
 
 @pytest.mark.parametrize("kind", MOUNT_KINDS)

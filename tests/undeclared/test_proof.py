@@ -60,7 +60,8 @@ def report(case: str) -> dict[str, Any]:
 
 
 def test_the_generator_has_every_effect_of_the_catalogue():
-    assert set(world.CATALOGUE) == set(CATALOGUE)
+    # Mirrors of that world have no neighbours: tests/model/test_known_neighbours.py has some.
+    assert set(world.CATALOGUE) == set(CATALOGUE) - {"known_neighbours"}
 
 
 @pytest.mark.parametrize("case", ["clean", *world.CATALOGUE])

@@ -98,6 +98,19 @@ def get_heliostats(session: Session, names: Sequence[str]) -> dict[str, Heliosta
     return {row.name: row for row in rows}
 
 
+def list_heliostats_near(
+    session: Session, row: HeliostatRow, reach_m: float
+) -> Sequence[HeliostatRow]:
+    """Other heliostats in a square of ``reach_m`` [m] to each side of one, sorted by name."""
+    return session.scalars(
+        select(HeliostatRow)
+        .where(HeliostatRow.east_m.between(row.east_m - reach_m, row.east_m + reach_m))
+        .where(HeliostatRow.north_m.between(row.north_m - reach_m, row.north_m + reach_m))
+        .where(HeliostatRow.id != row.id)
+        .order_by(HeliostatRow.name)
+    ).all()
+
+
 def list_heliostats(
     session: Session,
     limit: int,

@@ -40,6 +40,7 @@ from service.twin.heliostats.stored_mount import mount_at
 from service.twin.plant import model_versions
 from service.twin.plant.model_versions import ModelVersion
 from service.twin.runtime.runtime import Runtime
+from service.twin.studies.known_neighbours import load_neighbours, with_neighbours
 
 Surfaces = Literal["measured", "current"]
 
@@ -175,9 +176,9 @@ def add_photographs(
 
     ``rows`` are accepted photographs, loaded with their arrays. ``seen`` are identifiers of those
     that the mirror was computed from. A photograph that is newer than the calibration of its mount
-    also has the pointing from its motors.
+    also has the pointing from its motors. Mirrors near the heliostat may hide parts of it.
     """
-    stored = mount_at(session, twin.row)
+    stored, neighbours = mount_at(session, twin.row), load_neighbours(session, twin)
     for row in rows:
         try:
             _require_on_target(twin, row)
@@ -188,6 +189,7 @@ def add_photographs(
             if stored is not None:
                 motors, day = evidence.motor_position, day_of(evidence.taken_at)
                 photograph = photograph.sent(stored.heliostat, stored.mount, motors, day)
+            photograph = with_neighbours(photograph, neighbours, twin.model)
         except SKIPPED as error:
             material.skipped[f"{twin.row.name}/{row.identifier}"] = str(error)
             continue

@@ -10,6 +10,7 @@ pytest.importorskip("PySAM", reason="NREL-PySAM is not installed; see the extra 
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:DatetimeIndex.dayofyear")  # in pvlib, by pandas 3
 def test_efficiency_is_solarpilots(tmp_path: Path):
     theirs = solarpilot.laid_out(20.0)
     plant = solarpilot.our_plant(theirs.places, tmp_path)
