@@ -27,6 +27,10 @@ _CHUNK = 256
 _STEPS = 6
 _STEP = 0.05
 
+_LOOSE = 1.05
+_SHARES = (1.0, 0.3, 0.1, 0.0)
+"""Shares of the plan's multipliers that are tried if its bound is above `_LOOSE` of its power."""
+
 
 def bound_power(plan: AimPlan, steps: int = _STEPS) -> float:
     """Upper bound [W] on the power of any aims of the plan's mirrors under its limit.
@@ -34,12 +38,11 @@ def bound_power(plan: AimPlan, steps: int = _STEPS) -> float:
     ``steps`` are subgradient steps from the plan's multipliers; the smallest bound counts.
     """
     kernels, limit = plan.kernels, plan.limit
-    multipliers, least = plan.multipliers.clone(), math.inf
+    multipliers, least = _scaled(plan), math.inf
     with torch.no_grad():
         for number in range(steps + 1):
             best = _best_aims(plan, multipliers)
-            priced = (multipliers.double() * limit * kernels.areas).sum()
-            least = min(least, float(best.values.double().clamp(min=0).sum() + priced))
+            least = min(least, _bound(plan, multipliers, best))
             if number < steps:
                 flux = kernels.flux(best.moved, (best.values > 0).to(best.moved))
                 # The subgradient is the flux that is left; half of the way keeps what the plan
@@ -47,6 +50,25 @@ def bound_power(plan: AimPlan, steps: int = _STEPS) -> float:
                 left = 1 - (flux + plan.flux) / (2 * limit)
                 multipliers = (multipliers - _STEP / (number + 1) * left).clamp(min=0)
     return least
+
+
+def _scaled(plan: AimPlan) -> Tensor:
+    """The plan's multipliers (P,), or a share of them that gives a smaller bound.
+
+    Those of a plan that began far away may be too large.
+    """
+    with torch.no_grad():
+        least = _bound(plan, plan.multipliers, _best_aims(plan, plan.multipliers))
+        if least < _LOOSE * plan.power:
+            return plan.multipliers.clone()
+        shares = [share * plan.multipliers for share in _SHARES]
+        return min(shares, key=lambda few: _bound(plan, few, _best_aims(plan, few)))
+
+
+def _bound(plan: AimPlan, multipliers: Tensor, best: "_Best") -> float:
+    """The bound [W] of multipliers (P,) and their best aims."""
+    priced = (multipliers.double() * plan.limit * plan.kernels.areas).sum()
+    return float(best.values.double().clamp(min=0).sum() + priced)
 
 
 @dataclass(frozen=True, eq=False)

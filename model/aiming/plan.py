@@ -150,7 +150,8 @@ def plan_aims(
         Positive.
     start : AimPlan, optional
         Aims that were good for these mirrors a little before, by its ``moved`` and
-        ``multipliers``; its kernels and limit do not matter.
+        ``multipliers``; its kernels and limit do not matter. If they are too far from aims within
+        the limit, the plan begins without them.
     between : callable
         Called repeatedly; an exception ends the work.
 
@@ -182,6 +183,8 @@ def plan_aims(
         if excess <= 0:
             break
         if excess > max(_DEFOCUS_ABOVE, before / 2):
+            if start is not None:  # too far from these aims: others may need no defocusing
+                return plan_aims(kernels, limit, between=between)
             plan = _defocused(plan, excess)
         before = excess
     return ascent.plan

@@ -85,7 +85,7 @@ _Date = date
 class DayIn(Model):
     """The steps of a day by the clocks of the plant."""
 
-    date: _Date
+    date: _Date = Field(description="Of the plant's calendar.")
     first: Minute = clock(0, 0)
     last: Minute = clock(23, 59)
     step_minutes: Number = Field(
