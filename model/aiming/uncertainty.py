@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.aiming.kernels import Kernels
-from model.aiming.plan import DRAWS, AimPlan
+from model.aiming.plan import DRAWS, AimPlan, Draws
 from model.errors import InvalidInputError
 
 Array = NDArray[np.float64]
@@ -44,27 +44,29 @@ class PlanUncertainty:
 
 
 def plan_uncertainty(
-    plan: AimPlan, worlds: Sequence[Kernels] = (), count: int = DRAWS
+    plan: AimPlan, worlds: Sequence[Kernels] = (), own: Draws | None = None
 ) -> PlanUncertainty:
-    """Judge a plan by draws of pointing errors and surfaces.
+    """Judge a plan by `DRAWS` draws of pointing errors and surfaces, at least one for each world.
 
     Parameters
     ----------
     plan : AimPlan
     worlds : sequence of Kernels
         Of the same mirrors with drawn surfaces; by default the plan's kernels alone.
-    count : int
-        Draws in total, at least one for each world.
+    own : Draws, optional
+        The plan's, if they were traced before; without worlds these are what it is judged by.
 
     Raises
     ------
     InvalidInputError
         If a world has other mirrors than the plan.
     """
-    some = worlds or [plan.kernels]
-    each = max(1, count // len(some))
-    # A seed for each world: the same errors in all of them would hide part of the spread.
-    drawn = [judged_on(plan, one).draws(each, seed) for seed, one in enumerate(some)]
+    if worlds:
+        each = max(1, DRAWS // len(worlds))
+        # A seed for each world: the same errors in all of them would hide part of the spread.
+        drawn = [judged_on(plan, one).draws(each, seed) for seed, one in enumerate(worlds)]
+    else:
+        drawn = [own or plan.draws()]
     powers, peaks, ratios = (
         np.concatenate([getattr(one, name) for one in drawn])
         for name in ("powers", "peaks", "ratios")

@@ -82,9 +82,10 @@ def find_aims(
     single = trace_field(plant, replace(request, resolution=kernels.resolution), step)
     power = single.report["field"]["intercepted_w"]
     worlds = _drawn_worlds(plant, request, step)
-    moment = plan_uncertainty(plan, worlds)
+    drawn = plan.draws()
+    moment = plan_uncertainty(plan, worlds, drawn)
     report = AimReport(
-        **aim_figures(plan, found.task.receiver, power),
+        **aim_figures(plan, drawn, found.task.receiver, power),
         receiver=request.receiver,
         sun={"azimuth_deg": request.azimuth_deg, "elevation_deg": request.elevation_deg},
         dni_w_m2=found.task.model.optics.dni,

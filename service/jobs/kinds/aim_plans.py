@@ -340,7 +340,7 @@ class _Planner:
         }
         figures: dict[str, object] = {
             "at": None if at is None else format_time(at),
-            **aim_figures(plan, receiver, power),
+            **aim_figures(plan, plan.draws(), receiver, power),
             "exceeded": excess_of(maps["flux"], maps["limit"], receiver),
             "single_aim_exceeded": excess_of(maps["single_aim_flux"], maps["limit"], receiver),
             "sun": sun.model_dump(),

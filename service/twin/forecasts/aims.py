@@ -11,7 +11,7 @@ from torch import Tensor
 from model.aiming.bound import bound_power
 from model.aiming.k_factor import k_factor_aims
 from model.aiming.kernels import Kernels
-from model.aiming.plan import AimPlan, single_aim
+from model.aiming.plan import AimPlan, Draws, single_aim
 from model.plant import Cylinder, Receiver
 from model.receivers import Cavity, Panels
 
@@ -58,10 +58,12 @@ class AimFigures(TypedDict):
     inactive: list[str]
 
 
-def aim_figures(plan: AimPlan, receiver: Receiver, single_aim_power_w: float) -> AimFigures:
-    """Judge a plan by draws of the pointing errors, by its bound and by k-factors."""
+def aim_figures(
+    plan: AimPlan, drawn: Draws, receiver: Receiver, single_aim_power_w: float
+) -> AimFigures:
+    """Judge a plan by its draws of the pointing errors, by its bound and by k-factors."""
     other = k_factor_aims(plan.kernels, plan.limit, receiver)
-    drawn, names = plan.draws(), plan.kernels.names
+    names = plan.kernels.names
     return AimFigures(
         power_w=plan.power,
         single_aim_power_w=single_aim_power_w,
