@@ -177,8 +177,16 @@ def set_up(record: Recorder, root: Path) -> None:
         body = {"name": name, "properties": properties}
         for status in (201, 200):
             record.call("post_heliostat", "POST /v1/heliostats", status, json=body)
+    mirror = {
+        "mount": {"kind": "azimuth_elevation", "pivot_height_m": 1.8},
+        "facets": {"rows": 2, "columns": 2, "width_m": 1.6, "height_m": 1.25, "gap_m": 0.02},
+        "facet_shape": "slant_range",
+        "reflectance": 0.93,
+        "slope_error_mrad": 1.2,
+    }
+    body = {"type": mirror, "east_m": 12.0, "north_m": 85.0, "up_m": 0.0}
     for status in (201, 200):
-        record.call("put_heliostat", "PUT /v1/heliostats/AZ99", status, json=properties)
+        record.call("put_heliostat", "PUT /v1/heliostats/AZ99", status, json=body)
     record.call("delete_heliostat", "DELETE /v1/heliostats/AZ99", 204)
     record.call("list_heliostats", "GET /v1/heliostats")
     record.call("get_heliostat", "GET /v1/heliostats/AB12")

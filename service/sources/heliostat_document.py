@@ -4,22 +4,37 @@ PAINT's documents describe heliostats of the Solar Tower Juelich. This one has t
 and facets of any number, outline and focal length, in metres of east, north and up.
 """
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_validator
 
 from model.actuator import Actuator, LinearActuator, RotaryActuator
 from model.mount import Mount
 from model.plant import REFERENCE_SINE, Facet, Heliostat, MirrorOptics
-from service.base.fields import Number
-from service.sources.plant_schema import HeliostatEntry
+from service.base.fields import Flag, JsonObject, Name, Number, Position
+from service.sources.plant_schema import (
+    MAX_FACETS,
+    Angle,
+    Arm,
+    ErrorMrad,
+    HeliostatEntry,
+    Length,
+    Reflectance,
+    Steps,
+)
+from service.sources.plant_tables import MAX_CORNERS
 from service.sources.schema import parse
 
 FORMAT = "heliotwin heliostat 1"
 
-Point = tuple[Number, Number, Number]
+Short = Annotated[Number, Field(ge=-1e3, le=1e3)]
+Point = tuple[Short, Short, Short]
 Matrix = tuple[Point, Point, Point]
+Corner = Annotated[Number, Field(ge=-1.01, le=1.01)]
+
+# Largest deviation from unit length and right angles.
+_ROUNDING = 1e-6
 
 
 class _Part(BaseModel):
@@ -29,23 +44,25 @@ class _Part(BaseModel):
 class LinearDriveDocument(_Part):
     """`model.actuator.LinearActuator`."""
 
-    kind: Literal["linear"] = "linear"
-    increment: Number
-    initial_stroke_length: Number
-    offset: Number
-    pivot_radius: Number
-    initial_angle: Number
-    clockwise: bool
-    max_increment: Number
+    kind: Literal["linear"] = Field("linear", description="A spindle.")
+    increment: Steps = Field(description="Steps for one metre of stroke [1/m].")
+    initial_stroke_length: Annotated[Number, Field(ge=0, le=100)] = Field(
+        description="At zero steps [m]."
+    )
+    offset: Arm = Field(description="From the axis to the spindle's fixed end [m].")
+    pivot_radius: Arm = Field(description="From the axis to the spindle's moving end [m].")
+    initial_angle: Angle = Field(description="Axis angle at zero steps [rad].")
+    clockwise: Flag = Field(description="Whether the angle decreases as the stroke increases.")
+    max_increment: Steps = Field(description="The end of travel [steps].")
 
 
 class RotaryDriveDocument(_Part):
     """`model.actuator.RotaryActuator`."""
 
-    kind: Literal["rotary"] = "rotary"
-    increment: Number
-    initial_angle: Number
-    clockwise: bool
+    kind: Literal["rotary"] = Field("rotary", description="A drive proportional to the angle.")
+    increment: Steps = Field(description="Steps for one radian [1/rad].")
+    initial_angle: Angle = Field(description="Axis angle at zero steps [rad].")
+    clockwise: Flag = Field(description="Whether the angle decreases as the position increases.")
 
 
 DriveDocument = Annotated[LinearDriveDocument | RotaryDriveDocument, Field(discriminator="kind")]
@@ -54,32 +71,71 @@ DriveDocument = Annotated[LinearDriveDocument | RotaryDriveDocument, Field(discr
 class MountDocument(_Part):
     """`model.mount.Mount`."""
 
-    first_axis: Point
-    second_axis: Point
-    zero_attitude: Matrix
-    joint_m: Point
-    mirror_offset_m: Point
-    axis_zero_rad: tuple[Number, Number] = (0.0, 0.0)
-    drives: tuple[DriveDocument, DriveDocument] | None = None
-    jitter_axis: Literal["first", "second"] | None = None
+    first_axis: Point = Field(description="Unit vector at zero angles: east, north, up.")
+    second_axis: Point = Field(description="Unit vector at zero angles: east, north, up.")
+    zero_attitude: Matrix = Field(
+        description="Rotation of mirror coordinates to east, north, up at zero angles."
+    )
+    joint_m: Point = Field(description="The pivot of both axes from the pylon's foot [m].")
+    mirror_offset_m: Point = Field(
+        description="From the pivot to the mirror's middle, in mirror coordinates [m]."
+    )
+    axis_zero_rad: tuple[Angle, Angle] = Field(
+        (0.0, 0.0), description="Axis angles at which the drives' angles are zero [rad]."
+    )
+    drives: tuple[DriveDocument, DriveDocument] | None = Field(
+        None, description="Of the first and the second axis; null: not known."
+    )
+    jitter_axis: Literal["first", "second"] | None = Field(
+        None, description="The less stiff axis; null: the first."
+    )
+
+    @model_validator(mode="after")
+    def _rotations(self) -> Self:
+        for name in ("first_axis", "second_axis"):
+            if abs(np.linalg.norm(getattr(self, name)) - 1) > _ROUNDING:
+                raise ValueError(f"{name}: must be a vector of length 1; divide by its length")
+        attitude = np.array(self.zero_attitude)
+        is_near = np.abs(attitude @ attitude.T - np.eye(3)).max() < _ROUNDING
+        if not is_near or np.linalg.det(attitude) < 0:
+            raise ValueError("zero_attitude: must be a rotation; give orthogonal unit vectors")
+        return self
 
 
 class MirrorFacet(_Part):
     """`model.plant.Facet`."""
 
-    center_m: Point
-    half_width_m: Point
-    half_height_m: Point
-    focal_length_m: Number | None = None
-    outline: tuple[tuple[Number, Number], ...] | None = None
+    center_m: Point = Field(description="Its middle in mirror coordinates [m].")
+    half_width_m: Point = Field(description="From its middle to the right edge's [m].")
+    half_height_m: Point = Field(description="From its middle to the upper edge's [m].")
+    focal_length_m: Annotated[Number, Field(gt=0, le=1e7)] | None = Field(
+        None, description="Of its paraboloid [m]; null: flat."
+    )
+    outline: tuple[tuple[Corner, Corner], ...] | None = Field(
+        None,
+        min_length=3,
+        max_length=MAX_CORNERS,
+        description="Corners in half widths and heights [1]; null: a rectangle.",
+    )
+
+    @model_validator(mode="after")
+    def _area(self) -> Self:
+        x, y = np.array(self.half_width_m), np.array(self.half_height_m)
+        if np.linalg.norm(np.cross(x, y)) < 1e-6:
+            raise ValueError("half_width_m, half_height_m: span no area; they must not be parallel")
+        return self
 
 
 class OpticsDocument(_Part):
     """`model.plant.MirrorOptics`."""
 
-    reflectance: Number = 1.0
-    slope_error_mrad: Number = 0.0
-    pointing_error_mrad: Number = 0.0
+    reflectance: Reflectance = Field(1.0, description="Of the mirrors [1].")
+    slope_error_mrad: ErrorMrad = Field(
+        0.0, description="Of the normals, standard deviation per axis [mrad]."
+    )
+    pointing_error_mrad: ErrorMrad = Field(
+        0.0, description="Of the reflected beam, standard deviation per axis [mrad]."
+    )
 
 
 class HeliostatDocument(_Part):
@@ -88,17 +144,28 @@ class HeliostatDocument(_Part):
     ``type``, ``receiver`` and ``focal_length_m`` are those of the layout of its ``plant.yaml``.
     """
 
-    format: Literal["heliotwin heliostat 1"]
-    type: str = ""
-    position_m: Point
-    width_m: Number = Field(gt=0)
-    height_m: Number = Field(gt=0)
-    mount: MountDocument
-    facets: tuple[MirrorFacet, ...] = Field(min_length=1, max_length=256)
-    optics: OpticsDocument = OpticsDocument()
-    receiver: str | None = None
-    focal_length_m: Number | None = None
-    reference_sine: Annotated[Number, Field(ge=0, le=1)] | None = None
+    format: Literal["heliotwin heliostat 1"] = Field(description="Name and version of this format.")
+    type: Annotated[str, StringConstraints(max_length=32)] = Field(
+        "", description="Its heliostat type in plant.yaml; empty: none."
+    )
+    position_m: Position = Field(description="The pylon's foot: east, north, up [m].")
+    width_m: Annotated[Number, Field(gt=0, le=1e3)] = Field(description="Of the whole mirror [m].")
+    height_m: Annotated[Number, Field(gt=0, le=1e3)] = Field(description="Of the whole mirror [m].")
+    mount: MountDocument = Field(description="Its axes and drives.")
+    facets: list[MirrorFacet] = Field(
+        min_length=1, max_length=MAX_FACETS, description="Its facets in order."
+    )
+    optics: OpticsDocument = Field(OpticsDocument(), description="Reflectance and errors.")
+    receiver: Name | None = Field(None, description="What it was canted and focused to.")
+    focal_length_m: Length | None = Field(None, description="In place of its slant range [m].")
+    reference_sine: Annotated[Number, Field(ge=0, le=1)] | None = Field(
+        None, description="Sine of the normal's elevation at which it was canted [1]."
+    )
+
+    @property
+    def raw(self) -> JsonObject:
+        """The document as received."""
+        return self.model_dump(mode="json", exclude_unset=True)
 
 
 def is_heliostat_document(properties: Any) -> bool:
@@ -135,7 +202,7 @@ def heliostat_to_json(
             drives=drives,
             jitter_axis=mount.jitter_axis,
         ),
-        facets=tuple(map(_facet_part, heliostat.facets)),
+        facets=list(map(_facet_part, heliostat.facets)),
         optics=OpticsDocument(
             reflectance=heliostat.optics.reflectance,
             slope_error_mrad=heliostat.optics.slope_error * 1e3,

@@ -123,6 +123,8 @@ def _path(document: YamlDocument, entry: Mapping[str, Any]) -> KeyPath:
 
 def _message(entry: Mapping[str, Any], path: KeyPath) -> str:
     kind, context, value = entry["type"], entry.get("ctx", {}), entry["input"]
+    if isinstance(mistake := context.get("error"), KeyMistakeError):
+        return mistake.message  # its key is in the path
     if kind in ("literal_error", "union_tag_invalid"):
         expected = context.get("expected_tags", context.get("expected", ""))
         known = expected.replace(" or ", ", ").replace("'", "").split(", ")

@@ -230,7 +230,7 @@ class _PlantReader:
                     f"{placed.place}: type: {entry.type[:60]!r} is no heliostat type; {known}"
                 )
             goal = goals[receiver_of[entry.name]]
-            heliostats[entry.name] = _heliostat(placed, types[entry.type], goal)
+            heliostats[entry.name] = place_heliostat(placed, types[entry.type], goal)
         return heliostats
 
     def _warnings(self, layout: list[PlacedHeliostat]) -> Iterable[str]:
@@ -264,7 +264,16 @@ def _require_different(layout: list[PlacedHeliostat]) -> None:
         names[entry.name], places[foot] = placed.place, placed
 
 
-def _heliostat(placed: PlacedHeliostat, of_type: HeliostatType, goal: AnyReceiver) -> Heliostat:
+def place_heliostat(
+    placed: PlacedHeliostat, of_type: HeliostatType, goal: AnyReceiver
+) -> Heliostat:
+    """The heliostat of a type at its place, canted and focused to a receiver or target.
+
+    Raises
+    ------
+    InvalidInputError
+        If it is too near to its aim, or the model refuses it.
+    """
     entry = placed.entry
     foot = np.array([entry.east_m, entry.north_m, entry.up_m])
     aim = aim_of(goal, foot)

@@ -68,8 +68,8 @@ class KeyMistakeError(ValueError):
     """A mistake of one ``key`` of a part, found before its values are."""
 
     def __init__(self, key: str, message: str) -> None:
-        super().__init__(message)
-        self.key = key
+        super().__init__(f"{key}: {message}")
+        self.key, self.message = key, message
 
 
 def nearest(word: str, known: Sequence[str]) -> str:
@@ -104,6 +104,10 @@ Length = Annotated[Number, Field(gt=0, le=1e5)]
 Share = Annotated[Number, Field(ge=0, le=1)]
 Reflectance = Annotated[Number, Field(gt=0, le=1)]
 ErrorMrad = Annotated[Number, Field(ge=0, lt=100)]
+FacetCount = Annotated[Whole, Field(ge=1, le=MAX_FACETS)]
+Steps = Annotated[Number, Field(gt=0, le=1e12)]
+Arm = Annotated[Number, Field(gt=0, le=100)]
+Angle = Annotated[Number, Field(ge=-10, le=10)]
 Azimuth360 = Annotated[Number, Field(ge=-360, le=360, description="From north over east [deg].")]
 
 
@@ -126,31 +130,27 @@ class PlantHeader(PlantPart):
 class LinearDrive(PlantPart):
     """A spindle that turns an axis, as of `model.actuator.LinearActuator`."""
 
-    kind: Literal["linear"]
-    increment_steps_per_m: Annotated[Number, Field(gt=0, le=1e12)]
-    initial_stroke_length_m: Annotated[Number, Field(ge=0, le=100)]
-    offset_m: Annotated[Number, Field(gt=0, le=100)]
-    pivot_radius_m: Annotated[Number, Field(gt=0, le=100)]
-    initial_angle_rad: Annotated[Number, Field(ge=-10, le=10)] = Field(
-        description="Axis angle at zero steps."
+    kind: Literal["linear"] = Field(description="A spindle.")
+    increment_steps_per_m: Steps = Field(description="Steps for one metre of stroke [1/m].")
+    initial_stroke_length_m: Annotated[Number, Field(ge=0, le=100)] = Field(
+        description="At zero steps [m]."
     )
+    offset_m: Arm = Field(description="From the axis to the spindle's fixed end [m].")
+    pivot_radius_m: Arm = Field(description="From the axis to the spindle's moving end [m].")
+    initial_angle_rad: Angle = Field(description="Axis angle at zero steps [rad].")
     clockwise: Flag = Field(description="Whether the angle decreases as the stroke increases.")
-    max_increment_steps: Annotated[Number, Field(gt=0, le=1e12)] = Field(
-        description="The end of travel."
-    )
+    max_increment_steps: Steps = Field(description="The end of travel [steps].")
 
 
 class RotaryDrive(PlantPart):
     """A drive whose motor position is proportional to the axis angle."""
 
-    kind: Literal["rotary"]
-    steps_per_rad: Annotated[Number, Field(gt=0, le=1e12)] | None = None
+    kind: Literal["rotary"] = Field(description="A drive proportional to the angle.")
+    steps_per_rad: Steps | None = Field(None, description="Steps for one radian [1/rad].")
     gear: Annotated[Number, Field(gt=0, le=1e9)] | None = Field(
-        None, description="Motor turns for one turn of the axis."
+        None, description="In place of them: motor turns for one turn of the axis [1]."
     )
-    initial_angle_rad: Annotated[Number, Field(ge=-10, le=10)] = Field(
-        0.0, description="Axis angle at zero steps."
-    )
+    initial_angle_rad: Angle = Field(0.0, description="Axis angle at zero steps [rad].")
     clockwise: Flag = Field(
         False, description="Whether the angle decreases as the position increases."
     )
@@ -164,7 +164,7 @@ class RotaryDrive(PlantPart):
 class IdealDrive(PlantPart):
     """A drive that reaches every angle; its motor position is the axis angle in radians."""
 
-    kind: Literal["ideal"]
+    kind: Literal["ideal"] = Field(description="A drive without limits.")
 
 
 Drive = Annotated[LinearDrive | RotaryDrive | IdealDrive, Field(discriminator="kind")]
@@ -173,12 +173,14 @@ Drive = Annotated[LinearDrive | RotaryDrive | IdealDrive, Field(discriminator="k
 class MountEntry(PlantPart):
     """The mount: its two axes, and where they are."""
 
-    kind: Literal["azimuth_elevation", "juelich", "pitch_roll", "target_aligned"]
+    kind: Literal["azimuth_elevation", "juelich", "pitch_roll", "target_aligned"] = Field(
+        description="How its two axes are arranged."
+    )
     pivot_height_m: Annotated[Number, Field(ge=-100, le=100)] = Field(
-        0.0, description="Of both axes above the foot of the pylon."
+        0.0, description="Of both axes above the foot of the pylon [m]."
     )
     mirror_offset_m: Annotated[Number, Field(ge=-10, le=10)] = Field(
-        0.0, description="From the pivot to the mirror's middle along its normal."
+        0.0, description="From the pivot to the mirror's middle along its normal [m]."
     )
     drives: Annotated[list[Drive], Field(min_length=2, max_length=2)] | None = Field(
         None, description="Drives of the first and the second axis; ideal ones without it."
@@ -191,11 +193,11 @@ class MountEntry(PlantPart):
 class FacetGridEntry(PlantPart):
     """Equal facets in rows and columns."""
 
-    rows: Annotated[Whole, Field(ge=1, le=MAX_FACETS)]
-    columns: Annotated[Whole, Field(ge=1, le=MAX_FACETS)]
-    width_m: Extent = Field(description="Of one facet.")
-    height_m: Extent = Field(description="Of one facet.")
-    gap_m: Annotated[Number, Field(ge=0, le=10)] = Field(0.0, description="Between two facets.")
+    rows: FacetCount = Field(description="Facets above each other.")
+    columns: FacetCount = Field(description="Facets side by side.")
+    width_m: Extent = Field(description="Of one facet [m].")
+    height_m: Extent = Field(description="Of one facet [m].")
+    gap_m: Annotated[Number, Field(ge=0, le=10)] = Field(0.0, description="Between two facets [m].")
 
     @model_validator(mode="after")
     def _few(self) -> Self:
@@ -215,21 +217,23 @@ class FacetFileEntry(PlantPart):
 class FocusEntry(PlantPart):
     """A focal length that all facets of a type have."""
 
-    focal_length_m: Length
+    focal_length_m: Length = Field(description="Of each facet's paraboloid [m].")
 
 
 class SunDirection(PlantPart):
     """A sun as seen: azimuth from north over east, elevation."""
 
     azimuth_deg: Azimuth360
-    elevation_deg: Annotated[Number, Field(gt=0, le=90)]
+    elevation_deg: Annotated[Number, Field(gt=0, le=90, description="Above the horizon [deg].")]
 
 
 class CantingEntry(PlantPart):
     """Canting to a focal length, or for one position of the sun."""
 
-    focal_length_m: Length | None = None
-    off_axis: SunDirection | None = None
+    focal_length_m: Length | None = Field(None, description="On axis, to this focal length [m].")
+    off_axis: SunDirection | None = Field(
+        None, description="In place of it: for the sun in this direction."
+    )
 
     @model_validator(mode="after")
     def _one_way(self) -> Self:
@@ -237,40 +241,41 @@ class CantingEntry(PlantPart):
         return self
 
 
+FacetsEntry = Annotated[
+    Annotated[FacetGridEntry, Tag("(grid)")] | Annotated[FacetFileEntry, Tag("(file)")],
+    Discriminator(_facet_source),
+]
+CantingChoice = Annotated[
+    Annotated[Literal["on_axis", "flat", "individual"], Tag("(word)")]
+    | Annotated[CantingEntry, Tag("(object)")],
+    Discriminator(_form),
+]
+
+
 class HeliostatTypeEntry(PlantPart):
     """What the heliostats of one type have in common."""
 
-    mount: MountEntry
-    facets: Annotated[
-        Annotated[FacetGridEntry, Tag("(grid)")] | Annotated[FacetFileEntry, Tag("(file)")],
-        Discriminator(_facet_source),
-    ]
+    mount: MountEntry = Field(description="Its axes and drives.")
+    facets: FacetsEntry = Field(description="A grid of equal ones, or a CSV file with one a line.")
     facet_shape: Annotated[
         Annotated[Literal["flat", "slant_range"], Tag("(word)")]
         | Annotated[FocusEntry, Tag("(object)")],
         Discriminator(_form),
     ] = Field("flat", description="Each facet is a paraboloid of this focal length, or flat.")
-    canting: (
-        Annotated[
-            Annotated[Literal["on_axis", "flat", "individual"], Tag("(word)")]
-            | Annotated[CantingEntry, Tag("(object)")],
-            Discriminator(_form),
-        ]
-        | None
-    ) = Field(
+    canting: CantingChoice | None = Field(
         None, description="on_axis without it, or individual if the facets' file has their normals."
     )
-    reflectance: Reflectance = 1.0
+    reflectance: Reflectance = Field(1.0, description="Of the mirrors [1].")
     slope_error_mrad: ErrorMrad = Field(
-        0.0, description="Of the normals, standard deviation per axis."
+        0.0, description="Of the normals, standard deviation per axis [mrad]."
     )
     pointing_error_mrad: ErrorMrad = Field(
-        0.0, description="Of the reflected beam, standard deviation per axis."
+        0.0, description="Of the reflected beam, standard deviation per axis [mrad]."
     )
     reference_elevation_deg: Annotated[Number, Field(ge=0, le=90)] = Field(
         30.0,
-        description="Elevation of the mirror's normal at which its facets were canted. At others"
-        " the mirror sags by the effect gravity_bending.",
+        description="Elevation of the mirror's normal at which its facets were canted [deg]. At"
+        " others the mirror sags by the effect gravity_bending.",
     )
 
 
@@ -290,6 +295,12 @@ class HeliostatEntry(PlantPart):
         None, description="What it is canted and focused to; the first receiver without it."
     )
     focal_length_m: Length | None = Field(None, description="In place of its slant range.")
+
+
+TypeChoice = Annotated[
+    Annotated[NumberedName, Tag("(word)")] | Annotated[HeliostatTypeEntry, Tag("(object)")],
+    Discriminator(_form),
+]
 
 
 class LayoutEntry(PlantPart):

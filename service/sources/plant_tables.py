@@ -82,8 +82,13 @@ class CsvColumns:
 
 
 def read_rows(path: Path, columns: CsvColumns, most: int) -> list[CsvRow]:
-    """Rows of a CSV file with one line of column names; blank lines and those from ``#`` on are
-    skipped.
+    """Rows of a CSV file; raises what `parse_rows` raises."""
+    return parse_rows(file_name(path), read_text(path, MAX_CSV_BYTES), columns, most)
+
+
+def parse_rows(name: str, text: str, columns: CsvColumns, most: int) -> list[CsvRow]:
+    """Rows of the text of a CSV file with one line of column names; blank lines and those from
+    ``#`` on are skipped.
 
     Raises
     ------
@@ -91,8 +96,7 @@ def read_rows(path: Path, columns: CsvColumns, most: int) -> list[CsvRow]:
         If it cannot be read, columns are missing, unknown or there twice, a line has other than one
         cell a column, or there are no rows or more than ``most``. It names file and line.
     """
-    name = file_name(path)
-    lines = _lines(path, name)
+    lines = _lines(name, text)
     try:
         head = next(lines, None)
         if head is None:
@@ -114,9 +118,8 @@ def read_rows(path: Path, columns: CsvColumns, most: int) -> list[CsvRow]:
     return rows
 
 
-def _lines(path: Path, name: str) -> Iterator[CsvRow]:
+def _lines(name: str, text: str) -> Iterator[CsvRow]:
     """Lines that are not blank, their cells by column number."""
-    text = read_text(path, MAX_CSV_BYTES)
     reader = csv.reader(io.StringIO(text, newline=""))
     for cells in reader:
         place = f"{name}, line {reader.line_num}"
@@ -200,7 +203,12 @@ _FACETS = CsvColumns(
 
 
 def read_facets(path: Path) -> tuple[FacetDesign, ...]:
-    """Facets of a facets file.
+    """Facets of a facets file; raises what `parse_facets` raises."""
+    return parse_facets(file_name(path), read_text(path, MAX_CSV_BYTES))
+
+
+def parse_facets(name: str, text: str) -> tuple[FacetDesign, ...]:
+    """Facets of the text of a facets file.
 
     Each has a centre [m] in mirror coordinates (x to the right seen from the front, y up the
     mirror, z out of it), an optional normal or canting (slopes along x and y [mrad]), and width and
@@ -211,10 +219,10 @@ def read_facets(path: Path) -> tuple[FacetDesign, ...]:
     InvalidInputError
         It names file and line.
     """
-    rows = read_rows(path, _FACETS, MAX_FACETS)
+    rows = parse_rows(name, text, _FACETS, MAX_FACETS)
     if _NORMAL[0] in rows[0].cells and _CANTING[0] in rows[0].cells:
         raise InvalidInputError(
-            f"{file_name(path)}, line 1: has normals and cantings; keep the columns of one"
+            f"{name}, line 1: has normals and cantings; keep the columns of one"
         )
     return tuple(map(_facet, rows))
 

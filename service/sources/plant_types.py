@@ -1,6 +1,8 @@
 """Heliostat types of ``plant.yaml``."""
 
 import math
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 
 from model.actuator import Actuator, LinearActuator, RotaryActuator
@@ -21,20 +23,54 @@ from service.sources.plant_schema import (
     MountEntry,
     RotaryDrive,
 )
-from service.sources.plant_tables import MAX_CSV_BYTES, read_facets
+from service.sources.plant_tables import MAX_CSV_BYTES, parse_facets, read_facets
 from service.sources.yaml_text import KeyPath
 
 
 def read_type(plant: PlantText, name: str) -> HeliostatType:
     """The heliostat type of this name."""
-    entry = plant.entries.heliostat_types[name]
     path: KeyPath = ("heliostat_types", name)
-    facets = _facets(plant, entry.facets, path)
+
+    def facets_of(file: str) -> tuple[FacetDesign, ...]:
+        return read_facets(plant.file(file, *path, "facets", "file"))
+
+    return _type(name, plant.entries.heliostat_types[name], partial(plant.place, *path), facets_of)
+
+
+def type_of_entry(name: str, entry: HeliostatTypeEntry, files: Mapping[str, str]) -> HeliostatType:
+    """The heliostat type of an entry; ``files`` are texts of facets files by name.
+
+    Raises
+    ------
+    InvalidInputError
+        It names the field of `service.sources.heliostat_of_type.HeliostatOfType`.
+    """
+
+    def facets_of(file: str) -> tuple[FacetDesign, ...]:
+        if file not in files:
+            known = f", which has {', '.join(files)}" if files else ""
+            raise InvalidInputError(
+                f"facets.file: {file[:60]!r} is no facets file of the imported plant{known}; give"
+                " rows and columns, or import a plant.yaml that names the file"
+            )
+        return parse_facets(file, files[file])
+
+    return _type(name, entry, lambda *path: ".".join(map(str, path)) or "type", facets_of)
+
+
+def _type(
+    name: str,
+    entry: HeliostatTypeEntry,
+    place: Callable[..., str],
+    facets_of: Callable[[str], tuple[FacetDesign, ...]],
+) -> HeliostatType:
+    """The type of an entry, whose keys have a ``place`` in messages."""
+    facets = _facets(entry.facets, facets_of)
     optics = MirrorOptics(
         entry.reflectance, entry.slope_error_mrad / 1e3, entry.pointing_error_mrad / 1e3
     )
-    canting = _canting(plant, entry.canting, facets, path)
-    with mistakes_at(plant.place(*path)):
+    canting = _canting(entry.canting, facets, place("canting"))
+    with mistakes_at(place()):
         return HeliostatType(
             name,
             facets,
@@ -66,30 +102,27 @@ def types_to_json(path: Path) -> JsonObject:
 
 
 def _facets(
-    plant: PlantText, grid: FacetGridEntry | FacetFileEntry, path: KeyPath
+    grid: FacetGridEntry | FacetFileEntry, facets_of: Callable[[str], tuple[FacetDesign, ...]]
 ) -> tuple[FacetDesign, ...]:
     if isinstance(grid, FacetFileEntry):
-        return read_facets(plant.file(grid.file, *path, "facets", "file"))
+        return facets_of(grid.file)
     return facet_grid(grid.rows, grid.columns, grid.width_m, grid.height_m, grid.gap_m)
 
 
 def _canting(
-    plant: PlantText,
-    chosen: str | CantingEntry | None,
-    facets: tuple[FacetDesign, ...],
-    path: KeyPath,
+    chosen: str | CantingEntry | None, facets: tuple[FacetDesign, ...], place: str
 ) -> Canting:
     """The canting; that of the facets' file is individual."""
     has_normals = facets[0].normal is not None
     given = chosen or ("individual" if has_normals else "on_axis")
     if has_normals and given != "individual":
         raise InvalidInputError(
-            f"{plant.place(*path, 'canting')}: the facets' file has their normals; write"
+            f"{place}: the facets' file has their normals; write"
             " individual, or leave them out of it"
         )
     if given == "individual" and not has_normals:
         raise InvalidInputError(
-            f"{plant.place(*path, 'canting')}: individual needs each facet's normal; write a"
+            f"{place}: individual needs each facet's normal; write a"
             " facets file with normal_x, normal_y, normal_z, or another canting"
         )
     return _model_canting(given)

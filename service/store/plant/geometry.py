@@ -343,6 +343,15 @@ def get_target_or_receiver(session: Session, name: str) -> AnyReceiver:
     return target_plane(get_target(session, name)) if row is None else stored_receiver(row)
 
 
+def goals_of_heliostats(session: Session) -> dict[str, AnyReceiver]:
+    """What heliostats may be canted to by name: receivers, then targets, the first stored first."""
+    receivers = session.scalars(select(ReceiverRow).order_by(ReceiverRow.id))
+    targets = session.scalars(select(TargetRow).order_by(TargetRow.id))
+    return {row.name: stored_receiver(row) for row in receivers} | {
+        row.name: target_plane(row) for row in targets
+    }
+
+
 def put_plant_facts(session: Session, facts: PlantFacts) -> Change:
     """Set what is known of the plant besides its geometry; what is None stays as it is."""
     return assign(

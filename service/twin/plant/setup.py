@@ -15,6 +15,7 @@ from model.plant import Plant, Receiver, TargetPlane
 from service import store
 from service.base.plant_facts import NO_FACTS, PlantFacts
 from service.sources.documents import read_heliostat
+from service.sources.heliostat_of_type import HeliostatOfType, document_of
 from service.sources.paint_documents import Corners
 from service.store import Change, audit
 from service.store.plant.model_versions import put_declared
@@ -94,7 +95,7 @@ def set_receiver(session: Session, actor: str, receiver: Receiver) -> Put[Receiv
 def set_heliostat(
     session: Session, actor: str, name: str, properties: dict[str, object], replace: bool = True
 ) -> Put[HeliostatRow]:
-    """Set a heliostat's PAINT properties; raises what `store.put_heliostat` raises.
+    """Set a heliostat's properties; raises what `store.put_heliostat` raises.
 
     The model must be able to read them, so that all stored heliostats can be traced.
     """
@@ -103,6 +104,15 @@ def set_heliostat(
     )
     _note(session, actor, "heliostat", name, put.change)
     return put
+
+
+def set_heliostat_of_type(
+    session: Session, actor: str, name: str, given: HeliostatOfType, replace: bool = True
+) -> Put[HeliostatRow]:
+    """Set a heliostat in the terms of ``plant.yaml``; raises what `document_of` raises, too."""
+    store.serialize_writers(session)  # types and receivers must not change before it is written
+    types, goals = store.get_plant(session).heliostat_types, store.goals_of_heliostats(session)
+    return set_heliostat(session, actor, name, document_of(name, given, types, goals), replace)
 
 
 def remove(

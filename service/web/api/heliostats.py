@@ -1,14 +1,18 @@
 """Heliostats."""
 
 from datetime import datetime
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Query, Response, status
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, Discriminator, Field, Tag
+from sqlalchemy.orm import Session
 
 from service import store
 from service.base.fields import HeliostatOf, Model, Name, Search, from_row
+from service.sources.heliostat_document import HeliostatDocument
+from service.sources.heliostat_of_type import HeliostatOfType
 from service.sources.schema import HeliostatProperties
+from service.store.rows import Put
 from service.store.tables import HeliostatRow
 from service.twin.plant import setup
 from service.web.auth.dependencies import (
@@ -23,12 +27,40 @@ from service.web.auth.dependencies import (
 from service.web.responses.openapi import problems
 from service.web.responses.paging import Page, page
 
+_FORMS = {
+    "heliostat_position": "(paint)",
+    "format": "(document)",
+    "position_m": "(document)",
+    "type": "(type)",
+    "east_m": "(type)",
+}
+"""Forms of a heliostat's properties by keys; the first key that is there decides."""
+
+
+def _form(properties: Any) -> str:
+    known = _FORMS.items() if isinstance(properties, dict) else ()
+    return next((form for key, form in known if key in properties), "(paint)")
+
+
+AnyHeliostat = Annotated[
+    Annotated[HeliostatProperties, Tag("(paint)")]
+    | Annotated[HeliostatOfType, Tag("(type)")]
+    | Annotated[HeliostatDocument, Tag("(document)")],
+    Discriminator(_form),
+    Field(
+        description=(
+            "Its type and place in the terms of plant.yaml, or PAINT's properties, or what GET"
+            " gives as `properties`."
+        )
+    ),
+]
+
 
 class HeliostatIn(Model):
     """A heliostat to store."""
 
     name: Name
-    properties: HeliostatProperties = Field(description="PAINT properties.")
+    properties: AnyHeliostat
 
 
 class HeliostatSummary(BaseModel):
@@ -43,7 +75,12 @@ class HeliostatSummary(BaseModel):
 class HeliostatOut(HeliostatSummary):
     """A heliostat with its properties."""
 
-    properties: dict[str, object] = Field(description="PAINT properties as they were sent.")
+    properties: dict[str, object] = Field(
+        description=(
+            "PAINT's as they were sent; of other heliostats a document with axes and facets. PUT"
+            " takes both."
+        )
+    )
     updated_at: datetime = Field(description="When it was last changed.")
 
 
@@ -55,6 +92,18 @@ def heliostat_summary(row: HeliostatRow) -> HeliostatSummary:
 def heliostat_out(row: HeliostatRow) -> HeliostatOut:
     """A heliostat as JSON."""
     return from_row(HeliostatOut, row, position_m=(row.east_m, row.north_m, row.up_m))
+
+
+def _set(
+    session: Session,
+    actor: str,
+    name: str,
+    given: HeliostatProperties | HeliostatOfType | HeliostatDocument,
+    replace: bool = True,
+) -> Put[HeliostatRow]:
+    if isinstance(given, HeliostatOfType):
+        return setup.set_heliostat_of_type(session, actor, name, given, replace)
+    return setup.set_heliostat(session, actor, name, given.raw, replace)
 
 
 router = APIRouter(tags=["heliostats"])
@@ -96,8 +145,8 @@ def post_heliostat(
     The same heliostat again is no error. The same name with other properties is refused; use PUT.
     """
     row, change = runtime.database.run_in_transaction(
-        lambda session: setup.set_heliostat(
-            session, identity.name, request.name, request.properties.raw, replace=False
+        lambda session: _set(
+            session, identity.name, request.name, request.properties, replace=False
         )
     )
     if change is store.Change.UNCHANGED:
@@ -124,14 +173,19 @@ def get_heliostat(name: NamePath, runtime: RuntimeDep) -> HeliostatOut:
 )
 def put_heliostat(
     name: NamePath,
-    properties: HeliostatProperties,
+    properties: AnyHeliostat,
     runtime: RuntimeDep,
     identity: IdentityDep,
     response: Response,
 ) -> HeliostatOut:
-    """Set the properties of a heliostat (PAINT)."""
+    """Set a heliostat of any type.
+
+    In the terms of plant.yaml it has a `type`, by its name in the imported plant.yaml or written
+    out, and the place of its foot. PAINT's properties, and what GET gives as `properties`, are
+    taken as well.
+    """
     row, change = runtime.database.run_in_transaction(
-        lambda session: setup.set_heliostat(session, identity.name, name, properties.raw)
+        lambda session: _set(session, identity.name, name, properties)
     )
     if change is store.Change.NEW:
         response.status_code = status.HTTP_201_CREATED

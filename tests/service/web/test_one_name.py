@@ -14,8 +14,10 @@ PAINT = {
     "KinematicsProperties",
     "PowerPlantProperties",
     "TowerMeasurements",
+    "LinearDriveDocument",
+    "RotaryDriveDocument",
 }
-"""Schemas of PAINT's documents, which keep their names."""
+"""Schemas with the names of PAINT's documents, which stay."""
 
 FORMER = {
     "age",
@@ -43,7 +45,7 @@ FORMER = {
 }
 """Names that a quantity had beside its present one."""
 
-UNIT = re.compile(r"(^|_)(m|mm|m2|m_s|mrad|rad|deg|s|h|minutes|days|w|w_m2|c|px|bits|wgs84)$")
+UNIT = re.compile(r"(^|_)(m|mm|m2|m_s|mrad|rad|deg|s|h|minutes|days|w|w_m2|c|px|bits|steps|wgs84)$")
 """How the name of a physical quantity ends."""
 
 WITHOUT_UNIT = {
@@ -53,19 +55,32 @@ WITHOUT_UNIT = {
     "accuracy_before",
     "accuracy_mean",
     "accuracy_median",
+    "attenuation",
+    "blocking",
+    "cosine",
+    "gear",
+    "intercept",
     "mahalanobis_distance",
     "misfit",
     "noise_floor",
+    "optical_efficiency",
     "per_image",
     "progress",
+    "reference_sine",
+    "reflectance",
+    "shading",
     "unexplained_share",
     # Of cameras: matrices, and coefficients of a lens.
     "distortion",
     "homography",
     "rotation",
-    # Directions.
+    # Directions, a rotation of the mirror, and corners by the sides of their facet.
+    "first_axis",
     "normal",
+    "outline",
+    "second_axis",
     "up",
+    "zero_attitude",
     # Steps of drives.
     "motor_position",
     # Planes and receivers [m], and corners [px] or in WGS84.

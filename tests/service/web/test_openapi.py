@@ -19,6 +19,8 @@ UNITS = {
     "minutes": "[min]",
     "mm": "[mm]",
     "mrad": "[mrad]",
+    "per_m": "[1/m]",
+    "per_rad": "[1/rad]",
     "px": "[px]",
     "rad": "[rad]",
     "s": "[s]",
