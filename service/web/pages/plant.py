@@ -1,7 +1,8 @@
 """Pages of the plant: targets, receivers and model, and settings, keys and audit trail."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import NoneType
 from typing import Annotated
 
 import numpy as np
@@ -10,6 +11,7 @@ from fastapi.responses import HTMLResponse
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
+from model.locating import BracketMarks, CameraCorners, CameraHomography, CameraPose, SheetEdges
 from model.receivers import Cavity
 from service import store
 from service.base.fields import Version
@@ -25,6 +27,21 @@ from service.web.responses.pages import render
 router = APIRouter(include_in_schema=False, prefix="/plant")
 
 _PAGE = 100
+
+
+_LOCATED_BY: Mapping[type, str] = {
+    NoneType: "L and T marks",
+    BracketMarks: "L brackets",
+    SheetEdges: "edges",
+    CameraCorners: "camera, by corners",
+    CameraHomography: "camera, by homography",
+    CameraPose: "camera, by pose",
+}
+"""What shows in photographs where a target is, by its locator; without one as at Juelich."""
+
+
+def _located_by(row: TargetRow) -> str:
+    return _LOCATED_BY[type(store.target_plane(row).locator)]
 
 
 def _targets(session: Session) -> Sequence[tuple[TargetRow, int]]:
@@ -111,6 +128,7 @@ def get_plant_page(request: Request, runtime: RuntimeDep) -> HTMLResponse:
         types=_type_lines(plant),
         model=model,
         place=_place,
+        located_by=_located_by,
         sun=sun,
     )
 

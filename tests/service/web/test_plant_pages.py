@@ -1,5 +1,6 @@
 """Pages of a store that an import of another plant filled: heliostats of 28 and of 3 facets."""
 
+import csv
 from collections.abc import Iterator
 
 import numpy as np
@@ -56,3 +57,27 @@ def test_page_of_the_plant_has_the_heliostat_types(other_plant: TestClient):
     page = Page(other_plant.get("/plant", headers={"Accept": "text/html"}).text)
     assert "28 of 1.8 × 1.35 m" in page.words
     assert "as in facets.csv" in page.words
+
+
+_SQUARE = [[9, 9], [90, 9], [9, 90], [90, 90]]
+_MATRIX = [[0.01, 0, -7], [0, -0.01, 7], [0, 0, 1]]
+_POSE = {"position_m": [0, 90, 20], "look_at_m": [0, 5, 20], "field_of_view_deg": 20}
+
+
+def test_page_of_the_plant_has_what_locates_targets(other_plant: TestClient):
+    ways = {
+        "L and T marks": {},
+        "L brackets": {"marks": "l_brackets"},
+        "edges": {"marks": "none"},
+        "camera, by corners": {"camera": {"corners_px": _SQUARE}},
+        "camera, by homography": {"camera": {"homography": _MATRIX}},
+        "camera, by pose": {"camera": {"pose": _POSE}},
+    }
+    plane = {"center": [0, 5, 20], "normal": [0, 1, 0], "width": 8, "height": 8}
+    for number, declared in enumerate(ways.values()):
+        put = other_plant.put(f"/v1/targets/sheet-{number}", json={"plane": plane} | declared)
+        assert put.status_code == 201, put.text
+    page = other_plant.get("/plant?table=targets", headers={"Accept": "text/html"})
+    rows = csv.DictReader(page.text.removeprefix("\ufeff").splitlines())
+    shown = [row["Located by"] for row in rows if row["Target"].startswith("sheet")]
+    assert shown == list(ways)
