@@ -38,7 +38,7 @@ from service.base.fields import (
 )
 from service.jobs.common import require_some
 from service.jobs.kind import Context, Kind, Result
-from service.jobs.kinds.field_forecasts import FleetForecastIn, expected_s
+from service.jobs.kinds.field_forecasts import Fleet, FleetForecastIn, expected_s
 from service.sources.limits import Limit
 from service.store.jobs import queue
 from service.store.tables import HeliostatRow
@@ -52,7 +52,6 @@ from service.twin.forecasts.field_forecast import (
     trace_kernels,
 )
 from service.twin.forecasts.heliostat_forecast import position_of, receiver_as_json
-from service.twin.plant import model_versions
 from service.twin.runtime.runtime import Runtime
 
 MAX_STEPS = 100
@@ -234,27 +233,25 @@ def plan_field(context: Context, payload: AimPlanIn) -> Result:
     runtime = context.runtime
     with runtime.database.reading() as session:
         suns = _suns(session, payload, plant_time_zone(session, runtime.settings.time_zone))
-        model = model_versions.get_model(session, payload.model_version)
-        receiver = payload.on(session)
-    asked = payload.model_copy(update={"model_version": model.number})
-    names = _require_few_aims(asked, runtime, suns)
+    fleet = payload.fleet(runtime)
+    names = _require_few_aims(fleet, suns)
     with runtime.database.reading() as session:
-        drives = AimDrives.read(session, names, model)
+        drives = AimDrives.read(session, names, fleet.model)
         sources = sources_of(session, names, payload.model_version)
     done = context.steps()
     if SOURCES not in done:
         with runtime.database.writing() as session:
             context.keep(session, SOURCES, sources)
-    planner = _Planner(context, asked, receiver, drives, suns)
+    planner = _Planner(context, payload, fleet, _in_front(runtime, fleet), drives, suns)
     for index in range(len(suns.steps)):
         if step_name(index) not in done:
             planner.plan(index)
-    return _result(context, asked, planner)
+    return _result(context, payload, planner)
 
 
-def _require_few_aims(payload: AimPlanIn, runtime: Runtime, suns: _Suns) -> list[str]:
+def _require_few_aims(fleet: Fleet, suns: _Suns) -> list[str]:
     """Names of the plan's heliostats; ConflictError if there are too many with its steps."""
-    names = list(payload.fleet(runtime, suns.steps[0][1], ideal=True).names)
+    names = list(fleet.names)
     if len(names) * len(suns.steps) > MAX_AIMS:
         raise ConflictError(
             f"{len(suns.steps)} steps of {len(names)} heliostats are too many; a plan has at most"
@@ -298,22 +295,26 @@ class StepAims:
 
 @dataclass(frozen=True, eq=False)
 class _Planner:
-    """Plan the steps of a job, each from the step before."""
+    """Plan the steps of a job, each from the step before.
+
+    ``nearest_first`` is the ``fleet`` as of `_in_front`.
+    """
 
     context: Context
     asked: AimPlanIn
-    receiver: Receiver
+    fleet: Fleet
+    nearest_first: Fleet
     drives: AimDrives
     suns: _Suns
 
     def plan(self, index: int) -> None:
         """Plan a step and store it."""
-        context, asked, receiver = self.context, self.asked, self.receiver
+        context, asked, receiver = self.context, self.asked, self.fleet.receiver
         runtime, (at, sun) = context.runtime, self.suns.steps[index]
         resolution = asked.resolution or square_pixels(receiver, ROWS)
         begun = time.perf_counter()
-        fleet = asked.fleet(runtime, sun, asked.surface == "ideal")
-        group = _in_front(runtime, fleet)
+        is_ideal = asked.surface == "ideal"
+        group = self.nearest_first.under(sun, is_ideal)
 
         def report(share: float, message: str, **_counts: Any) -> None:
             self._report(index, share, message)
@@ -326,12 +327,16 @@ class _Planner:
         aimed = time.perf_counter()
         report(0.85, "what the plan is worth")
         single = forecast_group(
-            runtime, replace(fleet, aims={}), resolution, asked.neighbours, _unreported(context)
+            runtime,
+            replace(self.fleet, aims={}).under(sun, is_ideal),
+            resolution,
+            asked.neighbours,
+            _unreported(context),
         )
         require_some(single.heliostats, single.skipped)
         power = (
             sum(one.area * one.intercepted for one in single.losses.values())
-            * fleet.model.optics.dni
+            * group.model.optics.dni
         )
         maps = {
             "flux": plan.flux.numpy().reshape(resolution),
@@ -344,7 +349,7 @@ class _Planner:
             "exceeded": excess_of(maps["flux"], maps["limit"], receiver),
             "single_aim_exceeded": excess_of(maps["single_aim_flux"], maps["limit"], receiver),
             "sun": sun.model_dump(),
-            "dni_w_m2": fleet.model.optics.dni,
+            "dni_w_m2": group.model.optics.dni,
             "heliostats": len(kernels),
             "seconds": {
                 "images": round(traced - begun, 3),
@@ -436,7 +441,7 @@ def _aim_arrays(plan: AimPlan, receiver: Receiver) -> dict[str, NDArray[Any]]:
 
 def _result(context: Context, asked: AimPlanIn, planner: _Planner) -> Result:
     """The result of all steps; the aims are kept apart from its figures."""
-    kept, suns, receiver = context.steps(), planner.suns, planner.receiver
+    kept, suns, receiver = context.steps(), planner.suns, planner.fleet.receiver
     steps = [kept[step_name(index)] for index in range(len(suns.steps))]
     figures = [step["figures"] for step in steps]
     skipped: dict[str, str] = {}
@@ -446,7 +451,7 @@ def _result(context: Context, asked: AimPlanIn, planner: _Planner) -> Result:
     heliostats = max(one["heliostats"] for one in figures)
     result: dict[str, object] = {
         "warnings": group_warnings(len(ideal), heliostats),
-        "model_version": asked.model_version,
+        "model_version": planner.fleet.model.number,
         "date": None if suns.day is None else suns.day.isoformat(),
         "heliostats": heliostats,
         "skipped": skipped,
@@ -473,8 +478,8 @@ def _result(context: Context, asked: AimPlanIn, planner: _Planner) -> Result:
     return Result(result, planner.largest())
 
 
-def _in_front(runtime: Runtime, fleet: HeliostatGroup) -> HeliostatGroup:
-    """The group from near to far, aimed at the surface toward each heliostat.
+def _in_front(runtime: Runtime, fleet: Fleet) -> Fleet:
+    """The fleet from near to far, aimed at the surface toward each heliostat.
 
     Images of heliostats that are traced together have one size.
     """

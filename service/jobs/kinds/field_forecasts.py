@@ -2,17 +2,19 @@
 
 import json
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, field
 from hashlib import sha256
 from typing import Any, Literal, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from sqlalchemy.orm import Session
 
 from model.fleet import LOSSES, FleetFlux, Losses
 from model.frames import sun_direction
-from model.plant import Receiver
+from model.plant import Receiver, Tower
 from service import store
 from service.base.fields import (
     AnySun,
@@ -98,8 +100,8 @@ class FleetIn(Model):
         assert self.target is not None  # the schema requires one of the three
         return store.get_target_or_receiver(session, self.target)
 
-    def fleet(self, runtime: Runtime, sun: Sun, ideal: bool) -> HeliostatGroup:
-        """The heliostats under this sun, with their current surfaces or ``ideal`` ones."""
+    def fleet(self, runtime: Runtime) -> "Fleet":
+        """The heliostats as the store has them now."""
         names = chosen_names(runtime, self.heliostats)
         with runtime.database.reading() as session:
             receiver = self.on(session)
@@ -107,16 +109,15 @@ class FleetIn(Model):
             tower = store.stored_tower(session)
             altitude = store.get_plant(session).altitude_m
             around = self._around(session)
-        return HeliostatGroup(
-            names=[name for name in names if name not in around],
-            receiver=receiver,
-            sun=sun_direction(sun.azimuth_deg, sun.elevation_deg),
-            model=model.with_dni(dni_of(self.dni_w_m2, sun.elevation_deg, altitude)),
-            aim=np.array(receiver.aim if self.aim_point_m is None else self.aim_point_m),
-            aims=self.aim_points_m,
-            ideal=ideal,
-            tower=tower,
-            around=around,
+        return Fleet(
+            self,
+            [name for name in names if name not in around],
+            receiver,
+            model,
+            self.aim_points_m,
+            tower,
+            altitude,
+            around,
         )
 
     def _around(self, session: Session) -> dict[str, np.ndarray[Any, Any]]:
@@ -131,6 +132,38 @@ class FleetIn(Model):
             goal: store.get_target_or_receiver(session, goal).aim for goal in set(given.values())
         }
         return {name: aims[goal] for name, goal in given.items() if goal != self.target}
+
+
+@dataclass(frozen=True, eq=False)
+class Fleet:
+    """The heliostats of a request, read once for all suns; see `HeliostatGroup`.
+
+    ``altitude`` is the plant's [m].
+    """
+
+    request: FleetIn
+    names: Sequence[str]
+    receiver: Receiver
+    model: model_versions.ModelVersion
+    aims: Mapping[str, Sequence[float]]
+    tower: Tower | None
+    altitude: float
+    around: Mapping[str, NDArray[np.float64]]
+
+    def under(self, sun: Sun, ideal: bool) -> HeliostatGroup:
+        """The heliostats under this sun, with their current surfaces or ``ideal`` ones."""
+        aim, sunlight = self.request.aim_point_m, self.request.dni_w_m2
+        return HeliostatGroup(
+            names=self.names,
+            receiver=self.receiver,
+            sun=sun_direction(sun.azimuth_deg, sun.elevation_deg),
+            model=self.model.with_dni(dni_of(sunlight, sun.elevation_deg, self.altitude)),
+            aim=np.array(self.receiver.aim if aim is None else aim),
+            aims=self.aims,
+            ideal=ideal,
+            tower=self.tower,
+            around=self.around,
+        )
 
 
 class FleetForecastIn(FleetIn):
@@ -161,7 +194,7 @@ def forecast_field(context: Context, payload: FleetForecastIn) -> Result:
     """Sum the heliostats' flux maps [W/m2]. A restarted job continues from its checkpoint."""
     with context.runtime.database.reading() as session:
         sun = position_of(session, payload.sun)
-    fleet = payload.fleet(context.runtime, sun, payload.surface == "ideal")
+    fleet = payload.fleet(context.runtime).under(sun, payload.surface == "ideal")
     saved = _Checkpoints(context, _fingerprint(fleet))
     total = forecast_group(
         context.runtime,

@@ -19,11 +19,10 @@ from service.base.fields import Metres, Moment, Name, Number, Resolution, Sun, T
 from service.jobs.common import require_some
 from service.jobs.kind import Context, Kind, Result
 from service.jobs.kinds.aim_plans import PlannedAims
-from service.jobs.kinds.field_forecasts import FleetIn, expected_s
+from service.jobs.kinds.field_forecasts import Fleet, FleetIn, expected_s
 from service.twin.forecasts.field_forecast import HeliostatGroup, forecast_group, group_warnings
 from service.twin.forecasts.heliostat_forecast import receiver_as_json
 from service.twin.forecasts.watts import FieldWatts, field_watts
-from service.twin.plant import model_versions
 
 MAX_TIMES = 100
 """Maximum number of times of a plan."""
@@ -180,18 +179,17 @@ def plan_day(context: Context, payload: PlanIn) -> Result:
     Both use the same heliostats. Each time is a step of the job.
     """
     with context.runtime.database.reading() as session:
-        receiver = payload.on(session)
-        model = model_versions.get_model(session, payload.model_version)
         planned = None if payload.aim_plan is None else PlannedAims.read(session, payload.aim_plan)
-    aims = {name: aim_on(receiver, *offset) for name, offset in payload.aim_offsets_m.items()}
-    request = payload.model_copy(
-        update={"model_version": model.number, "aim_points_m": payload.aim_points_m | aims}
-    )
+    stored = payload.fleet(context.runtime)
+    receiver = stored.receiver
+    offsets = payload.aim_offsets_m.items()
+    aims = payload.aim_points_m | {name: aim_on(receiver, *offset) for name, offset in offsets}
+    stored = replace(stored, aims=aims)
     suns, done = _suns(context, payload), context.steps()
     require_some(len(suns), {"the sun": "it is night from first_at to last_at"})
     for index, (at, sun) in enumerate(suns):
         if map_name(index) not in done:
-            _plan_time(_Time(context, request, receiver, planned, index, len(suns), at, sun))
+            _plan_time(_Time(context, payload, stored, planned, index, len(suns), at, sun))
     steps = context.steps()
     fleet = steps.pop(_FLEET)
     peak = _peak(context, len(suns))
@@ -203,7 +201,7 @@ def plan_day(context: Context, payload: PlanIn) -> Result:
         "heliostats": heliostats,
         "times": len(suns),
         "left_out": payload.count() - len(suns),
-        "model_version": model.number,
+        "model_version": stored.model.number,
         "aim_plan": payload.aim_plan,
         "plane": receiver_as_json(receiver),
         "steps": [steps[map_name(index)] for index in range(len(suns))],
@@ -218,7 +216,7 @@ class _Time:
 
     context: Context
     asked: PlanIn
-    receiver: Receiver
+    stored: Fleet
     planned: PlannedAims | None
     index: int
     total: int
@@ -227,7 +225,7 @@ class _Time:
 
     def fleet(self, ideal: bool) -> HeliostatGroup:
         """The heliostats at this time, with the aims of the aim plan if there is one."""
-        fleet = self.asked.fleet(self.context.runtime, self.sun, ideal)
+        fleet = self.stored.under(self.sun, ideal)
         return fleet if self.planned is None else self.planned.aimed(fleet, self.at)
 
     def light(self, fleet: HeliostatGroup, begun: float) -> FleetFlux:
@@ -259,7 +257,7 @@ def _plan_time(time: _Time) -> None:
     fluxes = {"twin": twin, "ideal": ideal}
     dni = fleet.model.optics.dni
     loads = {
-        name: load_of(flux, time.receiver, request.allowed_w_m2, dni)
+        name: load_of(flux, time.stored.receiver, request.allowed_w_m2, dni)
         for name, flux in fluxes.items()
     }
     step = {

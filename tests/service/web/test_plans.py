@@ -14,6 +14,7 @@ from sqlalchemy import select, update
 
 from model.fleet import FleetFlux, Losses
 from model.plant import Cylinder, TargetPlane
+from service.jobs.kinds.field_forecasts import FleetIn
 from service.jobs.kinds.plans import PlanIn, aim_on, load_of
 from service.store.columns import now
 from service.store.job_tables import JobRow, JobStepRow
@@ -73,6 +74,15 @@ def test_day_is_a_series_by_twin_and_ideal_mirrors(
             two_heliostats.get(path, headers={"Accept": "application/json"}).json()["flux"]
         ) == (64, 64)
     assert two_heliostats.get(f"/v1/jobs/{job['id']}/flux?step=4&format=npz").status_code == 404
+
+
+def test_plan_reads_the_layout_once(
+    app: FastAPI, two_heliostats: TestClient, monkeypatch: pytest.MonkeyPatch
+):
+    read, calls = FleetIn.fleet, itertools.count()
+    monkeypatch.setattr(FleetIn, "fleet", lambda *given: (next(calls), read(*given))[1])
+    assert len(planned(app, two_heliostats)["result"]["steps"]) == 4
+    assert next(calls) == 1
 
 
 def test_what_is_wrong_is_named(two_heliostats: TestClient):
