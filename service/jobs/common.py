@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 from pydantic import Field
-from sqlalchemy import select
+from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from service import store
@@ -26,6 +26,14 @@ def chosen_names(runtime: Runtime, names: Sequence[str] | None) -> list[str]:
         return list(dict.fromkeys(names))
     with runtime.database.reading() as session:
         return list(session.scalars(select(HeliostatRow.name).order_by(HeliostatRow.name)))
+
+
+def count_chosen(runtime: Runtime, names: Sequence[str] | None) -> int:
+    """The number of requested heliostats; that of all stored ones if ``names`` is None."""
+    if names is not None:
+        return len(names)
+    with runtime.database.reading() as session:
+        return session.scalars(select(func.count()).select_from(HeliostatRow)).one()
 
 
 def require_some(n_successful: int, skipped: dict[str, str]) -> None:

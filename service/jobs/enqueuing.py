@@ -1,16 +1,11 @@
 """Creation and cancellation of jobs, for users or by the service itself."""
 
-from sqlalchemy import func, select
-from sqlalchemy.orm import Session
-
-from service.base.settings import Settings
 from service.jobs.common import require_stored
 from service.jobs.kind import Kind, Kinds, Payload
 from service.store import audit
 from service.store.job_tables import JobRow
 from service.store.jobs.queue import Bounds, add_job, cancel, delete_plan
 from service.store.keys import ITSELF
-from service.store.tables import HeliostatRow
 from service.twin.runtime.runtime import Runtime
 
 
@@ -30,8 +25,10 @@ def enqueue(
     """
     settings, document = runtime.settings, payload.model_dump(mode="json")
     bounds = Bounds(settings.max_queued_jobs, settings.max_queued_jobs_of_key)
+    is_short = (
+        kind.expected_s is not None and kind.expected_s(payload, runtime) <= settings.short_job_s
+    )
     with runtime.database.writing() as session:
-        is_short = _is_short(session, settings, kind, payload)
         row, is_new = add_job(
             session, kind.name, document, actor, idempotency_key, bounds, is_short
         )
@@ -41,14 +38,6 @@ def enqueue(
     # A worker for short jobs only may wait, too.
     runtime.job_came.release(2 if row.is_short else 1)
     return row
-
-
-def _is_short(session: Session, settings: Settings, kind: Kind[Payload], payload: Payload) -> bool:
-    """Whether a job is expected to be short enough for the workers for short jobs."""
-    if kind.expected_s is None:
-        return False
-    stored = session.scalars(select(func.count()).select_from(HeliostatRow)).one()
-    return kind.expected_s(payload, stored) <= settings.short_job_s
 
 
 def enqueue_due(runtime: Runtime, kinds: Kinds) -> None:

@@ -196,8 +196,8 @@ class Kind(Generic[Payload]):
     - ``so_far`` makes a result of the completed steps, for a job that did not finish.
     - ``details`` names the step with the part of the result that only the whole job shows.
     - ``require`` checks the settings before a job is queued.
-    - ``expected_s`` estimates the duration [s] from the payload and the number of stored
-      heliostats. A kind without it counts as long.
+    - ``expected_s`` estimates the duration [s] from the payload and what is stored. A kind without
+      it counts as long.
     """
 
     name: str
@@ -208,7 +208,7 @@ class Kind(Generic[Payload]):
     so_far: Callable[[Mapping[str, Mapping[str, Any]]], Mapping[str, object]] | None = None
     details: str | None = None
     require: Callable[[Settings], object] | None = None
-    expected_s: Callable[[Payload, int], float] | None = None
+    expected_s: Callable[[Payload, Runtime], float] | None = None
 
 
 Kinds = Mapping[str, Kind[Any]]

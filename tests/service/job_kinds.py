@@ -16,7 +16,7 @@ from service.base.settings import Settings
 from service.jobs import heartbeat, worker
 from service.jobs.kind import Context, Kind, Kinds, Result
 from service.store.job_tables import AuditRow
-from service.twin.runtime.runtime import Operations
+from service.twin.runtime.runtime import Operations, Runtime
 
 
 class SquareIn(Model):
@@ -115,7 +115,7 @@ def _attempt(context: Context) -> int:
         return queue.get_job(session, context.lease.job_id).attempts
 
 
-def expected_s(payload: SquareIn, _stored: int) -> float:
+def expected_s(payload: SquareIn, _runtime: Runtime) -> float:
     return payload.steps * payload.pause_s
 
 

@@ -532,11 +532,11 @@ class PlannedAims:
         )
 
 
-def expected_plan_s(payload: AimPlanIn, stored: int) -> float:
+def expected_plan_s(payload: AimPlanIn, runtime: Runtime) -> float:
     """Estimated duration [s]: images, aims, and what they are compared with."""
     count = 1 if payload.day is None else payload.day.count()
     request = payload.model_copy(update={"resolution": (ROWS, 2 * ROWS)})
-    return 4 * count * expected_s(request, stored)
+    return 4 * count * expected_s(request, runtime)
 
 
 KIND = Kind(

@@ -28,7 +28,7 @@ from service.base.fields import (
     Sun,
 )
 from service.base.receivers import ReceiverIn
-from service.jobs.common import Heliostats, chosen_names, require_some
+from service.jobs.common import Heliostats, chosen_names, count_chosen, require_some
 from service.jobs.kind import Context, Kind, Result
 from service.store.jobs import queue
 from service.twin.forecasts.field_forecast import (
@@ -288,11 +288,10 @@ def _figures(flux: np.ndarray[Any, Any], receiver: Receiver) -> dict[str, object
 _MAP_S, _MIN_S = 0.02, 0.005
 
 
-def expected_s(payload: FleetIn, stored: int) -> float:
+def expected_s(payload: FleetIn, runtime: Runtime) -> float:
     """Estimated duration for one sun position [s]."""
-    heliostats = stored if payload.heliostats is None else len(payload.heliostats)
     rows, columns = payload.resolution
-    return heliostats * max(_MIN_S, _MAP_S * rows * columns / 256**2)
+    return count_chosen(runtime, payload.heliostats) * max(_MIN_S, _MAP_S * rows * columns / 256**2)
 
 
 KIND = Kind(

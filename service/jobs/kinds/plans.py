@@ -23,6 +23,7 @@ from service.jobs.kinds.field_forecasts import Fleet, FleetIn, expected_s
 from service.twin.forecasts.field_forecast import HeliostatGroup, forecast_group, group_warnings
 from service.twin.forecasts.heliostat_forecast import receiver_as_json
 from service.twin.forecasts.watts import FieldWatts, field_watts
+from service.twin.runtime.runtime import Runtime
 
 MAX_TIMES = 100
 """Maximum number of times of a plan."""
@@ -290,9 +291,9 @@ def _peak(context: Context, times: int) -> NDArray[np.float32]:
     return peak
 
 
-def expected_plan_s(payload: PlanIn, stored: int) -> float:
+def expected_plan_s(payload: PlanIn, runtime: Runtime) -> float:
     """Estimated duration of a plan [s]."""
-    return 2 * payload.count() * expected_s(payload, stored)
+    return 2 * payload.count() * expected_s(payload, runtime)
 
 
 KIND = Kind(

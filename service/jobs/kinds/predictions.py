@@ -1,17 +1,21 @@
 """The job `predictions`: predict the surfaces of many heliostats."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self, TypedDict
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from model.progress import Progress
+from service import store
 from service.base.choices import require_images
 from service.base.errors import SKIPPED
 from service.base.fields import Method, Model, ModelVersion, Whole
 from service.jobs.common import Heliostats, chosen_names, require_some
 from service.jobs.kind import Context, Kind, Result
+from service.sources.documents import read_heliostat
+from service.sources.schema import STORED
 from service.twin.plant import model_versions
 from service.twin.runtime.runtime import Runtime
 from service.twin.surfaces.prediction import StoredSurface, compute_surface, keep_surface
@@ -26,7 +30,11 @@ class PredictionsIn(Model):
 
     heliostats: Heliostats = None
     method: Method = Field(
-        default="network", description="network: at once; refined: fitted through the ray tracer."
+        default="network",
+        description=(
+            "network: at once, if one was trained for the mirror; otherwise as refined. refined:"
+            " fitted through the ray tracer, which takes up to minutes."
+        ),
     )
     images: Whole = Field(
         default=8,
@@ -151,12 +159,26 @@ def _step(stored: StoredSurface) -> dict[str, object]:
 # Duration per heliostat [s] by method.
 _EACH_S: Mapping[Method, float] = {"network": 0.5, "refined": 60.0}
 
+# Heliostats whose type is looked up for all of a job.
+_SAMPLE = 50
 
-def expected_s(payload: PredictionsIn, stored: int) -> float:
-    """Estimated duration [s]."""
-    return _EACH_S[payload.method] * (
-        stored if payload.heliostats is None else len(payload.heliostats)
-    )
+
+def expected_s(payload: PredictionsIn, runtime: Runtime) -> float:
+    """Estimated duration [s]; mirrors that no network was trained for are refined."""
+    names = chosen_names(runtime, payload.heliostats)
+    refined = 1.0 if payload.method == "refined" else _share_refined(runtime, names[:_SAMPLE])
+    return len(names) * (refined * _EACH_S["refined"] + (1 - refined) * _EACH_S["network"])
+
+
+def _share_refined(runtime: Runtime, names: Sequence[str]) -> float:
+    """Share of heliostats that no network was trained for; 0 of those that are not stored."""
+    with runtime.database.reading() as session:
+        rows = store.get_heliostats(session, names)
+        if not rows:
+            return 0.0
+        origin = np.array(store.get_plant(session).origin)
+    mirrors = [read_heliostat(name, row.properties, origin, STORED) for name, row in rows.items()]
+    return sum(not runtime.operations.has_network(mirror) for mirror in mirrors) / len(mirrors)
 
 
 KIND = Kind(

@@ -60,7 +60,11 @@ class SurfaceIn(Model):
     """How to predict a surface. Without ``measurements`` the newest accepted ones are used."""
 
     method: Method = Field(
-        default="network", description="network: at once; refined: fitted through the ray tracer."
+        default="network",
+        description=(
+            "network: at once, if one was trained for the mirror; otherwise as refined. refined:"
+            " fitted through the ray tracer, which takes up to minutes."
+        ),
     )
     measurements: list[MeasurementName] | None = Field(
         default=None,

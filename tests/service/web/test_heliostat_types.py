@@ -6,6 +6,8 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
+from service.jobs.kinds import predictions
+from service.jobs.kinds.predictions import PredictionsIn
 from service.sources.folder import read_folder
 from service.twin.transfer.importing import import_folder
 from tests.service import real
@@ -58,6 +60,16 @@ def test_type_written_out_is_stored_and_lights_the_receiver(rich: TestClient):
     made = rich.post("/v1/forecasts", json={"heliostat": "W1", "target": "board", "sun": sun})
     assert made.json()["losses"]["mirror_area_m2"] == pytest.approx(9)
     assert made.json()["losses"]["reflectance"] == pytest.approx(0.9)
+
+
+def test_job_of_predictions_takes_the_time_of_refinement_without_a_network(
+    rich: TestClient, two_heliostats: TestClient
+):
+    other, juelich = real.runtime_of(rich), real.runtime_of(two_heliostats)
+    without = PredictionsIn(heliostats=["A1", "A2", "B1"])
+    assert predictions.expected_s(without, other) == 3 * 60.0
+    assert predictions.expected_s(PredictionsIn(), juelich) == 2 * 0.5
+    assert predictions.expected_s(PredictionsIn(method="refined"), juelich) == 2 * 60.0
 
 
 def test_own_facets_and_canting_replace_those_of_the_type(rich: TestClient):
