@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from zoneinfo import ZoneInfo
 
 import numpy as np
 import pytest
@@ -200,7 +201,7 @@ def outdated(client: TestClient) -> list[dict[str, Any]]:
 
 
 def test_a_change_since_todays_plan_raises_an_alert_until_a_new_plan(plant: TestClient):
-    noon = now().replace(hour=11, minute=0, second=0, microsecond=0)
+    noon = now().astimezone(ZoneInfo("Europe/Madrid")).replace(hour=13, minute=0, second=0)
     today = BODY | {"sun": {"at": noon.isoformat()}, "heliostats": some_names(plant)}
     job = real.done_job(plant, "/v1/jobs/aim-plans", **today)
     assert outdated(plant) == []
