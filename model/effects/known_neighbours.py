@@ -17,9 +17,8 @@ In an image
     dimmer, where the facets' images overlap.
 
 What it scales with
-    Low suns and dense rows hide much, high suns and the field's edge nothing. It needs a plant
-    whose layout is stored, and photographs near one another's heliostats; it does nothing on a
-    heliostat without neighbours.
+    Low suns and dense rows hide much, high suns and the field's edge nothing. It needs a stored
+    layout, and does nothing on a heliostat without neighbours.
 
 What it is confused with
     - Blocking: one line across the mirror for all suns. Use it where the neighbours' positions are
