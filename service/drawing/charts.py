@@ -240,6 +240,13 @@ def flux_map(
     return heat_map(title, flux, size, flux_scale(float(flux.max()) if top is None else top, unit))
 
 
+def irradiance_map(
+    title: str, flux: Array, size: tuple[float, float], top: float | None = None
+) -> HeatMap:
+    """A map of ``flux`` [W/m2] in kW/m2; ``top`` [W/m2] is the end of its scale."""
+    return flux_map(title, flux / 1e3, size, "kW/m²", None if top is None else top / 1e3)
+
+
 def outlined(drawn: HeatMap, mask: NDArray[np.bool_]) -> HeatMap:
     """A map with the edge of a region, if it is not empty; ``mask`` is (rows, columns)."""
     if not mask.any():

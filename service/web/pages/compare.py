@@ -226,12 +226,12 @@ def _forecasts(
     size = traced[0].receiver.width, traced[0].receiver.height
     top = max(float(one.flux.max()), float(other.flux.max()))
     first, second = (
-        charts.flux_map(f"Flux of {side.name} on {target}", made.flux, size, "W/m²", top)
+        charts.irradiance_map(f"Flux of {side.name} on {target}", made.flux, size, top)
         for side, made in zip(sides, (one, other), strict=True)
     )
     bound = max(runtime.settings.figure_scales["flux_difference"] * top, 1e-9)
     difference = charts.difference_map(
-        "Second minus first", other.flux - one.flux, size, "W/m²", bound
+        "Second minus first", (other.flux - one.flux) / 1e3, size, "kW/m²", bound / 1e3
     )
     return Forecasts(
         Trio(first, second, difference), one, other, flux_accuracy(one.flux, other.flux)

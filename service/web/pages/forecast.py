@@ -282,10 +282,9 @@ def get_forecast_page(
         row = store.get_forecast(session, number)
         choices = _choices(session)
     size = (row.window_m or row.plane["width"], row.window_m or row.plane["height"])
-    unit = "% per pixel" if row.normalised else "W/m²"
     title = (
-        f"Flux of {row.heliostat.name} on {row.target_name or 'a plane'}, peak {row.peak_w_m2:.0f}"
-        " W/m²"
+        f"Flux of {row.heliostat.name} on {row.target_name or 'a plane'},"
+        f" peak {row.peak_w_m2 / 1e3:.2f} kW/m²"
     )
     filled = ForecastForm.model_construct(
         heliostat=row.heliostat.name,
@@ -297,6 +296,10 @@ def get_forecast_page(
         surface="ideal" if row.surface is None else "current",
         dni_w_m2=row.dni_w_m2,
     )
-    flux = charts.flux_map(title, flux_of(row), size, unit)
+    flux = (
+        charts.flux_map(title, flux_of(row), size, "% per pixel")
+        if row.normalised
+        else charts.irradiance_map(title, flux_of(row), size)
+    )
     chain = loss_chain(row.losses) if row.losses else []
     return _page(request, runtime, choices, filled, forecast=row, flux=flux, chain=chain)

@@ -92,7 +92,7 @@ def _flux(row: JobRow) -> HeatMap | None:
     plane = row.result["plane"]
     flux = unpack(row.arrays)["flux"]
     title = f"Flux of {row.result['heliostats']} heliostats together"
-    return charts.flux_map(title, flux, (plane["width"], plane["height"]), "W/m²")
+    return charts.irradiance_map(title, flux, (plane["width"], plane["height"]))
 
 
 def _plain(value: Any) -> bool:

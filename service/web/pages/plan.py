@@ -220,7 +220,7 @@ def _maps(row: JobRow, of_time: bytes) -> dict[str, HeatMap]:
     }
     return {
         title: charts.outlined(
-            charts.flux_map(f"Flux {title}", flux, size, "W/m²", top), flux > allowed
+            charts.irradiance_map(f"Flux {title}", flux, size, top), flux > allowed
         )
         for title, flux in titles.items()
     }

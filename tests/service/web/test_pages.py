@@ -191,7 +191,7 @@ def test_colours_mean_the_same_in_every_field(tmp_path: Path):
             client.put("/v1/heliostats/AA39", json=properties_document())
             fill(client)
             colours[name] = settled(client).one("path", class_="mirrors")["fill"]
-    assert colours == {"usual": "#fde724", "strict": "#fde724", "lax": "#440154"}
+    assert colours == {"usual": "#5b95b8", "strict": "#fde724", "lax": "#d62020"}
 
 
 def test_accuracy_is_computed_once_for_each_surface(pages: TestClient, operations: FakeOperations):
