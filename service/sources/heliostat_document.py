@@ -71,10 +71,10 @@ DriveDocument = Annotated[LinearDriveDocument | RotaryDriveDocument, Field(discr
 class MountDocument(_Part):
     """`model.mount.Mount`."""
 
-    first_axis: Point = Field(description="Unit vector at zero angles: east, north, up.")
-    second_axis: Point = Field(description="Unit vector at zero angles: east, north, up.")
+    first_axis: Point = Field(description="Unit vector at zero angles: east, north, up [1].")
+    second_axis: Point = Field(description="Unit vector at zero angles: east, north, up [1].")
     zero_attitude: Matrix = Field(
-        description="Rotation of mirror coordinates to east, north, up at zero angles."
+        description="Rotation of mirror coordinates to east, north, up at zero angles [1]."
     )
     joint_m: Point = Field(description="The pivot of both axes from the pylon's foot [m].")
     mirror_offset_m: Point = Field(
@@ -145,7 +145,7 @@ class HeliostatDocument(_Part):
     """
 
     format: Literal["heliotwin heliostat 1"] = Field(description="Name and version of this format.")
-    type: Annotated[str, StringConstraints(max_length=32)] = Field(
+    type: Annotated[str, StringConstraints(pattern=r"^([A-Za-z0-9][A-Za-z0-9_-]{0,31})?$")] = Field(
         "", description="Its heliostat type in plant.yaml; empty: none."
     )
     position_m: Position = Field(description="The pylon's foot: east, north, up [m].")
