@@ -53,16 +53,18 @@ def bound_power(plan: AimPlan, steps: int = _STEPS) -> float:
 
 
 def _scaled(plan: AimPlan) -> Tensor:
-    """The plan's multipliers (P,), or a share of them that gives a smaller bound.
+    """The plan's multipliers (P,), or others if they give a smaller bound.
 
-    Those of a plan that began far away may be too large.
+    Those of a plan that began far away may be too large. Equal ones of 1 give the most that the
+    limit lets through, which is the bound of a strong limit.
     """
     with torch.no_grad():
         least = _bound(plan, plan.multipliers, _best_aims(plan, plan.multipliers))
         if least < _LOOSE * plan.power:
             return plan.multipliers.clone()
-        shares = [share * plan.multipliers for share in _SHARES]
-        return min(shares, key=lambda few: _bound(plan, few, _best_aims(plan, few)))
+        equal = torch.ones_like(plan.multipliers)
+        tried = [share * some for some in (plan.multipliers, equal) for share in _SHARES]
+        return min(tried, key=lambda some: _bound(plan, some, _best_aims(plan, some)))
 
 
 def _bound(plan: AimPlan, multipliers: Tensor, best: "_Best") -> float:

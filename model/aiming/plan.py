@@ -34,12 +34,18 @@ DRAWS = 200
 WITHIN = 0.95
 """Share of draws that must be within the limit."""
 
-_N_ANEW, _N_AGAIN, _N_FINE = 100, 20, 8
+_N_ANEW, _N_AGAIN, _N_FINE = 100, 20, 6
 """Steps on a quarter of the pixels, from the beginning or from aims that were good, and on all."""
+
+_STEPS_FIT = 2000
+"""Heliostats for which these steps suffice; fewer ones each matter more, and cost less a step."""
+
+_MOST_EASE, _MOST_FINE = 10, 4
+"""Most times that a small field takes the steps on a quarter of the pixels, and those on all."""
 
 _RHO = 10.0
 _MAX_PRESSURE = 3.0
-_UPDATE, _UPDATE_FINE = 10, 4
+_UPDATE, _UPDATE_FINE = 10, 6
 """Steps between updates of multipliers and margins."""
 
 _STEP, _STEP_AGAIN, _STEP_FINE, _LAST_STEP = 0.35, 0.06, 0.03, 0.05
@@ -164,7 +170,7 @@ def plan_aims(
         raise InvalidInputError("limit: must be positive everywhere; give the pixels a small one")
     if start is None:
         plan = _within_budget(replace(single_aim(kernels, limit), moved=_spread_out(kernels)))
-        step, count = _STEP, _N_ANEW
+        step, count = _STEP, _N_ANEW * _ease(kernels)
     else:
         plan, step, count = replace(start, kernels=kernels, limit=limit), _STEP_AGAIN, _N_AGAIN
     thin = kernels.thinned()
@@ -175,7 +181,7 @@ def plan_aims(
     second_order = _second_order(_on_blocks(plan, thin))
     for _ in range(_CORRECTIONS):
         ascent = _Ascent(plan, _STEP_FINE, between, deviations, second_order)
-        ascent.run(_N_FINE, _UPDATE_FINE)
+        ascent.run(_N_FINE * min(_ease(kernels), _MOST_FINE), _UPDATE_FINE)
         plan, deviations = ascent.plan, ascent.deviations
         linear = linear_draws(plan)
         second_order = _second_order(plan, linear)
@@ -203,13 +209,18 @@ def _on_blocks(plan: AimPlan, thin: Thinned) -> AimPlan:
 def _second_order(plan: AimPlan, linear: "LinearDraws | None" = None) -> float:
     """What `Draws.ratio` is above that of `linear_draws`, by tracing the draws of the largest."""
     linear = linear or linear_draws(plan)
-    rows = np.argsort(-linear.ratios)[:_FULL_DRAWS].tolist()
+    rows = np.argsort(-linear.ratios)[: _FULL_DRAWS * _ease(plan.kernels)].tolist()
     ratios = linear.ratios.copy()
     ratios[rows] = plan.draws(rows=rows).ratios
     return float(np.quantile(ratios, WITHIN)) - linear.ratio
 
 
-_FULL_DRAWS = 16
+_FULL_DRAWS = 12
+
+
+def _ease(kernels: Kernels) -> int:
+    """How many times more steps a field takes than one of thousands."""
+    return min(max(_STEPS_FIT // len(kernels), 1), _MOST_EASE)
 
 
 def _within_budget(plan: AimPlan) -> AimPlan:
