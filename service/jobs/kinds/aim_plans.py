@@ -1,11 +1,13 @@
 """The job `aim-plans`: aim points of the most power under the flux that a receiver can take."""
 
 import math
+import pickle
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, date, datetime, timedelta
 from datetime import time as clock
+from hashlib import sha256
 from typing import Annotated, Any, Self
 from zoneinfo import ZoneInfo
 
@@ -47,6 +49,7 @@ from service.twin.forecasts.aim_sources import SOURCES, plant_time_zone, sources
 from service.twin.forecasts.aims import ROWS, aim_figures, begin_at, excess_of, places_on
 from service.twin.forecasts.field_forecast import (
     HeliostatGroup,
+    TracedImages,
     forecast_group,
     group_warnings,
     trace_kernels,
@@ -309,35 +312,22 @@ class _Planner:
 
     def plan(self, index: int) -> None:
         """Plan a step and store it."""
-        context, asked, receiver = self.context, self.asked, self.fleet.receiver
-        runtime, (at, sun) = context.runtime, self.suns.steps[index]
-        resolution = asked.resolution or square_pixels(receiver, ROWS)
+        context, receiver = self.context, self.fleet.receiver
+        at, sun = self.suns.steps[index]
+        resolution = self.asked.resolution or square_pixels(receiver, ROWS)
         begun = time.perf_counter()
-        is_ideal = asked.surface == "ideal"
-        group = self.nearest_first.under(sun, is_ideal)
-
-        def report(share: float, message: str, **_counts: Any) -> None:
-            self._report(index, share, message)
-
-        kernels = trace_kernels(runtime, group, resolution, asked.neighbours, report)
+        group = self.nearest_first.under(sun, self.asked.surface == "ideal")
+        images = self._images(index, group, resolution)
+        kernels, single = images.kernels, images.single_aim
         traced = time.perf_counter()
-        limit = torch.tensor(asked.limit().on_map(*resolution), dtype=torch.float32).flatten()
-        report(0.55, "aims")
+        limits = self.asked.limit().on_map(*resolution)
+        limit = torch.tensor(limits, dtype=torch.float32).flatten()
+        self._report(index, 0.7, "aims")
         plan = plan_aims(kernels, limit, self._begin(index, kernels, limit), context.check)
         aimed = time.perf_counter()
-        report(0.85, "what the plan is worth")
-        single = forecast_group(
-            runtime,
-            replace(self.fleet, aims={}).under(sun, is_ideal),
-            resolution,
-            asked.neighbours,
-            _unreported(context),
-        )
-        require_some(single.heliostats, single.skipped)
-        power = (
-            sum(one.area * one.intercepted for one in single.losses.values())
-            * group.model.optics.dni
-        )
+        self._report(index, 0.9, "what the plan is worth")
+        dni = group.model.optics.dni
+        power = sum(one.area * one.intercepted for one in single.losses.values()) * dni
         maps = {
             "flux": plan.flux.numpy().reshape(resolution),
             "limit": limit.numpy().reshape(resolution),
@@ -349,7 +339,7 @@ class _Planner:
             "exceeded": excess_of(maps["flux"], maps["limit"], receiver),
             "single_aim_exceeded": excess_of(maps["single_aim_flux"], maps["limit"], receiver),
             "sun": sun.model_dump(),
-            "dni_w_m2": group.model.optics.dni,
+            "dni_w_m2": dni,
             "heliostats": len(kernels),
             "seconds": {
                 "images": round(traced - begun, 3),
@@ -357,10 +347,33 @@ class _Planner:
                 "all": round(time.perf_counter() - begun, 3),
             },
         }
-        ideal = sorted(group.without_surface - set(group.skipped))
-        about = {"figures": figures, "skipped": group.skipped, "ideal_surfaces": ideal}
-        with runtime.database.writing() as session:
+        ideal = sorted(images.without_surface - set(images.skipped))
+        about = {"figures": figures, "skipped": dict(images.skipped), "ideal_surfaces": ideal}
+        with context.runtime.database.writing() as session:
             context.keep(session, step_name(index), about, maps | _aim_arrays(plan, receiver))
+
+    def _images(
+        self, index: int, group: HeliostatGroup, resolution: tuple[int, int]
+    ) -> TracedImages:
+        """The images for a step, or those of a recent plan from the same sources."""
+        runtime, neighbours = self.context.runtime, self.asked.neighbours
+
+        def report(share: float, message: str, **_counts: Any) -> None:
+            self._report(index, share, message)
+
+        def trace() -> TracedImages:
+            kernels = trace_kernels(runtime, group, resolution, neighbours, report)
+            middle = replace(self.fleet, aims={}).under(self.suns.steps[index][1], group.ideal)
+            single = forecast_group(
+                runtime, middle, resolution, neighbours, _unreported(self.context)
+            )
+            require_some(single.heliostats, single.skipped)
+            return TracedImages(kernels, single, group.skipped, frozenset(group.without_surface))
+
+        with runtime.database.reading() as session:
+            sources = sources_of(session, [*group.names, *group.around], group.model.number)
+        of = pickle.dumps((group, resolution, neighbours, sources))
+        return runtime.recent_images.get(sha256(of).digest(), trace)
 
     def _begin(self, index: int, kernels: Kernels, limit: torch.Tensor) -> AimPlan | None:
         """The aims that a step begins with: those that were given, or of the step before.

@@ -193,6 +193,25 @@ def trace_kernels(
 
 
 @dataclass(frozen=True, eq=False)
+class TracedImages:
+    """Images of a group's mirrors, and the flux of the same group without a plan.
+
+    ``skipped`` and ``without_surface`` are those of `HeliostatGroup`.
+    """
+
+    kernels: Kernels
+    single_aim: FleetFlux
+    skipped: Mapping[str, str]
+    without_surface: frozenset[str]
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the images [bytes]."""
+        parts = vars(self.kernels).values()
+        return sum(part.nbytes for part in parts if hasattr(part, "nbytes"))
+
+
+@dataclass(frozen=True, eq=False)
 class _Counted:
     """Report steps of a phase, which is one part of the whole work.
 

@@ -21,6 +21,7 @@ from model.study import FluxImage, Study, StudyOptions
 from service.base import metrics
 from service.base.choices import Method
 from service.base.progress import Progress as Named
+from service.base.recent_results import LargeResults
 from service.base.settings import Settings
 from service.sources.decode import Pixels, TooManyPixelsError, decode_image
 from service.store.database import Database
@@ -128,6 +129,8 @@ class Runtime:
     """Slots for decoded photographs, which limit the memory of their pixels; see `decoded`."""
     large_image_slots: ComputeSlots = field(default_factory=lambda: ComputeSlots(1))
     """Single slot for photographs of more than `LARGE_PIXELS`."""
+    recent_images: LargeResults = field(default_factory=lambda: LargeResults(256_000_000))
+    """Images of the mirrors of recent plans: another limit takes the same ones."""
     timeout_s: float | None = None
     """Longest wait for a slot [s]; None, for jobs, is without limit."""
     check: Callable[[], None] | None = None
