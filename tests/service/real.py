@@ -73,7 +73,7 @@ def done_job(client: TestClient, path: str, **payload: Any) -> dict[str, Any]:
     """Post a job, run it here, and return it when it is done."""
     answer = client.post(path, json=payload)
     assert answer.status_code == 202, answer.text
-    assert Worker(runtime_of(client), KINDS, "tester", threading.Event()).work()
+    assert worker(client).work()
     job: dict[str, Any] = client.get(answer.headers["Location"]).json()
     assert job["state"] == "done", job["reason"]
     return job
@@ -100,3 +100,8 @@ def fill(stj: Path, folder: Path) -> None:
         assert client.get(path).json()["effects"][0]["scope"] == {"kind": "set"}
         assert client.post(f"{path}/adopt").status_code == 201
         assert client.post(f"{path}/withdraw").status_code == 200
+
+
+def worker(client: TestClient) -> Worker:
+    """A worker of the service behind a client."""
+    return Worker(runtime_of(client), KINDS, "tester", threading.Event())

@@ -1,6 +1,6 @@
 """The job `aim-plans` on an imported plant, and its page."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 from zoneinfo import ZoneInfo
@@ -11,6 +11,7 @@ from fastapi.testclient import TestClient
 
 from model.frames import sun_direction
 from service import store
+from service.jobs.kinds import aim_plans
 from service.sources.documents import read_heliostat
 from service.sources.folder import read_folder
 from service.sources.plant_tables import read_aims
@@ -176,6 +177,52 @@ def day_plan_takes_the_aims(client: TestClient, job: dict[str, Any]) -> bool:
     return True
 
 
+def test_exceeded_plan_gets_new_aims_in_the_browser(plant: TestClient):
+    """By forms only: a plan exceeds the limit, aims are found, and a plan with them keeps it."""
+    form = {
+        "name": "June",
+        "target": "main",
+        "first_at": "2026-06-21T11:00",
+        "last_at": "2026-06-21T13:00",
+        "step_minutes": "120",
+        "allowed_kw_m2": "80",
+        "dni_w_m2": "900",
+    }
+    assert exceeded_times(plant, form) == 2
+    answer = plant.post("/aims", data=form, follow_redirects=False)
+    assert answer.status_code == 303, answer.text
+    assert real.worker(plant).work()
+    page = Page(plant.get(answer.headers["Location"], headers={"Accept": "text/html"}).text)
+    for words in ("2 steps", "13:00 CEST", "Plan the day with these aims", "No place exceeds"):
+        assert words in page.words
+    fields = page.one("form", action="/plans").all("input", type="hidden")
+    assert exceeded_times(plant, {field["name"]: field["value"] for field in fields}) == 0
+
+
+def exceeded_times(client: TestClient, form: dict[str, str]) -> int:
+    """Number of times at which the plan of a form exceeds the limit."""
+    answer = client.post("/plans", data=form, follow_redirects=False)
+    assert answer.status_code == 303, answer.text
+    assert real.worker(client).work()
+    job = client.get(f"/v1/jobs/{answer.headers['Location'].rsplit('/')[-1]}").json()
+    return sum(bool(step["twin"]["exceeded_m2"]) for step in job["result"]["steps"])
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({}, "allowed_kw_m2"),
+        ({"limit_map_kw_m2": "800 900\n800 x"}, "limit_map_kw_m2"),
+        ({"allowed_kw_m2": "80", "last_at": "2026-06-22T13:00"}, "one day"),
+    ],
+)
+def test_a_wrong_form_of_aims_is_refused(plant: TestClient, changes: dict[str, str], said: str):
+    times = {"first_at": "2026-06-21T11:00", "last_at": "2026-06-21T13:00"}
+    answer = plant.post("/aims", data={"name": "June", "target": "main"} | times | changes)
+    assert answer.status_code == 422
+    assert said in answer.text
+
+
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
@@ -222,3 +269,80 @@ def test_a_change_since_todays_plan_raises_an_alert_until_a_new_plan(plant: Test
 
 def some_names(client: TestClient) -> list[str]:
     return [row["name"] for row in client.get("/v1/heliostats").json()["items"][:20]]
+
+
+def counted(monkeypatch: pytest.MonkeyPatch, name: str, then: Callable[[int], None]) -> list[str]:
+    """Call ``then`` with the number of each call of a function of the job, before it is done."""
+    function, calls = getattr(aim_plans, name), list[str]()
+
+    def counting(*arguments: Any, **options: Any) -> Any:
+        calls.append(name)
+        then(len(calls))
+        return function(*arguments, **options)
+
+    monkeypatch.setattr(aim_plans, name, counting)
+    return calls
+
+
+def test_another_limit_takes_the_same_images(plant: TestClient, monkeypatch: pytest.MonkeyPatch):
+    body: dict[str, Any] = {"sun": {"azimuth_deg": 170, "elevation_deg": 50}}
+    traces = counted(monkeypatch, "trace_kernels", lambda _: None)
+    first, lower = (planned(plant, limit_w_m2=limit, **body)["result"] for limit in (90e3, 70e3))
+    assert len(traces) == 1
+    assert lower["power_w"] < first["power_w"]
+    assert lower["peak_p95_w_m2"] <= 1.002 * 70e3
+    assert lower["single_aim_power_w"] == first["single_aim_power_w"]
+    name = next(iter(first["aim_points_m"]))
+    properties = plant.get(f"/v1/heliostats/{name}").json()["properties"]
+    properties["position_m"][2] += 0.01
+    with real.runtime_of(plant).database.writing() as session:
+        setup.set_heliostat(session, "tester", name, properties)
+    planned(plant, limit_w_m2=70e3, **body)
+    assert len(traces) == 2
+
+
+def test_cancelled_day_ends_between_steps(plant: TestClient, monkeypatch: pytest.MonkeyPatch):
+    path = plant.post("/v1/jobs/aim-plans", json=DAY).headers["Location"]
+
+    def cancel(call: int) -> None:
+        if call == 2:
+            plant.post(f"{path}/cancel")
+
+    plans = counted(monkeypatch, "plan_aims", cancel)
+    assert real.worker(plant).work()
+    job = plant.get(path).json()
+    assert (job["state"], job["result"], len(plans)) == ("cancelled", None, 2)
+
+
+def test_stopped_day_goes_on_with_its_step(plant: TestClient, monkeypatch: pytest.MonkeyPatch):
+    path = plant.post("/v1/jobs/aim-plans", json=DAY).headers["Location"]
+    worker = real.worker(plant)
+
+    def stop(call: int) -> None:
+        if call == 2:
+            worker.stopping.set()
+
+    plans = counted(monkeypatch, "plan_aims", stop)
+    assert worker.work()
+    assert plant.get(path).json()["state"] == "queued"
+    assert real.worker(plant).work()
+    job = plant.get(path).json()
+    assert (job["state"], len(job["result"]["steps"]), len(plans)) == ("done", 2, 3)
+
+
+def test_new_surface_and_new_model_raise_the_alert(real_client: TestClient):
+    noon = now().astimezone(ZoneInfo("Europe/Berlin")).replace(hour=12, minute=0, second=0)
+    body = {"target": "multi_focus_tower", "sun": {"at": noon.isoformat()}, "limit_w_m2": 60e3}
+    job = real.done_job(real_client, "/v1/jobs/aim-plans", **body)
+    assert outdated(real_client) == []
+    other = real_client.get("/v1/heliostats/AA39/surfaces", params={"source": "predicted"})
+    choice = {"version": other.json()[0]["version"], "reason": "better"}
+    answer = real_client.put("/v1/heliostats/AA39/surfaces/current", json=choice)
+    assert answer.status_code == 200, answer.text
+    (alert,) = outdated(real_client)
+    assert f"plan {job['id']} of aims for today" in alert["message"]
+    assert "surface of 1: AA39" in alert["message"]
+    (study,) = real_client.get("/v1/studies").json()["items"]
+    assert real_client.post(f"/v1/studies/{study['id']}/adopt").status_code == 201
+    (alert,) = outdated(real_client)
+    assert "model" in alert["message"]
