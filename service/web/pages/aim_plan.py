@@ -51,7 +51,7 @@ class AimView:
     chosen: int
     steps: list[Mapping[str, Any]]
     maps: dict[str, HeatMap]
-    plan: dict[str, Any] | None
+    plan: Mapping[str, object] | None
 
 
 def aim_view(runtime: Runtime, row: JobRow, step: int) -> AimView | None:
@@ -72,7 +72,7 @@ def aim_view(runtime: Runtime, row: JobRow, step: int) -> AimView | None:
     )
 
 
-def _plan_fields(row: JobRow, steps: list[Mapping[str, Any]]) -> dict[str, Any] | None:
+def _plan_fields(row: JobRow, steps: list[Mapping[str, Any]]) -> Mapping[str, object] | None:
     """Fields of `PlanForm` for the day of a plan of aims."""
     given = row.payload
     if given.get("target") is None or any(step["at"] is None for step in steps):

@@ -335,8 +335,8 @@ def test_new_surface_and_new_model_raise_the_alert(real_client: TestClient):
     body = {"target": "multi_focus_tower", "sun": {"at": noon.isoformat()}, "limit_w_m2": 60e3}
     job = real.done_job(real_client, "/v1/jobs/aim-plans", **body)
     assert outdated(real_client) == []
-    other = real_client.get("/v1/heliostats/AA39/surfaces", params={"source": "predicted"})
-    choice = {"version": other.json()[0]["version"], "reason": "better"}
+    other = real_client.get("/v1/heliostats/AA39/surfaces", params={"source": "network"})
+    choice = {"version": other.json()["items"][0]["version"], "reason": "better"}
     answer = real_client.put("/v1/heliostats/AA39/surfaces/current", json=choice)
     assert answer.status_code == 200, answer.text
     (alert,) = outdated(real_client)
