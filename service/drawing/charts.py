@@ -4,14 +4,12 @@ Templates turn them into SVG.
 """
 
 import base64
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
 from typing import Any, ClassVar, Protocol
 
 import cv2
 import matplotlib
-import matplotlib.dates
 import numpy as np
 from matplotlib.colors import LinearSegmentedColormap, to_hex
 from matplotlib.ticker import MaxNLocator
@@ -21,18 +19,6 @@ from service.drawing.facets import FacetPlaces
 from service.drawing.pictures import map_picture, mirror_heights, series_picture
 
 Array = NDArray[np.floating]
-
-_dates: Any = matplotlib.dates  # matplotlib.dates has no type hints
-
-# Largest interval between ticks, for each unit of time.
-_LONGEST = {
-    _dates.MONTHLY: 12,
-    _dates.DAILY: 31,
-    _dates.HOURLY: 24,
-    _dates.MINUTELY: 60,
-    _dates.SECONDLY: 60,
-}
-
 
 Sheet = tuple[Sequence[str], Sequence[Sequence[Any]]]
 """Columns and rows."""
@@ -322,136 +308,6 @@ def uncertainty_map(title: str, z_std: Array, places: FacetPlaces, top: float) -
     ``top`` [mm] is the end of the scale.
     """
     return _mirror_map(title, z_std, places, Scale("viridis_r", 0.0, top, "mm"))
-
-
-@dataclass(frozen=True)
-class Dot:
-    """A value of a series: its position from 0 to 1, rightwards and upwards, and its label."""
-
-    x: float
-    y: float
-    label: str
-    is_hollow: bool = False
-
-
-@dataclass(frozen=True)
-class Value:
-    """A number at a time; hollow if it is weaker evidence than others."""
-
-    at: datetime
-    number: float
-    name: str = ""
-    is_hollow: bool = False
-
-
-@dataclass(frozen=True)
-class Timeline:
-    """Series over time by name: the first is a solid line, the second dashed.
-
-    ``marks`` are vertical lines, and ``values`` the data of the series. ``when`` is the part of the
-    date that the tick labels leave out, such as the year. ``limit`` is the height of a horizontal
-    line, 0 to 1 from the bottom, or None.
-    """
-
-    formats: ClassVar[tuple[str, ...]] = ("csv", "png")
-
-    title: str
-    unit: str
-    series: dict[str, tuple[Dot, ...]]
-    marks: tuple[Tick, ...]
-    x_ticks: tuple[Tick, ...]
-    y_ticks: tuple[Tick, ...]
-    when: str
-    values: Mapping[str, Sequence[Value]]
-    limit: float | None = None
-
-    @property
-    def sheet(self) -> Sheet:
-        """All values by series and time."""
-        rows = [
-            (name, one.at, one.name, one.number)
-            for name, some in self.values.items()
-            for one in some
-        ]
-        return ("series", "time", "name", f"{self.title} [{self.unit}]"), rows
-
-    def drawn(self) -> bytes:
-        """The series as PNG, over UTC time."""
-        series = {
-            name: ([one.at for one in v], [one.number for one in v])
-            for name, v in self.values.items()
-        }
-        return series_picture(self.title, self.unit, series)
-
-
-def _share(low: float, high: float, value: float) -> float:
-    return (value - low) / (high - low)
-
-
-def timeline(
-    title: str,
-    unit: str,
-    series: Mapping[str, Sequence[Value]],
-    digits: int,
-    *,
-    marks: Sequence[tuple[datetime, str]] = (),
-    limit: float | None = None,
-    moments: Sequence[datetime] = (),
-) -> Timeline | None:
-    """Values over time, with the marks within their range; None without any value.
-
-    The range also includes these ``moments``. The axis of values begins at zero, except that of
-    percentages.
-    """
-    values = [value for some in series.values() for value in some]
-    if not values:
-        return None
-    first, last = (
-        _dates.date2num(of([*(value.at for value in values), *moments])) for of in (min, max)
-    )
-    margin = 0.04 * (last - first) or 0.5
-    first, last = first - margin, last + margin
-    numbers = [value.number for value in values] + ([] if limit is None else [limit])
-    # A change below half a percent of the value must not look large.
-    padding = max(0.1 * (max(numbers) - min(numbers)), 0.005 * abs(max(numbers)))
-    low = min(numbers) - padding if unit == "%" else 0.0
-    high = max(max(numbers) + 0.1 * (max(numbers) - low), low + 1e-9)
-    locator = _dates.AutoDateLocator(minticks=3, maxticks=5, tz=UTC)
-    # Its default steps are too short to limit the number of ticks.
-    for of_time, longest in _LONGEST.items():
-        locator.intervald[of_time] = [*locator.intervald[of_time], longest]
-    places = [
-        place
-        for place in locator.tick_values(_dates.num2date(first), _dates.num2date(last))
-        if first <= place <= last
-    ]
-    # Concise dates leave out what the first one already says.
-    formatter = _dates.ConciseDateFormatter(locator, tz=UTC)
-    names = formatter.format_ticks(places)
-
-    def dots(some: Sequence[Value]) -> tuple[Dot, ...]:
-        return tuple(
-            Dot(
-                _share(first, last, _dates.date2num(value.at)),
-                _share(low, high, value.number),
-                f"{value.name or f'{value.at:%Y-%m-%d %H:%M}'}: {value.number:.{digits}f} {unit}",
-                value.is_hollow,
-            )
-            for value in some
-        )
-
-    drawn = [Tick(_share(first, last, _dates.date2num(at)), name) for at, name in marks]
-    return Timeline(
-        title,
-        unit,
-        {name: dots(some) for name, some in series.items() if some},
-        tuple(mark for mark in drawn if 0 <= mark.at <= 1),
-        tuple(Tick(_share(first, last, at), name) for at, name in zip(places, names, strict=True)),
-        ticks(low, high, 4),
-        f"{formatter.get_offset()} UTC".strip(),
-        {name: some for name, some in series.items() if some},
-        None if limit is None else _share(low, high, limit),
-    )
 
 
 @dataclass(frozen=True)

@@ -67,15 +67,18 @@ def in_zone(zone: str | None) -> Callable[[datetime], str]:
     )
 
 
-def power(watts: float, unit: str = "W") -> Quantity:
+def power(watts: float) -> Quantity:
     """A power in W, or in kW from 1000 W."""
-    text = figure(watts / 1e3, 2, f"k{unit}") if abs(watts) >= 1000 else figure(watts, 0, unit)
-    return Quantity(text, float(watts), unit)
+    text = figure(watts / 1e3, 2, "kW") if abs(watts) >= 1000 else figure(watts, 0, "W")
+    return Quantity(text, float(watts), "W")
 
 
 def irradiance(watts_m2: float) -> Quantity:
-    """An irradiance in W/m², or in kW/m² from 1000 W/m²."""
-    return power(watts_m2, "W/m²")
+    """A flux in kW/m²; its ``value`` for tables as CSV is in W/m²."""
+    kilowatts = watts_m2 / 1e3
+    ends = enumerate((100.0, 10.0, 1.0))
+    digits = next((n for n, least in ends if abs(kilowatts) >= least), 3) if kilowatts else 0
+    return Quantity(figure(kilowatts, digits, "kW/m²"), float(watts_m2), "W/m²")
 
 
 def lasting(seconds: float) -> str:

@@ -4,31 +4,24 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Annotated, Any
-from zoneinfo import ZoneInfo
 
-from fastapi import APIRouter, Form, Path, Query, Request, Response
-from fastapi.exceptions import RequestValidationError
+from fastapi import APIRouter, Path, Query, Response
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
-from model.errors import InvalidInputError
 from service.base.arrays import unpack
 from service.base.errors import NotFoundError
-from service.base.fields import Lines, Version
+from service.base.fields import Version
 from service.drawing import charts
 from service.drawing.charts import HeatMap
-from service.jobs.enqueuing import enqueue
+from service.drawing.timelines import Threshold, TimeAxis, Timeline, Value, timeline
 from service.jobs.kind import result_of
-from service.jobs.kinds.aim_plans import KIND, MAX_STEPS, AimPlanIn, step_name
+from service.jobs.kinds.aim_plans import MAX_STEPS, step_name
 from service.sources.plant_tables import AIM_COLUMNS, DRIVE_COLUMNS
 from service.store.job_tables import JobRow
 from service.store.jobs import queue
-from service.twin.forecasts.aim_sources import plant_time_zone
 from service.twin.runtime.runtime import Runtime
-from service.web.auth.dependencies import OPERATE, READ, IdentityDep, KindsDep, RuntimeDep
-from service.web.pages.plan import PlanForm
+from service.web.auth.dependencies import READ, KindsDep, RuntimeDep
 from service.web.responses.csv_tables import sheet_answer
-from service.web.responses.pages import leave_for
 
 router = APIRouter(include_in_schema=False)
 
@@ -39,19 +32,34 @@ StepNumber = Annotated[
 ]
 
 
+# Excess of a plan that its draws cannot distinguish from none [1].
+_TOLERANCE = 0.005
+
+
 @dataclass(frozen=True)
 class AimView:
     """What the page shows of one step: its figures, its maps, and all steps of a day.
 
-    ``maps`` are on one scale: the limit with the aims, a single aim, and the plan. ``plan`` has the
-    fields of the form that plans the day with these aims; None if the plan has no times.
+    ``maps`` are on one scale: the limit with the aims, a single aim, and the plan. ``timelines``
+    are those of a day.
     """
 
     figures: Mapping[str, Any]
     chosen: int
     steps: list[Mapping[str, Any]]
     maps: dict[str, HeatMap]
-    plan: Mapping[str, object] | None
+    timelines: list[Timeline]
+
+    @property
+    def exceeded(self) -> list[Mapping[str, Any]]:
+        """The steps whose flux exceeds the limit."""
+        return [step for step in self.steps or [self.figures] if excess(step)]
+
+
+def excess(step: Mapping[str, Any]) -> float:
+    """By how much a step exceeds its limit in 95 % of draws, as a share of it [1], or 0."""
+    share: float = step["largest_share_of_limit"] - 1
+    return share if share > _TOLERANCE else 0.0
 
 
 def aim_view(runtime: Runtime, row: JobRow, step: int) -> AimView | None:
@@ -67,91 +75,28 @@ def aim_view(runtime: Runtime, row: JobRow, step: int) -> AimView | None:
     arrays = unpack(row.arrays if packed is None else packed)
     size = result["plane"]["width"], result["plane"]["height"]
     listed = steps if "steps" in result else []
-    return AimView(
-        {**result, **steps[chosen]}, chosen, listed, _maps(arrays, size), _plan_fields(row, steps)
+    lines = _timelines(listed, result.get("time_zone") or "UTC", row.payload["limit_w_m2"])
+    return AimView({**result, **steps[chosen]}, chosen, listed, _maps(arrays, size), lines)
+
+
+def _timelines(steps: list[Mapping[str, Any]], zone: str, limit_w_m2: Any) -> list[Timeline]:
+    """Power and flux over a day; the limit is a line if it is the same everywhere."""
+    limit = Threshold(limit_w_m2 / 1e3) if isinstance(limit_w_m2, int | float) else None
+    axis = TimeAxis(zone)
+
+    def series(names: Mapping[str, str]) -> dict[str, list[Value]]:
+        return {
+            name: [Value(step["at"], step[key] / 1e3) for step in steps]
+            for name, key in names.items()
+        }
+
+    power = {"plan": "power_w", "most that any aims can give": "bound_w"}
+    peak = {"peak in 95 % of draws": "peak_p95_w_m2", "expected peak": "peak_w_m2"}
+    drawn = (
+        timeline("Power on the receiver", "kW", series(power), 1, axis=axis),
+        timeline("Largest flux", "kW/m²", series(peak), 1, axis=axis, limit=limit),
     )
-
-
-def _plan_fields(row: JobRow, steps: list[Mapping[str, Any]]) -> Mapping[str, object] | None:
-    """Fields of `PlanForm` for the day of a plan of aims."""
-    given = row.payload
-    if given.get("target") is None or any(step["at"] is None for step in steps):
-        return None
-    limit, dni = given["limit_w_m2"], given["dni_w_m2"]
-    fields = {
-        "name": f"Aims of job {row.id}",
-        "target": given["target"],
-        "first_at": f"{steps[0]['at']:%Y-%m-%dT%H:%M}",
-        "last_at": f"{steps[-1]['at']:%Y-%m-%dT%H:%M}",
-        "step_minutes": (given.get("day") or {}).get("step_minutes", 60),
-        "heliostats": "\n".join(given.get("heliostats") or ()),
-        "aim_plan": row.id,
-    }
-    fields |= {"sunlight": "clear_sky"} if dni == "clear_sky" else {"dni_w_m2": dni}
-    return fields if isinstance(limit, list) else fields | {"allowed_kw_m2": limit / 1e3}
-
-
-class AimForm(PlanForm):
-    """The form of a plan, with another button.
-
-    ``limit_map_kw_m2`` has one row of the map a line [kW/m2], and replaces ``allowed_kw_m2``.
-    """
-
-    limit_map_kw_m2: Lines = ""
-
-    def limit(self) -> float | list[list[float]]:
-        """The limit [W/m2], as a number or a map.
-
-        Raises
-        ------
-        InvalidInputError
-            If there is none, or a line has something that is not a number.
-        """
-        lines = [line.replace(",", " ").split() for line in self.limit_map_kw_m2.splitlines()]
-        try:
-            rows = [[1e3 * float(word) for word in words] for words in lines if words]
-        except ValueError as error:
-            raise InvalidInputError(f"limit_map_kw_m2: give numbers only; {error}") from error
-        if rows:
-            return rows
-        if self.allowed_kw_m2 is None:
-            raise InvalidInputError(
-                "allowed_kw_m2: give the flux that the receiver can take; aims are found within it"
-            )
-        return 1e3 * self.allowed_kw_m2
-
-    def aim_payload(self, zone: str) -> AimPlanIn:
-        """The payload of the job, with the day in the plant's time zone."""
-        first, last = (at.astimezone(ZoneInfo(zone)) for at in (self.first_at, self.last_at))
-        if first.date() != last.date():
-            raise InvalidInputError(
-                f"last_at: {last:%Y-%m-%d %H:%M} at the plant is not on the day of first_at,"
-                f" {first:%Y-%m-%d}; aims are found for one day"
-            )
-        day = {"date": first.date(), "first": first.time(), "last": last.time()}
-        try:
-            return AimPlanIn.model_validate(
-                {
-                    "target": self.target,
-                    "day": day | {"step_minutes": self.step_minutes},
-                    "heliostats": list(self.chosen()) or None,
-                    "limit_w_m2": self.limit(),
-                    "dni_w_m2": "clear_sky" if self.sunlight == "clear_sky" else self.dni_w_m2,
-                }
-            )
-        except ValidationError as error:
-            raise RequestValidationError(error.errors()) from error
-
-
-@router.post("/aims", dependencies=[OPERATE])
-def post_aim_form(
-    request: Request, form: Annotated[AimForm, Form()], runtime: RuntimeDep, identity: IdentityDep
-) -> Response:
-    """Enqueue a plan of aims, and go to its page. Errors are shown next to the form."""
-    with runtime.database.reading() as session:
-        zone = plant_time_zone(session, runtime.settings.time_zone)
-    row = enqueue(runtime, KIND, form.aim_payload(zone), identity.name)
-    return leave_for(request, f"/jobs/{row.id}")
+    return [chart for chart in drawn if chart is not None]
 
 
 def _timed(step: Mapping[str, Any]) -> Mapping[str, Any]:

@@ -4,7 +4,7 @@ Maps share one scale. The page also shows the forecasts of both surfaces, and th
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, date, datetime, time, timedelta
 from functools import partial
 from statistics import fmean
@@ -23,22 +23,33 @@ from service import store
 from service.base.arrays import unpack
 from service.base.errors import NotFoundError
 from service.base.fields import AZIMUTH, ELEVATION, Model, Name, Sun, Version, drop_empty_fields
+from service.base.settings import Settings
 from service.drawing import charts
-from service.drawing.charts import HeatMap, Timeline, Value
+from service.drawing.charts import HeatMap
 from service.drawing.facets import FacetPlaces
+from service.drawing.timelines import Timeline, Value
 from service.store.listing import Period
 from service.store.pointing import mounts
 from service.store.tables import HeliostatRow, MountRow, PlantRow, SurfaceRow, TargetRow
 from service.twin.alerts.field_overview import SurfaceErrors, field_totals, surface_errors
+from service.twin.forecasts.aim_sources import plant_time_zone
 from service.twin.forecasts.heliostat_forecast import ForecastRequest, trace_request
 from service.twin.heliostats.facets import facet_places
 from service.twin.runtime.operations import Forecast
 from service.twin.runtime.runtime import Runtime
-from service.twin.surfaces.accuracy import Comparison, ComparisonResult
-from service.twin.surfaces.accuracy import photograph_name as photograph_of
+from service.twin.surfaces.accuracy import ComparisonResult
 from service.web.auth.dependencies import COMPUTE_SLOT, READ, RENDER_SLOT, RuntimeDep
 from service.web.pages.forecast import sun_now
 from service.web.pages.heliostat import ComparisonCacheDep, newest_surfaces
+from service.web.pages.heliostat_charts import (
+    OverTime,
+    accuracy_over_time,
+    accuracy_values,
+    draw_on_one_axis,
+    pointing_over_time,
+    pointing_values,
+    version_marks,
+)
 from service.web.responses.pages import render
 
 router = APIRouter(include_in_schema=False, dependencies=[READ])
@@ -116,11 +127,6 @@ class Side:
     def uncertainty_mm(self) -> float | None:
         """Uncertainty of the surface [mm]."""
         return field_totals(self.surface.arrays).uncertainty_mm
-
-
-def since_of(surface: SurfaceRow) -> datetime:
-    """Time from which a surface is valid, else when it was made."""
-    return surface.valid_from or surface.created_at
 
 
 _MAX_MOUNTS = 40
@@ -243,39 +249,21 @@ def _forecasts(
 
 
 def _within(values: Sequence[Value], span: Period) -> list[Value]:
+    """Values of a period; those without a time are of no period."""
     return [
-        value
-        for value in sorted(values, key=lambda value: value.at)
-        if (span.since is None or value.at >= span.since)
-        and (span.until is None or value.at < span.until)
-    ]
-
-
-def _judged(comparisons: Sequence[Comparison]) -> list[Value]:
-    """Accuracies of the forecasts [%] at the times of photographs, if these are known."""
-    return [
-        Value(row.taken_at, 100 * one.accuracy, photograph_of(row), one.was_used)
-        for one in comparisons
-        if (row := one.measurement).taken_at is not None
-    ]
-
-
-def _pointing(side: Side) -> list[Value]:
-    """Pointing errors by the newest mount [mrad], one for each photograph."""
-    if not side.mounts:
-        return []
-    history = side.mounts[-1].document["history"]
-    off_mrad = 1e3 * np.linalg.norm(np.array(history["residuals"]).reshape(-1, 2), axis=-1)
-    foreign = set(history["foreign"])
-    return [
-        Value(datetime.fromisoformat(at), float(off))
-        for index, (at, off) in enumerate(zip(history["at"], off_mrad, strict=True))
-        if index not in foreign and at is not None
+        one
+        for one in values
+        if span == Period()
+        or (
+            one.at is not None
+            and (span.since is None or one.at >= span.since)
+            and (span.until is None or one.at < span.until)
+        )
     ]
 
 
 def _timelines(
-    sides: tuple[Side, Side], compared: Sequence[ComparisonResult], span: Period
+    data: "_ComparisonData", sides: tuple[Side, Side], span: Period, settings: Settings
 ) -> list[Timeline]:
     """Timelines of accuracy, shape and pointing on one time axis.
 
@@ -283,12 +271,13 @@ def _timelines(
     """
     heliostats = {side.heliostat.name: side for side in sides}
     marks = [
-        (since_of(row), f"{name} {row.version}" if len(heliostats) > 1 else f"v{row.version}")
+        mark
         for name, side in heliostats.items()
-        for row in side.versions
+        for mark in version_marks(side.versions, f"{name} " if len(heliostats) > 1 else "v")
     ]
     accuracy = {
-        side.name: _judged(one.comparisons) for side, one in zip(sides, compared, strict=True)
+        side.name: accuracy_values(() if one is None else one.comparisons)
+        for side, one in zip(sides, data.compared, strict=True)
     }
     shapes = {
         name: [(row, side.shape_of(row)) for row in side.versions]
@@ -298,33 +287,27 @@ def _timelines(
     def of_shape(figure: str) -> dict[str, list[Value]]:
         return {
             name: [
-                Value(since_of(row), getattr(shape, figure), f"version {row.version}")
+                Value(row.valid_from, getattr(shape, figure), f"version {row.version}")
                 for row, shape in rows
             ]
             for name, rows in shapes.items()
         }
 
-    drawn: list[tuple[str, str, Mapping[str, Sequence[Value]], int]] = [
-        (
-            "Forecast accuracy of photographs; hollow: the surface was made from it",
-            "%",
-            accuracy,
-            1,
-        ),
-        ("Deviation from the ideal mirror", "mm", of_shape("deviation_mm"), 3),
-        ("Canting of the facets", "mrad", of_shape("canting_mrad"), 3),
-        ("Pointing error", "mrad", {name: _pointing(side) for name, side in heliostats.items()}, 2),
+    pointing = {
+        name: pointing_values(side.mounts[-1] if side.mounts else None)
+        for name, side in heliostats.items()
+    }
+    charts = [
+        accuracy_over_time(accuracy, settings),
+        OverTime("Deviation from the ideal mirror", "mm", of_shape("deviation_mm"), 3),
+        OverTime("Canting of the facets", "mrad", of_shape("canting_mrad"), 3),
+        pointing_over_time(pointing, settings),
     ]
-    shown = [
-        {name: _within(values, span) for name, values in series.items()}
-        for _, _, series, _ in drawn
+    within = [
+        replace(one, series={name: _within(some, span) for name, some in one.series.items()})
+        for one in charts
     ]
-    moments = [value.at for series in shown for values in series.values() for value in values]
-    made = [
-        charts.timeline(title, unit, series, digits, marks=marks, moments=moments)
-        for (title, unit, _, digits), series in zip(drawn, shown, strict=True)
-    ]
-    return [chart for chart in made if chart is not None]
+    return draw_on_one_axis(within, data.zone, marks)
 
 
 def _unseen(compared: Sequence[ComparisonResult]) -> tuple[list[float], int]:
@@ -355,6 +338,7 @@ class _ComparisonData:
     compared: Sequence[ComparisonResult | None]
     targets: Sequence[str]
     sun: tuple[float, float]
+    zone: str
 
 
 def _read(
@@ -363,6 +347,7 @@ def _read(
     with runtime.database.reading() as session:
         targets = session.scalars(select(TargetRow.name).order_by(TargetRow.name)).all()
         azimuth, elevation = sun_now(session.get(PlantRow, 1))
+        zone = plant_time_zone(session, runtime.settings.time_zone)
         sides = None if query.heliostat is None else _sides(session, query)
         if sides is not None:
             _require_as_many_facets(*sides)
@@ -372,7 +357,7 @@ def _read(
     compared = [ComparisonResult() if one is None else cache.wait_for(one) for one in shown]
     given = query.azimuth_deg, query.elevation_deg
     sun = (azimuth if given[0] is None else given[0], elevation if given[1] is None else given[1])
-    return _ComparisonData(sides, compared, targets, sun)
+    return _ComparisonData(sides, compared, targets, sun, zone)
 
 
 @router.get("/compare", dependencies=[RENDER_SLOT, COMPUTE_SLOT])
@@ -402,8 +387,6 @@ def get_compare_page(
         forecasts=forecasts,
         trouble=trouble,
         unseen=_unseen(known) if is_whole else None,
-        timelines=_timelines(
-            read.sides, [one or ComparisonResult() for one in read.compared], query.span
-        ),
+        timelines=_timelines(read, read.sides, query.span, runtime.settings),
         again=None if is_whole else str(request.url.query),
     )

@@ -20,10 +20,12 @@ from model.plant import inside_outline
 from service import store
 from service.base.arrays import unpack
 from service.base.fields import Version
+from service.base.settings import Settings
 from service.drawing import charts
 from service.drawing.charts import HeatMap, History, Scale
 from service.drawing.facets import FacetPlaces
 from service.drawing.pictures import comparison_picture, mirror_heights
+from service.drawing.timelines import Timeline
 from service.store.photographs.groups import (
     PhotographFilter,
     PhotographGroup,
@@ -39,10 +41,19 @@ from service.twin.alerts.field_overview import (
     field_totals,
     read_summaries,
 )
+from service.twin.forecasts.aim_sources import plant_time_zone
 from service.twin.heliostats.facets import facet_places
 from service.twin.pointing.calibration import CalibrationSlot, best_slot
 from service.twin.surfaces.accuracy import Comparison, ComparisonCache, ComparisonResult, rank_of
 from service.web.auth.dependencies import READ, FieldCacheDep, NamePath, RenderSlotDep, RuntimeDep
+from service.web.pages.heliostat_charts import (
+    accuracy_over_time,
+    accuracy_values,
+    draw_on_one_axis,
+    pointing_over_time,
+    pointing_values,
+    version_marks,
+)
 from service.web.responses.pages import render
 
 router = APIRouter(include_in_schema=False, dependencies=[READ])
@@ -279,6 +290,7 @@ class _HeliostatData:
     line: HeliostatOverview
     best: CalibrationSlot | None
     compared: ComparisonResult
+    zone: str
 
 
 def _read(
@@ -305,6 +317,7 @@ def _read(
         )
         mount = mounts.find_mount_at(session, row)
         shown, (line,) = cache.read(session, row, surface), read_summaries(session, row.id)
+        zone = plant_time_zone(session, runtime.settings.time_zone)
     # The rest of the page does not depend on the comparisons.
     compared = ComparisonResult() if shown is None else cache.wait_for(shown) or _UNDER_WAY
     line = field.with_pointing(line)
@@ -323,7 +336,19 @@ def _read(
         line,
         best,
         compared,
+        zone,
     )
+
+
+def _timelines(read: _HeliostatData, settings: Settings) -> list[Timeline]:
+    """Accuracy by the shown surface and pointing error by the mount, over time."""
+    surface = "ideal mirror" if read.surface is None else f"surface {read.surface.version}"
+    mount = "" if read.mount is None else f"mount {read.mount.version}"
+    charts = [
+        accuracy_over_time({surface: accuracy_values(read.compared.comparisons)}, settings),
+        pointing_over_time({mount: pointing_values(read.mount)}, settings),
+    ]
+    return draw_on_one_axis(charts, read.zone, version_marks(read.surfaces, "v"))
 
 
 @router.get("/heliostats/{name}")
@@ -350,6 +375,7 @@ def get_heliostat_page(
         decided=read.decided,
         undoable=read.undoable,
         histories=_histories(listed) if listed else [],
+        timelines=_timelines(read, runtime.settings),
         comparisons=comparison_figures(comparisons, ends["flux_difference"]),
         trouble=read.compared.trouble,
         groups=read.groups[:MAX_PHOTOGRAPHS],

@@ -31,7 +31,7 @@ from service.web.auth.dependencies import (
     KindsDep,
     RuntimeDep,
 )
-from service.web.pages.aim_plan import StepNumber, aim_view
+from service.web.pages.aim_plan import StepNumber, aim_view, excess
 from service.web.responses.csv_tables import sheet_answer
 from service.web.responses.pages import go_to, render
 
@@ -109,7 +109,12 @@ _LABELS = {
     "aim_offsets_m": "aims, right and up of the middle [m]",
     "images": "photographs of each heliostat",
 }
-_UNITS = {"_w_m2": "\N{NO-BREAK SPACE}W/m²", "_deg": "°", "_minutes": "\N{NO-BREAK SPACE}min"}
+_UNITS = {
+    "dni_w_m2": "\N{NO-BREAK SPACE}W/m²",
+    "_w_m2": "\N{NO-BREAK SPACE}kW/m²",
+    "_deg": "°",
+    "_minutes": "\N{NO-BREAK SPACE}min",
+}
 
 
 def _entry(name: str, value: Any) -> tuple[str, str]:
@@ -127,6 +132,8 @@ def _entry(name: str, value: Any) -> tuple[str, str]:
     if name in ("at", "first_at", "last_at"):
         return label, f"{datetime.fromisoformat(value):%Y-%m-%d %H:%M UTC}"
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if is_number and ending == "_w_m2":
+        value /= 1e3
     return label, f"{value:.10g}{_UNITS.get(ending, '')}" if is_number else in_words(value)
 
 
@@ -213,6 +220,7 @@ def get_job_page(
         by=by,
         light=result if row.kind == "forecasts" and "peak_w_m2" in result else None,
         aims=aims,
+        excess=excess,
         in_zone=in_zone(result.get("time_zone") or runtime.settings.time_zone),
         target=row.payload.get("target") if asked else None,
         facts={name: value for name, value in result.items() if _plain(value)},

@@ -20,18 +20,21 @@ from service.base.arrays import unpack
 from service.base.errors import NotFoundError
 from service.base.fields import FormMoment, Lines, Model, Name, Version
 from service.drawing import charts
-from service.drawing.charts import HeatMap, Timeline, Value
+from service.drawing.charts import HeatMap
 from service.drawing.templates import in_zone
+from service.drawing.timelines import Threshold, TimeAxis, Timeline, Value, timeline
 from service.jobs.enqueuing import delete_plan_for, enqueue
-from service.jobs.kinds import plans
+from service.jobs.kinds import aim_plans, plans
 from service.jobs.kinds.plans import PlanIn, PlanName, ReceiverLoad, map_name
 from service.store.columns import now
 from service.store.job_tables import JobRow
 from service.store.jobs import queue
+from service.twin.forecasts.aim_sources import plant_time_zone
 from service.twin.forecasts.watts import LossStage
 from service.twin.forecasts.watts import loss_chain as chain
 from service.twin.runtime.runtime import Runtime
 from service.web.auth.dependencies import OPERATE, READ, RENDER_SLOT, IdentityDep, RuntimeDep
+from service.web.pages.plan_aims import aims_for, plan_with
 from service.web.responses.pages import go_to, leave_for, render
 
 router = APIRouter(include_in_schema=False)
@@ -44,7 +47,7 @@ class PlanForm(Model):
     """The form. ``heliostats`` has one name a line.
 
     An optional aim follows the name: right and up of the middle [m]. ``aim_plan`` is the number of
-    a job `aim-plans`.
+    a job `aim-plans`. ``limit_map_kw_m2`` has one row of the receiver's map a line, for aims.
     """
 
     name: PlanName
@@ -54,6 +57,7 @@ class PlanForm(Model):
     step_minutes: float = Field(default=60.0, ge=1, le=1440)
     heliostats: Lines = ""
     allowed_kw_m2: float | None = Field(default=None, gt=0, le=1e5)
+    limit_map_kw_m2: Lines = ""
     aim_plan: Version | None = None
     sunlight: Literal["given", "clear_sky"] = "given"
     dni_w_m2: float = Field(default=1000.0, gt=0, le=2000)
@@ -80,6 +84,20 @@ class PlanForm(Model):
                 ) from error
             chosen[name] = (right, up) if aim else None
         return chosen
+
+    def limit_map(self) -> list[list[float]]:
+        """The limits [W/m2] over the receiver's map; none if they are not given.
+
+        Raises
+        ------
+        InvalidInputError
+            If a line has something that is not a number.
+        """
+        lines = [line.replace(",", " ").split() for line in self.limit_map_kw_m2.splitlines()]
+        try:
+            return [[1e3 * float(word) for word in words] for words in lines if words]
+        except ValueError as error:
+            raise InvalidInputError(f"limit_map_kw_m2: give numbers only; {error}") from error
 
     def payload(self) -> PlanIn:
         """The payload of the job."""
@@ -152,8 +170,7 @@ class Step:
 class Day:
     """Results of a finished plan.
 
-    ``energy_wh`` [Wh] is None if the plan has a single time. ``exceeded`` is the number of times at
-    which the flux exceeds the limit.
+    ``energy_wh`` [Wh] is None if the plan has a single time. ``allowed_w_m2`` is the limit, if any.
     """
 
     steps: list[Step]
@@ -161,7 +178,22 @@ class Day:
     timelines: list[Timeline]
     maps: dict[str, HeatMap]
     energy_wh: dict[str, float | None]
-    exceeded: int
+    allowed_w_m2: float | None
+
+    def excess(self, step: Step) -> float:
+        """By how much the twin's flux exceeds the limit at a time, as a share of it [1], or 0."""
+        allowed = self.allowed_w_m2
+        return 0.0 if allowed is None else max(0.0, step.twin["peak_w_m2"] / allowed - 1)
+
+    @property
+    def exceeded(self) -> list[Step]:
+        """The times at which the flux exceeds the limit."""
+        return [step for step in self.steps if self.excess(step) > 0]
+
+    @property
+    def worst(self) -> Step:
+        """The time of the largest flux."""
+        return max(self.steps, key=lambda step: step.twin["peak_w_m2"])
 
 
 def _series(steps: list[Step], figure: str, scale: float) -> dict[str, list[Value]]:
@@ -226,7 +258,7 @@ def _maps(row: JobRow, of_time: bytes) -> dict[str, HeatMap]:
     }
 
 
-def _day(session: Session, row: JobRow, at: int | None) -> Day:
+def _day(session: Session, row: JobRow, at: int | None, zone: str) -> Day:
     """A finished plan with the maps of one time. Other maps are not loaded."""
     assert row.result is not None
     steps = [
@@ -244,11 +276,13 @@ def _day(session: Session, row: JobRow, at: int | None) -> Day:
     of_time = queue.checkpoint_arrays(session, row.id, map_name(chosen))
     assert of_time is not None
     allowed = _allowed_w_m2(row)
-    limit = None if allowed is None else allowed / 1e3
+    limit, axis = None if allowed is None else Threshold(allowed / 1e3), TimeAxis(zone)
     drawn = (
-        charts.timeline("Power on the receiver", "kW", _series(steps, "power_w", 1e-3), 1),
-        charts.timeline("Largest flux", "kW/m²", _series(steps, "peak_w_m2", 1e-3), 1, limit=limit),
-        charts.timeline("Intercept factor", "%", _series(steps, "intercept", 100.0), 1),
+        timeline("Power on the receiver", "kW", _series(steps, "power_w", 1e-3), 1, axis=axis),
+        timeline(
+            "Largest flux", "kW/m²", _series(steps, "peak_w_m2", 1e-3), 1, axis=axis, limit=limit
+        ),
+        timeline("Intercept factor", "%", _series(steps, "intercept", 100.0), 1, axis=axis),
     )
     return Day(
         steps,
@@ -256,7 +290,7 @@ def _day(session: Session, row: JobRow, at: int | None) -> Day:
         [chart for chart in drawn if chart is not None],
         _maps(row, of_time),
         {kind: _energy(steps, kind) for kind in ("twin", "ideal")},
-        sum(bool(step.twin["exceeded_m2"]) for step in steps),
+        allowed,
     )
 
 
@@ -268,12 +302,13 @@ def _context(
     runtime: Runtime, session: Session, after: int | None, asked: PlanIn | None, name: str = ""
 ) -> dict[str, object]:
     """The form, filled with a request or with defaults, and the list of plans."""
+    zone = plant_time_zone(session, runtime.settings.time_zone)
     receivers = [row.name for row in store.list_receivers(session)]
     targets = [*receivers, *(row.name for row in store.list_targets(session))]
     plans = store.list_plans(session, LISTED + 1, after)
     return {
         "filled": _likely(targets, name) if asked is None else _filled(asked),
-        "in_zone": in_zone(runtime.settings.time_zone),
+        "in_zone": in_zone(None if zone == "UTC" else zone),
         "plan_days": runtime.settings.plan_retention_days,
         "targets": targets,
         "plans": plans[:LISTED],
@@ -287,10 +322,16 @@ Number = Annotated[Version, Path(description="Id of the plan's job.")]
 
 
 @router.get("/plans", dependencies=[READ])
-def get_plans_page(request: Request, runtime: RuntimeDep, after: After = None) -> HTMLResponse:
+def get_plans_page(
+    request: Request,
+    runtime: RuntimeDep,
+    after: After = None,
+    aims: Annotated[Version | None, Query(description="Job of an aim plan to fill in.")] = None,
+) -> HTMLResponse:
     """The form, and the list of plans."""
     with runtime.database.reading() as session:
-        context = _context(runtime, session, after, None)
+        asked = None if aims is None else plan_with(session, aims)
+        context = _context(runtime, session, after, asked)
     return render(request, "plan.html", **context, job=None, day=None)
 
 
@@ -307,10 +348,20 @@ def get_plan_page(
         row = queue.get_job(session, number, arrays=True)
         if row.kind != "plans":
             raise NotFoundError(f"job {number} is no plan")
-        day = None if row.result is None else _day(session, row, at)
+        zone = plant_time_zone(session, runtime.settings.time_zone)
+        day = None if row.result is None else _day(session, row, at, zone)
         context = _context(runtime, session, after, _stored_request(row), name=row.payload["name"])
-    is_live = row.state not in queue.ENDED
-    return render(request, "plan.html", **context, job=row, day=day, is_live=is_live)
+        asked = _stored_request(row)
+        aims = None if asked is None or day is None else aims_for(asked, zone)
+    return render(
+        request,
+        "plan.html",
+        **context,
+        job=row,
+        day=day,
+        is_live=row.state not in queue.ENDED,
+        aims_s=None if aims is None else aim_plans.expected_plan_s(aims, runtime),
+    )
 
 
 @router.post("/plans/{number}/delete", dependencies=[OPERATE])
@@ -331,3 +382,20 @@ def post_plan_form(
     payload = form.payload()
     row = enqueue(runtime, plans.KIND, payload, identity.name)
     return leave_for(request, f"/plans/{row.id}")
+
+
+@router.post("/aims", dependencies=[OPERATE])
+def post_aims_form(
+    request: Request, form: Annotated[PlanForm, Form()], runtime: RuntimeDep, identity: IdentityDep
+) -> Response:
+    """Enqueue aims for the times of the form, and go to the page of the job."""
+    with runtime.database.reading() as session:
+        zone = plant_time_zone(session, runtime.settings.time_zone)
+    try:
+        payload = aims_for(form.payload(), zone, form.limit_map())
+    except ValidationError as error:
+        raise RequestValidationError(error.errors()) from error
+    if payload is None:
+        raise InvalidInputError("allowed_kw_m2: give the flux that the receiver can take")
+    row = enqueue(runtime, aim_plans.KIND, payload, identity.name)
+    return leave_for(request, f"/jobs/{row.id}")

@@ -188,24 +188,32 @@ def test_exceeded_plan_gets_new_aims_in_the_browser(plant: TestClient):
         "allowed_kw_m2": "80",
         "dni_w_m2": "900",
     }
-    assert exceeded_times(plant, form) == 2
-    answer = plant.post("/aims", data=form, follow_redirects=False)
-    assert answer.status_code == 303, answer.text
-    assert real.worker(plant).work()
-    page = Page(plant.get(answer.headers["Location"], headers={"Accept": "text/html"}).text)
-    for words in ("2 steps", "13:00 CEST", "Plan the day with these aims", "No place exceeds"):
-        assert words in page.words
-    fields = page.one("form", action="/plans").all("input", type="hidden")
-    assert exceeded_times(plant, {field["name"]: field["value"] for field in fields}) == 0
+    plan = sent(plant, "/plans", form)
+    assert "exceeds the limit of 80.00 kW/m² at 2 of 2 times" in plan.words
+    (action,) = (one["action"] for one in plan.all("form") if one["action"].endswith("/aims"))
+    aims = sent(plant, action, {})
+    for words in ("2 steps", "13:00 CEST", "No place exceeds"):
+        assert words in aims.words
+    (link,) = (a["href"] for a in aims.all("a") if a.words == "Plan the day with these aims")
+    again = Page(plant.get(link, headers={"Accept": "text/html"}).text)
+    filled = {field["name"]: field.attributes.get("value", "") for field in again.all("input")}
+    kept = sent(plant, "/plans", form | {name: filled[name] for name in ("name", "aim_plan")})
+    assert "kept at all times" in kept.words
 
 
-def exceeded_times(client: TestClient, form: dict[str, str]) -> int:
-    """Number of times at which the plan of a form exceeds the limit."""
-    answer = client.post("/plans", data=form, follow_redirects=False)
+def test_aims_are_found_under_a_map_of_limits(plant: TestClient):
+    """From the form alone, without a plan before."""
+    form = {"name": "June", "target": "main", "limit_map_kw_m2": "200 200\n70, 70"}
+    form |= {"first_at": "2026-06-21T11:00", "last_at": "2026-06-21T11:00", "dni_w_m2": "900"}
+    assert "No place exceeds" in sent(plant, "/aims", form).words
+
+
+def sent(client: TestClient, path: str, form: dict[str, str]) -> Page:
+    """The page that a form leads to, when its job is done."""
+    answer = client.post(path, data=form, follow_redirects=False)
     assert answer.status_code == 303, answer.text
     assert real.worker(client).work()
-    job = client.get(f"/v1/jobs/{answer.headers['Location'].rsplit('/')[-1]}").json()
-    return sum(bool(step["twin"]["exceeded_m2"]) for step in job["result"]["steps"])
+    return Page(client.get(answer.headers["Location"], headers={"Accept": "text/html"}).text)
 
 
 @pytest.mark.parametrize(
@@ -213,7 +221,7 @@ def exceeded_times(client: TestClient, form: dict[str, str]) -> int:
     [
         ({}, "allowed_kw_m2"),
         ({"limit_map_kw_m2": "800 900\n800 x"}, "limit_map_kw_m2"),
-        ({"allowed_kw_m2": "80", "last_at": "2026-06-22T13:00"}, "one day"),
+        ({"limit_map_kw_m2": "800 900\n800"}, "rows of the same length"),
     ],
 )
 def test_a_wrong_form_of_aims_is_refused(plant: TestClient, changes: dict[str, str], said: str):
