@@ -105,7 +105,8 @@ def by_artist(scenario: Path, kernels: Kernels, power: float, limit: float) -> F
     out, listed = scenario.with_suffix(".npz"), scenario.with_suffix(".json")
     listed.write_text(json.dumps(entries))
     script, sun = Path(__file__).with_name("artist_tracer.py"), map(str, sun_direction(*SUN))
-    subprocess.run([sys.argv[1], "-P", script, scenario, "main", *sun, out, listed], check=True)
+    command = [Path(sys.argv[1]).absolute(), "-P", script, scenario, "main", *sun, out, listed]
+    subprocess.run(command, check=True, cwd=scenario.parent)  # where ARTIST writes its log
     with np.load(out) as found:
         names = found["names"].tolist()
         rows = [names.index(name) for name in kernels.names]
