@@ -101,9 +101,7 @@ def test_values_are_read_and_times_enlarged_on_all_charts(
 
 def test_exceeded_plan_says_so_in_words(page: Any):
     page.goto(plan_path(page))
-    expect(page.locator("p.alert")).to_contain_text(
-        "exceeds the limit of 0.500 kW/m² at 4 of 4 times"
-    )
+    expect(page.locator("main")).to_contain_text("exceeds the limit of 0.500 kW/m² at 4 of 4 times")
     expect(page.locator("#series .beyond >> text=exceeds by")).to_have_count(4)
 
 
