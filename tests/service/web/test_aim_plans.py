@@ -191,7 +191,7 @@ def test_exceeded_plan_gets_new_aims_in_the_browser(plant: TestClient):
         "dni_w_m2": "900",
     }
     plan = sent(plant, "/plans", form)
-    assert re.search(r"exceeds the limit of 80\S* kW/m² at 2 of 2 times", plan.words)
+    assert re.search(r"exceeds the limit of 80\S*\skW/m² at 2 of 2 times", plan.words)
     (action,) = (one["action"] for one in plan.all("form") if one["action"].endswith("/aims"))
     aims = sent(plant, action, {})
     for words in ("2 steps", "13:00 CEST", "No place exceeds"):
