@@ -23,8 +23,9 @@ from service.store import sizes
 from service.store.job_tables import JobRow
 from service.store.jobs import queue
 from service.store.tables import DriftRow, HeliostatRow
-from service.twin.alerts.alerts import REASONS, Alert, list_alerts
+from service.twin.alerts.alerts import Alert, list_alerts
 from service.twin.alerts.field_overview import PATIENCE_S, FieldOverviewCache, HeliostatOverview
+from service.twin.alerts.reasons import REASONS
 from service.twin.runtime.runtime import Runtime
 from service.twin.studies.camera_watch import CameraChange
 
@@ -132,10 +133,10 @@ def _attention(items: Sequence[Alert]) -> Metric:
     family = GaugeMetricFamily(
         "heliotwin_attention",
         "What needs attention, and whether it was acknowledged.",
-        labels=["reason", "acknowledged"],
+        labels=["reason", "severity", "acknowledged"],
     )
     for reason, seen in product(REASONS, ("no", "yes")):
-        family.add_metric([reason, seen], counted[reason, seen])
+        family.add_metric([reason, str(REASONS[reason].severity), seen], counted[reason, seen])
     return family
 
 

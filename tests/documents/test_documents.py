@@ -8,7 +8,7 @@ from typer.main import get_command
 
 from service.base.settings import Settings
 from service.cli.main import app
-from service.twin.alerts.alerts import REASONS
+from service.twin.alerts.reasons import REASONS
 
 from .prose import DOCS, ROOT, pages, sentences, statistics_of
 

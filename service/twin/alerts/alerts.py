@@ -10,12 +10,13 @@ import hashlib
 import math
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from datetime import time as clock
 from itertools import pairwise
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 from sqlalchemy import ColumnElement, case, func, or_, select
 from sqlalchemy.orm import Session
@@ -48,46 +49,12 @@ from service.twin.alerts.field_overview import (
     FieldOverviewCache,
     HeliostatOverview,
 )
+from service.twin.alerts.reasons import REASONS, SEVERITIES, Reason, Severity
 from service.twin.forecasts.aim_sources import outdated_plans
 from service.twin.plant import model_versions
 from service.twin.pointing.errors import DriveStep, PointingState
 from service.twin.runtime.runtime import Runtime
 from service.twin.studies.camera_watch import FIGURES, CameraChange
-
-Reason = Literal[
-    "queue",
-    "aims_outdated",
-    "camera",
-    "clock",
-    "moved",
-    "pointing",
-    "drift",
-    "accuracy",
-    "fell",
-    "untrusted",
-    "unlike_heliostat",
-    "sun_contradicts_time",
-    "no_photograph",
-    "times_unknown",
-]
-
-REASONS: dict[Reason, str] = {
-    "queue": "Queue stuck",
-    "aims_outdated": "Aims outdated",
-    "camera": "Camera changed",
-    "clock": "Clock wrong",
-    "moved": "Moved",
-    "pointing": "Pointing error",
-    "drift": "Drives drift",
-    "accuracy": "Newest forecast poor",
-    "fell": "Accuracy fell",
-    "untrusted": "Surface not trusted",
-    "unlike_heliostat": "Unlike its heliostat",
-    "sun_contradicts_time": "Sun contradicts time",
-    "no_photograph": "No photograph",
-    "times_unknown": "Times unknown",
-}
-"""All reasons with their labels, the most urgent first."""
 
 # Longest time that the count in the pages' menu is reused [s].
 _COUNT_HOLDS_S = 15.0
@@ -115,6 +82,11 @@ class Alert:
         """Identifier from heliostat, reason and fingerprint; it changes with the fingerprint."""
         digest = hashlib.sha256(self.fingerprint.encode()).hexdigest()[:8]
         return f"{self.heliostat or 'plant'}:{self.reason}:{digest}"
+
+    @property
+    def severity(self) -> Severity:
+        """How urgent the reason is: 1 (act now) to 3 (when there is time)."""
+        return REASONS[self.reason].severity
 
 
 class AlertList(NamedTuple):
@@ -556,25 +528,31 @@ def _acknowledge(session: Session, item: Alert, actor: str) -> Alert:
 
 
 class AlertCount:
-    """Number of alerts that nobody has acknowledged, for the menu of every page.
+    """Numbers of open alerts, which nobody has acknowledged, for the menu of every page.
 
-    The count is cached for some seconds.
+    They are cached for some seconds.
     """
 
     def __init__(self, runtime: Runtime, cache: FieldOverviewCache) -> None:
         self._runtime, self._cache = runtime, cache
         self._lock = threading.Lock()
-        self._counted, self._counted_s = 0, -math.inf
+        self._counted: dict[Severity, int] = dict.fromkeys(SEVERITIES, 0)
+        self._counted_s = -math.inf
 
-    def read(self) -> int:
-        """The count, at most some seconds old."""
+    def by_severity(self) -> dict[Severity, int]:
+        """The number of open alerts of each severity, at most some seconds old."""
         with self._lock:
             if time.monotonic() - self._counted_s >= _COUNT_HOLDS_S:
                 with self._runtime.database.reading() as session:
                     items, _ = list_alerts(session, self._cache, self._runtime.settings)
-                self._counted = sum(item.acknowledged_by is None for item in items)
+                counted = Counter(item.severity for item in items if item.acknowledged_by is None)
+                self._counted = {severity: counted[severity] for severity in SEVERITIES}
                 self._counted_s = time.monotonic()
-            return self._counted
+            return dict(self._counted)
+
+    def read(self) -> int:
+        """The number of all open alerts."""
+        return sum(self.by_severity().values())
 
     def forget(self) -> None:
         """Count again at the next read, because an alert was acknowledged."""

@@ -8,7 +8,8 @@ from fastapi import APIRouter, Body, Depends, Query, Request
 from pydantic import BaseModel, Field
 
 from service.base.fields import From, Model
-from service.twin.alerts.alerts import Alert, AlertCount, Reason, acknowledge, list_alerts
+from service.twin.alerts.alerts import Alert, AlertCount, acknowledge, list_alerts
+from service.twin.alerts.reasons import Reason, Severity
 from service.web.auth.dependencies import (
     OPERATE,
     OVERVIEW_SLOT,
@@ -42,6 +43,9 @@ class AttentionOut(BaseModel):
 
     id: ItemId
     reason: Reason = Field(description="What kind of alert it is.")
+    severity: Severity = Field(
+        description="By the reason: 1 act now, 2 act today, 3 when there is time."
+    )
     heliostat: str | None = Field(description="null: the plant as a whole.")
     since: From
     message: str = Field(description="What is wrong.")
@@ -87,6 +91,9 @@ def list_attention(
     runtime: RuntimeDep,
     cache: FieldCacheDep,
     reason: Annotated[Reason | None, Query(description="Only this reason.")] = None,
+    severity: Annotated[
+        int | None, Query(ge=1, le=3, description="Only this severity: 1, 2 or 3.")
+    ] = None,
     acknowledged: Annotated[
         bool | None, Query(description="Only alerts that are, or are not, acknowledged.")
     ] = None,
@@ -100,6 +107,7 @@ def list_attention(
         item
         for item in items
         if reason in (None, item.reason)
+        and severity in (None, item.severity)
         and acknowledged in (None, item.acknowledged_by is not None)
         and (after is None or item.id > after)
     ]

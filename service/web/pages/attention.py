@@ -9,7 +9,8 @@ from markupsafe import Markup
 from pydantic import Field
 
 from service.base.fields import Model
-from service.twin.alerts.alerts import REASONS, Reason, acknowledge, list_alerts
+from service.twin.alerts.alerts import acknowledge, list_alerts
+from service.twin.alerts.reasons import REASONS, SEVERITIES, Reason
 from service.web.api.attention import AttentionCountDep, ItemId
 from service.web.auth.dependencies import (
     OPERATE,
@@ -51,6 +52,7 @@ def get_attention_page(
         request,
         "attention.html",
         reasons=REASONS,
+        severities=SEVERITIES,
         counts=Counter(item.reason for item in chosen),
         others=len(items) - len(chosen),
         listed=listed[:_LISTED],

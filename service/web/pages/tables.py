@@ -41,7 +41,7 @@ def get_attention_table(runtime: RuntimeDep, cache: FieldCacheDep) -> Response:
     """All alerts, acknowledged or not."""
     with runtime.database.reading() as session:
         items, _ = list_alerts(session, cache, runtime.settings)
-    columns = [one.name for one in fields(Alert) if one.name != "mark"]
+    columns = ["id", "severity", *(one.name for one in fields(Alert) if one.name != "fingerprint")]
     return sheet_answer(
         "attention", columns, ([getattr(item, name) for name in columns] for item in items)
     )

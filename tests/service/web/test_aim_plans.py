@@ -272,7 +272,9 @@ def test_a_change_since_todays_plan_raises_an_alert_until_a_new_plan(plant: Test
     assert f"plan {job['id']} of aims for today on main" in alert["message"]
     assert f"properties of 1: {name}" in alert["message"]
     metrics = plant.get("/metrics").text
-    assert 'heliotwin_attention{acknowledged="no",reason="aims_outdated"} 1.0' in metrics
+    assert (
+        'heliotwin_attention{acknowledged="no",reason="aims_outdated",severity="1"} 1.0' in metrics
+    )
     real.done_job(plant, "/v1/jobs/aim-plans", **today)
     assert outdated(plant) == []
 

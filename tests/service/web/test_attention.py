@@ -23,7 +23,8 @@ from service.store.columns import now
 from service.store.job_tables import AuditRow, JobRow
 from service.store.jobs import queue
 from service.store.tables import DriftRow, HeliostatRow, MeasurementRow
-from service.twin.alerts.alerts import REASONS, Reason
+from service.twin.alerts.alerts import AlertCount
+from service.twin.alerts.reasons import REASONS, Reason
 from service.twin.surfaces.accuracy import accuracy_drop
 from service.web.app import create_app
 from tests.service.conftest import (
@@ -340,12 +341,22 @@ def test_queue_that_is_stuck(app: FastAPI, client: TestClient):
     (item,) = items(client)
     assert item["message"] == f"job {job.id} has waited since then"
     assert (
-        'heliotwin_attention{acknowledged="no",reason="queue"} 1.0' in client.get("/metrics").text
+        'heliotwin_attention{acknowledged="no",reason="queue",severity="1"} 1.0'
+        in client.get("/metrics").text
     )
     acknowledge(client, item)
     metrics = client.get("/metrics").text
-    assert 'heliotwin_attention{acknowledged="no",reason="queue"} 0.0' in metrics
-    assert 'heliotwin_attention{acknowledged="yes",reason="queue"} 1.0' in metrics
+    assert 'heliotwin_attention{acknowledged="no",reason="queue",severity="1"} 0.0' in metrics
+    assert 'heliotwin_attention{acknowledged="yes",reason="queue",severity="1"} 1.0' in metrics
+
+
+def test_severities_in_lists_tables_and_counts(stale: TestClient):
+    assert {item["severity"] for item in items(stale, severity=3)} == {3}
+    assert items(stale, severity=1) == []
+    assert stale.get(PATH, params={"severity": 4}).status_code == 422
+    counts: AlertCount = stale.app.state.attention  # type: ignore[attr-defined]
+    assert counts.by_severity() == {1: 0, 2: 0, 3: 3}
+    assert stale.get("/attention.csv").text.splitlines()[1].split(",")[1] == "3"
 
 
 @pytest.fixture

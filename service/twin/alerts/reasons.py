@@ -1,0 +1,51 @@
+"""Reasons of alerts: their labels and severities."""
+
+from typing import Literal, NamedTuple
+
+Reason = Literal[
+    "queue",
+    "aims_outdated",
+    "clock",
+    "camera",
+    "moved",
+    "pointing",
+    "accuracy",
+    "fell",
+    "untrusted",
+    "unlike_heliostat",
+    "sun_contradicts_time",
+    "drift",
+    "no_photograph",
+    "times_unknown",
+]
+
+Severity = Literal[1, 2, 3]
+
+SEVERITIES: dict[Severity, str] = {1: "Act now", 2: "Act today", 3: "When there is time"}
+"""All severities with their labels, the most urgent first."""
+
+
+class ReasonProperties(NamedTuple):
+    """Label and severity of a reason."""
+
+    label: str
+    severity: Severity
+
+
+REASONS: dict[Reason, ReasonProperties] = {
+    "queue": ReasonProperties("Queue stuck", 1),
+    "aims_outdated": ReasonProperties("Aims outdated", 1),
+    "clock": ReasonProperties("Clock wrong", 1),
+    "camera": ReasonProperties("Camera changed", 2),
+    "moved": ReasonProperties("Moved", 2),
+    "pointing": ReasonProperties("Pointing error", 2),
+    "accuracy": ReasonProperties("Newest forecast poor", 2),
+    "fell": ReasonProperties("Accuracy fell", 2),
+    "untrusted": ReasonProperties("Surface not trusted", 2),
+    "unlike_heliostat": ReasonProperties("Unlike its heliostat", 2),
+    "sun_contradicts_time": ReasonProperties("Sun contradicts time", 2),
+    "drift": ReasonProperties("Drives drift", 3),
+    "no_photograph": ReasonProperties("No photograph", 3),
+    "times_unknown": ReasonProperties("Times unknown", 3),
+}
+"""All reasons, the most urgent first."""
