@@ -156,8 +156,8 @@ def _step(stored: StoredSurface) -> dict[str, object]:
     return {"version": stored.row.version, "judged": judged}
 
 
-# Duration per heliostat [s] by method.
-_EACH_S: Mapping[Method, float] = {"network": 0.5, "refined": 60.0}
+EACH_S: Mapping[Method, float] = {"network": 0.5, "refined": 60.0}
+"""Stated duration per heliostat [s] by method."""
 
 # Heliostats whose type is looked up for all of a job.
 _SAMPLE = 50
@@ -167,7 +167,7 @@ def expected_s(payload: PredictionsIn, runtime: Runtime) -> float:
     """Estimated duration [s]; mirrors that no network was trained for are refined."""
     names = chosen_names(runtime, payload.heliostats)
     refined = 1.0 if payload.method == "refined" else _share_refined(runtime, names[:_SAMPLE])
-    return len(names) * (refined * _EACH_S["refined"] + (1 - refined) * _EACH_S["network"])
+    return len(names) * (refined * EACH_S["refined"] + (1 - refined) * EACH_S["network"])
 
 
 def _share_refined(runtime: Runtime, names: Sequence[str]) -> float:

@@ -1,4 +1,4 @@
-"""Pages of jobs: what runs, what has ended, and buttons that start and cancel jobs."""
+"""Pages of jobs: what runs, what has ended, and buttons that cancel jobs."""
 
 from collections.abc import Mapping
 from datetime import datetime
@@ -10,14 +10,12 @@ from fastapi.responses import HTMLResponse
 from model.fleet import LOSSES
 from service.base.arrays import unpack
 from service.base.errors import NotFoundError
-from service.base.fields import Method, Model, Name, Version
+from service.base.fields import Version
 from service.drawing import charts
 from service.drawing.charts import HeatMap
 from service.drawing.templates import in_words, in_zone
-from service.jobs.enqueuing import cancel_for, enqueue
+from service.jobs.enqueuing import cancel_for
 from service.jobs.kind import Kinds, result_of
-from service.jobs.kinds import predictions
-from service.jobs.kinds.predictions import PredictionsIn
 from service.store.job_tables import JobRow
 from service.store.jobs import queue
 from service.store.sizes import sizes
@@ -43,13 +41,6 @@ _PAGE = 50
 
 # Most names of a list that the page of a job shows, such as its heliostats.
 _SHOWN = 100
-
-
-class PredictionForm(Model):
-    """The form that requests surfaces, of one heliostat or of all."""
-
-    heliostat: Name | None = None
-    method: Method = "refined"
 
 
 @router.get("/jobs", dependencies=[READ])
@@ -232,16 +223,6 @@ def get_job_page(
         warnings=result.get("warnings", []),
         shown=_SHOWN,
     )
-
-
-@router.post("/jobs/predictions", dependencies=[OPERATE])
-def post_predictions_form(
-    form: Annotated[PredictionForm, Form()], runtime: RuntimeDep, identity: IdentityDep
-) -> Response:
-    """Enqueue predictions, and go to the page of the job."""
-    heliostats = None if form.heliostat is None else [form.heliostat]
-    payload = PredictionsIn(heliostats=heliostats, method=form.method)
-    return go_to(f"/jobs/{enqueue(runtime, predictions.KIND, payload, identity.name).id}")
 
 
 @router.post("/jobs/{number}/cancel", dependencies=[OPERATE])

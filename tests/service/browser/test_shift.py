@@ -59,6 +59,7 @@ PATHS = (
     "/calibration-plan?at=2026-06-21T10:00",
     "/studies/1",
     "/jobs",
+    "/jobs/start",
     "/jobs/1",
     "/compare?heliostat=AA39&version=1&other_version=1",
     "/plans",
@@ -209,11 +210,14 @@ def test_operator_follows_and_cancels_a_job(page: Any, served: Served):
     served.operations.gate.clear()
     page.goto("/heliostats/AA39")
     follow(page, "text=Predict its surface")
+    expect(page.locator("#predictions .cost")).to_contain_text("1 surface, about")
+    follow(page, "text=Predict AA39, refined")
     first = page.url
     expect(page.locator("#progress-title")).to_have_text("running")
     # The one worker is held up, so another job waits, and ends as soon as it is cancelled.
     page.goto("/heliostats/AA39")
     follow(page, "text=Predict its surface")
+    follow(page, "text=Predict AA39, refined")
     follow(page, "text=Cancel")
     expect(page.locator("#progress-title")).to_have_text("cancelled")
     page.goto(first)

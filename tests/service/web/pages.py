@@ -67,6 +67,7 @@ PATHS = (
     "/forecast?heliostat=AA39",
     "/forecasts/1",
     "/jobs",
+    "/jobs/start",
     "/jobs/1",
     "/studies",
     "/studies/1",

@@ -1,0 +1,106 @@
+"""Page of the work that can be started, with what each would cost before it starts."""
+
+from pathlib import Path
+from typing import Annotated
+
+from fastapi import APIRouter, Form, Query, Request, Response
+from fastapi.responses import HTMLResponse
+from pydantic import model_validator
+
+from service import store
+from service.base.fields import FormMoment, Method, Model, Name, Text, drop_empty_fields
+from service.jobs.costs import calibration_cost, import_cost, prediction_cost
+from service.jobs.enqueuing import enqueue
+from service.jobs.kinds import calibrations, imports, predictions
+from service.jobs.kinds.calibrations import CalibrationIn
+from service.jobs.kinds.imports import ImportIn, allowed_folder, allowed_root
+from service.jobs.kinds.predictions import PredictionsIn
+from service.web.auth.dependencies import OPERATE, IdentityDep, RuntimeDep
+from service.web.responses.pages import go_to, render
+
+router = APIRouter(include_in_schema=False, prefix="/jobs", dependencies=[OPERATE])
+
+_MOST_FOLDERS = 200
+
+
+class StartQuery(Model):
+    """What the page computes costs of: one ``heliostat`` or all, a method, and a folder."""
+
+    heliostat: Name | None = None
+    method: Method = "refined"
+    folder: Text | None = None
+
+    _filled = model_validator(mode="before")(drop_empty_fields)
+
+    @property
+    def heliostats(self) -> list[str] | None:
+        """The heliostats of a job's payload; None for all."""
+        return None if self.heliostat is None else [self.heliostat]
+
+
+class CalibrationForm(Model):
+    """The form that requests mounts, from photographs of a time range."""
+
+    heliostat: Name | None = None
+    since: FormMoment | None = None
+    until: FormMoment | None = None
+
+    _filled = model_validator(mode="before")(drop_empty_fields)
+
+
+def _folders(root: Path | None) -> list[str]:
+    """Folders that may be imported, the first of them."""
+    if root is None or not root.is_dir():
+        return []
+    return [".", *sorted(path.name for path in root.iterdir() if path.is_dir())][:_MOST_FOLDERS]
+
+
+@router.get("/start")
+def get_start_page(
+    request: Request, query: Annotated[StartQuery, Query()], runtime: RuntimeDep
+) -> HTMLResponse:
+    """Predictions, calibration, import and uploads, each with its expected cost."""
+    settings = runtime.settings
+    folder = None
+    if query.folder is not None:
+        folder = allowed_folder(allowed_root(settings), query.folder)
+    with runtime.database.reading() as session:
+        if query.heliostat is not None:
+            store.get_heliostat(session, query.heliostat)
+        return render(
+            request,
+            "job_start.html",
+            query=query,
+            prediction=prediction_cost(session, query.heliostat, query.method),
+            calibration=calibration_cost(session, query.heliostat),
+            importing=None if folder is None else import_cost(session, folder),
+            folders=_folders(settings.import_root),
+        )
+
+
+@router.post("/predictions")
+def post_predictions_form(
+    form: Annotated[StartQuery, Form()], runtime: RuntimeDep, identity: IdentityDep
+) -> Response:
+    """Enqueue predictions, and go to the page of the job."""
+    payload = PredictionsIn(heliostats=form.heliostats, method=form.method)
+    return go_to(f"/jobs/{enqueue(runtime, predictions.KIND, payload, identity.name).id}")
+
+
+@router.post("/calibrations")
+def post_calibrations_form(
+    form: Annotated[CalibrationForm, Form()], runtime: RuntimeDep, identity: IdentityDep
+) -> Response:
+    """Enqueue a calibration, and go to the page of the job."""
+    names = None if form.heliostat is None else [form.heliostat]
+    payload = CalibrationIn(heliostats=names, since=form.since, until=form.until)
+    return go_to(f"/jobs/{enqueue(runtime, calibrations.KIND, payload, identity.name).id}")
+
+
+@router.post("/imports")
+def post_imports_form(
+    form: Annotated[ImportIn, Form()], runtime: RuntimeDep, identity: IdentityDep
+) -> Response:
+    """Enqueue the import of a folder, and go to the page of the job."""
+    allowed_folder(allowed_root(runtime.settings), form.folder)
+    return go_to(f"/jobs/{enqueue(runtime, imports.KIND, form, identity.name).id}")

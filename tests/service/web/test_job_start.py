@@ -1,0 +1,78 @@
+"""The page of the work that can be started: what each would cost, and a second click that starts."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+
+from service.base.settings import Settings
+from tests.service import real
+from tests.service.conftest import QUIET, Post, png
+from tests.service.spots import photographs
+from tests.service.web.pages import HTML, text_of
+
+
+@pytest.fixture
+def settings(tmp_path: Path) -> Settings:
+    root = tmp_path / "imports"
+    (root / "stj" / "AB01" / "Properties").mkdir(parents=True)
+    return Settings(data_dir=tmp_path / "data", import_root=root, **QUIET)
+
+
+def _started(client: TestClient, path: str, **form: str) -> dict[str, Any]:
+    """The job that a form starts, when it is done."""
+    answer = client.post(path, data=form, headers=HTML, follow_redirects=False)
+    assert answer.status_code == 303, answer.text
+    assert real.worker(client).work()
+    job: dict[str, Any] = client.get(f"/v1{answer.headers['Location']}").json()
+    return job
+
+
+def test_predictions_show_their_cost_before_they_start(client: TestClient, post: Post):
+    post(png(1))
+    page = text_of(client, "/jobs/start")
+    text = page.one("section", id="predictions").words
+    assert "1 surface, about 60 s" in text.replace("\xa0", " ")
+    assert "a stated rate" in text
+    assert client.get("/v1/jobs").json()["items"] == []
+    job = _started(client, "/jobs/predictions", method="refined", heliostat="")
+    assert job["state"] == "done"
+    assert job["payload"]["heliostats"] is None
+    text = text_of(client, "/jobs/start?heliostat=AA39").one("section", id="predictions").words
+    assert "the median of 1 earlier job on this machine" in text
+    assert "Predict AA39, refined" in text
+
+
+def test_calibration_and_import_show_their_cost(
+    client: TestClient, post: Post, settings: Settings, tower: Any, properties: Any
+):
+    for number, taken in enumerate(photographs(tower, properties)):
+        assert post(png(number), **taken).status_code == 201
+    page = text_of(client, "/jobs/start?folder=stj")
+    assert "1 mount, about" in page.one("section", id="calibrations").words.replace("\xa0", " ")
+    assert "0 images" in page.one("section", id="imports").words.replace("\xa0", " ")
+    job = _started(client, "/jobs/calibrations", heliostat="AA39", since="2024-05-01T00:00")
+    assert job["result"]["mounts"] == {"AA39": 1}
+    root = settings.import_root
+    assert root is not None
+    (root / "stj" / "tower-measurements.json").write_text(json.dumps(tower))
+    (root / "stj" / "AB01" / "Properties" / "AB01-heliostat-properties.json").write_text(
+        json.dumps(properties)
+    )
+    assert _started(client, "/jobs/imports", folder="stj")["result"]["counts"]["heliostats new"] == 1
+
+
+@pytest.mark.parametrize("folder", ["..", "nothing"])
+def test_only_folders_of_the_allowed_one_are_offered(client: TestClient, folder: str):
+    answer = client.get("/jobs/start", params={"folder": folder}, headers=HTML)
+    assert answer.status_code == 422
+    assert "under the one that may be imported" in answer.text
+    assert client.post("/jobs/imports", data={"folder": folder}, headers=HTML).status_code == 422
+
+
+def test_an_unknown_heliostat_is_named(client: TestClient):
+    answer = client.get("/jobs/start?heliostat=ZZ99", headers=HTML)
+    assert answer.status_code == 404
+    assert "ZZ99" in answer.text
