@@ -1,4 +1,4 @@
-"""The page of the work that can be started: what each would cost, and a second click that starts."""
+"""The page of work that can be started: the cost of each, and the second click that starts it."""
 
 import json
 from pathlib import Path
@@ -61,7 +61,9 @@ def test_calibration_and_import_show_their_cost(
     (root / "stj" / "AB01" / "Properties" / "AB01-heliostat-properties.json").write_text(
         json.dumps(properties)
     )
-    assert _started(client, "/jobs/imports", folder="stj")["result"]["counts"]["heliostats new"] == 1
+    assert (
+        _started(client, "/jobs/imports", folder="stj")["result"]["counts"]["heliostats new"] == 1
+    )
 
 
 @pytest.mark.parametrize("folder", ["..", "nothing"])
