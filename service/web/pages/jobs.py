@@ -30,6 +30,7 @@ from service.web.auth.dependencies import (
     RuntimeDep,
 )
 from service.web.pages.aim_plan import StepNumber, aim_view, excess
+from service.web.pages.calibration_result import OFFSETS, calibration_view
 from service.web.responses.csv_tables import sheet_answer
 from service.web.responses.pages import go_to, render
 
@@ -187,6 +188,7 @@ def get_job_page(
         row = queue.get_summary(session, number)
         is_live, asked, flux, aims = row.state not in queue.ENDED, None, None, None
         result: Mapping[str, Any] = {}
+        calibration = None
         if not is_live or "hx-request" not in request.headers:
             session.expunge(row)
             row = queue.get_job(session, number, arrays=True)
@@ -196,6 +198,7 @@ def get_job_page(
                 _flux(row),
             )
             aims = aim_view(runtime, row, step)
+            calibration = calibration_view(session, row, result)
     return render(
         request,
         "job.html",
@@ -211,6 +214,8 @@ def get_job_page(
         by=by,
         light=result if row.kind == "forecasts" and "peak_w_m2" in result else None,
         aims=aims,
+        calibration=calibration,
+        offsets=OFFSETS,
         excess=excess,
         in_zone=in_zone(result.get("time_zone") or runtime.settings.time_zone),
         target=row.payload.get("target") if asked else None,
@@ -219,7 +224,7 @@ def get_job_page(
         surfaces=result.get("surfaces", {}),
         unchanged=result.get("unchanged", {}),
         judged=result.get("judged", {}),
-        skipped=result.get("skipped", {}),
+        skipped={} if calibration else result.get("skipped", {}),
         warnings=result.get("warnings", []),
         shown=_SHOWN,
     )

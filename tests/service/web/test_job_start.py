@@ -78,3 +78,32 @@ def test_an_unknown_heliostat_is_named(client: TestClient):
     answer = client.get("/jobs/start?heliostat=ZZ99", headers=HTML)
     assert answer.status_code == 404
     assert "ZZ99" in answer.text
+
+
+def test_a_calibration_shows_mounts_steps_outliers_and_why_it_skipped(
+    client: TestClient, post: Post, tower: Any, properties: Any
+):
+    taken = photographs(tower, properties, step_mrad=6.0)
+    taken[3] = taken[3] | {
+        "focal_spot_m": [x + 0.8 for x in taken[3]["focal_spot_m"][:1]]
+        + taken[3]["focal_spot_m"][1:]
+    }
+    for number, one in enumerate(taken):
+        assert post(png(number), **one).status_code == 201
+    client.put("/v1/heliostats/AB01", json=properties)
+    job = _started(client, "/jobs/calibrations")
+    page = text_of(client, f"/jobs/{job['id']}")
+    assert "AA39" in page.one("table", id="mounts").words
+    assert page.one("table", id="mounts").words.count("±") == 5  # with the caption
+    (step,) = page.one("table", id="steps").all("tr")[1:]
+    assert "it likely lost steps" in step.words
+    assert step.all("a", href="/heliostats/AA39/photographs/7")
+    (outlier,) = page.one("table", id="outliers").all("tr")[1:]
+    assert outlier.one("a")["href"] == "/heliostats/AA39/photographs/3"
+    assert "no measurement with motor positions and a spot: AB01" in page.words
+    assert "No clock error was found." in page.words
+    sheet = client.get(f"/jobs/{job['id']}?table=mounts").text
+    assert sheet.startswith("Heliostat,Version,")
+    # A later calibration of the same state replaces the mount.
+    _started(client, "/jobs/calibrations")
+    assert "calibrated again since" in text_of(client, f"/jobs/{job['id']}").words
