@@ -35,14 +35,14 @@ class CalibrationView:
 
     versions: Mapping[str, int]
     mounts: Mapping[str, Mapping[str, Any] | None]
-    steps: list[tuple[str, Mapping[str, Any]]]
+    steps: list[tuple[str, Mapping[str, object]]]
     outliers: list[tuple[str, str, str]]
     skipped: Mapping[str, list[tuple[str, str]]]
     clock: str | None
     undated: str | None
 
 
-def _step(step: Mapping[str, Any]) -> dict[str, Any]:
+def _step(step: Mapping[str, Any]) -> Mapping[str, object]:
     ends = {end: datetime.fromisoformat(step[end]) for end in ("from", "to")}
     return {"detail": "", "std_mrad": None} | dict(step) | ends
 
