@@ -80,7 +80,7 @@ def calibration_view(
             for step in reversed(steps)
         ],
         [
-            (*key.split("/", 1), found["detail"])  # type: ignore[misc]
+            (*key.split("/", 1), found["detail"])
             for key, found in sorted(result.get("outliers", {}).items())
         ],
         skipped,
