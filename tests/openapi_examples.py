@@ -292,7 +292,8 @@ def study(record: Recorder) -> None:
     record.call("list_studies", "GET /v1/studies")
     assert record.call("get_study", f"GET {path}")["verdict"] == "effect"
     record.call("get_study_report", f"GET {path}/report")
-    record.call("adopt_study", f"POST {path}/adopt", 201, json={"force": False})
+    reason = {"reason": "the camera's maker confirms the curve"}
+    record.call("adopt_study", f"POST {path}/adopt", 201, json=reason)
     record.call("list_models", "GET /v1/models")
     record.call("get_current_model", "GET /v1/models/current")
     record.call("withdraw_study", f"POST {path}/withdraw")

@@ -7,6 +7,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from model.errors import InvalidInputError
+
 if TYPE_CHECKING:
     from sqlalchemy.orm import Session
 
@@ -18,6 +20,12 @@ def keep_private() -> None:
     The store holds hashes of keys, photographs and positions, and so does a backup.
     """
     os.umask(0o077)
+
+
+def require_reason(reason: str) -> None:
+    """Require a reason that fits the store; InvalidInputError else."""
+    if not 1 <= len(reason) <= 200:
+        raise InvalidInputError("--reason must have 1 to 200 characters")
 
 
 @contextmanager

@@ -58,6 +58,7 @@ from service.store.results import (
     list_studies,
     recent_field_forecasts,
     recent_forecasts,
+    study_findings,
 )
 from service.store.rows import Change, insert, serialize_writers
 from service.store.surfaces.surface_versions import (
@@ -147,6 +148,7 @@ __all__ = [
     "serialize_writers",
     "stored_receiver",
     "stored_tower",
+    "study_findings",
     "target_plane",
     "use_image",
 ]

@@ -1,9 +1,9 @@
 """Storage of forecasts and studies, and row counts."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from typing import cast
+from typing import Any, cast
 
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session, joinedload, lazyload, load_only, undefer
@@ -203,6 +203,22 @@ def list_studies(
     if verdict is not None:
         query = query.where(StudyRow.verdict == verdict)
     return session.scalars(select_after(session, query, StudyRow, order, after)).all()
+
+
+@dataclass(frozen=True)
+class StudyFindings:
+    """Parts of a study's report: the effects found, and the share of the error that is left."""
+
+    effects: Sequence[Mapping[str, Any]]
+    unexplained_share: float
+
+
+def study_findings(session: Session, studies: Sequence[int]) -> dict[int, StudyFindings]:
+    """Findings by study id. The database extracts them from the reports."""
+    report = StudyRow.report
+    query = select(StudyRow.id, report["effects"], report["unexplained_share"].as_float())
+    rows = session.execute(query.where(StudyRow.id.in_(studies)))
+    return {number: StudyFindings(effects, share) for number, effects, share in rows}
 
 
 _COUNTED: dict[str, type[Base]] = {

@@ -501,7 +501,8 @@ class ModelRow(Base):
 
     ``study_id`` is the study that it was adopted from. Without one, the version came from a changed
     declaration. The first version has no row; its declaration is in the plant's row. Rows are never
-    deleted, and change only by withdrawal.
+    deleted, and change only by withdrawal. ``reason`` and ``withdrawn_reason`` are those that a
+    person gave.
     """
 
     __tablename__ = "models"
@@ -515,3 +516,5 @@ class ModelRow(Base):
     adopted_by: Mapped[str] = mapped_column(String(64))
     withdrawn_at: Mapped[datetime | None]
     withdrawn_by: Mapped[str | None] = mapped_column(String(64))
+    reason: Mapped[str | None] = mapped_column(String(200))
+    withdrawn_reason: Mapped[str | None] = mapped_column(String(200))

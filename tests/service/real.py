@@ -26,6 +26,8 @@ CANDIDATES = ["camera_response", "camera_shoulder"]
 """Of the catalogue's effects those that a study of all of them finds in these photographs: two of
 them are cheap.
 """
+REASON = {"reason": "the photographs that would decide are ordered"}
+"""For adopting what that study found, because it leaves questions open."""
 SUN = {"azimuth_deg": 200.0, "elevation_deg": 45.0}
 
 
@@ -98,7 +100,7 @@ def fill(stj: Path, folder: Path) -> None:
         assert study["verdict"] == "effect", study
         path = f"/v1/studies/{study['study']}"
         assert client.get(path).json()["effects"][0]["scope"] == {"kind": "set"}
-        assert client.post(f"{path}/adopt").status_code == 201
+        assert client.post(f"{path}/adopt", json=REASON).status_code == 201
         assert client.post(f"{path}/withdraw").status_code == 200
 
 

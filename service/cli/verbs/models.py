@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from service.cli.output import AsJson
-from service.cli.store import actor, reading, writing
+from service.cli.store import actor, reading, require_reason, writing
 
 app = typer.Typer(
     name="models",
@@ -46,6 +46,9 @@ def adopt(
     force: Annotated[
         bool, typer.Option("--force", help="Also where its verdict is not `effect`.")
     ] = False,
+    reason: Annotated[
+        str | None, typer.Option(help="Why; needed if the study leaves questions open.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Add the effects of a folder's study to its model; this model becomes current."""
@@ -54,13 +57,15 @@ def adopt(
     from service.twin.plant import model_versions
     from service.twin.studies.study import model_of_report, parse_report, row_of_report
 
+    if reason is not None:
+        require_reason(reason)
     name = report.name
     with writing() as session:
         document = read_json(report)
         parse_report(document, name)
         model = model_of_report(session, document, name)
         study = store.add_study(session, row_of_report(document, name, model, actor()))
-        row = model_versions.adopt(session, study.id, actor(), force)
+        row = model_versions.adopt(session, study.id, actor(), force, reason)
         outdated = {
             one.heliostat: one.version for one in store.outdated_surfaces(session, row.version)
         }

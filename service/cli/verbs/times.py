@@ -9,7 +9,7 @@ import typer
 
 from model.errors import InvalidInputError
 from service.cli.output import AsJson
-from service.cli.store import actor
+from service.cli.store import actor, require_reason
 
 if TYPE_CHECKING:
     from service.twin.photographs.corrections import GivenTime
@@ -38,8 +38,7 @@ def times(
     from service.twin.runtime.runtime import Runtime
 
     given = read_times(file)
-    if not 1 <= len(reason) <= 200:
-        raise InvalidInputError("--reason must have 1 to 200 characters")
+    require_reason(reason)
     settings = Settings()
     require_store(settings)
     runtime = Runtime.from_settings(settings)

@@ -29,12 +29,12 @@ from service.store.plant.model_versions import (
     version_name,
 )
 from service.store.tables import ModelRow
+from service.twin.plant.open_questions import open_questions
 
 __all__ = [
     "DECLARED",
     "ModelVersion",
     "adopt",
-    "adopted_from",
     "current_number",
     "current_version",
     "find_adopted",
@@ -42,6 +42,7 @@ __all__ = [
     "find_model",
     "get_model",
     "list_models",
+    "newest_of",
     "version_name",
     "withdraw",
 ]
@@ -64,14 +65,15 @@ class ModelVersion(PlantModel):
 
 def find_adopted(session: Session, study: int) -> ModelRow | None:
     """The newest version adopted from a study, unless it is withdrawn."""
-    return adopted_from(session, [study]).get(study)
+    row = newest_of(session, [study]).get(study)
+    return None if row is None or row.withdrawn_at else row
 
 
-def adopted_from(session: Session, studies: Sequence[int]) -> dict[int, ModelRow]:
-    """The version that `find_adopted` finds for each study, by study id."""
-    query = select(ModelRow).where(ModelRow.study_id.in_(studies), ModelRow.withdrawn_at.is_(None))
-    # The last of a study's versions overwrites the others.
-    rows = session.scalars(query.order_by(ModelRow.number))
+def newest_of(session: Session, studies: Sequence[int]) -> dict[int, ModelRow]:
+    """The newest version of each study, withdrawn only if all its versions are, by study id."""
+    query = select(ModelRow).where(ModelRow.study_id.in_(studies)).order_by(ModelRow.number)
+    rows = [row for row in session.scalars(query) if row.study_id is not None]
+    rows.sort(key=lambda row: (row.withdrawn_at is None, row.number))
     return {row.study_id: row for row in rows if row.study_id is not None}
 
 
@@ -147,7 +149,9 @@ def _effects(data: Any) -> tuple[Effect, ...]:
 # -----------------------------------------------------------------------------------------
 
 
-def adopt(session: Session, number: int, actor: str, force: bool = False) -> ModelRow:
+def adopt(
+    session: Session, number: int, actor: str, force: bool = False, reason: str | None = None
+) -> ModelRow:
     """Adopt the effects of a study in a new current version.
 
     The new version has the effects that the study assumed and those that it found. This is the
@@ -160,7 +164,8 @@ def adopt(session: Session, number: int, actor: str, force: bool = False) -> Mod
         If there is no such study.
     ConflictError
         If the study found no effect. Without ``force``, also if its verdict is not "effect", or if
-        it was made with another version than the current one.
+        it was made with another version than the current one. Without a ``reason``, if the study
+        leaves questions open (`open_questions`).
     """
     store.serialize_writers(session)
     study = store.get_study(session, number)
@@ -182,17 +187,28 @@ def adopt(session: Session, number: int, actor: str, force: bool = False) -> Mod
     held = find_adopted(session, number)
     if held is not None and held.number == current:
         return held
+    questions = open_questions(study.report["effects"], study.report["unexplained_share"])
+    if questions and not reason:
+        raise ConflictError(
+            f"reason: study {number} leaves questions open"
+            f" ({'; '.join(question.finding for question in questions)}); resolve them, or give the"
+            " reason to adopt it nevertheless"
+        )
     base = _row(session, study.model)
     before = () if base is None else _effects(base.effects)
     row = add_model(session, (*before, *found), declared_of(session, base), study.id, actor)
+    row.reason = reason
     names = [effect.name for effect in found]
-    audit.record(
-        session, actor, "effect.adopted", f"study {number}", model=row.version, effects=names
-    )
+    about = {"model": row.version, "effects": names, **_given(reason)}
+    audit.record(session, actor, "effect.adopted", f"study {number}", **about)
     return row
 
 
-def withdraw(session: Session, study: int, actor: str) -> ModelRow:
+def _given(reason: str | None) -> dict[str, str]:
+    return {"reason": reason} if reason else {}
+
+
+def withdraw(session: Session, study: int, actor: str, reason: str | None = None) -> ModelRow:
     """Withdraw the version adopted from a study; the version before is current again.
 
     Raises
@@ -212,6 +228,7 @@ def withdraw(session: Session, study: int, actor: str) -> ModelRow:
             f"version {row.number} of the model is not the current one: "
             f"withdraw version {current.number}, adopted from study {current.study_id}, first"
         )
-    row.withdrawn_at, row.withdrawn_by = now(), actor
-    audit.record(session, actor, "effect.withdrawn", f"study {study}", model=row.version)
+    row.withdrawn_at, row.withdrawn_by, row.withdrawn_reason = now(), actor, reason
+    about = {"model": row.version, **_given(reason)}
+    audit.record(session, actor, "effect.withdrawn", f"study {study}", **about)
     return row

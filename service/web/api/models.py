@@ -38,13 +38,15 @@ class ModelOut(BaseModel):
     adopted_by: str | None = Field(description="Name of the key that adopted it.")
     withdrawn_at: datetime | None = Field(description="When it was withdrawn; null: it was not.")
     withdrawn_by: str | None = Field(description="Name of the key that withdrew it.")
+    reason: str | None = Field(description="Why it was adopted, as it was given.")
+    withdrawn_reason: str | None = Field(description="Why it was withdrawn, as it was given.")
 
 
 def declared_model(declared: dict[str, object] | None, is_current: bool) -> ModelOut:
     """The declared model, which is the first version."""
-    unknown = dict.fromkeys(("study", "adopted_at", "adopted_by", "withdrawn_at", "withdrawn_by"))
+    unknown = dict.fromkeys(ModelOut.model_fields)
     about = {"version": model_versions.DECLARED, "effects": [], "declared": declared}
-    return ModelOut.model_validate({**about, "is_current": is_current, **unknown})
+    return ModelOut.model_validate({**unknown, **about, "is_current": is_current})
 
 
 def model_out(row: ModelRow, is_current: bool) -> ModelOut:

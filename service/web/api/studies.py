@@ -6,7 +6,6 @@ from typing import Annotated
 from fastapi import APIRouter, Path, Query, Response, status
 from fastapi.responses import HTMLResponse
 from pydantic import BaseModel, Field
-from sqlalchemy.orm import Session
 
 from service import store
 from service.base.errors import NotFoundError
@@ -16,6 +15,7 @@ from service.base.fields import (
     Id,
     Model,
     ModelNumber,
+    Reason,
     StudyReport,
     Verdict,
     Version,
@@ -26,6 +26,7 @@ from service.store.listing import Order, Period
 from service.store.tables import StudyRow
 from service.twin.plant import model_versions
 from service.twin.runtime.runtime import Runtime
+from service.twin.studies.states import AdoptionState, StudyState, study_states
 from service.web.api.jobs import add_creator
 from service.web.api.models import ModelOut, current_out, model_out
 from service.web.auth.dependencies import OPERATE, READ, IdentityDep, Limit, RuntimeDep
@@ -55,6 +56,15 @@ class StudySummary(BaseModel):
         description="effect: it is found; none: nothing is missing; unexplained: something is."
     )
     conclusion: str = Field(description="The verdict in one sentence.")
+    state: AdoptionState = Field(
+        description=(
+            "What became of it; replaced: a version that was adopted from it, and a later one is"
+            " current."
+        )
+    )
+    open_questions: list[str] = Field(
+        description="What it leaves open; to adopt it then needs a reason."
+    )
 
 
 class StudyOut(StudySummary, StudyReport):
@@ -82,17 +92,32 @@ class AdoptIn(Model):
             " now, which it then takes the place of."
         ),
     )
+    reason: Reason | None = Field(
+        default=None,
+        description=(
+            "Why; kept with the version. Needed if the study leaves questions open: more than half"
+            " of the error beyond noise is unexplained, or other effects look alike."
+        ),
+    )
 
 
-def study_summary(row: StudyRow, adopted: int | None) -> StudySummary:
-    """A study without its figures. ``adopted`` is the version that was adopted from it."""
-    return from_row(StudySummary, row, adopted=adopted)
+class WithdrawIn(Model):
+    """How to withdraw what was adopted from a study."""
+
+    reason: Reason | None = Field(default=None, description="Why; kept with the version.")
 
 
-def study_out(row: StudyRow, adopted: int | None) -> StudyOut:
+def study_summary(row: StudyRow, state: StudyState) -> StudySummary:
+    """A study without its figures."""
+    questions = [question.finding for question in state.questions]
+    about = {"adopted": state.adopted, "state": state.state, "open_questions": questions}
+    return from_row(StudySummary, row, **about)
+
+
+def study_out(row: StudyRow, state: StudyState) -> StudyOut:
     """A study, loaded with its report, as JSON."""
     return StudyOut.model_validate(
-        {**row.report, **dict(study_summary(row, adopted)), "skipped": row.skipped}
+        {**row.report, **dict(study_summary(row, state)), "skipped": row.skipped}
     )
 
 
@@ -121,11 +146,6 @@ Nothing else may load or run in it. It keeps this origin, so that its links work
 add_creator(router, KINDS["studies"], "/studies", "post_study")
 
 
-def _adopted(session: Session, row: StudyRow) -> int | None:
-    version = model_versions.find_adopted(session, row.id)
-    return None if version is None else version.number
-
-
 @router.get("/studies", responses=problems(), dependencies=[READ])
 def list_studies(
     runtime: RuntimeDep,
@@ -142,9 +162,8 @@ def list_studies(
         rows = store.list_studies(
             session, limit + 1, after, verdict=verdict, created=made, order=direction
         )
-        adopted = model_versions.adopted_from(session, [row.id for row in rows])
-    versions_of = {study: version.number for study, version in adopted.items()}
-    items = [study_summary(row, versions_of.get(row.id)) for row in rows]
+        states = study_states(session, rows)
+    items = [study_summary(row, states[row.id]) for row in rows]
     return page(items, limit)
 
 
@@ -153,7 +172,7 @@ def get_study(number: Number, runtime: RuntimeDep) -> StudyOut:
     """Get a study: its verdict, its results, and their benefit."""
     with runtime.database.reading() as session:
         row = store.get_study(session, number)
-        return study_out(row, _adopted(session, row))
+        return study_out(row, study_states(session, [row])[number])
 
 
 @router.get(
@@ -181,21 +200,25 @@ def adopt_study(
     number: Number, runtime: RuntimeDep, identity: IdentityDep, request: AdoptIn | None = None
 ) -> AdoptedOut:
     """Adopt the result of a study. It becomes the current version of the plant model."""
-    force = request is not None and request.force
+    asked = request or AdoptIn()
     with runtime.database.writing() as session:
-        row = model_versions.adopt(session, number, identity.name, force)
+        row = model_versions.adopt(session, number, identity.name, asked.force, asked.reason)
         outdated = {
             one.heliostat: one.version for one in store.outdated_surfaces(session, row.version)
         }
         return AdoptedOut(**dict(model_out(row, is_current=True)), outdated_surfaces=outdated)
 
 
-@router.post("/studies/{number}/withdraw", responses=problems(404, 409), dependencies=[OPERATE])
-def withdraw_study(number: Number, runtime: RuntimeDep, identity: IdentityDep) -> ModelOut:
+@router.post(
+    "/studies/{number}/withdraw", responses=problems(404, 409, 413), dependencies=[OPERATE]
+)
+def withdraw_study(
+    number: Number, runtime: RuntimeDep, identity: IdentityDep, request: WithdrawIn | None = None
+) -> ModelOut:
     """Withdraw what was adopted from a study.
 
     The version before it is current again, and is the response.
     """
     with runtime.database.writing() as session:
-        model_versions.withdraw(session, number, identity.name)
+        model_versions.withdraw(session, number, identity.name, (request or WithdrawIn()).reason)
         return current_out(session)

@@ -1,19 +1,21 @@
 """Pages of studies: which effects the model still lacks, and the decision to adopt them."""
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from fastapi import APIRouter, Form, Path, Query, Request, Response
 from fastapi.responses import HTMLResponse
+from pydantic import Field
 
 from service import store
 from service.base.errors import ConflictError
-from service.base.fields import CheckedStudyReport, Method, Model, Version
+from service.base.fields import CheckedStudyReport, Method, Model, Text, Version
 from service.jobs.enqueuing import enqueue
 from service.jobs.kinds import predictions, studies
 from service.jobs.kinds.predictions import PredictionsIn
 from service.jobs.kinds.studies import StudyIn
 from service.store.tables import PlantRow
 from service.twin.plant import model_versions
+from service.twin.studies.states import study_states
 from service.web.api.studies import REPORT_POLICY, study_html
 from service.web.auth.dependencies import OPERATE, READ, IdentityDep, RuntimeDep
 from service.web.responses.pages import go_to, render
@@ -28,10 +30,19 @@ _PAGE = 50
 _CRUMB = "heliotwin study</p>"
 
 
-class AdoptForm(Model):
-    """The button. ``force`` adopts against the verdict of the study."""
+class DecisionForm(Model):
+    """A form that adopts or withdraws. ``read`` is the tick below warnings.
 
-    force: bool = False
+    ``back`` is the page to return to.
+    """
+
+    read: bool = False
+    reason: Annotated[Text, Field(max_length=200)] = ""
+    back: Literal["", "list"] = ""
+
+    def path(self, number: int) -> str:
+        """The path of the page to return to."""
+        return "/studies#studies-title" if self.back else f"/studies/{number}"
 
 
 class PredictAgainForm(Model):
@@ -47,7 +58,7 @@ def get_studies_page(
     """Studies, newest first, and the versions of the plant model that were adopted from them."""
     with runtime.database.reading() as session:
         rows = store.list_studies(session, _PAGE + 1, after)
-        adopted = model_versions.adopted_from(session, [row.id for row in rows])
+        states = study_states(session, rows[:_PAGE])
         current = None if session.get(PlantRow, 1) is None else model_versions.get_model(session)
         adoptions = model_versions.list_models(session)
         outdated = store.outdated_surfaces(session, model_versions.current_version(session))
@@ -56,7 +67,7 @@ def get_studies_page(
         request,
         "studies.html",
         studies=rows[:_PAGE],
-        adopted=adopted,
+        states=states,
         current=current,
         outdated=outdated,
         versions=adoptions,
@@ -70,10 +81,8 @@ def get_study_page(number: Number, request: Request, runtime: RuntimeDep) -> HTM
     """A study with its report, and the button that adopts its result."""
     with runtime.database.reading() as session:
         row, has_page = store.get_study(session, number), store.has_study_page(session, number)
-        adopted, current = (
-            model_versions.find_adopted(session, number),
-            model_versions.current_number(session),
-        )
+        state = study_states(session, [row])[number]
+        current = model_versions.current_number(session)
         outdated = store.outdated_surfaces(session, model_versions.current_version(session))
     report = CheckedStudyReport.model_validate(row.report)
     return render(
@@ -87,7 +96,8 @@ def get_study_page(number: Number, request: Request, runtime: RuntimeDep) -> HTM
             for name, fitted in effect.parameters.items()
         ],
         has_page=has_page,
-        adopted=adopted,
+        state=state,
+        adopted=state.version if state.adopted else None,
         current=current,
         outdated=outdated,
     )
@@ -132,17 +142,28 @@ def post_predict_again_form(
 
 @router.post("/studies/{number}/adopt", dependencies=[OPERATE])
 def post_adopt_form(
-    number: Number, form: Annotated[AdoptForm, Form()], runtime: RuntimeDep, identity: IdentityDep
+    number: Number,
+    form: Annotated[DecisionForm, Form()],
+    runtime: RuntimeDep,
+    identity: IdentityDep,
 ) -> Response:
     """Adopt the result of a study as the next plant model."""
     with runtime.database.writing() as session:
-        model_versions.adopt(session, number, identity.name, form.force)
-    return go_to(f"/studies/{number}")
+        state = study_states(session, [store.get_study(session, number)])[number]
+        if state.questions and form.reason and not form.read:
+            raise ConflictError("read: tick 'I have read this' below the warning")
+        model_versions.adopt(session, number, identity.name, form.read, form.reason or None)
+    return go_to(form.path(number))
 
 
 @router.post("/studies/{number}/withdraw", dependencies=[OPERATE])
-def post_withdraw_form(number: Number, runtime: RuntimeDep, identity: IdentityDep) -> Response:
+def post_withdraw_form(
+    number: Number,
+    form: Annotated[DecisionForm, Form()],
+    runtime: RuntimeDep,
+    identity: IdentityDep,
+) -> Response:
     """Withdraw the adopted model."""
     with runtime.database.writing() as session:
-        model_versions.withdraw(session, number, identity.name)
-    return go_to(f"/studies/{number}")
+        model_versions.withdraw(session, number, identity.name, form.reason or None)
+    return go_to(form.path(number))

@@ -34,6 +34,8 @@ def test_operator_adopts_what_a_study_found_and_withdraws_it(page: Any):
     page.goto("/studies")
     follow(page, 'a[href="/studies/1"]')
     expect(page.locator("#verdict-title")).to_contain_text("effect found")
+    page.check("text=I have read this")
+    page.fill("input[name=reason]", "the camera is known")
     follow(page, "button:has-text('Adopt')")
     expect(page.locator("#verdict-title .state.done")).to_have_text("adopted")
     with page.expect_download() as csv:

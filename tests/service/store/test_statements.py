@@ -63,7 +63,7 @@ def test_studies_of_a_page_are_found_with_their_versions_at_once(database: Datab
     for study in studies[:3]:
         adopt(database, study, force=True)
     with database.reading() as session, statements(database) as sent:
-        found = model_versions.adopted_from(session, studies)
+        found = model_versions.newest_of(session, studies)
     assert {study: row.number for study, row in found.items()} == dict(
         zip(studies[:3], (2, 3, 4), strict=True)
     )

@@ -1,5 +1,6 @@
 """Adopting an effect: surfaces made with the old model are listed, and made again."""
 
+import csv
 import json
 from pathlib import Path
 from typing import Any
@@ -44,6 +45,63 @@ def test_adopting_names_the_surfaces_of_the_old_model(app: FastAPI, pages: TestC
     # Withdrawn, the old model is the current one again, and its surfaces are in order.
     assert pages.post(f"/studies/{number}/withdraw", follow_redirects=False).status_code == 303
     assert "another version of the model" not in text_of(pages, "/studies")
+
+
+def test_open_questions_need_a_tick_and_a_reason(real_client: TestClient):
+    """The real study finds an effect with a look-alike, and most of the error stays."""
+    rest, page = "/v1/studies/1", text_of(real_client, "/studies/1")
+    unexplained = "61% of the error beyond noise is unexplained"
+    alike = "the photographs cannot distinguish camera shoulder from camera response"
+    assert real_client.get(rest).json()["open_questions"] == [unexplained, alike]
+    for text in (unexplained, alike.capitalize(), "To decide, photograph a lamp"):
+        assert text in page
+    assert page.one("input", name="read").attributes.keys() >= {"required"}
+    for body in ({}, {"force": True}):
+        refused = real_client.post(f"{rest}/adopt", json=body)
+        assert refused.status_code == 409
+        detail = refused.json()["detail"]
+        assert detail.startswith("reason: ")
+        assert unexplained in detail
+        assert alike in detail
+    form = {"reason": "the lamp said so"}
+    assert "tick" in real_client.post("/studies/1/adopt", data=form).json()["detail"]
+    assert real_client.post("/studies/1/adopt", data={"read": "true"}).status_code == 409
+    done = real_client.post(
+        "/studies/1/adopt", data=form | {"read": "true"}, follow_redirects=False
+    )
+    assert done.status_code == 303
+    assert real_client.get("/v1/models/current").json()["reason"] == "the lamp said so"
+    assert "the lamp said so" in text_of(real_client, "/studies/1")
+    back = {"reason": "it was another lamp"}
+    assert real_client.post(f"{rest}/withdraw", json=back).status_code == 200
+    versions = real_client.get("/v1/models").json()["items"]
+    assert versions[-1]["withdrawn_reason"] == "it was another lamp"
+    entries = [entry["detail"] for entry in real_client.get("/v1/audit").json()["items"][:2]]
+    assert [entry["reason"] for entry in entries] == ["it was another lamp", "the lamp said so"]
+
+
+def test_list_adopts_withdraws_and_adopts_again(real_client: TestClient):
+    def state() -> str:
+        table = real_client.get("/studies", params={"table": "studies"}).text.splitlines()
+        (line,) = csv.DictReader(table)
+        assert (line["Verdict"], line["Found"]) == ("effect found", "camera shoulder")
+        assert float(line["Unexplained [%]"]) == pytest.approx(60.84)
+        return line["State"]
+
+    def post(action: str) -> None:
+        form = {"read": "true", "reason": "as agreed", "back": "list"}
+        answer = real_client.post(f"/studies/1/{action}", data=form, follow_redirects=False)
+        assert answer.headers["Location"] == "/studies#studies-title"
+
+    assert state() == "withdrawn (version 2)"
+    assert "Adopt again" in text_of(real_client, "/studies")
+    post("adopt")
+    assert state() == "active (version 3)"
+    page = text_of(real_client, "/studies")
+    assert "as agreed" in page
+    assert "Adopt again" not in page
+    post("withdraw")
+    assert state() == "withdrawn (version 3)"
 
 
 def test_job_predicts_outdated_surfaces_again(
@@ -96,3 +154,9 @@ def test_command_line_names_them_too(
     done = CliRunner().invoke(command, ["models", "adopt", str(report)])
     assert done.exit_code == 0, done.output
     assert "AA39, AB01" in done.output.replace("\n", " ")
+    document = report_of(SLOPE | {"lookalikes": ["sun_shape"]})
+    report.write_text(json.dumps(document), encoding="utf-8")
+    refused = CliRunner().invoke(command, ["models", "adopt", str(report)])
+    assert "cannot distinguish slope error from sun shape" in str(refused.exception)
+    options = ["--reason", "no haze"]
+    assert CliRunner().invoke(command, ["models", "adopt", str(report), *options]).exit_code == 0

@@ -356,6 +356,6 @@ def test_new_surface_and_new_model_raise_the_alert(real_client: TestClient):
     assert f"plan {job['id']} of aims for today" in alert["message"]
     assert "surface of 1: AA39" in alert["message"]
     (study,) = real_client.get("/v1/studies").json()["items"]
-    assert real_client.post(f"/v1/studies/{study['id']}/adopt").status_code == 201
+    assert real_client.post(f"/v1/studies/{study['id']}/adopt", json=real.REASON).status_code == 201
     (alert,) = outdated(real_client)
     assert "model" in alert["message"]

@@ -419,13 +419,13 @@ def test_study_is_adopted_and_withdrawn(app: FastAPI, pages: TestClient):
 
 def test_unexplained_study_is_adopted_by_force(app: FastAPI, pages: TestClient):
     number, empty = keep_study(app, SLOPE, verdict="unexplained"), keep_study(app)
-    assert 'name="force" value="true" required' in text_of(pages, f"/studies/{number}")
+    assert 'name="read" value="true" required' in text_of(pages, f"/studies/{number}")
     refused = pages.post(f"/studies/{number}/adopt")
     assert refused.status_code == 409
     assert "unexplained" in refused.text
     assert (
         pages.post(
-            f"/studies/{number}/adopt", data={"force": "true"}, follow_redirects=False
+            f"/studies/{number}/adopt", data={"read": "true"}, follow_redirects=False
         ).status_code
         == 303
     )

@@ -131,7 +131,7 @@ def every_study(real_store: Path, tmp_path_factory: pytest.TempPathFactory) -> I
         day = {"first_at": "2026-06-21T10:00:00Z", "last_at": "2026-06-21T12:00:00Z"}
         real.run_job(client, "/v1/jobs/plans", name="noon", allowed_w_m2=100.0, **day, **body)
         newest = client.get("/v1/studies").json()["items"][0]["id"]
-        assert client.post(f"/v1/studies/{newest}/adopt").status_code == 201
+        assert client.post(f"/v1/studies/{newest}/adopt", json=real.REASON).status_code == 201
         yield client
 
 

@@ -1,0 +1,65 @@
+"""What became of studies, and what to know before their results are adopted."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from sqlalchemy.orm import Session
+
+from service import store
+from service.store.results import StudyFindings
+from service.store.tables import ModelRow, StudyRow
+from service.twin.plant import model_versions
+from service.twin.plant.open_questions import OpenQuestion, open_questions
+
+AdoptionState = Literal["active", "replaced", "withdrawn", "candidate", "nothing_to_adopt"]
+
+
+@dataclass(frozen=True)
+class StudyState:
+    """A study's findings, and the newest version adopted from it.
+
+    ``state`` is "replaced" if a later version is current. ``warnings`` are the conflicts that
+    adoption by force ignores.
+    """
+
+    findings: StudyFindings
+    version: ModelRow | None
+    state: AdoptionState
+    questions: list[OpenQuestion]
+    warnings: list[str]
+
+    @property
+    def adopted(self) -> int | None:
+        """Number of the version that was adopted from it, unless it is withdrawn."""
+        return None if self.version is None or self.version.withdrawn_at else self.version.number
+
+
+def study_states(session: Session, rows: Sequence[StudyRow]) -> dict[int, StudyState]:
+    """The states of studies, by id."""
+    numbers = [row.id for row in rows]
+    findings, current = (
+        store.study_findings(session, numbers),
+        model_versions.current_number(session),
+    )
+    versions = model_versions.newest_of(session, numbers)
+    return {row.id: _state(row, findings[row.id], versions.get(row.id), current) for row in rows}
+
+
+def _state(
+    row: StudyRow, findings: StudyFindings, version: ModelRow | None, current: int
+) -> StudyState:
+    state: AdoptionState = "candidate" if findings.effects else "nothing_to_adopt"
+    if version is not None:
+        is_active = version.number == current
+        state = "withdrawn" if version.withdrawn_at else "active" if is_active else "replaced"
+    warnings = []
+    if row.verdict != "effect":
+        warnings.append("its verdict does not rest on its effects")
+    if row.model != current:
+        warnings.append(
+            f"it was made with version {row.model} of the model, and would replace version"
+            f" {current}, which is current"
+        )
+    questions = open_questions(findings.effects, findings.unexplained_share)
+    return StudyState(findings, version, state, questions, warnings)
