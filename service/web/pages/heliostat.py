@@ -35,6 +35,7 @@ from service.store.photographs.groups import (
 from service.store.pointing import mounts
 from service.store.surfaces import decisions
 from service.store.tables import DecisionRow, HeliostatRow, MountRow, SurfaceRow
+from service.twin.alerts import causes
 from service.twin.alerts.field_overview import (
     FieldTotals,
     HeliostatOverview,
@@ -291,6 +292,7 @@ class _HeliostatData:
     best: CalibrationSlot | None
     compared: ComparisonResult
     zone: str
+    causes: list[causes.LikelyCause]
 
 
 def _read(
@@ -322,6 +324,11 @@ def _read(
     compared = ComparisonResult() if shown is None else cache.wait_for(shown) or _UNDER_WAY
     line = field.with_pointing(line)
     best = None if line.pointing is None else best_slot(runtime, name)
+    likely, settings = list[causes.LikelyCause](), runtime.settings
+    with runtime.database.reading() as session:
+        facts = causes.read_facts(session, line, row, surface, compared.comparisons, settings)
+        if causes.is_poor(session, facts, row, compared.comparisons, settings):
+            likely = causes.rank_causes(facts)
     return _HeliostatData(
         row,
         origin,
@@ -337,6 +344,7 @@ def _read(
         best,
         compared,
         zone,
+        likely,
     )
 
 
@@ -388,6 +396,7 @@ def get_heliostat_page(
         mount=read.mount,
         line=read.line,
         best=read.best,
+        causes=read.causes,
         pointing=None if read.mount is None else _mount_context(read.mount),
         **(
             _surface_context(read.row, read.surface, read.origin, ends)

@@ -1,0 +1,446 @@
+"""Rank likely causes of a heliostat's poor forecasts, each with its evidence and the next step."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, date, datetime, timedelta
+from datetime import time as clock
+from statistics import median
+from typing import Literal, NamedTuple
+
+import numpy as np
+from sqlalchemy import func, select
+from sqlalchemy.orm import Session
+
+from model.frames import sun_direction
+from service import store
+from service.base.settings import Settings
+from service.store.tables import (
+    SUN_CONTRADICTS_TIME,
+    UNLIKE_HELIOSTAT,
+    DriftRow,
+    HeliostatRow,
+    MeasurementRow,
+    StudyRow,
+    SurfaceRow,
+)
+from service.twin.alerts.field_overview import HeliostatOverview
+from service.twin.heliostats.outliers import list_outliers
+from service.twin.plant import model_versions
+from service.twin.surfaces.accuracy import (
+    Comparison,
+    photograph_name,
+    photographs_of_surface,
+    rank_of,
+)
+
+CauseKind = Literal["clock", "foreign_light", "haze", "moved", "few_suns", "model", "times_unknown"]
+
+CAUSES: dict[CauseKind, str] = {
+    "clock": "Wrong sun or clock",
+    "foreign_light": "Another heliostat's light, a shadow or a cloud",
+    "haze": "Haze, or the camera",
+    "moved": "It moved",
+    "few_suns": "Too few suns",
+    "model": "The model lacks something",
+    "times_unknown": "Haze and clock not checked",
+}
+"""All causes with their labels; of equal shares the first is the likelier one."""
+
+# Newest photographs that are looked at.
+_NEWEST = 32
+# Drop of accuracy [1] that makes a photograph of the day worse than usual.
+_DROP = 0.05
+# Photographs of other heliostats that a hazy day needs.
+_MIN_OTHERS = 2
+# Suns that a prediction takes; fewer than `_FEW` are too few, and so is a span below `_SPAN_DEG`.
+_SUNS, _FEW, _SPAN_DEG, _SAME_SUN_DEG = 8, 4, 20.0, 5.0
+# Misfit relative to the field's median, above which the model or the mirror is unusual.
+_MISFIT_RATIO = 1.5
+
+
+@dataclass(frozen=True)
+class PhotographFacts:
+    """What the store knows of a photograph.
+
+    ``accuracy`` [1] is that of the compared forecast, else that of its arrival. ``warnings`` are
+    those of the measurement. ``was_used`` is whether the surface was computed from it.
+    """
+
+    identifier: str
+    taken_at: datetime | None
+    sun: tuple[float, float, float]
+    accuracy: float | None
+    warnings: tuple[Mapping[str, object], ...] = ()
+    was_used: bool = False
+
+    def warning(self, type_: str) -> Mapping[str, object] | None:
+        """Its warning of a type; None without any."""
+        return next((one for one in self.warnings if one["type"] == type_), None)
+
+
+class StudyFinding(NamedTuple):
+    """The number of a study, and what it says."""
+
+    number: int
+    said: str
+
+
+@dataclass(frozen=True)
+class DayOfOthers:
+    """Photographs of other heliostats on a day: number, heliostats, accuracy [1], usual one [1]."""
+
+    photographs: int
+    heliostats: int
+    accuracy: float
+    usual: float
+
+
+@dataclass(frozen=True)
+class HeliostatFacts:
+    """What the store knows of a heliostat, as `rank_causes` needs it.
+
+    ``study`` is the newest study's sentence about what the model lacks. ``usual_misfit`` [1] is the
+    median of the field's active surfaces.
+    """
+
+    limit: float
+    photographs: Sequence[PhotographFacts]
+    line: HeliostatOverview
+    others: Mapping[date, DayOfOthers]
+    suspicious: Sequence[str] = ()
+    sun_span_deg: float | None = None
+    misfit: float | None = None
+    usual_misfit: float | None = None
+    study: StudyFinding | None = None
+
+
+@dataclass(frozen=True)
+class LikelyCause:
+    """A likely cause with one sentence of evidence.
+
+    ``share`` [1] is the share of the poor photographs that the evidence concerns; for causes that
+    concern all of them, the share of the shortfall that it explains. ``photographs`` are
+    identifiers, ``day`` and ``study`` where to look.
+    """
+
+    kind: CauseKind
+    share: float
+    evidence: str
+    photographs: tuple[str, ...] = ()
+    day: date | None = None
+    study: int | None = None
+
+    @property
+    def label(self) -> str:
+        """The cause in words."""
+        return CAUSES[self.kind]
+
+
+def count_photographs(count: int) -> str:
+    """A number of photographs in words."""
+    return f"{count} photograph{'' if count == 1 else 's'}"
+
+
+def outlier_reasons(facts: HeliostatFacts) -> dict[str, str]:
+    """Why each photograph is an outlier, by identifier; photographs that are none are left out."""
+    known = [one.accuracy for one in facts.photographs if one.accuracy is not None]
+    usual = median(known) if known else 0.0
+    in_time = sorted(
+        (one for one in facts.photographs if one.accuracy is not None),
+        key=lambda one: (one.taken_at is not None, one.taken_at),
+    )
+    undated = sum(one.taken_at is None for one in in_time)
+    apart = list_outliers([1 - (one.accuracy or 0) for one in in_time], undated) if in_time else []
+    far = {in_time[place].identifier for place in apart}
+    reasons = {}
+    for one in facts.photographs:
+        said = []
+        if (found := one.warning(SUN_CONTRADICTS_TIME)) is not None:
+            said.append(f"its sun contradicts its time: {found['detail']}")
+        if (found := one.warning(UNLIKE_HELIOSTAT)) is not None:
+            said.append(str(found["detail"]))
+        if one.identifier in facts.suspicious:
+            said.append("the surface does not explain it, although it was made from it")
+        if one.accuracy is not None and (one.identifier in far or one.accuracy < facts.limit):
+            said.append(
+                f"it is forecast with an accuracy of {one.accuracy:.0%}, the others with"
+                f" {usual:.0%} in the median"
+            )
+        if said:
+            reasons[one.identifier] = "; ".join(said)
+    return reasons
+
+
+def rank_causes(facts: HeliostatFacts) -> list[LikelyCause]:
+    """Rank the causes by the share of the poor photographs that they explain, the largest first."""
+    poor = outlier_reasons(facts)
+    found = [
+        *_clock(facts, poor),
+        *_foreign_light(facts, poor),
+        *_haze(facts, poor),
+        *_moved(facts, poor),
+        *_few_suns(facts),
+        *_model(facts),
+    ]
+    undated = sum(one.taken_at is None for one in facts.photographs)
+    if undated and not any(one.kind in ("clock", "haze") for one in found):
+        said = f"the times of {undated} of {count_photographs(len(facts.photographs))} are unknown"
+        found.append(LikelyCause("times_unknown", 0.0, said))
+    order = list(CAUSES)
+    return sorted(found, key=lambda one: (-one.share, order.index(one.kind)))
+
+
+def _of_photographs(
+    kind: CauseKind, concerned: Sequence[PhotographFacts], poor: Mapping[str, str], said: str
+) -> list[LikelyCause]:
+    names = tuple(one.identifier for one in concerned)
+    return [LikelyCause(kind, len(names) / max(len(poor), len(names)), said, names)]
+
+
+def _clock(facts: HeliostatFacts, poor: Mapping[str, str]) -> list[LikelyCause]:
+    wrong = [one for one in facts.photographs if one.warning(SUN_CONTRADICTS_TIME)]
+    if not wrong:
+        return []
+    detail = (wrong[0].warning(SUN_CONTRADICTS_TIME) or {})["detail"]
+    said = (
+        f"{count_photographs(len(wrong))} of {len(facts.photographs)}, the newest first: {detail}"
+    )
+    return _of_photographs("clock", wrong, poor, said)
+
+
+def _foreign_light(facts: HeliostatFacts, poor: Mapping[str, str]) -> list[LikelyCause]:
+    """Photographs that contradict the others, without a contradicting time or a day of haze."""
+    unlike = [one for one in facts.photographs if one.warning(UNLIKE_HELIOSTAT)]
+    if unlike:
+        likes = sorted({str((one.warning(UNLIKE_HELIOSTAT) or {})["like"]) for one in unlike})
+        said = (
+            f"the surface of {', '.join(likes)} forecasts {count_photographs(len(unlike))} of"
+            f" {len(facts.photographs)} much better"
+        )
+        return _of_photographs("foreign_light", unlike, poor, said)
+    days = set(_hazy_days(facts, poor))
+    apart = [
+        one
+        for one in facts.photographs
+        if one.identifier in poor
+        and one.warning(SUN_CONTRADICTS_TIME) is None
+        and (one.taken_at is None or one.taken_at.date() not in days)
+    ]
+    usual = [one for one in facts.photographs if one.identifier not in poor]
+    # If most are poor, none contradicts the others.
+    if not apart or len(poor) > len(usual):
+        return []
+    values = [one.accuracy for one in apart if one.accuracy is not None]
+    worst = f", {min(values):.0%} accurate at worst" if values else ""
+    said = (
+        f"{count_photographs(len(apart))} of {len(facts.photographs)} contradict the others{worst}"
+    )
+    return _of_photographs("foreign_light", apart, poor, said)
+
+
+def _hazy_days(facts: HeliostatFacts, poor: Mapping[str, str]) -> list[date]:
+    """Days with poor photographs, on which those of other heliostats were poor too; worst first."""
+    counts: dict[date, int] = {}
+    for one in facts.photographs:
+        if one.identifier in poor and one.taken_at is not None:
+            day = one.taken_at.date()
+            other = facts.others.get(day)
+            if (
+                other is not None
+                and other.photographs >= _MIN_OTHERS
+                and other.usual - other.accuracy >= _DROP
+            ):
+                counts[day] = counts.get(day, 0) + 1
+    return sorted(counts, key=lambda day: (-counts[day], day))
+
+
+def _haze(facts: HeliostatFacts, poor: Mapping[str, str]) -> list[LikelyCause]:
+    days = _hazy_days(facts, poor)
+    if not days:
+        return []
+    day, other = days[0], facts.others[days[0]]
+    own = [
+        one
+        for one in facts.photographs
+        if one.identifier in poor and one.taken_at is not None and one.taken_at.date() == day
+    ]
+    values = [one.accuracy for one in own if one.accuracy is not None]
+    mine = f" ({median(values):.0%})" if values else ""
+    said = (
+        f"on {day:%Y-%m-%d}, not only {count_photographs(len(own))} of it{mine} but also"
+        f" {count_photographs(other.photographs)} of {other.heliostats} other heliostat"
+        f"{'' if other.heliostats == 1 else 's'} were forecast with {other.accuracy:.0%} instead of"
+        f" {other.usual:.0%}"
+    )
+    (cause,) = _of_photographs("haze", own, poor, said)
+    return [replace(cause, day=day)]
+
+
+def _moved(facts: HeliostatFacts, poor: Mapping[str, str]) -> list[LikelyCause]:
+    pointing = facts.line.pointing
+    if pointing is None:
+        return []
+    metres = (
+        "" if facts.line.pointing_m is None else f", {facts.line.pointing_m:.2f} m on the receiver"
+    )
+    if pointing.moved is not None and not pointing.moved.is_calibrated:
+        moved = pointing.moved
+        said = f"it moved {moved.when}: its spot is {moved.size_mrad:.1f} mrad off since{metres}"
+        since = {
+            one.identifier
+            for one in facts.photographs
+            if one.taken_at is not None and one.taken_at >= moved.until
+        }
+        return [LikelyCause("moved", max(0.5, len(since & poor.keys()) / max(len(poor), 1)), said)]
+    if pointing.beyond_since is not None and pointing.error_mrad is not None:
+        said = (
+            f"its spot is {pointing.error_mrad:.1f} mrad off{metres}, beyond the limit since"
+            f" {pointing.beyond_since:%Y-%m-%d}"
+        )
+        return [LikelyCause("moved", 0.5, said)]
+    return []
+
+
+def count_suns(suns: Sequence[tuple[float, float, float]]) -> int:
+    """Number of suns that lie at least 5 degrees apart, of unit vectors (n, 3)."""
+    kept: list[np.ndarray] = []
+    for sun in np.asarray(suns).reshape(-1, 3):
+        if all(sun @ other < np.cos(np.radians(_SAME_SUN_DEG)) for other in kept):
+            kept.append(sun)
+    return len(kept)
+
+
+def _few_suns(facts: HeliostatFacts) -> list[LikelyCause]:
+    used = [one for one in facts.photographs if one.was_used]
+    if not used:
+        return []
+    suns, span = count_suns([one.sun for one in used]), facts.sun_span_deg or 0.0
+    if suns >= _FEW and span >= _SPAN_DEG:
+        return []
+    others = count_suns([one.sun for one in facts.photographs])
+    said = (
+        f"its surface was made from {count_photographs(len(used))} under {suns}"
+        f" sun{'' if suns == 1 else 's'}, {span:.0f}° apart at most; a prediction takes up to"
+        f" {_SUNS}, and its accepted photographs have {others}"
+    )
+    return [LikelyCause("few_suns", 1 - suns / _SUNS, said)]
+
+
+def _model(facts: HeliostatFacts) -> list[LikelyCause]:
+    excess = 0.0
+    if facts.misfit and facts.usual_misfit and facts.misfit > _MISFIT_RATIO * facts.usual_misfit:
+        excess = 1 - facts.usual_misfit / facts.misfit
+    if facts.study is not None:
+        number, said = facts.study
+        return [LikelyCause("model", max(excess, 0.25), said, study=number)]
+    if not excess:
+        return []
+    said = (
+        f"its surface misses {facts.misfit:.0%} of the photographs that it was made from;"
+        f" {facts.usual_misfit:.0%} is the field's median"
+    )
+    return [LikelyCause("model", excess, said)]
+
+
+# --- from the store
+# --------------------------------------------------------------------------------------------------
+
+
+def read_facts(
+    session: Session,
+    line: HeliostatOverview,
+    row: HeliostatRow,
+    surface: SurfaceRow | None,
+    comparisons: Sequence[Comparison],
+    settings: Settings,
+) -> HeliostatFacts:
+    """Read what `rank_causes` needs of a heliostat and of the surface that forecasts it."""
+    compared = {one.measurement.id: one.accuracy for one in comparisons}
+    used = photographs_of_surface(surface)
+    recent = store.recent_measurements(session, row, _NEWEST)
+    photographs = [
+        PhotographFacts(
+            one.identifier,
+            one.taken_at,
+            tuple(sun_direction(one.sun_azimuth_deg, one.sun_elevation_deg).tolist()),
+            compared.get(one.id, one.forecast_accuracy),
+            tuple(one.warnings or ()),
+            photograph_name(one) in used,
+        )
+        for one in recent
+    ]
+    days = {one.taken_at.date() for one in photographs if one.taken_at is not None}
+    return HeliostatFacts(
+        settings.attention_accuracy,
+        photographs,
+        line,
+        {day: found for day in days if (found := _others_on(session, row.id, day)) is not None},
+        () if surface is None else tuple(surface.suspicious or ()),
+        None if surface is None else surface.sun_span_deg,
+        None if surface is None else surface.misfit,
+        _usual_misfit(session),
+        _study(session, row.name),
+    )
+
+
+def _others_on(session: Session, heliostat: int, day: date) -> DayOfOthers | None:
+    """Compare other heliostats' accuracies on arrival of a day with their usual ones."""
+    begin = datetime.combine(day, clock(), UTC)
+    row = MeasurementRow
+    is_other = (row.heliostat_id != heliostat, row.accepted, row.forecast_accuracy.is_not(None))
+    is_of_day = row.taken_at.between(begin, begin + timedelta(days=1))
+    query = select(row.heliostat_id, row.forecast_accuracy).where(*is_other, is_of_day)
+    found = session.execute(query.limit(_NEWEST)).all()
+    if len(found) < _MIN_OTHERS:
+        return None
+    of = {number for number, _ in found}
+    usual = select(func.avg(row.forecast_accuracy)).where(
+        row.heliostat_id.in_(of), *is_other, ~is_of_day
+    )
+    mean = session.scalar(usual)
+    if mean is None:
+        return None
+    return DayOfOthers(len(found), len(of), median(value or 0.0 for _, value in found), mean)
+
+
+def _usual_misfit(session: Session) -> float | None:
+    """Median misfit [1] of the newest active surfaces of the field; None for fewer than three."""
+    query = select(SurfaceRow.misfit).where(
+        SurfaceRow.misfit.is_not(None), ~SurfaceRow.is_candidate
+    )
+    found = session.scalars(query.order_by(SurfaceRow.id.desc()).limit(200)).all()
+    return median(one or 0.0 for one in found) if len(found) > 2 else None
+
+
+def _study(session: Session, heliostat: str) -> StudyFinding | None:
+    """What the newest study found that the model lacks, if it included the heliostat."""
+    query = select(StudyRow).order_by(StudyRow.id.desc()).limit(1)
+    study = session.scalars(query).one_or_none()
+    if study is None or study.verdict == "none" or heliostat not in study.heliostats:
+        return None
+    if model_versions.find_adopted(session, study.id) is not None:
+        return None
+    return StudyFinding(study.id, f"study {study.id} of its photographs: {study.conclusion}")
+
+
+def is_poor(
+    session: Session,
+    facts: HeliostatFacts,
+    row: HeliostatRow,
+    comparisons: Sequence[Comparison],
+    settings: Settings,
+) -> bool:
+    """Whether a heliostat is below the accuracy limit, or one of its alarms is open."""
+    drift = session.get(DriftRow, row.id)
+    accuracy = rank_of(comparisons).accuracy
+    shown = facts.line.surface or facts.line.candidate
+    pointing = facts.line.pointing
+    return bool(
+        (accuracy is not None and accuracy < settings.attention_accuracy)
+        or (drift is not None and drift.accuracy < settings.attention_accuracy)
+        or (drift is not None and (drift.min_drop or 0) > settings.attention_accuracy_drop)
+        or (shown is not None and shown.warnings and shown.acknowledged_by is None)
+        or (pointing is not None and pointing.beyond_since is not None)
+        or (pointing is not None and pointing.moved and not pointing.moved.is_calibrated)
+        or any(one.warnings for one in facts.photographs)
+    )
