@@ -554,6 +554,11 @@ class AlertCount:
         """The number of all open alerts."""
         return sum(self.by_severity().values())
 
+    @property
+    def last(self) -> int:
+        """The number of all open alerts at the last count, without a new one."""
+        return sum(self._counted.values())
+
     def forget(self) -> None:
         """Count again at the next read, because an alert was acknowledged."""
         with self._lock:

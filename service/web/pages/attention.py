@@ -5,7 +5,6 @@ from typing import Annotated
 
 from fastapi import APIRouter, Form, Query, Request, Response
 from fastapi.responses import HTMLResponse
-from markupsafe import Markup
 from pydantic import Field
 
 from service.base.fields import Model
@@ -20,7 +19,7 @@ from service.web.auth.dependencies import (
     IdentityDep,
     RuntimeDep,
 )
-from service.web.responses.pages import go_to, render
+from service.web.responses.pages import count_badge, go_to, render
 
 router = APIRouter(include_in_schema=False)
 
@@ -67,11 +66,7 @@ def get_attention_page(
 @router.get("/attention/count", dependencies=[READ])
 def get_attention_count(count: AttentionCountDep) -> Response:
     """The number of alerts that are not acknowledged, for the menu."""
-    number = count.read()
-    badge = Markup(
-        '<span class="count">{}<span class="hidden"> not acknowledged</span></span>'
-    ).format(number)
-    return HTMLResponse(badge if number else "")
+    return HTMLResponse(count_badge(count.read()))
 
 
 @router.post("/attention/acknowledgements", dependencies=[OPERATE])

@@ -7,13 +7,15 @@ from typing import Annotated, Any, ClassVar
 from urllib.parse import urlencode
 
 import numpy as np
-from fastapi import APIRouter, Query, Request
+from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import HTMLResponse
 from numpy.typing import NDArray
 from pydantic import Field
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
+from service import store
+from service.base.fields import Search
 from service.base.settings import Settings
 from service.drawing.charts import CONDITION, Scale
 from service.drawing.pictures import places_picture
@@ -29,7 +31,7 @@ from service.twin.alerts.field_filter import (
 )
 from service.twin.alerts.field_overview import HeliostatOverview
 from service.web.auth.dependencies import READ, RENDER_SLOT, FieldCacheDep, RuntimeDep
-from service.web.responses.pages import render
+from service.web.responses.pages import go_to, render
 
 router = APIRouter(include_in_schema=False, dependencies=[READ])
 
@@ -261,6 +263,19 @@ def _counts(lines: Sequence[HeliostatOverview]) -> dict[str, int]:
         "unacknowledged": sum(not surface.acknowledged_by for surface in flagged),
         "judged": sum(line.rank is not None and line.rank.photographs > 0 for line in lines),
     }
+
+
+@router.get("/find")
+def get_found_heliostat(runtime: RuntimeDep, find: Annotated[Search, Query()] = "") -> Response:
+    """Go to the heliostat of this name, or to the list of those whose names contain it."""
+    name = find.strip()
+    with runtime.database.reading() as session:
+        found = store.list_heliostats(session, 2, search=name)
+        exact = [row for row in store.list_heliostats(session, 1, prefix=name) if name]
+    exact = [row for row in exact if row.name.lower() == name.lower()] or [*found]
+    if len(exact) == 1:
+        return go_to(f"/heliostats/{exact[0].name}")
+    return go_to(FieldView().link(search=name or None))
 
 
 @router.get("/", dependencies=[RENDER_SLOT])

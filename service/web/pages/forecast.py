@@ -170,11 +170,12 @@ def get_offered_heliostats(
     request: Request,
     runtime: RuntimeDep,
     heliostat: Annotated[Search, Query()] = "",
+    find: Annotated[Search, Query()] = "",
     after: Annotated[Name | None, Query(description="The last name of the list before.")] = None,
 ) -> HTMLResponse:
-    """The first names that begin with ``heliostat``, as suggestions for the form."""
+    """The first names that begin with ``heliostat`` or ``find``, as suggestions for forms."""
     with runtime.database.reading() as session:
-        rows = store.list_heliostats(session, _OFFERED, after, heliostat)
+        rows = store.list_heliostats(session, _OFFERED, after, heliostat or find)
     return render(request, "offered.html", heliostats=rows)
 
 

@@ -130,12 +130,20 @@ TEMPLATES = _environment()
 """The templates of the pages."""
 
 
+def count_badge(number: int) -> Markup:
+    """The number of alerts that are not acknowledged, for the menu; empty for none."""
+    badge = '<span class="count">{}<span class="hidden"> not acknowledged</span></span>'
+    return Markup(badge).format(number) if number else Markup("")
+
+
 def _text(scope: Scope, template: str, context: dict[str, object]) -> tuple[str, _Rendering]:
     identity: Identity | None = scope.get("state", {}).get("identity")
-    may = {
+    may: dict[str, object] = {
         f"may_{role}": identity is not None and identity.role.includes(role)
         for role in (Role.OPERATE, Role.ADMIN)
     }
+    counted = getattr(getattr(scope.get("app"), "state", None), "attention", None)
+    may["alarm_count"] = count_badge(0 if counted is None else counted.last)
     path, query = scope.get("path", ""), scope.get("query_string", b"").decode("ascii", "replace")
     rendering = _Rendering(quote(path) + (f"?{query}" if query else ""))
     token = _RENDERING.set(rendering)
